@@ -1,0 +1,199 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.trials import flights, trials
+from torchgco.experiments.report import compare, format_table, main, merge, write_report
+from torchgco.experiments.statistics import summarise
+from torchgco.scenarios.layouts import Layouts
+from torchgco.shapes import InputError
+
+HITS = [i < 30 for i in range(32)]
+
+
+def study(folder: Path, *rows: dict[str, Any], config: str | None = None) -> Path:
+    """A folder as a study leaves it, with its configuration if there is one."""
+    folder.mkdir(parents=True, exist_ok=True)
+    trials(*rows).to_parquet(folder / "trials.parquet", index=False)
+    if config is not None:
+        (folder / ".hydra").mkdir()
+        (folder / ".hydra" / "config.yaml").write_text(config)
+    return folder
+
+
+def table(*rows: dict[str, Any]) -> str:
+    frame = trials(*rows)
+    return format_table(summarise(frame), compare(frame))
+
+
+def test_rates_are_written_with_counts_and_interval() -> None:
+    assert "30/32 94 % [80, 98]" in table(*flights("gco", HITS))
+
+
+def test_columns_are_aligned() -> None:
+    text = table(*flights("gco", HITS), *flights("a_long_name", [False] * 32, cost=1e7))
+    blocks = [block.splitlines() for block in text.split("\n\n")]
+    assert [len(block) for block in blocks] == [1, 3, 3, 4]
+    for block in blocks:
+        assert len({len(line) for line in block}) == 1
+
+
+def test_what_is_not_defined_is_a_dash() -> None:
+    text = table({"success": pd.NA, "reached": False, "iterations": np.nan})
+    rates, effort = text.split("\n\n")[1:3]
+    assert rates.split()[-1] == "-"
+    assert effort.split("\n")[1].split().count("-") == 2, "median cost of those that reached, and iterations"
+
+
+def test_the_first_solver_is_the_one_compared_with_the_others() -> None:
+    text = table(*flights("gco", HITS), *flights("al_ilqr", [False] * 32))
+    line = next(line for line in text.splitlines() if "reached" in line and "gco - al_ilqr" in line)
+    assert line.split()[3:] == ["reached", "32", "0", "30", "0", "2", "+94", "points", "1.9e-09", "0"]
+
+
+def test_each_task_has_its_own_tables() -> None:
+    text = table(*flights("gco", [True]), *flights("gco", [False], scenario="trap", model="planar", seed=5))
+    assert "forest (quadrotor), seed 0" in text and "trap (planar), seed 5" in text
+    assert text.count("1/1 100 %") == 3 and text.count("0/1 0 %") == 3
+
+
+def test_a_report_writes_summary_and_figures(tmp_path: Path) -> None:
+    folder = study(tmp_path, *flights("gco", HITS), *flights("al_ilqr", HITS[::-1]))
+    text = write_report(folder)
+    summary = pd.read_csv(folder / "summary.csv")
+    assert summary["solver"].tolist() == ["gco", "al_ilqr"]
+    assert summary["reached_count"].tolist() == [30, 30]
+    assert sorted(path.stem for path in folder.glob("figures/*.png")) == ["clearance", "rates", "violation"]
+    assert "gco - al_ilqr" in text
+
+
+@pytest.fixture
+def flown(tmp_path: Path) -> Path:
+    folder = study(tmp_path, *flights("gco", [True, False]))
+    start, goal = np.zeros(6), np.ones(6)
+    Layouts(np.full((2, 1, 2), 0.5), np.full((2, 1), 0.1), start=start, goal=goal).save(folder / "layouts.npz")
+    np.savez(folder / "solutions.npz", U=np.zeros((1, 2, 3, 2)), solver=np.array(["gco"]))
+    return folder
+
+
+def test_given_trajectories_are_drawn(flown: Path) -> None:
+    write_report(flown, {"gco": np.zeros((2, 4, 6))})
+    assert (flown / "figures" / "layouts.png").is_file()
+
+
+def test_trajectories_may_be_made_from_the_files(flown: Path) -> None:
+    seen = {}
+
+    def roll_out(layouts: Any, solutions: Any) -> dict[str, np.ndarray]:
+        seen.update(centers=layouts["centers"].shape, controls=solutions["U"].shape)
+        return {"gco": np.zeros((2, 4, 6))}
+
+    write_report(flown, roll_out)
+    assert seen == {"centers": (2, 1, 2), "controls": (1, 2, 3, 2)}
+    assert (flown / "figures" / "layouts.png").is_file()
+
+
+def test_a_folder_without_trials_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"trials\.parquet"):
+        write_report(tmp_path)
+
+
+def test_merging_joins_what_differs_in_seed(tmp_path: Path) -> None:
+    study(tmp_path / "a", *flights("gco", HITS))
+    study(tmp_path / "deep" / "b", *flights("gco", HITS, seed=1))
+    merged = merge([tmp_path])
+    assert len(merged) == 64 and set(merged["solver"]) == {"gco"}
+    assert list(merged.columns) == list(trials({}).columns)
+
+
+def test_a_table_found_twice_counts_once(tmp_path: Path) -> None:
+    folder = study(tmp_path / "a", *flights("gco", HITS))
+    assert len(merge([tmp_path, folder, folder])) == 32
+
+
+def test_the_same_result_in_two_runs_counts_once_with_its_first_time(tmp_path: Path) -> None:
+    study(tmp_path / "a", *flights("gco", HITS, seconds=1.0))
+    study(tmp_path / "b", *flights("gco", HITS, seconds=2.0))
+    merged = merge([tmp_path])
+    assert len(merged) == 32 and set(merged["seconds"]) == {1.0}
+    assert merged.attrs["repeated"] == 32
+
+
+CONFLICTS = {
+    "unknown": (None, None),
+    "one unknown": ("limit: 1", None),
+    "same": ("limit: 1", "limit: 1"),
+}
+
+
+@pytest.mark.parametrize("configs", CONFLICTS.values(), ids=CONFLICTS.keys())
+def test_different_results_under_one_name_are_refused(tmp_path: Path, configs: tuple) -> None:
+    first, second = configs
+    study(tmp_path / "a", *flights("gco", HITS), config=first)
+    study(tmp_path / "b", *flights("gco", HITS, cost=7.0), config=second)
+    with pytest.raises(InputError) as error:
+        merge([tmp_path])
+    message = str(error.value)
+    assert "cost" in message and "layout 0" in message and "solver gco" in message
+    assert str(tmp_path / "a") in message and str(tmp_path / "b") in message
+
+
+def test_different_configurations_get_a_label_where_their_results_differ(tmp_path: Path) -> None:
+    steady = flights("fatrop", HITS)
+    more = [{"solver": "gco", "layout": 40}]
+    study(tmp_path / "a", *flights("gco", HITS), *more, *steady, config="limit: 1")
+    study(tmp_path / "sub" / "b", *flights("gco", HITS[::-1]), *steady, config="limit: 2")
+    merged = merge([tmp_path])
+    assert merged["solver"].value_counts().to_dict() == {"gco [a]": 33, "gco [sub/b]": 32, "fatrop": 32}
+    assert set(merged.loc[merged["layout"] == 40, "solver"]) == {"gco [a]"}, "all rows of a run, shared or not"
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    study(tmp_path / "a", *flights("gco", HITS))
+    with pytest.raises(InputError, match="nowhere"):
+        merge([tmp_path / "a", tmp_path / "nowhere"])
+
+
+def test_folders_without_trials_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"trials\.parquet"):
+        merge([tmp_path])
+
+
+def test_a_broken_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "trials.parquet").write_bytes(b"not a table")
+    with pytest.raises(InputError, match="readable parquet"):
+        merge([tmp_path])
+
+
+def test_the_command_prints_and_writes_the_merged_report(tmp_path: Path, capsys) -> None:
+    study(tmp_path / "a", *flights("gco", HITS))
+    study(tmp_path / "b", *flights("gco", HITS, seed=1))
+    assert main([str(tmp_path)]) == 0
+    first = capsys.readouterr().out
+    assert "60/64 94 %" in first
+    written = {path.name for path in (tmp_path / "report").rglob("*") if path.is_file()}
+    assert written == {"trials.parquet", "summary.csv", "rates.png", "clearance.png", "violation.png"}
+    assert main([str(tmp_path)]) == 0, "the report of the first call lies below the folder of the second"
+    assert capsys.readouterr().out == first
+
+
+def test_the_command_writes_where_it_is_told(tmp_path: Path, capsys) -> None:
+    study(tmp_path / "a", *flights("gco", HITS))
+    assert main([str(tmp_path / "a"), "--output", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "summary.csv").is_file() and not (tmp_path / "a" / "report").exists()
+
+
+def test_the_command_never_overwrites_a_study(tmp_path: Path, capsys) -> None:
+    folder = study(tmp_path / "a", *flights("gco", HITS))
+    before = (folder / "trials.parquet").read_bytes()
+    assert main([str(folder), "--output", str(folder)]) == 2
+    assert (folder / "trials.parquet").read_bytes() == before
+
+
+def test_the_command_answers_wrong_input_with_one_line(tmp_path: Path, capsys) -> None:
+    assert main([str(tmp_path / "nowhere")]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and len(captured.err.splitlines()) == 1 and "nowhere" in captured.err

@@ -1,0 +1,48 @@
+"""Trials by hand: a table with every column of a study, in which a test writes only what it is about."""
+
+from collections.abc import Iterable
+from itertools import count
+from typing import Any
+
+import pandas as pd
+
+PLAIN = {
+    "scenario": "forest",
+    "layout": 0,
+    "seed": 0,
+    "model": "quadrotor",
+    "solver": "gco",
+    "status": "CONVERGED",
+    "feasible": True,
+    "reached": True,
+    "success": True,
+    "cost": 100.0,
+    "best_cost": 100.0,
+    "violation": 1e-6,
+    "clearance": 0.05,
+    "clearance_knots": 0.06,
+    "goal_distance": 0.2,
+    "iterations": 40,
+    "outer_iterations": 10,
+    "guided": 2,
+    "seconds": 0.1,
+    "batch_size": 8,
+    "threads": 1,
+    "device": "cpu",
+    "dtype": "float64",
+    "version": "0.1.0",
+}
+
+
+def trials(*rows: dict[str, Any]) -> pd.DataFrame:
+    """A table of rows that say only in what they differ from PLAIN."""
+    table = pd.DataFrame([PLAIN | row for row in rows])
+    return table.astype({"success": "boolean"})
+
+
+def flights(solver: str, reached: Iterable[bool], **more: Any) -> list[dict[str, Any]]:
+    """One row per layout 0, 1, ..., that reached the goal or failed altogether."""
+    return [
+        {"solver": solver, "layout": i, "feasible": hit, "reached": hit, "success": hit, **more}
+        for i, hit in zip(count(), reached, strict=False)
+    ]

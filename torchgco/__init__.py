@@ -1,0 +1,54 @@
+"""torchgco: constrained trajectory optimisation, many problems at once.
+
+    problem  = Problem(dynamics, cost, constraints, x0, N)
+    solution = torchgco.solve(problem)
+
+`torchgco.compose` needs Hydra and is reached lazily: importing torchgco loads neither Hydra nor matplotlib.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from torchgco.api import solve as solve
+from torchgco.baselines import Hold as Hold
+from torchgco.baselines import IteratedMPPI as IteratedMPPI
+from torchgco.constraints import Constraint as Constraint
+from torchgco.constraints import ControlBounds as ControlBounds
+from torchgco.constraints import FirstStepRates as FirstStepRates
+from torchgco.constraints import FunctionConstraint as FunctionConstraint
+from torchgco.constraints import Spheres as Spheres
+from torchgco.constraints import StateBounds as StateBounds
+from torchgco.costs import Cost as Cost
+from torchgco.costs import QuadraticCost as QuadraticCost
+from torchgco.dynamics import Airframe as Airframe
+from torchgco.dynamics import Dynamics as Dynamics
+from torchgco.dynamics import FunctionDynamics as FunctionDynamics
+from torchgco.dynamics import Planar as Planar
+from torchgco.dynamics import QuadrotorPlanning as QuadrotorPlanning
+from torchgco.dynamics import QuadrotorPlant as QuadrotorPlant
+from torchgco.dynamics import RotorTracking as RotorTracking
+from torchgco.guidance import GCO as GCO
+from torchgco.guidance import MPPI as MPPI
+from torchgco.judge import judge as judge
+from torchgco.problem import Problem as Problem
+from torchgco.scenarios import Layouts as Layouts
+from torchgco.shapes import InputError as InputError
+from torchgco.solution import Solution as Solution
+from torchgco.solvers import ILQR as ILQR
+from torchgco.solvers import AugmentedLagrangian as AugmentedLagrangian
+from torchgco.solvers import LineSearch as LineSearch
+from torchgco.status import Status as Status
+
+if TYPE_CHECKING:
+    from torchgco.experiments.build import compose as compose
+
+__version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    if name == "compose":
+        from torchgco.experiments.build import compose
+
+        return compose
+    raise AttributeError(f"module 'torchgco' has no attribute {name!r}")

@@ -1,0 +1,7 @@
+"""python -m torchgco"""
+
+import sys
+
+from torchgco.experiments.app import main
+
+sys.exit(main())

@@ -1,0 +1,39 @@
+"""Derivatives of batched functions by `torch.func`, for the parts that bring none of their own.
+
+Every basis direction is pushed through the whole batch at once, so a function sees the shapes it was written for and
+may use parameters per problem. `vmap` over the batch itself could not offer that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+
+def jacobian(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
+    """Derivatives of function(*args) (..., out) by the last axis of each argument: one (..., out, in) each."""
+    columns = []
+    for j, arg in enumerate(args):
+
+        def along(direction: Tensor, j: int = j) -> Tensor:
+            tangents = tuple(direction.expand_as(a) if i == j else torch.zeros_like(a) for i, a in enumerate(args))
+            return torch.func.jvp(function, args, tangents)[1]
+
+        columns.append(torch.func.vmap(along)(_basis(arg)).movedim(0, -1))
+    return tuple(columns)
+
+
+def gradient_and_hessian(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradient (..., s) and Hessian (..., s, s) of function(z) (...), which maps each row of z (..., s) to a number."""
+    gradient = torch.func.grad(lambda rows: function(rows).sum())
+
+    def along(direction: Tensor) -> Tensor:
+        return torch.func.jvp(gradient, (z,), (direction.expand_as(z),))[1]
+
+    return gradient(z), torch.func.vmap(along)(_basis(z)).movedim(0, -1)
+
+
+def _basis(like: Tensor) -> Tensor:
+    return torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)

@@ -1,0 +1,4 @@
+"""What the guided solver is compared with."""
+
+from torchgco.baselines.hold import Hold as Hold
+from torchgco.baselines.mppi import IteratedMPPI as IteratedMPPI

@@ -1,0 +1,55 @@
+"""Hold: the initial guess flown as it is, the floor that shows what feasible alone is worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchgco.lagrangian import Multipliers, violation
+from torchgco.problem import Problem
+from torchgco.rollout import open_loop
+from torchgco.solution import Solution
+from torchgco.solvers.batch import Callback, check_call
+from torchgco.status import Status
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Solves nothing: the trajectory of U0, with the statuses of bad starts."""
+
+    violation_tolerance: float = 1e-3
+
+    def solve(
+        self,
+        problem: Problem,
+        U0: Tensor,
+        seed: int = 0,
+        ids: Tensor | None = None,
+        warm: Multipliers | None = None,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """U0 (B, N, m) rolled out; seed, warm and callback change nothing.
+
+        Raises:
+            InputError: U0 or ids don't fit the problem.
+        """
+        check_call(problem, U0, ids)
+        return rolled_out(problem, U0, self.violation_tolerance, iterations=0)
+
+
+def rolled_out(problem: Problem, U: Tensor, violation_tolerance: float, iterations: int) -> Solution:
+    """A solution without gains or multipliers from controls that no local solver refined."""
+    X = open_loop(problem.dynamics, problem.x0, U)
+    cost, worst = problem.cost.total(X, U), violation(problem, X, U)
+    status = torch.full((problem.B,), int(Status.CONVERGED), device=U.device)
+    status[worst > violation_tolerance] = Status.INFEASIBLE
+    status[~problem.start_is_clear] = Status.INVALID_START
+    status[~torch.isfinite(cost)] = Status.NON_FINITE
+    none = torch.zeros_like(status)
+    return Solution(
+        X=X, U=U.clone(), K=U.new_zeros(*U.shape, problem.n), d=torch.zeros_like(U),
+        multipliers=Multipliers.zero(problem, 0.0), cost=cost, violation=worst, status=status,
+        iterations=torch.full_like(none, iterations), outer_iterations=none, guided=none.clone(),
+    )  # fmt: skip

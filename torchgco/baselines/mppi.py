@@ -1,0 +1,70 @@
+"""Plain MPPI: the sampler alone, iterated open loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchgco.baselines.hold import rolled_out
+from torchgco.draws import DrawKey
+from torchgco.guidance.mppi import MPPI
+from torchgco.lagrangian import Multipliers, violation
+from torchgco.problem import Problem
+from torchgco.shapes import InputError
+from torchgco.solution import Solution
+from torchgco.solvers.batch import Callback, check_call
+
+
+@dataclass(frozen=True)
+class IteratedMPPI:
+    """Algorithm 3 again and again, each time around its own mean; the best iterate is kept.
+
+    Best is: feasible before infeasible, then by cost, then by violation. The initial guess doesn't count.
+
+    Args:
+        sampler: draws and weighs.
+        iterations: how often.
+        violation_tolerance: what counts as feasible (metres for lengths).
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    sampler: MPPI = MPPI()
+    iterations: int = 20
+    violation_tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise InputError("solver.iterations", "at least 1", self.iterations)
+        if not self.violation_tolerance > 0:
+            raise InputError("solver.violation_tolerance", "above 0", self.violation_tolerance)
+
+    def solve(
+        self,
+        problem: Problem,
+        U0: Tensor,
+        seed: int = 0,
+        ids: Tensor | None = None,
+        warm: Multipliers | None = None,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Sample around U0 (B, N, m); draws are keyed by (seed, id, iteration). warm and callback change nothing.
+
+        Raises:
+            InputError: U0 or ids don't fit the problem.
+        """
+        ids = check_call(problem, U0, ids)
+        U, best = U0, U0
+        best_cost = best_violation = torch.full_like(problem.x0[:, 0], torch.inf)
+        for i in range(self.iterations):
+            X, U = self.sampler.improve(problem, U, DrawKey(seed, ids, torch.full_like(ids, i)))
+            cost, worst = problem.cost.total(X, U), violation(problem, X, U)
+            fits, held = worst <= self.violation_tolerance, best_violation <= self.violation_tolerance
+            better = (fits & (~held | (cost < best_cost))) | (~fits & ~held & (worst < best_violation))
+            best = torch.where(better.view(-1, 1, 1), U, best)
+            best_cost = torch.where(better, cost, best_cost)
+            best_violation = torch.where(better, worst, best_violation)
+        return rolled_out(problem, best, self.violation_tolerance, self.iterations)

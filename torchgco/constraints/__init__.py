@@ -1,0 +1,10 @@
+"""Constraints: a function, a sense, and the knots at which it holds."""
+
+from torchgco.constraints.base import Constraint as Constraint
+from torchgco.constraints.base import FunctionConstraint as FunctionConstraint
+from torchgco.constraints.bounds import ControlBounds as ControlBounds
+from torchgco.constraints.bounds import StateBounds as StateBounds
+from torchgco.constraints.equalities import FirstStepRates as FirstStepRates
+from torchgco.constraints.obstacles import CONTACT_FACTOR as CONTACT_FACTOR
+from torchgco.constraints.obstacles import GuideRegion as GuideRegion
+from torchgco.constraints.obstacles import Spheres as Spheres

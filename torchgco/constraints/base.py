@@ -1,0 +1,144 @@
+"""Constraint = a function, a sense, and the knots at which it holds. c <= 0 (or c = 0) is feasible."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.autodiff import jacobian
+from torchgco.costs.base import add_blocks
+from torchgco.shapes import Dimensions, InputError, PerElement
+
+Sense = Literal["inequality", "equality"]
+Knots = slice | Sequence[int] | Tensor
+
+
+class Constraint(PerElement):
+    """Rows c (B, K, p) at K knots of a trajectory.
+
+    `geometric` marks constraints on the position: those that sampling counts as collisions, and in which the
+    guidance looks for rows that cancel each other (F_k of Equation 53).
+    """
+
+    sense: Sense = "inequality"
+    geometric: bool = False
+    knots: Any  # a slice, or an int64 tensor (K,), once bound
+
+    def bind(self, dims: Dimensions) -> Self:
+        """The constraint checked and shaped for one problem; called once, by Problem."""
+        raise NotImplementedError
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        """c (B, K, p) along X (B, N+1, n), U (B, N, m)."""
+        raise NotImplementedError
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        """Add sum_i g_i dc_i and sum_i h_i dc_i' dc_i (Gauss-Newton) to H (B, N+1, s, s); g, h are (B, K, p)."""
+        raise NotImplementedError
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """By how much each row is violated, (B, K, p) >= 0: lengths in metres, all else in the units of c."""
+        c = self.value(X, U)
+        return c.abs() if self.sense == "equality" else c.clamp(min=0.0)
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        """Rows (B, S, p) for samples x (B, S, n) of one knot; geometric constraints only."""
+        raise NotImplementedError
+
+    def holds_at(self, k: int) -> bool:
+        """Whether the constraint speaks of knot k."""
+        if isinstance(self.knots, slice):
+            return self.knots.start <= k < self.knots.stop
+        return bool((self.knots == k).any())
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        """Whether a problem that starts at x0 (B, n) makes sense, (B,) bool."""
+        return torch.ones(x0.shape[0], dtype=torch.bool, device=x0.device)
+
+
+def resolve_knots(knots: Knots, last: int, field: str, device: torch.device) -> slice | Tensor:
+    """Knots as a slice where they are contiguous, else as indices; negative ones count from the end.
+
+    Raises:
+        InputError: none at all, a repeated one, or one outside 0..last.
+    """
+    if isinstance(knots, slice):
+        chosen = list(range(last + 1)[knots])
+    else:
+        chosen = [int(k) for k in knots]
+        if any(not -last - 1 <= k <= last for k in chosen):
+            raise InputError(field, f"knots within 0..{last}", chosen)
+        chosen = [k % (last + 1) for k in chosen]
+    if not chosen or len(set(chosen)) != len(chosen):
+        raise InputError(field, "at least one knot, none twice", chosen)
+    if chosen == list(range(chosen[0], chosen[-1] + 1)):
+        return slice(chosen[0], chosen[-1] + 1)
+    return torch.tensor(chosen, device=device)
+
+
+def check_sense(sense: str, field: str) -> None:
+    if sense not in ("inequality", "equality"):
+        raise InputError(field, "inequality or equality", repr(sense))
+
+
+@dataclass(frozen=True)
+class FunctionConstraint(Constraint):
+    """A constraint given as a function; derivatives by `torch.func`.
+
+    `of` says what the function takes: "x" for function(x), "u" for function(u), "xu" for function(x, u). It maps
+    (..., n), (..., m) to rows (..., p). Default knots: 1..N for "x" (x_0 is given), 0..N-1 otherwise.
+
+    Raises:
+        InputError: on `Problem(...)`: bad sense, knots, or `of`; a function that doesn't return (..., p).
+    """
+
+    function: Callable[..., Tensor]
+    sense: Sense = "inequality"
+    knots: Any = None
+    of: Literal["x", "u", "xu"] = "x"
+    geometric: bool = False
+    name: str = "constraint"
+
+    def bind(self, dims: Dimensions) -> Self:
+        check_sense(self.sense, f"{self.name}.sense")
+        if self.of not in ("x", "u", "xu"):
+            raise InputError(f"{self.name}.of", "x, u or xu", repr(self.of))
+        if self.geometric and self.of != "x":
+            raise InputError(f"{self.name}.geometric", "a function of x alone", f"of={self.of!r}")
+        last = dims.N if self.of == "x" else dims.N - 1
+        default = slice(1, dims.N + 1) if self.of == "x" else slice(0, dims.N)
+        knots = resolve_knots(
+            default if self.knots is None else self.knots, last, f"{self.name}.knots", dims.like.device
+        )
+        rows = self.function(*(dims.like.new_zeros(dims.B, 1, dims.n if a == "x" else dims.m) for a in self.of))
+        if rows.dim() != 3 or rows.shape[:2] != (dims.B, 1):
+            raise InputError(f"{self.name}.function", f"rows ({dims.B}, 1, p)", tuple(rows.shape))
+        return replace(self, knots=knots)
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.function(*self._arguments(X, U))
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        return self.function(x)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        n = X.shape[-1]
+        parts = dict(zip(self.of, jacobian(self.function, *self._arguments(X, U)), strict=True))
+        cx, cu = parts.get("x"), parts.get("u")
+        add = H.new_zeros(*g.shape[:2], *H.shape[2:])
+
+        def gradient(c: Tensor | None) -> Tensor | None:
+            return None if c is None else (g.unsqueeze(-2) @ c).squeeze(-2)
+
+        def product(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+            return None if a is None or b is None else (h.unsqueeze(-1) * a).mT @ b
+
+        add_blocks(add, n, gradient(cx), gradient(cu), product(cx, cx), product(cu, cu), product(cu, cx))
+        H[:, self.knots] += add
+
+    def _arguments(self, X: Tensor, U: Tensor) -> tuple[Tensor, ...]:
+        return tuple((X if a == "x" else U)[:, self.knots] for a in self.of)

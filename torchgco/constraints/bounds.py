@@ -1,0 +1,92 @@
+"""Box bounds on controls and on states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Literal, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint, resolve_knots
+from torchgco.shapes import Dimensions, InputError, check_shape, tensor
+
+
+@dataclass(frozen=True)
+class _Bounds(Constraint):
+    """lower <= z <= upper, as rows [z - upper, lower - z] of those components that are bounded at all.
+
+    Bounds are (size,) or, one per problem, (B, size); infinity means unbounded.
+
+    Raises:
+        InputError: on `Problem(...)`: wrong shape, NaN, bounds crossed, nothing bounded.
+    """
+
+    lower: Any
+    upper: Any
+    knots: Any = None
+    above: Tensor | None = field(default=None, repr=False)  # components with an upper bound, once bound
+    below: Tensor | None = field(default=None, repr=False)
+
+    per_element: ClassVar[tuple[str, ...]] = ("lower", "upper")
+    of: ClassVar[Literal["x", "u"]]
+
+    def bind(self, dims: Dimensions) -> Self:
+        name, size = ("control_bounds", dims.m) if self.of == "u" else ("state_bounds", dims.n)
+        last = dims.N - 1 if self.of == "u" else dims.N
+        lower = self._checked(self.lower, f"{name}.lower", size, dims)
+        upper = self._checked(self.upper, f"{name}.upper", size, dims)
+        if bool((lower > upper).any()):
+            raise InputError(f"{name}.lower", "at most the upper bound", f"{lower.tolist()} over {upper.tolist()}")
+        default = slice(0, dims.N) if self.of == "u" else slice(1, dims.N + 1)
+        above = torch.isfinite(upper).any(dim=0).nonzero().flatten()
+        below = torch.isfinite(lower).any(dim=0).nonzero().flatten()
+        if above.numel() + below.numel() == 0:
+            raise InputError(name, "at least one finite bound", "none")
+        # A component bounded in one problem and free in the next: 0 * infinity would poison the free one.
+        lower, upper = lower.nan_to_num(neginf=-1e20), upper.nan_to_num(posinf=1e20)
+        knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", lower.device)
+        return replace(self, lower=lower, upper=upper, knots=knots, above=above, below=below)
+
+    def _checked(self, value: Any, name: str, size: int, dims: Dimensions) -> Tensor:
+        bound = tensor(value, name, dims.like)
+        bound = bound.unsqueeze(0) if bound.dim() == 1 else bound
+        check_shape(bound, (1 if bound.shape[0] == 1 else dims.B, size), name)
+        if bool(torch.isnan(bound).any()):
+            raise InputError(name, "numbers or infinity", "NaN")
+        return bound
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        z = (U if self.of == "u" else X)[:, self.knots]
+        upper, lower = self.upper[:, None, self.above], self.lower[:, None, self.below]
+        return torch.cat((z[..., self.above] - upper, lower - z[..., self.below]), dim=-1)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        assert self.above is not None and self.below is not None
+        n, offset = X.shape[-1], X.shape[-1] + 1 if self.of == "u" else 0
+        split = self.above.numel()
+        add = H.new_zeros(*g.shape[:2], H.shape[-1], 2)  # gradient, and diagonal of the Hessian
+        add[..., self.above + offset, 0] += g[..., :split]
+        add[..., self.below + offset, 0] -= g[..., split:]
+        add[..., self.above + offset, 1] += h[..., :split]
+        add[..., self.below + offset, 1] += h[..., split:]
+        H[:, self.knots, :, n] += add[..., 0]
+        H[:, self.knots, n, :] += add[..., 0]
+        if isinstance(self.knots, slice):
+            H[:, self.knots].diagonal(dim1=-2, dim2=-1).add_(add[..., 1])
+        else:
+            H[:, self.knots] += torch.diag_embed(add[..., 1])
+
+
+@dataclass(frozen=True)
+class ControlBounds(_Bounds):
+    """lower <= u_k <= upper at knots 0..N-1, in the units of u."""
+
+    of: ClassVar[Literal["x", "u"]] = "u"
+
+
+@dataclass(frozen=True)
+class StateBounds(_Bounds):
+    """lower <= x_k <= upper at knots 1..N (x_0 is given), in the units of x."""
+
+    of: ClassVar[Literal["x", "u"]] = "x"

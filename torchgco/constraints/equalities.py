@@ -1,0 +1,59 @@
+"""Equalities of the quadrotor's planning problem."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint, Sense
+from torchgco.dynamics.quadrotor import Airframe
+from torchgco.shapes import Dimensions, InputError, check_shape, tensor
+
+
+@dataclass(frozen=True)
+class FirstStepRates(Constraint):
+    """What the rotors can do in the first control period (section 5.2.1):
+
+        0 = w(t1) - w(t0) - J^-1 (T F(t0) - w x (J w) - D w) T_s,   at knot 1, with w = w(t0) of x_0.
+
+    Args:
+        thrusts: F(t0), (4,) or (B, 4), N.
+        period: T_s, s.
+        airframe: the quadrotor's parameters.
+
+    Raises:
+        InputError: on `Problem(...)`: wrong shapes, dynamics without the planning model's 14 states.
+    """
+
+    thrusts: Any
+    period: float = 0.05
+    airframe: Airframe = Airframe()
+    target: Tensor | None = None  # (B, 3): w(t1), once bound
+
+    knots: ClassVar[slice] = slice(1, 2)
+    sense: ClassVar[Sense] = "equality"
+    batched: ClassVar[tuple[str, ...]] = ("thrusts", "target")
+    rates: ClassVar[slice] = slice(10, 13)
+
+    def bind(self, dims: Dimensions) -> Self:
+        if dims.n != 14:
+            raise InputError("first_step.dynamics", "the planning model with 14 states", f"{dims.n} states")
+        thrusts = tensor(self.thrusts, "first_step.thrusts", dims.like)
+        thrusts = thrusts.expand(dims.B, 4) if thrusts.dim() == 1 else thrusts
+        check_shape(thrusts, (dims.B, 4), "first_step.thrusts")
+        w0 = dims.like[:, self.rates]
+        target = w0 + self.period * self.airframe.angular_acceleration(w0, thrusts)
+        return replace(self, thrusts=thrusts.contiguous(), target=target)
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        assert self.target is not None
+        return (X[:, 1, self.rates] - self.target).unsqueeze(1)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        n = X.shape[-1]
+        H[:, 1, self.rates, n] += g[:, 0]
+        H[:, 1, n, self.rates] += g[:, 0]
+        H[:, 1, self.rates, self.rates] += torch.diag_embed(h[:, 0])

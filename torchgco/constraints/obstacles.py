@@ -1,0 +1,259 @@
+"""Spherical obstacles, static or moving, and the spherical guide region.
+
+All obstacles of a trajectory are evaluated by one small matrix product per problem: with t = k dt and
+features q = [p, |p|^2, 1 | t p, t, t^2], the constraint c = R^2 - |p - o - t v|^2 is linear in q. Gradient and
+Gauss-Newton Hessian are products of the weights with moments of o and v in the same way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.shapes import Dimensions, InputError, check_shape, tensor
+
+CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
+
+
+@dataclass(frozen=True)
+class Spheres(Constraint):
+    """(r_obs,i + r_veh)^2 - |p_obs,i(k) - p_k|^2 <= 0 for every obstacle i (Equation 52).
+
+    Args:
+        centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent obstacles (padding).
+        radii: (M,) or (B, M), m; NaN where the centre is.
+        vehicle_radius: number or (B,), m.
+        velocities: as centers, m/s; the obstacle is at centers + velocities * k dt. None: static.
+        knots: default 1..N.
+
+    Raises:
+        InputError: on `Problem(...)`: wrong shapes, NaN centre with a finite radius, negative radius, dynamics
+            without a position of the obstacles' dimension.
+    """
+
+    centers: Any
+    radii: Any
+    vehicle_radius: Any = 0.0
+    velocities: Any = None
+    knots: Any = None
+
+    sense: ClassVar[Sense] = "inequality"
+    geometric: ClassVar[bool] = True
+
+    def bind(self, dims: Dimensions) -> Constraint:
+        centers = _batched(self.centers, "obstacles.centers", 3, dims)
+        d = centers.shape[-1]
+        if dims.position is None or dims.position.stop - dims.position.start != d:
+            raise InputError("obstacles.centers", "the dimension of the vehicle's position", f"{d}-D centres")
+        M = centers.shape[1]
+        radii = _batched(self.radii, "obstacles.radii", 2, dims)
+        check_shape(radii, (dims.B, M), "obstacles.radii")
+        vehicle = tensor(self.vehicle_radius, "obstacles.vehicle_radius", dims.like).reshape(-1, 1)
+        absent = torch.isnan(centers).all(-1)
+        if bool((absent != torch.isnan(radii)).any()) or bool(torch.isnan(centers[~absent]).any()):
+            raise InputError("obstacles.radii", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
+        if bool((radii < 0).any()) or bool((vehicle < 0).any()):
+            raise InputError("obstacles.radii", "radii of at least 0 m", float(radii.nan_to_num(0.0).min()))
+        velocities = None
+        if self.velocities is not None:
+            velocities = _batched(self.velocities, "obstacles.velocities", 3, dims)
+            check_shape(velocities, (dims.B, M, d), "obstacles.velocities")
+            velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
+        if velocities is not None and dims.dt is None:
+            raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
+        return BoundSpheres.prepare(
+            torch.where(absent.unsqueeze(-1), 0.0, centers),
+            torch.where(absent, 0.0, radii + vehicle),
+            velocities,
+            absent,
+            vehicle.expand(dims.B, 1)[:, 0].contiguous(),
+            resolve_knots(
+                slice(1, dims.N + 1) if self.knots is None else self.knots, dims.N, "obstacles.knots", radii.device
+            ),
+            dims,
+        )
+
+
+@dataclass(frozen=True)
+class BoundSpheres(Constraint):
+    """Spheres shaped for their problem, with the matrices of the one-product evaluation prepared."""
+
+    centers: Tensor  # (B, M, d), at t = 0
+    distances: Tensor  # (B, M): r_obs + r_veh
+    velocities: Tensor | None  # (B, M, d)
+    absent: Tensor  # (B, M) bool
+    vehicle_radius: Tensor  # (B,)
+    knots: Any
+    position: slice
+    dt: float
+    weights: Tensor  # (B, r, M): c = q @ weights
+    first: Tensor  # (B, M, 1 + d [+ d]): 1, o, and v where they move
+    second: Tensor  # (B, M, d d [* 3]): o o', and o v' + v o', v v' where they move
+
+    sense: ClassVar[Sense] = "inequality"
+    geometric: ClassVar[bool] = True
+    batched: ClassVar[tuple[str, ...]] = (
+        "centers", "distances", "velocities", "absent", "vehicle_radius", "weights", "first", "second",
+    )  # fmt: skip
+
+    @classmethod
+    def prepare(
+        cls,
+        centers: Tensor,
+        distances: Tensor,
+        velocities: Tensor | None,
+        absent: Tensor,
+        vehicle_radius: Tensor,
+        knots: Any,
+        dims: Dimensions,
+    ) -> BoundSpheres:
+        assert dims.position is not None
+        o, one = centers, torch.ones_like(distances).unsqueeze(-1)
+        rows = [2 * o, -one, (distances.square() - o.square().sum(-1)).unsqueeze(-1)]
+        first, second = [one, o], [_outer(o, o)]
+        if velocities is not None:
+            v = velocities
+            rows += [2 * v, -2 * (o * v).sum(-1, keepdim=True), -v.square().sum(-1, keepdim=True)]
+            first += [v]
+            second += [_outer(o, v) + _outer(v, o), _outer(v, v)]
+        weights = torch.cat(rows, dim=-1)
+        # An absent sphere is c = -1 everywhere: satisfied, with a multiplier that stays zero.
+        constant = torch.zeros_like(weights)
+        constant[..., o.shape[-1] + 1] = -1.0
+        weights = torch.where(absent.unsqueeze(-1), constant, weights).mT.contiguous()
+        return cls(
+            centers, distances, velocities, absent, vehicle_radius, knots, dims.position, dims.dt or 0.0,
+            weights, torch.cat(first, dim=-1), torch.cat(second, dim=-1),
+        )  # fmt: skip
+
+    def bind(self, dims: Dimensions) -> Self:
+        return self
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        p = X[:, self.knots, self.position]
+        return torch.bmm(self._features(p, self._times(X)), self.weights)
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        p = x[..., self.position]
+        return torch.bmm(self._features(p, x.new_tensor(k * self.dt)), self.weights)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        # With c_p = -2 (p - o):  sum g c_p = 2 (sum g o - p sum g),  sum h c_p c_p' = 4 sum h (o - p)(o - p)'.
+        p = X[:, self.knots, self.position]
+        d, n, t = p.shape[-1], X.shape[-1], self._times(X)
+        g_sum, g_o = self._first_moments(g, t, d)
+        h_sum, h_o = self._first_moments(h, t, d)
+        h_oo = self._second_moment(h, t, d)
+        gradient = 2.0 * (g_o - p * g_sum)
+        cross = p.unsqueeze(-1) * h_o.unsqueeze(-2)
+        hessian = 4.0 * (h_oo - cross - cross.mT + h_sum.unsqueeze(-1) * _outer(p, p).unflatten(-1, (d, d)))
+        at = self.position
+        H[:, self.knots, at, n] += gradient
+        H[:, self.knots, n, at] += gradient
+        H[:, self.knots, at, at] += hessian
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """Penetration depth r_obs + r_veh - |p_obs - p|, m, by plain differences."""
+        return (self.distances.unsqueeze(1) - self.gaps(X)).clamp(min=0.0)
+
+    def gaps(self, X: Tensor) -> Tensor:
+        """Distance |p_obs,i(k) - p_k| (B, K, M), m; infinite where absent."""
+        p, t = X[:, self.knots, self.position], self._times(X)
+        o = self.centers.unsqueeze(1)
+        if self.velocities is not None:
+            o = o + t.view(1, -1, 1, 1) * self.velocities.unsqueeze(1)
+        gap = (p.unsqueeze(2) - o).square().sum(-1).sqrt()
+        return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        """False where the vehicle touches an obstacle at the start, (B,)."""
+        gap = (x0[:, None, self.position] - self.centers).square().sum(-1).sqrt()
+        return ((gap >= CONTACT_FACTOR * self.distances) | self.absent).all(-1)
+
+    def _times(self, X: Tensor) -> Tensor:
+        """t = k dt at the constraint's knots, (K, 1)."""
+        k = torch.arange(X.shape[1], dtype=X.dtype, device=X.device)[self.knots]
+        return (k * self.dt).unsqueeze(-1)
+
+    def _features(self, p: Tensor, t: Tensor) -> Tensor:
+        q = [p, p.square().sum(-1, keepdim=True), torch.ones_like(p[..., :1])]
+        if self.velocities is not None:
+            t = t.expand(*p.shape[:-1], 1)
+            q += [t * p, t, t.square()]
+        return torch.cat(q, dim=-1)
+
+    def _first_moments(self, w: Tensor, t: Tensor, d: int) -> tuple[Tensor, Tensor]:
+        """sum w (B, K, 1) and sum w o(t) (B, K, d) over the obstacles, for weights w (B, K, M)."""
+        s = torch.bmm(w, self.first)
+        moving = 0.0 if self.velocities is None else t * s[..., 1 + d :]
+        return s[..., :1], s[..., 1 : 1 + d] + moving
+
+    def _second_moment(self, w: Tensor, t: Tensor, d: int) -> Tensor:
+        """sum w o(t) o(t)' (B, K, d, d)."""
+        s = torch.bmm(w, self.second)
+        if self.velocities is not None:
+            fixed, linear, square = s.split(d * d, dim=-1)
+            s = fixed + t * linear + t.square() * square
+        return s.unflatten(-1, (d, d))
+
+
+@dataclass(frozen=True)
+class GuideRegion:
+    """Balls that knots are drawn into: a pure penalty on f_k = |p_k - center_k|^2 - radius_k^2 (Equations 62-65).
+
+    A knot without guidance has an infinite radius (the paper's r_F, larger than the whole scene).
+    """
+
+    center: Tensor  # (B, N+1, d), m
+    radius: Tensor  # (B, N+1), m
+    weight: Tensor  # (B,): mu_gco
+    position: slice
+
+    @classmethod
+    def inactive(cls, X: Tensor, weight: Tensor, position: slice) -> GuideRegion:
+        """No guidance along X (B, N+1, n)."""
+        center = X[..., position].clone()
+        return cls(center, torch.full_like(center[..., 0], torch.inf), weight, position)
+
+    @property
+    def is_active(self) -> Tensor:
+        """Whether any knot is guided, (B,) bool."""
+        return torch.isfinite(self.radius).any(-1)
+
+    def value(self, X: Tensor) -> Tensor:
+        """J_gco (B,) = sum_k 1/2 mu_gco f_k^2 over the knots outside their ball."""
+        f = self._excess(X).clamp(min=0.0)
+        return 0.5 * self.weight * f.square().sum(-1)
+
+    def accumulate(self, X: Tensor, H: Tensor) -> None:
+        """Add gradient and Gauss-Newton Hessian to H (B, N+1, s, s)."""
+        n, at = X.shape[-1], self.position
+        f = self._excess(X)
+        rho = torch.where(f > 0, self.weight.unsqueeze(-1), 0.0).unsqueeze(-1)
+        fx = 2.0 * (X[..., at] - self.center)
+        gradient = rho * f.clamp(min=0.0).unsqueeze(-1) * fx
+        H[..., at, n] += gradient
+        H[..., n, at] += gradient
+        H[..., at, at] += rho.unsqueeze(-1) * fx.unsqueeze(-1) * fx.unsqueeze(-2)
+
+    def _excess(self, X: Tensor) -> Tensor:
+        return (X[..., self.position] - self.center).square().sum(-1) - self.radius.square()
+
+
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    """a b' of the last axis, flattened: (..., d * d)."""
+    return (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2)
+
+
+def _batched(value: Any, name: str, dim: int, dims: Dimensions) -> Tensor:
+    """`value` with its batch axis, repeated for every problem where it came without one."""
+    given = tensor(value, name, dims.like)
+    if given.dim() == dim - 1:
+        given = given.unsqueeze(0).expand(dims.B, *given.shape)
+    if given.dim() != dim or given.shape[0] != dims.B:
+        raise InputError(name, f"one set for all, or {dims.B} sets", f"shape {tuple(given.shape)}")
+    return given.contiguous()

@@ -1,0 +1,73 @@
+"""Cost: what a trajectory is worth, and its expansion. Users' own costs subclass `Cost`."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from torchgco.autodiff import gradient_and_hessian
+from torchgco.shapes import Dimensions, PerElement
+
+
+class Cost(PerElement):
+    """J_var = terminal(x_N) + sum_k stage(x_k, u_k, k).
+
+    A subclass defines `stage` and `terminal` on any leading axes; derivatives come from `torch.func` unless it
+    overrides `expand` too. A Hessian that isn't positive semidefinite is met by the solver's regularisation.
+    """
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        """Cost (...) of stage k for x (..., n), u (..., m).
+
+        k is a number where all rows belong to one stage, or arange(N) where x is (B, N, n).
+        """
+        raise NotImplementedError(f"{type(self).__name__} defines no stage cost")
+
+    def terminal(self, x: Tensor) -> Tensor:
+        """Cost (...) of the last knot for x (..., n)."""
+        raise NotImplementedError(f"{type(self).__name__} defines no terminal cost")
+
+    def bind(self, dims: Dimensions) -> Self:
+        """The cost checked and shaped for one problem; called once, by Problem."""
+        return self
+
+    def total(self, X: Tensor, U: Tensor) -> Tensor:
+        """J_var (B,) of trajectories X (B, N+1, n), U (B, N, m)."""
+        k = torch.arange(U.shape[1], device=U.device)
+        return self.stage(X[:, :-1], U, k).sum(-1) + self.terminal(X[:, -1])
+
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        """Add gradient and Hessian at X, U to the homogeneous blocks H (B, N+1, s, s), order [x, 1, u]."""
+        n, N = X.shape[-1], U.shape[1]
+        k = torch.arange(N, device=U.device)
+        g, h = gradient_and_hessian(lambda z: self.stage(z[..., :n], z[..., n:], k), torch.cat((X[:, :-1], U), dim=-1))
+        add_blocks(H[:, :-1], n, g[..., :n], g[..., n:], h[..., :n, :n], h[..., n:, n:], h[..., n:, :n])
+        g, h = gradient_and_hessian(self.terminal, X[:, -1])
+        add_blocks(H[:, -1], n, g, None, h, None)
+
+
+def add_blocks(
+    H: Tensor,
+    n: int,
+    lx: Tensor | None,
+    lu: Tensor | None,
+    lxx: Tensor | None,
+    luu: Tensor | None,
+    lux: Tensor | None = None,
+) -> None:
+    """Add the pieces of a quadratic model to homogeneous blocks H (..., s, s) with z = [x, 1, u], in place."""
+    if lx is not None:
+        H[..., :n, n] += lx
+        H[..., n, :n] += lx
+    if lu is not None:
+        H[..., n + 1 :, n] += lu
+        H[..., n, n + 1 :] += lu
+    if lxx is not None:
+        H[..., :n, :n] += lxx
+    if luu is not None:
+        H[..., n + 1 :, n + 1 :] += luu
+    if lux is not None:
+        H[..., n + 1 :, :n] += lux
+        H[..., :n, n + 1 :] += lux.mT

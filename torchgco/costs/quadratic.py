@@ -1,0 +1,210 @@
+"""The quadratic cost of the paper, with linear and cross terms (section 2 of the method)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchgco.costs.base import Cost, add_blocks
+from torchgco.shapes import Dimensions, InputError, check_shape, tensor
+
+
+@dataclass(frozen=True)
+class QuadraticCost(Cost):
+    """Quadratic cost in e_x = x - x_ref, e_u = u - u_ref.
+
+        stage     q' e_x + 1/2 e_x' Q e_x + r' e_u + 1/2 e_u' R e_u + e_u' H e_x        (Equation 49)
+        terminal  qf' e_x + 1/2 e_x' Qf e_x                                             (Equation 48)
+
+    A weight is given as a diagonal (n,), a matrix (n, n), one per stage (N, n, n), or one per problem and stage
+    (B or 1, N or 1, n, n); Qf has no stage axis: (n,), (n, n), (B, n, n). A reference or linear term is a vector
+    (n,), one per knot (N+1, n) or stage (N, m), or per problem (B or 1, N+1 or 1, n); qf is (n,) or (B, n).
+
+    Raises:
+        InputError: on `Problem(...)`: wrong shapes, weights that aren't finite, symmetric and positive semidefinite.
+    """
+
+    Q: Any
+    R: Any
+    Qf: Any
+    x_ref: Any = 0.0
+    u_ref: Any = 0.0
+    q: Any = 0.0
+    r: Any = 0.0
+    qf: Any = 0.0
+    H: Any = None
+
+    def bind(self, dims: Dimensions) -> Cost:
+        B, N, n, m = dims.B, dims.N, dims.n, dims.m
+        Q, R = _weight(self.Q, "Q", n, B, N, dims.like), _weight(self.R, "R", m, B, N, dims.like)
+        Qf = _weight(self.Qf, "Qf", n, B, None, dims.like)
+        H = None if self.H is None else _cross(self.H, m, n, B, N, dims.like)
+        _check_semidefinite(Q, R, Qf, H)
+        x_ref = _vector(self.x_ref, "x_ref", n, B, N + 1, dims.like)
+        diagonal = H is None and all(_is_diagonal(W) for W in (Q, R, Qf))
+        if diagonal:
+            Q, R, Qf = (W.diagonal(dim1=-2, dim2=-1).contiguous() for W in (Q, R, Qf))
+        return BoundQuadratic(
+            Q=Q,
+            R=R,
+            Qf=Qf,
+            x_ref=x_ref if x_ref.shape[1] == 1 else x_ref[:, :-1].contiguous(),
+            xf_ref=x_ref[:, -1].contiguous(),
+            u_ref=_vector(self.u_ref, "u_ref", m, B, N, dims.like),
+            q=_optional(self.q, "q", n, B, N, dims.like),
+            r=_optional(self.r, "r", m, B, N, dims.like),
+            qf=_optional(self.qf, "qf", n, B, None, dims.like),
+            H=H,
+            diagonal=diagonal,
+        )
+
+
+@dataclass(frozen=True)
+class BoundQuadratic(Cost):
+    """A QuadraticCost shaped for its problem: tensors with a batch and a stage axis of their length or 1.
+
+    Diagonal weights are kept as diagonals: most are, and products then replace matrix products.
+    """
+
+    Q: Tensor  # (B|1, N|1, n) or (B|1, N|1, n, n)
+    R: Tensor
+    Qf: Tensor  # (B|1, n) or (B|1, n, n)
+    x_ref: Tensor  # (B|1, N|1, n)
+    xf_ref: Tensor  # (B|1, n)
+    u_ref: Tensor
+    q: Tensor | None
+    r: Tensor | None
+    qf: Tensor | None
+    H: Tensor | None
+    diagonal: bool
+
+    per_element: ClassVar[tuple[str, ...]] = (
+        "Q", "R", "Qf", "x_ref", "xf_ref", "u_ref", "q", "r", "qf", "H",
+    )  # fmt: skip
+
+    def bind(self, dims: Dimensions) -> BoundQuadratic:
+        return self
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        def at_k(part: Tensor) -> Tensor:
+            if not isinstance(k, int):
+                return part
+            part = part[:, k if part.shape[1] > 1 else 0]
+            # Samples, if any, stand between the batch axis and the last ones.
+            return part if x.dim() == 2 else part.unsqueeze(1)
+
+        ex, eu = x - at_k(self.x_ref), u - at_k(self.u_ref)
+        value = 0.5 * ((ex * self._times(at_k(self.Q), ex)).sum(-1) + (eu * self._times(at_k(self.R), eu)).sum(-1))
+        if self.q is not None:
+            value = value + (at_k(self.q) * ex).sum(-1)
+        if self.r is not None:
+            value = value + (at_k(self.r) * eu).sum(-1)
+        if self.H is not None:
+            value = value + (eu * (at_k(self.H) * ex.unsqueeze(-2)).sum(-1)).sum(-1)
+        return value
+
+    def terminal(self, x: Tensor) -> Tensor:
+        xf_ref, Qf, qf = self.xf_ref, self.Qf, self.qf
+        if x.dim() == 3:
+            xf_ref, Qf = xf_ref.unsqueeze(1), Qf.unsqueeze(1)
+            qf = None if qf is None else qf.unsqueeze(1)
+        e = x - xf_ref
+        value = 0.5 * (e * self._times(Qf, e)).sum(-1)
+        return value if qf is None else value + (qf * e).sum(-1)
+
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        n = X.shape[-1]
+        ex, eu, ef = X[:, :-1] - self.x_ref, U - self.u_ref, X[:, -1] - self.xf_ref
+        lx, lu, lf = self._times(self.Q, ex), self._times(self.R, eu), self._times(self.Qf, ef)
+        lx = lx if self.q is None else lx + self.q
+        lu = lu if self.r is None else lu + self.r
+        lf = lf if self.qf is None else lf + self.qf
+        if self.H is not None:
+            lx = lx + (self.H * eu.unsqueeze(-1)).sum(-2)
+            lu = lu + (self.H * ex.unsqueeze(-2)).sum(-1)
+        if self.diagonal:
+            add_blocks(H[:, :-1], n, lx, lu, None, None)
+            add_blocks(H[:, -1], n, lf, None, None, None)
+            H[:, :-1].diagonal(dim1=-2, dim2=-1)[..., :n] += self.Q
+            H[:, :-1].diagonal(dim1=-2, dim2=-1)[..., n + 1 :] += self.R
+            H[:, -1].diagonal(dim1=-2, dim2=-1)[..., :n] += self.Qf
+        else:
+            add_blocks(H[:, :-1], n, lx, lu, self.Q, self.R, self.H)
+            add_blocks(H[:, -1], n, lf, None, self.Qf, None)
+
+    def _times(self, W: Tensor, e: Tensor) -> Tensor:
+        # Products and sums keep each problem's bits independent of the batch; a shared matrix in one GEMM would not.
+        return W * e if self.diagonal else (W * e.unsqueeze(-2)).sum(-1)
+
+
+def _weight(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor:
+    """A weight as (B|1, N|1, size, size), without the stage axis where N is None."""
+    W = tensor(value, f"cost.{field}", like)
+    if W.dim() == 1:
+        W = torch.diag(W)
+    if N is None:
+        W = W.unsqueeze(0) if W.dim() == 2 else W
+        check_shape(W, (_one_of(W, 0, B), size, size), f"cost.{field}")
+    else:
+        W = W[(None,) * (4 - W.dim())] if W.dim() < 4 else W
+        check_shape(W, (_one_of(W, 0, B), _one_of(W, 1, N), size, size), f"cost.{field}")
+    return W
+
+
+def _cross(value: Any, m: int, n: int, B: int, N: int, like: Tensor) -> Tensor:
+    H = tensor(value, "cost.H", like)
+    H = H[(None,) * (4 - H.dim())] if H.dim() < 4 else H
+    check_shape(H, (_one_of(H, 0, B), _one_of(H, 1, N), m, n), "cost.H")
+    return H
+
+
+def _vector(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor:
+    """A reference or linear term as (B|1, N|1, size), without the stage axis where N is None."""
+    v = tensor(value, f"cost.{field}", like)
+    v = v.expand(size) if v.dim() == 0 else v
+    if N is None:
+        v = v.unsqueeze(0) if v.dim() == 1 else v
+        check_shape(v, (_one_of(v, 0, B), size), f"cost.{field}")
+    else:
+        v = v[(None,) * (3 - v.dim())] if v.dim() < 3 else v
+        check_shape(v, (_one_of(v, 0, B), _one_of(v, 1, N), size), f"cost.{field}")
+    if not bool(torch.isfinite(v).all()):
+        raise InputError(f"cost.{field}", "finite numbers", "NaN or infinity")
+    return v
+
+
+def _optional(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor | None:
+    """A linear term, None where it is zero throughout."""
+    v = _vector(value, field, size, B, N, like)
+    return v if bool((v != 0).any()) else None
+
+
+def _one_of(value: Tensor, axis: int, length: int) -> int:
+    """The length that an axis may have: 1 (shared) or `length`."""
+    return 1 if value.dim() > axis and value.shape[axis] == 1 else length
+
+
+def _is_diagonal(W: Tensor) -> bool:
+    return bool((W - torch.diag_embed(W.diagonal(dim1=-2, dim2=-1)) == 0).all())
+
+
+def _check_semidefinite(Q: Tensor, R: Tensor, Qf: Tensor, H: Tensor | None) -> None:
+    blocks = {"Q": Q, "R": R, "Qf": Qf}
+    if H is not None:
+        # Q and R alone may pass while the cross term makes the stage cost unbounded below.
+        lead_axes = torch.broadcast_shapes(Q.shape[:2], R.shape[:2], H.shape[:2])
+        Q, R, H = (W.expand(*lead_axes, *W.shape[2:]) for W in (Q, R, H))
+        blocks["H"] = torch.cat((torch.cat((Q, H.mT), -1), torch.cat((H, R), -1)), -2)
+    for field, W in blocks.items():
+        if not bool(torch.isfinite(W).all()):
+            raise InputError(f"cost.{field}", "finite numbers", "NaN or infinity")
+        scale = float(W.abs().max()) if W.numel() else 0.0
+        if float((W - W.mT).abs().max()) > 1e-9 * max(scale, 1.0):
+            raise InputError(f"cost.{field}", "a symmetric matrix", "an unsymmetric one")
+        lowest = float(torch.linalg.eigvalsh(W).min())
+        if lowest < -1e-9 * max(scale, 1.0):
+            what = "a weight [[Q, H'], [H, R]]" if field == "H" else "a weight"
+            raise InputError(f"cost.{field}", f"{what} that is positive semidefinite", f"an eigenvalue of {lowest:.3g}")

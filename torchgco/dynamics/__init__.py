@@ -1,0 +1,9 @@
+"""Models of vehicles and the integrators that turn their vector fields into steps."""
+
+from torchgco.dynamics.base import Dynamics as Dynamics
+from torchgco.dynamics.base import FunctionDynamics as FunctionDynamics
+from torchgco.dynamics.planar import Planar as Planar
+from torchgco.dynamics.quadrotor import Airframe as Airframe
+from torchgco.dynamics.quadrotor import QuadrotorPlanning as QuadrotorPlanning
+from torchgco.dynamics.quadrotor import QuadrotorPlant as QuadrotorPlant
+from torchgco.dynamics.quadrotor import RotorTracking as RotorTracking

@@ -1,0 +1,26 @@
+"""Derivatives along a trajectory, all knots at once, in homogeneous form z = [x, 1, u]."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchgco.problem import Problem
+
+
+def linearise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """F (B, N, n+1, s) with [dx_{k+1}, 1] = F_k [dx_k, 1, du_k], around X (B, N+1, n), U (B, N, m)."""
+    n, m = problem.n, problem.m
+    fx, fu = problem.dynamics.jacobians(X[:, :-1], U)
+    F = X.new_zeros(*U.shape[:2], n + 1, n + 1 + m)
+    F[..., :n, :n] = fx
+    F[..., :n, n + 1 :] = fu
+    F[..., n, n] = 1.0
+    return F
+
+
+def quadratise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """H (B, N+1, s, s): gradient and Hessian of J_var at every knot; the last block has no control part."""
+    s = problem.n + 1 + problem.m
+    H = X.new_zeros(X.shape[0], X.shape[1], s, s)
+    problem.cost.expand(X, U, H)
+    return H

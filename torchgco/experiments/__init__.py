@@ -1,0 +1,1 @@
+"""Studies and missions from configs to tables: the floor above everything else."""

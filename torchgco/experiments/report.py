@@ -1,0 +1,182 @@
+"""From the files of finished studies to what a person reads: a table, `summary.csv` and figures.
+
+`torchgco-report DIR [DIR ...]` merges every `trials.parquet` below the folders and reports on all of them
+together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from math import isnan
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from torchgco.experiments.merge import REPEATED, TRIALS, is_merged, merge, read_trials
+from torchgco.experiments.statistics import OUTCOMES, TASK, paired_table, summarise
+from torchgco.plotting.distributions import clearance_histogram, violation_histogram
+from torchgco.plotting.layouts import layout_grid
+from torchgco.plotting.rates import rates_figure
+from torchgco.plotting.style import save
+from torchgco.scenarios.layouts import Layouts
+from torchgco.shapes import InputError
+
+__all__ = ["compare", "format_table", "main", "merge", "write_report"]
+
+Arrays = Mapping[str, np.ndarray]
+# X (L, N+1, n) by solver, or what makes them of the arrays in layouts.npz and in solutions.npz.
+Trajectories = Arrays | Callable[[Arrays, Arrays], Arrays]
+
+
+def compare(trials: pd.DataFrame) -> pd.DataFrame:
+    """For each (scenario, model) the solver that comes first, the one under study, against every other.
+
+    Columns as `paired_table` has them; no rows where a solver flew alone.
+    """
+    tasks = [task for _, task in trials.groupby(TASK, sort=False, dropna=False)]
+    tables = [paired_table(task, task["solver"].iloc[0]) for task in tasks]
+    return pd.concat(tables, ignore_index=True)
+
+
+def write_report(folder: str | os.PathLike[str], trajectories: Trajectories | None = None) -> str:
+    """Write `summary.csv` and `figures/*.png` beside the `trials.parquet` in a folder, and return the table.
+
+    trajectories  states for the picture of the layouts, which needs `layouts.npz` too: X (L, N+1, n) by
+                  solver, row by row as in that file; or a function (layouts, solutions) -> that, called with
+                  the arrays of the two files (`solutions` is empty without `solutions.npz`). None: no such
+                  picture.
+
+    Raises InputError if the table is missing, unreadable or empty, and where the trajectories don't fit the
+    layouts.
+    """
+    folder = Path(folder)
+    trials = read_trials(folder / TRIALS)
+    summary = summarise(trials)
+    summary.to_csv(folder / "summary.csv", index=False)
+    figures = {
+        "rates": rates_figure(summary),
+        "clearance": clearance_histogram(trials),
+        "violation": violation_histogram(trials),
+    }
+    if trajectories is not None:
+        layouts = Layouts.load(folder / "layouts.npz").arrays()
+        if callable(trajectories):
+            trajectories = trajectories(layouts, _solutions(folder / "solutions.npz"))
+        figures["layouts"] = layout_grid(layouts, trajectories, trials)
+    for name, figure in figures.items():
+        save(figure, folder / "figures" / f"{name}.png")
+    text = format_table(summary, compare(trials))
+    if repeated := trials.attrs.get(REPEATED, 0):
+        text += f"\n\n{repeated} rows left out: another run has the same, and each counts once"
+    return text
+
+
+def _solutions(path: Path) -> Arrays:
+    if not path.is_file():
+        return {}
+    with np.load(path, allow_pickle=False) as held:
+        return dict(held)
+
+
+def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
+    """The report for a terminal, some 100 columns wide: rates, effort and comparisons of each task.
+
+    summary, paired  as `summarise` and `paired_table` return them; `paired` may have no rows
+
+    A rate reads "30/32 94 % [80, 98]": attained of defined, and the 95 % Wilson interval. "-" stands for what
+    isn't defined. Costs are medians, over the trials that reached the goal and over all that are finite.
+    """
+    blocks = []
+    for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
+        seeds = ", ".join(task["seed"].unique())
+        blocks.append(f"{scenario} ({model}), seed {seeds}")
+        blocks += [_rates(task), _effort(task)]
+        rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
+        if len(rows):
+            blocks.append(_paired(rows))
+    return "\n\n".join(blocks)
+
+
+def _rates(task: pd.DataFrame) -> str:
+    rows = [[row["solver"], *(_rate(row, name) for name in OUTCOMES)] for _, row in task.iterrows()]
+    return _align([["solver", *OUTCOMES], *rows])
+
+
+def _rate(row: pd.Series, name: str) -> str:
+    if not row[f"{name}_n"]:
+        return "-"
+    rate, low, high = (100 * row[f"{name}_{part}"] for part in ("rate", "low", "high"))
+    return f"{row[f'{name}_count']}/{row[f'{name}_n']} {rate:.0f} % [{low:.0f}, {high:.0f}]"
+
+
+# Header in the terminal, column of the summary, and how its numbers are written.
+EFFORT = (
+    ("n", "n", "d"),
+    ("invalid", "invalid", "d"),
+    ("viol. ok", "violation_ok", ".0%"),
+    ("violation", "violation_median", ".2g"),
+    ("cost reached", "cost_median_reached", ".1f"),
+    ("cost all", "cost_median", ".1f"),
+    ("iter.", "iterations_mean", ".1f"),
+    ("outer", "outer_iterations_median", ".3g"),
+    ("guided", "guided_mean", ".1f"),
+    ("seconds", "seconds_mean", ".3g"),
+)
+
+
+def _effort(task: pd.DataFrame) -> str:
+    rows = [["solver", *(header for header, _, _ in EFFORT)]]
+    for _, row in task.iterrows():
+        cells = ["-" if isnan(row[name]) else f"{row[name]:{form}}" for _, name, form in EFFORT]
+        rows.append([row["solver"], *cells])
+    return _align(rows)
+
+
+COUNTS = {"n": "n", "both": "both", "only_a": "first", "only_b": "second", "neither": "neither"}
+PAIRED = ("paired", "outcome", *COUNTS.values(), "difference", "McNemar p", "left out")
+
+
+def _paired(rows: pd.DataFrame) -> str:
+    lines: list[Sequence[str]] = [PAIRED]
+    for row in rows.itertuples():
+        difference = f"{100 * row.difference:+.0f} points" if row.n else "-"
+        p_value = f"{row.p_value:.2g}" if row.n else "-"
+        pair, left_out = f"{row.solver_a} - {row.solver_b}", row.undefined + row.unmatched
+        counts = [str(getattr(row, name)) for name in COUNTS]
+        lines.append([pair, row.outcome, *counts, difference, p_value, str(left_out)])
+    return _align(lines)
+
+
+def _align(rows: Sequence[Sequence[str]]) -> str:
+    """Rows as lines of columns: the first flush left, the others flush right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        first, *rest = zip(row, widths, strict=True)
+        lines.append("  ".join([first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in rest)]))
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`torchgco-report`: merge, print and write. Returns the exit code, 2 for input that is at fault."""
+    parser = argparse.ArgumentParser(prog="torchgco-report", description="One report on many studies.")
+    parser.add_argument("folders", nargs="+", metavar="DIR", type=Path, help="a study, or a folder of studies")
+    parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
+    options = parser.parse_args(arguments)
+    output = options.output or options.folders[0] / "report"
+    try:
+        merged = merge(options.folders)
+        if (output / TRIALS).exists() and not is_merged(read_trials(output / TRIALS)):
+            raise InputError("--output", "a folder without the results of a study, which are kept", output)
+        output.mkdir(parents=True, exist_ok=True)
+        merged.to_parquet(output / TRIALS, index=False)
+        print(write_report(output))
+        print(f"\nwritten to {output}")
+    except InputError as error:
+        print(f"torchgco-report: {error}", file=sys.stderr)
+        return 2
+    return 0

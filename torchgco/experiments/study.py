@@ -1,0 +1,180 @@
+"""A study: several solvers fly the same layouts, and every flight becomes a row."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+import torchgco
+from torchgco.experiments.build import Setup, build, solver_of
+from torchgco.experiments.records import COLUMNS, Records
+from torchgco.experiments.report import write_report
+from torchgco.judge import frame_columns, judge
+from torchgco.rollout import open_loop
+from torchgco.scenarios import Layouts
+from torchgco.shapes import InputError
+from torchgco.solvers.batch import Progress
+from torchgco.status import Status
+
+# How the configuration of a baseline is found: its name in, the whole configuration with that solver out.
+Recompose = Callable[[str], DictConfig]
+NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
+
+
+def run_study(config: DictConfig, folder: Path, recompose: Recompose, show: Callable[[str], None] = print) -> int:
+    """Fly, judge, write and report; returns how many trials could be flown at all.
+
+    Starting it again on the same folder goes on where it was stopped; finished, it only shows the table.
+
+    Raises:
+        InputError: malformed configuration, or a folder that holds another study.
+    """
+    setup = build(config)
+    layouts = setup.layouts()
+    setup.vehicle.task(layouts.take([0]))  # a misfit is said before anything is written
+    solvers = _solvers(setup, recompose)
+    records = Records(folder)
+    records.claim(_described(config), layouts)
+    if records.finished():
+        show(f"Already done in {folder}: nothing was computed anew.\n")
+    else:
+        rows, U = _fly_all(setup, layouts, solvers, records)
+        trials = with_success(rows, layouts, len(solvers))
+        records.finish(trials, U, list(solvers), layouts)
+    show(write_report(folder, lambda held, flown: _trajectories(setup, layouts, flown)))
+    records.close()
+    show(f"\nTable, arrays and figures: {folder}")
+    trials = pd.read_parquet(folder / "trials.parquet")
+    return int((trials["status"] != Status.INVALID_START.name).sum())
+
+
+def _described(config: DictConfig) -> dict[str, Any]:
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    return {"version": torchgco.__version__, **{str(key): value for key, value in plain.items()}}
+
+
+def _solvers(setup: Setup, recompose: Recompose) -> dict[str, Any]:
+    """The solver under study first, then the baselines; one that is the solver itself is dropped."""
+    baselines = setup.config.study.baselines
+    if isinstance(baselines, str) or not all(isinstance(name, str) for name in baselines or ()):
+        raise InputError("study.baselines", "a list of solver names, as [al_ilqr]", repr(baselines))
+    solvers = {setup.solver_name: setup.solver}
+    for name in baselines or ():
+        if name not in solvers:
+            solvers[name] = solver_of(recompose(name))
+    return solvers
+
+
+def _fly_all(
+    setup: Setup, layouts: Layouts, solvers: Mapping[str, Any], records: Records
+) -> tuple[pd.DataFrame, np.ndarray]:
+    """Rows and controls of every solver on every layout, batch by batch, from the shards where they exist."""
+    size = setup.config.study.batch_size
+    if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+        raise InputError("study.batch_size", "at least 1", repr(size))
+    rows: list[pd.DataFrame] = []
+    controls: list[np.ndarray] = []
+    with tqdm(total=layouts.count * len(solvers), unit="trial", dynamic_ncols=True) as bar:
+        for name, solver in solvers.items():
+            bar.set_description(name)
+            flown = []
+            for start in range(0, layouts.count, size):
+                shard = records.shard(name, start)
+                batch = layouts.take(range(start, min(start + size, layouts.count)))
+                if not shard.is_file():
+                    records.write_shard(shard, *_Flight(setup, batch, name, solver, bar).fly())
+                else:
+                    bar.update(batch.count)
+                table, U = records.read_shard(shard)
+                rows.append(table)
+                flown.append(U)
+            controls.append(np.concatenate(flown))
+    return pd.concat(rows, ignore_index=True), np.stack(controls)
+
+
+@dataclass
+class _Flight:
+    """One batch of layouts flown by one solver."""
+
+    setup: Setup
+    layouts: Layouts
+    name: str
+    solver: Any
+    bar: tqdm
+    shown: int = 0
+
+    def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
+        """Rows (without success) and controls (L, N, m), NaN where nothing was flown."""
+        setup, layouts = self.setup, self.layouts
+        task = setup.vehicle.task(layouts, setup.device, setup.dtype)
+        ids = torch.as_tensor(layouts.ids, device=setup.device)
+        began = _now(setup.device)
+        solution = self.solver.solve(task.problem, task.U0, seed=setup.seed, ids=ids, callback=self._progress)
+        seconds = (_now(setup.device) - began) / layouts.count
+        self.bar.update(layouts.count - self.shown)
+        statuses = [status.name for status in solution.statuses]
+        U = solution.U.detach().to("cpu", torch.float64)
+        U[[status in NOT_FLOWN for status in statuses]] = torch.nan
+        checked = setup.vehicle.task(layouts)
+        verdict = judge(checked.problem, U, checked.goal, checked.goal_radius)
+        rows = pd.DataFrame(
+            {
+                "scenario": layouts.name, "layout": layouts.ids, "seed": setup.seed, "model": setup.vehicle.name,
+                "solver": self.name, "status": statuses, **frame_columns(verdict), "sound": verdict.sound.numpy(),
+                "iterations": solution.iterations.cpu().numpy(),
+                "outer_iterations": solution.outer_iterations.cpu().numpy(),
+                "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": layouts.count,
+                "threads": torch.get_num_threads(), "device": setup.device.type,
+                "dtype": str(setup.dtype).removeprefix("torch."), "version": torchgco.__version__,
+            }
+        )  # fmt: skip
+        return rows, U.numpy()
+
+    def _progress(self, progress: Progress) -> None:
+        self.bar.update(progress.finished - self.shown)
+        self.bar.set_postfix({"pass": progress.passes}, refresh=False)
+        self.shown = progress.finished
+
+
+def with_success(rows: pd.DataFrame, layouts: Layouts, solvers: int) -> pd.DataFrame:
+    """The rows with `best_cost` and `success`: against the file's best, else the best in the study.
+
+    Where neither is known (a single solver, no best in the file) success is NA.
+    """
+    best_sound = rows["cost"].where(rows["sound"].astype(bool)).groupby(rows["layout"]).transform("min")
+    best = pd.Series(np.nan, index=rows.index)
+    if layouts.best_cost is not None:
+        best = rows["layout"].map(dict(zip(layouts.ids.tolist(), layouts.best_cost, strict=True)))
+    known = best.notna() | (solvers > 1)
+    best = best.fillna(best_sound) if solvers > 1 else best
+    from torchgco.judge import SUCCESS_COST
+
+    success = (rows["sound"].astype(bool) & (rows["cost"] <= SUCCESS_COST * best)).astype("boolean")
+    trials = rows.assign(best_cost=best.astype(float), success=success.where(known, pd.NA))
+    return trials[list(COLUMNS)]
+
+
+def _trajectories(setup: Setup, layouts: Layouts, flown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """States (L, N+1, n) of every solver, for the pictures."""
+    problem = setup.vehicle.task(layouts).problem
+    names: Sequence[str] = flown["solver"].tolist()
+    return {
+        name: open_loop(problem.dynamics, problem.x0, torch.from_numpy(U)).numpy()
+        for name, U in zip(names, flown["U"], strict=True)
+    }
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()

@@ -1,0 +1,4 @@
+"""Guidance: find where a trajectory is caught, and a region to pass through."""
+
+from torchgco.guidance.gco import GCO as GCO
+from torchgco.guidance.mppi import MPPI as MPPI

@@ -1,0 +1,75 @@
+"""Guidance by constraint optimisation: the paper's plug-in of the outer loop (Algorithm 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.obstacles import BoundSpheres, GuideRegion
+from torchgco.draws import DrawKey
+from torchgco.guidance.detection import caught_knots
+from torchgco.guidance.mppi import MPPI
+from torchgco.guidance.region import guide_along
+from torchgco.problem import Problem
+from torchgco.shapes import InputError, put, take
+
+
+@dataclass(frozen=True)
+class GCO:
+    """Where a solved trajectory is caught between obstacles, draw it to where MPPI found a way.
+
+    Args:
+        sampler: finds the way, from the present controls.
+        initial_penalty, penalty_growth: mu_gco and its factor nu per outer iteration; nu above the solver's eta lets
+            the guide prevail.
+        radius: r_guide, m; None takes the vehicle's radius.
+        grow_when_idle: mu_gco grows in every outer iteration (as Algorithm 4, line 11, prints it), or only in those
+            that find the element caught, so that late guidance starts as gently as early guidance.
+
+    Raises:
+        InputError: a field out of its range; on `start`, dynamics without a position.
+    """
+
+    sampler: MPPI = MPPI()
+    initial_penalty: float = 20.0
+    penalty_growth: float = 4.84
+    radius: float | None = None
+    grow_when_idle: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.initial_penalty > 0:
+            raise InputError("gco.initial_penalty", "above 0", self.initial_penalty)
+        if not self.penalty_growth >= 1:
+            raise InputError("gco.penalty_growth", "at least 1", self.penalty_growth)
+        if self.radius is not None and not self.radius > 0:
+            raise InputError("gco.radius", "above 0 m, or null", self.radius)
+
+    def start(self, problem: Problem, X: Tensor) -> GuideRegion:
+        """No guidance yet, for any element (Algorithm 4, lines 3-4)."""
+        if problem.dynamics.position is None:
+            raise InputError("guidance", "dynamics with a position", type(problem.dynamics).__name__)
+        weight = X.new_full((problem.B,), self.initial_penalty)
+        return GuideRegion.inactive(X, weight, problem.dynamics.position)
+
+    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> GuideRegion:
+        """CPUF for every element: a region where it is caught, none where it isn't."""
+        caught = caught_knots(problem, X, U)
+        growing = torch.ones_like(caught[:, 0]) if self.grow_when_idle else caught.any(-1)
+        weight = torch.where(growing, guide.weight * self.penalty_growth, guide.weight)
+        new = GuideRegion.inactive(X, weight, guide.position)
+        rows = caught.any(-1).nonzero().flatten()
+        if rows.numel() > 0:
+            X_safe, _ = self.sampler.improve(problem.take(rows), U[rows], key.take(rows))
+            put(new, rows, guide_along(take(new, rows), X_safe, caught[rows], self._radius(problem)[rows]))
+        return new
+
+    def _radius(self, problem: Problem) -> Tensor:
+        """r_guide (B,), m."""
+        if self.radius is not None:
+            return problem.x0.new_full((problem.B,), self.radius)
+        for constraint in problem.geometric:
+            if isinstance(constraint, BoundSpheres):
+                return constraint.vehicle_radius
+        raise InputError("gco.radius", "a radius in metres, for obstacles that are no spheres", None)

@@ -1,0 +1,99 @@
+"""MPPI over B problems x S samples (Algorithm 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.bounds import ControlBounds
+from torchgco.draws import DrawKey, standard_normal
+from torchgco.problem import Problem
+from torchgco.rollout import open_loop
+from torchgco.shapes import InputError, check_shape, tensor
+
+
+@dataclass(frozen=True)
+class MPPI:
+    """Model predictive path integral: a weighted mean of sampled controls, rolled out.
+
+        eps ~ N(0, Sigma),  v = saturate(u + eps)
+        S   = J_var + rho_mp (collisions) + sum_k lambda u' Sigma^-1 eps,   w = softmax(-(S - min S)/lambda)
+
+    Args:
+        samples: S per problem.
+        covariance: diagonal of Sigma (m,), or one number for all controls; in squared units of u.
+        temperature: lambda, in units of cost.
+        collision_penalty: rho_mp, per knot and obstacle touched.
+        saturation: "bounds" clamps samples to the problem's control bounds; "symmetric" to [-upper, upper], wider
+            than the bounds on purpose (planar study); None leaves them.
+
+    Raises:
+        InputError: a field out of its range; on `improve`, a covariance that doesn't fit the controls.
+    """
+
+    samples: int = 100
+    covariance: Any = 1.0
+    temperature: float = 1.0
+    collision_penalty: float = 1e8
+    saturation: Literal["bounds", "symmetric"] | None = "bounds"
+
+    def __post_init__(self) -> None:
+        if self.samples < 1:
+            raise InputError("mppi.samples", "at least 1", self.samples)
+        if not self.temperature > 0:
+            raise InputError("mppi.temperature", "above 0", self.temperature)
+        if not self.collision_penalty >= 0:
+            raise InputError("mppi.collision_penalty", "at least 0", self.collision_penalty)
+        if self.saturation not in ("bounds", "symmetric", None):
+            raise InputError("mppi.saturation", "bounds, symmetric or null", repr(self.saturation))
+
+    def improve(self, problem: Problem, U: Tensor, key: DrawKey, stream: int = 0) -> tuple[Tensor, Tensor]:
+        """X (B, N+1, n) and U (B, N, m) after one weighted mean of samples around U."""
+        sigma = self._sigma(problem).sqrt()
+        noise = sigma * standard_normal(key, (self.samples, problem.N, problem.m), U.dtype, stream)
+        V = self.saturate(problem, U.unsqueeze(1) + noise)
+        S = self.sample_costs(problem, U, V, noise)
+        weights = torch.softmax(-(S - S.amin(dim=1, keepdim=True)) / self.temperature, dim=1)
+        mean = torch.bmm(weights.unsqueeze(1), V.flatten(2)).view_as(U)
+        return open_loop(problem.dynamics, problem.x0, mean), mean
+
+    def sample_costs(self, problem: Problem, U: Tensor, V: Tensor, noise: Tensor) -> Tensor:
+        """S (B, S) of controls V (B, S, N, m) drawn around U with `noise` (lines 5-11)."""
+        # u' Sigma^-1 eps as products and two sums, which keep an element's bits apart from the batch's.
+        likelihood = (U.unsqueeze(1) / self._sigma(problem) * noise).sum(-1).sum(-1)
+        x = problem.x0.unsqueeze(1).expand(-1, V.shape[1], -1).contiguous()
+        cost, collisions = torch.zeros_like(likelihood), torch.zeros_like(likelihood)
+        for k in range(problem.N):
+            u = V[:, :, k]
+            cost = cost + problem.cost.stage(x, u, k)
+            x = problem.dynamics.step(x, u)
+            for constraint in problem.geometric:
+                if constraint.holds_at(k + 1):
+                    collisions = collisions + (constraint.at(x, k + 1) >= 0).sum(-1)
+        cost = cost + problem.cost.terminal(x)
+        S = cost + self.temperature * likelihood + self.collision_penalty * collisions
+        # A sample that left the finite numbers must not take the others with it.
+        return torch.where(torch.isfinite(S), S, torch.finfo(S.dtype).max)
+
+    def saturate(self, problem: Problem, V: Tensor) -> Tensor:
+        """Samples (B, S, N, m) clamped as `saturation` says (line 7)."""
+        if self.saturation is None:
+            return V
+        for constraint in problem.constraints:
+            if isinstance(constraint, ControlBounds):
+                upper = constraint.upper[:, None, None, :]
+                lower = constraint.lower[:, None, None, :] if self.saturation == "bounds" else -upper
+                V = V.clamp(lower, upper)
+        return V
+
+    def _sigma(self, problem: Problem) -> Tensor:
+        """Diagonal of Sigma, (m,)."""
+        sigma = tensor(self.covariance, "mppi.covariance", problem.x0)
+        sigma = sigma.expand(problem.m) if sigma.dim() == 0 else sigma
+        check_shape(sigma, (problem.m,), "mppi.covariance")
+        if not bool((sigma > 0).all()):
+            raise InputError("mppi.covariance", "variances above 0", sigma.tolist())
+        return sigma

@@ -1,0 +1,125 @@
+"""What controls are worth: a re-simulation from U alone, in float64, that no solver has a hand in.
+
+It rolls the planning model out again, adds the cost up stage by stage, and measures distances by plain differences. The
+words it returns have one meaning everywhere (README, "What the words mean").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.obstacles import CONTACT_FACTOR, BoundSpheres
+from torchgco.problem import Problem
+from torchgco.shapes import InputError
+
+OTHERS_WITHIN = 1e-3  # how far all constraints but the obstacles may be violated by a feasible trajectory
+SUCCESS_VIOLATION = 1e-3  # full radii, in metres
+SUCCESS_COST = 1.05  # share of the best known cost
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One value per problem, (B,)."""
+
+    cost: Tensor  # J_var
+    violation: Tensor  # largest violation of the planning problem, full radii; lengths in metres
+    clearance_knots: Tensor  # m to a surface of 0.95 (r_obs + r_veh), at the knots; infinite without obstacles
+    clearance: Tensor  # the same along the straight segments between the knots
+    goal_distance: Tensor  # m, last knot to goal, positions only
+    feasible: Tensor  # bool: clearance_knots >= 0, every other constraint within 1e-3
+    reached: Tensor  # bool: feasible, and closer to the goal than the goal radius
+    sound: Tensor  # bool: reached, violation <= 1e-3, clearance >= 0: success, but for the cost
+
+    def success(self, best_cost: Tensor) -> Tensor:
+        """Sound, and within 5 % of the best known cost (B,); where that is NaN the answer means nothing."""
+        return self.sound & (self.cost <= SUCCESS_COST * best_cost)
+
+
+def judge(problem: Problem, U: Tensor, goal: Tensor, goal_radius: float) -> Verdict:
+    """Judge controls U (B, N, m) by what they do from x0.
+
+    Args:
+        problem: the planning problems, float64.
+        U: controls; NaN where a solver returned none, which is then neither feasible nor reached.
+        goal: positions (B, d) or (d,), m.
+        goal_radius: m.
+
+    Raises:
+        InputError: U doesn't fit the problem, or the problem isn't float64.
+    """
+    problem.check_controls(U, "U")
+    if problem.x0.dtype != torch.float64:
+        raise InputError("x0", "torch.float64 for the judge", problem.x0.dtype)
+    if problem.dynamics.position is None:
+        raise InputError("dynamics.position", "a model with a position", type(problem.dynamics).__name__)
+    X = [problem.x0]
+    cost = torch.zeros_like(problem.x0[:, 0])
+    for k in range(problem.N):
+        cost = cost + problem.cost.stage(X[-1], U[:, k], k)
+        X.append(problem.dynamics.step(X[-1], U[:, k]))
+    cost = cost + problem.cost.terminal(X[-1])
+    return _verdict(problem, torch.stack(X, dim=1), U, cost, goal, goal_radius)
+
+
+def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor, goal_radius: float) -> Verdict:
+    far = torch.full_like(cost, torch.inf)
+    clearance_knots, clearance, violation, others = far, far, torch.zeros_like(cost), torch.zeros_like(cost)
+    for constraint in problem.constraints:
+        worst = _worst(constraint, X, U)
+        violation = torch.maximum(violation, worst)
+        if isinstance(constraint, BoundSpheres):
+            at_knots, between = sphere_clearance(constraint, X)
+            clearance_knots = torch.minimum(clearance_knots, at_knots)
+            clearance = torch.minimum(clearance, between)
+        else:
+            others = torch.maximum(others, worst)
+    position = X[:, -1, problem.dynamics.position]
+    goal_distance = (position - goal).square().sum(-1).sqrt()
+    finite = torch.isfinite(X).flatten(1).all(-1)
+    feasible = finite & (clearance_knots >= 0) & (others <= OTHERS_WITHIN)
+    reached = feasible & (goal_distance < goal_radius)
+    sound = reached & (violation <= SUCCESS_VIOLATION) & (clearance >= 0)
+    return Verdict(cost, violation, clearance_knots, clearance, goal_distance, feasible, reached, sound)
+
+
+def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest distance (B,) to a surface of 0.95 (r_obs + r_veh), at the knots and along the segments between, m.
+
+    All knots count, the given start too. Both vehicle and obstacle move straight from knot to knot, so the nearest
+    point of a segment to the obstacle's centre is exact; for an integrator other than Euler, the chord is meant.
+    """
+    contact = torch.where(spheres.absent, -torch.inf, CONTACT_FACTOR * spheres.distances)
+    at_knots = between = torch.full_like(X[:, 0, 0], torch.inf)
+    before = None
+    for k in range(X.shape[1]):
+        relative = X[:, k, None, spheres.position] - spheres.centers
+        if spheres.velocities is not None:
+            relative = relative - k * spheres.dt * spheres.velocities
+        at_knots = torch.minimum(at_knots, (relative.norm(dim=-1) - contact).amin(-1))
+        if before is not None:
+            between = torch.minimum(between, (_segment_distance(before, relative) - contact).amin(-1))
+        before = relative
+    return at_knots, torch.minimum(between, at_knots)
+
+
+def _segment_distance(a: Tensor, b: Tensor) -> Tensor:
+    """Distance (...) of the origin from the segment between a and b (..., d)."""
+    along = b - a
+    length = along.square().sum(-1)
+    share = (-(a * along).sum(-1) / length.clamp(min=torch.finfo(a.dtype).tiny)).clamp(0.0, 1.0)
+    return (a + share.unsqueeze(-1) * along).norm(dim=-1)
+
+
+def _worst(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
+    return constraint.violation(X, U).flatten(1).amax(-1)
+
+
+def frame_columns(verdict: Verdict) -> dict[str, Any]:
+    """The verdict as arrays, by the names of a study's columns (`success` needs the best cost first)."""
+    names = ("feasible", "reached", "cost", "violation", "clearance", "clearance_knots", "goal_distance")
+    return {name: getattr(verdict, name).cpu().numpy() for name in names}

@@ -1,0 +1,131 @@
+"""The augmented Lagrangian: value, expansion, multiplier and penalty update, violation report (Equations 17-22)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.obstacles import GuideRegion
+from torchgco.expansion import quadratise
+from torchgco.problem import Problem
+from torchgco.shapes import InputError, take
+
+
+@dataclass(frozen=True)
+class Multipliers:
+    """What the outer loop carries: one lam (B, K, p) per constraint, and one penalty per problem."""
+
+    lam: tuple[Tensor, ...]
+    mu: Tensor  # (B,)
+
+    @classmethod
+    def zero(cls, problem: Problem, mu: float) -> Multipliers:
+        """lam = 0 and the same penalty for all."""
+        X = problem.x0.new_zeros(problem.B, problem.N + 1, problem.n)
+        U = problem.x0.new_zeros(problem.B, problem.N, problem.m)
+        lam = tuple(torch.zeros_like(c.value(X, U)) for c in problem.constraints)
+        return cls(lam, problem.x0.new_full((problem.B,), mu))
+
+    def check(self, problem: Problem) -> None:
+        """Raise InputError unless these multipliers belong to a problem of this form (a warm start)."""
+        want = Multipliers.zero(problem, 0.0)
+        got, expected = [tuple(t.shape) for t in self.lam], [tuple(t.shape) for t in want.lam]
+        if got != expected:
+            raise InputError("warm", f"multipliers of shapes {expected}", got)
+
+
+def penalty_weights(constraint: Constraint, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> Tensor:
+    """rho: mu where a row pulls, else 0 (Equation 18).
+
+    As printed, an inequality lets go once c < 0 and lam = 0. With `clip` it lets go where lam + mu c < 0, so that a
+    multiplier pushes away from an obstacle but never holds the path to its surface.
+    """
+    rho = mu.view(-1, 1, 1).expand_as(c)
+    if constraint.sense == "equality":
+        return rho
+    idle = (lam + rho * c < 0) if clip else ((c < 0) & (lam == 0))
+    return rho.masked_fill(idle, 0.0)
+
+
+@dataclass(frozen=True)
+class Lagrangian:
+    """L_M = J_var + sum_k sum_i [lam c + rho/2 c^2] + J_gco for fixed multipliers (Equations 17, 64).
+
+    With `clip` the terms of an inequality are the continuous ones of `penalty_weights`, else as printed.
+    """
+
+    problem: Problem
+    duals: Multipliers
+    guide: GuideRegion | None
+    clip: bool
+
+    def take(self, index: Tensor) -> Lagrangian:
+        """The same for the problems in `index`."""
+        return Lagrangian(self.problem.take(index), take(self.duals, index), take(self.guide, index), self.clip)
+
+    def value(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+        """J_var (B,) and L_M (B,)."""
+        cost = self.problem.cost.total(X, U)
+        merit = cost
+        for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
+            c = constraint.value(X, U)
+            rho = penalty_weights(constraint, c, lam, self.duals.mu, self.clip)
+            terms = (lam + 0.5 * rho * c) * c
+            if self.clip and constraint.sense == "inequality":
+                # Continued by its minimum over c where the row lets go, so that L_M stays continuous.
+                terms = torch.where(rho == 0, -0.5 * lam.square() / self.duals.mu.view(-1, 1, 1), terms)
+            # Two sums, knots last: one over both axes would be split among threads by batch size.
+            merit = merit + terms.sum(-1).sum(-1)
+        return cost, merit if self.guide is None else merit + self.guide.value(X)
+
+    def expand(self, X: Tensor, U: Tensor) -> Tensor:
+        """H (B, N+1, s, s) of L_M: first derivatives of the constraints only (Equations 31-37)."""
+        H = quadratise(self.problem, X, U)
+        for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
+            c = constraint.value(X, U)
+            rho = penalty_weights(constraint, c, lam, self.duals.mu, self.clip)
+            g = lam + rho * c
+            if self.clip and constraint.sense == "inequality":
+                g = g.masked_fill(rho == 0, 0.0)
+            constraint.accumulate(X, U, g, rho, H)
+        if self.guide is not None:
+            self.guide.accumulate(X, H)
+        return H
+
+
+def update(
+    problem: Problem, X: Tensor, U: Tensor, duals: Multipliers, growth: Tensor | float, mu_max: float
+) -> Multipliers:
+    """lam + mu c, at least 0 for inequalities; mu times `growth`, at most mu_max (Equations 21, 22)."""
+    lam = []
+    for constraint, old in zip(problem.constraints, duals.lam, strict=True):
+        new = old + duals.mu.view(-1, 1, 1) * constraint.value(X, U)
+        lam.append(new if constraint.sense == "equality" else new.clamp(min=0.0))
+    return Multipliers(tuple(lam), (duals.mu * growth).clamp(max=mu_max))
+
+
+def violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The largest violation (B,): lengths in metres, all else in the units of its constraint."""
+    worst = X.new_zeros(X.shape[0])
+    for constraint in problem.constraints:
+        worst = torch.maximum(worst, constraint.violation(X, U).flatten(1).amax(-1))
+    return worst
+
+
+def worst_rows(problem: Problem, X: Tensor, U: Tensor) -> list[dict[str, Any]]:
+    """Which constraint, knot and row is violated most, one entry per problem (the first thing to look at)."""
+    report: list[dict[str, Any]] = [{"violation": 0.0, "constraint": None} for _ in range(X.shape[0])]
+    for constraint in problem.constraints:
+        rows = constraint.violation(X, U)
+        knots = torch.arange(problem.N + 1)[constraint.knots]
+        worst, place = rows.flatten(1).max(-1)
+        for b, (value, flat) in enumerate(zip(worst.tolist(), place.tolist(), strict=True)):
+            if value > report[b]["violation"]:
+                knot, row = divmod(flat, rows.shape[-1])
+                name = getattr(constraint, "name", type(constraint).__name__)
+                report[b] = {"violation": value, "constraint": name, "knot": int(knots[knot]), "row": row}
+    return report

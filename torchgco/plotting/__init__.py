@@ -1,0 +1,1 @@
+"""Figures of studies and of single solves; every function returns a matplotlib Figure and shows nothing."""

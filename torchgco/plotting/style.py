@@ -1,0 +1,90 @@
+"""What all figures share: a colour per solver, panels, axes, and how a figure is saved.
+
+Figures are plain `matplotlib.figure.Figure` objects without pyplot, so that no window system and no global
+state is touched, and a figure is gone when nobody holds it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from math import ceil
+from pathlib import Path
+from zlib import crc32
+
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, told apart by colour-blind readers too; their yellow is lost on white paper.
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+KNOWN = ("gco", "al_ilqr", "fatrop", "ipopt", "mppi", "ilqr")
+INK, FAINT = "#333333", "#BBBBBB"
+SMALL, TEXT, TITLE = 8, 9, 10  # points
+
+
+def solver_colours(solvers: Iterable[str]) -> dict[str, str]:
+    """A colour (hex) for each solver, the same in every figure.
+
+    The names in KNOWN have theirs. Any other starts at a place that follows from its letters and takes the
+    first colour free there; only with more solvers than colours do two share one.
+    """
+    names = list(dict.fromkeys(solvers))
+    colours = {name: PALETTE[KNOWN.index(name)] for name in names if name in KNOWN}
+    for name in sorted(set(names) - set(KNOWN)):
+        start = crc32(name.encode()) % len(PALETTE)
+        ring = PALETTE[start:] + PALETTE[:start]
+        colours[name] = next((colour for colour in ring if colour not in colours.values()), ring[0])
+    return {name: colours[name] for name in names}
+
+
+def panels(count: int, columns: int, size: tuple[float, float], share: bool = False) -> tuple[Figure, list[Axes]]:
+    """A figure with `count` panels of `size` (width, height in inches) in at most `columns` columns.
+
+    share  one scale for all panels, labelled at the outer ones only
+    """
+    columns = min(columns, count)
+    rows = ceil(count / columns)
+    # The extra height is the legend's.
+    figure = Figure(figsize=(columns * size[0], rows * size[1] + 0.5), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=share, sharey=share)
+    axes = list(grid.flat)
+    for spare in axes[count:]:
+        spare.remove()
+    return figure, axes[:count]
+
+
+def tidy(axes: Axes, title: str = "", grid: str | None = "y") -> None:
+    """Plain axes: two spines, small ticks, a title at the left, grid lines along "x", "y", "both" or None."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=SMALL, colors=INK)
+    axes.set_axisbelow(True)
+    axes.set_title(title, fontsize=TITLE, loc="left", color=INK)
+    for label in (axes.xaxis.label, axes.yaxis.label):
+        label.set(fontsize=TEXT, color=INK)
+    if grid is not None:
+        axes.grid(axis=grid, color="#E6E6E6", linewidth=0.8)  # type: ignore[arg-type]
+
+
+def legend(figure: Figure, handles: Sequence[Artist]) -> None:
+    """One legend above all panels, where it covers no data, in as few rows as the figure's width allows."""
+    # Some 0.07 inches a letter, and as much again for handle and gap as for nine letters.
+    needed = sum(0.65 + 0.07 * len(str(handle.get_label())) for handle in handles)
+    rows = ceil(needed / figure.get_figwidth())
+    columns = ceil(len(handles) / rows)
+    figure.legend(handles=handles, loc="outside upper center", ncols=columns, fontsize=TEXT, frameon=False)
+
+
+def tasks_of(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """The rows of each (scenario, model) in order of appearance, with a title for their panel."""
+    for (scenario, model), rows in table.groupby(["scenario", "model"], sort=False, dropna=False):
+        yield f"{scenario} ({model})", rows
+
+
+def save(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) -> Path:
+    """Write the figure, in the format that the ending of `path` names, into a folder made if need be."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=dpi, facecolor="white")
+    return path

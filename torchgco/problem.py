@@ -1,0 +1,136 @@
+"""Problem: dynamics, cost and constraints of a batch, joined and validated once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint
+from torchgco.costs.base import Cost
+from torchgco.dynamics.base import Dynamics
+from torchgco.shapes import Dimensions, InputError
+
+
+@dataclass(frozen=True)
+class Problem:
+    """minimise J_var(X, U) subject to x_{k+1} = step(x_k, u_k), x_0 given, and the constraints: B problems at once.
+
+    Args:
+        dynamics, cost, constraints: the parts; whatever is given per problem has the batch of x0.
+        x0: (B, n), fixes batch, device and dtype.
+        N: number of stages.
+
+    Raises:
+        InputError: names the part at fault, what was expected and what came. A start that is bad in one problem (not
+            finite, inside an obstacle) is no error: that problem ends with its own status.
+    """
+
+    dynamics: Dynamics
+    cost: Cost
+    constraints: Sequence[Constraint]
+    x0: Tensor
+    N: int
+
+    def __post_init__(self) -> None:
+        self._check_border()
+        dims = Dimensions(
+            self.B, self.N, self.n, self.m,
+            getattr(self.dynamics, "dt", None), self.dynamics.position, self.x0,
+        )  # fmt: skip
+        self._check_dynamics()
+        object.__setattr__(self, "cost", self.cost.bind(dims))
+        object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
+
+    @property
+    def B(self) -> int:
+        return self.x0.shape[0]
+
+    @property
+    def n(self) -> int:
+        return self.dynamics.n
+
+    @property
+    def m(self) -> int:
+        return self.dynamics.m
+
+    @property
+    def geometric(self) -> tuple[Constraint, ...]:
+        """The constraints on position that sampling and guidance look at."""
+        return tuple(c for c in self.constraints if c.geometric)
+
+    @cached_property
+    def start_is_clear(self) -> Tensor:
+        """Whether each problem starts outside its obstacles, (B,) bool."""
+        clear = torch.ones(self.B, dtype=torch.bool, device=self.x0.device)
+        for constraint in self.constraints:
+            clear &= constraint.start_is_clear(self.x0)
+        return clear
+
+    def take(self, index: Tensor) -> Self:
+        """The problems in `index` (int64, (B',)); a row may occur more than once."""
+        parts = {
+            "dynamics": self.dynamics.take(index),
+            "cost": self.cost.take(index),
+            "constraints": tuple(c.take(index) for c in self.constraints),
+            "x0": self.x0[index],
+        }
+        return self._with(parts)
+
+    def without_constraints(self) -> Self:
+        """The same problems with the constraints dropped."""
+        return self._with({"constraints": ()})
+
+    def _with(self, parts: dict[str, object]) -> Self:
+        # The parts are bound already: checking them again for every subset would cost more than a pass.
+        copy = object.__new__(type(self))
+        for f in fields(self):
+            object.__setattr__(copy, f.name, parts.get(f.name, getattr(self, f.name)))
+        return copy
+
+    def check_controls(self, U: Tensor, field: str = "U0") -> None:
+        """Raise InputError unless U is (B, N, m) of this problem's dtype and device."""
+        if not isinstance(U, Tensor) or tuple(U.shape) != (self.B, self.N, self.m):
+            got = tuple(U.shape) if isinstance(U, Tensor) else type(U).__name__
+            raise InputError(field, f"a tensor ({self.B}, {self.N}, {self.m})", got)
+        if U.dtype != self.x0.dtype or U.device != self.x0.device:
+            raise InputError(field, f"{self.x0.dtype} on {self.x0.device} as x0", f"{U.dtype} on {U.device}")
+
+    def _check_border(self) -> None:
+        if not isinstance(self.x0, Tensor) or self.x0.dim() != 2 or not self.x0.is_floating_point():
+            raise InputError("x0", f"a floating tensor (B, {self.dynamics.n})", _describe(self.x0))
+        if self.x0.shape[1] != self.dynamics.n or self.x0.shape[0] < 1:
+            raise InputError("x0", f"shape (B, {self.dynamics.n})", tuple(self.x0.shape))
+        if isinstance(self.N, bool) or not isinstance(self.N, int) or self.N < 1:
+            raise InputError("N", "at least one stage", repr(self.N))
+        for name, part, kind in (("dynamics", self.dynamics, Dynamics), ("cost", self.cost, Cost)):
+            if not isinstance(part, kind):
+                raise InputError(name, f"a {kind.__name__}", type(part).__name__)
+        for constraint in self.constraints:
+            if not isinstance(constraint, Constraint):
+                raise InputError("constraints", "a sequence of Constraint", type(constraint).__name__)
+
+    def _check_dynamics(self) -> None:
+        for name in self.dynamics.per_element:
+            value = getattr(self.dynamics, name)
+            if not isinstance(value, Tensor) or value.dim() == 0:
+                continue
+            if tuple(value.shape) not in ((self.B,), (1,)):
+                raise InputError(f"dynamics.{name}", f"a number or a tensor ({self.B},)", tuple(value.shape))
+            if value.dtype != self.x0.dtype or value.device != self.x0.device:
+                raise InputError(
+                    f"dynamics.{name}", f"{self.x0.dtype} on {self.x0.device} as x0", f"{value.dtype} on {value.device}"
+                )
+        after = self.dynamics.step(self.x0, self.x0.new_zeros(self.B, self.m))
+        if after.shape != self.x0.shape or after.dtype != self.x0.dtype:
+            raise InputError(
+                "dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", f"{after.dtype} {tuple(after.shape)}"
+            )
+
+
+def _describe(value: object) -> str:
+    return f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__

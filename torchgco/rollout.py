@@ -1,0 +1,35 @@
+"""Trajectories from controls, and from feedback along a nominal one."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.dynamics.base import Dynamics
+
+
+def open_loop(dynamics: Dynamics, x0: Tensor, U: Tensor) -> Tensor:
+    """X (B, N+1, n) from x0 (B, n) and U (B, N, m)."""
+    x, knots = x0, [x0]
+    for k in range(U.shape[1]):
+        x = dynamics.step(x, U[:, k])
+        knots.append(x)
+    return torch.stack(knots, dim=1)
+
+
+def closed_loop(dynamics: Dynamics, X: Tensor, U: Tensor, G: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Roll out u = u_old + K (x - x_old) + alpha d (Equation 47) around X (B, N+1, n), U (B, N, m).
+
+    Args:
+        G: gains [K d], stage first: (N, B, m, n+1).
+        alpha: step lengths (B,).
+    """
+    x, knots, controls = X[:, 0], [X[:, 0]], []
+    step = alpha.unsqueeze(-1)
+    for k in range(U.shape[1]):
+        deviation = torch.cat((x - X[:, k], step), dim=-1).unsqueeze(-1)  # K and alpha d in one product
+        u = U[:, k] + torch.bmm(G[k], deviation).squeeze(-1)
+        x = dynamics.step(x, u)
+        knots.append(x)
+        controls.append(u)
+    return torch.stack(knots, dim=1), torch.stack(controls, dim=1)

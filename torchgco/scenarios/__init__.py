@@ -1,0 +1,22 @@
+"""Named sources of obstacle layouts: random families and files."""
+
+from torchgco.scenarios.base import Scenario
+from torchgco.scenarios.files import LayoutFile
+from torchgco.scenarios.layouts import Layouts, concatenate
+from torchgco.scenarios.planar import PlanarRandom, PlanarTrap
+from torchgco.scenarios.quadrotor import Forest, ForestMoving, Walls
+from torchgco.scenarios.vehicle import Task, Vehicle
+
+__all__ = [
+    "Forest",
+    "ForestMoving",
+    "LayoutFile",
+    "Layouts",
+    "PlanarRandom",
+    "PlanarTrap",
+    "Scenario",
+    "Task",
+    "Vehicle",
+    "Walls",
+    "concatenate",
+]

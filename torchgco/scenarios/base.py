@@ -1,0 +1,139 @@
+"""What a scenario is: a named source of layouts, drawn by number from a seed or read from a file."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from torchgco.scenarios import checks
+from torchgco.scenarios.layouts import Layouts, concatenate
+from torchgco.shapes import InputError
+
+MAX_DRAWS = 5000  # rounds of redrawing what lies too near before a rule is called impossible
+
+
+class Scenario(ABC):
+    """A named source of obstacle layouts.
+
+    A layout depends on (seed, id) alone: neither on how many others are drawn with it nor on who flies it. A
+    subclass has a `name` and a `dimension` and overrides `_draw_one`.
+    """
+
+    name: str
+
+    @property
+    @abstractmethod
+    def dimension(self) -> int:
+        """Dimension d of space, 2 or 3."""
+
+    @property
+    def available(self) -> int | None:
+        """How many layouts there are; None where any number can be drawn."""
+        return None
+
+    def draw(self, ids: Sequence[int], seed: int) -> Layouts:
+        """The layouts numbered `ids` (each >= 0) under `seed` (>= 0), in that order.
+
+        Raises InputError where ids or seed are malformed, or the scenario's rule can't be satisfied.
+        """
+        numbers = checks.indices(ids, "ids")
+        seed = checks.integer(seed, "seed", 0)
+        drawn = concatenate([self._draw_one(generator(seed, int(number))) for number in numbers])
+        return replace(drawn, name=self.name, ids=numbers)
+
+    def _draw_one(self, rng: np.random.Generator) -> Layouts:
+        """One layout (L = 1) from its own stream. The number of rows M should be the same for all."""
+        raise NotImplementedError(f"{type(self).__name__} overrides _draw_one or draw")
+
+
+def generator(seed: int, number: int) -> np.random.Generator:
+    """The stream of layout `number` under `seed`: counter-based, independent of every other number's."""
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=(number,))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Family(Scenario):
+    """What the built-in random families share: equal spheres, one start at rest, one goal.
+
+    start, goal      positions (d,) m; the full states are at rest
+    obstacle_radius  m; vehicle_radius: m; goal_radius: m
+    stages           N; dt: s
+
+    Raises InputError naming `scenario.<field>`.
+    """
+
+    name: str
+    obstacle_radius: float
+    vehicle_radius: float
+    start: Sequence[float]
+    goal: Sequence[float]
+    goal_radius: float
+    stages: int
+    dt: float
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError("scenario.name", "a name", repr(self.name))
+        for field in ("obstacle_radius", "vehicle_radius"):
+            self._set(field, checks.number, at_least=0)
+        for field in ("goal_radius", "dt"):
+            self._set(field, checks.number, above=0)
+        for field in ("start", "goal"):
+            self._set(field, checks.vector, length=self.dimension)
+        self._set("stages", checks.integer, at_least=1)
+
+    def _set(self, field: str, check: Any, **limits: Any) -> None:
+        """Replace a field by its checked, plain form."""
+        object.__setattr__(self, field, check(getattr(self, field), f"scenario.{field}", **limits))
+
+    @abstractmethod
+    def _at_rest(self, position: Sequence[float]) -> np.ndarray:
+        """The vehicle's state (n,) at rest in `position` (d,)."""
+
+    def _layout(self, centers: np.ndarray, **more: Any) -> Layouts:
+        """One layout of spheres at `centers` (M, d), NaN where absent; `more` goes to Layouts as it is."""
+        radii = np.where(np.isnan(centers[:, 0]), np.nan, self.obstacle_radius)
+        return Layouts(
+            centers=centers[None],
+            radii=radii[None],
+            start=self._at_rest(self.start),
+            goal=self._at_rest(self.goal),
+            vehicle_radius=self.vehicle_radius,
+            goal_radius=self.goal_radius,
+            dt=self.dt,
+            stages=self.stages,
+            **more,
+        )
+
+
+def uniform_clear(
+    rng: np.random.Generator,
+    region: Sequence[Sequence[float]],
+    count: int,
+    keep_clear: Iterable[tuple[Sequence[float], float]],
+) -> np.ndarray:
+    """`count` points (count, d) uniform in the box `region`, each redrawn until it is clear.
+
+    `region` is d pairs [low, high] in m; clear means farther than `distance` from `point` for every
+    (point, distance) in `keep_clear`. Raises InputError where some point never is.
+    """
+    low, high = np.array(region, np.float64).T
+    points = rng.uniform(low, high, (count, len(low)))
+    keep_clear = list(keep_clear)
+    for _ in range(MAX_DRAWS):
+        near = np.zeros(count, bool)
+        for point, distance in keep_clear:
+            near |= np.linalg.norm(points - np.asarray(point), axis=1) <= distance
+        if not near.any():
+            return points
+        points[near] = rng.uniform(low, high, (int(near.sum()), len(low)))
+    distances = " and ".join(f"{distance:g} m from {tuple(point)}" for point, distance in keep_clear)
+    raise InputError(
+        "scenario.region",
+        f"room for scenario.num_obstacles = {count} centres more than {distances}",
+        f"{[list(pair) for pair in region]}, where {MAX_DRAWS} draws found too little",
+    )

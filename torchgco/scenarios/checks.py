@@ -1,0 +1,181 @@
+"""Checks of what scenarios and layouts are given.
+
+Each returns the value in one plain form or raises InputError. Letters as in `layouts`: L layouts,
+M obstacles, d the dimension of space, n states, m controls.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from torchgco.shapes import InputError
+
+
+def number(value: Any, field: str, above: float = -math.inf, at_least: float = -math.inf) -> float:
+    """`value` as a finite float that is > `above` and >= `at_least`."""
+    try:
+        plain = float(value)
+    except (TypeError, ValueError):
+        plain = math.nan
+    if not (math.isfinite(plain) and plain > above and plain >= at_least):
+        limit = f" > {above:g}" if above > -math.inf else f" >= {at_least:g}" if at_least > -math.inf else ""
+        raise InputError(field, f"a finite number{limit}", repr(value))
+    return plain
+
+
+def optional_number(value: Any, field: str, **limits: float) -> float | None:
+    """As `number`, None staying None."""
+    return None if value is None else number(value, field, **limits)
+
+
+def integer(value: Any, field: str, at_least: int) -> int:
+    """`value` as an int >= `at_least`; 5.0 is one, 5.5 is not."""
+    try:
+        plain = float(value)
+    except (TypeError, ValueError):
+        plain = math.nan
+    if not (plain >= at_least and plain.is_integer()):
+        raise InputError(field, f"an integer >= {at_least}", repr(value))
+    return int(value)
+
+
+def vector(value: Any, field: str, length: int | None = None) -> tuple[float, ...]:
+    """A sequence of `length` (by default at least one) finite numbers as a tuple of floats."""
+    items = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
+    if not items or (length is not None and len(items) != length):
+        raise InputError(field, "a list of numbers" if length is None else f"a list of {length} numbers", repr(value))
+    return tuple(number(item, field) for item in items)
+
+
+def vectors(value: Any, field: str, length: int) -> tuple[tuple[float, ...], ...]:
+    """A sequence of at least one sequence of `length` numbers, as tuples."""
+    rows = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
+    if not rows:
+        raise InputError(field, f"a list of lists of {length} numbers", repr(value))
+    return tuple(vector(row, field, length) for row in rows)
+
+
+def box(value: Any, field: str, dimension: int) -> tuple[tuple[float, float], ...]:
+    """`dimension` pairs (low, high) with low <= high."""
+    pairs = vectors(value, field, 2)
+    if len(pairs) != dimension or any(low > high for low, high in pairs):
+        raise InputError(field, f"{dimension} pairs [low, high] with low <= high", repr(value))
+    return tuple((low, high) for low, high in pairs)
+
+
+def indices(value: Any, field: str) -> np.ndarray:
+    """A sequence of at least one integer >= 0, as int64 (count,)."""
+    try:
+        plain = [operator.index(item) for item in value]
+    except TypeError:
+        plain = []
+    if not plain or min(plain) < 0:
+        raise InputError(field, "a list of at least one integer >= 0", repr(value))
+    return np.array(plain, np.int64)
+
+
+def array(value: Any, field: str) -> np.ndarray:
+    """A float64 copy of numbers of any shape."""
+    try:
+        if np.asarray(value).dtype.kind not in "iuf":
+            raise TypeError
+        return np.array(value, np.float64)
+    except (TypeError, ValueError):
+        got = f"dtype {value.dtype}" if isinstance(value, np.ndarray) else repr(value)
+        raise InputError(field, "an array of real numbers", got) from None
+
+
+def obstacles(centers: Any, radii: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (L, M, d) and radii (L, M) that are present or absent together."""
+    centers, radii = array(centers, "layouts.centers"), array(radii, "layouts.radii")
+    if centers.ndim != 3 or centers.shape[0] < 1 or centers.shape[2] not in (2, 3):
+        raise InputError("layouts.centers", "shape (L, M, d), L >= 1, d = 2 or 3", f"shape {centers.shape}")
+    if radii.shape != centers.shape[:2]:
+        raise InputError("layouts.radii", f"shape (L, M) = {centers.shape[:2]} as in centers", radii.shape)
+    absent = np.isnan(centers).all(axis=2)
+    partial = ~absent & ~np.isfinite(centers).all(axis=2)
+    _none_of(partial, "layouts.centers", "finite rows or rows of NaN", centers)
+    _none_of(np.isinf(radii) | (radii < 0), "layouts.radii", "finite radii >= 0", radii)
+    _none_of(absent & ~np.isnan(radii), "layouts.radii", "NaN where the centre is NaN", radii)
+    _none_of(~absent & np.isnan(radii), "layouts.radii", "a radius where the centre is finite", radii)
+    return centers, radii
+
+
+def velocities(value: Any, centers: np.ndarray) -> np.ndarray | None:
+    """Velocities (L, M, d), finite where there is an obstacle and NaN where there is none."""
+    if value is None:
+        return None
+    moving = array(value, "layouts.velocities")
+    if moving.shape != centers.shape:
+        raise InputError("layouts.velocities", f"the shape {centers.shape} of centers", moving.shape)
+    absent = np.isnan(centers).all(axis=2)
+    bad = ~absent & ~np.isfinite(moving).all(axis=2)
+    _none_of(bad, "layouts.velocities", "finite velocities where the centre is finite", moving)
+    moving[absent] = np.nan
+    return moving
+
+
+def states(value: Any, field: str, centers: np.ndarray) -> np.ndarray | None:
+    """Finite states (L, n), n >= d, from one state (n,) for all layouts or one each (L, n)."""
+    if value is None:
+        return None
+    given = array(value, field)
+    count, _, dimension = centers.shape
+    fits = given.ndim == 1 or (given.ndim == 2 and given.shape[0] == count)
+    if not fits or given.shape[-1] < dimension:
+        expected = f"shape (n,) or ({count}, n) with n >= {dimension}"
+        raise InputError(field, expected, f"shape {given.shape}")
+    given = np.tile(given, (count, 1)) if given.ndim == 1 else given
+    _none_of(~np.isfinite(given).all(axis=1), field, "finite states", given)
+    return given
+
+
+def control_bounds(lower: Any, upper: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Bounds (m,) of the controls, either of them possibly None, infinite where there is none."""
+    bounds: list[np.ndarray | None] = []
+    for value, field in ((lower, "layouts.control_lower"), (upper, "layouts.control_upper")):
+        bound = None if value is None else array(value, field)
+        if bound is not None and (bound.ndim != 1 or not bound.size or np.isnan(bound).any()):
+            raise InputError(field, "shape (m,) without NaN", f"{bound.tolist()} of shape {bound.shape}")
+        bounds.append(bound)
+    low, high = bounds
+    if low is not None and high is not None:
+        if low.shape != high.shape:
+            raise InputError("layouts.control_upper", f"the shape {low.shape} of control_lower", high.shape)
+        if (low > high).any():
+            raise InputError("layouts.control_lower", f"at most control_upper, {high.tolist()}", low.tolist())
+    return low, high
+
+
+def best_cost(value: Any, count: int) -> np.ndarray | None:
+    """Costs (L,), NaN where none is known."""
+    if value is None:
+        return None
+    costs = array(value, "layouts.best_cost")
+    if costs.shape != (count,):
+        raise InputError("layouts.best_cost", f"shape ({count},)", f"shape {costs.shape}")
+    _none_of(np.isinf(costs), "layouts.best_cost", "finite costs, or NaN where none is known", costs)
+    return costs
+
+
+def ids(value: Any, count: int) -> np.ndarray:
+    """Ids (L,) >= 0 as int64; None or an empty array stands for 0..L-1."""
+    given = np.asarray(() if value is None else value)
+    if given.size == 0:
+        return np.arange(count)
+    if given.shape != (count,) or not np.issubdtype(given.dtype, np.integer) or given.min() < 0:
+        got = f"{given.dtype} of shape {given.shape}, from {given.min()}"
+        raise InputError("layouts.ids", f"integers >= 0 of shape ({count},)", got)
+    return given.astype(np.int64)
+
+
+def _none_of(bad: Any, field: str, expected: str, values: np.ndarray) -> None:
+    """Raise InputError that shows the first of `values` where `bad` is true."""
+    if bad.any():
+        place = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise InputError(field, expected, f"{values[place].tolist()} at {list(place)}")

@@ -1,0 +1,225 @@
+"""Obstacle layouts: what a scenario draws, and what a layout file holds.
+
+L layouts, M obstacles each, d the dimension of space (2 or 3). A layout with fewer than M obstacles is padded
+with rows of NaN. Lengths in metres, times in seconds.
+"""
+
+from __future__ import annotations
+
+import os
+import uuid
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchgco.scenarios import checks
+from torchgco.shapes import InputError
+
+# What a file may hold, in the order of the fields of Layouts. `layout` are the ids, if they are not 0..L-1.
+REQUIRED = ("centers", "radii")
+SCALARS = ("vehicle_radius", "goal_radius", "dt", "stages")
+CONTROLS = ("control_lower", "control_upper")
+NAMED = (*REQUIRED, "velocities", "start", "goal", *SCALARS, *CONTROLS, "best_cost")
+IDS = "layout"
+
+# What np.load raises on a file that is no npz, holds pickles or is damaged; a lone .npy fails as a context.
+UNREADABLE = (OSError, EOFError, AttributeError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
+
+
+@dataclass(frozen=True, eq=False)
+class Layouts:
+    """A batch of obstacle layouts with what is known of the task in them.
+
+    centers         (L, M, d) m, rows of NaN where an obstacle is absent
+    radii           (L, M) m, NaN where absent
+    velocities      (L, M, d) m/s, constant, or None if nothing moves
+    start, goal     (L, n) states, given as (n,) or (L, n), or None; positions come first
+    vehicle_radius  m; goal_radius: m; dt: s; stages: N; each one number for all layouts, or None
+    control_lower, control_upper
+                    (m,) in the units of the inputs, infinite where unbounded, or None
+    best_cost       (L,) J_var of the best solution known, NaN where none is, or None
+    name            of the family, or the stem of the file
+    ids             (L,) int64, index of each layout in its file or generator; 0..L-1 unless given
+
+    Arrays are copied on construction. Raises InputError naming `layouts.<field>`.
+    """
+
+    centers: np.ndarray
+    radii: np.ndarray
+    velocities: np.ndarray | None = None
+    start: np.ndarray | None = None
+    goal: np.ndarray | None = None
+    vehicle_radius: float | None = None
+    goal_radius: float | None = None
+    dt: float | None = None
+    stages: int | None = None
+    control_lower: np.ndarray | None = None
+    control_upper: np.ndarray | None = None
+    best_cost: np.ndarray | None = None
+    name: str = "layouts"
+    ids: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  # empty stands for 0..L-1
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        centers, radii = checks.obstacles(self.centers, self.radii)
+        put("centers", centers)
+        put("radii", radii)
+        put("velocities", checks.velocities(self.velocities, centers))
+        for name in ("start", "goal"):
+            put(name, checks.states(getattr(self, name), f"layouts.{name}", centers))
+        if self.start is not None and self.goal is not None and self.start.shape != self.goal.shape:
+            raise InputError("layouts.goal", f"n = {self.start.shape[1]} as start has", self.goal.shape[1])
+        for name, limit in (("vehicle_radius", "at_least"), ("goal_radius", "above"), ("dt", "above")):
+            put(name, checks.optional_number(getattr(self, name), f"layouts.{name}", **{limit: 0.0}))
+        put("stages", None if self.stages is None else checks.integer(self.stages, "layouts.stages", 1))
+        lower, upper = checks.control_bounds(self.control_lower, self.control_upper)
+        put("control_lower", lower)
+        put("control_upper", upper)
+        put("best_cost", checks.best_cost(self.best_cost, len(centers)))
+        put("ids", checks.ids(self.ids, len(centers)))
+
+    @property
+    def count(self) -> int:
+        """L, the number of layouts."""
+        return self.centers.shape[0]
+
+    @property
+    def dimension(self) -> int:
+        """d, 2 or 3."""
+        return self.centers.shape[2]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays a file of these layouts holds, by name; what is None isn't among them."""
+        held = {name: np.asarray(getattr(self, name)) for name in NAMED if getattr(self, name) is not None}
+        if not np.array_equal(self.ids, np.arange(self.count)):
+            held[IDS] = self.ids
+        return held
+
+    def __eq__(self, other: object) -> bool:
+        """Same name, same ids and the same arrays; an absent obstacle (NaN) equals an absent one."""
+        if not isinstance(other, Layouts):
+            return NotImplemented
+        mine, theirs = self.arrays(), other.arrays()
+        return (
+            self.name == other.name
+            and mine.keys() == theirs.keys()
+            and all(np.array_equal(mine[name], theirs[name], equal_nan=True) for name in mine)
+        )
+
+    def take(self, indices: Sequence[int] | np.ndarray) -> Layouts:
+        """The layouts at `indices`, positions 0..L-1 in any order; InputError if one lies outside."""
+        index = checks.indices(indices, "layouts.take")
+        if index.max() >= self.count:
+            raise InputError("layouts.take", f"positions in 0..{self.count - 1}", int(index.max()))
+        rows = ("centers", "radii", "velocities", "start", "goal", "best_cost", "ids")
+        held = {name: getattr(self, name) for name in rows if getattr(self, name) is not None}
+        return replace(self, **{name: value[index] for name, value in held.items()})
+
+    def pad(self, obstacles: int) -> Layouts:
+        """The same layouts with M = `obstacles`, absent ones added last; InputError if there are more."""
+        present = self.radii.shape[1]
+        missing = checks.integer(obstacles, "layouts.pad", 0) - present
+        if missing < 0:
+            raise InputError("layouts.pad", f"at least the {present} obstacles there are", obstacles)
+        if missing == 0:
+            return self
+
+        def padded(value: np.ndarray) -> np.ndarray:
+            return np.pad(value, [(0, 0), (0, missing), (0, 0)][: value.ndim], constant_values=np.nan)
+
+        velocities = None if self.velocities is None else padded(self.velocities)
+        return replace(self, centers=padded(self.centers), radii=padded(self.radii), velocities=velocities)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the arrays to `path` (npz): all of it or, if interrupted, nothing."""
+        path = Path(path)
+        part = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
+        try:
+            with open(part, "xb") as handle:
+                np.savez(handle, **self.arrays())  # type: ignore[arg-type]
+                handle.flush()
+                os.fsync(handle.fileno())
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Layouts:
+        """The layouts of a file, named by its stem.
+
+        Raises InputError: `scenario.path` if there is no readable npz file, `layouts.<array>` if an array is
+        missing, unknown or malformed.
+        """
+        path = Path(path)
+        held = _read(path)
+        for name in REQUIRED:
+            if name not in held:
+                raise InputError(f"layouts.{name}", f"this array in {path}", f"only {sorted(held)}")
+        known = (*NAMED, IDS)
+        for name in held:
+            if name not in known:
+                raise InputError(f"layouts.{name}", f"only {', '.join(known)}", f"this one in {path}")
+        ids = held.pop(IDS, np.empty(0, np.int64))
+        return cls(**held, name=path.stem, ids=ids)  # type: ignore[arg-type]
+
+
+def concatenate(parts: Sequence[Layouts]) -> Layouts:
+    """One batch of all layouts in `parts`, in order, padded to the largest number of obstacles.
+
+    Obstacles rest in parts without velocities, and best_cost is NaN in parts without one. Raises InputError
+    where the parts differ in what a batch shares: dimension, lengths of states, scalars, control bounds.
+    """
+    if not parts:
+        raise InputError("layouts", "at least one part to concatenate", "none")
+    _same("dimension", [part.dimension for part in parts])
+    shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*SCALARS, *CONTROLS)}
+    width = max(part.radii.shape[1] for part in parts)
+    parts = [part.pad(width) for part in parts]
+    joined = ("start", "goal", "velocities", "best_cost")
+    columns = {name: [getattr(part, name) for part in parts] for name in joined}
+    for name in ("start", "goal"):
+        _same(name, [None if state is None else state.shape[1] for state in columns[name]])
+    if any(value is not None for value in columns["velocities"]):
+        columns["velocities"] = [
+            np.zeros_like(part.centers) if part.velocities is None else part.velocities for part in parts
+        ]
+    if any(value is not None for value in columns["best_cost"]):
+        columns["best_cost"] = [
+            np.full(part.count, np.nan) if part.best_cost is None else part.best_cost for part in parts
+        ]
+    return Layouts(
+        centers=np.concatenate([part.centers for part in parts]),
+        radii=np.concatenate([part.radii for part in parts]),
+        **{name: None if column[0] is None else np.concatenate(column) for name, column in columns.items()},
+        **shared,
+        name="+".join(dict.fromkeys(part.name for part in parts)),
+        ids=np.concatenate([part.ids for part in parts]),
+    )
+
+
+def _same(name: str, values: list[Any]) -> Any:
+    """The one value that all parts hold."""
+    first = values[0]
+    for value in values[1:]:
+        if (value is None) != (first is None) or not np.array_equal(value, first):
+            raise InputError(f"layouts.{name}", "the same in all parts", f"{first} and {value}")
+    return first
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an npz file."""
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            return {name: held[name] for name in held.files}
+    except FileNotFoundError:
+        raise InputError("scenario.path", "a layout file (.npz)", f"{path}, which isn't there") from None
+    except UNREADABLE as error:
+        got = f"{path} ({error})"
+        raise InputError("scenario.path", "a readable npz file without pickles", got) from None

@@ -1,0 +1,152 @@
+"""Scenarios in space: spheres before the quadrotor's planning model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchgco.scenarios import checks
+from torchgco.scenarios.base import Family, uniform_clear
+from torchgco.scenarios.layouts import Layouts
+
+HOVER = 9.81  # thrust acceleration that holds the vehicle, m/s^2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quadrotor(Family):
+    """What the quadrotor families share: state n = 14 [p, v, q, w, a], at rest upright and hovering.
+
+    Control bounds are the model's.
+    """
+
+    obstacle_radius: float = 0.60
+    vehicle_radius: float = 0.36
+    start: Sequence[float] = (-1.0, 1.0, 0.0)
+    goal: Sequence[float] = (20.0, 1.0, 0.2)
+    goal_radius: float = 2.0
+    stages: int = 100
+    dt: float = 0.05
+
+    @property
+    def dimension(self) -> int:
+        """3."""
+        return 3
+
+    def _at_rest(self, position: Sequence[float]) -> np.ndarray:
+        velocity, upright, rates = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        return np.array([*position, *velocity, *upright, *rates, HOVER])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Forest(Quadrotor):
+    """Spheres with centres uniform in `region` (3 pairs [low, high], m), which may overlap.
+
+    num_obstacles  how many
+    density        per m^3 of the region; where given it overrides num_obstacles by the nearest whole number
+    clearance      a centre is redrawn until it is more than this from start and goal, m
+    """
+
+    name: str = "forest"
+    num_obstacles: int = 30
+    density: float | None = None
+    region: Sequence[Sequence[float]] = ((2.0, 16.0), (-1.0, 3.0), (-1.0, 1.0))
+    clearance: float = 1.26
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set("num_obstacles", checks.integer, at_least=0)
+        self._set("density", checks.optional_number, at_least=0)
+        self._set("region", checks.box, dimension=3)
+        self._set("clearance", checks.number, at_least=0)
+
+    @property
+    def obstacle_count(self) -> int:
+        """M, from density where it is given, else num_obstacles."""
+        if self.density is None:
+            return self.num_obstacles
+        return round(self.density * float(np.prod([high - low for low, high in self.region])))
+
+    def _centers(self, rng: np.random.Generator) -> np.ndarray:
+        clear = ((self.start, self.clearance), (self.goal, self.clearance))
+        return uniform_clear(rng, self.region, self.obstacle_count, clear)
+
+    def _draw_one(self, rng: np.random.Generator) -> Layouts:
+        return self._layout(self._centers(rng))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForestMoving(Forest):
+    """A forest whose spheres move, each in a random horizontal direction at a constant velocity.
+
+    Speeds are uniform in [0, speed] m/s. At the first instant it is the Forest of the same seed and number.
+    """
+
+    name: str = "forest_moving"
+    speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set("speed", checks.number, at_least=0)
+
+    def _draw_one(self, rng: np.random.Generator) -> Layouts:
+        centers = self._centers(rng)
+        speed = rng.uniform(0.0, self.speed, len(centers))
+        heading = rng.uniform(-np.pi, np.pi, len(centers))
+        direction = np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(centers))])
+        return self._layout(centers, velocities=(speed[:, None] * direction)[None])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walls(Quadrotor):
+    """Walls of spheres across the way, with round holes at random places.
+
+    positions    x of each wall, m
+    extent       [[low, high] in y, [low, high] in z] of the grid of centres, which starts at the low ends, m
+    pitch        distance between neighbours on the grid, m
+    holes        holes in each wall
+    hole_radius  spheres nearer than this to a hole, centre to centre in the wall's plane, are left out, m
+    hole_region  box [[y], [z]] in which the centres of holes are uniform, m
+
+    M is the size of the full grids in every layout (absent spheres last), so it never depends on the draw.
+    """
+
+    name: str = "walls"
+    stages: int = 160
+    positions: Sequence[float] = (7.0, 13.0)
+    extent: Sequence[Sequence[float]] = ((-5.0, 7.0), (-3.0, 3.0))
+    pitch: float = 0.9
+    holes: int = 1
+    hole_radius: float = 1.5
+    hole_region: Sequence[Sequence[float]] = ((-1.5, 3.5), (-1.0, 1.0))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set("positions", checks.vector)
+        for field in ("extent", "hole_region"):
+            self._set(field, checks.box, dimension=2)
+        self._set("pitch", checks.number, above=0)
+        self._set("holes", checks.integer, at_least=0)
+        self._set("hole_radius", checks.number, at_least=0)
+
+    def _grid(self) -> np.ndarray:
+        """Centres in the plane of a wall, (G, 2): all z for each y."""
+        # The small addition keeps an end that a whole number of pitches reaches but for rounding.
+        steps = [int((high - low) / self.pitch + 1e-9) for low, high in self.extent]
+        y, z = (low + self.pitch * np.arange(n + 1) for n, (low, _) in zip(steps, self.extent, strict=True))
+        return np.stack(np.meshgrid(y, z, indexing="ij"), axis=-1).reshape(-1, 2)
+
+    def _draw_one(self, rng: np.random.Generator) -> Layouts:
+        grid = self._grid()
+        low, high = np.array(self.hole_region).T
+        standing = []
+        for x in self.positions:
+            holes = rng.uniform(low, high, (self.holes, 2))
+            distance = np.linalg.norm(grid[:, None] - holes, axis=2)
+            wall = grid[(distance >= self.hole_radius).all(axis=1)]
+            standing.append(np.column_stack([np.full(len(wall), x), wall]))
+        centers = np.full((len(self.positions) * len(grid), 3), np.nan)
+        present = np.concatenate(standing)
+        centers[: len(present)] = present
+        return self._layout(centers)

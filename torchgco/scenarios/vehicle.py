@@ -1,0 +1,112 @@
+"""Vehicle: a planning model with its weights, limits and habits; with layouts it makes a batch of problems."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.bounds import ControlBounds
+from torchgco.constraints.obstacles import Spheres
+from torchgco.costs.quadratic import QuadraticCost
+from torchgco.dynamics.base import Dynamics
+from torchgco.problem import Problem
+from torchgco.scenarios.layouts import Layouts
+from torchgco.shapes import InputError
+
+
+@dataclass(frozen=True)
+class Task:
+    """A batch of planning problems with what a study needs beside them."""
+
+    problem: Problem
+    U0: Tensor  # (B, N, m), the vehicle at rest
+    goal: Tensor  # (B, d), m
+    goal_radius: float  # m
+    layouts: Layouts
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What flies: the planning model and what the paper's tables say of it. Layouts overrule the last group.
+
+    Args:
+        name: as the study's column `model` shows it.
+        dynamics: planning model; its time step gives way to the layouts'.
+        state_weight, control_weight, terminal_weight: diagonals of Q, R, Qf.
+        control_reference: u_ref (m,), also the initial guess: the vehicle at rest.
+        control_lower, control_upper: (m,).
+        start, goal: states (n,); radius: r_veh, m; goal_radius: m; stages: N.
+
+    Raises:
+        InputError: on `task`: layouts of another dimension or with states of another length.
+    """
+
+    name: str
+    dynamics: Dynamics
+    state_weight: Sequence[float]
+    control_weight: Sequence[float]
+    terminal_weight: Sequence[float]
+    control_reference: Sequence[float]
+    control_lower: Sequence[float]
+    control_upper: Sequence[float]
+    start: Sequence[float]
+    goal: Sequence[float]
+    radius: float
+    goal_radius: float
+    stages: int
+
+    @property
+    def dimension(self) -> int:
+        """d of the space the vehicle moves in, 2 or 3."""
+        position = self.dynamics.position
+        return 0 if position is None else position.stop - position.start
+
+    def task(self, layouts: Layouts, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float64) -> Task:
+        """The planning problems of these layouts: quadratic cost to the goal, spheres, control bounds (section 5)."""
+        if layouts.dimension != self.dimension:
+            other = "quadrotor" if layouts.dimension == 3 else "planar"
+            raise InputError("model", f"model={other} for the {layouts.dimension}-D {layouts.name}", self.name)
+        start, goal = self._states(layouts, "start"), self._states(layouts, "goal")
+
+        def tensor(value: object) -> Tensor:
+            return torch.as_tensor(value, dtype=dtype, device=device)
+
+        dynamics = self.dynamics if layouts.dt is None else replace(self.dynamics, dt=layouts.dt)  # type: ignore
+        stages = _given(layouts.stages, self.stages)
+        constraints = [
+            Spheres(
+                tensor(layouts.centers),
+                tensor(layouts.radii),
+                _given(layouts.vehicle_radius, self.radius),
+                None if layouts.velocities is None else tensor(layouts.velocities),
+            ),
+            ControlBounds(
+                tensor(_given(layouts.control_lower, self.control_lower)),
+                tensor(_given(layouts.control_upper, self.control_upper)),
+            ),
+        ]
+        cost = QuadraticCost(
+            Q=tensor(list(self.state_weight)), R=tensor(list(self.control_weight)),
+            Qf=tensor(list(self.terminal_weight)), x_ref=tensor(goal).unsqueeze(1),
+            u_ref=tensor(list(self.control_reference)),
+        )  # fmt: skip
+        problem = Problem(dynamics, cost, constraints, tensor(start), stages)
+        U0 = tensor(list(self.control_reference)).expand(layouts.count, stages, -1).contiguous()
+        goal_radius = _given(layouts.goal_radius, self.goal_radius)
+        return Task(problem, U0, tensor(goal)[:, dynamics.position], goal_radius, layouts)
+
+    def _states(self, layouts: Layouts, name: str):
+        """start or goal (L, n): the layouts' own, or the vehicle's for all."""
+        states = getattr(layouts, name)
+        if states is None:
+            return torch.tensor([list(getattr(self, name))] * layouts.count, dtype=torch.float64).numpy()
+        if states.shape[1] != self.dynamics.n:
+            raise InputError(f"layouts.{name}", f"{self.dynamics.n} states of model={self.name}", states.shape[1])
+        return states
+
+
+def _given(value, default):
+    return default if value is None else value

@@ -1,0 +1,90 @@
+"""Solution: what a solver returns for every problem of the batch."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.lagrangian import Multipliers
+from torchgco.shapes import InputError, take
+from torchgco.status import Status
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Trajectories, feedback gains, multipliers and how each problem ended. Saved and loaded as npz."""
+
+    X: Tensor  # (B, N+1, n)
+    U: Tensor  # (B, N, m)
+    K: Tensor  # (B, N, m, n): u = U + K (x - X) + d
+    d: Tensor  # (B, N, m)
+    multipliers: Multipliers
+    cost: Tensor  # (B,): J_var
+    violation: Tensor  # (B,): largest violation, metres for lengths
+    status: Tensor  # (B,) int64, see Status
+    iterations: Tensor  # (B,) int64, inner iterations altogether
+    outer_iterations: Tensor  # (B,) int64
+    guided: Tensor  # (B,) int64, outer iterations with guidance on
+    trace: pd.DataFrame | None = None  # a row per element and iteration, where the solver records
+
+    @property
+    def statuses(self) -> list[Status]:
+        """The statuses by name; `.sentence` explains one."""
+        return [Status(s) for s in self.status.tolist()]
+
+    def take(self, index: Tensor) -> Solution:
+        """The problems in `index` (the trace is left behind)."""
+        return take(replace(self, trace=None), index)
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row per problem: status, cost, violation and the iteration counts."""
+        import pandas as pd
+
+        columns: dict[str, Any] = {"status": [s.name for s in self.statuses]}
+        for name in ("cost", "violation", "iterations", "outer_iterations", "guided"):
+            columns[name] = getattr(self, name).cpu().numpy()
+        return pd.DataFrame(columns).rename_axis("element")
+
+    def save(self, path: str | Path) -> None:
+        """Write an npz beside its final place, then move it there: a reader never sees half a file."""
+        path = Path(path)
+        arrays = {f.name: getattr(self, f.name).cpu().numpy() for f in fields(self) if f.name in _TENSORS}
+        arrays["mu"] = self.multipliers.mu.cpu().numpy()
+        for i, lam in enumerate(self.multipliers.lam):
+            arrays[f"lam{i}"] = lam.cpu().numpy()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+            np.savez_compressed(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(file.name, path)
+
+    @classmethod
+    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Solution:
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: no such file, or one that isn't a solution.
+        """
+        if not Path(path).is_file():
+            raise InputError("path", "a solution file", f"{path}, which isn't there")
+        with np.load(path, allow_pickle=False) as file:
+            missing = {*_TENSORS, "mu"} - set(file.files)
+            if missing:
+                raise InputError("path", "a solution file", f"{path} without {sorted(missing)}")
+            tensors = {name: torch.from_numpy(file[name]).to(device) for name in file.files}
+        lam = tuple(tensors[f"lam{i}"] for i in range(sum(name.startswith("lam") for name in tensors)))
+        return cls(multipliers=Multipliers(lam, tensors["mu"]), **{name: tensors[name] for name in _TENSORS})
+
+
+_TENSORS = tuple(f.name for f in fields(Solution) if f.name not in ("multipliers", "trace"))

@@ -1,0 +1,5 @@
+"""Batched solvers: iLQR, and the augmented Lagrangian around it."""
+
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian as AugmentedLagrangian
+from torchgco.solvers.ilqr import ILQR as ILQR
+from torchgco.solvers.line_search import LineSearch as LineSearch

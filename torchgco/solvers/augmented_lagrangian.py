@@ -1,0 +1,98 @@
+"""Augmented Lagrangian around a local solver, with a place for guidance (Algorithms 1 and 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchgco.lagrangian import Multipliers
+from torchgco.problem import Problem
+from torchgco.shapes import InputError
+from torchgco.solution import Solution
+from torchgco.solvers.batch import Callback, Guidance, InnerEnd, Loop
+from torchgco.solvers.ilqr import ILQR
+from torchgco.status import Status
+
+
+@dataclass(frozen=True)
+class AugmentedLagrangian:
+    """AL-iLQR; with `guidance`, the paper's GCO or whatever else speaks its protocol.
+
+    Args:
+        inner: the local solver.
+        guidance: asked after every inner solve where the next one should be drawn to; None for none.
+        initial_penalty, penalty_growth, penalty_max: mu, its factor eta per outer iteration, and its ceiling.
+        max_outer_iterations: outer limit; the paper's only end.
+        violation_tolerance: what counts as feasible (metres for lengths), for the status and the best iterate.
+        cost_tolerance: end early once an inner solve converged, its violation is under the tolerance and J_var
+            changed by less than this share since the one before. None: never, as in the paper.
+        clip: inequalities push but never pull (`lagrangian.penalty_weights`); False as printed.
+        record: keep the history of every element in `solution.trace`.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    inner: ILQR = ILQR()
+    guidance: Guidance | None = None
+    initial_penalty: float = 20.0
+    penalty_growth: float = 2.2
+    penalty_max: float = 1e12
+    max_outer_iterations: int = 10
+    violation_tolerance: float = 1e-3
+    cost_tolerance: float | None = None
+    clip: bool = False
+    record: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.initial_penalty > 0:
+            raise InputError("solver.initial_penalty", "above 0", self.initial_penalty)
+        if not self.penalty_growth >= 1:
+            raise InputError("solver.penalty_growth", "at least 1", self.penalty_growth)
+        if not self.penalty_max >= self.initial_penalty:
+            raise InputError("solver.penalty_max", "at least initial_penalty", self.penalty_max)
+        if self.max_outer_iterations < 1:
+            raise InputError("solver.max_outer_iterations", "at least 1", self.max_outer_iterations)
+        if not self.violation_tolerance > 0:
+            raise InputError("solver.violation_tolerance", "above 0", self.violation_tolerance)
+        if self.cost_tolerance is not None and not self.cost_tolerance > 0:
+            raise InputError("solver.cost_tolerance", "above 0, or null", self.cost_tolerance)
+
+    def solve(
+        self,
+        problem: Problem,
+        U0: Tensor,
+        seed: int = 0,
+        ids: Tensor | None = None,
+        warm: Multipliers | None = None,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve every problem of the batch.
+
+        Args:
+            problem: B problems.
+            U0: initial controls (B, N, m).
+            seed, ids: key the random draws; an element's result depends on (seed, id), not on its place. ids is
+                int64 (B,), 0..B-1 unless given.
+            warm: multipliers and penalties to start from, as a former solution's `multipliers`.
+            callback: told of the progress after every pass.
+
+        Raises:
+            InputError: U0, ids or warm don't fit the problem.
+        """
+        return Loop(self, problem, U0, seed, ids, warm, callback).run()
+
+    def verdict(self, inner: InnerEnd) -> Tensor:
+        """CONVERGED or INFEASIBLE at the outer limit, CONVERGED where the early test holds, else RUNNING."""
+        fits = inner.best_violation <= self.violation_tolerance
+        status = torch.full_like(inner.outer, Status.RUNNING)
+        over = inner.outer >= self.max_outer_iterations
+        status[over & fits] = Status.CONVERGED
+        status[over & ~fits] = Status.INFEASIBLE
+        if self.cost_tolerance is not None:
+            settled = (inner.cost - inner.last_cost).abs() <= self.cost_tolerance * inner.cost.abs()
+            done = inner.converged & settled & (inner.violation <= self.violation_tolerance)
+            status[done] = Status.CONVERGED
+        return status

@@ -1,0 +1,344 @@
+"""The one loop: every pass is one iLQR iteration for all problems that still run.
+
+In nested loops a batch would wait for its slowest member at three levels. Here each element carries its own phase:
+inner and outer iteration, regularisation, penalty, guidance. Those whose inner solve has ended get their multiplier
+update in the same pass, and those that end leave the batch. Per element the iterates are those of the paper's nested
+loops, whatever its companions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.obstacles import GuideRegion
+from torchgco.draws import DrawKey
+from torchgco.expansion import linearise
+from torchgco.lagrangian import Lagrangian, Multipliers, update, violation
+from torchgco.problem import Problem
+from torchgco.rollout import open_loop
+from torchgco.shapes import InputError, put, take
+from torchgco.solution import Solution
+from torchgco.solvers.riccati import BackwardPass, backward
+from torchgco.solvers.trace import Recorder
+from torchgco.status import Status
+
+if TYPE_CHECKING:
+    from torchgco.solvers.ilqr import ILQR
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """A trajectory and its worth."""
+
+    X: Tensor
+    U: Tensor
+    duals: Multipliers
+    cost: Tensor
+    violation: Tensor
+
+
+@dataclass
+class State:
+    """Everything that an element carries from pass to pass; every tensor starts with the running batch."""
+
+    rows: Tensor  # place in the batch as it was given
+    X: Tensor
+    U: Tensor
+    cost: Tensor
+    merit: Tensor
+    duals: Multipliers
+    guide: GuideRegion | None
+    regularisation: Tensor  # mu_r
+    inner: Tensor  # iterations of this inner solve
+    outer: Tensor  # inner solves ended
+    iterations: Tensor
+    guided: Tensor
+    last_cost: Tensor  # J_var when the inner solve before ended
+    best: Iterate
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a callback is told after every pass."""
+
+    passes: int
+    finished: int
+    total: int
+    state: State
+
+
+Callback = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class InnerEnd:
+    """How the inner solve ended, for the elements that have just ended one; every tensor is (B',)."""
+
+    converged: Tensor
+    refused: Tensor  # no step length was acceptable
+    outer: Tensor  # inner solves ended, this one included
+    cost: Tensor
+    last_cost: Tensor  # when the inner solve before ended; infinite at first
+    violation: Tensor
+    best_violation: Tensor
+
+
+class Guidance(Protocol):
+    """Plug-in of the outer loop: looks at a solved batch and says where the next inner solve should be drawn to."""
+
+    def start(self, problem: Problem, X: Tensor) -> GuideRegion: ...
+
+    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> GuideRegion: ...
+
+
+class OuterLoop(Protocol):
+    """What the loop asks of the solver that started it."""
+
+    @property
+    def inner(self) -> ILQR: ...
+    @property
+    def guidance(self) -> Guidance | None: ...
+    @property
+    def initial_penalty(self) -> float: ...
+    @property
+    def penalty_growth(self) -> float: ...
+    @property
+    def penalty_max(self) -> float: ...
+    @property
+    def violation_tolerance(self) -> float: ...
+    @property
+    def clip(self) -> bool: ...
+    @property
+    def record(self) -> bool: ...
+
+    def verdict(self, inner: InnerEnd) -> Tensor:
+        """A status (B',) for each element whose inner solve has ended; RUNNING starts the next one."""
+        ...
+
+
+class Loop:
+    """One solve of one batch. Holds the running state; created and dropped by a solver's `solve`.
+
+    Raises:
+        InputError: U0, ids or warm don't fit the problem.
+    """
+
+    def __init__(
+        self,
+        solver: OuterLoop,
+        problem: Problem,
+        U0: Tensor,
+        seed: int,
+        ids: Tensor | None,
+        warm: Multipliers | None,
+        callback: Callback | None,
+    ) -> None:
+        self.ids = check_call(problem, U0, ids)
+        if warm is not None:
+            warm.check(problem)
+        self.solver, self.seed, self.callback = solver, seed, callback
+        self.whole = self.problem = problem
+        self.state = self._start(U0, warm)
+        self.result = self._empty_result(U0)
+        self.recorder = Recorder() if solver.record else None
+
+    def run(self) -> Solution:
+        """Pass after pass until every element has ended."""
+        self._end(self._bad_starts())
+        passes = 0
+        while self.state.rows.numel() > 0:
+            self._end(self._pass())
+            passes += 1
+            if self.callback is not None:
+                total = self.whole.B
+                self.callback(Progress(passes, total - self.state.rows.numel(), total, self.state))
+        return self._with_gains()
+
+    # Start -------------------------------------------------------------------------------------------------------
+
+    def _start(self, U0: Tensor, warm: Multipliers | None) -> State:
+        problem = self.problem
+        X, U = open_loop(problem.dynamics, problem.x0, U0), U0.clone()
+        duals = Multipliers.zero(problem, self.solver.initial_penalty) if warm is None else warm
+        guidance = self.solver.guidance
+        guide = None if guidance is None else guidance.start(problem, X)
+        cost, merit = Lagrangian(problem, duals, guide, self.solver.clip).value(X, U)
+        zero = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
+        worst = torch.full_like(cost, torch.inf)
+        return State(
+            rows=torch.arange(problem.B, device=X.device),
+            X=X, U=U, cost=cost, merit=merit, duals=duals, guide=guide,
+            regularisation=torch.zeros_like(cost),
+            inner=zero, outer=zero.clone(), iterations=zero.clone(), guided=zero.clone(),
+            last_cost=worst,
+            best=Iterate(X.clone(), U.clone(), take(duals, torch.arange(problem.B)), cost.clone(), worst.clone()),
+        )  # fmt: skip
+
+    def _empty_result(self, U0: Tensor) -> Solution:
+        s, problem = self.state, self.problem
+        blank = torch.zeros_like(s.rows)
+        N, n, m = problem.N, problem.n, problem.m
+        return Solution(
+            X=s.X.clone(), U=s.U.clone(), K=U0.new_zeros(problem.B, N, m, n), d=torch.zeros_like(U0),
+            multipliers=take(s.duals, s.rows), cost=s.cost.clone(), violation=torch.zeros_like(s.cost),
+            status=blank, iterations=blank.clone(), outer_iterations=blank.clone(), guided=blank.clone(),
+        )  # fmt: skip
+
+    def _bad_starts(self) -> Tensor:
+        """Statuses (B,) of elements that can't begin, RUNNING for the others."""
+        status = torch.full_like(self.state.rows, Status.RUNNING)
+        status[~self.problem.start_is_clear] = Status.INVALID_START
+        # NaN compares as clear of every obstacle, hence after it.
+        finite = torch.isfinite(self.state.merit) & torch.isfinite(self.state.X).flatten(1).all(-1)
+        status[~finite] = Status.NON_FINITE
+        return status
+
+    # One pass ----------------------------------------------------------------------------------------------------
+
+    def _pass(self) -> Tensor:
+        """One iteration of every running element; returns the statuses it leaves them in."""
+        s, inner = self.state, self.solver.inner
+        lagrangian = Lagrangian(self.problem, s.duals, s.guide, self.solver.clip)
+        F, H = linearise(self.problem, s.X, s.U), lagrangian.expand(s.X, s.U)
+        step = backward(F, H, s.regularisation)
+        status = torch.full_like(s.rows, Status.RUNNING)
+        settled = step.expected_change(torch.ones_like(s.merit)).abs() <= 1e-14 * s.merit.abs().clamp(min=1.0)
+        moving = ~step.failed & ~settled
+        if bool(step.failed.any()):
+            self._raise_regularisation(step, F, H, status)
+        old_merit, alpha, refused = self._move(lagrangian, step, moving)
+        change = (s.merit - old_merit).abs()
+        s.inner, s.iterations = s.inner + ~step.failed, s.iterations + ~step.failed
+        if self.recorder is not None:
+            self.recorder.add(self.problem, s, alpha, step.failed)
+        s.regularisation = torch.where(step.failed, s.regularisation, 0.0)
+        converged = settled | (moving & ~refused & (change < inner.tolerance))
+        ended = ~step.failed & (converged | refused | (s.inner >= inner.max_iterations))
+        if bool(ended.any()):
+            self._end_inner(ended, converged, refused, status)
+        return status
+
+    def _raise_regularisation(self, step: BackwardPass, F: Tensor, H: Tensor, status: Tensor) -> None:
+        """mu_r up for elements whose Cholesky failed (Algorithm 2, line 9): they try again in the next pass."""
+        s, inner = self.state, self.solver.inner
+        higher = (s.regularisation * inner.regularisation_growth).clamp(min=inner.regularisation_first)
+        s.regularisation = torch.where(step.failed, higher, s.regularisation)
+        finite = torch.isfinite(F).flatten(1).all(-1) & torch.isfinite(H).flatten(1).all(-1)
+        status[step.failed & (s.regularisation > inner.regularisation_max)] = Status.NOT_POSITIVE_DEFINITE
+        status[step.failed & ~finite] = Status.NON_FINITE
+
+    def _move(self, lagrangian: Lagrangian, step: BackwardPass, moving: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Forward pass of the elements in `moving`; returns the merit before, the step lengths, and who was refused."""
+        s, old_merit = self.state, self.state.merit
+        alpha, refused = torch.zeros_like(old_merit), torch.zeros_like(moving)
+        rows = moving.nonzero().flatten()
+        if rows.numel() == 0:
+            return old_merit, alpha, refused
+        if rows.numel() == moving.numel():
+            found = self.solver.inner.line_search.search(lagrangian, s.X, s.U, s.merit, step)
+        else:
+            part = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
+            found = self.solver.inner.line_search.search(
+                lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows], part
+            )
+        won = rows[found.accepted]
+        for name in ("X", "U", "cost", "merit"):
+            values = getattr(s, name).clone()
+            values[won] = getattr(found, name)[found.accepted]
+            setattr(s, name, values)
+        alpha[rows] = found.alpha
+        refused[rows] = ~found.accepted
+        return old_merit, alpha, refused
+
+    # Outer iteration ---------------------------------------------------------------------------------------------
+
+    def _end_inner(self, ended: Tensor, converged: Tensor, refused: Tensor, status: Tensor) -> None:
+        """Algorithm 4, lines 7-12, for the elements whose inner solve has ended."""
+        s, solver = self.state, self.solver
+        rows = ended.nonzero().flatten()
+        problem, X, U, duals = self.problem.take(rows), s.X[rows], s.U[rows], take(s.duals, rows)
+        now = violation(problem, X, U)
+        updated = update(problem, X, U, duals, solver.penalty_growth, solver.penalty_max)
+        self._remember(rows, Iterate(X, U, updated, s.cost[rows], now))
+        s.outer[rows] += 1
+        inner_end = InnerEnd(
+            converged[rows], refused[rows], s.outer[rows], s.cost[rows], s.last_cost[rows], now,
+            s.best.violation[rows],
+        )  # fmt: skip
+        status[rows] = solver.verdict(inner_end)
+        s.last_cost[rows] = s.cost[rows]
+        going = rows[status[rows] == Status.RUNNING]
+        if going.numel() > 0:
+            self._next_inner(going, take(updated, (status[rows] == Status.RUNNING).nonzero().flatten()))
+
+    def _remember(self, rows: Tensor, new: Iterate) -> None:
+        """Keep the best iterate that ended an inner solve: feasible before infeasible, then by cost."""
+        old, limit = take(self.state.best, rows), self.solver.violation_tolerance
+        new_fits, old_fits = new.violation <= limit, old.violation <= limit
+        better = (new_fits & (~old_fits | (new.cost < old.cost))) | (
+            ~new_fits & ~old_fits & (new.violation < old.violation)
+        )
+        chosen = better.nonzero().flatten()
+        put(self.state.best, rows[chosen], take(new, chosen))
+
+    def _next_inner(self, rows: Tensor, duals: Multipliers) -> None:
+        """Guidance, new multipliers and penalties, and L_M anew for the elements in `rows`."""
+        s, solver = self.state, self.solver
+        problem, X, U = self.problem.take(rows), s.X[rows], s.U[rows]
+        guide = None
+        if solver.guidance is not None:
+            key = DrawKey(self.seed, self.ids[s.rows[rows]], s.outer[rows])
+            guide = solver.guidance.update(problem, X, U, take(s.guide, rows), key)
+            put(s.guide, rows, guide)
+            s.guided[rows] += guide.is_active
+        s.duals = Multipliers(tuple(lam.clone() for lam in s.duals.lam), s.duals.mu.clone())
+        put(s.duals, rows, duals)
+        s.cost[rows], s.merit[rows] = Lagrangian(problem, duals, guide, solver.clip).value(X, U)
+        s.inner[rows] = 0
+
+    # End ---------------------------------------------------------------------------------------------------------
+
+    def _end(self, status: Tensor) -> None:
+        """Write the elements that have ended into the result and drop them from the batch."""
+        ended = status != Status.RUNNING
+        if not bool(ended.any()):
+            return
+        s, rows = self.state, ended.nonzero().flatten()
+        last = Iterate(s.X[rows], s.U[rows], take(s.duals, rows), s.cost[rows], torch.zeros_like(s.cost[rows]))
+        has_best = torch.isfinite(s.best.violation[rows]).nonzero().flatten()
+        last = replace(last, violation=violation(self.problem.take(rows), last.X, last.U))
+        put(last, has_best, take(take(s.best, rows), has_best))
+        place, r = s.rows[rows], self.result
+        r.X[place], r.U[place], r.cost[place], r.violation[place] = last.X, last.U, last.cost, last.violation
+        put(r.multipliers, place, last.duals)
+        r.status[place] = status[rows]
+        r.iterations[place], r.outer_iterations[place] = s.iterations[rows], s.outer[rows]
+        r.guided[place] = s.guided[rows]
+        stay = (~ended).nonzero().flatten()
+        self.state = State(**{name: take(value, stay) for name, value in vars(s).items()})
+        self.problem = self.problem.take(stay)
+
+    def _with_gains(self) -> Solution:
+        """Feedback gains along what is returned, from one more backward pass with its multipliers."""
+        r = self.result
+        lagrangian = Lagrangian(self.whole, r.multipliers, None, self.solver.clip)
+        step = backward(linearise(self.whole, r.X, r.U), lagrangian.expand(r.X, r.U), torch.zeros_like(r.cost))
+        G = step.gains.movedim(0, 1)
+        G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, G)
+        trace = None if self.recorder is None else self.recorder.frame()
+        return replace(r, K=G[..., :-1].contiguous(), d=G[..., -1].contiguous(), trace=trace)
+
+
+def check_call(problem: Problem, U0: Tensor, ids: Tensor | None) -> Tensor:
+    """The ids (B,), after checking what every solver is handed."""
+    problem.check_controls(U0)
+    if ids is None:
+        return torch.arange(problem.B, device=problem.x0.device)
+    if not isinstance(ids, Tensor) or tuple(ids.shape) != (problem.B,) or ids.dtype != torch.int64:
+        raise InputError("ids", f"an int64 tensor ({problem.B},)", getattr(ids, "shape", type(ids).__name__))
+    return ids

@@ -1,0 +1,92 @@
+"""iLQR, the local solver (Algorithm 2)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchgco.lagrangian import Multipliers
+from torchgco.problem import Problem
+from torchgco.shapes import InputError
+from torchgco.solution import Solution
+from torchgco.solvers.batch import Callback, InnerEnd, Loop
+from torchgco.solvers.line_search import LineSearch
+from torchgco.status import Status
+
+
+@dataclass(frozen=True)
+class ILQR:
+    """Iterative LQR: expansions, backward pass, line search, until |J - J_prev| < tolerance.
+
+    Alone it leaves constraints out (`penalty` = 0) or holds them by a fixed quadratic penalty; inside
+    `AugmentedLagrangian` it is the inner solver.
+
+    Args:
+        tolerance: on the change of L_M, in units of cost.
+        max_iterations: inner limit.
+        line_search: how step lengths are chosen.
+        regularisation_first, regularisation_growth, regularisation_max: mu_r after a failed Cholesky: its first
+            value, its growth, and where the element gives up.
+        penalty: weight of constraint violations when used alone.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    tolerance: float = 0.10
+    max_iterations: int = 50
+    line_search: LineSearch = LineSearch()
+    regularisation_first: float = 1e-6
+    regularisation_growth: float = 10.0
+    regularisation_max: float = 1e10
+    penalty: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.tolerance >= 0:
+            raise InputError("ilqr.tolerance", "at least 0", self.tolerance)
+        if self.max_iterations < 1:
+            raise InputError("ilqr.max_iterations", "at least 1", self.max_iterations)
+        if not 0 < self.regularisation_first <= self.regularisation_max:
+            raise InputError("ilqr.regularisation_first", "positive, below its maximum", self.regularisation_first)
+        if not self.regularisation_growth > 1:
+            raise InputError("ilqr.regularisation_growth", "above 1", self.regularisation_growth)
+        if not self.penalty >= 0:
+            raise InputError("ilqr.penalty", "at least 0", self.penalty)
+
+    def solve(
+        self,
+        problem: Problem,
+        U0: Tensor,
+        seed: int = 0,
+        ids: Tensor | None = None,
+        warm: Multipliers | None = None,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """One inner solve of every problem, from U0 (B, N, m); `violation` tells what the constraints say of it.
+
+        `warm` multipliers are held fixed, with their own penalties. `seed` is unused: nothing here is random.
+        """
+        return Loop(_OneInnerSolve(self, self.penalty), problem, U0, seed, ids, warm, callback).run()
+
+
+@dataclass(frozen=True)
+class _OneInnerSolve:
+    """The outer loop that isn't one: it ends with the first inner solve, and says how that ended."""
+
+    inner: ILQR
+    initial_penalty: float
+    guidance: None = None
+    penalty_growth: float = 1.0
+    penalty_max: float = math.inf
+    violation_tolerance: float = math.inf
+    clip: bool = False
+    record: bool = False
+
+    def verdict(self, inner: InnerEnd) -> Tensor:
+        status = torch.full_like(inner.outer, Status.MAX_ITERATIONS)
+        status[inner.refused] = Status.LINE_SEARCH_FAILED
+        status[inner.converged] = Status.CONVERGED
+        return status

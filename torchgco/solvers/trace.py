@@ -1,0 +1,50 @@
+"""Recorder: the history of every element, a row per iteration."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchgco.lagrangian import violation
+from torchgco.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class Recorder:
+    """Collects one small tensor per pass and column; the table is made once, at the end."""
+
+    def __init__(self) -> None:
+        self._passes: list[dict[str, Tensor]] = []
+
+    def add(self, problem: Problem, state: Any, alpha: Tensor, failed: Tensor) -> None:
+        """Note the iteration just made by every element whose backward pass succeeded."""
+        guided = state.guide.is_active if state.guide is not None else torch.zeros_like(failed)
+        row = {
+            "element": state.rows,
+            "iteration": state.iterations - 1,
+            "outer": state.outer,
+            "inner": state.inner - 1,
+            "cost": state.cost,
+            "merit": state.merit,
+            "alpha": alpha,
+            "regularisation": state.regularisation,
+            "violation": violation(problem, state.X, state.U),
+            "guided": guided,
+        }
+        self._passes.append({name: value[~failed].clone() for name, value in row.items()})
+
+    def frame(self) -> pd.DataFrame:
+        """The table, sorted by element and iteration."""
+        import pandas as pd
+
+        columns = (
+            {name: torch.cat([row[name] for row in self._passes]).cpu().numpy() for name in self._passes[0]}
+            if self._passes
+            else {}
+        )
+        frame = pd.DataFrame(columns)
+        return frame.sort_values(["element", "iteration"], ignore_index=True) if self._passes else frame
