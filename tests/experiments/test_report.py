@@ -109,9 +109,11 @@ def test_merging_joins_what_differs_in_seed(tmp_path: Path) -> None:
     assert list(merged.columns) == list(trials({}).columns)
 
 
-def test_a_table_found_twice_counts_once(tmp_path: Path) -> None:
+def test_a_table_found_twice_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = study(tmp_path / "a", *flights("gco", HITS))
-    assert len(merge([tmp_path, folder, folder])) == 32
+    monkeypatch.chdir(tmp_path)
+    merged = merge([tmp_path, folder, "a"])
+    assert len(merged) == 32 and merged.attrs["repeated"] == 0
 
 
 def test_the_same_result_in_two_runs_counts_once_with_its_first_time(tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ class BoundSpheres(Constraint):
         dims: Dimensions,
     ) -> BoundSpheres:
         assert dims.position is not None
-        o, one = centers, torch.ones_like(distances).unsqueeze(-1)
+        o, one = centers, (~absent).to(centers.dtype).unsqueeze(-1)  # no sum counts an absent one
         rows = [2 * o, -one, (distances.square() - o.square().sum(-1)).unsqueeze(-1)]
         first, second = [one, o], [_outer(o, o)]
         if velocities is not None:

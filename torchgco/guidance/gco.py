@@ -9,11 +9,12 @@ from torch import Tensor
 
 from torchgco.constraints.obstacles import BoundSpheres, GuideRegion
 from torchgco.draws import DrawKey
-from torchgco.guidance.detection import caught_knots
+from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, put, take
+from torchgco.solvers.batch import Advice
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class GCO:
         radius: r_guide, m; None takes the vehicle's radius.
         grow_when_idle: mu_gco grows in every outer iteration (as Algorithm 4, line 11, prints it), or only in those
             that find the element caught, so that late guidance starts as gently as early guidance.
+        adopt: where the sampled plan touches nothing, go on from the plan itself instead of being drawn to it.
+        patience: from this outer iteration on, a single active sphere counts as being caught too; None: never.
 
     Raises:
         InputError: a field out of its range; on `start`, dynamics without a position.
@@ -37,6 +40,8 @@ class GCO:
     penalty_growth: float = 4.84
     radius: float | None = None
     grow_when_idle: bool = True
+    adopt: bool = False
+    patience: int | None = None
 
     def __post_init__(self) -> None:
         if not self.initial_penalty > 0:
@@ -53,17 +58,25 @@ class GCO:
         weight = X.new_full((problem.B,), self.initial_penalty)
         return GuideRegion.inactive(X, weight, problem.dynamics.position)
 
-    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> GuideRegion:
-        """CPUF for every element: a region where it is caught, none where it isn't."""
-        caught = caught_knots(problem, X, U)
-        growing = torch.ones_like(caught[:, 0]) if self.grow_when_idle else caught.any(-1)
+    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> Advice:
+        """CPUF for every element: a region where it is caught, none where it isn't; or the plan itself, where taken."""
+        knots = caught_knots(problem, X, U)
+        if self.patience is not None:
+            # One sphere met dead-centre has no gradient to the side: J stays empty, and only time tells.
+            knots = knots | (caught_knots(problem, X, U, least=1) & (key.outer >= self.patience).unsqueeze(-1))
+        caught = knots.any(-1)
+        growing = torch.ones_like(caught) if self.grow_when_idle else caught
         weight = torch.where(growing, guide.weight * self.penalty_growth, guide.weight)
-        new = GuideRegion.inactive(X, weight, guide.position)
-        rows = caught.any(-1).nonzero().flatten()
+        new, plan, taken = GuideRegion.inactive(X, weight, guide.position), U.clone(), torch.zeros_like(caught)
+        rows = caught.nonzero().flatten()
         if rows.numel() > 0:
-            X_safe, _ = self.sampler.improve(problem.take(rows), U[rows], key.take(rows))
-            put(new, rows, guide_along(take(new, rows), X_safe, caught[rows], self._radius(problem)[rows]))
-        return new
+            part = problem.take(rows)
+            X_safe, plan[rows] = self.sampler.improve(part, U[rows], key.take(rows))
+            if self.adopt:
+                taken[rows] = ~active_counts(part, X_safe, plan[rows]).any(-1)
+            drawn = guide_along(take(new, rows), X_safe, knots[rows], self._radius(problem)[rows])
+            put(new, rows[~taken[rows]], take(drawn, (~taken[rows]).nonzero().flatten()))
+        return Advice(new, plan, taken)
 
     def _radius(self, problem: Problem) -> Tensor:
         """r_guide (B,), m."""

@@ -22,13 +22,21 @@ class MPPI:
         eps ~ N(0, Sigma),  v = saturate(u + eps)
         S   = J_var + rho_mp (collisions) + sum_k lambda u' Sigma^-1 eps,   w = softmax(-(S - min S)/lambda)
 
+    One round with white noise is Algorithm 3. Beyond the paper, rounds can follow each other with smoother and
+    shrinking noise, and with a temperature that follows the spread of the better samples.
+
     Args:
-        samples: S per problem.
+        samples: S per problem and round.
         covariance: diagonal of Sigma (m,), or one number for all controls; in squared units of u.
         temperature: lambda, in units of cost.
         collision_penalty: rho_mp, per knot and obstacle touched.
         saturation: "bounds" clamps samples to the problem's control bounds; "symmetric" to [-upper, upper], wider
             than the bounds on purpose (planar study); None leaves them.
+        rounds: how often; each draws around the mean of the one before.
+        knots: noise is drawn at so many knots and linear between them; 0: white, at every stage. Smooth noise moves the
+            vehicle where white noise averages out. Its likelihood term (u' Sigma^-1 eps) is left out.
+        decay: factor of the noise's standard deviation from round to round.
+        elite: the temperature is raised to the gap between the best sample and the elite-th best; 0 leaves it.
 
     Raises:
         InputError: a field out of its range; on `improve`, a covariance that doesn't fit the controls.
@@ -39,10 +47,21 @@ class MPPI:
     temperature: float = 1.0
     collision_penalty: float = 1e8
     saturation: Literal["bounds", "symmetric"] | None = "bounds"
+    rounds: int = 1
+    knots: int = 0
+    decay: float = 1.0
+    elite: int = 0
 
     def __post_init__(self) -> None:
-        if self.samples < 1:
-            raise InputError("mppi.samples", "at least 1", self.samples)
+        for name, least in (("samples", 1), ("rounds", 1), ("knots", 0), ("elite", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"mppi.{name}", f"at least {least}", getattr(self, name))
+        if self.elite > self.samples:
+            raise InputError("mppi.elite", f"at most the {self.samples} samples", self.elite)
+        if self.knots == 1:
+            raise InputError("mppi.knots", "0, or at least 2", self.knots)
+        if not 0 < self.decay <= 1:
+            raise InputError("mppi.decay", "above 0, at most 1", self.decay)
         if not self.temperature > 0:
             raise InputError("mppi.temperature", "above 0", self.temperature)
         if not self.collision_penalty >= 0:
@@ -51,19 +70,40 @@ class MPPI:
             raise InputError("mppi.saturation", "bounds, symmetric or null", repr(self.saturation))
 
     def improve(self, problem: Problem, U: Tensor, key: DrawKey, stream: int = 0) -> tuple[Tensor, Tensor]:
-        """X (B, N+1, n) and U (B, N, m) after one weighted mean of samples around U."""
+        """X (B, N+1, n) and U (B, N, m): the mean of the last round's samples, the first drawn around U."""
         sigma = self._sigma(problem).sqrt()
-        noise = sigma * standard_normal(key, (self.samples, problem.N, problem.m), U.dtype, stream)
-        V = self.saturate(problem, U.unsqueeze(1) + noise)
-        S = self.sample_costs(problem, U, V, noise)
-        weights = torch.softmax(-(S - S.amin(dim=1, keepdim=True)) / self.temperature, dim=1)
-        mean = torch.bmm(weights.unsqueeze(1), V.flatten(2)).view_as(U)
-        return open_loop(problem.dynamics, problem.x0, mean), mean
+        for i in range(self.rounds):
+            noise = self.decay**i * sigma * self._draw(problem, key, U.dtype, stream * self.rounds + i)
+            V = self.saturate(problem, U.unsqueeze(1) + noise)
+            weights = self._weights(self.sample_costs(problem, U, V, noise))
+            U = torch.bmm(weights.unsqueeze(1), V.flatten(2)).view_as(U)
+        return open_loop(problem.dynamics, problem.x0, U), U
+
+    def _draw(self, problem: Problem, key: DrawKey, dtype: torch.dtype, stream: int) -> Tensor:
+        """Unit noise (B, S, N, m): white, or linear between the knots."""
+        if self.knots == 0:
+            return standard_normal(key, (self.samples, problem.N, problem.m), dtype, stream)
+        z = standard_normal(key, (self.samples, self.knots, problem.m), dtype, stream)
+        place = torch.linspace(0, self.knots - 1, problem.N, dtype=dtype, device=z.device)
+        left = place.floor().clamp(max=self.knots - 2)
+        share = (place - left).unsqueeze(-1)
+        left = left.long()
+        return z[:, :, left] * (1 - share) + z[:, :, left + 1] * share
+
+    def _weights(self, S: Tensor) -> Tensor:
+        """w (B, S) from the samples' costs."""
+        gap = S - S.amin(dim=1, keepdim=True)
+        if self.elite == 0:
+            return torch.softmax(-gap / self.temperature, dim=1)
+        spread = gap.kthvalue(self.elite, dim=1, keepdim=True).values
+        return torch.softmax(-gap / spread.clamp(min=self.temperature), dim=1)
 
     def sample_costs(self, problem: Problem, U: Tensor, V: Tensor, noise: Tensor) -> Tensor:
         """S (B, S) of controls V (B, S, N, m) drawn around U with `noise` (lines 5-11)."""
-        # u' Sigma^-1 eps as products and two sums, which keep an element's bits apart from the batch's.
-        likelihood = (U.unsqueeze(1) / self._sigma(problem) * noise).sum(-1).sum(-1)
+        likelihood = torch.zeros_like(V[:, :, 0, 0])
+        if self.knots == 0:
+            # u' Sigma^-1 eps as products and two sums, which keep an element's bits apart from the batch's.
+            likelihood = (U.unsqueeze(1) / self._sigma(problem) * noise).sum(-1).sum(-1)
         x = problem.x0.unsqueeze(1).expand(-1, V.shape[1], -1).contiguous()
         cost, collisions = torch.zeros_like(likelihood), torch.zeros_like(likelihood)
         for k in range(problem.N):

@@ -24,10 +24,14 @@ class AugmentedLagrangian:
         inner: the local solver.
         guidance: asked after every inner solve where the next one should be drawn to; None for none.
         initial_penalty, penalty_growth, penalty_max: mu, its factor eta per outer iteration, and its ceiling.
+        grow_when_feasible: mu grows after every inner solve (as printed), or only while the violation is over its
+            tolerance, which spares feasible iterates a stiffer problem.
         max_outer_iterations: outer limit; the paper's only end.
         violation_tolerance: what counts as feasible (metres for lengths), for the status and the best iterate.
         cost_tolerance: end early once an inner solve converged, its violation is under the tolerance and J_var
             changed by less than this share since the one before. None: never, as in the paper.
+        hold_factor: where guidance puts another path in place of the iterate, the penalty is raised until the path that
+            is left costs at least this times what the new one costs more (not in the paper).
         clip: inequalities push but never pull (`lagrangian.penalty_weights`); False as printed.
         record: keep the history of every element in `solution.trace`.
 
@@ -40,9 +44,11 @@ class AugmentedLagrangian:
     initial_penalty: float = 20.0
     penalty_growth: float = 2.2
     penalty_max: float = 1e12
+    grow_when_feasible: bool = True
     max_outer_iterations: int = 10
     violation_tolerance: float = 1e-3
     cost_tolerance: float | None = None
+    hold_factor: float = 10.0
     clip: bool = False
     record: bool = False
 
@@ -57,6 +63,8 @@ class AugmentedLagrangian:
             raise InputError("solver.max_outer_iterations", "at least 1", self.max_outer_iterations)
         if not self.violation_tolerance > 0:
             raise InputError("solver.violation_tolerance", "above 0", self.violation_tolerance)
+        if not self.hold_factor >= 1:
+            raise InputError("solver.hold_factor", "at least 1", self.hold_factor)
         if self.cost_tolerance is not None and not self.cost_tolerance > 0:
             raise InputError("solver.cost_tolerance", "above 0, or null", self.cost_tolerance)
 

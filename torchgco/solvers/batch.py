@@ -88,12 +88,25 @@ class InnerEnd:
     best_violation: Tensor
 
 
+@dataclass(frozen=True)
+class Advice:
+    """What guidance says of a solved batch: where to draw the next inner solve, or from where to start it."""
+
+    guide: GuideRegion  # penalty of the next inner solve
+    U: Tensor  # (B', N, m): controls to go on from
+    taken: Tensor  # (B',) bool: where U replaces the iterate
+
+
 class Guidance(Protocol):
-    """Plug-in of the outer loop: looks at a solved batch and says where the next inner solve should be drawn to."""
+    """Plug-in of the outer loop, asked after every inner solve."""
 
-    def start(self, problem: Problem, X: Tensor) -> GuideRegion: ...
+    def start(self, problem: Problem, X: Tensor) -> GuideRegion:
+        """The penalty that is no penalty yet, for every element."""
+        ...
 
-    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> GuideRegion: ...
+    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> Advice:
+        """Advice for the elements whose inner solve has just ended, with X, U."""
+        ...
 
 
 class OuterLoop(Protocol):
@@ -110,7 +123,11 @@ class OuterLoop(Protocol):
     @property
     def penalty_max(self) -> float: ...
     @property
+    def grow_when_feasible(self) -> bool: ...
+    @property
     def violation_tolerance(self) -> float: ...
+    @property
+    def hold_factor(self) -> float: ...
     @property
     def clip(self) -> bool: ...
     @property
@@ -263,7 +280,10 @@ class Loop:
         rows = ended.nonzero().flatten()
         problem, X, U, duals = self.problem.take(rows), s.X[rows], s.U[rows], take(s.duals, rows)
         now = violation(problem, X, U)
-        updated = update(problem, X, U, duals, solver.penalty_growth, solver.penalty_max)
+        growth = torch.full_like(now, solver.penalty_growth)
+        if not solver.grow_when_feasible:
+            growth = growth.masked_fill(now <= solver.violation_tolerance, 1.0)
+        updated = update(problem, X, U, duals, growth, solver.penalty_max)
         self._remember(rows, Iterate(X, U, updated, s.cost[rows], now))
         s.outer[rows] += 1
         inner_end = InnerEnd(
@@ -289,17 +309,41 @@ class Loop:
     def _next_inner(self, rows: Tensor, duals: Multipliers) -> None:
         """Guidance, new multipliers and penalties, and L_M anew for the elements in `rows`."""
         s, solver = self.state, self.solver
-        problem, X, U = self.problem.take(rows), s.X[rows], s.U[rows]
-        guide = None
+        problem, guide = self.problem.take(rows), None
         if solver.guidance is not None:
             key = DrawKey(self.seed, self.ids[s.rows[rows]], s.outer[rows])
-            guide = solver.guidance.update(problem, X, U, take(s.guide, rows), key)
+            advice = solver.guidance.update(problem, s.X[rows], s.U[rows], take(s.guide, rows), key)
+            guide = advice.guide
             put(s.guide, rows, guide)
-            s.guided[rows] += guide.is_active
+            s.guided[rows] += guide.is_active | advice.taken
+            duals = self._go_on_from(rows, problem, advice, duals)
         s.duals = Multipliers(tuple(lam.clone() for lam in s.duals.lam), s.duals.mu.clone())
         put(s.duals, rows, duals)
-        s.cost[rows], s.merit[rows] = Lagrangian(problem, duals, guide, solver.clip).value(X, U)
+        s.cost[rows], s.merit[rows] = Lagrangian(problem, duals, guide, solver.clip).value(s.X[rows], s.U[rows])
         s.inner[rows] = 0
+
+    def _go_on_from(self, rows: Tensor, problem: Problem, advice: Advice, duals: Multipliers) -> Multipliers:
+        """Put the advised controls in place of the iterate where they are taken, with multipliers that hold them there.
+
+        The old multipliers belong to the path that is left: they start again at zero. The penalty must keep the solver from
+        falling back, so it is raised until the path that is left costs more than the one that is taken.
+        """
+        s, taken = self.state, advice.taken.nonzero().flatten()
+        if taken.numel() == 0:
+            return duals
+        part, place = problem.take(taken), rows[taken]
+        old_X, old_U = s.X[place], s.U[place]
+        U = advice.U[taken]
+        X = open_loop(part.dynamics, part.x0, U)
+        none = Multipliers(tuple(torch.zeros_like(lam[taken]) for lam in duals.lam), torch.ones_like(duals.mu[taken]))
+        cost, merit = Lagrangian(part, none, None, True).value(old_X, old_U)
+        gain = (part.cost.total(X, U) - cost).clamp(min=0.0) / (merit - cost).clamp(min=1e-12)
+        mu = torch.maximum(duals.mu[taken], self.solver.hold_factor * gain).clamp(max=self.solver.penalty_max)
+        held = Multipliers(tuple(lam.clone() for lam in duals.lam), duals.mu.clone())
+        put(held, taken, Multipliers(none.lam, mu))
+        s.X, s.U = s.X.clone(), s.U.clone()
+        s.X[place], s.U[place] = X, U
+        return held
 
     # End ---------------------------------------------------------------------------------------------------------
 

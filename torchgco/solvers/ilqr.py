@@ -81,7 +81,9 @@ class _OneInnerSolve:
     guidance: None = None
     penalty_growth: float = 1.0
     penalty_max: float = math.inf
+    grow_when_feasible: bool = True
     violation_tolerance: float = math.inf
+    hold_factor: float = 1.0
     clip: bool = False
     record: bool = False
 

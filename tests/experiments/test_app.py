@@ -1,0 +1,225 @@
+"""The command line as a user types it: results, resuming, sweeps, and one clear line for every mistake."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import torchgco
+from torchgco.experiments import app
+from torchgco.experiments.build import compose, config_dir
+from torchgco.experiments.records import COLUMNS
+from torchgco.scenarios import Layouts
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT / "benchmarks" / "data"
+TINY = ["study.layouts=3", "scenario.stages=12", "study.batch_size=2", "solver.max_outer_iterations=2"]
+SCENARIOS = sorted(p.stem for p in (ROOT / "conf" / "scenario").glob("*.yaml"))
+SOLVERS = sorted(p.stem for p in (ROOT / "conf" / "solver").glob("*.yaml"))
+EXPERIMENTS = sorted(p.stem for p in (ROOT / "conf" / "experiment").glob("*.yaml"))
+
+
+def command(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    line = [sys.executable, "-m", "torchgco", *words]
+    return subprocess.run(line, cwd=cwd, env=env, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """torchgco in this process: (exit code, stdout, stderr). Quicker than a new one for every case."""
+
+    def call(*words: str) -> tuple[int, str, str]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["torchgco", *words])
+        try:
+            code = app.main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
+
+
+def problem_line(err: str) -> str:
+    """The one line of an error; the progress bar aside, nothing else may stand there."""
+    lines = [line for line in err.splitlines() if line.strip() and "trial/s" not in line]
+    assert len(lines) == 1, err
+    return lines[0]
+
+
+def test_a_study_writes_what_the_design_says(tmp_path) -> None:
+    done = command(*TINY, "hydra.run.dir=out", "study.baselines=[hold,gco]", "seed=3", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "out"
+    trials = pd.read_parquet(out / "trials.parquet")
+    assert tuple(trials.columns) == COLUMNS
+    assert trials.solver.tolist() == ["gco"] * 3 + ["hold"] * 3 and trials.layout.tolist() == [0, 1, 2] * 2
+    assert (trials.seed == 3).all() and (trials.version == torchgco.__version__).all()
+    assert trials.batch_size.tolist() == [2, 2, 1] * 2 and (trials.threads == 1).all()
+    with np.load(out / "solutions.npz", allow_pickle=False) as held:
+        assert held["U"].shape == (2, 3, 12, 4) and held["solver"].tolist() == ["gco", "hold"]
+        assert held["layout"].tolist() == [0, 1, 2]
+    assert Layouts.load(out / "layouts.npz").count == 3
+    assert (out / ".hydra" / "config.yaml").is_file() and (out / "summary.csv").is_file()
+    assert {p.stem for p in (out / "figures").glob("*.png")} == {"rates", "layouts", "clearance", "violation"}
+    assert not (out / "shards").exists()
+    assert "gco" in done.stdout and "McNemar" in done.stdout and "3/3" in done.stdout
+    assert "trial" in done.stderr  # a progress bar
+    again = command(*TINY, "hydra.run.dir=out", "study.baselines=[hold,gco]", "seed=3", cwd=tmp_path)
+    assert again.returncode == 0 and "nothing was computed anew" in again.stdout
+    other = command(*TINY, "hydra.run.dir=out", "study.baselines=[hold,gco]", "seed=4", cwd=tmp_path)
+    assert other.returncode == 2 and "seed is 3 there, 4 here" in problem_line(other.stderr)
+
+
+def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:
+    for size in (1, 3):
+        assert run(*TINY[:2], f"study.batch_size={size}", f"hydra.run.dir=b{size}", "study.baselines=[]")[0] == 0
+    one, three = (pd.read_parquet(tmp_path / f"b{size}" / "trials.parquet") for size in (1, 3))
+    measured = ["seconds", "batch_size"]
+    pd.testing.assert_frame_equal(one.drop(columns=measured), three.drop(columns=measured), check_exact=True)
+    assert one.success.isna().all()  # nobody to compare with
+
+
+def test_a_killed_study_goes_on(tmp_path) -> None:
+    words = ["study.layouts=6", "study.batch_size=2", "scenario.stages=40", "study.baselines=[]", "hydra.run.dir=out"]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "torchgco", *words], cwd=tmp_path, env=env, stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    shards = tmp_path / "out" / "shards"
+    deadline = time.monotonic() + 120
+    while not list(shards.glob("*.npz")) and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    kept = {p.name: p.stat().st_mtime_ns for p in shards.glob("*.npz")}
+    assert kept and not (tmp_path / "out" / "done").exists()
+    first = next(iter(sorted(shards.glob("*.npz"))))
+    with np.load(first) as held:  # make it recognisable: what is done must not be done again
+        rows = json.loads(str(held["rows"]))
+        U = held["U"]
+    rows["iterations"] = [777] * len(rows["iterations"])
+    np.savez(first, U=U, rows=np.array(json.dumps(rows)))
+    assert command(*words, cwd=tmp_path).returncode == 0
+    trials = pd.read_parquet(tmp_path / "out" / "trials.parquet")
+    assert len(trials) == 6 and (trials.iterations[:2] == 777).all() and (trials.iterations[2:] != 777).all()
+
+
+def test_a_sweep_writes_separate_results(tmp_path) -> None:
+    done = command(
+        "-m", "solver=hold,ilqr", "scenario.num_obstacles=2,3", "study.layouts=2",
+        "scenario.stages=5", "study.baselines=[]", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    tables = [pd.read_parquet(p) for p in sorted((tmp_path / "outputs").rglob("trials.parquet"))]
+    assert len(tables) == 4
+    assert sorted(t.solver[0] for t in tables) == ["hold", "hold", "ilqr", "ilqr"]
+
+
+def test_start_inside_an_obstacle_is_a_status(run, tmp_path) -> None:
+    centers = np.array([[[0.0, 0.5]], [[-1.0, 0.0]]])
+    np.savez(tmp_path / "two.npz", centers=centers, radii=np.full((2, 1), 0.1))
+    words = ["scenario=layouts", "scenario.path=two.npz", "model=planar", "study.baselines=[hold]", "solver=al_ilqr"]
+    words += ["solver.max_outer_iterations=1", "solver.inner.max_iterations=3", "hydra.run.dir=out"]
+    code, out, _ = run(*words)
+    assert code == 0
+    trials = pd.read_parquet(tmp_path / "out" / "trials.parquet")
+    assert (trials.scenario == "two").all()
+    assert (trials.status[trials.layout == 1] == "INVALID_START").all()
+    assert not trials.feasible[trials.layout == 1].any()
+    with np.load(tmp_path / "out" / "solutions.npz") as held:
+        assert np.isnan(held["U"][:, 1]).all() and np.isfinite(held["U"][:, 0]).all()
+    np.savez(tmp_path / "bad.npz", centers=centers[1:], radii=np.full((1, 1), 0.1))
+    code, _, err = run(*[w.replace("two", "bad").replace("=out", "=bad") for w in words])
+    assert code == 2 and "a layout whose start is outside its obstacles" in err
+
+
+BAD = {
+    "unknown key": (["solver.speed=3"], "speed"),
+    "unknown group": (["planner=rrt"], "planner"),
+    "unknown option": (["solver=rrt"], "rrt"),
+    "unknown baseline": (["study.baselines=[rrt]"], "rrt"),
+    "added key": (["+solver.inner.speed=3"], "speed"),
+    "missing path": (["scenario=layouts"], "scenario.path"),
+    "no such file": (["scenario=layouts", "scenario.path=nowhere.npz"], "scenario.path: expected a layout file"),
+    "model misfit": (["model=planar"], "model: expected model=quadrotor"),
+    "model misfit in a file": (["scenario=layouts", f"scenario.path={DATA / 'walls.npz'}", "model=planar"], "model=quadrotor"),
+    "too many layouts": (["scenario=layouts", f"scenario.path={DATA / 'walls.npz'}", "study.layouts=40"], "study.layouts"),
+    "no layouts": (["study.layouts=0"], "study.layouts: expected at least 1"),
+    "no stages": (["scenario.stages=0"], "stages"),
+    "negative radius": (["scenario.obstacle_radius=-1"], "obstacle_radius"),
+    "weights": (["model.vehicle.control_weight=[1,1,1,-1]"], "cost.R"),
+    "crossed bounds": (["model.vehicle.control_lower=[9,9,9,9]"], "control_bounds.lower"),
+    "solver option": (["solver.inner.tolerance=-1"], "ilqr.tolerance"),
+    "batch size": (["study.batch_size=0"], "study.batch_size"),
+    "threads": (["device.threads=0"], "device.threads"),
+    "dtype": (["device.dtype=float16"], "device.dtype"),
+    "seed": (["seed=-1"], "seed"),
+    "baselines": (["study.baselines=al_ilqr"], "study.baselines"),
+    "a word that is no override": (["forest"], "forest"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_mistakes_get_one_clear_line(case: str, run) -> None:
+    words, message = BAD[case]
+    code, out, err = run("study.layouts=2", "scenario.stages=4", *words) if "layouts" not in words[0] else run(*words)
+    assert code == 2 and message in problem_line(err), err
+    assert "Traceback" not in err + out
+
+
+def test_a_broken_layout_file_is_named(run, tmp_path) -> None:
+    for name, centers, radii, field in (
+        ("shapes", np.zeros((2, 3, 2)), np.zeros((2, 4)), "layouts.radii"),
+        ("nan", np.full((1, 1, 2), np.nan), np.ones((1, 1)), "layouts.radii"),
+        ("negative", np.zeros((1, 1, 2)), -np.ones((1, 1)), "layouts.radii"),
+    ):
+        np.savez(tmp_path / f"{name}.npz", centers=centers, radii=radii)
+        code, _, err = run("scenario=layouts", f"scenario.path={name}.npz", "model=planar")
+        assert code == 2 and field in problem_line(err)
+
+
+def test_version_and_help(run) -> None:
+    code, out, _ = run("--version")
+    assert code == 0 and out.strip() == f"torchgco {torchgco.__version__}"
+    code, out, _ = run("--help")
+    assert code == 0 and "torchgco -m solver=al_ilqr,gco" in out and "planar_trap" in out
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("model", ["planar", "quadrotor"])
+def test_every_solver_fits_both_models(model: str, solver: str) -> None:
+    scenario = "planar_random" if model == "planar" else "walls"
+    setup = compose([f"model={model}", f"scenario={scenario}", f"solver={solver}"])
+    task = setup.task(setup.layouts(1))
+    assert setup.solver_name == solver and task.problem.B == 1
+
+
+@pytest.mark.parametrize("scenario", [s for s in SCENARIOS if s != "layouts"])
+def test_scenario_configs_hold_the_defaults_of_the_code(scenario: str) -> None:
+    """The numbers in YAML are there to be seen and overridden; they must be those of the class."""
+    model = "planar" if scenario.startswith("planar") else "quadrotor"
+    made = compose([f"model={model}", f"scenario={scenario}"]).scenario
+    assert made == type(made)(name=scenario)
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_composes(experiment: str) -> None:
+    setup = compose([f"experiment={experiment}"])
+    assert setup.task(setup.layouts(1)).problem.B == 1
+
+
+def test_the_wheel_and_the_checkout_find_their_configs() -> None:
+    assert (config_dir() / "config.yaml").is_file() and config_dir().is_absolute()

@@ -1,0 +1,136 @@
+"""MPPI, detection and region against the NumPy reference; the draws by their promises."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from tests.problems import planar_batch, quadrotor_batch, reference_of
+from tests.reference.guidance import active_spheres, cpuf, stuck_knots
+from tests.reference.mppi import MppiSettings, mppi
+from torchgco import GCO, MPPI, InputError
+from torchgco.constraints import GuideRegion
+from torchgco.draws import DrawKey, standard_normal
+from torchgco.guidance.detection import active_counts, caught_knots
+
+BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
+
+
+def key(B: int, seed: int = 0, outer: int = 1) -> DrawKey:
+    return DrawKey(seed, torch.arange(B), torch.full((B,), outer))
+
+
+@pytest.mark.parametrize("saturation", ["bounds", "symmetric"])
+@pytest.mark.parametrize("batch", BATCHES)
+def test_improve_equals_algorithm_3(batch: str, saturation: str) -> None:
+    problem, U = BATCHES[batch](B=3, N=20)
+    U = U + 0.2 * torch.randn(U.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    sampler = MPPI(samples=30, covariance=torch.linspace(0.5, 9.0, problem.m).tolist(), temperature=5.0,
+                   collision_penalty=50.0, saturation=saturation)  # fmt: skip
+    X, mean = sampler.improve(problem, U, key(3))
+    z = standard_normal(key(3), (30, problem.N, problem.m), torch.float64).numpy()
+    for b in range(3):
+        twin = reference_of(problem, b)
+        lower = twin.u_lower if saturation == "bounds" else -twin.u_upper
+        sigma = np.linspace(0.5, 9.0, problem.m)
+        settings = MppiSettings(sigma=sigma, lower=lower, upper=twin.u_upper, temperature=5.0, rho_mp=50.0)
+        expected = mppi(twin, U[b].numpy(), z[b], settings)
+        # Scores of wild samples reach 1e7, so weights at temperature 5 carry some 1e-9 of rounding.
+        np.testing.assert_allclose(mean[b], expected.U, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(X[b], expected.X, rtol=1e-6, atol=1e-6)
+
+
+def through_the_obstacles(problem):
+    """X (B, N+1, n) straight through the scene, which no dynamics would fly."""
+    X = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1)
+    X[..., 0] += torch.linspace(0, 6 if problem.n == 14 else 2, problem.N + 1, dtype=torch.float64)
+    return X
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_detection_and_region_equal_algorithm_5(batch: str) -> None:
+    problem, U = BATCHES[batch](B=4, N=30, obstacles=14)
+    X = through_the_obstacles(problem)
+    counts, caught = active_counts(problem, X, U), caught_knots(problem, X, U)
+    gco = GCO(sampler=MPPI(samples=20))
+    start = GuideRegion.inactive(X, torch.full((4,), 20.0, dtype=torch.float64), problem.dynamics.position)
+    guide = gco.update(problem, X, U, start, key(4))
+    z = standard_normal(key(4), (20, problem.N, problem.m), torch.float64).numpy()
+    for b in range(4):
+        twin = reference_of(problem, b)
+        active = [len(row) for row in active_spheres(twin, X[b].numpy())]
+        assert counts[b].tolist() == active
+        knots = stuck_knots(twin, X[b].numpy())
+        assert caught[b].nonzero().flatten().tolist() == list(knots)
+        settings = MppiSettings(sigma=np.ones(problem.m), lower=twin.u_lower, upper=twin.u_upper)
+        vehicle = float(problem.constraints[0].vehicle_radius[b])
+        expected = cpuf(twin, X[b].numpy(), U[b].numpy(), z[b], settings, vehicle)
+        assert bool(guide.is_active[b]) == (expected is not None)
+        if expected is not None:
+            np.testing.assert_allclose(guide.center[b, caught[b]], expected.p[caught[b].numpy()], rtol=1e-7, atol=1e-8)
+            assert torch.isinf(guide.radius[b, ~caught[b]]).all()
+            np.testing.assert_allclose(guide.radius[b, caught[b]], expected.r[caught[b].numpy()])
+    assert caught.any() and not caught[:, 1:-1].all()
+    assert guide.weight.tolist() == [pytest.approx(20.0 * 4.84)] * 4
+
+
+def test_growth_only_where_caught() -> None:
+    problem, U = planar_batch(B=4, N=30, obstacles=14)
+    X = through_the_obstacles(problem)
+    start = GuideRegion.inactive(X, torch.full((4,), 20.0, dtype=torch.float64), problem.dynamics.position)
+    guide = GCO(sampler=MPPI(samples=5), grow_when_idle=False).update(problem, X, U, start, key(4))
+    caught = caught_knots(problem, X, U).any(-1)
+    assert guide.weight.tolist() == [pytest.approx(96.8 if c else 20.0) for c in caught.tolist()]
+
+
+def test_draws_are_standard_normal_and_independent() -> None:
+    z = standard_normal(key(40), (25, 60, 2), torch.float64)
+    assert stats.kstest(z.flatten().numpy(), "norm").pvalue > 1e-3
+    flat = z.flatten(1)
+    correlation = torch.corrcoef(flat) - torch.eye(40)
+    assert float(correlation.abs().max()) < 5.0 / flat.shape[1] ** 0.5
+    lagged = float((flat[:, 1:] * flat[:, :-1]).mean())
+    assert abs(lagged) < 5.0 / flat.numel() ** 0.5
+    first, second = flat[:, : flat.shape[1] // 2], flat[:, flat.shape[1] // 2 :]
+    assert abs(float((first * second).mean())) < 5.0 / first.numel() ** 0.5  # the two halves of a Box-Muller pair
+
+
+def test_draws_are_keyed_by_element_not_by_place() -> None:
+    whole = standard_normal(DrawKey(7, torch.tensor([3, 9, 4]), torch.tensor([1, 2, 1])), (5, 4, 2), torch.float64)
+    alone = standard_normal(DrawKey(7, torch.tensor([9]), torch.tensor([2])), (5, 4, 2), torch.float64)
+    assert torch.equal(whole[1], alone[0])
+    for other in (
+        DrawKey(8, torch.tensor([9]), torch.tensor([2])),
+        DrawKey(7, torch.tensor([8]), torch.tensor([2])),
+        DrawKey(7, torch.tensor([9]), torch.tensor([3])),
+    ):
+        assert not torch.equal(standard_normal(other, (5, 4, 2), torch.float64)[0], alone[0])
+    key_ = DrawKey(7, torch.tensor([9]), torch.tensor([2]))
+    assert not torch.equal(standard_normal(key_, (5, 4, 2), torch.float64, stream=1), alone)
+
+
+def test_a_diverging_sample_is_not_chosen() -> None:
+    problem, U = planar_batch(B=1, N=5)
+    V = U.unsqueeze(1).repeat(1, 3, 1, 1)
+    V[0, 1] = torch.inf
+    S = MPPI(samples=3).sample_costs(problem, U, V, torch.zeros_like(V))
+    assert torch.isfinite(S).all() and S[0, 1] > 1e300
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: MPPI(samples=0), "mppi.samples"),
+        (lambda: MPPI(temperature=0.0), "mppi.temperature"),
+        (lambda: MPPI(collision_penalty=-1.0), "mppi.collision_penalty"),
+        (lambda: MPPI(saturation="clip"), "mppi.saturation"),
+        (lambda: MPPI(covariance=[1.0, 1.0, 1.0]).improve(*planar_batch(B=1, N=3), key(1)), "mppi.covariance"),
+        (lambda: MPPI(covariance=0.0).improve(*planar_batch(B=1, N=3), key(1)), "mppi.covariance"),
+        (lambda: GCO(initial_penalty=0.0), "gco.initial_penalty"),
+        (lambda: GCO(penalty_growth=0.5), "gco.penalty_growth"),
+        (lambda: GCO(radius=-1.0), "gco.radius"),
+    ],
+)
+def test_bad_options_are_named(make, field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        make()

@@ -1,0 +1,91 @@
+"""Small problems that many tests share, and their twins in the NumPy reference."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tests.reference import models
+from tests.reference.problem import ReferenceProblem
+from torchgco import ControlBounds, Planar, Problem, QuadraticCost, QuadrotorPlanning, Spheres
+
+HOVER = [0.0, 0.0, 0.0, 9.81]
+START = [-1.0, 1.0, 0.0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 9.81]
+
+
+def planar_batch(B: int = 4, N: int = 60, obstacles: int = 5, seed: int = 0) -> tuple[Problem, Tensor]:
+    """Planar problems with discs between start and goal, one of them absent in every other problem."""
+    rng = np.random.default_rng(seed)
+    centers = rng.uniform([-0.6, -0.4], [0.7, 0.6], (B, obstacles, 2))
+    radii = rng.uniform(0.06, 0.12, (B, obstacles))
+    centers[1::2, -1], radii[1::2, -1] = np.nan, np.nan
+    problem = Problem(
+        dynamics=Planar(dt=0.1),
+        cost=QuadraticCost(
+            Q=[5, 5, 1e-8, 1, 1, 1e-8], R=[0.1, 0.1], Qf=[50, 50, 1e-8, 1, 1, 1e-8], x_ref=[1, 0.4, 0, 0, 0, 0]
+        ),
+        constraints=[Spheres(centers, radii, 0.06), ControlBounds([-10, -10], [10, 10])],
+        x0=torch.tensor([[-1.0, 0, 0, 0, 0, 0]], dtype=torch.float64).repeat(B, 1),
+        N=N,
+    )
+    return problem, torch.zeros(B, N, 2, dtype=torch.float64)
+
+
+def quadrotor_batch(B: int = 3, N: int = 40, obstacles: int = 6, seed: int = 0) -> tuple[Problem, Tensor]:
+    """Quadrotor problems with spheres on the way to a goal some metres ahead."""
+    rng = np.random.default_rng(seed)
+    centers = rng.uniform([0.2, -0.2, -0.7], [5.0, 2.2, 0.7], (B, obstacles, 3))
+    radii = rng.uniform(0.3, 0.6, (B, obstacles))
+    near = np.linalg.norm(centers - np.array(START[:3]), axis=-1) < 1.1
+    centers[near], radii[near] = np.nan, np.nan
+    goal = torch.tensor(START, dtype=torch.float64)
+    goal[0] = 6.0
+    problem = Problem(
+        dynamics=QuadrotorPlanning(dt=0.1),
+        cost=QuadraticCost(
+            Q=[1, 1, 100, 1, 1, 1, 1, 1, 1, 1, 10, 10, 10, 10],
+            R=[10, 10, 10, 1],
+            Qf=[1, 1, 10, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1],
+            x_ref=goal,
+            u_ref=HOVER,
+        ),
+        constraints=[Spheres(centers, radii, 0.36), ControlBounds([-5, -5, -5, 0.26], [5, 5, 5, 14.9])],
+        x0=torch.tensor([START], dtype=torch.float64).repeat(B, 1),
+        N=N,
+    )
+    return problem, torch.tensor(HOVER, dtype=torch.float64).repeat(B, N, 1)
+
+
+def random_trajectory(problem: Problem, seed: int = 0, spread: float = 0.3) -> tuple[Tensor, Tensor]:
+    """X, U near the start, no solution of the dynamics: for derivative tests."""
+    generator = torch.Generator().manual_seed(seed)
+    shape_X, shape_U = (problem.B, problem.N + 1, problem.n), (problem.B, problem.N, problem.m)
+    X = problem.x0.unsqueeze(1) + spread * torch.randn(shape_X, generator=generator, dtype=torch.float64)
+    U = spread * torch.randn(shape_U, generator=generator, dtype=torch.float64)
+    X[:, 0] = problem.x0
+    return X, U
+
+
+def reference_of(problem: Problem, b: int) -> ReferenceProblem:
+    """Element b of a planar or quadrotor batch, as the NumPy reference takes it (absent spheres left out)."""
+    spheres, bounds = problem.constraints[0], problem.constraints[1]
+    present = ~spheres.absent[b].numpy()
+    planar = problem.n == 6
+    field = models.planar_field if planar else models.quadrotor_planning_field
+    cost = problem.cost
+    return ReferenceProblem(
+        step=models.euler(field, problem.dynamics.dt),
+        x0=problem.x0[b].numpy(),
+        N=problem.N,
+        Q=np.diag(cost.Q[0, 0].numpy()),
+        R=np.diag(cost.R[0, 0].numpy()),
+        S=np.diag(cost.Qf[0].numpy()),
+        x_ref=cost.xf_ref[0].numpy(),
+        u_ref=cost.u_ref[0, 0].numpy(),
+        position=(0, 1) if planar else (0, 1, 2),
+        centers=spheres.centers[b].numpy()[present],
+        contact=spheres.distances[b].numpy()[present],
+        u_lower=bounds.lower[0].numpy(),
+        u_upper=bounds.upper[0].numpy(),
+    )

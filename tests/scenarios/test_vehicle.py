@@ -1,0 +1,61 @@
+"""A vehicle and layouts make planning problems; what the layouts leave open, the vehicle knows."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchgco import InputError
+from torchgco.dynamics import Planar
+from torchgco.experiments.build import compose
+from torchgco.scenarios import Layouts, PlanarTrap
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def vehicle(name: str):
+    scenario = "forest" if name == "quadrotor" else "planar_trap"
+    return compose([f"model={name}", f"scenario={scenario}"]).vehicle
+
+
+def test_public_layouts_make_the_published_problem() -> None:
+    """Every number of the file arrives in the problem."""
+    layouts = Layouts.load(ROOT / "benchmarks" / "data" / "forest30.npz")
+    task = vehicle("quadrotor").task(layouts)
+    problem = task.problem
+    assert (problem.B, problem.N, problem.dynamics.dt, task.goal_radius) == (32, 100, 0.05, 2.0)
+    spheres, bounds = problem.constraints
+    np.testing.assert_array_equal(spheres.centers, layouts.centers)
+    np.testing.assert_allclose(spheres.distances, 0.96)
+    np.testing.assert_array_equal(bounds.upper[0], layouts.control_upper)
+    np.testing.assert_array_equal(problem.x0[0], layouts.start[0])
+    assert task.goal[0].tolist() == [20, 1, 0.2] and task.U0[3, 7].tolist() == [0, 0, 0, 9.81]
+
+
+def test_what_the_file_leaves_open_comes_from_the_vehicle() -> None:
+    bare = Layouts(centers=[[[0.0, 0.0]]], radii=[[0.1]])
+    task = vehicle("planar").task(bare)
+    assert (task.problem.N, task.goal_radius) == (200, 0.3)
+    assert task.problem.x0[0, :2].tolist() == [-1, 0] and task.goal[0].tolist() == [1, 0.4]
+    assert float(task.problem.constraints[0].distances) == pytest.approx(0.16)
+    assert task.problem.constraints[1].lower[0].tolist() == [-10, -10]
+
+
+def test_the_layouts_time_step_rules() -> None:
+    layouts = PlanarTrap(dt=0.02, stages=30).draw([0], 0)
+    problem = vehicle("planar").task(layouts).problem
+    assert problem.dynamics == Planar(dt=0.02) and problem.N == 30
+
+
+@pytest.mark.parametrize(("name", "other"), [("planar", "forest30"), ("quadrotor", "planar_trap")])
+def test_a_misfit_says_which_model_to_give(name: str, other: str) -> None:
+    layouts = Layouts.load(ROOT / "benchmarks" / "data" / f"{other}.npz")
+    wanted = "quadrotor" if name == "planar" else "planar"
+    with pytest.raises(InputError, match=f"model: expected model={wanted}"):
+        vehicle(name).task(layouts)
+
+
+def test_states_of_another_length_are_named() -> None:
+    layouts = Layouts(centers=[[[0.0, 0.0]]], radii=[[0.1]], start=[[0.0, 0.0, 0.0]])
+    with pytest.raises(InputError, match="layouts.start: expected 6 states"):
+        vehicle("planar").task(layouts)

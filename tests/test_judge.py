@@ -1,0 +1,122 @@
+"""The judge against plain NumPy, and its words against hand-made cases."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.problems import planar_batch, quadrotor_batch, reference_of
+from tests.reference.problem import cost as reference_cost
+from tests.reference.problem import rollout as reference_rollout
+from torchgco import ControlBounds, InputError, Planar, Problem, QuadraticCost, Spheres
+from torchgco.judge import judge
+
+BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
+
+
+def sampled_clearance(problem: Problem, X: np.ndarray, b: int, per_segment: int = 400) -> tuple[float, float]:
+    """Clearance at the knots and between them, by brute force."""
+    spheres = problem.constraints[0]
+    dt = spheres.dt
+    at, between = np.inf, np.inf
+    for i in range(spheres.centers.shape[1]):
+        if spheres.absent[b, i]:
+            continue
+        o = spheres.centers[b, i].numpy()
+        v = np.zeros_like(o) if spheres.velocities is None else spheres.velocities[b, i].numpy()
+        R = 0.95 * float(spheres.distances[b, i])
+        for k in range(problem.N + 1):
+            p = X[k, : len(o)]
+            at = min(at, np.linalg.norm(p - o - v * k * dt) - R)
+            if k < problem.N:
+                for s in np.linspace(0, 1, per_segment):
+                    q = (1 - s) * p + s * X[k + 1, : len(o)]
+                    between = min(between, np.linalg.norm(q - o - v * (k + s) * dt) - R)
+    return at, between
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_judged_by_numpy(batch: str) -> None:
+    problem, U = BATCHES[batch](B=3, N=20)
+    U = U + torch.randn(U.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    goal = torch.tensor([1.0, 0.4, 0.0], dtype=torch.float64)[: problem.dynamics.position.stop]
+    verdict = judge(problem, U, goal, 0.5)
+    for b in range(3):
+        twin = reference_of(problem, b)
+        X = reference_rollout(twin, U[b].numpy())
+        assert float(verdict.cost[b]) == pytest.approx(reference_cost(twin, X, U[b].numpy()), rel=1e-12)
+        at, between = sampled_clearance(problem, X, b)
+        assert float(verdict.clearance_knots[b]) == pytest.approx(at, abs=1e-12)
+        assert between - 1e-4 <= float(verdict.clearance[b]) <= between + 1e-12
+        position = X[-1][: len(goal)]
+        assert float(verdict.goal_distance[b]) == pytest.approx(np.linalg.norm(position - goal.numpy()))
+        depth = max(
+            (R - np.linalg.norm(X[k][: len(goal)] - o))
+            for k in range(1, 21) for o, R in zip(twin.centers, twin.contact, strict=True)
+        )  # fmt: skip
+        bounds = np.maximum(U[b].numpy() - twin.u_upper, twin.u_lower - U[b].numpy()).max()
+        assert float(verdict.violation[b]) == pytest.approx(max(depth, bounds, 0.0), abs=1e-12)
+
+
+def passing(
+    speed: float, offset: float, radius: float = 0.1, velocity: float | None = None
+) -> tuple[Problem, torch.Tensor]:
+    """A point that crosses x = 0.5 at constant speed, past one disc whose centre is `offset` to the side."""
+    dynamics = Planar(dt=0.1, drag=0.0)
+    velocities = None if velocity is None else [[velocity, 0.0]]
+    problem = Problem(
+        dynamics, QuadraticCost([1] * 6, [1, 1], [1] * 6), 
+        [Spheres([[0.5, offset]], [radius], 0.0, velocities), ControlBounds([-1, -1], [1, 1])],
+        torch.tensor([[0.0, 0, 0, speed, 0, 0]], dtype=torch.float64), 10,
+    )  # fmt: skip
+    return problem, torch.zeros(1, 10, 2, dtype=torch.float64)
+
+
+def test_a_collision_between_the_knots_is_seen() -> None:
+    problem, U = passing(speed=2.0, offset=0.0, radius=0.09)  # knots at 0.4 and 0.6, the disc between them
+    verdict = judge(problem, U, torch.tensor([2.0, 0.0], dtype=torch.float64), 0.1)
+    assert float(verdict.clearance_knots) == pytest.approx(0.1 - 0.95 * 0.09)
+    assert float(verdict.clearance) == pytest.approx(-0.95 * 0.09)
+    assert bool(verdict.feasible) and bool(verdict.reached)  # the paper's notion looks at the knots alone
+    assert not bool(verdict.sound)
+
+
+def test_a_moving_obstacle_is_followed_between_the_knots() -> None:
+    """Disc and point fly towards each other and pass at a distance: the nearest moment lies between two knots."""
+    problem, U = passing(speed=1.0, offset=0.3, radius=0.1, velocity=-1.3)
+    verdict = judge(problem, U, torch.tensor([1.0, 0.0], dtype=torch.float64), 0.1)
+    assert float(verdict.clearance) == pytest.approx(0.3 - 0.095, abs=1e-12)
+    assert float(verdict.clearance_knots) > float(verdict.clearance) + 1e-4
+
+
+def test_what_the_words_mean() -> None:
+    problem, U = passing(speed=1.0, offset=0.098)  # 0.098 from the centre: inside the full radius, outside 0.95 of it
+    goal = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    verdict = judge(problem, U, goal, 0.1)
+    assert float(verdict.violation) == pytest.approx(0.002) and bool(verdict.feasible) and not bool(verdict.sound)
+    assert not bool(judge(problem, U, goal + 0.2, 0.1).reached)
+    hard = U.clone()
+    hard[:, -1] = 1.01  # after which nothing moves any more, but the bound is broken
+    assert not bool(judge(problem, hard, goal, 0.1).feasible)
+    free, U = passing(speed=1.0, offset=0.5)
+    sound = judge(free, U, goal, 0.1)
+    assert bool(sound.sound)
+    assert bool(sound.success(sound.cost / 1.04)) and not bool(sound.success(sound.cost / 1.06))
+    assert not bool(sound.success(torch.full_like(sound.cost, torch.nan)))
+
+
+def test_missing_controls_and_missing_obstacles() -> None:
+    problem, U = planar_batch(B=2, N=5)
+    U = U.clone()
+    U[0] = torch.nan
+    goal = torch.tensor([1.0, 0.4], dtype=torch.float64)
+    verdict = judge(problem, U, goal, 5.0)
+    assert verdict.feasible.tolist() == [False, True] and verdict.reached.tolist() == [False, True]
+    empty = Problem(problem.dynamics, problem.cost, [], problem.x0, problem.N)
+    assert judge(empty, U, goal, 5.0).clearance.tolist()[1] == float("inf")
+
+
+def test_bad_calls_are_named() -> None:
+    problem, U = planar_batch(B=2, N=5)
+    goal = torch.tensor([1.0, 0.4], dtype=torch.float64)
+    with pytest.raises(InputError, match="U: expected"):
+        judge(problem, U[:1], goal, 0.3)

@@ -1,0 +1,141 @@
+"""The augmented Lagrangian against plain autodiff of its definition."""
+
+import pytest
+import torch
+
+from tests.problems import planar_batch, quadrotor_batch, random_trajectory
+from torchgco.constraints import FunctionConstraint, GuideRegion, StateBounds
+from torchgco.lagrangian import Lagrangian, Multipliers, penalty_weights, update, worst_rows
+from torchgco.problem import Problem
+
+BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
+
+
+def _with_more(problem: Problem) -> Problem:
+    """Every kind of constraint at once: a function of x and u, an equality at one knot, state bounds."""
+    limit = torch.full((problem.n,), torch.inf, dtype=torch.float64)
+    limit[0] = 0.5
+    more = [
+        FunctionConstraint(lambda x, u: x[..., :1] * u[..., :1] - 0.02, of="xu", knots=[1, 4, 7]),
+        FunctionConstraint(lambda x: x[..., :2].square() - 0.1, sense="equality", knots=[-1]),
+        StateBounds(-limit, limit),
+    ]
+    return Problem(problem.dynamics, problem.cost, [*problem.constraints, *more], problem.x0, problem.N)
+
+
+def _random_duals(problem: Problem, X, U, mu: float = 7.0) -> Multipliers:
+    torch.manual_seed(1)
+    lam = [torch.rand_like(c.value(X, U)) * (torch.rand_like(c.value(X, U)) > 0.5) for c in problem.constraints]
+    return Multipliers(tuple(lam), torch.linspace(mu, 2 * mu, problem.B, dtype=torch.float64))
+
+
+def _guide(X, position) -> GuideRegion:
+    guide = GuideRegion.inactive(X, torch.full_like(X[:, 0, 0], 3.0), position)
+    guide.radius[:, 2:6] = 0.1
+    guide.center[:, 2:6] += 0.4
+    return guide
+
+
+@pytest.mark.parametrize("clip", [False, True])
+@pytest.mark.parametrize("batch", BATCHES)
+def test_gradient_is_the_derivative_of_the_value(batch: str, clip: bool) -> None:
+    problem = _with_more(BATCHES[batch](B=3, N=9)[0])
+    X, U = random_trajectory(problem)
+    lagrangian = Lagrangian(problem, _random_duals(problem, X, U), _guide(X, problem.dynamics.position), clip)
+    X_, U_ = X.clone().requires_grad_(), U.clone().requires_grad_()
+    gX, gU = torch.autograd.grad(lagrangian.value(X_, U_)[1].sum(), (X_, U_))
+    H, n = lagrangian.expand(X, U), problem.n
+    torch.testing.assert_close(H[..., :n, n], gX, rtol=1e-10, atol=1e-8)
+    torch.testing.assert_close(H[:, :-1, n + 1 :, n], gU, rtol=1e-10, atol=1e-8)
+    torch.testing.assert_close(H, H.mT, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_hessian_is_gauss_newton(batch: str) -> None:
+    """J_var's Hessian plus rho c_z' c_z, rebuilt from autodiff Jacobians of every row."""
+    problem = _with_more(BATCHES[batch](B=2, N=9)[0])
+    X, U = random_trajectory(problem)
+    duals, n = _random_duals(problem, X, U), problem.n
+    guide = _guide(X, problem.dynamics.position)
+    H = Lagrangian(problem, duals, guide, False).expand(X, U)
+    plain = Problem(problem.dynamics, problem.cost, [], problem.x0, problem.N)
+    expected = Lagrangian(plain, Multipliers((), duals.mu), None, False).expand(X, U)
+    for constraint, lam in zip(problem.constraints, duals.lam, strict=True):
+        c = constraint.value(X, U)
+        rho = penalty_weights(constraint, c, lam, duals.mu, False)
+        knots = torch.arange(problem.N + 1)[constraint.knots]
+        for b in range(problem.B):
+            for j, k in enumerate(knots.tolist()):
+                for i in range(c.shape[-1]):
+                    x, u = X.clone().requires_grad_(), U.clone().requires_grad_()
+                    gx, gu = torch.autograd.grad(
+                        constraint.value(x, u)[b, j, i], (x, u), allow_unused=True, materialize_grads=True
+                    )
+                    z = torch.zeros(H.shape[-1], dtype=torch.float64)
+                    z[:n] = gx[b, k]
+                    if k < problem.N:
+                        z[n + 1 :] = gu[b, k]
+                    expected[b, k] += rho[b, j, i] * torch.outer(z, z)
+    f = (X[..., guide.position] - guide.center).square().sum(-1) - guide.radius.square()
+    fx = 2 * (X[..., guide.position] - guide.center)
+    at = guide.position
+    expected[..., at, at] += (3.0 * (f > 0))[..., None, None] * fx.unsqueeze(-1) * fx.unsqueeze(-2)
+    n_block = torch.arange(H.shape[-1]) != n
+    torch.testing.assert_close(
+        H[..., n_block, :][..., n_block], expected[..., n_block, :][..., n_block], rtol=1e-10, atol=1e-9
+    )
+
+
+def test_printed_rule_of_the_penalty() -> None:
+    """rho = 0 only where an inequality has c < 0 and lam = 0 (Equation 18)."""
+    problem, _ = planar_batch(B=1, N=3, obstacles=1)
+    c = torch.tensor([[[-1.0], [-1.0], [0.0], [2.0]]], dtype=torch.float64)
+    lam = torch.tensor([[[0.0], [0.5], [0.0], [0.0]]], dtype=torch.float64)
+    mu = torch.tensor([4.0], dtype=torch.float64)
+    spheres = problem.constraints[0]
+    assert penalty_weights(spheres, c, lam, mu, clip=False).flatten().tolist() == [0, 4, 4, 4]
+    assert penalty_weights(spheres, c, lam, mu, clip=True).flatten().tolist() == [0, 0, 4, 4]
+
+
+def test_clipped_value_is_continuous_where_a_row_lets_go() -> None:
+    problem, _ = planar_batch(B=1, N=3, obstacles=1)
+    spheres, mu, lam = problem.constraints[0], 4.0, 0.6
+    X = problem.x0.unsqueeze(1).repeat(1, 4, 1)
+    duals = Multipliers(
+        (torch.full((1, 3, 1), lam, dtype=torch.float64), torch.zeros(1, 3, 4, dtype=torch.float64)),
+        torch.tensor([mu], dtype=torch.float64),
+    )
+    U = torch.zeros(1, 3, 2, dtype=torch.float64)
+    # Along a ray away from the disc, c passes -lam / mu.
+    R = float(spheres.distances[0, 0])
+    edge = (R**2 + lam / mu) ** 0.5
+    values = []
+    for gap in (edge - 1e-7, edge + 1e-7):
+        X[:, 1:, :2] = spheres.centers[0, 0] + torch.tensor([gap, 0.0], dtype=torch.float64)
+        cost, merit = Lagrangian(problem, duals, None, True).value(X, U)
+        values.append(float(merit - cost))
+    assert values[0] == pytest.approx(values[1], abs=1e-5)
+    assert values[1] == pytest.approx(-3 * lam**2 / (2 * mu))
+
+
+def test_update_of_multipliers_and_penalty() -> None:
+    problem, _ = planar_batch(B=2, N=5)
+    X, U = random_trajectory(problem)
+    duals = _random_duals(problem, X, U)
+    new = update(problem, X, U, duals, 3.0, mu_max=30.0)
+    for constraint, lam, after in zip(problem.constraints, duals.lam, new.lam, strict=True):
+        expected = lam + duals.mu.view(-1, 1, 1) * constraint.value(X, U)
+        torch.testing.assert_close(after, expected.clamp(min=0.0))
+    assert new.mu.tolist() == [21.0, 30.0]
+
+
+def test_the_worst_row_is_named() -> None:
+    problem, U = planar_batch(B=2, N=5)
+    X = problem.x0.unsqueeze(1).repeat(1, 6, 1)
+    X[1, 3, :2] = problem.constraints[0].centers[1, 2]
+    U = U.clone()
+    U[0, 4, 1] = -10.5
+    first, second = worst_rows(problem, X, U)
+    assert first == {"violation": pytest.approx(0.5), "constraint": "ControlBounds", "knot": 4, "row": 3}
+    assert second["constraint"] == "BoundSpheres" and second["knot"] == 3 and second["row"] == 2
+    assert second["violation"] == pytest.approx(float(problem.constraints[0].distances[1, 2]))

@@ -1,0 +1,135 @@
+"""Malformed input is one error that names the part at fault; constraints hold where they say."""
+
+import pickle
+
+import pytest
+import torch
+
+from tests.problems import HOVER, START, planar_batch
+from torchgco import (
+    ControlBounds,
+    FirstStepRates,
+    FunctionConstraint,
+    FunctionDynamics,
+    InputError,
+    Planar,
+    Problem,
+    QuadraticCost,
+    QuadrotorPlanning,
+    Spheres,
+    StateBounds,
+)
+from torchgco.api import solve
+
+nan, inf = float("nan"), float("inf")
+
+
+def planar(constraints=(), x0=None, N=5, dynamics=None, cost=None) -> Problem:
+    x0 = torch.zeros(2, 6, dtype=torch.float64) if x0 is None else x0
+    cost = cost or QuadraticCost([1] * 6, [1, 1], [1] * 6)
+    return Problem(dynamics or Planar(), cost, list(constraints), x0, N)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: planar(N=0), "N: expected at least one stage"),
+        (lambda: planar(N=2.5), "N: expected"),
+        (lambda: planar(x0=torch.zeros(2, 5, dtype=torch.float64)), "x0: expected shape"),
+        (lambda: planar(x0=torch.zeros(6, dtype=torch.float64)), "x0: expected a floating tensor"),
+        (lambda: planar(x0=torch.zeros(2, 6, dtype=torch.int64)), "x0"),
+        (lambda: planar(dynamics=Planar(drag=torch.ones(3, dtype=torch.float64))), "dynamics.drag"),
+        (lambda: planar(dynamics=Planar(drag=torch.ones(2))), "dynamics.drag: expected torch.float64"),
+        (lambda: planar(dynamics=FunctionDynamics(lambda x, u: x[..., :3], 6, 2, 0.1)), "dynamics.step"),
+        (lambda: planar(constraints=[ControlBounds([1, 1], [0, 2])]), "control_bounds.lower: expected at most the upper"),
+        (lambda: planar(constraints=[ControlBounds([-1, nan], [1, 1])]), "control_bounds.lower"),
+        (lambda: planar(constraints=[ControlBounds([-1], [1])]), "control_bounds.lower"),
+        (lambda: planar(constraints=[StateBounds([-inf] * 6, [inf] * 6)]), "state_bounds: expected at least one finite"),
+        (lambda: planar(constraints=[Spheres([[0.0, 0, 0]], [0.1])]), "obstacles.centers"),
+        (lambda: planar(constraints=[Spheres([[nan, nan]], [0.1])]), "obstacles.radii: expected NaN exactly where"),
+        (lambda: planar(constraints=[Spheres([[0.0, 1.0]], [-0.1])]), "obstacles.radii: expected radii of at least 0"),
+        (lambda: planar(constraints=[Spheres([[0.0, 1.0]], [0.1, 0.2])]), "obstacles.radii"),
+        (lambda: planar(constraints=[Spheres([[0.0, 1.0]], [0.1], 0.0, [[1.0, 1.0]] * 2)]), "obstacles.velocities"),
+        (lambda: planar(constraints=[FunctionConstraint(lambda x: x[..., 0])]), "constraint.function"),
+        (lambda: planar(constraints=[FunctionConstraint(lambda x: x, sense="equal")]), "constraint.sense"),
+        (lambda: planar(constraints=[FunctionConstraint(lambda x: x, of="y")]), "constraint.of"),
+        (lambda: planar(constraints=[FunctionConstraint(lambda x: x, knots=[6])]), "constraint.knots"),
+        (lambda: planar(constraints=[FunctionConstraint(lambda x: x, knots=[2, 2])]), "constraint.knots"),
+        (lambda: planar(constraints=[FunctionConstraint(lambda u: u, of="u", geometric=True)]), "constraint.geometric"),
+        (lambda: planar(constraints=[FirstStepRates([1.0] * 4)]), "first_step.dynamics"),
+        (lambda: planar(constraints=["spheres"]), "constraints"),
+    ],
+)  # fmt: skip
+def test_malformed_parts_are_named(make, message: str) -> None:
+    with pytest.raises(InputError, match=message.replace("(", r"\(")):
+        make()
+
+
+def test_mixed_dtypes_are_named() -> None:
+    x0 = torch.zeros(2, 6)
+    bounds = ControlBounds(torch.tensor([-1.0, -1.0], dtype=torch.float64), [1, 1])
+    with pytest.raises(InputError, match=r"control_bounds.lower: expected dtype torch.float32 as in x0"):
+        planar(x0=x0, constraints=[bounds])
+
+
+def test_errors_survive_a_worker_process() -> None:
+    error = pickle.loads(pickle.dumps(InputError("N", "at least 1", 0)))
+    assert str(error) == "N: expected at least 1, got 0" and error.field == "N"
+
+
+def test_knots_of_a_constraint() -> None:
+    """A waypoint at two knots, counted from both ends, and a bound on one state only."""
+    waypoint = FunctionConstraint(lambda x: x[..., :1] - 1.0, sense="equality", knots=[2, -1])
+    limit = StateBounds([-inf, -inf, -inf, -0.5, -inf, -inf], [inf] * 6)
+    problem = planar([waypoint, limit])
+    X = torch.arange(6, dtype=torch.float64).view(1, 6, 1).repeat(2, 1, 6)
+    U = torch.zeros(2, 5, 2, dtype=torch.float64)
+    assert problem.constraints[0].value(X, U)[0, :, 0].tolist() == [1.0, 4.0]
+    assert problem.constraints[1].value(-X, U)[0, :, 0].tolist() == [0.5, 1.5, 2.5, 3.5, 4.5]
+    assert [problem.constraints[0].holds_at(k) for k in range(6)] == [False, False, True, False, False, True]
+
+
+def test_moving_spheres_are_where_they_say() -> None:
+    centers, velocities = torch.rand(2, 3, 2, dtype=torch.float64), torch.rand(2, 3, 2, dtype=torch.float64)
+    problem = planar([Spheres(centers, [0.1, 0.2, 0.3], torch.tensor([0.05, 0.1]).double(), velocities)])
+    spheres = problem.constraints[0]
+    X = torch.rand(2, 6, 6, dtype=torch.float64)
+    U = torch.zeros(2, 5, 2, dtype=torch.float64)
+    t = 0.05 * torch.arange(1, 6, dtype=torch.float64).view(1, 5, 1, 1)
+    where = centers.unsqueeze(1) + t * velocities.unsqueeze(1)
+    R = torch.tensor([[0.15, 0.25, 0.35], [0.2, 0.3, 0.4]], dtype=torch.float64).unsqueeze(1)
+    expected = R**2 - (X[:, 1:, None, :2] - where).square().sum(-1)
+    torch.testing.assert_close(spheres.value(X, U), expected)
+    torch.testing.assert_close(spheres.at(X[:, 3:4], 3)[:, 0], expected[:, 2])
+    torch.testing.assert_close(spheres.violation(X, U), (R - (R**2 - expected).sqrt()).clamp(min=0.0))
+
+
+def test_layouts_of_unequal_counts_share_a_batch() -> None:
+    centers = torch.tensor([[[0.5, 0.0], [nan, nan]], [[0.5, 0.0], [0.0, 0.5]]], dtype=torch.float64)
+    radii = torch.tensor([[0.1, nan], [0.1, 0.1]], dtype=torch.float64)
+    spheres = planar([Spheres(centers, radii)]).constraints[0]
+    X, U = torch.zeros(2, 6, 6, dtype=torch.float64), torch.zeros(2, 5, 2, dtype=torch.float64)
+    assert (spheres.value(X, U)[0, :, 1] == -1.0).all()
+    assert spheres.violation(X, U)[0, :, 1].abs().sum() == 0
+
+
+def test_first_step_rates_are_those_of_the_airframe() -> None:
+    x0 = torch.tensor([START], dtype=torch.float64)
+    x0[0, 10:13] = torch.tensor([0.3, -0.2, 0.5])
+    cost = QuadraticCost([1] * 14, [1] * 4, [1] * 14, x_ref=START, u_ref=HOVER)
+    first = FirstStepRates([3.0, 4.0, 5.0, 4.0], period=0.05)
+    problem = Problem(QuadrotorPlanning(), cost, [first], x0, 3)
+    from tests.reference.models import first_step_consistency
+
+    g = first_step_consistency(x0[0, 10:13].numpy(), torch.tensor([3.0, 4, 5, 4]).numpy(), 0.05)
+    X = torch.randn(1, 4, 14, dtype=torch.float64)
+    value = problem.constraints[0].value(X, torch.zeros(1, 3, 4, dtype=torch.float64))
+    torch.testing.assert_close(value[0, 0], torch.as_tensor(g(X[0, 1].numpy())), rtol=1e-12, atol=1e-12)
+
+
+def test_solve_takes_sensible_defaults() -> None:
+    problem, _ = planar_batch(B=2, N=8, obstacles=2)
+    solution = solve(problem)
+    assert solution.X.shape == (2, 9, 6) and bool(torch.isfinite(solution.cost).all())
+    again = solve(problem, warm=solution)
+    assert bool((again.cost <= solution.cost * 1.01).all())

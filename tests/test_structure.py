@@ -1,0 +1,90 @@
+"""The house: imports go one way, `import torchgco` stays light, and no file or function outgrows its reader."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "torchgco"
+FLOORS = [
+    ["shapes", "status", "autodiff", "draws"],
+    ["dynamics", "costs", "constraints"],
+    ["problem"],
+    ["rollout", "expansion", "judge"],
+    ["lagrangian"],
+    ["solution"],
+    ["solvers", "guidance.mppi", "guidance.detection", "guidance.region"],
+    ["guidance"],
+    ["scenarios", "baselines", "api"],
+    ["plotting"],
+    ["experiments"],
+]
+MODULES = sorted(
+    p for p in PACKAGE.rglob("*.py") if (p.name != "__main__.py" and p.parent != PACKAGE) or p.stem != "__init__"
+)
+
+
+def floor_of(name: str) -> tuple[int, str]:
+    """Floor and room of a module, the longest matching room first."""
+    rooms = [(level, room) for level, rooms in enumerate(FLOORS) for room in rooms]
+    for level, room in sorted(rooms, key=lambda pair: -len(pair[1])):
+        if name == room or name.startswith(f"{room}."):
+            return level, room
+    raise AssertionError(f"{name} stands on no floor")
+
+
+def imports_of(path: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("torchgco"):
+            names.add(node.module.removeprefix("torchgco").removeprefix("."))
+    return names - {""}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_go_one_way(path: Path) -> None:
+    name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
+    if name == "__main__":
+        return
+    level, room = floor_of(name)
+    for imported in imports_of(path):
+        other, other_room = floor_of(imported)
+        same_house = {room.split(".")[0], other_room.split(".")[0]} <= {"dynamics", "costs", "constraints"}
+        assert other < level or other_room == room or same_house, f"{name} imports {imported}"
+
+
+def test_solvers_do_not_know_guidance_and_problems_know_no_solver() -> None:
+    for path in (PACKAGE / "solvers").glob("*.py"):
+        assert not any(name.startswith("guidance") for name in imports_of(path)), path
+    for room in ("dynamics", "costs", "constraints"):
+        for path in (PACKAGE / room).glob("*.py"):
+            assert not any(name.startswith(("solvers", "lagrangian", "guidance")) for name in imports_of(path)), path
+
+
+def test_only_experiments_know_hydra() -> None:
+    for path in PACKAGE.rglob("*.py"):
+        if path.parent.name != "experiments":
+            text = path.read_text()
+            assert "import hydra" not in text and "omegaconf" not in text, path
+
+
+def test_importing_torchgco_loads_neither_hydra_nor_matplotlib() -> None:
+    code = "import sys, torchgco; print([m for m in ('hydra', 'matplotlib', 'pandas') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    assert done.stdout.strip() == "[]"
+
+
+def test_instantiate_is_called_in_one_place() -> None:
+    places = [path.name for path in PACKAGE.rglob("*.py") if "utils.instantiate(" in path.read_text()]
+    assert places == ["build.py"]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_files_and_functions_fit_their_reader(path: Path) -> None:
+    text = path.read_text()
+    assert len(text.splitlines()) <= 400
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            assert node.end_lineno - node.lineno <= 65, f"{node.name} in {path.name}"
