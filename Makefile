@@ -1,4 +1,5 @@
 # make study   the default study, in an environment of its own (ARGS="experiment=planar_trap seed=1" for others)
+# make families   every solver on the public layouts (an hour or more)
 # make test    the quick tests; test-slow: the others; lint, types: the static checks; clean: start afresh
 
 PYTHON ?= python3
@@ -11,7 +12,10 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constrain
 RUNTIME := $(VENV)/.runtime
 DEV := $(VENV)/.dev
 
-.PHONY: study test test-slow lint types clean
+# The public layouts of benchmarks/data, all solvers; FAMILIES picks some. An hour or more on two cores.
+FAMILIES ?= forest30 forest60 walls planar_trap planar_random
+
+.PHONY: study test test-slow lint types clean families $(FAMILIES:%=family-%)
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -21,6 +25,15 @@ test: $(DEV)
 
 test-slow: $(DEV)
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+families: $(FAMILIES:%=family-%)
+	$(BIN)/torchgco-report outputs/families --output outputs/families-report
+	cp outputs/families-report/summary.csv benchmarks/families.csv
+
+family-%: $(RUNTIME)
+	$(BIN)/torchgco scenario=layouts scenario.path=benchmarks/data/$*.npz \
+	    model=$(if $(filter planar%,$*),planar,quadrotor) \
+	    study.baselines=[gco_paper,al_ilqr,mppi,hold] hydra.run.dir=outputs/families/$* $(ARGS)
 
 lint: $(DEV)
 	$(BIN)/ruff check .

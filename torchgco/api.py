@@ -7,11 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.guidance.gco import GCO
+from torchgco.guidance.mppi import MPPI
 from torchgco.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
+from torchgco.solvers.ilqr import ILQR
+from torchgco.solvers.line_search import LineSearch
 
 
 def solve(
@@ -35,7 +37,7 @@ def solve(
         InputError: U0, ids or warm don't fit the problem.
     """
     if U0 is None:
-        U0 = warm.U if warm is not None else _reference_controls(problem)
+        U0 = warm.U if warm is not None else _at_rest(problem)
     if solver is None:
         solver = default_solver(guided=bool(problem.geometric))
     multipliers = None if warm is None else warm.multipliers
@@ -43,11 +45,19 @@ def solve(
 
 
 def default_solver(guided: bool = True) -> AugmentedLagrangian:
-    """What `solve` takes where no solver is given."""
-    return AugmentedLagrangian(guidance=GCO() if guided else None)
+    """What `solve` takes where no solver is given: the settings of the config `gco` that depend on no vehicle."""
+    sampler = MPPI(samples=256, covariance=None, rounds=16, knots=8, decay=0.9, linger=1.0, elite=5)
+    return AugmentedLagrangian(
+        inner=ILQR(tolerance=1e-2, max_iterations=20, line_search=LineSearch(accept_last=False)),
+        guidance=GCO(sampler=sampler, adopt=True, patience=4) if guided else None,
+        max_outer_iterations=20,
+        grow_when_feasible=False,
+        cost_tolerance=1e-3,
+        hold_factor=2.0,
+        clip=True,
+    )
 
 
-def _reference_controls(problem: Problem) -> Tensor:
-    if isinstance(problem.cost, BoundQuadratic):
-        return problem.cost.u_ref.expand(problem.B, problem.N, problem.m).contiguous()
-    return torch.zeros(problem.B, problem.N, problem.m, dtype=problem.x0.dtype, device=problem.x0.device)
+def _at_rest(problem: Problem) -> Tensor:
+    like = torch.zeros(problem.B, problem.N, problem.m, dtype=problem.x0.dtype, device=problem.x0.device)
+    return problem.cost.rest_controls(like)

@@ -22,6 +22,7 @@ from torchgco.scenarios import Layouts
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "benchmarks" / "data"
+WALLS = f"scenario.path={DATA / 'walls.npz'}"
 TINY = ["study.layouts=3", "scenario.stages=12", "study.batch_size=2", "solver.max_outer_iterations=2"]
 SCENARIOS = sorted(p.stem for p in (ROOT / "conf" / "scenario").glob("*.yaml"))
 SOLVERS = sorted(p.stem for p in (ROOT / "conf" / "solver").glob("*.yaml"))
@@ -133,7 +134,7 @@ def test_start_inside_an_obstacle_is_a_status(run, tmp_path) -> None:
     np.savez(tmp_path / "two.npz", centers=centers, radii=np.full((2, 1), 0.1))
     words = ["scenario=layouts", "scenario.path=two.npz", "model=planar", "study.baselines=[hold]", "solver=al_ilqr"]
     words += ["solver.max_outer_iterations=1", "solver.inner.max_iterations=3", "hydra.run.dir=out"]
-    code, out, _ = run(*words)
+    code, _, _ = run(*words)
     assert code == 0
     trials = pd.read_parquet(tmp_path / "out" / "trials.parquet")
     assert (trials.scenario == "two").all()
@@ -155,8 +156,8 @@ BAD = {
     "missing path": (["scenario=layouts"], "scenario.path"),
     "no such file": (["scenario=layouts", "scenario.path=nowhere.npz"], "scenario.path: expected a layout file"),
     "model misfit": (["model=planar"], "model: expected model=quadrotor"),
-    "model misfit in a file": (["scenario=layouts", f"scenario.path={DATA / 'walls.npz'}", "model=planar"], "model=quadrotor"),
-    "too many layouts": (["scenario=layouts", f"scenario.path={DATA / 'walls.npz'}", "study.layouts=40"], "study.layouts"),
+    "model misfit in a file": (["scenario=layouts", WALLS, "model=planar"], "model=quadrotor"),
+    "too many layouts": (["scenario=layouts", WALLS, "study.layouts=40"], "study.layouts"),
     "no layouts": (["study.layouts=0"], "study.layouts: expected at least 1"),
     "no stages": (["scenario.stages=0"], "stages"),
     "negative radius": (["scenario.obstacle_radius=-1"], "obstacle_radius"),

@@ -54,7 +54,7 @@ def test_detection_and_region_equal_algorithm_5(batch: str) -> None:
     counts, caught = active_counts(problem, X, U), caught_knots(problem, X, U)
     gco = GCO(sampler=MPPI(samples=20))
     start = GuideRegion.inactive(X, torch.full((4,), 20.0, dtype=torch.float64), problem.dynamics.position)
-    guide = gco.update(problem, X, U, start, key(4))
+    guide = gco.update(problem, X, U, start, key(4)).guide
     z = standard_normal(key(4), (20, problem.N, problem.m), torch.float64).numpy()
     for b in range(4):
         twin = reference_of(problem, b)
@@ -78,7 +78,7 @@ def test_growth_only_where_caught() -> None:
     problem, U = planar_batch(B=4, N=30, obstacles=14)
     X = through_the_obstacles(problem)
     start = GuideRegion.inactive(X, torch.full((4,), 20.0, dtype=torch.float64), problem.dynamics.position)
-    guide = GCO(sampler=MPPI(samples=5), grow_when_idle=False).update(problem, X, U, start, key(4))
+    guide = GCO(sampler=MPPI(samples=5), grow_when_idle=False).update(problem, X, U, start, key(4)).guide
     caught = caught_knots(problem, X, U).any(-1)
     assert guide.weight.tolist() == [pytest.approx(96.8 if c else 20.0) for c in caught.tolist()]
 
@@ -122,6 +122,11 @@ def test_a_diverging_sample_is_not_chosen() -> None:
     [
         (lambda: MPPI(samples=0), "mppi.samples"),
         (lambda: MPPI(temperature=0.0), "mppi.temperature"),
+        (lambda: MPPI(rounds=0), "mppi.rounds"),
+        (lambda: MPPI(knots=1), "mppi.knots"),
+        (lambda: MPPI(decay=0.0), "mppi.decay"),
+        (lambda: MPPI(elite=101), "mppi.elite"),
+        (lambda: MPPI(linger=-1.0), "mppi.linger"),
         (lambda: MPPI(collision_penalty=-1.0), "mppi.collision_penalty"),
         (lambda: MPPI(saturation="clip"), "mppi.saturation"),
         (lambda: MPPI(covariance=[1.0, 1.0, 1.0]).improve(*planar_batch(B=1, N=3), key(1)), "mppi.covariance"),

@@ -57,5 +57,5 @@ def test_a_misfit_says_which_model_to_give(name: str, other: str) -> None:
 
 def test_states_of_another_length_are_named() -> None:
     layouts = Layouts(centers=[[[0.0, 0.0]]], radii=[[0.1]], start=[[0.0, 0.0, 0.0]])
-    with pytest.raises(InputError, match="layouts.start: expected 6 states"):
+    with pytest.raises(InputError, match=r"layouts\.start: expected 6 states"):
         vehicle("planar").task(layouts)

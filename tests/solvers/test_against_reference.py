@@ -13,7 +13,7 @@ from tests.reference.guidance import cpuf_hook
 from tests.reference.mppi import MppiSettings
 from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian
 from torchgco.draws import DrawKey, standard_normal
-from torchgco.solvers.batch import Progress
+from torchgco.solvers.state import Progress
 
 CASES = {
     "planar": (lambda: planar_batch(B=4, N=40, obstacles=8, seed=4), 1e-3, 30),

@@ -23,12 +23,15 @@ from torchgco import (
     Problem,
     QuadraticCost,
     Solution,
+    Spheres,
     Status,
     solve,
 )
 from torchgco.baselines import Hold, IteratedMPPI
+from torchgco.constraints import GuideRegion
 from torchgco.rollout import open_loop
 from torchgco.solvers.riccati import backward
+from torchgco.solvers.state import Advice
 
 
 def linear_problem(B: int = 2, N: int = 8, constraints=()) -> Problem:
@@ -216,26 +219,33 @@ def test_save_and_load(tmp_path) -> None:
 
 BASE = AugmentedLagrangian(
     inner=ILQR(max_iterations=10, tolerance=1e-2),
-    guidance=GCO(sampler=MPPI(samples=12)),
+    guidance=GCO(sampler=MPPI(samples=12, rounds=2, knots=5)),
     max_outer_iterations=7,
     record=True,
 )
+# One other value for every option, and with it what else the option needs to show.
 CHANGES = {
     AugmentedLagrangian: dict(
         inner=ILQR(max_iterations=2), guidance=None, initial_penalty=50.0, penalty_growth=5.0, penalty_max=60.0,
         max_outer_iterations=3, violation_tolerance=0.2, cost_tolerance=0.9, clip=True, record=False,
+        grow_when_feasible=False,
     ),
     ILQR: dict(tolerance=1e3, max_iterations=3, line_search=LineSearch(shrink=0.3)),
-    LineSearch: dict(shrink=0.25, ratio_min=0.6, ratio_max=1.0, smallest=0.4, accept_last=False),
+    LineSearch: dict(shrink=0.25, ratio_min=0.9, ratio_max=0.9),
     GCO: dict(
-        sampler=MPPI(samples=5), initial_penalty=2.0, penalty_growth=1.0, radius=0.5, grow_when_idle=False
+        sampler=MPPI(samples=5), initial_penalty=2.0, penalty_growth=1.0, radius=0.5, grow_when_idle=False,
+        adopt=True, patience=1, afresh=True,
     ),
-    MPPI: dict(samples=7, covariance=4.0, temperature=100.0, collision_penalty=0.1, saturation=None),
+    MPPI: dict(
+        samples=7, covariance=4.0, temperature=100.0, collision_penalty=0.1, saturation=None, rounds=1, knots=3,
+        decay=0.3, elite=4, linger=10.0,
+    ),
 }  # fmt: skip
-# What shows only elsewhere, with the test that shows it.
+# What shows only in other tests of this file.
 ELSEWHERE = {
     (ILQR, "regularisation_first"), (ILQR, "regularisation_growth"), (ILQR, "regularisation_max"), (ILQR, "penalty"),
-    (LineSearch, "parallel"),
+    (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"),
+    (AugmentedLagrangian, "hold_factor"),
 }  # fmt: skip
 PLACES = {
     AugmentedLagrangian: lambda s, c: replace(s, **c),
@@ -271,7 +281,7 @@ def test_no_option_is_forgotten_above() -> None:
         assert {f.name for f in fields(cls)} == covered, cls
 
 
-def test_options_that_show_elsewhere() -> None:
+def test_regularisation_and_penalty_are_read() -> None:
     problem = saddle(1.0)
 
     def peak(**options) -> float:
@@ -279,12 +289,84 @@ def test_options_that_show_elsewhere() -> None:
         return float(solver.solve(problem, zeros(problem)).trace.regularisation.max())
 
     assert peak(regularisation_first=0.3) != peak() != peak(regularisation_growth=3.0)
-    planar, U0 = planar_batch(B=2, N=15)
-    free, held = ILQR().solve(planar, U0), ILQR(penalty=100.0).solve(planar, U0)
-    assert not torch.equal(free.U, held.U) and bool((held.violation < free.violation).all())
-    # Rungs side by side are the same rungs: only the time changes.
-    one, many = (replace(BASE, inner=replace(BASE.inner, line_search=LineSearch(parallel=p))) for p in (1, 6))
-    np.testing.assert_array_equal(_run(one)[1], _run(many)[1])
+    disc = Problem(
+        FunctionDynamics(lambda x, u: u, 2, 2, 0.1, position=slice(0, 2)),
+        QuadraticCost([1, 1], [0.1, 0.1], [10, 10], x_ref=[1.0, 0.1]),
+        [Spheres([[0.5, 0.0]], [0.2])], torch.zeros(1, 2, dtype=torch.float64), 20,
+    )  # fmt: skip
+    free, held = ILQR().solve(disc, zeros(disc)), ILQR(penalty=1e4).solve(disc, zeros(disc))
+    assert float(held.violation) < 0.5 * float(free.violation)
+
+
+def steep() -> Problem:
+    """A step that overshoots: full Gauss-Newton steps on a strongly curved constraint are refused."""
+    curved = FunctionConstraint(lambda x: (8 * x[..., :1]).sin() - 0.5 * x[..., 1:].square(), sense="equality")
+    return linear_problem(constraints=[curved])
+
+
+def steep_run(**options) -> Solution:
+    line_search = LineSearch(**{"ratio_min": 0.3, "accept_last": False, **options.pop("line_search", {})})
+    inner = ILQR(max_iterations=25, tolerance=1e-6, line_search=line_search, **options)
+    return AugmentedLagrangian(inner=inner, max_outer_iterations=3, record=True).solve(steep(), zeros(steep()))
+
+
+def test_the_end_of_the_ladder_is_read() -> None:
+    short = steep_run(line_search={"smallest": 0.4})
+    assert float(short.trace.alpha[short.trace.alpha > 0].min()) >= 0.5 > float(steep_run().trace.alpha.max()) * 0.4
+    assert (short.trace.alpha == 0).any()  # refused
+    taken = steep_run(line_search={"smallest": 0.4, "accept_last": True})
+    assert not torch.equal(taken.U, short.U) and float(taken.trace.alpha.min()) == 0.25
+
+
+def test_damping_goes_on_where_the_search_fails() -> None:
+    plain, damped = steep_run(line_search={"smallest": 0.4}), steep_run(line_search={"smallest": 0.4}, damping=1.0)
+    assert float(damped.trace.regularisation.max()) >= 1.0 and float(plain.trace.regularisation.max()) == 0.0
+    after = [run.trace[run.trace.outer == 0].groupby("element").merit.last() for run in (plain, damped)]
+    assert bool((after[1] <= after[0]).all()) and bool((after[1] < after[0]).any())
+
+
+def test_rungs_side_by_side_are_the_same_rungs() -> None:
+    one, many = (steep_run(line_search={"parallel": p}) for p in (1, 6))
+    torch.testing.assert_close(one.U, many.U, rtol=1e-9, atol=1e-9)
+    assert one.iterations.tolist() == many.iterations.tolist()
+
+
+class Detour:
+    """Guidance that hands over one given plan, once."""
+
+    def __init__(self, plan: torch.Tensor) -> None:
+        self.plan = plan
+
+    def start(self, problem, X):
+        return GuideRegion.inactive(X, torch.ones_like(X[:, 0, 0]), slice(0, 2))
+
+    def update(self, problem, X, U, guide, key):
+        return Advice(guide, self.plan.expand_as(U), key.outer == 1)
+
+
+@pytest.mark.parametrize("hold_factor", [1.0, 100.0])
+def test_an_adopted_plan_is_held(hold_factor: float) -> None:
+    """The path that is left costs hold_factor times what the new one costs more, and the multipliers start again."""
+    problem, U0 = planar_batch(B=2, N=25, obstacles=8, seed=4)
+    plan = torch.full_like(U0[:1], 1.0)
+    seen = []
+
+    def look(progress) -> None:
+        state = progress.state
+        if not seen and bool((state.outer == 1).all()):
+            seen.append((state.U.clone(), state.duals.mu.clone(), [lam.abs().max() for lam in state.duals.lam]))
+
+    solver = AugmentedLagrangian(
+        inner=ILQR(max_iterations=1), guidance=Detour(plan), max_outer_iterations=3, hold_factor=hold_factor, clip=True
+    )
+    solver.solve(problem, U0, callback=look)
+    U, mu, lam = seen[0]
+    assert torch.equal(U, plan.expand_as(U)) and all(float(m) == 0 for m in lam)
+    left = ILQR(max_iterations=1, penalty=20.0).solve(problem, U0)
+    new_X = open_loop(problem.dynamics, problem.x0, U)
+    squares = sum(c.value(left.X, left.U).clamp(min=0).square().sum((1, 2)) for c in problem.constraints)
+    gain = (problem.cost.total(new_X, U) - left.cost).clamp(min=0) / (0.5 * squares)
+    torch.testing.assert_close(mu, (hold_factor * gain).clamp(min=44.0), rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -293,6 +375,8 @@ def test_options_that_show_elsewhere() -> None:
         (lambda: ILQR(tolerance=-1.0), "ilqr.tolerance"),
         (lambda: ILQR(max_iterations=0), "ilqr.max_iterations"),
         (lambda: ILQR(penalty=-1.0), "ilqr.penalty"),
+        (lambda: ILQR(damping=-1.0), "ilqr.damping"),
+        (lambda: AugmentedLagrangian(hold_factor=0.5), "solver.hold_factor"),
         (lambda: ILQR(regularisation_first=0.0), "ilqr.regularisation_first"),
         (lambda: ILQR(regularisation_growth=1.0), "ilqr.regularisation_growth"),
         (lambda: LineSearch(shrink=1.0), "line_search.shrink"),

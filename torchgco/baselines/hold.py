@@ -11,7 +11,8 @@ from torchgco.lagrangian import Multipliers, violation
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.solution import Solution
-from torchgco.solvers.batch import Callback, check_call
+from torchgco.solvers.batch import check_call
+from torchgco.solvers.state import Callback
 from torchgco.status import Status
 
 

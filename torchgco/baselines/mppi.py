@@ -14,7 +14,8 @@ from torchgco.lagrangian import Multipliers, violation
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 from torchgco.solution import Solution
-from torchgco.solvers.batch import Callback, check_call
+from torchgco.solvers.batch import check_call
+from torchgco.solvers.state import Callback
 
 
 @dataclass(frozen=True)

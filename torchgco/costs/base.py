@@ -33,6 +33,10 @@ class Cost(PerElement):
         """The cost checked and shaped for one problem; called once, by Problem."""
         return self
 
+    def rest_controls(self, like: Tensor) -> Tensor:
+        """Controls (B, N, m) that ask nothing of the vehicle: the references of a quadratic cost, else zero."""
+        return torch.zeros_like(like)
+
     def total(self, X: Tensor, U: Tensor) -> Tensor:
         """J_var (B,) of trajectories X (B, N+1, n), U (B, N, m)."""
         k = torch.arange(U.shape[1], device=U.device)

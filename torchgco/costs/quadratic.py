@@ -106,6 +106,9 @@ class BoundQuadratic(Cost):
             value = value + (eu * (at_k(self.H) * ex.unsqueeze(-2)).sum(-1)).sum(-1)
         return value
 
+    def rest_controls(self, like: Tensor) -> Tensor:
+        return self.u_ref.expand_as(like).contiguous()
+
     def terminal(self, x: Tensor) -> Tensor:
         xf_ref, Qf, qf = self.xf_ref, self.Qf, self.qf
         if x.dim() == 3:

@@ -22,7 +22,7 @@ from torchgco.judge import frame_columns, judge
 from torchgco.rollout import open_loop
 from torchgco.scenarios import Layouts
 from torchgco.shapes import InputError
-from torchgco.solvers.batch import Progress
+from torchgco.solvers.state import Progress
 from torchgco.status import Status
 
 # How the configuration of a baseline is found: its name in, the whole configuration with that solver out.

@@ -14,7 +14,7 @@ from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, put, take
-from torchgco.solvers.batch import Advice
+from torchgco.solvers.state import Advice
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class GCO:
         grow_when_idle: mu_gco grows in every outer iteration (as Algorithm 4, line 11, prints it), or only in those
             that find the element caught, so that late guidance starts as gently as early guidance.
         adopt: where the sampled plan touches nothing, go on from the plan itself instead of being drawn to it.
+        afresh: sample around the cost's reference controls (the vehicle at rest), not around the path that is caught.
         patience: from this outer iteration on, a single active sphere counts as being caught too; None: never.
 
     Raises:
@@ -42,6 +43,7 @@ class GCO:
     grow_when_idle: bool = True
     adopt: bool = False
     patience: int | None = None
+    afresh: bool = False
 
     def __post_init__(self) -> None:
         if not self.initial_penalty > 0:
@@ -71,12 +73,16 @@ class GCO:
         rows = caught.nonzero().flatten()
         if rows.numel() > 0:
             part = problem.take(rows)
-            X_safe, plan[rows] = self.sampler.improve(part, U[rows], key.take(rows))
+            X_safe, plan[rows] = self.sampler.improve(part, self._mean(part, U[rows]), key.take(rows))
             if self.adopt:
                 taken[rows] = ~active_counts(part, X_safe, plan[rows]).any(-1)
             drawn = guide_along(take(new, rows), X_safe, knots[rows], self._radius(problem)[rows])
             put(new, rows[~taken[rows]], take(drawn, (~taken[rows]).nonzero().flatten()))
         return Advice(new, plan, taken)
+
+    def _mean(self, problem: Problem, U: Tensor) -> Tensor:
+        """What the sampler starts from, (B, N, m)."""
+        return problem.cost.rest_controls(U) if self.afresh else U
 
     def _radius(self, problem: Problem) -> Tensor:
         """r_guide (B,), m."""

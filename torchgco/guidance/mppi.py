@@ -27,7 +27,8 @@ class MPPI:
 
     Args:
         samples: S per problem and round.
-        covariance: diagonal of Sigma (m,), or one number for all controls; in squared units of u.
+        covariance: diagonal of Sigma (m,), or one number for all controls; in squared units of u. None: a standard
+            deviation of a quarter of the range that the control bounds leave, 1 where they leave it open.
         temperature: lambda, in units of cost.
         collision_penalty: rho_mp, per knot and obstacle touched.
         saturation: "bounds" clamps samples to the problem's control bounds; "symmetric" to [-upper, upper], wider
@@ -36,6 +37,8 @@ class MPPI:
         knots: noise is drawn at so many knots and linear between them; 0: white, at every stage. Smooth noise moves the
             vehicle where white noise averages out. Its likelihood term (u' Sigma^-1 eps) is left out.
         decay: factor of the noise's standard deviation from round to round.
+        linger: horizons that a sample is charged for staying where it ends, at its last stage's cost. A plan that
+            stops before an obstacle is cheap within the horizon; this makes it dear.
         elite: the temperature is raised to the gap between the best sample and the elite-th best; 0 leaves it.
 
     Raises:
@@ -50,6 +53,7 @@ class MPPI:
     rounds: int = 1
     knots: int = 0
     decay: float = 1.0
+    linger: float = 0.0
     elite: int = 0
 
     def __post_init__(self) -> None:
@@ -64,6 +68,8 @@ class MPPI:
             raise InputError("mppi.decay", "above 0, at most 1", self.decay)
         if not self.temperature > 0:
             raise InputError("mppi.temperature", "above 0", self.temperature)
+        if not self.linger >= 0:
+            raise InputError("mppi.linger", "at least 0 horizons", self.linger)
         if not self.collision_penalty >= 0:
             raise InputError("mppi.collision_penalty", "at least 0", self.collision_penalty)
         if self.saturation not in ("bounds", "symmetric", None):
@@ -114,6 +120,8 @@ class MPPI:
                 if constraint.holds_at(k + 1):
                     collisions = collisions + (constraint.at(x, k + 1) >= 0).sum(-1)
         cost = cost + problem.cost.terminal(x)
+        if self.linger > 0:
+            cost = cost + self.linger * problem.N * problem.cost.stage(x, V[:, :, -1], problem.N - 1)
         S = cost + self.temperature * likelihood + self.collision_penalty * collisions
         # A sample that left the finite numbers must not take the others with it.
         return torch.where(torch.isfinite(S), S, torch.finfo(S.dtype).max)
@@ -130,10 +138,20 @@ class MPPI:
         return V
 
     def _sigma(self, problem: Problem) -> Tensor:
-        """Diagonal of Sigma, (m,)."""
+        """Diagonal of Sigma, (m,), or (B, 1, 1, m) where it comes from bounds per problem."""
+        if self.covariance is None:
+            return _from_bounds(problem)
         sigma = tensor(self.covariance, "mppi.covariance", problem.x0)
         sigma = sigma.expand(problem.m) if sigma.dim() == 0 else sigma
         check_shape(sigma, (problem.m,), "mppi.covariance")
         if not bool((sigma > 0).all()):
             raise InputError("mppi.covariance", "variances above 0", sigma.tolist())
         return sigma
+
+
+def _from_bounds(problem: Problem) -> Tensor:
+    for constraint in problem.constraints:
+        if isinstance(constraint, ControlBounds):
+            spread = 0.25 * (constraint.upper - constraint.lower)
+            return torch.where(spread < 1e10, spread.square(), 1.0)[:, None, None, :]
+    return problem.x0.new_ones(problem.m)

@@ -11,8 +11,9 @@ from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 from torchgco.solution import Solution
-from torchgco.solvers.batch import Callback, Guidance, InnerEnd, Loop
+from torchgco.solvers.batch import Loop
 from torchgco.solvers.ilqr import ILQR
+from torchgco.solvers.state import Callback, Guidance, InnerEnd
 from torchgco.status import Status
 
 

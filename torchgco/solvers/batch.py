@@ -8,14 +8,11 @@ loops, whatever its companions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from torchgco.constraints.obstacles import GuideRegion
 from torchgco.draws import DrawKey
 from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian, Multipliers, update, violation
@@ -24,118 +21,9 @@ from torchgco.rollout import open_loop
 from torchgco.shapes import InputError, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.riccati import BackwardPass, backward
+from torchgco.solvers.state import Advice, Callback, InnerEnd, Iterate, OuterLoop, Progress, State
 from torchgco.solvers.trace import Recorder
 from torchgco.status import Status
-
-if TYPE_CHECKING:
-    from torchgco.solvers.ilqr import ILQR
-
-
-@dataclass(frozen=True)
-class Iterate:
-    """A trajectory and its worth."""
-
-    X: Tensor
-    U: Tensor
-    duals: Multipliers
-    cost: Tensor
-    violation: Tensor
-
-
-@dataclass
-class State:
-    """Everything that an element carries from pass to pass; every tensor starts with the running batch."""
-
-    rows: Tensor  # place in the batch as it was given
-    X: Tensor
-    U: Tensor
-    cost: Tensor
-    merit: Tensor
-    duals: Multipliers
-    guide: GuideRegion | None
-    regularisation: Tensor  # mu_r
-    inner: Tensor  # iterations of this inner solve
-    outer: Tensor  # inner solves ended
-    iterations: Tensor
-    guided: Tensor
-    last_cost: Tensor  # J_var when the inner solve before ended
-    best: Iterate
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a callback is told after every pass."""
-
-    passes: int
-    finished: int
-    total: int
-    state: State
-
-
-Callback = Callable[[Progress], None]
-
-
-@dataclass(frozen=True)
-class InnerEnd:
-    """How the inner solve ended, for the elements that have just ended one; every tensor is (B',)."""
-
-    converged: Tensor
-    refused: Tensor  # no step length was acceptable
-    outer: Tensor  # inner solves ended, this one included
-    cost: Tensor
-    last_cost: Tensor  # when the inner solve before ended; infinite at first
-    violation: Tensor
-    best_violation: Tensor
-
-
-@dataclass(frozen=True)
-class Advice:
-    """What guidance says of a solved batch: where to draw the next inner solve, or from where to start it."""
-
-    guide: GuideRegion  # penalty of the next inner solve
-    U: Tensor  # (B', N, m): controls to go on from
-    taken: Tensor  # (B',) bool: where U replaces the iterate
-
-
-class Guidance(Protocol):
-    """Plug-in of the outer loop, asked after every inner solve."""
-
-    def start(self, problem: Problem, X: Tensor) -> GuideRegion:
-        """The penalty that is no penalty yet, for every element."""
-        ...
-
-    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> Advice:
-        """Advice for the elements whose inner solve has just ended, with X, U."""
-        ...
-
-
-class OuterLoop(Protocol):
-    """What the loop asks of the solver that started it."""
-
-    @property
-    def inner(self) -> ILQR: ...
-    @property
-    def guidance(self) -> Guidance | None: ...
-    @property
-    def initial_penalty(self) -> float: ...
-    @property
-    def penalty_growth(self) -> float: ...
-    @property
-    def penalty_max(self) -> float: ...
-    @property
-    def grow_when_feasible(self) -> bool: ...
-    @property
-    def violation_tolerance(self) -> float: ...
-    @property
-    def hold_factor(self) -> float: ...
-    @property
-    def clip(self) -> bool: ...
-    @property
-    def record(self) -> bool: ...
-
-    def verdict(self, inner: InnerEnd) -> Tensor:
-        """A status (B',) for each element whose inner solve has ended; RUNNING starts the next one."""
-        ...
 
 
 class Loop:
@@ -233,12 +121,22 @@ class Loop:
         s.inner, s.iterations = s.inner + ~step.failed, s.iterations + ~step.failed
         if self.recorder is not None:
             self.recorder.add(self.problem, s, alpha, step.failed)
-        s.regularisation = torch.where(step.failed, s.regularisation, 0.0)
+        s.regularisation = torch.where(step.failed, s.regularisation, self._damping(refused))
+        stuck = refused & (s.regularisation == 0)
         converged = settled | (moving & ~refused & (change < inner.tolerance))
-        ended = ~step.failed & (converged | refused | (s.inner >= inner.max_iterations))
+        ended = ~step.failed & (converged | stuck | (s.inner >= inner.max_iterations))
         if bool(ended.any()):
-            self._end_inner(ended, converged, refused, status)
+            self._end_inner(ended, converged, stuck, status)
         return status
+
+    def _damping(self, refused: Tensor) -> Tensor:
+        """mu_r of the next pass (B,): zero as printed; with damping, up where the search failed and down elsewhere."""
+        now, first = self.state.regularisation, self.solver.inner.damping
+        if first == 0:
+            return torch.zeros_like(now)
+        up, down = (10.0 * now).clamp(min=first), now / 3.0
+        up = torch.where(up > self.solver.inner.regularisation_max, 0.0, up)
+        return torch.where(refused, up, torch.where(down < first, 0.0, down))
 
     def _raise_regularisation(self, step: BackwardPass, F: Tensor, H: Tensor, status: Tensor) -> None:
         """mu_r up for elements whose Cholesky failed (Algorithm 2, line 9): they try again in the next pass."""
@@ -319,13 +217,14 @@ class Loop:
             duals = self._go_on_from(rows, problem, advice, duals)
         s.duals = Multipliers(tuple(lam.clone() for lam in s.duals.lam), s.duals.mu.clone())
         put(s.duals, rows, duals)
+        s.regularisation[rows] = 0.0
         s.cost[rows], s.merit[rows] = Lagrangian(problem, duals, guide, solver.clip).value(s.X[rows], s.U[rows])
         s.inner[rows] = 0
 
     def _go_on_from(self, rows: Tensor, problem: Problem, advice: Advice, duals: Multipliers) -> Multipliers:
-        """Put the advised controls in place of the iterate where they are taken, with multipliers that hold them there.
+        """Put the advised controls in place of the iterate where they are taken, and return multipliers for it.
 
-        The old multipliers belong to the path that is left: they start again at zero. The penalty must keep the solver from
+        The old ones belong to the path that is left: they start again at zero. The penalty must keep the solver from
         falling back, so it is raised until the path that is left costs more than the one that is taken.
         """
         s, taken = self.state, advice.taken.nonzero().flatten()

@@ -12,8 +12,9 @@ from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 from torchgco.solution import Solution
-from torchgco.solvers.batch import Callback, InnerEnd, Loop
+from torchgco.solvers.batch import Loop
 from torchgco.solvers.line_search import LineSearch
+from torchgco.solvers.state import Callback, InnerEnd
 from torchgco.status import Status
 
 
@@ -30,6 +31,8 @@ class ILQR:
         line_search: how step lengths are chosen.
         regularisation_first, regularisation_growth, regularisation_max: mu_r after a failed Cholesky: its first
             value, its growth, and where the element gives up.
+        damping: mu_r after a failed line search, ten times more after the next, a third after a success; the inner
+            solve ends where even regularisation_max didn't help. 0: it ends with the first failure.
         penalty: weight of constraint violations when used alone.
 
     Raises:
@@ -42,6 +45,7 @@ class ILQR:
     regularisation_first: float = 1e-6
     regularisation_growth: float = 10.0
     regularisation_max: float = 1e10
+    damping: float = 0.0
     penalty: float = 0.0
 
     def __post_init__(self) -> None:
@@ -53,6 +57,8 @@ class ILQR:
             raise InputError("ilqr.regularisation_first", "positive, below its maximum", self.regularisation_first)
         if not self.regularisation_growth > 1:
             raise InputError("ilqr.regularisation_growth", "above 1", self.regularisation_growth)
+        if not self.damping >= 0:
+            raise InputError("ilqr.damping", "at least 0", self.damping)
         if not self.penalty >= 0:
             raise InputError("ilqr.penalty", "at least 0", self.penalty)
 

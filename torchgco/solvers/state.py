@@ -1,0 +1,124 @@
+"""What the batched loop carries, and what it asks of the solver that starts it and of the guidance that steers it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from torch import Tensor
+
+from torchgco.constraints.obstacles import GuideRegion
+from torchgco.draws import DrawKey
+from torchgco.lagrangian import Multipliers
+from torchgco.problem import Problem
+
+if TYPE_CHECKING:
+    from torchgco.solvers.ilqr import ILQR
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """A trajectory and its worth."""
+
+    X: Tensor
+    U: Tensor
+    duals: Multipliers
+    cost: Tensor
+    violation: Tensor
+
+
+@dataclass
+class State:
+    """Everything that an element carries from pass to pass; every tensor starts with the running batch."""
+
+    rows: Tensor  # place in the batch as it was given
+    X: Tensor
+    U: Tensor
+    cost: Tensor
+    merit: Tensor
+    duals: Multipliers
+    guide: GuideRegion | None
+    regularisation: Tensor  # mu_r
+    inner: Tensor  # iterations of this inner solve
+    outer: Tensor  # inner solves ended
+    iterations: Tensor
+    guided: Tensor
+    last_cost: Tensor  # J_var when the inner solve before ended
+    best: Iterate
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a callback is told after every pass."""
+
+    passes: int
+    finished: int
+    total: int
+    state: State
+
+
+Callback = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class InnerEnd:
+    """How the inner solve ended, for the elements that have just ended one; every tensor is (B',)."""
+
+    converged: Tensor
+    refused: Tensor  # no step length was acceptable
+    outer: Tensor  # inner solves ended, this one included
+    cost: Tensor
+    last_cost: Tensor  # when the inner solve before ended; infinite at first
+    violation: Tensor
+    best_violation: Tensor
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What guidance says of a solved batch: where to draw the next inner solve, or from where to start it."""
+
+    guide: GuideRegion  # penalty of the next inner solve
+    U: Tensor  # (B', N, m): controls to go on from
+    taken: Tensor  # (B',) bool: where U replaces the iterate
+
+
+class Guidance(Protocol):
+    """Plug-in of the outer loop, asked after every inner solve."""
+
+    def start(self, problem: Problem, X: Tensor) -> GuideRegion:
+        """The penalty that is no penalty yet, for every element."""
+        ...
+
+    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> Advice:
+        """Advice for the elements whose inner solve has just ended, with X, U."""
+        ...
+
+
+class OuterLoop(Protocol):
+    """What the loop asks of the solver that started it."""
+
+    @property
+    def inner(self) -> ILQR: ...
+    @property
+    def guidance(self) -> Guidance | None: ...
+    @property
+    def initial_penalty(self) -> float: ...
+    @property
+    def penalty_growth(self) -> float: ...
+    @property
+    def penalty_max(self) -> float: ...
+    @property
+    def grow_when_feasible(self) -> bool: ...
+    @property
+    def violation_tolerance(self) -> float: ...
+    @property
+    def hold_factor(self) -> float: ...
+    @property
+    def clip(self) -> bool: ...
+    @property
+    def record(self) -> bool: ...
+
+    def verdict(self, inner: InnerEnd) -> Tensor:
+        """A status (B',) for each element whose inner solve has ended; RUNNING starts the next one."""
+        ...
