@@ -12,6 +12,7 @@ from torchgco import GCO, MPPI, InputError
 from torchgco.constraints import GuideRegion
 from torchgco.draws import DrawKey, standard_normal
 from torchgco.guidance.detection import active_counts, caught_knots
+from torchgco.rollout import open_loop
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
 
@@ -81,6 +82,60 @@ def test_growth_only_where_caught() -> None:
     guide = GCO(sampler=MPPI(samples=5), grow_when_idle=False).update(problem, X, U, start, key(4)).guide
     caught = caught_knots(problem, X, U).any(-1)
     assert guide.weight.tolist() == [pytest.approx(96.8 if c else 20.0) for c in caught.tolist()]
+
+
+def test_a_plan_that_touches_nothing_is_handed_over() -> None:
+    """The path is caught, the plan stays where the vehicle stands: with `adopt` it is taken, and no region is left."""
+    problem, U = planar_batch(B=4, N=30, obstacles=14)
+    X = through_the_obstacles(problem)
+    caught = caught_knots(problem, X, U).any(-1)
+    start = GuideRegion.inactive(X, torch.full((4,), 20.0, dtype=torch.float64), problem.dynamics.position)
+    still = MPPI(samples=3, covariance=1e-12)
+    advice = GCO(sampler=still, adopt=True).update(problem, X, U, start, key(4))
+    assert torch.equal(advice.taken, caught) and not advice.guide.is_active.any()
+    torch.testing.assert_close(advice.U, U, rtol=0, atol=1e-4)
+    drawn = GCO(sampler=still).update(problem, X, U, start, key(4))
+    assert not drawn.taken.any() and torch.equal(drawn.guide.is_active, caught)
+
+
+def test_patience_counts_a_single_sphere() -> None:
+    problem, U = planar_batch(B=3, N=30, obstacles=1)
+    X = through_the_obstacles(problem)
+    X[..., 1] = problem.constraints[0].centers[:, :1, 1]
+    start = GuideRegion.inactive(X, torch.full((3,), 20.0, dtype=torch.float64), problem.dynamics.position)
+    gco = GCO(sampler=MPPI(samples=3), patience=2)
+    assert not gco.update(problem, X, U, start, key(3, outer=1)).guide.is_active.any()
+    present = ~problem.constraints[0].absent[:, 0]
+    assert torch.equal(gco.update(problem, X, U, start, key(3, outer=2)).guide.is_active, present)
+
+
+def test_smooth_noise_is_linear_between_its_knots_and_shrinks() -> None:
+    problem, U = planar_batch(B=2, N=21)
+    noise = MPPI(samples=4, knots=5)._draw(problem, key(2), torch.float64, 0)
+    z = standard_normal(key(2), (4, 5, 2), torch.float64)
+    torch.testing.assert_close(noise[:, :, ::5], z)
+    torch.testing.assert_close(noise[:, :, 2], 0.6 * z[:, :, 0] + 0.4 * z[:, :, 1])
+    wide, narrow = (MPPI(samples=64, rounds=6, decay=d, covariance=4.0, knots=5) for d in (1.0, 0.5))
+    spread = [float((s.improve(problem, U, key(2))[1] - U).abs().mean()) for s in (wide, narrow)]
+    assert spread[1] < spread[0]
+
+
+def test_elite_temperature_is_the_gap_to_the_better_samples() -> None:
+    S = torch.tensor([[3.0, 1.0, 2.0, 9.0]], dtype=torch.float64)
+    expected = torch.softmax(-torch.tensor([[2.0, 0.0, 1.0, 8.0]]) / 2.0, dim=1).double()
+    torch.testing.assert_close(MPPI(samples=4, elite=3)._weights(S), expected)
+    torch.testing.assert_close(MPPI(samples=4)._weights(S), torch.softmax(-S, dim=1))
+
+
+def test_lingering_charges_where_a_sample_ends() -> None:
+    problem, U = planar_batch(B=1, N=6)
+    V, none = U.unsqueeze(1) + torch.tensor([0.0, 4.0]).view(1, 2, 1, 1), torch.zeros(1, 2, 6, 2, dtype=torch.float64)
+    plain = MPPI(samples=2).sample_costs(problem, U, V, none)
+    longer = MPPI(samples=2, linger=2.0).sample_costs(problem, U, V, none)
+    for s in range(2):
+        X = open_loop(problem.dynamics, problem.x0, V[:, s])
+        last = problem.cost.stage(X[:, -1], V[:, s, -1], 5)
+        torch.testing.assert_close(longer[:, s] - plain[:, s], 12 * last, rtol=1e-9, atol=1e-9)
 
 
 def test_draws_are_standard_normal_and_independent() -> None:
