@@ -246,6 +246,7 @@ ELSEWHERE = {
     (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"),
     (AugmentedLagrangian, "hold_factor"), (AugmentedLagrangian, "cost_tolerance"),
     (AugmentedLagrangian, "grow_when_feasible"), (GCO, "grow_when_idle"), (GCO, "adopt"),
+    (AugmentedLagrangian, "attempts"),
 }  # fmt: skip
 PLACES = {
     AugmentedLagrangian: lambda s, c: replace(s, **c),
@@ -353,6 +354,36 @@ class Detour:
         return Advice(guide, self.plan.expand_as(U), key.outer == 1)
 
 
+class Choices(Detour):
+    """Hands over one plan at the first question and another whenever the caught path comes back."""
+
+    def __init__(self, plans: list[torch.Tensor]) -> None:
+        self.plans, self.asked_at = plans, []
+
+    def update(self, problem, X, U, guide, key):
+        caught = U[..., 0].mean(-1) < 5.0 if not self.asked_at else (U - self.asked_at[0]).abs().amax((1, 2)) < 1e-12
+        if bool(caught.any()):
+            self.asked_at.append(U.clone())
+        plan = self.plans[min(len(self.asked_at), len(self.plans)) - 1]
+        return Advice(guide, plan.expand_as(U), caught)
+
+
+def test_attempts_start_from_the_caught_path_and_the_best_is_kept() -> None:
+    problem, U0 = planar_batch(B=1, N=25, obstacles=3, seed=3)
+    good, bad = (torch.full_like(U0, level) for level in (3.0, -3.0))
+    solver = AugmentedLagrangian(
+        inner=ILQR(max_iterations=2), max_outer_iterations=3, clip=True, violation_tolerance=10.0, penalty_growth=1.0
+    )
+    costs = {}
+    for name, plans in {"bad": [bad], "good": [good], "bad, then good": [bad, good]}.items():
+        guidance = Choices(plans)
+        solution = replace(solver, guidance=guidance, attempts=len(plans)).solve(problem, U0)
+        assert len(guidance.asked_at) == len(plans)
+        assert int(solution.outer_iterations) == 3 + 3 * (len(plans) - 1)
+        costs[name] = float(solution.cost)
+    assert costs["bad, then good"] <= min(costs["bad"], costs["good"]) + 1e-9
+
+
 @pytest.mark.parametrize("hold_factor", [1.0, 100.0])
 def test_an_adopted_plan_is_held(hold_factor: float) -> None:
     """The path that is left costs hold_factor times what the new one costs more, and the multipliers start again."""
@@ -386,6 +417,7 @@ def test_an_adopted_plan_is_held(hold_factor: float) -> None:
         (lambda: ILQR(penalty=-1.0), "ilqr.penalty"),
         (lambda: ILQR(damping=-1.0), "ilqr.damping"),
         (lambda: AugmentedLagrangian(hold_factor=0.5), "solver.hold_factor"),
+        (lambda: AugmentedLagrangian(attempts=0), "solver.attempts"),
         (lambda: ILQR(regularisation_first=0.0), "ilqr.regularisation_first"),
         (lambda: ILQR(regularisation_growth=1.0), "ilqr.regularisation_growth"),
         (lambda: LineSearch(shrink=1.0), "line_search.shrink"),

@@ -33,6 +33,8 @@ class AugmentedLagrangian:
             changed by less than this share since the one before. None: never, as in the paper.
         hold_factor: where guidance puts another path in place of the iterate, the penalty is raised until the path that
             is left costs at least this times what the new one costs more (not in the paper).
+        attempts: where guidance puts another path in place of the iterate, so many are tried from the same caught path,
+            each to its end, and the best is kept; max_outer_iterations then counts for each (not in the paper).
         clip: inequalities push but never pull (`lagrangian.penalty_weights`); False as printed.
         record: keep the history of every element in `solution.trace`.
 
@@ -50,6 +52,7 @@ class AugmentedLagrangian:
     violation_tolerance: float = 1e-3
     cost_tolerance: float | None = None
     hold_factor: float = 10.0
+    attempts: int = 1
     clip: bool = False
     record: bool = False
 
@@ -64,6 +67,8 @@ class AugmentedLagrangian:
             raise InputError("solver.max_outer_iterations", "at least 1", self.max_outer_iterations)
         if not self.violation_tolerance > 0:
             raise InputError("solver.violation_tolerance", "above 0", self.violation_tolerance)
+        if self.attempts < 1:
+            raise InputError("solver.attempts", "at least 1", self.attempts)
         if not self.hold_factor >= 1:
             raise InputError("solver.hold_factor", "at least 1", self.hold_factor)
         if self.cost_tolerance is not None and not self.cost_tolerance > 0:

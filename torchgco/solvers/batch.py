@@ -74,14 +74,16 @@ class Loop:
         guide = None if guidance is None else guidance.start(problem, X)
         cost, merit = Lagrangian(problem, duals, guide, self.solver.clip).value(X, U)
         zero = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
-        worst = torch.full_like(cost, torch.inf)
+        worst, rows = torch.full_like(cost, torch.inf), torch.arange(problem.B, device=X.device)
         return State(
-            rows=torch.arange(problem.B, device=X.device),
+            rows=rows,
             X=X, U=U, cost=cost, merit=merit, duals=duals, guide=guide,
             regularisation=torch.zeros_like(cost),
             inner=zero, outer=zero.clone(), iterations=zero.clone(), guided=zero.clone(),
             last_cost=worst,
-            best=Iterate(X.clone(), U.clone(), take(duals, torch.arange(problem.B)), cost.clone(), worst.clone()),
+            best=Iterate(X.clone(), U.clone(), take(duals, rows), cost.clone(), worst.clone()),
+            origin=Iterate(X.clone(), U.clone(), take(duals, rows), cost.clone(), worst.clone()),
+            attempt=zero.clone(), since=zero.clone(),
         )  # fmt: skip
 
     def _empty_result(self, U0: Tensor) -> Solution:
@@ -185,14 +187,32 @@ class Loop:
         self._remember(rows, Iterate(X, U, updated, s.cost[rows], now))
         s.outer[rows] += 1
         inner_end = InnerEnd(
-            converged[rows], refused[rows], s.outer[rows], s.cost[rows], s.last_cost[rows], now,
+            converged[rows], refused[rows], s.outer[rows] - s.since[rows], s.cost[rows], s.last_cost[rows], now,
             s.best.violation[rows],
         )  # fmt: skip
         status[rows] = solver.verdict(inner_end)
         s.last_cost[rows] = s.cost[rows]
-        going = rows[status[rows] == Status.RUNNING]
+        self._try_again(rows, updated, status)
+        going = (status[rows] == Status.RUNNING).nonzero().flatten()
         if going.numel() > 0:
-            self._next_inner(going, take(updated, (status[rows] == Status.RUNNING).nonzero().flatten()))
+            self._next_inner(rows[going], take(updated, going))
+
+    def _try_again(self, rows: Tensor, duals: Multipliers, status: Tensor) -> None:
+        """Back to the caught path for elements that have ended an attempt and have another left (in place)."""
+        s = self.state
+        left = (s.attempt[rows] > 0) & (s.attempt[rows] < self.solver.attempts)
+        again = ((status[rows] != Status.RUNNING) & left).nonzero().flatten()
+        if again.numel() == 0:
+            return
+        place = rows[again]
+        origin = take(s.origin, place)
+        s.X, s.U = s.X.clone(), s.U.clone()
+        s.X[place], s.U[place] = origin.X, origin.U
+        put(duals, again, origin.duals)
+        s.attempt[place] += 1
+        s.since[place] = s.outer[place]
+        s.last_cost[place] = torch.inf
+        status[place] = Status.RUNNING
 
     def _remember(self, rows: Tensor, new: Iterate) -> None:
         """Keep the best iterate that ended an inner solve: feasible before infeasible, then by cost."""
@@ -232,6 +252,10 @@ class Loop:
             return duals
         part, place = problem.take(taken), rows[taken]
         old_X, old_U = s.X[place], s.U[place]
+        first = (s.attempt[place] == 0).nonzero().flatten()
+        left = Iterate(old_X, old_U, take(duals, taken), s.cost[place], s.best.violation[place])
+        put(s.origin, place[first], take(left, first))
+        s.attempt[place[first]] = 1
         U = advice.U[taken]
         X = open_loop(part.dynamics, part.x0, U)
         none = Multipliers(tuple(torch.zeros_like(lam[taken]) for lam in duals.lam), torch.ones_like(duals.mu[taken]))

@@ -90,6 +90,7 @@ class _OneInnerSolve:
     grow_when_feasible: bool = True
     violation_tolerance: float = math.inf
     hold_factor: float = 1.0
+    attempts: int = 1
     clip: bool = False
     record: bool = False
 

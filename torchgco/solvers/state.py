@@ -46,6 +46,9 @@ class State:
     guided: Tensor
     last_cost: Tensor  # J_var when the inner solve before ended
     best: Iterate
+    origin: Iterate  # the caught path that guidance first replaced
+    attempt: Tensor  # plans tried from there, 0 while none was
+    since: Tensor  # `outer` when the attempt began
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class InnerEnd:
 
     converged: Tensor
     refused: Tensor  # no step length was acceptable
-    outer: Tensor  # inner solves ended, this one included
+    outer: Tensor  # inner solves ended in this attempt, this one included
     cost: Tensor
     last_cost: Tensor  # when the inner solve before ended; infinite at first
     violation: Tensor
@@ -114,6 +117,8 @@ class OuterLoop(Protocol):
     def violation_tolerance(self) -> float: ...
     @property
     def hold_factor(self) -> float: ...
+    @property
+    def attempts(self) -> int: ...
     @property
     def clip(self) -> bool: ...
     @property
