@@ -25,10 +25,17 @@ class DrawKey:
     seed: int
     ids: Tensor  # (B,) int64
     outer: Tensor  # (B,) int64
+    began: Tensor | None = None  # (B,) int64: where the present attempt began; None: with the solve
+
+    @property
+    def age(self) -> Tensor:
+        """Outer iterations of the present attempt, (B,)."""
+        return self.outer if self.began is None else self.outer - self.began
 
     def take(self, index: Tensor) -> DrawKey:
         """The keys of the elements in `index`."""
-        return DrawKey(self.seed, self.ids[index], self.outer[index])
+        began = None if self.began is None else self.began[index]
+        return DrawKey(self.seed, self.ids[index], self.outer[index], began)
 
 
 def standard_normal(key: DrawKey, shape: tuple[int, ...], dtype: torch.dtype, stream: int = 0) -> Tensor:

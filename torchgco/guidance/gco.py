@@ -65,7 +65,7 @@ class GCO:
         knots = caught_knots(problem, X, U)
         if self.patience is not None:
             # One sphere met dead-centre has no gradient to the side: J stays empty, and only time tells.
-            knots = knots | (caught_knots(problem, X, U, least=1) & (key.outer >= self.patience).unsqueeze(-1))
+            knots = knots | (caught_knots(problem, X, U, least=1) & (key.age >= self.patience).unsqueeze(-1))
         caught = knots.any(-1)
         growing = torch.ones_like(caught) if self.grow_when_idle else caught
         weight = torch.where(growing, guide.weight * self.penalty_growth, guide.weight)

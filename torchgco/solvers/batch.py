@@ -229,7 +229,7 @@ class Loop:
         s, solver = self.state, self.solver
         problem, guide = self.problem.take(rows), None
         if solver.guidance is not None:
-            key = DrawKey(self.seed, self.ids[s.rows[rows]], s.outer[rows])
+            key = DrawKey(self.seed, self.ids[s.rows[rows]], s.outer[rows], s.since[rows])
             advice = solver.guidance.update(problem, s.X[rows], s.U[rows], take(s.guide, rows), key)
             guide = advice.guide
             put(s.guide, rows, guide)
