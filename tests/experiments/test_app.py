@@ -23,7 +23,13 @@ from torchgco.scenarios import Layouts
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
-TINY = ["study.layouts=3", "scenario.stages=12", "study.batch_size=2", "solver.max_outer_iterations=2"]
+TINY = [
+    "study.layouts=3",
+    "scenario.stages=12",
+    "study.batch_size=2",
+    "solver.max_outer_iterations=2",
+    "study.workers=1",
+]
 SCENARIOS = sorted(p.stem for p in (ROOT / "conf" / "scenario").glob("*.yaml"))
 SOLVERS = sorted(p.stem for p in (ROOT / "conf" / "solver").glob("*.yaml"))
 EXPERIMENTS = sorted(p.stem for p in (ROOT / "conf" / "experiment").glob("*.yaml"))
@@ -84,8 +90,17 @@ def test_a_study_writes_what_the_design_says(tmp_path) -> None:
 
 
 def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:
-    for size in (1, 3):
-        assert run(*TINY[:2], f"study.batch_size={size}", f"hydra.run.dir=b{size}", "study.baselines=[]")[0] == 0
+    for size in (1, 3):  # three batches by three processes, one batch by this one
+        assert (
+            run(
+                *TINY[:2],
+                f"study.batch_size={size}",
+                f"study.workers={4 - size}",
+                f"hydra.run.dir=b{size}",
+                "study.baselines=[]",
+            )[0]
+            == 0
+        )
     one, three = (pd.read_parquet(tmp_path / f"b{size}" / "trials.parquet") for size in (1, 3))
     measured = ["seconds", "batch_size"]
     pd.testing.assert_frame_equal(one.drop(columns=measured), three.drop(columns=measured), check_exact=True)
@@ -93,7 +108,14 @@ def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:
 
 
 def test_a_killed_study_goes_on(tmp_path) -> None:
-    words = ["study.layouts=6", "study.batch_size=2", "scenario.stages=40", "study.baselines=[]", "hydra.run.dir=out"]
+    words = [
+        "study.layouts=6",
+        "study.batch_size=2",
+        "scenario.stages=40",
+        "study.baselines=[]",
+        "hydra.run.dir=out",
+        "study.workers=1",
+    ]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
         [sys.executable, "-m", "torchgco", *words], cwd=tmp_path, env=env, stdout=subprocess.DEVNULL,
@@ -121,7 +143,7 @@ def test_a_killed_study_goes_on(tmp_path) -> None:
 def test_a_sweep_writes_separate_results(tmp_path) -> None:
     done = command(
         "-m", "solver=hold,ilqr", "scenario.num_obstacles=2,3", "study.layouts=2",
-        "scenario.stages=5", "study.baselines=[]", cwd=tmp_path,
+        "scenario.stages=5", "study.baselines=[]", "study.workers=1", cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     tables = [pd.read_parquet(p) for p in sorted((tmp_path / "outputs").rglob("trials.parquet"))]
@@ -133,7 +155,7 @@ def test_start_inside_an_obstacle_is_a_status(run, tmp_path) -> None:
     centers = np.array([[[0.0, 0.5]], [[-1.0, 0.0]]])
     np.savez(tmp_path / "two.npz", centers=centers, radii=np.full((2, 1), 0.1))
     words = ["scenario=layouts", "scenario.path=two.npz", "model=planar", "study.baselines=[hold]", "solver=al_ilqr"]
-    words += ["solver.max_outer_iterations=1", "solver.inner.max_iterations=3", "hydra.run.dir=out"]
+    words += ["study.workers=1", "solver.max_outer_iterations=1", "solver.inner.max_iterations=3", "hydra.run.dir=out"]
     code, _, _ = run(*words)
     assert code == 0
     trials = pd.read_parquet(tmp_path / "out" / "trials.parquet")
@@ -166,6 +188,7 @@ BAD = {
     "solver option": (["solver.inner.tolerance=-1"], "ilqr.tolerance"),
     "batch size": (["study.batch_size=0"], "study.batch_size"),
     "threads": (["device.threads=0"], "device.threads"),
+    "workers": (["study.workers=0"], "study.workers"),
     "dtype": (["device.dtype=float16"], "device.dtype"),
     "seed": (["seed=-1"], "seed"),
     "baselines": (["study.baselines=al_ilqr"], "study.baselines"),

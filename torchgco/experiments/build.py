@@ -155,10 +155,14 @@ def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
     return torch.device(node.name), getattr(torch, node.dtype)
 
 
+def allotted_cores() -> int:
+    """Cores that this process may use, by the scheduler's word or the system's."""
+    return int(os.environ.get("SLURM_CPUS_PER_TASK", 0)) or len(os.sched_getaffinity(0))
+
+
 def _threads(wanted: int | None) -> int:
-    allotted = int(os.environ.get("SLURM_CPUS_PER_TASK", 0)) or len(os.sched_getaffinity(0))
     if wanted is None:
-        return allotted
+        return allotted_cores()
     if isinstance(wanted, bool) or not isinstance(wanted, int) or wanted < 1:
         raise InputError("device.threads", "at least 1, or null for all that are allotted", repr(wanted))
     return wanted

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,10 +17,10 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 import torchgco
-from torchgco.experiments.build import Setup, build, solver_of
+from torchgco.experiments.build import Setup, allotted_cores, build, solver_of
 from torchgco.experiments.records import COLUMNS, Records
 from torchgco.experiments.report import write_report
-from torchgco.judge import frame_columns, judge
+from torchgco.judge import SUCCESS_COST, frame_columns, judge
 from torchgco.rollout import open_loop
 from torchgco.scenarios import Layouts
 from torchgco.shapes import InputError
@@ -85,6 +87,7 @@ def _fly_all(
     rows: list[pd.DataFrame] = []
     controls: list[np.ndarray] = []
     with tqdm(total=layouts.count * len(solvers), unit="trial", dynamic_ncols=True) as bar:
+        bar_knows = _fly_side_by_side(setup, layouts, solvers, records, bar)
         for name, solver in solvers.items():
             bar.set_description(name)
             flown = []
@@ -93,13 +96,54 @@ def _fly_all(
                 batch = layouts.take(range(start, min(start + size, layouts.count)))
                 if not shard.is_file():
                     records.write_shard(shard, *_Flight(setup, batch, name, solver, bar).fly())
-                else:
+                elif shard not in bar_knows:
                     bar.update(batch.count)
                 table, U = records.read_shard(shard)
                 rows.append(table)
                 flown.append(U)
             controls.append(np.concatenate(flown))
     return pd.concat(rows, ignore_index=True), np.stack(controls)
+
+
+def _fly_side_by_side(
+    setup: Setup, layouts: Layouts, solvers: Mapping[str, Any], records: Records, bar: tqdm
+) -> set[Path]:
+    """The batches that are missing, by as many processes as `study.workers` says; returns the shards written."""
+    size, missing = setup.config.study.batch_size, []
+    for name, solver in solvers.items():
+        for start in range(0, layouts.count, size):
+            batch = layouts.take(range(start, min(start + size, layouts.count)))
+            if not records.shard(name, start).is_file():
+                missing.append((records.shard(name, start), setup, batch, name, solver))
+    workers = min(_workers(setup), len(missing))
+    if workers < 2:
+        return set()  # one after the other, in this process, with a bar that moves inside a batch
+    bar.set_description(f"{workers} processes")
+    with multiprocessing.get_context("spawn").Pool(workers, _prepare_worker, (torch.get_num_threads(),)) as pool:
+        for shard, rows, U in pool.imap_unordered(_fly_batch, missing):
+            records.write_shard(shard, rows, U)
+            bar.update(len(rows))
+    return {shard for shard, *_ in missing}
+
+
+def _workers(setup: Setup) -> int:
+    wanted = setup.config.study.workers
+    if wanted is None:
+        # On a GPU the batches would fight for one device.
+        return 1 if setup.device.type == "cuda" else max(1, allotted_cores() // torch.get_num_threads())
+    if isinstance(wanted, bool) or not isinstance(wanted, int) or wanted < 1:
+        raise InputError("study.workers", "at least 1, or null for one a core", repr(wanted))
+    return wanted
+
+
+def _prepare_worker(threads: int) -> None:
+    torch.set_num_threads(threads)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
+
+
+def _fly_batch(job: tuple[Path, Setup, Layouts, str, Any]) -> tuple[Path, pd.DataFrame, np.ndarray]:
+    shard, setup, batch, name, solver = job
+    return shard, *_Flight(setup, batch, name, solver, tqdm(disable=True)).fly()
 
 
 @dataclass
@@ -157,8 +201,6 @@ def with_success(rows: pd.DataFrame, layouts: Layouts, solvers: int) -> pd.DataF
         best = rows["layout"].map(dict(zip(layouts.ids.tolist(), layouts.best_cost, strict=True)))
     known = best.notna() | (solvers > 1)
     best = best.fillna(best_sound) if solvers > 1 else best
-    from torchgco.judge import SUCCESS_COST
-
     success = (rows["sound"].astype(bool) & (rows["cost"] <= SUCCESS_COST * best)).astype("boolean")
     trials = rows.assign(best_cost=best.astype(float), success=success.where(known, pd.NA))
     return trials[list(COLUMNS)]
