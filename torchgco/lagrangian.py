@@ -116,6 +116,12 @@ def violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     return worst
 
 
+def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, limit: float) -> Tensor:
+    """Whether an iterate is worth more than an old one (B,): feasible before infeasible, then cost, then violation."""
+    fits, old_fits = worst <= limit, old_worst <= limit
+    return (fits & (~old_fits | (cost < old_cost))) | (~fits & ~old_fits & (worst < old_worst))
+
+
 def worst_rows(problem: Problem, X: Tensor, U: Tensor) -> list[dict[str, Any]]:
     """Which constraint, knot and row is violated most, one entry per problem (the first thing to look at)."""
     report: list[dict[str, Any]] = [{"violation": 0.0, "constraint": None} for _ in range(X.shape[0])]

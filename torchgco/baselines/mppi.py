@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgco.baselines.hold import rolled_out
 from torchgco.draws import DrawKey
 from torchgco.guidance.mppi import MPPI
-from torchgco.lagrangian import Multipliers, violation
+from torchgco.lagrangian import Multipliers, is_better, violation
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 from torchgco.solution import Solution
@@ -63,8 +63,7 @@ class IteratedMPPI:
         for i in range(self.iterations):
             X, U = self.sampler.improve(problem, U, DrawKey(seed, ids, torch.full_like(ids, i)))
             cost, worst = problem.cost.total(X, U), violation(problem, X, U)
-            fits, held = worst <= self.violation_tolerance, best_violation <= self.violation_tolerance
-            better = (fits & (~held | (cost < best_cost))) | (~fits & ~held & (worst < best_violation))
+            better = is_better(cost, worst, best_cost, best_violation, self.violation_tolerance)
             best = torch.where(better.view(-1, 1, 1), U, best)
             best_cost = torch.where(better, cost, best_cost)
             best_violation = torch.where(better, worst, best_violation)

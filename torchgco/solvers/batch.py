@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgco.draws import DrawKey
 from torchgco.expansion import linearise
-from torchgco.lagrangian import Lagrangian, Multipliers, update, violation
+from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.shapes import InputError, put, take
@@ -217,10 +217,7 @@ class Loop:
     def _remember(self, rows: Tensor, new: Iterate) -> None:
         """Keep the best iterate that ended an inner solve: feasible before infeasible, then by cost."""
         old, limit = take(self.state.best, rows), self.solver.violation_tolerance
-        new_fits, old_fits = new.violation <= limit, old.violation <= limit
-        better = (new_fits & (~old_fits | (new.cost < old.cost))) | (
-            ~new_fits & ~old_fits & (new.violation < old.violation)
-        )
+        better = is_better(new.cost, new.violation, old.cost, old.violation, limit)
         chosen = better.nonzero().flatten()
         put(self.state.best, rows[chosen], take(new, chosen))
 
