@@ -9,12 +9,12 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "torchgco"
 FLOORS = [
-    ["shapes", "status", "autodiff", "draws"],
+    ["shapes", "status", "autodiff", "draws", "kernels"],
     ["dynamics", "costs", "constraints"],
     ["problem"],
     ["rollout", "expansion", "judge"],
     ["lagrangian"],
-    ["solution"],
+    ["solution", "guidance.samples"],
     ["solvers", "guidance.mppi", "guidance.detection", "guidance.region"],
     ["guidance"],
     ["scenarios", "baselines", "api"],

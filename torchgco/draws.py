@@ -1,8 +1,9 @@
 """Normal draws that are a function of their key, not of their place in a batch.
 
-A draw is keyed by (seed, element id, outer iteration) and numbered by a counter within. The bits come from the
-SplitMix64 finaliser (Steele, Lea and Flood, OOPSLA 2014) of the counter, computed as int64 tensors, so that an element
-sees the same noise alone, in any batch and in any shard.
+A draw is keyed by (seed, element id, outer iteration, stream) and numbered by a counter within. The key is mixed by the
+SplitMix64 finaliser (Steele, Lea and Flood, OOPSLA 2014) into two 32-bit words; the counter is hashed with them by the
+finaliser of MurmurHash3 (Appleby), in int32 tensors, which processors multiply many at a time. So an element sees the
+same noise alone, in any batch and in any shard.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ from torch import Tensor
 _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64
 _MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
+_MURMUR_1 = -2048144789  # 0x85EBCA6B as int32
+_MURMUR_2 = -1028477387  # 0xC2B2AE35
+_WEYL = -1640531527  # 0x9E3779B9: neighbouring counters start far apart
 
 
 @dataclass(frozen=True)
@@ -38,26 +42,46 @@ class DrawKey:
         return DrawKey(self.seed, self.ids[index], self.outer[index], began)
 
 
-def standard_normal(key: DrawKey, shape: tuple[int, ...], dtype: torch.dtype, stream: int = 0) -> Tensor:
-    """Independent N(0, 1) draws (B, *shape), the same for an element whatever batch it is in.
+def standard_normal(
+    key: DrawKey, rows: int, samples: range, dtype: torch.dtype = torch.float32, stream: int = 0
+) -> Tensor:
+    """Independent N(0, 1) draws (rows, B, S) for the samples in a range, of single precision whatever the dtype.
 
-    `stream` separates draws of one key that serve different purposes.
+    They are the same for an element whatever batch it is in, and for a sample whatever range it is asked in. `stream`
+    separates draws of one key that serve different purposes. Row i and row i + ceil(rows / 2) are a Box-Muller pair.
     """
-    count = math.prod(shape)
-    half = (count + 1) // 2
-    base = _mix(_mix(_mix(torch.full_like(key.ids, key.seed)) + key.ids) + key.outer * 1_000_003 + stream)
-    counter = torch.arange(half, dtype=torch.int64, device=key.ids.device)
-    bits = _mix(base.unsqueeze(-1) + counter * _GOLDEN)
-    # One 64-bit word gives two 32-bit uniforms in (0, 1), and those two normals by Box and Muller.
-    scale = 2.0**-32
-    first = (((bits >> 32) & 0xFFFFFFFF).to(torch.float64) + 0.5) * scale
-    second = ((bits & 0xFFFFFFFF).to(torch.float64) + 0.5) * scale
-    radius, angle = torch.sqrt(-2.0 * torch.log(first)), (2.0 * math.pi) * second
-    normal = torch.cat((radius * torch.cos(angle), radius * torch.sin(angle)), dim=-1)
-    return normal[:, :count].to(dtype).reshape(-1, *shape)
+    half, width = (rows + 1) // 2, len(samples)
+    mixed = _mix64(_mix64(_mix64(torch.full_like(key.ids, key.seed)) + key.ids) + key.outer * 1_000_003 + stream)
+    high, low = ((mixed >> 32).to(torch.int32).view(1, -1, 1), mixed.to(torch.int32).view(1, -1, 1))
+    # Counted by sample first, so that a sample keeps its numbers however many are drawn beside it.
+    place = torch.arange(half, dtype=torch.int32, device=key.ids.device).view(half, 1, 1)
+    number = torch.arange(samples.start, samples.stop, dtype=torch.int32, device=key.ids.device)
+    counter = (number * half).view(1, 1, width) + place
+    word = _mix32_((counter * _WEYL) ^ low)
+    radius = _uniform(word).log_().mul_(-2.0).sqrt_()
+    angle = _uniform(_mix32_(word ^ high)).mul_(2.0 * math.pi)
+    normal = radius.new_empty(2 * half, key.ids.numel(), width)
+    torch.mul(radius, torch.cos(angle), out=normal[:half])
+    torch.mul(radius, torch.sin(angle), out=normal[half:])
+    return normal[:rows].to(dtype)
 
 
-def _mix(z: Tensor) -> Tensor:
+def _uniform(word: Tensor) -> Tensor:
+    """24 bits of each word as a float32 in (0, 1]."""
+    return ((word >> 8) & 0xFFFFFF).to(torch.float32).add_(0.5).mul_(2.0**-24)
+
+
+def _mix32_(z: Tensor) -> Tensor:
+    """MurmurHash3's 32-bit finaliser, in place; products wrap, and shifts are made logical by a mask."""
+    z ^= (z >> 16) & 0xFFFF
+    z *= _MURMUR_1
+    z ^= (z >> 13) & 0x7FFFF
+    z *= _MURMUR_2
+    z ^= (z >> 16) & 0xFFFF
+    return z
+
+
+def _mix64(z: Tensor) -> Tensor:
     """SplitMix64's finaliser; int64 products wrap, and shifts are made logical by a mask."""
     z = z + _GOLDEN
     z = (z ^ ((z >> 30) & ((1 << 34) - 1))) * _MIX_1

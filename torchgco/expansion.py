@@ -8,12 +8,15 @@ from torchgco.problem import Problem
 
 
 def linearise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """F (B, N, n+1, s) with [dx_{k+1}, 1] = F_k [dx_k, 1, du_k], around X (B, N+1, n), U (B, N, m)."""
+    """F (N, B, n+1, s) with [dx_{k+1}, 1] = F_k [dx_k, 1, du_k], around X (B, N+1, n), U (B, N, m).
+
+    Stage first, as the backward pass reads it.
+    """
     n, m = problem.n, problem.m
     fx, fu = problem.dynamics.jacobians(X[:, :-1], U)
-    F = X.new_zeros(*U.shape[:2], n + 1, n + 1 + m)
-    F[..., :n, :n] = fx
-    F[..., :n, n + 1 :] = fu
+    F = X.new_zeros(problem.N, problem.B, n + 1, n + 1 + m)
+    F[..., :n, :n] = fx.transpose(0, 1)
+    F[..., :n, n + 1 :] = fu.transpose(0, 1)
     F[..., n, n] = 1.0
     return F
 
@@ -21,6 +24,6 @@ def linearise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 def quadratise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """H (B, N+1, s, s): gradient and Hessian of J_var at every knot; the last block has no control part."""
     s = problem.n + 1 + problem.m
-    H = X.new_zeros(X.shape[0], X.shape[1], s, s)
+    H = X.new_zeros(X.shape[1], X.shape[0], s, s).transpose(0, 1)  # stage first in memory
     problem.cost.expand(X, U, H)
     return H

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.constraints.base import Constraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
-from torchgco.shapes import Dimensions, InputError
+from torchgco.shapes import Dimensions, InputError, cast
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,16 @@ class Problem:
             "x0": self.x0[index],
         }
         return self._with(parts)
+
+    def cast(self, dtype: torch.dtype) -> Self:
+        """The same problems in another precision."""
+        parts = {name: cast(getattr(self, name), dtype) for name in ("dynamics", "cost", "constraints", "x0")}
+        return self._with(parts)
+
+    @property
+    def is_autonomous(self) -> bool:
+        """Whether all stages are alike to a sampler: no reference, weight, obstacle or constraint changes with k."""
+        return self.cost.is_autonomous and all(c.is_autonomous(self.N) for c in self.geometric)
 
     def without_constraints(self) -> Self:
         """The same problems with the constraints dropped."""

@@ -63,6 +63,20 @@ def take(tree: Any, index: Tensor) -> Any:
     return tree
 
 
+def cast(tree: Any, dtype: torch.dtype) -> Any:
+    """Every floating tensor in nested tuples and dataclasses in another precision; all else passes unchanged."""
+    if isinstance(tree, Tensor):
+        return tree.to(dtype) if tree.is_floating_point() else tree
+    if isinstance(tree, tuple):
+        return tuple(cast(leaf, dtype) for leaf in tree)
+    if is_dataclass(tree) and not isinstance(tree, type):
+        copy = object.__new__(type(tree))  # parts are checked and bound already
+        for name, value in vars(tree).items():
+            object.__setattr__(copy, name, cast(value, dtype))
+        return copy
+    return tree
+
+
 def put(tree: Any, index: Tensor, rows: Any) -> None:
     """Write `rows` into rows `index` of every tensor of `tree`, in place; the two have the same structure."""
     if isinstance(tree, Tensor):
@@ -118,11 +132,22 @@ def check_shape(value: Tensor, shape: tuple[int | str, ...], field: str) -> None
         raise InputError(field, f"shape ({', '.join(map(str, shape))})", tuple(value.shape))
 
 
-def lead(parameter: Tensor | float, x: Tensor) -> Tensor | float:
-    """A model parameter shaped to multiply a component x[..., i] of states with leading batch axis.
+def lead(parameter: Tensor | float, component: Tensor) -> Tensor | float:
+    """A model parameter shaped to multiply a component (B, ...) of states with leading batch axis.
 
-    A number or a tensor without axes is returned as it is; one of shape (B,) gets the axes that x (B, ..., n) has.
+    A number or a tensor without axes is returned as it is; one of shape (B,) gets the axes that the component has.
     """
     if isinstance(parameter, Tensor) and parameter.dim() == 1:
-        return parameter.view(-1, *([1] * (x.dim() - 2)))
+        return parameter.view(-1, *([1] * (component.dim() - 1)))
     return parameter
+
+
+def sum_rows(z: Tensor) -> Tensor:
+    """Sum over the first axis, by halves: `sum(0)` would add in an order that depends on the length of the others."""
+    while z.shape[0] > 1:
+        half = z.shape[0] // 2
+        folded = z[:half] + z[half : 2 * half]
+        if z.shape[0] % 2:
+            folded[0] += z[-1]
+        z = folded
+    return z[0]

@@ -1,5 +1,7 @@
 """MPPI, detection and region against the NumPy reference; the draws by their promises."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -21,6 +23,12 @@ def key(B: int, seed: int = 0, outer: int = 1) -> DrawKey:
     return DrawKey(seed, torch.arange(B), torch.full((B,), outer))
 
 
+def white_noise(problem, key_: DrawKey, samples: int) -> np.ndarray:
+    """z (B, S, N, m) as the sampler draws it."""
+    z = standard_normal(key_, problem.N * problem.m, range(samples), torch.float64)
+    return z.unflatten(0, (problem.N, problem.m)).permute(2, 3, 0, 1).numpy()
+
+
 @pytest.mark.parametrize("saturation", ["bounds", "symmetric"])
 @pytest.mark.parametrize("batch", BATCHES)
 def test_improve_equals_algorithm_3(batch: str, saturation: str) -> None:
@@ -29,7 +37,7 @@ def test_improve_equals_algorithm_3(batch: str, saturation: str) -> None:
     sampler = MPPI(samples=30, covariance=torch.linspace(0.5, 9.0, problem.m).tolist(), temperature=5.0,
                    collision_penalty=50.0, saturation=saturation)  # fmt: skip
     X, mean = sampler.improve(problem, U, key(3))
-    z = standard_normal(key(3), (30, problem.N, problem.m), torch.float64).numpy()
+    z = white_noise(problem, key(3), 30)
     for b in range(3):
         twin = reference_of(problem, b)
         lower = twin.u_lower if saturation == "bounds" else -twin.u_upper
@@ -56,7 +64,7 @@ def test_detection_and_region_equal_algorithm_5(batch: str) -> None:
     gco = GCO(sampler=MPPI(samples=20))
     start = GuideRegion.inactive(X, torch.full((4,), 20.0, dtype=torch.float64), problem.dynamics.position)
     guide = gco.update(problem, X, U, start, key(4)).guide
-    z = standard_normal(key(4), (20, problem.N, problem.m), torch.float64).numpy()
+    z = white_noise(problem, key(4), 20)
     for b in range(4):
         twin = reference_of(problem, b)
         active = [len(row) for row in active_spheres(twin, X[b].numpy())]
@@ -111,10 +119,12 @@ def test_patience_counts_a_single_sphere() -> None:
 
 def test_smooth_noise_is_linear_between_its_knots_and_shrinks() -> None:
     problem, U = planar_batch(B=2, N=21)
-    noise = MPPI(samples=4, knots=5)._draw(problem, key(2), torch.float64, 0)
-    z = standard_normal(key(2), (4, 5, 2), torch.float64)
-    torch.testing.assert_close(noise[:, :, ::5], z)
-    torch.testing.assert_close(noise[:, :, 2], 0.6 * z[:, :, 0] + 0.4 * z[:, :, 1])
+    sampler = MPPI(samples=4, knots=5, saturation=None)
+    z = standard_normal(key(2), 10, range(4), torch.float64).unflatten(0, (5, 2))
+    mean, scale = torch.zeros(21, 2, 2, 1, dtype=torch.float64), torch.ones(2, 1, 1, dtype=torch.float64)
+    noise = sampler.controls(problem, mean, z, scale)
+    torch.testing.assert_close(noise[::5], z)
+    torch.testing.assert_close(noise[2], 0.6 * z[0] + 0.4 * z[1])
     wide, narrow = (MPPI(samples=64, rounds=6, decay=d, covariance=4.0, knots=5) for d in (1.0, 0.5))
     spread = [float((s.improve(problem, U, key(2))[1] - U).abs().mean()) for s in (wide, narrow)]
     assert spread[1] < spread[0]
@@ -129,46 +139,81 @@ def test_elite_temperature_is_the_gap_to_the_better_samples() -> None:
 
 def test_lingering_charges_where_a_sample_ends() -> None:
     problem, U = planar_batch(B=1, N=6)
-    V, none = U.unsqueeze(1) + torch.tensor([0.0, 4.0]).view(1, 2, 1, 1), torch.zeros(1, 2, 6, 2, dtype=torch.float64)
-    plain = MPPI(samples=2).sample_costs(problem, U, V, none)
-    longer = MPPI(samples=2, linger=2.0).sample_costs(problem, U, V, none)
+    mean = U.permute(1, 2, 0).unsqueeze(-1)
+    V, none = mean + torch.tensor([0.0, 4.0]), torch.zeros(6, 2, 1, 2, dtype=torch.float64)
+    plain = MPPI(samples=2).scores(problem, mean, V, none, torch.ones(2, 1, 1))
+    longer = MPPI(samples=2, linger=2.0).scores(problem, mean, V, none, torch.ones(2, 1, 1))
     for s in range(2):
-        X = open_loop(problem.dynamics, problem.x0, V[:, s])
-        last = problem.cost.stage(X[:, -1], V[:, s, -1], 5)
+        controls = V[..., s].permute(2, 0, 1)
+        X = open_loop(problem.dynamics, problem.x0, controls)
+        last = problem.cost.stage(X[:, -1], controls[:, -1], 5)
         torch.testing.assert_close(longer[:, s] - plain[:, s], 12 * last, rtol=1e-9, atol=1e-9)
 
 
+def test_single_precision_keeps_cost_apart_from_collisions() -> None:
+    """rho_mp = 1e8 beside costs of some thousands: added in float32, the costs would be lost."""
+    problem, U = quadrotor_batch(B=3, N=30)
+    sampler = MPPI(samples=64, knots=4, elite=5, rounds=3)
+    one, two = (replace(sampler, dtype=dtype).improve(problem, U, key(3)) for dtype in (None, "float32"))
+    torch.testing.assert_close(one[1], two[1], rtol=0, atol=2e-2)
+    assert two[1].dtype == torch.float64
+
+
+@pytest.mark.parametrize("knots", [0, 4])
+def test_many_samples_are_flown_in_blocks(knots: int, monkeypatch) -> None:
+    problem, U = planar_batch(B=3, N=12)
+    sampler = MPPI(samples=23, knots=knots, rounds=2, covariance=4.0)
+    whole = sampler.improve(problem, U, key(3))[1]
+    monkeypatch.setattr("torchgco.guidance.mppi.CHUNK", 10)
+    torch.testing.assert_close(sampler.improve(problem, U, key(3))[1], whole, rtol=1e-12, atol=1e-12)
+
+
 def test_draws_are_standard_normal_and_independent() -> None:
-    z = standard_normal(key(40), (25, 60, 2), torch.float64)
+    z = standard_normal(key(40), 120, range(25))
     assert stats.kstest(z.flatten().numpy(), "norm").pvalue > 1e-3
-    flat = z.flatten(1)
+    flat = z.movedim(1, 0).flatten(1)
     correlation = torch.corrcoef(flat) - torch.eye(40)
     assert float(correlation.abs().max()) < 5.0 / flat.shape[1] ** 0.5
-    lagged = float((flat[:, 1:] * flat[:, :-1]).mean())
-    assert abs(lagged) < 5.0 / flat.numel() ** 0.5
-    first, second = flat[:, : flat.shape[1] // 2], flat[:, flat.shape[1] // 2 :]
-    assert abs(float((first * second).mean())) < 5.0 / first.numel() ** 0.5  # the two halves of a Box-Muller pair
+    rows = torch.corrcoef(standard_normal(key(1), 60, range(500))[:, 0]) - torch.eye(60)  # Box-Muller pairs among them
+    assert float(rows.abs().max()) < 5.0 / 500**0.5
+    samples = torch.corrcoef(standard_normal(key(1), 500, range(60))[:, 0].T) - torch.eye(60)
+    assert float(samples.abs().max()) < 5.0 / 500**0.5
 
 
-def test_draws_are_keyed_by_element_not_by_place() -> None:
-    whole = standard_normal(DrawKey(7, torch.tensor([3, 9, 4]), torch.tensor([1, 2, 1])), (5, 4, 2), torch.float64)
-    alone = standard_normal(DrawKey(7, torch.tensor([9]), torch.tensor([2])), (5, 4, 2), torch.float64)
-    assert torch.equal(whole[1], alone[0])
+def test_draws_are_keyed_by_element_and_sample_not_by_place() -> None:
+    whole = standard_normal(DrawKey(7, torch.tensor([3, 9, 4]), torch.tensor([1, 2, 1])), 9, range(5))
+    mine = DrawKey(7, torch.tensor([9]), torch.tensor([2]))
+    alone = standard_normal(mine, 9, range(5))
+    assert torch.equal(whole[:, 1:2], alone)
+    assert torch.equal(standard_normal(mine, 9, range(2, 5)), alone[..., 2:])
     for other in (
         DrawKey(8, torch.tensor([9]), torch.tensor([2])),
         DrawKey(7, torch.tensor([8]), torch.tensor([2])),
         DrawKey(7, torch.tensor([9]), torch.tensor([3])),
     ):
-        assert not torch.equal(standard_normal(other, (5, 4, 2), torch.float64)[0], alone[0])
-    key_ = DrawKey(7, torch.tensor([9]), torch.tensor([2]))
-    assert not torch.equal(standard_normal(key_, (5, 4, 2), torch.float64, stream=1), alone)
+        assert not torch.equal(standard_normal(other, 9, range(5)), alone)
+    assert not torch.equal(standard_normal(mine, 9, range(5), stream=1), alone)
+
+
+@pytest.mark.parametrize("samples", [33, 100])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("batch", BATCHES)
+def test_samples_do_not_know_their_companions(batch: str, dtype: str, samples: int) -> None:
+    """Bit by bit: sums and products over the samples of all problems must not mix their order."""
+    problem, U = BATCHES[batch](B=7, N=12)
+    sampler = MPPI(samples=samples, knots=4, elite=3, rounds=2, dtype=dtype)
+    whole = sampler.improve(problem, U, key(7))[1]
+    for rows in ([2], [4, 1], [6, 5, 3]):
+        index = torch.tensor(rows)
+        assert torch.equal(sampler.improve(problem.take(index), U[index], key(7).take(index))[1], whole[index])
 
 
 def test_a_diverging_sample_is_not_chosen() -> None:
     problem, U = planar_batch(B=1, N=5)
-    V = U.unsqueeze(1).repeat(1, 3, 1, 1)
-    V[0, 1] = torch.inf
-    S = MPPI(samples=3).sample_costs(problem, U, V, torch.zeros_like(V))
+    mean = U.permute(1, 2, 0).unsqueeze(-1)
+    V = mean.repeat(1, 1, 1, 3)
+    V[..., 1] = torch.inf
+    S = MPPI(samples=3).scores(problem, mean, V, torch.zeros_like(V), torch.ones(2, 1, 1))
     assert torch.isfinite(S).all() and S[0, 1] > 1e300
 
 
@@ -184,6 +229,7 @@ def test_a_diverging_sample_is_not_chosen() -> None:
         (lambda: MPPI(linger=-1.0), "mppi.linger"),
         (lambda: MPPI(collision_penalty=-1.0), "mppi.collision_penalty"),
         (lambda: MPPI(saturation="clip"), "mppi.saturation"),
+        (lambda: MPPI(dtype="float16"), "mppi.dtype"),
         (lambda: MPPI(covariance=[1.0, 1.0, 1.0]).improve(*planar_batch(B=1, N=3), key(1)), "mppi.covariance"),
         (lambda: MPPI(covariance=0.0).improve(*planar_batch(B=1, N=3), key(1)), "mppi.covariance"),
         (lambda: GCO(initial_penalty=0.0), "gco.initial_penalty"),

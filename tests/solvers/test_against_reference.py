@@ -45,7 +45,8 @@ def _reference(problem, U0, b: int, tolerance: float, limit: int, guided: bool):
     def noise(outer: int) -> np.ndarray:
         # The reference counts guided updates from 0; the key holds how many inner solves have ended.
         key = DrawKey(0, torch.tensor([b]), torch.tensor([outer + 1]))
-        return standard_normal(key, (SAMPLES, problem.N, problem.m), torch.float64)[0].numpy()
+        z = standard_normal(key, problem.N * problem.m, range(SAMPLES), torch.float64)
+        return z.unflatten(0, (problem.N, problem.m))[:, :, 0].permute(2, 0, 1).numpy()
 
     settings = MppiSettings(sigma=np.ones(problem.m), lower=twin.u_lower, upper=twin.u_upper)
     vehicle = float(problem.constraints[0].vehicle_radius[b])

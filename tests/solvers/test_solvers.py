@@ -72,14 +72,14 @@ def test_backward_pass_satisfies_the_general_recursion() -> None:
     """With mu_r > 0, V of the homogeneous form is Vxx = Qxx + K'Qux + Qxu K + K'Quu K, and so on (Equations 43, 44)."""
     torch.manual_seed(0)
     n, m, N, B = 3, 2, 1, 2
-    F = torch.zeros(B, N, n + 1, n + 1 + m, dtype=torch.float64)
-    F[..., :n, :] = torch.randn(B, N, n, n + 1 + m, dtype=torch.float64)
+    F = torch.zeros(N, B, n + 1, n + 1 + m, dtype=torch.float64)
+    F[..., :n, :] = torch.randn(N, B, n, n + 1 + m, dtype=torch.float64)
     F[..., n, n] = 1.0
-    A = torch.randn(B, N + 1, n + 1 + m, n + 1 + m, dtype=torch.float64)
+    A = torch.randn(N + 1, B, n + 1 + m, n + 1 + m, dtype=torch.float64)
     H = A @ A.mT
     mu = torch.tensor([0.0, 0.7], dtype=torch.float64)
     step = backward(F, H, mu)
-    Q = H[:, 0] + F[:, 0].mT @ H[:, 1, : n + 1, : n + 1] @ F[:, 0]
+    Q = H[0] + F[0].mT @ H[1, :, : n + 1, : n + 1] @ F[0]
     u, z = slice(n + 1, None), slice(0, n + 1)
     regular = Q[:, u, u] + mu.view(-1, 1, 1) * torch.eye(m)
     G = -torch.linalg.solve(regular, Q[:, u, z])
@@ -237,7 +237,7 @@ CHANGES = {
     ),
     MPPI: dict(
         samples=7, covariance=4.0, temperature=100.0, collision_penalty=0.1, saturation=None, rounds=1, knots=3,
-        decay=0.3, elite=4, linger=10.0,
+        decay=0.3, elite=4, linger=10.0, dtype="float32",
     ),
 }  # fmt: skip
 # What shows only in other tests, here or in tests/guidance.

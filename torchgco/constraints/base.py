@@ -49,11 +49,19 @@ class Constraint(PerElement):
         """Rows (B, S, p) for samples x (B, S, n) of one knot; geometric constraints only."""
         raise NotImplementedError
 
+    def hits(self, x: Tensor, k: int) -> Tensor:
+        """How many rows each sample touches, c >= 0: counts (B, S) for x (n, B, S) of knot k."""
+        return (self.at(x.movedim(0, -1), k) >= 0).sum(-1)
+
     def holds_at(self, k: int) -> bool:
         """Whether the constraint speaks of knot k."""
         if isinstance(self.knots, slice):
             return self.knots.start <= k < self.knots.stop
         return bool((self.knots == k).any())
+
+    def is_autonomous(self, N: int) -> bool:
+        """Whether samples meet the same rows at all knots 1..N; a geometric constraint that says so is compiled."""
+        return False
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """Whether a problem that starts at x0 (B, n) makes sense, (B,) bool."""

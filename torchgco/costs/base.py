@@ -18,6 +18,8 @@ class Cost(PerElement):
     overrides `expand` too. A Hessian that isn't positive semidefinite is met by the solver's regularisation.
     """
 
+    is_autonomous: bool = False  # whether `stage` is the same for every k
+
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         """Cost (...) of stage k for x (..., n), u (..., m).
 
@@ -28,6 +30,14 @@ class Cost(PerElement):
     def terminal(self, x: Tensor) -> Tensor:
         """Cost (...) of the last knot for x (..., n)."""
         raise NotImplementedError(f"{type(self).__name__} defines no terminal cost")
+
+    def stage_rows(self, x: Tensor, u: Tensor, k: int) -> Tensor:
+        """The same, components first: (B, S) for samples x (n, B, S), u (m, B, S) of stage k."""
+        return self.stage(x.movedim(0, -1), u.movedim(0, -1), k)
+
+    def terminal_rows(self, x: Tensor) -> Tensor:
+        """The terminal cost, components first: (B, S) for samples x (n, B, S)."""
+        return self.terminal(x.movedim(0, -1))
 
     def bind(self, dims: Dimensions) -> Self:
         """The cost checked and shaped for one problem; called once, by Problem."""

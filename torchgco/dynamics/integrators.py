@@ -1,7 +1,8 @@
 """Integrators as combinators: a vector field in, a discrete step (and its derivatives) out.
 
-Each takes `field(x, u) -> x'` on (..., n), (..., m), a time step dt in seconds, and returns x at the next knot with u
-held. The `linearise_*` twins take `jacobians(x, u) -> (field_x, field_u)` as well and return (fx, fu) of the step.
+Each takes a state as a tuple of tensors (all components apart, or one tensor that holds them), `rates(x) -> x'` in the
+same form, a time step dt in seconds, and returns x at the next knot. The `linearise_*` twins take `field(x, u)` on
+(..., n), (..., m) and `jacobians(x, u) -> (field_x, field_u)`, and return (fx, fu) of the step.
 """
 
 from __future__ import annotations
@@ -11,24 +12,31 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+Parts = tuple[Tensor, ...]
+Rates = Callable[[Parts], Parts]
 Field = Callable[[Tensor, Tensor], Tensor]
 FieldJacobians = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
-def euler(field: Field, x: Tensor, u: Tensor, dt: float) -> Tensor:
-    return x + dt * field(x, u)
+def euler(rates: Rates, x: Parts, dt: float) -> Parts:
+    return _ahead(x, dt, rates(x))
 
 
-def midpoint(field: Field, x: Tensor, u: Tensor, dt: float) -> Tensor:
-    return x + dt * field(x + 0.5 * dt * field(x, u), u)
+def midpoint(rates: Rates, x: Parts, dt: float) -> Parts:
+    return _ahead(x, dt, rates(_ahead(x, 0.5 * dt, rates(x))))
 
 
-def rk4(field: Field, x: Tensor, u: Tensor, dt: float) -> Tensor:
-    k1 = field(x, u)
-    k2 = field(x + 0.5 * dt * k1, u)
-    k3 = field(x + 0.5 * dt * k2, u)
-    k4 = field(x + dt * k3, u)
-    return x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+def rk4(rates: Rates, x: Parts, dt: float) -> Parts:
+    k1 = rates(x)
+    k2 = rates(_ahead(x, 0.5 * dt, k1))
+    k3 = rates(_ahead(x, 0.5 * dt, k2))
+    k4 = rates(_ahead(x, dt, k3))
+    slopes = tuple(a + 2.0 * b + 2.0 * c + d for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
+    return _ahead(x, dt / 6.0, slopes)
+
+
+def _ahead(x: Parts, h: float, slope: Parts) -> Parts:
+    return tuple(torch.add(a, b, alpha=h) for a, b in zip(x, slope, strict=True))
 
 
 def linearise_euler(field: Field, jacobians: FieldJacobians, x: Tensor, u: Tensor, dt: float) -> tuple[Tensor, Tensor]:

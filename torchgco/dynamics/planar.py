@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -40,25 +41,22 @@ class Planar(Dynamics):
     def __post_init__(self) -> None:
         check_model(self, "planar")
 
-    def field(self, x: Tensor, u: Tensor) -> Tensor:
-        theta = x[..., 2].contiguous()  # strided and contiguous cosines may differ in the last bit
-        k1, k2, k3, k4 = self._coefficients(x)
-        push = k2 * (u[..., 0] + u[..., 1])
-        return torch.stack(
-            (
-                x[..., 3],
-                x[..., 4],
-                x[..., 5],
-                push * torch.cos(theta) - k1 * x[..., 3],
-                push * torch.sin(theta) - k1 * x[..., 4],
-                k4 * (u[..., 1] - u[..., 0]) - k3 * x[..., 5],
-            ),
-            dim=-1,
+    def rates(self, x: Sequence[Tensor], u: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        theta = x[2].contiguous()  # strided and contiguous cosines may differ in the last bit
+        k1, k2, k3, k4 = self._coefficients(theta)
+        push = k2 * (u[0] + u[1])
+        return (
+            x[3],
+            x[4],
+            x[5],
+            push * torch.cos(theta) - k1 * x[3],
+            push * torch.sin(theta) - k1 * x[4],
+            k4 * (u[1] - u[0]) - k3 * x[5],
         )
 
     def field_jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         theta = x[..., 2].contiguous()
-        k1, k2, k3, k4 = self._coefficients(x)
+        k1, k2, k3, k4 = self._coefficients(theta)
         cos, sin = torch.cos(theta), torch.sin(theta)
         push = k2 * (u[..., 0] + u[..., 1])
         ax = x.new_zeros(*x.shape[:-1], 6, 6)
@@ -74,5 +72,5 @@ class Planar(Dynamics):
         au[..., 5, 1] = k4
         return ax, au
 
-    def _coefficients(self, x: Tensor) -> tuple[Tensor | float, ...]:
-        return tuple(lead(k, x) for k in (self.drag, self.thrust_gain, self.turn_drag, self.turn_gain))
+    def _coefficients(self, component: Tensor) -> tuple[Tensor | float, ...]:
+        return tuple(lead(k, component) for k in (self.drag, self.thrust_gain, self.turn_drag, self.turn_gain))

@@ -6,6 +6,7 @@ Quaternions are scalar first; q' = 1/2 Qx(w) q, and R(q) e3 is the body's thrust
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -162,17 +163,16 @@ class QuadrotorPlanning(Dynamics):
     def __post_init__(self) -> None:
         check_model(self, "quadrotor")
 
-    def field(self, x: Tensor, u: Tensor) -> Tensor:
-        T_w, T_a = lead(self.rate_time_constant, x), lead(self.thrust_time_constant, x)
-        vx, vy, vz, q0, q1, q2, q3, w1, w2, w3, a = x[..., 3:].unbind(-1)
-        u1, u2, u3, a_c = u.unbind(-1)
+    def rates(self, x: Sequence[Tensor], u: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        vx, vy, vz, q0, q1, q2, q3, w1, w2, w3, a = x[3:]
+        T_w, T_a = lead(self.rate_time_constant, a), lead(self.thrust_time_constant, a)
         bx, by, bz = _thrust_axis(q0, q1, q2, q3)
         dq = _attitude_rate((q0, q1, q2, q3), (w1, w2, w3))
-        dw = ((u1 - w1) / T_w, (u2 - w2) / T_w, (u3 - w3) / T_w)
-        return torch.stack((vx, vy, vz, a * bx, a * by, a * bz - self.gravity, *dq, *dw, (a_c - a) / T_a), dim=-1)
+        dw = ((u[0] - w1) / T_w, (u[1] - w2) / T_w, (u[2] - w3) / T_w)
+        return (vx, vy, vz, a * bx, a * by, a * bz - self.gravity, *dq, *dw, (u[3] - a) / T_a)
 
     def field_jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        T_w, T_a = lead(self.rate_time_constant, x), lead(self.thrust_time_constant, x)
+        T_w, T_a = (lead(T, x[..., 0]) for T in (self.rate_time_constant, self.thrust_time_constant))
         ax = x.new_zeros(*x.shape[:-1], 14, 14)
         ax[..., 3:6, 13] = _fill_pose_jacobian(ax, x, x[..., 13])
         au = x.new_zeros(*x.shape[:-1], 14, 4)

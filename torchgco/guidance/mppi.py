@@ -10,9 +10,12 @@ from torch import Tensor
 
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.draws import DrawKey, standard_normal
+from torchgco.guidance.samples import fly
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
-from torchgco.shapes import InputError, check_shape, tensor
+from torchgco.shapes import InputError, check_shape, sum_rows, tensor
+
+CHUNK = 8192  # samples flown side by side: what a stage needs of them stays in a core's cache
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,7 @@ class MPPI:
         decay: factor of the noise's standard deviation from round to round.
         linger: horizons that a sample is charged for staying where it ends, at its last stage's cost. A plan that
             stops before an obstacle is cheap within the horizon; this makes it dear.
+        dtype: "float32" to sample in single precision, twice as fast; None: in the problem's own.
         elite: the temperature is raised to the gap between the best sample and the elite-th best; 0 leaves it.
 
     Raises:
@@ -55,6 +59,7 @@ class MPPI:
     decay: float = 1.0
     linger: float = 0.0
     elite: int = 0
+    dtype: Literal["float32", "float64"] | None = None
 
     def __post_init__(self) -> None:
         for name, least in (("samples", 1), ("rounds", 1), ("knots", 0), ("elite", 0)):
@@ -72,29 +77,64 @@ class MPPI:
             raise InputError("mppi.linger", "at least 0 horizons", self.linger)
         if not self.collision_penalty >= 0:
             raise InputError("mppi.collision_penalty", "at least 0", self.collision_penalty)
+        if self.dtype not in ("float32", "float64", None):
+            raise InputError("mppi.dtype", "float32, float64 or null", repr(self.dtype))
         if self.saturation not in ("bounds", "symmetric", None):
             raise InputError("mppi.saturation", "bounds, symmetric or null", repr(self.saturation))
 
     def improve(self, problem: Problem, U: Tensor, key: DrawKey, stream: int = 0) -> tuple[Tensor, Tensor]:
         """X (B, N+1, n) and U (B, N, m): the mean of the last round's samples, the first drawn around U."""
-        sigma = self._sigma(problem).sqrt()
-        for i in range(self.rounds):
-            noise = self.decay**i * sigma * self._draw(problem, key, U.dtype, stream * self.rounds + i)
-            V = self.saturate(problem, U.unsqueeze(1) + noise)
-            weights = self._weights(self.sample_costs(problem, U, V, noise))
-            U = torch.bmm(weights.unsqueeze(1), V.flatten(2)).view_as(U)
-        return open_loop(problem.dynamics, problem.x0, U), U
+        sigma = self._sigma(problem)
+        dtype = U.dtype if self.dtype is None else getattr(torch, self.dtype)
+        quick, plans = problem.cast(dtype), []
+        at_once = max(1, CHUNK // self.samples)
+        for rows in torch.arange(problem.B, device=U.device).split(at_once):
+            spread = sigma if sigma.shape[1] == 1 else sigma[:, rows]
+            part = quick if rows.numel() == problem.B else quick.take(rows)
+            plans.append(self._rounds(part, U[rows].to(dtype), spread.to(dtype), key.take(rows), stream))
+        plan = torch.cat(plans).to(U.dtype)
+        return open_loop(problem.dynamics, problem.x0, plan), plan
 
-    def _draw(self, problem: Problem, key: DrawKey, dtype: torch.dtype, stream: int) -> Tensor:
-        """Unit noise (B, S, N, m): white, or linear between the knots."""
-        if self.knots == 0:
-            return standard_normal(key, (self.samples, problem.N, problem.m), dtype, stream)
-        z = standard_normal(key, (self.samples, self.knots, problem.m), dtype, stream)
-        place = torch.linspace(0, self.knots - 1, problem.N, dtype=dtype, device=z.device)
-        left = place.floor().clamp(max=self.knots - 2)
-        share = (place - left).unsqueeze(-1)
-        left = left.long()
-        return z[:, :, left] * (1 - share) + z[:, :, left + 1] * share
+    def _rounds(self, problem: Problem, U: Tensor, sigma: Tensor, key: DrawKey, stream: int) -> Tensor:
+        """All rounds for one chunk of problems; U (B, N, m), sigma (m, B|1, 1)."""
+        mean = U.permute(1, 2, 0).unsqueeze(-1)  # (N, m, B, 1)
+        # A block that is not the only one is drawn again rather than kept: memory stays bounded whatever S.
+        blocks = [range(s, min(s + CHUNK, self.samples)) for s in range(0, self.samples, CHUNK)]
+        for i in range(self.rounds):
+            scale, number = self.decay**i * sigma.sqrt(), stream * self.rounds + i
+            V, scores = mean, []
+            for block in blocks:
+                z = self._draw(problem, key, U.dtype, number, block)
+                V = self.controls(problem, mean, z, scale)
+                scores.append(self.scores(problem, mean, V, z, scale))
+            weights = self._weights(torch.cat(scores, dim=-1)).to(U.dtype)
+            if len(blocks) == 1:
+                mean = (V * weights).sum(-1, keepdim=True)
+                continue
+            total = torch.zeros_like(mean)
+            for block in blocks:
+                V = self.controls(problem, mean, self._draw(problem, key, U.dtype, number, block), scale)
+                total += (V * weights[:, block.start : block.stop]).sum(-1, keepdim=True)
+            mean = total
+        return mean.squeeze(-1).permute(2, 0, 1)
+
+    def _draw(self, problem: Problem, key: DrawKey, dtype: torch.dtype, stream: int, samples: range) -> Tensor:
+        """Unit noise at the knots, or at every stage where it is white, (knots or N, m, B, S)."""
+        rows = self.knots or problem.N
+        return standard_normal(key, rows * problem.m, samples, dtype, stream).unflatten(0, (rows, problem.m))
+
+    def controls(self, problem: Problem, mean: Tensor, z: Tensor, scale: Tensor) -> Tensor:
+        """V (N, m, B, S): mean (N, m, B, 1) and noise `scale` (m, B|1, 1) times z, saturated (lines 6-7)."""
+        V = z.new_empty(problem.N, *z.shape[1:])
+        place = torch.linspace(0, max(self.knots - 1, 0), problem.N, dtype=z.dtype).tolist()
+        for k in range(problem.N):  # stage by stage, for what is at work to stay in the cache
+            if self.knots == 0:
+                noise = z[k]
+            else:
+                left = min(int(place[k]), self.knots - 2)
+                noise = torch.lerp(z[left], z[left + 1], place[k] - left)
+            torch.addcmul(mean[k], noise, scale, out=V[k])
+        return self.saturate(problem, V)
 
     def _weights(self, S: Tensor) -> Tensor:
         """w (B, S) from the samples' costs."""
@@ -104,41 +144,35 @@ class MPPI:
         spread = gap.kthvalue(self.elite, dim=1, keepdim=True).values
         return torch.softmax(-gap / spread.clamp(min=self.temperature), dim=1)
 
-    def sample_costs(self, problem: Problem, U: Tensor, V: Tensor, noise: Tensor) -> Tensor:
-        """S (B, S) of controls V (B, S, N, m) drawn around U with `noise` (lines 5-11)."""
-        likelihood = torch.zeros_like(V[:, :, 0, 0])
-        if self.knots == 0:
-            # u' Sigma^-1 eps as products and two sums, which keep an element's bits apart from the batch's.
-            likelihood = (U.unsqueeze(1) / self._sigma(problem) * noise).sum(-1).sum(-1)
-        x = problem.x0.unsqueeze(1).expand(-1, V.shape[1], -1).contiguous()
-        cost, collisions = torch.zeros_like(likelihood), torch.zeros_like(likelihood)
-        for k in range(problem.N):
-            u = V[:, :, k]
-            cost = cost + problem.cost.stage(x, u, k)
-            x = problem.dynamics.step(x, u)
-            for constraint in problem.geometric:
-                if constraint.holds_at(k + 1):
-                    collisions = collisions + (constraint.at(x, k + 1) >= 0).sum(-1)
-        cost = cost + problem.cost.terminal(x)
+    def scores(self, problem: Problem, mean: Tensor, V: Tensor, z: Tensor, scale: Tensor) -> Tensor:
+        """S (B, S) in float64 of controls V (N, m, B, S) around mean (N, m, B, 1) with noise scale z (lines 5-11)."""
+        cost, hits, x = fly(problem, V)
+        cost = cost + problem.cost.terminal_rows(x)
         if self.linger > 0:
-            cost = cost + self.linger * problem.N * problem.cost.stage(x, V[:, :, -1], problem.N - 1)
-        S = cost + self.temperature * likelihood + self.collision_penalty * collisions
+            cost = cost + self.linger * problem.N * problem.cost.stage_rows(x, V[-1], problem.N - 1)
+        if self.knots == 0:
+            likelihood = torch.zeros_like(cost)
+            for k in range(problem.N):
+                likelihood += sum_rows(mean[k] / scale * z[k])  # u' Sigma^-1 eps
+            cost = cost + self.temperature * likelihood
+        S = cost.double() + self.collision_penalty * hits.double()
         # A sample that left the finite numbers must not take the others with it.
         return torch.where(torch.isfinite(S), S, torch.finfo(S.dtype).max)
 
     def saturate(self, problem: Problem, V: Tensor) -> Tensor:
-        """Samples (B, S, N, m) clamped as `saturation` says (line 7)."""
+        """Samples (N, m, B, S) clamped in place as `saturation` says (line 7)."""
         if self.saturation is None:
             return V
         for constraint in problem.constraints:
             if isinstance(constraint, ControlBounds):
-                upper = constraint.upper[:, None, None, :]
-                lower = constraint.lower[:, None, None, :] if self.saturation == "bounds" else -upper
-                V = V.clamp(lower, upper)
+                upper = constraint.upper.mT.unsqueeze(-1)
+                lower = constraint.lower.mT.unsqueeze(-1) if self.saturation == "bounds" else -upper
+                for v in V:
+                    v.clamp_(lower, upper)
         return V
 
     def _sigma(self, problem: Problem) -> Tensor:
-        """Diagonal of Sigma, (m,), or (B, 1, 1, m) where it comes from bounds per problem."""
+        """Diagonal of Sigma, (m, B|1, 1)."""
         if self.covariance is None:
             return _from_bounds(problem)
         sigma = tensor(self.covariance, "mppi.covariance", problem.x0)
@@ -146,12 +180,12 @@ class MPPI:
         check_shape(sigma, (problem.m,), "mppi.covariance")
         if not bool((sigma > 0).all()):
             raise InputError("mppi.covariance", "variances above 0", sigma.tolist())
-        return sigma
+        return sigma.view(-1, 1, 1)
 
 
 def _from_bounds(problem: Problem) -> Tensor:
     for constraint in problem.constraints:
         if isinstance(constraint, ControlBounds):
             spread = 0.25 * (constraint.upper - constraint.lower)
-            return torch.where(spread < 1e10, spread.square(), 1.0)[:, None, None, :]
-    return problem.x0.new_ones(problem.m)
+            return torch.where(spread < 1e10, spread.square(), 1.0).mT.unsqueeze(-1)
+    return problem.x0.new_ones(problem.m, 1, 1)

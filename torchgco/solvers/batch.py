@@ -111,7 +111,7 @@ class Loop:
         """One iteration of every running element; returns the statuses it leaves them in."""
         s, inner = self.state, self.solver.inner
         lagrangian = Lagrangian(self.problem, s.duals, s.guide, self.solver.clip)
-        F, H = linearise(self.problem, s.X, s.U), lagrangian.expand(s.X, s.U)
+        F, H = linearise(self.problem, s.X, s.U), lagrangian.expand(s.X, s.U).transpose(0, 1)
         step = backward(F, H, s.regularisation)
         status = torch.full_like(s.rows, Status.RUNNING)
         settled = step.expected_change(torch.ones_like(s.merit)).abs() <= 1e-14 * s.merit.abs().clamp(min=1.0)
@@ -145,7 +145,7 @@ class Loop:
         s, inner = self.state, self.solver.inner
         higher = (s.regularisation * inner.regularisation_growth).clamp(min=inner.regularisation_first)
         s.regularisation = torch.where(step.failed, higher, s.regularisation)
-        finite = torch.isfinite(F).flatten(1).all(-1) & torch.isfinite(H).flatten(1).all(-1)
+        finite = torch.isfinite(F).all(-1).all(-1).all(0) & torch.isfinite(H).all(-1).all(-1).all(0)
         status[step.failed & (s.regularisation > inner.regularisation_max)] = Status.NOT_POSITIVE_DEFINITE
         status[step.failed & ~finite] = Status.NON_FINITE
 
@@ -291,7 +291,8 @@ class Loop:
         """Feedback gains along what is returned, from one more backward pass with its multipliers."""
         r = self.result
         lagrangian = Lagrangian(self.whole, r.multipliers, None, self.solver.clip)
-        step = backward(linearise(self.whole, r.X, r.U), lagrangian.expand(r.X, r.U), torch.zeros_like(r.cost))
+        H = lagrangian.expand(r.X, r.U).transpose(0, 1)
+        step = backward(linearise(self.whole, r.X, r.U), H, torch.zeros_like(r.cost))
         G = step.gains.movedim(0, 1)
         G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, G)
         trace = None if self.recorder is None else self.recorder.frame()

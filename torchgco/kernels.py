@@ -1,0 +1,49 @@
+"""Kernels that may be compiled: eager by default, through torch.compile where the caller has asked for it.
+
+Compiling is a choice of the process, as the number of threads is: `device.compile=true`, or `compile_kernels(True)`.
+A compiled kernel fuses many small operations; its results may differ from the eager ones in the last bits.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class _Switch:
+    """Whether kernels are compiled in this process."""
+
+    on = False
+
+
+def compile_kernels(on: bool) -> None:
+    """Compile all kernels on their next call, or go back to eager ones."""
+    _Switch.on = on
+
+
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """A function that is compiled once its process compiles kernels; eager where no compiler is found."""
+    compiled: Any = None
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        nonlocal compiled
+        if not _Switch.on or torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        if compiled is None:
+            compiled = torch.compile(function, dynamic=True)
+        try:
+            return compiled(*args, **kwargs)
+        except torch._dynamo.exc.BackendCompilerFailed as error:  # no C++ compiler, or none that works
+            _Switch.on = False
+            warnings.warn(f"kernels run eagerly, as compiling failed: {str(error).splitlines()[0]}", stacklevel=2)
+            return function(*args, **kwargs)
+
+    return call
