@@ -38,6 +38,7 @@ from torchgco.solution import Solution as Solution
 from torchgco.solvers import ILQR as ILQR
 from torchgco.solvers import AugmentedLagrangian as AugmentedLagrangian
 from torchgco.solvers import LineSearch as LineSearch
+from torchgco.solvers import plan_batch as plan_batch
 from torchgco.status import Status as Status
 
 if TYPE_CHECKING:

@@ -77,6 +77,17 @@ def cast(tree: Any, dtype: torch.dtype) -> Any:
     return tree
 
 
+def copied(tree: Any) -> Any:
+    """The same with every tensor cloned."""
+    if isinstance(tree, Tensor):
+        return tree.clone()
+    if isinstance(tree, tuple):
+        return tuple(copied(leaf) for leaf in tree)
+    if is_dataclass(tree) and not isinstance(tree, type):
+        return replace(tree, **{f.name: copied(getattr(tree, f.name)) for f in fields(tree)})
+    return tree
+
+
 def put(tree: Any, index: Tensor, rows: Any) -> None:
     """Write `rows` into rows `index` of every tensor of `tree`, in place; the two have the same structure."""
     if isinstance(tree, Tensor):
@@ -84,7 +95,7 @@ def put(tree: Any, index: Tensor, rows: Any) -> None:
     elif isinstance(tree, tuple):
         for leaf, new in zip(tree, rows, strict=True):
             put(leaf, index, new)
-    elif is_dataclass(tree):
+    elif is_dataclass(tree) and not isinstance(tree, type):
         for f in fields(tree):
             put(getattr(tree, f.name), index, getattr(rows, f.name))
 

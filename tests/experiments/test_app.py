@@ -13,12 +13,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 import torchgco
 from torchgco.experiments import app
 from torchgco.experiments.build import compose, config_dir
 from torchgco.experiments.records import COLUMNS
 from torchgco.scenarios import Layouts
+from torchgco.solvers.batch import Loop
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "benchmarks" / "data"
@@ -90,11 +92,12 @@ def test_a_study_writes_what_the_design_says(tmp_path) -> None:
 
 
 def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:
-    for size in (1, 3):  # three batches by three processes, one batch by this one
+    for size in (1, 3):  # three shards by three processes, one shard in three slots by this one
         assert (
             run(
                 *TINY[:2],
                 f"study.batch_size={size}",
+                f"study.shard_size={size}",
                 f"study.workers={4 - size}",
                 f"hydra.run.dir=b{size}",
                 "study.baselines=[]",
@@ -107,10 +110,22 @@ def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:
     assert one.success.isna().all()  # nobody to compare with
 
 
+def test_out_of_memory_halves_the_batch(run, tmp_path, monkeypatch) -> None:
+    def begin(self, rows, real=Loop._begin):
+        if rows.numel() > 1:
+            raise torch.OutOfMemoryError("no more")
+        return real(self, rows)
+
+    monkeypatch.setattr(Loop, "_begin", begin)
+    code, _, err = run(*TINY, "hydra.run.dir=out", "study.baselines=[]")
+    assert code == 0 and "on with 1 problems at once" in err
+    assert (pd.read_parquet(tmp_path / "out" / "trials.parquet").batch_size == 1).all()
+
+
 def test_a_killed_study_goes_on(tmp_path) -> None:
     words = [
         "study.layouts=6",
-        "study.batch_size=2",
+        "study.shard_size=2",
         "scenario.stages=40",
         "study.baselines=[]",
         "hydra.run.dir=out",
@@ -187,6 +202,7 @@ BAD = {
     "crossed bounds": (["model.vehicle.control_lower=[9,9,9,9]"], "control_bounds.lower"),
     "solver option": (["solver.inner.tolerance=-1"], "ilqr.tolerance"),
     "batch size": (["study.batch_size=0"], "study.batch_size"),
+    "shard size": (["study.shard_size=0"], "study.shard_size"),
     "threads": (["device.threads=0"], "device.threads"),
     "workers": (["study.workers=0"], "study.workers"),
     "dtype": (["device.dtype=float16"], "device.dtype"),

@@ -1,5 +1,7 @@
 """An element's result is the same bits alone, in any batch, in any order; a broken element disturbs nobody."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -50,6 +52,21 @@ BATCHES = {
     "quadrotor": lambda: quadrotor_batch(B=7, N=25, obstacles=7, seed=2),
 }
 FIELDS = ("X", "U", "K", "d", "cost", "violation", "status", "iterations", "outer_iterations", "guided")
+
+
+@pytest.mark.parametrize("solver", ["gco", "gco with plans"])
+@pytest.mark.parametrize("batch", BATCHES)
+def test_freed_slots_are_taken_by_those_that_wait(batch: str, solver: str) -> None:
+    problem, U0 = BATCHES[batch]()
+    problem.x0[4, 0] = torch.nan  # one that waits and can't begin
+    seen = []
+    few = replace(SOLVERS[solver], slots=2).solve(problem, U0, seed=3, callback=lambda p: seen.append(p))
+    assert max(p.state.rows.numel() for p in seen) == 2 and seen[-1].finished == 7
+    assert_same_bits(few.take(KEPT), SOLVERS[solver].solve(problem, U0, seed=3).take(KEPT))
+    assert few.statuses[4] == Status.NON_FINITE
+
+
+KEPT = torch.tensor([0, 1, 2, 3, 5, 6])
 
 
 def assert_same_bits(a: Solution, b: Solution) -> None:

@@ -246,7 +246,7 @@ ELSEWHERE = {
     (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"),
     (AugmentedLagrangian, "hold_factor"), (AugmentedLagrangian, "cost_tolerance"),
     (AugmentedLagrangian, "grow_when_feasible"), (GCO, "grow_when_idle"), (GCO, "adopt"),
-    (AugmentedLagrangian, "attempts"),
+    (AugmentedLagrangian, "attempts"), (AugmentedLagrangian, "slots"),
 }  # fmt: skip
 PLACES = {
     AugmentedLagrangian: lambda s, c: replace(s, **c),

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import pandas as pd
 import torch
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 from tqdm import tqdm
 
 import torchgco
@@ -21,9 +23,12 @@ from torchgco.experiments.build import Setup, allotted_cores, build, solver_of
 from torchgco.experiments.records import COLUMNS, Records
 from torchgco.experiments.report import write_report
 from torchgco.judge import SUCCESS_COST, frame_columns, judge
+from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.scenarios import Layouts
 from torchgco.shapes import InputError
+from torchgco.solution import Solution
+from torchgco.solvers.memory import is_out_of_memory, plan_batch
 from torchgco.solvers.state import Progress
 from torchgco.status import Status
 
@@ -80,10 +85,8 @@ def _solvers(setup: Setup, recompose: Recompose) -> dict[str, Any]:
 def _fly_all(
     setup: Setup, layouts: Layouts, solvers: Mapping[str, Any], records: Records
 ) -> tuple[pd.DataFrame, np.ndarray]:
-    """Rows and controls of every solver on every layout, batch by batch, from the shards where they exist."""
-    size = setup.config.study.batch_size
-    if isinstance(size, bool) or not isinstance(size, int) or size < 1:
-        raise InputError("study.batch_size", "at least 1", repr(size))
+    """Rows and controls of every solver on every layout, shard by shard, from the files where they exist."""
+    size = _shard_size(setup)
     rows: list[pd.DataFrame] = []
     controls: list[np.ndarray] = []
     with tqdm(total=layouts.count * len(solvers), unit="trial", dynamic_ncols=True) as bar:
@@ -108,8 +111,8 @@ def _fly_all(
 def _fly_side_by_side(
     setup: Setup, layouts: Layouts, solvers: Mapping[str, Any], records: Records, bar: tqdm
 ) -> set[Path]:
-    """The batches that are missing, by as many processes as `study.workers` says; returns the shards written."""
-    size, missing = setup.config.study.batch_size, []
+    """The shards that are missing, by as many processes as `study.workers` says; returns those written."""
+    size, missing = _shard_size(setup), []
     for name, solver in solvers.items():
         for start in range(0, layouts.count, size):
             batch = layouts.take(range(start, min(start + size, layouts.count)))
@@ -124,6 +127,23 @@ def _fly_side_by_side(
             records.write_shard(shard, rows, U)
             bar.update(len(rows))
     return {shard for shard, *_ in missing}
+
+
+def _shard_size(setup: Setup) -> int:
+    size = setup.config.study.shard_size
+    if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+        raise InputError("study.shard_size", "at least 1", repr(size))
+    return size
+
+
+def _slots(setup: Setup, problem: Problem) -> int:
+    """How many problems of a shard are worked on at once."""
+    wanted = setup.config.study.batch_size
+    if wanted == "auto":
+        return min(problem.B, plan_batch(problem, setup.device, _workers(setup)))
+    if isinstance(wanted, bool) or not isinstance(wanted, int) or wanted < 1:
+        raise InputError("study.batch_size", "at least 1, or auto", repr(wanted))
+    return min(problem.B, wanted)
 
 
 def _workers(setup: Setup) -> int:
@@ -148,7 +168,7 @@ def _fly_batch(job: tuple[Path, Setup, Layouts, str, Any]) -> tuple[Path, pd.Dat
 
 @dataclass
 class _Flight:
-    """One batch of layouts flown by one solver."""
+    """One shard of layouts flown by one solver."""
 
     setup: Setup
     layouts: Layouts
@@ -162,9 +182,7 @@ class _Flight:
         setup, layouts = self.setup, self.layouts
         task = setup.vehicle.task(layouts, setup.device, setup.dtype)
         ids = torch.as_tensor(layouts.ids, device=setup.device)
-        began = _now(setup.device)
-        solution = self.solver.solve(task.problem, task.U0, seed=setup.seed, ids=ids, callback=self._progress)
-        seconds = (_now(setup.device) - began) / layouts.count
+        solution, seconds, slots = self._solve(task.problem, task.U0, ids)
         self.bar.update(layouts.count - self.shown)
         statuses = [status.name for status in solution.statuses]
         U = solution.U.detach().to("cpu", torch.float64)
@@ -177,17 +195,33 @@ class _Flight:
                 "solver": self.name, "status": statuses, **frame_columns(verdict), "sound": verdict.sound.numpy(),
                 "iterations": solution.iterations.cpu().numpy(),
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),
-                "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": layouts.count,
+                "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": slots,
                 "threads": torch.get_num_threads(), "device": setup.device.type,
                 "dtype": str(setup.dtype).removeprefix("torch."), "version": torchgco.__version__,
             }
         )  # fmt: skip
         return rows, U.numpy()
 
+    def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, int]:
+        """The solution, seconds a problem, and slots; half as many slots wherever memory runs out."""
+        slots = _slots(self.setup, problem)
+        while True:
+            solver = replace(self.solver, slots=slots) if hasattr(self.solver, "slots") else self.solver
+            began = _now(self.setup.device)
+            try:
+                solution = solver.solve(problem, U0, seed=self.setup.seed, ids=ids, callback=self._progress)
+            except (RuntimeError, MemoryError) as error:
+                if slots == 1 or not hasattr(solver, "slots") or not is_out_of_memory(error):
+                    raise
+                slots //= 2
+                self.bar.write(f"{self.name}: out of memory, on with {slots} problems at once", sys.stderr)
+                continue
+            return solution, (_now(self.setup.device) - began) / problem.B, slots
+
     def _progress(self, progress: Progress) -> None:
-        self.bar.update(progress.finished - self.shown)
+        self.bar.update(max(0, progress.finished - self.shown))
         self.bar.set_postfix({"pass": progress.passes}, refresh=False)
-        self.shown = progress.finished
+        self.shown = max(self.shown, progress.finished)
 
 
 def with_success(rows: pd.DataFrame, layouts: Layouts, solvers: int) -> pd.DataFrame:

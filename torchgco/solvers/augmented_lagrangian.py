@@ -36,6 +36,7 @@ class AugmentedLagrangian:
         attempts: where guidance puts another path in place of the iterate, so many are tried from the same caught path,
             each to its end, and the best is kept; max_outer_iterations then counts for each (not in the paper).
         clip: inequalities push but never pull (`lagrangian.penalty_weights`); False as printed.
+        slots: problems worked on at once; the others wait until a slot falls free. None: all. No result depends on it.
         record: keep the history of every element in `solution.trace`.
 
     Raises:
@@ -54,6 +55,7 @@ class AugmentedLagrangian:
     hold_factor: float = 10.0
     attempts: int = 1
     clip: bool = False
+    slots: int | None = None
     record: bool = False
 
     def __post_init__(self) -> None:
@@ -69,6 +71,8 @@ class AugmentedLagrangian:
             raise InputError("solver.violation_tolerance", "above 0", self.violation_tolerance)
         if self.attempts < 1:
             raise InputError("solver.attempts", "at least 1", self.attempts)
+        if self.slots is not None and self.slots < 1:
+            raise InputError("solver.slots", "at least 1, or null", self.slots)
         if not self.hold_factor >= 1:
             raise InputError("solver.hold_factor", "at least 1", self.hold_factor)
         if self.cost_tolerance is not None and not self.cost_tolerance > 0:

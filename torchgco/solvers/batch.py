@@ -2,8 +2,8 @@
 
 In nested loops a batch would wait for its slowest member at three levels. Here each element carries its own phase:
 inner and outer iteration, regularisation, penalty, guidance. Those whose inner solve has ended get their multiplier
-update in the same pass, and those that end leave the batch. Per element the iterates are those of the paper's nested
-loops, whatever its companions.
+update in the same pass, and those that end give their slot to one that waits, or leave the batch. Per element the
+iterates are those of the paper's nested loops, whatever its companions.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
-from torchgco.shapes import InputError, put, take
+from torchgco.shapes import InputError, copied, put, take
 from torchgco.solution import Solution
+from torchgco.solvers.attempts import go_on_from, try_again
 from torchgco.solvers.riccati import BackwardPass, backward
-from torchgco.solvers.state import Advice, Callback, InnerEnd, Iterate, OuterLoop, Progress, State
+from torchgco.solvers.state import Callback, InnerEnd, Iterate, OuterLoop, Progress, State
 from torchgco.solvers.trace import Recorder
 from torchgco.status import Status
 
@@ -47,61 +48,56 @@ class Loop:
         if warm is not None:
             warm.check(problem)
         self.solver, self.seed, self.callback = solver, seed, callback
-        self.whole = self.problem = problem
-        self.state = self._start(U0, warm)
-        self.result = self._empty_result(U0)
+        self.whole, self.U0, self.warm = problem, U0, warm
+        self.result = _empty_result(problem, U0)
         self.recorder = Recorder() if solver.record else None
+        everyone = torch.arange(problem.B, device=U0.device)
+        slots = problem.B if solver.slots is None else min(solver.slots, problem.B)
+        self.waiting = everyone[slots:]
+        self.state = self._begin(everyone[:slots])
+        self.problem = problem if slots == problem.B else problem.take(everyone[:slots])
 
     def run(self) -> Solution:
         """Pass after pass until every element has ended."""
-        self._end(self._bad_starts())
+        self._end(self._bad_starts(self.state))
         passes = 0
         while self.state.rows.numel() > 0:
             self._end(self._pass())
             passes += 1
             if self.callback is not None:
                 total = self.whole.B
-                self.callback(Progress(passes, total - self.state.rows.numel(), total, self.state))
+                left = self.state.rows.numel() + self.waiting.numel()
+                self.callback(Progress(passes, total - left, total, self.state))
         return self._with_gains()
 
     # Start -------------------------------------------------------------------------------------------------------
 
-    def _start(self, U0: Tensor, warm: Multipliers | None) -> State:
-        problem = self.problem
-        X, U = open_loop(problem.dynamics, problem.x0, U0), U0.clone()
-        duals = Multipliers.zero(problem, self.solver.initial_penalty) if warm is None else warm
-        guidance = self.solver.guidance
-        guide = None if guidance is None else guidance.start(problem, X)
-        cost, merit = Lagrangian(problem, duals, guide, self.solver.clip).value(X, U)
-        zero = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
-        worst, rows = torch.full_like(cost, torch.inf), torch.arange(problem.B, device=X.device)
+    def _begin(self, rows: Tensor) -> State:
+        """The state in which the elements `rows` begin."""
+        problem, solver = self.whole.take(rows), self.solver
+        U = self.U0[rows]
+        X = open_loop(problem.dynamics, problem.x0, U)
+        duals = Multipliers.zero(problem, solver.initial_penalty) if self.warm is None else take(self.warm, rows)
+        guide = None if solver.guidance is None else solver.guidance.start(problem, X)
+        cost, merit = Lagrangian(problem, duals, guide, solver.clip).value(X, U)
+        zero, worst = torch.zeros_like(rows), torch.full_like(cost, torch.inf)
+        iterate = Iterate(X, U, duals, cost, worst)
         return State(
             rows=rows,
-            X=X, U=U, cost=cost, merit=merit, duals=duals, guide=guide,
+            X=X, U=U, cost=cost, merit=merit.clone(), duals=duals, guide=guide,
             regularisation=torch.zeros_like(cost),
             inner=zero, outer=zero.clone(), iterations=zero.clone(), guided=zero.clone(),
-            last_cost=worst,
-            best=Iterate(X.clone(), U.clone(), take(duals, rows), cost.clone(), worst.clone()),
-            origin=Iterate(X.clone(), U.clone(), take(duals, rows), cost.clone(), worst.clone()),
+            last_cost=worst.clone(),
+            best=copied(iterate), origin=copied(iterate),
             attempt=zero.clone(), since=zero.clone(),
         )  # fmt: skip
 
-    def _empty_result(self, U0: Tensor) -> Solution:
-        s, problem = self.state, self.problem
-        blank = torch.zeros_like(s.rows)
-        N, n, m = problem.N, problem.n, problem.m
-        return Solution(
-            X=s.X.clone(), U=s.U.clone(), K=U0.new_zeros(problem.B, N, m, n), d=torch.zeros_like(U0),
-            multipliers=take(s.duals, s.rows), cost=s.cost.clone(), violation=torch.zeros_like(s.cost),
-            status=blank, iterations=blank.clone(), outer_iterations=blank.clone(), guided=blank.clone(),
-        )  # fmt: skip
-
-    def _bad_starts(self) -> Tensor:
-        """Statuses (B,) of elements that can't begin, RUNNING for the others."""
-        status = torch.full_like(self.state.rows, Status.RUNNING)
-        status[~self.problem.start_is_clear] = Status.INVALID_START
+    def _bad_starts(self, state: State) -> Tensor:
+        """Statuses (B',) of elements that can't begin, RUNNING for the others."""
+        status = torch.full_like(state.rows, Status.RUNNING)
+        status[~self.whole.start_is_clear[state.rows]] = Status.INVALID_START
         # NaN compares as clear of every obstacle, hence after it.
-        finite = torch.isfinite(self.state.merit) & torch.isfinite(self.state.X).flatten(1).all(-1)
+        finite = torch.isfinite(state.merit) & torch.isfinite(state.X).flatten(1).all(-1)
         status[~finite] = Status.NON_FINITE
         return status
 
@@ -192,27 +188,10 @@ class Loop:
         )  # fmt: skip
         status[rows] = solver.verdict(inner_end)
         s.last_cost[rows] = s.cost[rows]
-        self._try_again(rows, updated, status)
+        try_again(s, rows, updated, status, solver.attempts)
         going = (status[rows] == Status.RUNNING).nonzero().flatten()
         if going.numel() > 0:
             self._next_inner(rows[going], take(updated, going))
-
-    def _try_again(self, rows: Tensor, duals: Multipliers, status: Tensor) -> None:
-        """Back to the caught path for elements that have ended an attempt and have another left (in place)."""
-        s = self.state
-        left = (s.attempt[rows] > 0) & (s.attempt[rows] < self.solver.attempts)
-        again = ((status[rows] != Status.RUNNING) & left).nonzero().flatten()
-        if again.numel() == 0:
-            return
-        place = rows[again]
-        origin = take(s.origin, place)
-        s.X, s.U = s.X.clone(), s.U.clone()
-        s.X[place], s.U[place] = origin.X, origin.U
-        put(duals, again, origin.duals)
-        s.attempt[place] += 1
-        s.since[place] = s.outer[place]
-        s.last_cost[place] = torch.inf
-        status[place] = Status.RUNNING
 
     def _remember(self, rows: Tensor, new: Iterate) -> None:
         """Keep the best iterate that ended an inner solve: feasible before infeasible, then by cost."""
@@ -231,51 +210,40 @@ class Loop:
             guide = advice.guide
             put(s.guide, rows, guide)
             s.guided[rows] += guide.is_active | advice.taken
-            duals = self._go_on_from(rows, problem, advice, duals)
+            duals = go_on_from(s, rows, problem, advice, duals, solver)
         s.duals = Multipliers(tuple(lam.clone() for lam in s.duals.lam), s.duals.mu.clone())
         put(s.duals, rows, duals)
         s.regularisation[rows] = 0.0
         s.cost[rows], s.merit[rows] = Lagrangian(problem, duals, guide, solver.clip).value(s.X[rows], s.U[rows])
         s.inner[rows] = 0
 
-    def _go_on_from(self, rows: Tensor, problem: Problem, advice: Advice, duals: Multipliers) -> Multipliers:
-        """Put the advised controls in place of the iterate where they are taken, and return multipliers for it.
-
-        The old ones belong to the path that is left: they start again at zero. The penalty must keep the solver from
-        falling back, so it is raised until the path that is left costs more than the one that is taken.
-        """
-        s, taken = self.state, advice.taken.nonzero().flatten()
-        if taken.numel() == 0:
-            return duals
-        part, place = problem.take(taken), rows[taken]
-        old_X, old_U = s.X[place], s.U[place]
-        first = (s.attempt[place] == 0).nonzero().flatten()
-        left = Iterate(old_X, old_U, take(duals, taken), s.cost[place], s.best.violation[place])
-        put(s.origin, place[first], take(left, first))
-        s.attempt[place[first]] = 1
-        U = advice.U[taken]
-        X = open_loop(part.dynamics, part.x0, U)
-        none = Multipliers(tuple(torch.zeros_like(lam[taken]) for lam in duals.lam), torch.ones_like(duals.mu[taken]))
-        cost, merit = Lagrangian(part, none, None, True).value(old_X, old_U)
-        gain = (part.cost.total(X, U) - cost).clamp(min=0.0) / (merit - cost).clamp(min=1e-12)
-        mu = torch.maximum(duals.mu[taken], self.solver.hold_factor * gain).clamp(max=self.solver.penalty_max)
-        held = Multipliers(tuple(lam.clone() for lam in duals.lam), duals.mu.clone())
-        put(held, taken, Multipliers(none.lam, mu))
-        s.X, s.U = s.X.clone(), s.U.clone()
-        s.X[place], s.U[place] = X, U
-        return held
-
     # End ---------------------------------------------------------------------------------------------------------
 
     def _end(self, status: Tensor) -> None:
-        """Write the elements that have ended into the result and drop them from the batch."""
-        ended = status != Status.RUNNING
-        if not bool(ended.any()):
-            return
-        s, rows = self.state, ended.nonzero().flatten()
+        """Elements that have ended make room for those that wait, or leave the batch."""
+        while True:
+            ended = (status != Status.RUNNING).nonzero().flatten()
+            if ended.numel() == 0:
+                return
+            self._write(ended, status)
+            news = min(ended.numel(), self.waiting.numel())
+            fresh, self.waiting = self._begin(self.waiting[:news]), self.waiting[news:]
+            put(self.state, ended[:news], fresh)
+            status = torch.full_like(status, Status.RUNNING)
+            status[ended[:news]] = self._bad_starts(fresh)
+            if ended.numel() > news:
+                stays = torch.ones_like(status, dtype=torch.bool)
+                stays[ended[news:]] = False
+                stay = stays.nonzero().flatten()
+                self.state, status = take(self.state, stay), status[stay]
+            self.problem = self.whole.take(self.state.rows)
+
+    def _write(self, rows: Tensor, status: Tensor) -> None:
+        """Copy what the elements in `rows` are worth into the result: the best iterate where there is one."""
+        s, problem = self.state, self.problem.take(rows)
         last = Iterate(s.X[rows], s.U[rows], take(s.duals, rows), s.cost[rows], torch.zeros_like(s.cost[rows]))
         has_best = torch.isfinite(s.best.violation[rows]).nonzero().flatten()
-        last = replace(last, violation=violation(self.problem.take(rows), last.X, last.U))
+        last = replace(last, violation=violation(problem, last.X, last.U))
         put(last, has_best, take(take(s.best, rows), has_best))
         place, r = s.rows[rows], self.result
         r.X[place], r.U[place], r.cost[place], r.violation[place] = last.X, last.U, last.cost, last.violation
@@ -283,20 +251,30 @@ class Loop:
         r.status[place] = status[rows]
         r.iterations[place], r.outer_iterations[place] = s.iterations[rows], s.outer[rows]
         r.guided[place] = s.guided[rows]
-        stay = (~ended).nonzero().flatten()
-        self.state = State(**{name: take(value, stay) for name, value in vars(s).items()})
-        self.problem = self.problem.take(stay)
 
     def _with_gains(self) -> Solution:
         """Feedback gains along what is returned, from one more backward pass with its multipliers."""
-        r = self.result
-        lagrangian = Lagrangian(self.whole, r.multipliers, None, self.solver.clip)
-        H = lagrangian.expand(r.X, r.U).transpose(0, 1)
-        step = backward(linearise(self.whole, r.X, r.U), H, torch.zeros_like(r.cost))
-        G = step.gains.movedim(0, 1)
-        G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, G)
-        trace = None if self.recorder is None else self.recorder.frame()
-        return replace(r, K=G[..., :-1].contiguous(), d=G[..., -1].contiguous(), trace=trace)
+        r, slots = self.result, self.solver.slots or self.whole.B
+        for rows in torch.arange(self.whole.B, device=self.U0.device).split(slots):
+            part = self.whole.take(rows)
+            lagrangian = Lagrangian(part, take(r.multipliers, rows), None, self.solver.clip)
+            X, U = r.X[rows], r.U[rows]
+            H = lagrangian.expand(X, U).transpose(0, 1)
+            step = backward(linearise(part, X, U), H, torch.zeros_like(r.cost[rows]))
+            G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
+            r.K[rows], r.d[rows] = G[..., :-1], G[..., -1]
+        return replace(r, trace=None if self.recorder is None else self.recorder.frame())
+
+
+def _empty_result(problem: Problem, U0: Tensor) -> Solution:
+    blank = torch.zeros(problem.B, dtype=torch.int64, device=U0.device)
+    worth = U0.new_zeros(problem.B)
+    return Solution(
+        X=U0.new_zeros(problem.B, problem.N + 1, problem.n), U=torch.zeros_like(U0),
+        K=U0.new_zeros(*U0.shape, problem.n), d=torch.zeros_like(U0),
+        multipliers=Multipliers.zero(problem, 0.0), cost=worth, violation=worth.clone(),
+        status=blank, iterations=blank.clone(), outer_iterations=blank.clone(), guided=blank.clone(),
+    )  # fmt: skip
 
 
 def check_call(problem: Problem, U0: Tensor, ids: Tensor | None) -> Tensor:

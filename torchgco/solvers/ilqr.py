@@ -92,6 +92,7 @@ class _OneInnerSolve:
     hold_factor: float = 1.0
     attempts: int = 1
     clip: bool = False
+    slots: None = None
     record: bool = False
 
     def verdict(self, inner: InnerEnd) -> Tensor:

@@ -1,0 +1,50 @@
+"""What a batch is said to need, against what it takes."""
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.problems import planar_batch, quadrotor_batch
+from torchgco import InputError
+from torchgco.solvers.memory import CPU_LIMIT, element_bytes, is_out_of_memory, plan_batch
+
+PEAK = """
+import torch
+from tests.problems import quadrotor_batch
+from torchgco import AugmentedLagrangian, ILQR
+torch.set_num_threads(1)
+def peak(B):
+    problem, U0 = quadrotor_batch(B=B, N=40, obstacles=20)
+    AugmentedLagrangian(inner=ILQR(max_iterations=1), max_outer_iterations=2).solve(problem, U0)
+    status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+    return int(status["VmHWM"].split()[0]) * 1024
+small = peak(2)
+print((peak(402) - small) / 400)
+"""
+
+
+def test_an_element_takes_what_is_said() -> None:
+    problem, _ = quadrotor_batch(B=3, N=40, obstacles=20)
+    done = subprocess.run([sys.executable, "-c", PEAK], capture_output=True, text=True, check=True)
+    assert 0.5 < element_bytes(problem) / float(done.stdout) < 2.0
+
+
+def test_a_plan_fits_the_memory_that_is_free(monkeypatch) -> None:
+    problem, _ = planar_batch(B=2, N=30)
+    need = element_bytes(problem)
+    monkeypatch.setattr("torchgco.solvers.memory._free_memory", lambda: 40 * need)
+    assert plan_batch(problem) == 20 and plan_batch(problem, "cpu", processes=4) == 5
+    monkeypatch.setattr("torchgco.solvers.memory._free_memory", lambda: 0)
+    assert plan_batch(problem) == 1
+    monkeypatch.setattr("torchgco.solvers.memory._free_memory", lambda: 10**15)
+    assert plan_batch(problem) == CPU_LIMIT
+    with pytest.raises(InputError, match="processes"):
+        plan_batch(problem, processes=0)
+
+
+def test_running_out_of_memory_is_recognised() -> None:
+    assert is_out_of_memory(MemoryError()) and is_out_of_memory(
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes")
+    )
+    assert not is_out_of_memory(RuntimeError("shapes differ"))

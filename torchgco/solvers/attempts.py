@@ -1,0 +1,60 @@
+"""Other paths in place of the iterate: taken from guidance, and tried again from where the first one was caught."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.problem import Problem
+from torchgco.rollout import open_loop
+from torchgco.shapes import copied, put, take
+from torchgco.solvers.state import Advice, Iterate, OuterLoop, State
+from torchgco.status import Status
+
+
+def try_again(s: State, rows: Tensor, duals: Multipliers, status: Tensor, attempts: int) -> None:
+    """Back to the caught path for elements that have ended an attempt and have another left (in place)."""
+    left = (s.attempt[rows] > 0) & (s.attempt[rows] < attempts)
+    again = ((status[rows] != Status.RUNNING) & left).nonzero().flatten()
+    if again.numel() == 0:
+        return
+    place = rows[again]
+    origin = take(s.origin, place)
+    s.X, s.U = s.X.clone(), s.U.clone()
+    s.X[place], s.U[place] = origin.X, origin.U
+    put(duals, again, origin.duals)
+    s.attempt[place] += 1
+    s.since[place] = s.outer[place]
+    s.last_cost[place] = torch.inf
+    status[place] = Status.RUNNING
+
+
+def go_on_from(
+    s: State, rows: Tensor, problem: Problem, advice: Advice, duals: Multipliers, solver: OuterLoop
+) -> Multipliers:
+    """Put the advised controls in place of the iterate where they are taken, and return multipliers for it.
+
+    The old ones belong to the path that is left: they start again at zero. The penalty must keep the solver from
+    falling back, so it is raised until the path that is left costs more than the one that is taken.
+    """
+    taken = advice.taken.nonzero().flatten()
+    if taken.numel() == 0:
+        return duals
+    part, place = problem.take(taken), rows[taken]
+    old_X, old_U = s.X[place], s.U[place]
+    first = (s.attempt[place] == 0).nonzero().flatten()
+    left = Iterate(old_X, old_U, take(duals, taken), s.cost[place], s.best.violation[place])
+    put(s.origin, place[first], take(left, first))
+    s.attempt[place[first]] = 1
+    U = advice.U[taken]
+    X = open_loop(part.dynamics, part.x0, U)
+    none = Multipliers(tuple(torch.zeros_like(lam[taken]) for lam in duals.lam), torch.ones_like(duals.mu[taken]))
+    cost, merit = Lagrangian(part, none, None, True).value(old_X, old_U)
+    gain = (part.cost.total(X, U) - cost).clamp(min=0.0) / (merit - cost).clamp(min=1e-12)
+    mu = torch.maximum(duals.mu[taken], solver.hold_factor * gain).clamp(max=solver.penalty_max)
+    held = copied(duals)
+    put(held, taken, Multipliers(none.lam, mu))
+    s.X, s.U = s.X.clone(), s.U.clone()
+    s.X[place], s.U[place] = X, U
+    return held

@@ -1,0 +1,59 @@
+"""How many problems fit into memory at once, told before anything runs."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+
+from torchgco.lagrangian import Multipliers
+from torchgco.problem import Problem
+from torchgco.shapes import InputError
+
+CPU_LIMIT = 256  # more problems at once are no faster on a core: what they share is paid for by then
+SHARE = 0.5  # of the free memory; the rest is the system's and other processes'
+NUMBER = 8  # bytes of float64
+
+
+def element_bytes(problem: Problem) -> int:
+    """Bytes that one problem of this form takes in a solve, measured to be within a factor of 2 (tests)."""
+    N, n, m = problem.N, problem.n, problem.m
+    z, s = n + 1, n + 1 + m
+    one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
+    rows = sum(lam.numel() for lam in Multipliers.zero(one, 0.0).lam)
+    expansion = N * (2 * z * s + 2 * s * s + 2 * m * z)  # F, H and gains, with what they are made of
+    trajectories = N * (n + m) * 16  # iterate, best, origin, result, and those tried by a line search
+    return NUMBER * (expansion + trajectories + 12 * rows)
+
+
+def plan_batch(problem: Problem, device: str | torch.device | None = None, processes: int = 1) -> int:
+    """How many problems like these to work on at once on a device, at least 1.
+
+    Args:
+        problem: any batch of the form that is meant; only one element of it is looked at.
+        device: default: where the problem is.
+        processes: how many share the device's memory.
+
+    Raises:
+        InputError: fewer than one process.
+    """
+    if processes < 1:
+        raise InputError("processes", "at least 1", processes)
+    where = torch.device(device) if device is not None else problem.x0.device
+    free = torch.cuda.mem_get_info(where)[0] if where.type == "cuda" else _free_memory()
+    fits = max(1, int(SHARE * free / processes) // element_bytes(problem))
+    return fits if where.type == "cuda" else min(fits, CPU_LIMIT)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory ran out, on whatever device."""
+    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "can't allocate memory" in str(error)
+
+
+def _free_memory() -> int:
+    """Bytes that can be had without swapping: the kernel's own estimate, else unused pages."""
+    try:
+        with open("/proc/meminfo") as lines:
+            return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
