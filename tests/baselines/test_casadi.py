@@ -70,6 +70,19 @@ def test_companions_change_nothing(plugin: str, solved) -> None:
         assert torch.equal(alone.U, solved[plugin].U[index]) and torch.equal(alone.status, solved[plugin].status[index])
 
 
+def test_alone_and_in_company_it_is_the_same_program() -> None:
+    """A goal that is one problem's own in a batch looks like a shared one when that problem is taken out of it."""
+    goals = torch.tensor([[1.0, 0.4, 0, 0, 0, 0], [0.0, 0.2, 0, 0, 0, 0]], dtype=torch.float64).unsqueeze(1)
+    cost = QuadraticCost(Q=[5.0, 1, 0, 1, 0, 1], R=[0.1, 0.1], Qf=[50.0] * 6, x_ref=goals)
+    plain, _ = planar_batch(B=2, N=8)
+    problem = Problem(plain.dynamics, cost, plain.constraints, plain.x0, 8)
+    both, alone = (CasADiSolver().prepare(p) for p in (problem, problem.take(torch.tensor([1]))))
+    assert both.program.parameters.numel() == alone.program.parameters.numel()
+    assert str(both.program.objective) == str(alone.program.objective)
+    assert str(both.program.rows) == str(alone.program.rows)
+    assert both.program.values(problem, 1).tolist() == alone.program.values(alone.problem, 0).tolist()
+
+
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_a_bad_start_is_one_problem_s_own(plugin: str) -> None:
     problem, U0 = planar_batch(B=4, N=12, obstacles=2, seed=1)

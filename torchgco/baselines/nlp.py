@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from torchgco.baselines.tracing import Traced
-from torchgco.constraints.base import Constraint
 from torchgco.problem import Problem
+from torchgco.shapes import PerElement
 
 UNBOUNDED = 1e19  # and above: a bound that is there for other problems of the batch only
 
@@ -101,14 +101,17 @@ def transcribe(problem: Problem) -> Program:
 
 def _traces(problem: Problem) -> tuple[Traced, Traced, list[Traced]]:
     X, U = problem.x0.new_zeros(1, problem.N + 1, problem.n), problem.x0.new_zeros(1, problem.N, problem.m)
-    step = Traced("dynamics.step", lambda i, x, u: problem.dynamics.take(i).step(x, u), X[:, 0], U[:, 0])
-    cost = Traced("cost", lambda i, X, U: problem.cost.take(i).total(X, U), X, U)
 
-    def rows_of(number: int, constraint: Constraint) -> Traced:
-        field = f"constraints[{number}] ({type(constraint).__name__})"
-        return Traced(field, lambda i, X, U: constraint.take(i).value(X, U), X, U)
+    def trace(field: str, part: PerElement, method: str, *examples: Tensor) -> Traced:
+        named = (getattr(part, name) for name in (*part.batched, *part.per_element))
+        own = [value for value in named if isinstance(value, Tensor)]
+        return Traced(field, lambda i, *z: getattr(part.take(i), method)(*z), *examples, own=own)
 
-    return step, cost, [rows_of(number, constraint) for number, constraint in enumerate(problem.constraints)]
+    return (
+        trace("dynamics.step", problem.dynamics, "step", X[:, 0], U[:, 0]),
+        trace("cost", problem.cost, "total", X, U),
+        [trace(f"constraints[{i}] ({type(c).__name__})", c, "value", X, U) for i, c in enumerate(problem.constraints)],
+    )
 
 
 def _limits(

@@ -30,13 +30,17 @@ class Traced:
         field: what the function is, for errors.
         function: tensors in, one tensor out.
         examples: variables of the shapes that it is called with.
+        own: tensors that are treated as one problem's own even where all problems of the batch share them: the
+            expressions, and with them the last bits, then don't depend on who else is in the batch.
 
     Raises:
         InputError: the function can't be traced (it branches on values of its arguments, say), or holds an operation
             that CasADi has no counterpart for; the error names it.
     """
 
-    def __init__(self, field: str, function: Callable[..., Tensor], *examples: Tensor) -> None:
+    def __init__(
+        self, field: str, function: Callable[..., Tensor], *examples: Tensor, own: Iterable[Tensor] = ()
+    ) -> None:
         self.field = field
         index = torch.zeros(1, dtype=torch.int64, device=examples[0].device)
         recorder = _record(field, function, index, *examples)
@@ -52,7 +56,9 @@ class Traced:
         # Where PyTorch's part ends and CasADi's begins.
         border = dict.fromkeys(slot for call in self._symbolic for slot in call.inputs) | {self._result: None}
         border = [slot for slot in border if slot not in followers]
-        varying = _followers(self._plain, [self._index])
+        own_ids = {id(tensor) for tensor in own}
+        named = [slot for slot, tensor in self._captured.items() if id(tensor) in own_ids]
+        varying = _followers(self._plain, [self._index, *named])
         self._own = [slot for slot in border if slot in varying]
         computed = self._computed(index)
         self._own_shapes = [tuple(computed[slot].shape) for slot in self._own]
