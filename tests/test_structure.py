@@ -70,8 +70,9 @@ def test_only_experiments_know_hydra() -> None:
             assert "import hydra" not in text and "omegaconf" not in text, path
 
 
-def test_importing_torchgco_loads_neither_hydra_nor_matplotlib() -> None:
-    code = "import sys, torchgco; print([m for m in ('hydra', 'matplotlib', 'pandas') if m in sys.modules])"
+def test_importing_torchgco_loads_neither_hydra_nor_matplotlib_nor_casadi() -> None:
+    heavy = ("hydra", "matplotlib", "pandas", "casadi")
+    code = f"import sys, torchgco, torchgco.baselines; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
     assert done.stdout.strip() == "[]"
 

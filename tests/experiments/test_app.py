@@ -29,6 +29,7 @@ TINY = [
     "study.layouts=3",
     "scenario.stages=12",
     "study.batch_size=2",
+    "study.shard_size=2",
     "solver.max_outer_iterations=2",
     "study.workers=1",
 ]

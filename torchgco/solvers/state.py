@@ -53,12 +53,12 @@ class State:
 
 @dataclass(frozen=True)
 class Progress:
-    """What a callback is told after every pass."""
+    """What a callback is told after every pass, or after every problem by a solver that takes them one by one."""
 
     passes: int
     finished: int
     total: int
-    state: State
+    state: State | None  # None from a solver that carries no batch
 
 
 Callback = Callable[[Progress], None]

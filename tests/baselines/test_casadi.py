@@ -1,0 +1,248 @@
+"""IPOPT and FATROP on the problem's own model: the same optimum, statuses per problem, no memory."""
+
+import importlib.util
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from tests.problems import planar_batch
+from torchgco import (
+    AugmentedLagrangian,
+    ControlBounds,
+    FunctionConstraint,
+    InputError,
+    Planar,
+    Problem,
+    QuadraticCost,
+    StateBounds,
+    Status,
+)
+from torchgco.baselines import CasADiSolver, Hold
+from torchgco.constraints import Constraint
+from torchgco.experiments.build import compose
+from torchgco.experiments.study import _Flight
+from torchgco.rollout import open_loop
+
+PLUGINS = ["ipopt", "fatrop"]
+DATA = Path(__file__).resolve().parents[2] / "benchmarks" / "data"
+
+
+def with_constraints(*constraints, B: int = 2, N: int = 20, **parts) -> tuple[Problem, Tensor]:
+    """The planar batch with other constraints."""
+    plain, U0 = planar_batch(B, N)
+    return Problem(plain.dynamics, plain.cost, constraints, parts.get("x0", plain.x0), N), U0
+
+
+def three_problems() -> tuple[Problem, Tensor]:
+    return planar_batch(B=3, N=30, obstacles=3, seed=2)
+
+
+@pytest.fixture(scope="module")
+def solved() -> dict:
+    return {plugin: CasADiSolver(plugin).solve(*three_problems()) for plugin in PLUGINS}
+
+
+def test_both_find_what_al_ilqr_finds(solved) -> None:
+    """In the last two: in the first one, obstacles part the ways that solvers take."""
+    problem, U0 = three_problems()
+    al_ilqr = AugmentedLagrangian(max_outer_iterations=15, clip=True).solve(problem, U0)
+    for solution in solved.values():
+        assert solution.statuses == [Status.CONVERGED] * 3 and float(solution.violation.max()) < 1e-6
+        torch.testing.assert_close(solution.cost[1:], al_ilqr.cost[1:], rtol=1e-2, atol=0)
+        torch.testing.assert_close(solution.cost, problem.cost.total(solution.X, solution.U))
+        assert torch.equal(solution.X, open_loop(problem.dynamics, problem.x0, solution.U))
+        assert bool((solution.iterations > 5).all())
+    torch.testing.assert_close(solved["ipopt"].cost[1:], solved["fatrop"].cost[1:], rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_companions_change_nothing(plugin: str, solved) -> None:
+    """Bit by bit, and in another order: the program is the same, and the solver keeps nothing from one to the next."""
+    problem, U0 = three_problems()
+    for rows in ([1], [2, 0]):
+        index = torch.tensor(rows)
+        alone = CasADiSolver(plugin).solve(problem.take(index), U0[index])
+        assert torch.equal(alone.U, solved[plugin].U[index]) and torch.equal(alone.status, solved[plugin].status[index])
+
+
+def test_alone_and_in_company_it_is_the_same_program() -> None:
+    """A goal that is one problem's own in a batch looks like a shared one when that problem is taken out of it."""
+    goals = torch.tensor([[1.0, 0.4, 0, 0, 0, 0], [0.0, 0.2, 0, 0, 0, 0]], dtype=torch.float64).unsqueeze(1)
+    cost = QuadraticCost(Q=[5.0, 1, 0, 1, 0, 1], R=[0.1, 0.1], Qf=[50.0] * 6, x_ref=goals)
+    plain, _ = planar_batch(B=2, N=8)
+    problem = Problem(plain.dynamics, cost, plain.constraints, plain.x0, 8)
+    both, alone = (CasADiSolver().prepare(p) for p in (problem, problem.take(torch.tensor([1]))))
+    assert both.program.parameters.numel() == alone.program.parameters.numel()
+    assert str(both.program.objective) == str(alone.program.objective)
+    assert str(both.program.rows) == str(alone.program.rows)
+    assert both.program.values(problem, 1).tolist() == alone.program.values(alone.problem, 0).tolist()
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_a_bad_start_is_one_problem_s_own(plugin: str) -> None:
+    problem, U0 = planar_batch(B=4, N=12, obstacles=2, seed=1)
+    x0 = problem.x0.clone()
+    x0[1, 0] = torch.nan
+    x0[2, :2] = problem.constraints[0].centers[2, 0]
+    told = []
+    bad = Problem(problem.dynamics, problem.cost, problem.constraints, x0, problem.N)
+    solution = CasADiSolver(plugin).solve(bad, U0, callback=told.append)
+    assert solution.statuses == [Status.CONVERGED, Status.NON_FINITE, Status.INVALID_START, Status.CONVERGED]
+    good = CasADiSolver(plugin).solve(problem, U0)
+    assert torch.equal(solution.U[[0, 3]], good.U[[0, 3]])
+    assert [(p.finished, p.total) for p in told] == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_every_kind_of_row_holds() -> None:
+    """Equalities, bounds on some knots, a control held still, a bound that differs, a row of x and u together.
+
+    FATROP gets there too, but not always to its own tolerance.
+    """
+    upper = torch.tensor([[0.5] * 5 + [torch.inf], [9.0, 0.6, 9, 0.4, 9, 9]], dtype=torch.float64)
+    problem, U0 = with_constraints(
+        ControlBounds([-4.0, 0.0], [4.0, 4.0]),
+        ControlBounds([-torch.inf, 1.0], [torch.inf, 1.0], knots=[3]),
+        StateBounds([-2.0] * 6, upper),
+        FunctionConstraint(lambda x: x[..., :1] + 0.4, "equality", knots=[-1]),
+        FunctionConstraint(lambda x, u: x[..., 3:4] * u[..., :1] - 0.5, of="xu"),
+    )
+    found = {plugin: CasADiSolver(plugin, max_iterations=100).solve(problem, U0) for plugin in PLUGINS}
+    for solution in found.values():
+        for constraint in problem.constraints:
+            assert float(constraint.violation(solution.X, solution.U).max()) < 1e-6
+        assert float((solution.U[:, 3, 1] - 1.0).abs().max()) < 1e-6
+    assert found["ipopt"].statuses == [Status.CONVERGED] * 2
+    torch.testing.assert_close(found["ipopt"].cost, found["fatrop"].cost, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_what_cannot_be_met_is_infeasible(plugin: str) -> None:
+    """The second problem's bounds cross, so that CasADi refuses it; the first is solved all the same."""
+    above = torch.tensor([[-1.0, -9.0], [3.0, -9.0]], dtype=torch.float64)
+    problem, U0 = with_constraints(ControlBounds(above, [9.0, 9.0]), ControlBounds([-9.0, -9.0], [2.0, 9.0]))
+    assert CasADiSolver(plugin).solve(problem, U0).statuses == [Status.CONVERGED, Status.INFEASIBLE]
+
+
+@dataclass(frozen=True)
+class Jerk(Constraint):
+    """|u_{k+1} - u_k| <= 1 / 10: rows that join two knots."""
+
+    knots: ClassVar[slice] = slice(0, 19)
+
+    def bind(self, dims) -> "Jerk":
+        return self
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        change = U[:, 1:] - U[:, :-1]
+        return torch.cat((change, -change), dim=-1) - 0.1
+
+
+def test_rows_that_join_knots_are_for_ipopt_alone() -> None:
+    problem, U0 = with_constraints(Jerk())
+    assert CasADiSolver("ipopt").solve(problem, U0).statuses == [Status.CONVERGED] * 2
+    with pytest.raises(InputError, match="fatrop"):
+        CasADiSolver("fatrop").solve(problem, U0)
+
+
+def test_what_cannot_be_traced_names_the_part() -> None:
+    problem, U0 = with_constraints(FunctionConstraint(lambda x: torch.erfinv(x[..., :1])))
+    with pytest.raises(InputError, match=r"constraints\[0\].*erfinv"):
+        CasADiSolver().solve(problem, U0)
+
+
+def test_single_precision() -> None:
+    problem, U0 = planar_batch(B=1, N=10, obstacles=2)
+    cost = QuadraticCost(Q=[1.0] * 6, R=[0.1] * 2, Qf=[9.0] * 6)
+    single = Problem(Planar(dt=0.1), cost, [ControlBounds([-5.0] * 2, [5.0] * 2)], problem.x0.float(), 10)
+    double = Problem(Planar(dt=0.1), cost, [ControlBounds([-5.0] * 2, [5.0] * 2)], problem.x0, 10)
+    short, full = CasADiSolver("fatrop").solve(single, U0.float()), CasADiSolver("fatrop").solve(double, U0)
+    assert short.U.dtype == torch.float32 and short.statuses == [Status.CONVERGED]
+    torch.testing.assert_close(short.cost.double(), full.cost, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_every_option_is_read(plugin: str) -> None:
+    problem, U0 = planar_batch(B=1, N=15, obstacles=3, seed=1)
+    base = CasADiSolver(plugin)
+    full = base.solve(problem, U0)
+    stopped = replace(base, max_iterations=3, violation_tolerance=10.0).solve(problem, U0)
+    assert stopped.statuses == [Status.MAX_ITERATIONS] and stopped.iterations.item() in (3, 4)  # FATROP: one more
+    assert replace(base, violation_tolerance=1e-12).solve(problem, U0).statuses == [Status.INFEASIBLE]
+    assert replace(base, tolerance=1e-2).solve(problem, U0).iterations < full.iterations
+    assert not torch.equal(replace(base, options={"mu_init": 10.0}).solve(problem, U0).U, full.U)
+    other = {"ipopt": "fatrop", "fatrop": "ipopt"}[plugin]
+    assert not torch.equal(replace(base, plugin=other).solve(problem, U0).U, full.U)
+    assert {f.name for f in fields(base)} == {"plugin", "max_iterations", "tolerance", "violation_tolerance", "options"}
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [({"plugin": "snopt"}, "plugin"), ({"max_iterations": 0}, "max_iterations"), ({"tolerance": 0.0}, "tolerance"),
+     ({"violation_tolerance": -1.0}, "violation_tolerance")],
+)  # fmt: skip
+def test_options_out_of_range(change: dict, field: str) -> None:
+    with pytest.raises(InputError, match=f"solver.{field}"):
+        CasADiSolver(**change)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_an_unknown_option_is_named(plugin: str) -> None:
+    problem, U0 = planar_batch(B=1, N=5, obstacles=2)
+    with pytest.raises(InputError, match="no_such"):
+        CasADiSolver(plugin, options={"no_such": 1}).solve(problem, U0)
+
+
+def test_without_casadi_there_is_one_clear_line(monkeypatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr("torchgco.baselines.casadi.find_spec", lambda name: None if name == "casadi" else find(name))
+    with pytest.raises(InputError, match=r"torchgco\[peers\]"):
+        CasADiSolver()
+
+
+def test_bad_calls_are_named() -> None:
+    problem, U0 = planar_batch(B=2, N=5)
+    with pytest.raises(InputError, match="U0"):
+        CasADiSolver().solve(problem, U0[:, :3])
+    with pytest.raises(InputError, match="ids"):
+        CasADiSolver().solve(problem, U0, ids=torch.arange(3))
+    with pytest.raises(InputError, match="problem"):
+        CasADiSolver().prepare(problem).solve(problem.take(torch.tensor([0, 1])), U0)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_the_configuration_holds_the_defaults_of_the_code(plugin: str) -> None:
+    assert compose([f"solver={plugin}"]).solver == CasADiSolver(plugin)
+
+
+def test_a_study_prepares_before_the_clock_starts(monkeypatch) -> None:
+    """The clock is read twice, and what is prepared is done by then."""
+    setup = compose(["scenario=layouts", f"scenario.path={DATA / 'planar_trap.npz'}", "model=planar"])
+    layouts, events = replace(setup.layouts(2), stages=5), []
+
+    class Builder:
+        def prepare(self, problem: Problem):
+            events.append("prepare")
+            self.problem = problem
+            return self
+
+        def solve(self, problem: Problem, U0: Tensor, **call):
+            events.append("solve")
+            assert problem is self.problem
+            return Hold().solve(problem, U0, **call)
+
+    monkeypatch.setattr("torchgco.experiments.study._now", lambda device: float(events.append("clock") or 0.0))
+    _Flight(setup, layouts, "builder", Builder(), tqdm(disable=True)).fly()
+    assert events == ["prepare", "clock", "solve", "clock"]
+
+
+def test_a_flight_in_a_study() -> None:
+    setup = compose(["scenario=layouts", f"scenario.path={DATA / 'planar_trap.npz'}", "model=planar", "solver=fatrop"])
+    layouts = replace(setup.layouts(2), stages=20)
+    with tqdm(total=2, disable=True) as bar:
+        rows, U = _Flight(setup, layouts, "fatrop", setup.solver, bar).fly()
+    assert rows["status"].tolist() == ["CONVERGED"] * 2 and U.shape == (2, 20, 2) and bool(rows["feasible"].all())

@@ -1,0 +1,193 @@
+"""IPOPT and FATROP through CasADi, for any Problem: the yardsticks of constrained trajectory optimisation.
+
+The model isn't written a second time: its step, cost and constraints are traced (`tracing`) and become one nonlinear
+program with exact derivatives (`nlp`), of which every problem of the batch is a set of parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.baselines.hold import rolled_out
+from torchgco.lagrangian import Multipliers
+from torchgco.problem import Problem
+from torchgco.rollout import open_loop
+from torchgco.shapes import InputError
+from torchgco.solution import Solution
+from torchgco.solvers.batch import check_call
+from torchgco.solvers.state import Callback, Progress
+from torchgco.status import Status
+
+if TYPE_CHECKING:
+    from torchgco.baselines.nlp import Program
+
+_End = tuple[Status, int]  # how the solver ended, and its iterations
+
+
+@dataclass(frozen=True)
+class CasADiSolver:
+    """An interior-point solver on the multiple-shooting program, one problem of the batch after the other.
+
+    Args:
+        plugin: "ipopt" (with MUMPS) or "fatrop" (a Riccati recursion by stages).
+        max_iterations: of each problem.
+        tolerance: the solver's own, on its optimality conditions.
+        violation_tolerance: what counts as feasible in the end (metres for lengths).
+        options: further options of the plugin, by its names.
+
+    Raises:
+        InputError: a field out of its range; CasADi isn't installed.
+    """
+
+    plugin: Literal["ipopt", "fatrop"] = "ipopt"
+    max_iterations: int = 1000
+    tolerance: float = 1e-8
+    violation_tolerance: float = 1e-3
+    options: Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.plugin not in ("ipopt", "fatrop"):
+            raise InputError("solver.plugin", "ipopt or fatrop", repr(self.plugin))
+        if self.max_iterations < 1:
+            raise InputError("solver.max_iterations", "at least 1", self.max_iterations)
+        for name in ("tolerance", "violation_tolerance"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"solver.{name}", "above 0", getattr(self, name))
+        if find_spec("casadi") is None:
+            raise InputError("solver", "CasADi, which `pip install torchgco[peers]` brings", "no such module")
+
+    def prepare(self, problem: Problem) -> PreparedCasADi:
+        """The program and the solver built for one batch; solving it then costs the solver's time alone.
+
+        Raises:
+            InputError: a part of the problem that can't be traced, an operation without a counterpart in CasADi, an
+                option that the plugin refuses, or (FATROP) rows that join several knots.
+        """
+        import casadi
+
+        from torchgco.baselines.nlp import transcribe
+
+        program = transcribe(problem)
+        nlp = {"x": program.variables, "p": program.parameters, "f": program.objective, "g": program.rows}
+        try:
+            run = casadi.nlpsol("solver", self.plugin, nlp, self._options(problem, program))
+        except RuntimeError as error:
+            raise _refused(self.plugin, error) from error
+        return PreparedCasADi(self, problem, program, run)
+
+    def solve(
+        self,
+        problem: Problem,
+        U0: Tensor,
+        seed: int = 0,
+        ids: Tensor | None = None,
+        warm: Multipliers | None = None,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """From U0 (B, N, m) and its rollout; X is the rollout of the controls found. seed and warm change nothing.
+
+        Raises:
+            InputError: U0 or ids don't fit the problem, and what `prepare` raises.
+        """
+        check_call(problem, U0, ids)
+        return self.prepare(problem).solve(problem, U0, seed, ids, warm, callback)
+
+    def _options(self, problem: Problem, program: Program) -> dict[str, Any]:
+        """Options of the plugin and of CasADi around it; both say nothing while they work."""
+        quiet = {"print_time": False, "show_eval_warnings": False}
+        given = dict(self.options or {})
+        if self.plugin == "ipopt":
+            own = {"print_level": 0, "sb": "yes", "max_iter": self.max_iterations, "tol": self.tolerance}
+            return {**quiet, "ipopt": {**own, **given}}
+        own = {"print_level": 0, "max_iter": self.max_iterations, "tolerance": self.tolerance}
+        return {
+            **quiet,
+            "fatrop": {**own, **given},
+            "structure_detection": "manual",  # the stages are known: nothing to guess
+            "N": problem.N,
+            "nx": [problem.n] * (problem.N + 1),
+            "nu": [problem.m] * problem.N + [0],
+            "ng": program.path_rows,
+            "equality": program.equality,
+        }
+
+
+@dataclass(frozen=True)
+class PreparedCasADi:
+    """A CasADiSolver with all that one batch needs, built."""
+
+    solver: CasADiSolver
+    problem: Problem
+    program: Program
+    run: Any  # casadi.Function
+
+    def solve(
+        self,
+        problem: Problem,
+        U0: Tensor,
+        seed: int = 0,
+        ids: Tensor | None = None,
+        warm: Multipliers | None = None,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """As `CasADiSolver.solve`.
+
+        Raises:
+            InputError: another problem than the prepared one; U0 or ids don't fit it.
+        """
+        if problem is not self.problem:
+            raise InputError("problem", "the one that was prepared", "another")
+        check_call(problem, U0, ids)
+        X0 = open_loop(problem.dynamics, problem.x0, U0)
+        X0 = torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1))
+        sound = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
+        U, ends = U0.clone(), [(Status.CONVERGED, 0)] * problem.B
+        for b in range(problem.B):
+            if bool(sound[b]):
+                U[b], ends[b] = self._one(b, X0[b], U0[b])
+            if callback is not None:
+                callback(Progress(b + 1, b + 1, problem.B, None))
+        solution = rolled_out(problem, U, self.solver.violation_tolerance, iterations=0)
+        return _with_ends(solution, ends)
+
+    def _one(self, b: int, X0: Tensor, U0: Tensor) -> tuple[Tensor, _End]:
+        """Controls (N, m) of problem b, and how it ended."""
+        n, size = X0.shape[-1], self.program.variables.numel()
+        p = self.program.values(self.problem, b)
+        lower, upper = self.program.limits.bounds(p, size)
+        stages = torch.cat((X0[:-1], U0), dim=-1).flatten()
+        guess = torch.cat((stages, X0[-1])).double().cpu().numpy()
+        highest = np.zeros(len(self.program.equality))
+        lowest = np.where(self.program.equality, 0.0, -np.inf)
+        try:
+            found = self.run(x0=guess, p=p, lbx=lower, ubx=upper, lbg=lowest, ubg=highest)
+            stats = self.run.stats()
+        except RuntimeError as error:  # with bounds that cross, say: no loss to the others
+            if "option" in str(error).lower():  # FATROP reads them only now
+                raise _refused(self.solver.plugin, error) from error
+            return U0, (Status.LINE_SEARCH_FAILED, 0)
+        v = torch.from_numpy(np.array(found["x"]).reshape(-1)[:-n]).to(U0)
+        iterations = int(stats["iter_count"])
+        at_limit = iterations >= self.solver.max_iterations
+        failed = Status.MAX_ITERATIONS if at_limit else Status.LINE_SEARCH_FAILED
+        return v.view(U0.shape[0], -1)[:, n:], (Status.CONVERGED if stats["success"] else failed, iterations)
+
+
+def _refused(plugin: str, error: RuntimeError) -> InputError:
+    told = " ".join(str(error).split())[-300:]  # CasADi says last what is wrong
+    return InputError("solver", f"a problem and options that {plugin} takes", told)
+
+
+def _with_ends(solution: Solution, ends: list[_End]) -> Solution:
+    """The solver's word where the trajectory has nothing against it."""
+    status = solution.status
+    told = status.new_tensor([int(end) for end, _ in ends])
+    iterations = status.new_tensor([count for _, count in ends])
+    return replace(solution, status=torch.where(status == Status.CONVERGED, told, status), iterations=iterations)

@@ -1,0 +1,160 @@
+"""A Problem as one nonlinear program of CasADi by multiple shooting, built once for the whole batch.
+
+Variables stand by stage, [x_0, u_0, x_1, u_1, ..., x_N], and so do the rows: x_{k+1} - step(x_k, u_k) first, then what
+the constraints say of knot k. Interior-point solvers for optimal control find their blocks by this order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.baselines.tracing import Traced
+from torchgco.problem import Problem
+from torchgco.shapes import PerElement
+
+UNBOUNDED = 1e19  # and above: a bound that is there for other problems of the batch only
+
+
+@dataclass(frozen=True)
+class Program:
+    """minimise f(v, p) subject to lower <= v <= upper and to rows g(v, p), all zero or, where not `equality`, <= 0."""
+
+    variables: ca.SX  # v
+    parameters: ca.SX  # p: x_0, then each part's own numbers
+    objective: ca.SX
+    rows: ca.SX
+    equality: list[bool]
+    path_rows: list[int]  # rows of each knot 0..N beside the step to the next
+    limits: _Limits
+    sources: tuple[Traced, ...]
+
+    def values(self, problem: Problem, b: int) -> np.ndarray:
+        """p for problem b of the batch."""
+        index = torch.tensor([b], device=problem.x0.device)
+        own = [source.parameters(index) for source in self.sources]
+        return np.concatenate([problem.x0[b].double().cpu().numpy(), *own])
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Rows that bound one variable, as `slope * v[variable] + offset(p) <= 0`."""
+
+    variable: np.ndarray
+    slope: np.ndarray
+    offset: ca.Function
+
+    def bounds(self, p: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """lower and upper (size,) for the parameters p."""
+        lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
+        at = -np.asarray(self.offset(p)).reshape(-1) / self.slope
+        rising = self.slope > 0
+        np.minimum.at(upper, self.variable[rising], at[rising])
+        np.maximum.at(lower, self.variable[~rising], at[~rising])
+        lower[lower <= -UNBOUNDED], upper[upper >= UNBOUNDED] = -np.inf, np.inf
+        return lower, upper
+
+
+def transcribe(problem: Problem) -> Program:
+    """The program of a batch.
+
+    Raises:
+        InputError: a part that can't be traced, or that uses what CasADi has no counterpart for.
+    """
+    N, n, m = problem.N, problem.n, problem.m
+    step, cost, constraints = _traces(problem)
+    sources = (step, cost, *constraints)
+    variables = ca.SX.sym("v", N * (n + m) + n)
+    start = ca.SX.sym("x0", n)
+    own = [ca.SX.sym(f"p{i}", source.count) for i, source in enumerate(sources)]
+    stages = [k * (n + m) for k in range(N + 1)]
+    x = [variables[at : at + n] for at in stages]
+    u = [variables[at + n : at + n + m] for at in stages[:-1]]
+    X, U = np.stack([_elements(z) for z in x])[None], np.stack([_elements(z) for z in u])[None]
+
+    at_knot: list[list[tuple[ca.SX, bool]]] = [[] for _ in range(N + 1)]  # rows, and whether each is an equality
+    at_knot[0] = [(row, True) for row in _elements(x[0] - start)]
+    for constraint, traced, p in zip(problem.constraints, constraints, own[2:], strict=True):
+        values = traced(_elements(p), X, U)[0]
+        for k, rows in zip(_knots(constraint.knots, N), values, strict=True):
+            at_knot[k] += [(row, constraint.sense == "equality") for row in rows]
+    parameters = ca.vertcat(start, *own)
+    limits, at_knot = _limits(at_knot, variables, parameters)
+
+    rows, equality = [], []
+    one_step = ca.Function("step", [x[0], u[0], own[0]], [_column(step(_elements(own[0]), X[:, 0], U[:, 0])[0])])
+    for k in range(N + 1):
+        gap = [(row, True) for row in _elements(x[k + 1] - one_step(x[k], u[k], own[0]))] if k < N else []
+        rows += [row for row, _ in gap + at_knot[k]]
+        equality += [is_equality for _, is_equality in gap + at_knot[k]]
+    return Program(
+        variables, parameters, _column(cost(_elements(own[1]), X, U)), _column(rows), equality,
+        [len(knot) for knot in at_knot], limits, sources,
+    )  # fmt: skip
+
+
+def _traces(problem: Problem) -> tuple[Traced, Traced, list[Traced]]:
+    X, U = problem.x0.new_zeros(1, problem.N + 1, problem.n), problem.x0.new_zeros(1, problem.N, problem.m)
+
+    def trace(field: str, part: PerElement, method: str, *examples: Tensor) -> Traced:
+        named = (getattr(part, name) for name in (*part.batched, *part.per_element))
+        own = [value for value in named if isinstance(value, Tensor)]
+        return Traced(field, lambda i, *z: getattr(part.take(i), method)(*z), *examples, own=own)
+
+    return (
+        trace("dynamics.step", problem.dynamics, "step", X[:, 0], U[:, 0]),
+        trace("cost", problem.cost, "total", X, U),
+        [trace(f"constraints[{i}] ({type(c).__name__})", c, "value", X, U) for i, c in enumerate(problem.constraints)],
+    )
+
+
+def _limits(
+    at_knot: list[list[tuple[ca.SX, bool]]], variables: ca.SX, parameters: ca.SX
+) -> tuple[_Limits, list[list[tuple[ca.SX, bool]]]]:
+    """Inequalities that bound a single variable, and what is left. Rows without any variable decide nothing: they go.
+
+    A solver keeps strictly inside bounds that it knows as such, and saves a slack for each.
+    """
+    rows = _column([row for knot in at_knot for row, _ in knot])
+    jacobian = ca.jacobian(rows, variables)
+    entries: list[Any] = jacobian.nonzeros()
+    entry_row, entry_variable = map(np.asarray, jacobian.sparsity().get_triplet())
+    per_row = np.bincount(entry_row, minlength=rows.numel())
+    single = {int(entry_row[i]): i for i in range(len(entries)) if per_row[entry_row[i]] == 1}
+    left: list[list[tuple[ca.SX, bool]]] = []
+    bounds, place = [], 0
+    for knot in at_knot:
+        left.append([])
+        for row, is_equality in knot:
+            entry = single.get(place)
+            if entry is not None and not is_equality and entries[entry].is_constant():
+                bounds.append((row, int(entry_variable[entry]), float(entries[entry])))
+            elif per_row[place]:
+                left[-1].append((row, is_equality))
+            place += 1
+    at_zero = ca.substitute(_column([row for row, *_ in bounds]), variables, ca.SX.zeros(*variables.shape))
+    offset = ca.Function("offset", [parameters], [at_zero])
+    limits = _Limits(np.array([v for _, v, _ in bounds], dtype=int), np.array([s for *_, s in bounds]), offset)
+    return limits, left
+
+
+def _knots(knots: slice | Tensor, N: int) -> list[int]:
+    return list(range(N + 1)[knots]) if isinstance(knots, slice) else [int(k) for k in knots]
+
+
+def _elements(column: ca.SX) -> np.ndarray:
+    """The scalars of a column, (size,) objects."""
+    elements = np.empty(column.numel(), dtype=object)
+    for i in range(column.numel()):
+        elements[i] = column[i]
+    return elements
+
+
+def _column(elements: Iterable) -> ca.SX:
+    return ca.vertcat(ca.SX(0, 1), *elements)

@@ -1,0 +1,233 @@
+"""What each ATen operation does to arrays whose elements are CasADi expressions.
+
+An array is a NumPy array of objects, each a number or a scalar `casadi.SX`: NumPy brings shapes, broadcasting and
+indexing, CasADi the arithmetic. Where all arguments are numbers the result is a number.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import torch
+
+from torchgco.baselines import arrays
+from torchgco.baselines.arrays import NoCounterpart, boxed
+
+
+def _elementwise(function: Callable, inputs: int) -> Callable:
+    """`function` of scalars, on arrays that are broadcast to one shape."""
+    over = np.frompyfunc(function, inputs, 1)
+    return lambda *arrays: boxed(over(*arrays))
+
+
+def _unary(function: Callable) -> Callable:
+    return _elementwise(function, 1)
+
+
+def _binary(function: Callable) -> Callable:
+    return _elementwise(function, 2)
+
+
+def _choose(condition: Any, a: Any, b: Any) -> Any:
+    # CasADi's own choice drops the branch not taken, so that a NaN there does no harm.
+    return ca.if_else(condition, a, b) if isinstance(condition, ca.SX) else (a if condition else b)
+
+
+_where = _elementwise(_choose, 3)
+_add, _sub, _mul = _binary(operator.add), _binary(operator.sub), _binary(operator.mul)
+_truediv, _floor = _binary(operator.truediv), _unary(ca.floor)
+_sqrt = _unary(ca.sqrt)
+_fmin, _fmax = _binary(ca.fmin), _binary(ca.fmax)
+
+
+def _divide(a: Any, b: Any, rounding_mode: str | None = None) -> np.ndarray:
+    if rounding_mode == "trunc":
+        raise NoCounterpart
+    return _truediv(a, b) if rounding_mode is None else _floor(_truediv(a, b))
+
+
+def _clamp(a: Any, min: Any = None, max: Any = None) -> np.ndarray:
+    a = a if min is None else _fmax(a, min)
+    return a if max is None else _fmin(a, max)
+
+
+def _matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    # CasADi's own product: one by one, the thousands of entries of an obstacle constraint would take their time.
+    if a.ndim == 2:
+        product = ca.mtimes(_matrix(a), _matrix(b))
+        return np.array(ca.densify(product).nonzeros(), dtype=object).reshape(b.shape[1], a.shape[0]).T
+    return np.stack([_matmul(first, second) for first, second in zip(a, b, strict=True)])
+
+
+def _matrix(a: np.ndarray) -> ca.SX:
+    return ca.reshape(ca.vertcat(ca.SX(0, 1), *a.T.reshape(-1)), *a.shape)
+
+
+def _addmm(c: np.ndarray, a: np.ndarray, b: np.ndarray, beta: float = 1, alpha: float = 1) -> np.ndarray:
+    return _add(_mul(beta, c), _mul(alpha, _matmul(a, b)))
+
+
+def _sum(a: np.ndarray, dim: Any = None, keepdim: bool = False, **_: Any) -> np.ndarray:
+    return boxed(np.sum(a, axis=arrays.axes(a, dim), keepdims=keepdim))
+
+
+def _mean(a: np.ndarray, dim: Any = None, keepdim: bool = False, **_: Any) -> np.ndarray:
+    return _truediv(_sum(a, dim, keepdim), math.prod(a.shape[axis] for axis in arrays.axes(a, dim)))
+
+
+def _fold(combine: Callable) -> Callable:
+    """A reduction by pairs along some axes, or along all."""
+
+    def reduce(a: np.ndarray, dim: Any = None, keepdim: bool = False, **_: Any) -> np.ndarray:
+        axes = arrays.axes(a, dim)
+        front = np.moveaxis(a, axes, range(len(axes)))
+        rest = front.shape[len(axes) :]
+        reduced = functools.reduce(combine, map(boxed, front.reshape(-1, *rest)))
+        return np.expand_dims(reduced, axes) if keepdim else reduced
+
+    return reduce
+
+
+def _norm(a: np.ndarray, ord: float = 2, dim: Any = None, keepdim: bool = False, **_: Any) -> np.ndarray:
+    if ord != 2:
+        raise NoCounterpart
+    return _sqrt(_sum(_mul(a, a), dim, keepdim))
+
+
+def _cumsum(a: np.ndarray, dim: int, **_: Any) -> np.ndarray:
+    return np.cumsum(a, axis=dim)
+
+
+def _to_copy(a: np.ndarray, dtype: torch.dtype | None = None, **_: Any) -> np.ndarray:
+    if dtype is not None and not dtype.is_floating_point:
+        raise NoCounterpart  # rounding to whole numbers, or to true and false
+    return a
+
+
+def _filled(value: float) -> Callable:
+    return lambda a, **_: np.full(a.shape, value, dtype=object)
+
+
+def _new(value: float) -> Callable:
+    return lambda a, size, **_: np.full(tuple(size), value, dtype=object)
+
+
+def _new_filled(a: np.ndarray, size: Sequence[int], value: float, **_: Any) -> np.ndarray:
+    return np.full(tuple(size), value, dtype=object)
+
+
+def _same(a: np.ndarray, **_: Any) -> np.ndarray:
+    return a
+
+
+# By name of the operation, without its overload. What isn't here, PyTorch first takes apart where it can.
+OPERATIONS: dict[str, Callable] = {
+    # arithmetic
+    "aten.add": lambda a, b, alpha=1: _add(a, b if alpha == 1 else _mul(b, alpha)),
+    "aten.sub": lambda a, b, alpha=1: _sub(a, b if alpha == 1 else _mul(b, alpha)),
+    "aten.rsub": lambda a, b, alpha=1: _sub(b, a if alpha == 1 else _mul(a, alpha)),
+    "aten.mul": _mul,
+    "aten.div": _divide,
+    "aten.neg": _unary(operator.neg),
+    "aten.reciprocal": _unary(lambda x: 1.0 / x),
+    "aten.pow": _binary(operator.pow),
+    "aten.square": _unary(lambda x: x * x),
+    "aten.sqrt": _sqrt,
+    "aten.rsqrt": _unary(lambda x: 1.0 / ca.sqrt(x)),
+    "aten.abs": _unary(ca.fabs),
+    "aten.sign": _unary(ca.sign),
+    "aten.floor": _floor,
+    "aten.ceil": _unary(ca.ceil),
+    "aten.fmod": _binary(ca.fmod),
+    "aten.remainder": lambda a, b: _sub(a, _mul(_floor(_truediv(a, b)), b)),
+    # functions
+    **{
+        f"aten.{name}": _unary(getattr(ca, name))
+        for name in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
+    },
+    **{f"aten.{name}": _unary(getattr(ca, name)) for name in ("exp", "expm1", "log", "log1p", "log10", "erf")},
+    "aten.log2": _unary(lambda x: ca.log(x) / math.log(2.0)),
+    "aten.atan2": _binary(ca.atan2),
+    "aten.sigmoid": _unary(lambda x: 0.5 + 0.5 * ca.tanh(0.5 * x)),
+    "aten.relu": _unary(lambda x: ca.fmax(x, 0.0)),
+    "aten.leaky_relu": lambda a, slope=0.01: _where(_binary(operator.gt)(a, 0.0), a, _mul(a, slope)),
+    "aten.gelu": _unary(lambda x: 0.5 * x * (1.0 + ca.erf(x / math.sqrt(2.0)))),
+    # choices
+    "aten.where": _where,
+    "aten.clamp": _clamp,
+    "aten.clamp_min": _fmax,
+    "aten.clamp_max": _fmin,
+    "aten.hardtanh": lambda a, low=-1.0, high=1.0: _clamp(a, low, high),
+    "aten.maximum": _fmax,
+    "aten.minimum": _fmin,
+    **{f"aten.{name}": _binary(getattr(operator, name)) for name in ("lt", "le", "gt", "ge", "eq", "ne")},
+    "aten.logical_and": _binary(ca.logic_and),
+    "aten.logical_or": _binary(ca.logic_or),
+    "aten.logical_not": _unary(ca.logic_not),
+    "aten.bitwise_and": _binary(ca.logic_and),
+    "aten.bitwise_or": _binary(ca.logic_or),
+    "aten.bitwise_not": _unary(ca.logic_not),
+    # products and reductions
+    "aten.mm": _matmul,
+    "aten.bmm": _matmul,
+    "aten.addmm": _addmm,
+    "aten.sum": _sum,
+    "aten.mean": _mean,
+    "aten.prod": _fold(_mul),
+    "aten.linalg_vector_norm": _norm,
+    "aten.amax": _fold(_fmax),
+    "aten.amin": _fold(_fmin),
+    "aten.any": _fold(_binary(ca.logic_or)),
+    "aten.all": _fold(_binary(ca.logic_and)),
+    "aten.cumsum": _cumsum,
+    # shapes
+    "aten.view": lambda a, shape: a.reshape(tuple(shape)),
+    "aten.reshape": lambda a, shape: a.reshape(tuple(shape)),
+    "aten._unsafe_view": lambda a, shape: a.reshape(tuple(shape)),
+    "aten.unsqueeze": lambda a, dim: np.expand_dims(a, dim),
+    "aten.squeeze": arrays.squeeze,
+    "aten.expand": arrays.expand,
+    "aten.permute": lambda a, dims: np.transpose(a, tuple(dims)),
+    "aten.transpose": lambda a, i, j: np.swapaxes(a, i, j),
+    "aten.t": lambda a: a.T,
+    "aten.flip": lambda a, dims: np.flip(a, tuple(dims)),
+    "aten.repeat": arrays.repeat,
+    "aten.diagonal": lambda a, offset=0, dim1=0, dim2=1: np.diagonal(a, offset, dim1, dim2),
+    "aten.cat": lambda parts, dim=0: np.concatenate(list(parts), axis=dim),
+    "aten.stack": lambda parts, dim=0: np.stack(list(parts), axis=dim),
+    "aten.split": arrays.split,
+    "aten.split_with_sizes": arrays.pieces,
+    "aten.unbind": arrays.unbind,
+    # places
+    "aten.select": arrays.select,
+    "aten.slice": arrays.cut,
+    "aten.index": arrays.index,
+    "aten.index_select": arrays.index_select,
+    "aten.gather": arrays.gather,
+    "aten.select_scatter": arrays.select_scatter,
+    "aten.slice_scatter": arrays.slice_scatter,
+    "aten.index_put": arrays.index_put,
+    # copies and new ones
+    "aten.clone": _same,
+    "aten.alias": _same,
+    "aten.detach": _same,
+    "aten.lift_fresh_copy": _same,
+    "aten._to_copy": _to_copy,
+    "prims.convert_element_type": lambda a, dtype: _to_copy(a, dtype),
+    "aten.copy": lambda a, source, *_: arrays.expand(source, a.shape),
+    "aten.fill": lambda a, value: arrays.expand(boxed(value), a.shape),
+    "aten.zeros_like": _filled(0.0),
+    "aten.ones_like": _filled(1.0),
+    "aten.full_like": lambda a, value, **_: np.full(a.shape, value, dtype=object),
+    "aten.new_zeros": _new(0.0),
+    "aten.new_ones": _new(1.0),
+    "aten.new_full": _new_filled,
+    "aten.empty_like": _filled(0.0),
+    "aten.new_empty": _new(0.0),
+}
