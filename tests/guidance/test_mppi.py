@@ -14,6 +14,7 @@ from torchgco import GCO, MPPI, InputError
 from torchgco.constraints import GuideRegion
 from torchgco.draws import DrawKey, standard_normal
 from torchgco.guidance.detection import active_counts, caught_knots
+from torchgco.guidance.samples import Flight, Noise, draw, fly
 from torchgco.rollout import open_loop
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
@@ -47,6 +48,13 @@ def test_improve_equals_algorithm_3(batch: str, saturation: str) -> None:
         # Scores of wild samples reach 1e7, so weights at temperature 5 carry some 1e-9 of rounding.
         np.testing.assert_allclose(mean[b], expected.U, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(X[b], expected.X, rtol=1e-6, atol=1e-6)
+
+
+def flown(problem, V: torch.Tensor) -> Flight:
+    """Samples with the controls V (B, S, N, m)."""
+    V = V.permute(2, 3, 0, 1)
+    noise = Noise(V, torch.ones(problem.m, 1, 1, dtype=V.dtype), None, None)
+    return fly(problem, torch.zeros_like(V[..., :1]), noise, None)
 
 
 def through_the_obstacles(problem):
@@ -119,12 +127,10 @@ def test_patience_counts_a_single_sphere() -> None:
 
 def test_smooth_noise_is_linear_between_its_knots_and_shrinks() -> None:
     problem, U = planar_batch(B=2, N=21)
-    sampler = MPPI(samples=4, knots=5, saturation=None)
-    z = standard_normal(key(2), 10, range(4), torch.float64).unflatten(0, (5, 2))
-    mean, scale = torch.zeros(21, 2, 2, 1, dtype=torch.float64), torch.ones(2, 1, 1, dtype=torch.float64)
-    noise = sampler.controls(problem, mean, z, scale)
-    torch.testing.assert_close(noise[::5], z)
-    torch.testing.assert_close(noise[2], 0.6 * z[0] + 0.4 * z[1])
+    noise = MPPI(samples=4, knots=5)._noise(problem, key(2), torch.ones(2, 1, 1, dtype=torch.float64), 0, range(4))
+    V = draw(torch.zeros(21, 2, 2, 1, dtype=torch.float64), noise, None)
+    torch.testing.assert_close(V[::5], noise.z)
+    torch.testing.assert_close(V[2], 0.6 * noise.z[0] + 0.4 * noise.z[1])
     wide, narrow = (MPPI(samples=64, rounds=6, decay=d, covariance=4.0, knots=5) for d in (1.0, 0.5))
     spread = [float((s.improve(problem, U, key(2))[1] - U).abs().mean()) for s in (wide, narrow)]
     assert spread[1] < spread[0]
@@ -139,10 +145,9 @@ def test_elite_temperature_is_the_gap_to_the_better_samples() -> None:
 
 def test_lingering_charges_where_a_sample_ends() -> None:
     problem, U = planar_batch(B=1, N=6)
-    mean = U.permute(1, 2, 0).unsqueeze(-1)
-    V, none = mean + torch.tensor([0.0, 4.0]), torch.zeros(6, 2, 1, 2, dtype=torch.float64)
-    plain = MPPI(samples=2).scores(problem, mean, V, none, torch.ones(2, 1, 1))
-    longer = MPPI(samples=2, linger=2.0).scores(problem, mean, V, none, torch.ones(2, 1, 1))
+    flight = flown(problem, U.unsqueeze(1) + torch.tensor([0.0, 4.0]).view(1, 2, 1, 1))
+    V = flight.V
+    plain, longer = MPPI(samples=2).scores(problem, flight), MPPI(samples=2, linger=2.0).scores(problem, flight)
     for s in range(2):
         controls = V[..., s].permute(2, 0, 1)
         X = open_loop(problem.dynamics, problem.x0, controls)
@@ -165,7 +170,9 @@ def test_many_samples_are_flown_in_blocks(knots: int, monkeypatch) -> None:
     sampler = MPPI(samples=23, knots=knots, rounds=2, covariance=4.0)
     whole = sampler.improve(problem, U, key(3))[1]
     monkeypatch.setattr("torchgco.guidance.mppi.CHUNK", 10)
-    torch.testing.assert_close(sampler.improve(problem, U, key(3))[1], whole, rtol=1e-12, atol=1e-12)
+    for kept in (2**25, 1):
+        monkeypatch.setattr("torchgco.guidance.mppi.KEPT", kept)
+        torch.testing.assert_close(sampler.improve(problem, U, key(3))[1], whole, rtol=1e-12, atol=1e-12)
 
 
 def test_draws_are_standard_normal_and_independent() -> None:
@@ -210,10 +217,9 @@ def test_samples_do_not_know_their_companions(batch: str, dtype: str, samples: i
 
 def test_a_diverging_sample_is_not_chosen() -> None:
     problem, U = planar_batch(B=1, N=5)
-    mean = U.permute(1, 2, 0).unsqueeze(-1)
-    V = mean.repeat(1, 1, 1, 3)
-    V[..., 1] = torch.inf
-    S = MPPI(samples=3).scores(problem, mean, V, torch.zeros_like(V), torch.ones(2, 1, 1))
+    V = U.unsqueeze(1).repeat(1, 3, 1, 1)
+    V[0, 1] = torch.inf
+    S = MPPI(samples=3).scores(problem, flown(problem, V))
     assert torch.isfinite(S).all() and S[0, 1] > 1e300
 
 

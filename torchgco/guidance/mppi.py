@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -10,12 +11,13 @@ from torch import Tensor
 
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.draws import DrawKey, standard_normal
-from torchgco.guidance.samples import fly
+from torchgco.guidance.samples import Flight, Noise, average, draw, fly
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
-from torchgco.shapes import InputError, check_shape, sum_rows, tensor
+from torchgco.shapes import InputError, check_shape, tensor
 
 CHUNK = 8192  # samples flown side by side: what a stage needs of them stays in a core's cache
+KEPT = 2**25  # numbers: controls of more samples than this are drawn again rather than kept
 
 
 @dataclass(frozen=True)
@@ -97,44 +99,34 @@ class MPPI:
 
     def _rounds(self, problem: Problem, U: Tensor, sigma: Tensor, key: DrawKey, stream: int) -> Tensor:
         """All rounds for one chunk of problems; U (B, N, m), sigma (m, B|1, 1)."""
-        mean = U.permute(1, 2, 0).unsqueeze(-1)  # (N, m, B, 1)
-        # A block that is not the only one is drawn again rather than kept: memory stays bounded whatever S.
+        mean, bounds = U.permute(1, 2, 0).unsqueeze(-1).contiguous(), self._bounds(problem)  # (N, m, B, 1)
         blocks = [range(s, min(s + CHUNK, self.samples)) for s in range(0, self.samples, CHUNK)]
+        keep = self.samples * problem.N * problem.m <= KEPT
         for i in range(self.rounds):
-            scale, number = self.decay**i * sigma.sqrt(), stream * self.rounds + i
-            V, scores = mean, []
+            scale = self.decay**i * sigma.sqrt()
+            draws = partial(self._noise, problem, key, scale, stream * self.rounds + i)
+            scores, drawn = [], []
             for block in blocks:
-                z = self._draw(problem, key, U.dtype, number, block)
-                V = self.controls(problem, mean, z, scale)
-                scores.append(self.scores(problem, mean, V, z, scale))
+                flight = fly(problem, mean, draws(block), bounds)
+                scores.append(self.scores(problem, flight))
+                drawn.append(flight.V if keep else None)
             weights = self._weights(torch.cat(scores, dim=-1)).to(U.dtype)
-            if len(blocks) == 1:
-                mean = (V * weights).sum(-1, keepdim=True)
-                continue
-            total = torch.zeros_like(mean)
-            for block in blocks:
-                V = self.controls(problem, mean, self._draw(problem, key, U.dtype, number, block), scale)
-                total += (V * weights[:, block.start : block.stop]).sum(-1, keepdim=True)
-            mean = total
+            new = torch.zeros_like(mean)
+            for block, V in zip(blocks, drawn, strict=True):
+                # Drawn again rather than kept where they are too many: memory stays bounded whatever S.
+                V = draw(mean, draws(block), bounds) if V is None else V
+                new = new + average(V, weights[:, block.start : block.stop])
+            mean = new
         return mean.squeeze(-1).permute(2, 0, 1)
 
-    def _draw(self, problem: Problem, key: DrawKey, dtype: torch.dtype, stream: int, samples: range) -> Tensor:
-        """Unit noise at the knots, or at every stage where it is white, (knots or N, m, B, S)."""
+    def _noise(self, problem: Problem, key: DrawKey, scale: Tensor, stream: int, samples: range) -> Noise:
         rows = self.knots or problem.N
-        return standard_normal(key, rows * problem.m, samples, dtype, stream).unflatten(0, (rows, problem.m))
-
-    def controls(self, problem: Problem, mean: Tensor, z: Tensor, scale: Tensor) -> Tensor:
-        """V (N, m, B, S): mean (N, m, B, 1) and noise `scale` (m, B|1, 1) times z, saturated (lines 6-7)."""
-        V = z.new_empty(problem.N, *z.shape[1:])
-        place = torch.linspace(0, max(self.knots - 1, 0), problem.N, dtype=z.dtype).tolist()
-        for k in range(problem.N):  # stage by stage, for what is at work to stay in the cache
-            if self.knots == 0:
-                noise = z[k]
-            else:
-                left = min(int(place[k]), self.knots - 2)
-                noise = torch.lerp(z[left], z[left + 1], place[k] - left)
-            torch.addcmul(mean[k], noise, scale, out=V[k])
-        return self.saturate(problem, V)
+        z = standard_normal(key, rows * problem.m, samples, scale.dtype, stream).unflatten(0, (rows, problem.m))
+        if self.knots == 0:
+            return Noise(z, scale, None, None)
+        place = torch.linspace(0, self.knots - 1, problem.N, dtype=z.dtype, device=z.device)
+        left = place.floor().clamp(max=self.knots - 2)
+        return Noise(z, scale, left.long(), (place - left).view(-1, 1, 1, 1))
 
     def _weights(self, S: Tensor) -> Tensor:
         """w (B, S) from the samples' costs."""
@@ -144,32 +136,25 @@ class MPPI:
         spread = gap.kthvalue(self.elite, dim=1, keepdim=True).values
         return torch.softmax(-gap / spread.clamp(min=self.temperature), dim=1)
 
-    def scores(self, problem: Problem, mean: Tensor, V: Tensor, z: Tensor, scale: Tensor) -> Tensor:
-        """S (B, S) in float64 of controls V (N, m, B, S) around mean (N, m, B, 1) with noise scale z (lines 5-11)."""
-        cost, hits, x = fly(problem, V)
-        cost = cost + problem.cost.terminal_rows(x)
+    def scores(self, problem: Problem, flight: Flight) -> Tensor:
+        """S (B, S) in float64 of a block of samples."""
+        cost = flight.cost + problem.cost.terminal_rows(flight.x)
         if self.linger > 0:
-            cost = cost + self.linger * problem.N * problem.cost.stage_rows(x, V[-1], problem.N - 1)
-        if self.knots == 0:
-            likelihood = torch.zeros_like(cost)
-            for k in range(problem.N):
-                likelihood += sum_rows(mean[k] / scale * z[k])  # u' Sigma^-1 eps
-            cost = cost + self.temperature * likelihood
-        S = cost.double() + self.collision_penalty * hits.double()
+            cost = cost + self.linger * problem.N * problem.cost.stage_rows(flight.x, flight.V[-1], problem.N - 1)
+        cost = cost + self.temperature * flight.likelihood
+        S = cost.double() + self.collision_penalty * flight.hits.double()
         # A sample that left the finite numbers must not take the others with it.
         return torch.where(torch.isfinite(S), S, torch.finfo(S.dtype).max)
 
-    def saturate(self, problem: Problem, V: Tensor) -> Tensor:
-        """Samples (N, m, B, S) clamped in place as `saturation` says (line 7)."""
+    def _bounds(self, problem: Problem) -> tuple[Tensor, Tensor] | None:
+        """What samples are clamped to as `saturation` says (line 7): two (m, B|1, 1)."""
         if self.saturation is None:
-            return V
+            return None
         for constraint in problem.constraints:
             if isinstance(constraint, ControlBounds):
                 upper = constraint.upper.mT.unsqueeze(-1)
-                lower = constraint.lower.mT.unsqueeze(-1) if self.saturation == "bounds" else -upper
-                for v in V:
-                    v.clamp_(lower, upper)
-        return V
+                return (constraint.lower.mT.unsqueeze(-1) if self.saturation == "bounds" else -upper), upper
+        return None
 
     def _sigma(self, problem: Problem) -> Tensor:
         """Diagonal of Sigma, (m, B|1, 1)."""
