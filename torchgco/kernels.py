@@ -28,6 +28,11 @@ def compile_kernels(on: bool) -> None:
     _Switch.on = on
 
 
+def compiling() -> bool:
+    """Whether this process compiles its kernels."""
+    return _Switch.on
+
+
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """A function that is compiled once its process compiles kernels; eager where no compiler is found."""
     compiled: Any = None

@@ -6,6 +6,9 @@ import torch
 from torch import Tensor
 
 from torchgco.dynamics.base import Dynamics
+from torchgco.kernels import compiling, kernel
+
+STAGES = 5  # compiled into one kernel
 
 
 def open_loop(dynamics: Dynamics, x0: Tensor, U: Tensor) -> Tensor:
@@ -24,6 +27,8 @@ def closed_loop(dynamics: Dynamics, X: Tensor, U: Tensor, G: Tensor, alpha: Tens
         G: gains [K d], stage first: (N, B, m, n+1).
         alpha: step lengths (B,).
     """
+    if compiling():
+        return _closed_loop_rows(dynamics, X, U, G, alpha)
     x, knots, controls = X[:, 0], [X[:, 0]], []
     step = alpha.unsqueeze(-1)
     for k in range(U.shape[1]):
@@ -33,3 +38,32 @@ def closed_loop(dynamics: Dynamics, X: Tensor, U: Tensor, G: Tensor, alpha: Tens
         knots.append(x)
         controls.append(u)
     return torch.stack(knots, dim=1), torch.stack(controls, dim=1)
+
+
+def _closed_loop_rows(dynamics: Dynamics, X: Tensor, U: Tensor, G: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """The same, components first and some stages at a time: the form that compiles into few kernels."""
+    states, controls, gains = X.permute(1, 2, 0).contiguous(), U.permute(1, 2, 0).contiguous(), G.permute(0, 2, 3, 1)
+    gains, x = gains.contiguous(), states[0]
+    knots, inputs = [x.unsqueeze(0)], []
+    for k in range(0, U.shape[1], STAGES):
+        part = slice(k, k + STAGES)
+        x_part, u_part = _follow(dynamics, x, states[part], controls[part], gains[part], alpha)
+        x = x_part[-1]
+        knots.append(x_part)
+        inputs.append(u_part)
+    return torch.cat(knots).permute(2, 0, 1).contiguous(), torch.cat(inputs).permute(2, 0, 1).contiguous()
+
+
+@kernel
+def _follow(
+    dynamics: Dynamics, x: Tensor, states: Tensor, controls: Tensor, gains: Tensor, alpha: Tensor
+) -> tuple[Tensor, Tensor]:
+    """States and controls (c, n, B), (c, m, B) of c stages from x (n, B), with gains (c, m, n+1, B)."""
+    new_x, new_u = [], []
+    for k in range(controls.shape[0]):
+        deviation = torch.cat((x - states[k], alpha.unsqueeze(0)))
+        u = controls[k] + (gains[k] * deviation).sum(1)
+        x = dynamics.step_rows(x.unsqueeze(-1), u.unsqueeze(-1)).squeeze(-1)
+        new_x.append(x)
+        new_u.append(u)
+    return torch.stack(new_x), torch.stack(new_u)

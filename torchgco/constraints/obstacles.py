@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
-from torchgco.shapes import Dimensions, InputError, check_shape, tensor
+from torchgco.shapes import Dimensions, InputError, check_shape, sum_rows, tensor
 
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
 
@@ -143,6 +143,11 @@ class BoundSpheres(Constraint):
 
     def hits(self, x: Tensor, k: int) -> Tensor:
         p = x[self.position]
+        if torch.compiler.is_compiling() and self.velocities is None:
+            # A product would break the fusion of a whole stage into one loop.
+            away = (p.unsqueeze(2) - self.centers.movedim(-1, 0).unsqueeze(-1)).square()  # (d, B, M, S)
+            reach = torch.where(self.absent, -1.0, self.distances.square()).unsqueeze(-1)
+            return (sum_rows(away) <= reach).to(p.dtype).sum(1)
         rows = [*p.unbind(0), p.square().sum(0), torch.ones_like(p[0])]
         if self.velocities is not None:
             t = k * self.dt

@@ -15,7 +15,7 @@ from torchgco.kernels import kernel
 from torchgco.problem import Problem
 from torchgco.shapes import sum_rows
 
-STAGES = 10  # drawn and flown together; compiled, they are one kernel
+STAGES = 5  # drawn and flown together; compiled, they are one kernel
 
 
 @dataclass(frozen=True)

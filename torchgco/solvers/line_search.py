@@ -16,6 +16,8 @@ from torchgco.rollout import closed_loop
 from torchgco.shapes import InputError
 from torchgco.solvers.riccati import BackwardPass
 
+SIDE_BY_SIDE = 256  # trajectories that cost little more than one
+
 
 @dataclass(frozen=True)
 class Candidates:
@@ -38,7 +40,8 @@ class LineSearch:
         ratio_min, ratio_max: accepted range of the ratio.
         smallest: step lengths end with the first one below this.
         accept_last: take that last one whatever it does to L_M (as printed), rather than no step at all.
-        parallel: rungs tried side by side by those that refused alpha = 1.
+        parallel: rungs that those who refused alpha = 1 try side by side, at least. More where few refused: rolling
+            out some dozens of trajectories costs what one costs.
 
     Raises:
         InputError: a field out of its range.
@@ -76,11 +79,12 @@ class LineSearch:
         """
         found = self._try(lagrangian, X, U, merit, step, torch.ones_like(merit))
         rungs = self.ladder[1:]
-        for start in range(0, len(rungs), self.parallel):
+        while rungs:
             refused = (~found.accepted).nonzero().flatten()
             if refused.numel() == 0:
                 break
-            chunk = rungs[start : start + self.parallel]
+            width = max(self.parallel, SIDE_BY_SIDE // refused.numel())
+            chunk, rungs = rungs[:width], rungs[width:]
             rows = refused.repeat_interleave(len(chunk))
             alpha = merit.new_tensor(chunk).repeat(refused.numel())
             part = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
