@@ -1,6 +1,6 @@
 # make study   the default study, in an environment of its own (ARGS="experiment=planar_trap seed=1" for others)
 # make families   every solver on the public layouts (an hour or more)
-# make test    the quick tests; lint, types: the static checks; clean: start afresh
+# make test    the quick tests; test-slow: those that compile; lint, types: the static checks; clean: start afresh
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -15,13 +15,16 @@ DEV := $(VENV)/.dev
 # The public layouts of benchmarks/data, all solvers; FAMILIES picks some. An hour or more on two cores.
 FAMILIES ?= forest30 forest60 walls planar_trap planar_random
 
-.PHONY: study test lint types clean families $(FAMILIES:%=family-%)
+.PHONY: study test test-slow lint types clean families $(FAMILIES:%=family-%)
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
 
 test: $(DEV)
 	$(BIN)/python -m pytest -n auto $(ARGS)
+
+test-slow: $(DEV)
+	$(BIN)/python -m pytest -m slow $(ARGS)
 
 families: $(FAMILIES:%=family-%)
 	$(BIN)/torchgco-report outputs/families --output outputs/families-report

@@ -203,6 +203,7 @@ BAD = {
     "crossed bounds": (["model.vehicle.control_lower=[9,9,9,9]"], "control_bounds.lower"),
     "solver option": (["solver.inner.tolerance=-1"], "ilqr.tolerance"),
     "batch size": (["study.batch_size=0"], "study.batch_size"),
+    "compile": (["device.compile=sometimes"], "device.compile"),
     "shard size": (["study.shard_size=0"], "study.shard_size"),
     "threads": (["device.threads=0"], "device.threads"),
     "workers": (["study.workers=0"], "study.workers"),

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
+from torchgco.kernels import compile_kernels
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 from torchgco.shapes import InputError
 
@@ -144,14 +145,17 @@ def as_input_error(error: BaseException, field: str = "configuration") -> InputE
 
 
 def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
-    """The device, once its threads are set."""
+    """The device, once threads and kernels of this process are set."""
     if node.name not in ("cpu", "cuda"):
         raise InputError("device.name", "cpu or cuda", node.name)
     if node.name == "cuda" and not torch.cuda.is_available():
         raise InputError("device", "device=cpu, as no CUDA device is visible", "device=cuda")
     if node.dtype not in ("float64", "float32"):
         raise InputError("device.dtype", "float64 or float32", node.dtype)
+    if not isinstance(node.compile, bool):
+        raise InputError("device.compile", "true or false", repr(node.compile))
     torch.set_num_threads(_threads(node.threads))
+    compile_kernels(node.compile)
     return torch.device(node.name), getattr(torch, node.dtype)
 
 

@@ -23,6 +23,7 @@ from torchgco.experiments.build import Setup, allotted_cores, build, solver_of
 from torchgco.experiments.records import COLUMNS, Records
 from torchgco.experiments.report import write_report
 from torchgco.judge import SUCCESS_COST, frame_columns, judge
+from torchgco.kernels import compile_kernels, compiling
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.scenarios import Layouts
@@ -34,6 +35,7 @@ from torchgco.status import Status
 
 # How the configuration of a baseline is found: its name in, the whole configuration with that solver out.
 Recompose = Callable[[str], DictConfig]
+WARM_UP = 8  # problems that are solved once for what they compile
 NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
 
 
@@ -122,7 +124,9 @@ def _fly_side_by_side(
     if workers < 2:
         return set()  # one after the other, in this process, with a bar that moves inside a batch
     bar.set_description(f"{workers} processes")
-    with multiprocessing.get_context("spawn").Pool(workers, _prepare_worker, (torch.get_num_threads(),)) as pool:
+    with multiprocessing.get_context("spawn").Pool(
+        workers, _prepare_worker, (torch.get_num_threads(), compiling())
+    ) as pool:
         for shard, rows, U in pool.imap_unordered(_fly_batch, missing):
             records.write_shard(shard, rows, U)
             bar.update(len(rows))
@@ -156,8 +160,9 @@ def _workers(setup: Setup) -> int:
     return wanted
 
 
-def _prepare_worker(threads: int) -> None:
+def _prepare_worker(threads: int, compiled: bool) -> None:
     torch.set_num_threads(threads)
+    compile_kernels(compiled)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
 
 
@@ -205,8 +210,11 @@ class _Flight:
     def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, int]:
         """The solution, seconds a problem, and slots; half as many slots wherever memory runs out."""
         slots, solver = _slots(self.setup, problem), self.solver
-        # What a solver builds for a batch is set-up: the clock starts after it.
+        # What a solver builds or compiles for a batch is set-up: the clock starts after it.
         solver = solver.prepare(problem) if hasattr(solver, "prepare") else solver
+        if compiling():
+            few = torch.arange(min(WARM_UP, problem.B), device=U0.device)
+            self.solver.solve(problem.take(few), U0[few], seed=self.setup.seed, ids=ids[few])
         while True:
             solver = replace(solver, slots=slots) if hasattr(solver, "slots") else solver
             began = _now(self.setup.device)
