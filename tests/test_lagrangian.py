@@ -5,6 +5,7 @@ import torch
 
 from tests.problems import planar_batch, quadrotor_batch, random_trajectory
 from torchgco.constraints import FunctionConstraint, GuideRegion, StateBounds
+from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian, Multipliers, penalty_weights, update, worst_rows
 from torchgco.problem import Problem
 
@@ -44,7 +45,7 @@ def test_gradient_is_the_derivative_of_the_value(batch: str, clip: bool) -> None
     lagrangian = Lagrangian(problem, _random_duals(problem, X, U), _guide(X, problem.dynamics.position), clip)
     X_, U_ = X.clone().requires_grad_(), U.clone().requires_grad_()
     gX, gU = torch.autograd.grad(lagrangian.value(X_, U_)[1].sum(), (X_, U_))
-    H, n = lagrangian.expand(X, U), problem.n
+    H, n = lagrangian.expand(X, U).transpose(0, 1), problem.n
     torch.testing.assert_close(H[..., :n, n], gX, rtol=1e-10, atol=1e-8)
     torch.testing.assert_close(H[:, :-1, n + 1 :, n], gU, rtol=1e-10, atol=1e-8)
     torch.testing.assert_close(H, H.mT, rtol=0, atol=1e-12)
@@ -57,9 +58,9 @@ def test_hessian_is_gauss_newton(batch: str) -> None:
     X, U = random_trajectory(problem)
     duals, n = _random_duals(problem, X, U), problem.n
     guide = _guide(X, problem.dynamics.position)
-    H = Lagrangian(problem, duals, guide, False).expand(X, U)
+    H = Lagrangian(problem, duals, guide, False).expand(X, U).transpose(0, 1)
     plain = Problem(problem.dynamics, problem.cost, [], problem.x0, problem.N)
-    expected = Lagrangian(plain, Multipliers((), duals.mu), None, False).expand(X, U)
+    expected = Lagrangian(plain, Multipliers((), duals.mu), None, False).expand(X, U).transpose(0, 1)
     for constraint, lam in zip(problem.constraints, duals.lam, strict=True):
         c = constraint.value(X, U)
         rho = penalty_weights(constraint, c, lam, duals.mu, False)
@@ -139,3 +140,15 @@ def test_the_worst_row_is_named() -> None:
     assert first == {"violation": pytest.approx(0.5), "constraint": "ControlBounds", "knot": 4, "row": 3}
     assert second["constraint"] == "BoundSpheres" and second["knot"] == 3 and second["row"] == 2
     assert second["violation"] == pytest.approx(float(problem.constraints[0].distances[1, 2]))
+
+
+def test_a_large_batch_is_valued_and_expanded_in_pieces(monkeypatch) -> None:
+    problem = _with_more(quadrotor_batch(B=5, N=9)[0])
+    X, U = random_trajectory(problem)
+    lagrangian = Lagrangian(problem, _random_duals(problem, X, U), _guide(X, problem.dynamics.position), True)
+    whole = (*lagrangian.value(X, U), lagrangian.expand(X, U), linearise(problem, X, U))
+    for module in ("lagrangian", "expansion"):
+        monkeypatch.setattr(f"torchgco.{module}.AT_ONCE", 2)
+    F = torch.full_like(whole[3], torch.nan)  # memory that a pass before has left
+    for a, b in zip(whole, (*lagrangian.value(X, U), lagrangian.expand(X, U), linearise(problem, X, U, F)), strict=True):
+        assert torch.equal(a, b)

@@ -14,6 +14,8 @@ from torchgco.expansion import quadratise
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, take
 
+AT_ONCE = 64  # problems that are valued and expanded together on a CPU
+
 
 @dataclass(frozen=True)
 class Multipliers:
@@ -69,6 +71,12 @@ class Lagrangian:
 
     def value(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         """J_var (B,) and L_M (B,)."""
+        if X.shape[0] <= AT_ONCE:
+            return self._value(X, U)
+        parts = [self.take(rows)._value(X[rows], U[rows]) for rows in _split(X)]
+        return torch.cat([cost for cost, _ in parts]), torch.cat([merit for _, merit in parts])
+
+    def _value(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         cost = self.problem.cost.total(X, U)
         merit = cost
         for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
@@ -82,8 +90,19 @@ class Lagrangian:
             merit = merit + terms.sum(-1).sum(-1)
         return cost, merit if self.guide is None else merit + self.guide.value(X)
 
-    def expand(self, X: Tensor, U: Tensor) -> Tensor:
-        """H (B, N+1, s, s) of L_M: first derivatives of the constraints only (Equations 31-37)."""
+    def expand(self, X: Tensor, U: Tensor, out: Tensor | None = None) -> Tensor:
+        """H (N+1, B, s, s) of L_M: first derivatives of the constraints only (Equations 31-37).
+
+        Stage first, as the backward pass reads it; written into `out` where that is given.
+        """
+        s = self.problem.n + 1 + self.problem.m
+        H = X.new_empty(X.shape[1], X.shape[0], s, s) if out is None else out
+        for rows in _split(X):
+            part = self if rows.numel() == X.shape[0] else self.take(rows)
+            H[:, rows[0] : rows[-1] + 1] = part._expand(X[rows], U[rows]).transpose(0, 1)
+        return H
+
+    def _expand(self, X: Tensor, U: Tensor) -> Tensor:
         H = quadratise(self.problem, X, U)
         for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
             c = constraint.value(X, U)
@@ -95,6 +114,11 @@ class Lagrangian:
         if self.guide is not None:
             self.guide.accumulate(X, H)
         return H
+
+
+def _split(X: Tensor) -> tuple[Tensor, ...]:
+    """Rows of a batch, a few problems at a time: what is at work then stays in the cache."""
+    return torch.arange(X.shape[0], device=X.device).split(AT_ONCE if X.device.type == "cpu" else X.shape[0])
 
 
 def update(

@@ -41,7 +41,9 @@ def _ahead(x: Parts, h: float, slope: Parts) -> Parts:
 
 def linearise_euler(field: Field, jacobians: FieldJacobians, x: Tensor, u: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     ax, au = jacobians(x, u)
-    return _identity(ax) + dt * ax, dt * au
+    fx = dt * ax
+    fx.diagonal(dim1=-2, dim2=-1).add_(1.0)
+    return fx, dt * au
 
 
 def linearise_midpoint(

@@ -56,6 +56,9 @@ class Loop:
         self.waiting = everyone[slots:]
         self.state = self._begin(everyone[:slots])
         self.problem = problem if slots == problem.B else problem.take(everyone[:slots])
+        # F and H of every pass: memory that is had afresh costs more than what is written into it.
+        z, s = problem.n + 1, problem.n + 1 + problem.m
+        self.space = (U0.new_empty(problem.N, slots, z, s), U0.new_empty(problem.N + 1, slots, s, s))
 
     def run(self) -> Solution:
         """Pass after pass until every element has ended."""
@@ -107,7 +110,9 @@ class Loop:
         """One iteration of every running element; returns the statuses it leaves them in."""
         s, inner = self.state, self.solver.inner
         lagrangian = Lagrangian(self.problem, s.duals, s.guide, self.solver.clip)
-        F, H = linearise(self.problem, s.X, s.U), lagrangian.expand(s.X, s.U).transpose(0, 1)
+        F, H = (t[:, : self.problem.B] for t in self.space)
+        linearise(self.problem, s.X, s.U, out=F)
+        lagrangian.expand(s.X, s.U, out=H)
         step = backward(F, H, s.regularisation)
         status = torch.full_like(s.rows, Status.RUNNING)
         settled = step.expected_change(torch.ones_like(s.merit)).abs() <= 1e-14 * s.merit.abs().clamp(min=1.0)
@@ -259,8 +264,7 @@ class Loop:
             part = self.whole.take(rows)
             lagrangian = Lagrangian(part, take(r.multipliers, rows), None, self.solver.clip)
             X, U = r.X[rows], r.U[rows]
-            H = lagrangian.expand(X, U).transpose(0, 1)
-            step = backward(linearise(part, X, U), H, torch.zeros_like(r.cost[rows]))
+            step = backward(linearise(part, X, U), lagrangian.expand(X, U), torch.zeros_like(r.cost[rows]))
             G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
             r.K[rows], r.d[rows] = G[..., :-1], G[..., -1]
         return replace(r, trace=None if self.recorder is None else self.recorder.frame())
