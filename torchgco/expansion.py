@@ -7,7 +7,6 @@ from torch import Tensor
 
 from torchgco.problem import Problem
 
-
 AT_ONCE = 64  # problems that are differentiated together on a CPU: what is at work stays in the cache
 
 

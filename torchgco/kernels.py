@@ -42,11 +42,13 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
         nonlocal compiled
         if not _Switch.on or torch.compiler.is_compiling():
             return function(*args, **kwargs)
+        from torch._dynamo.exc import BackendCompilerFailed  # loaded by those who compile
+
         if compiled is None:
             compiled = torch.compile(function, dynamic=True)
         try:
             return compiled(*args, **kwargs)
-        except torch._dynamo.exc.BackendCompilerFailed as error:  # no C++ compiler, or none that works
+        except BackendCompilerFailed as error:  # no C++ compiler, or none that works
             _Switch.on = False
             warnings.warn(f"kernels run eagerly, as compiling failed: {str(error).splitlines()[0]}", stacklevel=2)
             return function(*args, **kwargs)
