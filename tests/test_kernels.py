@@ -35,7 +35,7 @@ def test_compiled_kernels_equal_eager_ones(batch: str, compiled) -> None:
         compile_kernels(on)
         rolled = closed_loop(problem.dynamics, X, U, G, alpha)
         fewer = closed_loop(problem.dynamics, X[:3], U[:3], G[:, :3], alpha[:3])
-        kinds = (4, 0) if batch == "planar" else (4,)  # smooth and white noise; a quadrotor's kernels take long to compile
+        kinds = (4, 0) if batch == "planar" else (4,)  # smooth, and white noise
         plans = [MPPI(samples=24, knots=knots, rounds=2).improve(problem, U, key)[1] for knots in kinds]
         results.append((*rolled, *fewer, *plans))
     for fused, eager in zip(*results, strict=True):
