@@ -1,5 +1,7 @@
 # make study   the default study, in an environment of its own (ARGS="experiment=planar_trap seed=1" for others)
 # make families   every solver on the public layouts (an hour or more)
+# make benchmark   speed, side by side with the peers (a quarter of an hour; ARGS="families --compile" for some or more);
+#                  benchmark-gpu: the same on a GPU
 # make test    the quick tests; test-slow: those that compile; lint, types: the static checks; clean: start afresh
 
 PYTHON ?= python3
@@ -11,11 +13,14 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constrain
 # A stamp is newer than what it was made from for as long as there is nothing to install.
 RUNTIME := $(VENV)/.runtime
 DEV := $(VENV)/.dev
+PEERS := $(VENV)/.peers
 
 # The public layouts of benchmarks/data, all solvers; FAMILIES picks some. An hour or more on two cores.
 FAMILIES ?= forest30 forest60 walls planar_trap planar_random
 
-.PHONY: study test test-slow lint types clean families $(FAMILIES:%=family-%)
+SPEED := $(BIN)/python -m benchmarks.speed
+
+.PHONY: study test test-slow lint types clean benchmark benchmark-gpu families $(FAMILIES:%=family-%)
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -34,6 +39,12 @@ family-%: $(RUNTIME)
 	$(BIN)/torchgco scenario=layouts scenario.path=benchmarks/data/$*.npz \
 	    model=$(if $(filter planar%,$*),planar,quadrotor) \
 	    study.baselines=[gco_paper,al_ilqr,mppi,hold] hydra.run.dir=outputs/families/$* $(ARGS)
+
+benchmark: $(PEERS)
+	$(SPEED) $(ARGS)
+
+benchmark-gpu: $(PEERS)
+	$(SPEED) --device cuda $(ARGS)
 
 lint: $(DEV)
 	$(BIN)/ruff check .
@@ -56,3 +67,7 @@ $(RUNTIME): pyproject.toml constraints.txt | $(BIN)/python
 $(DEV): pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) -e '.[dev]'
 	touch $@ $(RUNTIME)
+
+$(PEERS): pyproject.toml constraints.txt | $(BIN)/python
+	$(INSTALL) -e '.[dev,peers]'
+	touch $@ $(RUNTIME) $(DEV)

@@ -1,0 +1,1 @@
+"""Measurements of torchgco. Not part of the package."""

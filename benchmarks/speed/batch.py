@@ -1,0 +1,48 @@
+"""Seconds and memory an element as the batch grows, every batch in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import asdict
+
+from benchmarks.speed.bench import Bench
+from benchmarks.speed.provenance import ROOT
+
+SECTION = "batch"
+START = 10.0  # seconds that a process takes before it solves anything
+SHARE = 0.15  # of the time left, what one batch may take
+
+
+def run(bench: Bench) -> None:
+    solver = "gco, compiled" if bench.compiled else "gco"
+    for batches, limited in ((bench.sizes.whole_batches, False), (bench.sizes.limited_batches, True)):
+        known = 0.0
+        for batch in batches:
+            case = f"B = {batch}{', 2 outer' if limited else ''}"
+            # The last one's seconds an element: more of them take no longer each.
+            seconds = START + known * max(batch, bench.sizes.fewest_layouts)
+            if bench.fits(SECTION, case, seconds, SHARE):
+                known = _measure(bench, case, solver, batch, limited)
+
+
+def _measure(bench: Bench, case: str, solver: str, batch: int, limited: bool) -> float:
+    """Start the process, read its one line; returns its seconds an element."""
+    order = {"batch": batch, "limited": limited, "device": bench.device, "compiled": bench.compiled}
+    words = [sys.executable, "-m", "benchmarks.speed.one_batch", json.dumps({**order, "sizes": asdict(bench.sizes)})]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    if done.returncode != 0:
+        # Out of memory, most likely, and killed for it: a finding, no reason to stop.
+        bench.row(SECTION, case, solver, "ended with", str(done.returncode))
+        bench.say(done.stderr[-2000:])
+        return 0.0
+    told = json.loads(done.stdout.splitlines()[-1])
+    seconds = told["seconds"]
+    bench.row(SECTION, case, solver, "an element", 1000 * seconds, "ms")
+    bench.row(SECTION, case, solver, "an element and iteration", 1000 * seconds / told["iterations"], "ms")
+    bench.row(SECTION, case, solver, "problems a second", 1 / seconds, "1/s")
+    if told["bytes"] is not None:
+        bench.row(SECTION, case, solver, "peak memory", told["bytes"] / 2**20, "MiB")
+        bench.row(SECTION, case, solver, "memory an element", told["bytes"] / 2**20 / batch, "MiB")
+    return seconds

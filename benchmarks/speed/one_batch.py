@@ -1,0 +1,83 @@
+"""One batch size in a process of its own, as only so its peak of memory can be told: `batch` starts this."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.speed.bench import Bench
+from benchmarks.speed.sizes import Sizes
+from torchgco.experiments.build import Setup
+from torchgco.problem import Problem
+from torchgco.solution import Solution
+
+
+def measure(order: dict[str, Any]) -> dict[str, Any]:
+    """Seconds and iterations an element, and the peak of memory above what was held before (None: can't be told)."""
+    sizes = Sizes(**order["sizes"])
+    bench = Bench(sizes, device=order["device"])
+    setup = bench.setup("scenario=forest")
+    if order["limited"]:
+        setup = replace(setup, solver=replace(setup.solver, max_outer_iterations=2, attempts=1))
+    batch = order["batch"]
+    with bench.mode(order["compiled"]):
+        _warm_up(setup, min(batch, 2))
+        held = _start_of_memory(bench.device)
+        seconds, iterations, flown = 0.0, 0, 0
+        # Few problems say little: small batches fly until as many layouts are flown as for the others.
+        while flown < max(batch, sizes.fewest_layouts):
+            problem, U0 = _problem(setup, flown, batch)
+            solution, took = bench.timed(lambda p=problem, U=U0: _solve(setup, p, U))
+            seconds, iterations, flown = seconds + took, iterations + int(solution.iterations.sum()), flown + batch
+    peak = _peak_of_memory(bench.device)
+    above = None if held is None or peak is None else max(0, peak - held)
+    return {"seconds": seconds / flown, "iterations": max(1.0, iterations / flown), "bytes": above}
+
+
+def _problem(setup: Setup, start: int, batch: int) -> tuple[Problem, torch.Tensor]:
+    task = setup.task(setup.scenario.draw(range(start, start + batch), setup.seed))
+    return task.problem, task.U0
+
+
+def _solve(setup: Setup, problem: Problem, U0: torch.Tensor) -> Solution:
+    return setup.solver.solve(problem, U0, seed=setup.seed)
+
+
+def _warm_up(setup: Setup, batch: int) -> None:
+    """Compilation, and what libraries allocate once."""
+    problem, U0 = _problem(setup, 0, batch)
+    replace(setup.solver, max_outer_iterations=2, attempts=1).solve(problem, U0)
+
+
+def _start_of_memory(device: str) -> int | None:
+    """Bytes held now; from here on the peak is counted."""
+    if device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+        return torch.cuda.memory_allocated()
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM
+    except OSError:
+        return None
+    return _memory("VmRSS")
+
+
+def _peak_of_memory(device: str) -> int | None:
+    return torch.cuda.max_memory_allocated() if device == "cuda" else _memory("VmHWM")
+
+
+def _memory(name: str) -> int | None:
+    """Bytes, as Linux counts them."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(name)), None)
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure(json.loads(sys.argv[1]))))

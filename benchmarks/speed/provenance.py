@@ -1,0 +1,58 @@
+"""Where a measurement comes from: day, commit, processor, versions."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from datetime import date
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+WRITTEN = (":!benchmarks/README.md", ":!benchmarks/results.csv")  # what a benchmark itself changes
+
+
+def provenance(device: str) -> dict[str, str]:
+    """What every row of a run carries, by column."""
+    import torch
+
+    graphics = torch.cuda.get_device_name() if device == "cuda" else ""
+    return {
+        "date": date.today().isoformat(),
+        "commit": _commit(),
+        "processor": graphics or _processor(),
+        "torch": torch.__version__,
+        "casadi": _version("casadi"),
+        "pytorch_mppi": _version("pytorch-mppi"),
+        "threads": str(torch.get_num_threads()),
+        "device": device,
+    }
+
+
+def _commit() -> str:
+    """Short hash of what is checked out, with a word where files were changed since."""
+    try:
+        head = _git("rev-parse", "--short", "HEAD")
+        return head + (" and changes" if _git("status", "--porcelain", "-uno", "--", ".", *WRITTEN) else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def _processor() -> str:
+    """The name that the system gives its processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"

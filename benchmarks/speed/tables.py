@@ -1,0 +1,92 @@
+"""Rows as tables for people, and the part of benchmarks/README.md that holds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.speed.results import Row
+
+BEGIN, END = "<!-- speed -->", "<!-- end speed -->"
+NOT_MEASURED = "Not measured yet: `make benchmark` does."
+NO_GPU = "No GPU was at hand: `make benchmark-gpu` measures `families`, `batch` and `mppi` where there is one."
+
+# What stands above each section's table, in the order of the file.
+WORDS = {
+    "families": "Drawn layouts (seed 1000). The peers fly the first of the same layouts, before and after `gco`;\n"
+    "spread is the difference of the two times. Costs are compared where both are feasible, by the median.",
+    "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
+    "plan that is left, `gco` from its multipliers as well.",
+    "batch": "Forests of 30 spheres. `2 outer` ends every element after two outer iterations. Memory is the peak of a\n"
+    "process of its own above what it held before the problems were made.",
+    "mppi": "One round of white noise around the hover, 30 spheres, float32, B = 1; medians of rounds in turns.",
+    "growth": "`al_ilqr`, line search included. Quadrotor (n = 14), 100 stages, 30 spheres but for what is named;\n"
+    "more stages cut the same 5 s finer, more spheres fill the same region. The planar vehicle has n = 6.",
+    "share": "Timers around the kernels of one solve; each leaves out the kernels that it calls.",
+}
+
+
+def section_table(rows: list[Row]) -> str:
+    """A Markdown table: a line per case and solver, a column per quantity, in the order they were measured."""
+    lines = list(dict.fromkeys((row["case"], row["solver"]) for row in rows))
+    heads = list(dict.fromkeys(_head(row) for row in rows))
+    cells = {(row["case"], row["solver"], _head(row)): _rounded(row["value"]) for row in rows}
+    text = ["| case | solver | " + " | ".join(heads) + " |", "|---" * (len(heads) + 2) + "|"]
+    for case, solver in lines:
+        values = [cells.get((case, solver, head), "") for head in heads]
+        text.append(f"| {case} | `{solver}` | " + " | ".join(values) + " |")
+    return "\n".join(text)
+
+
+def _rounded(value: str) -> str:
+    """Three digits of a number; anything else as it is."""
+    try:
+        number = float(value)
+    except ValueError:
+        return value or "-"
+    return f"{number:.3g}" if abs(number) < 100 else f"{number:.0f}"
+
+
+def _head(row: Row) -> str:
+    return row["quantity"] + (f", {row['unit']}" if row["unit"] else "")
+
+
+def speed_text(rows: list[Row]) -> str:
+    """All that stands between the marks."""
+    blocks = [_device_text([row for row in rows if row["device"] == "cpu"]) or NOT_MEASURED]
+    graphics = _device_text([row for row in rows if row["device"] == "cuda"])
+    return "\n\n".join([*blocks, f"## Speed on a GPU\n\n{graphics}" if graphics else NO_GPU])
+
+
+def _device_text(rows: list[Row]) -> str:
+    """Tables of one device, each section below where it comes from unless that is where the one before came from."""
+    blocks, before = [], ""
+    present = {row["section"] for row in rows}
+    for section in [name for name in WORDS if name in present]:
+        own = [row for row in rows if row["section"] == section]
+        source = _source(own[0])
+        blocks += [source] if source != before else []
+        blocks.append(f"### `{section}`\n\n{WORDS[section]}\n\n{section_table(own)}")
+        before = source
+    return "\n\n".join(blocks)
+
+
+def _source(row: Row) -> str:
+    where = "one core, one thread" if row["device"] == "cpu" else "one GPU"
+    return (
+        f"Measured on {row['date']} at commit {row['commit']}, {row['processor']}, {where}; torch {row['torch']}, "
+        f"CasADi {row['casadi']}, pytorch-mppi {row['pytorch_mppi']}."
+    )
+
+
+def rewrite(readme: Path, rows: list[Row]) -> None:
+    """Put the tables between the marks; everything else of the file stays as it is.
+
+    Raises:
+        ValueError: the marks aren't there, once each and in order.
+    """
+    text = readme.read_text()
+    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
+        raise ValueError(f"{readme} has no part between {BEGIN} and {END}")
+    head, rest = text.split(BEGIN)
+    tail = rest.split(END)[1]
+    readme.write_text(f"{head}{BEGIN}\n{speed_text(rows)}\n\n{END}{tail}")

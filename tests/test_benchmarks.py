@@ -1,0 +1,133 @@
+"""The benchmarks at their smallest: every section gives whole rows, and the tables are rewritten in place."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.speed import batch, families, growth, latency, mppi, share
+from benchmarks.speed.__main__ import main
+from benchmarks.speed.bench import Bench
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
+from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
+from benchmarks.speed.sizes import Sizes
+from benchmarks.speed.tables import BEGIN, END, rewrite, section_table
+
+ROOT = Path(__file__).resolve().parents[1]
+TINY = Sizes(
+    families=("forest30",), family_batches=(2,), fatrop_layouts=1, ipopt_layouts=1,
+    whole_batches=(), limited_batches=(2,), fewest_layouts=2,
+    growth_batch=2, stages=(6,), obstacles=(3,), samples=(16,), mppi_repeats=1,
+    latency_layouts=1, share_batch=2, num_stages=8, inner_iterations=2,
+)  # fmt: skip
+
+
+def tiny(folder: Path) -> Bench:
+    return Bench(TINY, Results(folder / "results.csv"), provenance("cpu"), say=lambda text: None)
+
+
+def numbers(bench: Bench, quantity: str) -> list[float]:
+    return [float(row["value"]) for row in bench.results.rows if row["quantity"] == quantity]
+
+
+@pytest.mark.parametrize("section", [batch, families, growth, latency, mppi, share])
+def test_a_section_gives_whole_rows(section, tmp_path: Path) -> None:
+    bench = tiny(tmp_path)
+    section.run(bench)
+    rows = bench.results.rows
+    assert rows and {row["section"] for row in rows} == {section.SECTION}
+    assert not any(row["quantity"].startswith(("left out", "ended with")) for row in rows)
+    assert all(row["quantity"] and row["case"] and row["solver"] and row["commit"] for row in rows)
+    with (tmp_path / "results.part.csv").open(newline="") as file:
+        assert list(csv.DictReader(file)) == rows  # on disk as they are measured
+    for case, solver in {(row["case"], row["solver"]) for row in rows}:
+        assert f"| {case} | `{solver}` |" in section_table(rows)
+
+
+def test_ratios_are_those_of_their_rows(tmp_path: Path) -> None:
+    pytest.importorskip("casadi")
+    bench = tiny(tmp_path)
+    families.run(bench)
+    seconds = {r["solver"]: float(r["value"]) for r in bench.results.rows if r["quantity"] == "seconds a problem"}
+    assert numbers(bench, "seconds fatrop / gco")[0] == pytest.approx(seconds["fatrop"] / seconds["gco"], rel=1e-4)
+    assert [r["ratio"] for r in bench.results.rows if r["quantity"] == "seconds ipopt / gco"] == ["ipopt / gco"]
+
+
+def test_shares_add_up(tmp_path: Path) -> None:
+    bench = tiny(tmp_path)
+    share.run(bench)
+    shares = [float(row["value"]) for row in bench.results.rows if row["unit"] == "%"]
+    assert sum(shares) == pytest.approx(100, abs=1) and numbers(bench, "backward pass")[0] > 0
+
+
+def test_what_takes_too_long_is_left_out_and_named(tmp_path: Path) -> None:
+    bench = tiny(tmp_path)
+    bench.deadline = 0.0
+    families.run(bench)
+    assert [row["quantity"] for row in bench.results.rows] == ["left out: would take"]
+
+
+def test_the_model_for_pytorch_mppi_is_the_planner_s_own(tmp_path: Path) -> None:
+    setup = Bench(TINY).setup("scenario=forest")
+    problem = setup.task(setup.layouts(1)).problem
+    model = QuadrotorAmongSpheres(problem, 1e8)
+    x = problem.x0 + 3 * torch.randn(200, 14, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    u = torch.linspace(-3, 9, 800, dtype=torch.float64).view(200, 4)
+    after = model.dynamics(x.float(), u.float())
+    torch.testing.assert_close(after.double(), problem.dynamics.step(x, u), rtol=1e-4, atol=1e-4)
+    spheres = problem.constraints[0]
+    inside = (x[:, None, :3] - spheres.centers[0]).norm(dim=-1) < spheres.distances[0]
+    assert bool(inside.any()) and torch.equal(model.hits(x.float()).long(), inside.sum(1))
+    cost = model.running_cost(x.float(), u.float()).double() - 1e8 * inside.sum(1)
+    clear = ~inside.any(1)  # where no collision takes the digits
+    torch.testing.assert_close(cost[clear], problem.cost.stage(x, u, 0)[clear], rtol=1e-4, atol=1e-3)
+
+
+def row_of(section: str, value: str, device: str = "cpu") -> Row:
+    given = {"section": section, "case": "B = 2", "solver": "gco", "quantity": "time", "value": value, "unit": "s"}
+    return {**dict.fromkeys(COLUMNS, ""), **given, "device": device}
+
+
+def test_a_finished_section_replaces_its_former_rows_and_no_others(tmp_path: Path) -> None:
+    path = tmp_path / "results.csv"
+    runs = (("mppi", "1", "cpu"), ("share", "2", "cpu"), ("mppi", "3", "cuda"), ("mppi", "4", "cpu"))
+    for section, value, device in runs:
+        results = Results(path)
+        results.add(row_of(section, value, device))
+        results.finish(section, device)
+    Results(path).add(row_of("share", "5"))  # stopped before its end
+    assert sorted(row["value"] for row in read_rows(path)) == ["2", "3", "4"]
+
+
+def test_the_tables_are_rewritten_in_place(tmp_path: Path) -> None:
+    readme = tmp_path / "README.md"
+    readme.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    rows = [row_of("mppi", "0.12345"), row_of("share", "1234.4"), row_of("mppi", "7", "cuda")]
+    rewrite(readme, rows)
+    once = readme.read_text()
+    rewrite(readme, rows)
+    assert readme.read_text() == once
+    assert once.startswith(f"before\n{BEGIN}\n") and once.endswith(f"{END}\nafter\n") and "old" not in once
+    assert "| 0.123 |" in once and "| 1234 |" in once and "## Speed on a GPU" in once
+    readme.write_text("no marks")
+    with pytest.raises(ValueError):
+        rewrite(readme, rows)
+
+
+def test_the_published_page_says_what_the_published_rows_say(tmp_path: Path) -> None:
+    page = (ROOT / "benchmarks" / "README.md").read_text()
+    copy = tmp_path / "README.md"
+    copy.write_text(page)
+    rewrite(copy, read_rows(ROOT / "benchmarks" / "results.csv"))
+    assert copy.read_text() == page
+
+
+def test_without_a_gpu_nothing_is_measured(monkeypatch, capsys, tmp_path: Path) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr("benchmarks.speed.__main__._one_core", lambda: None)
+    assert main(["--device", "cuda", "--results", str(tmp_path / "results.csv")]) == 0
+    assert "No CUDA device" in capsys.readouterr().out and not (tmp_path / "results.csv").exists()
