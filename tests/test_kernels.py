@@ -34,13 +34,14 @@ def test_compiled_kernels_equal_eager_ones(batch: str, compiled) -> None:
     for on in (True, False):
         compile_kernels(on)
         rolled = closed_loop(problem.dynamics, X, U, G, alpha)
+        free = open_loop(problem.dynamics, problem.x0, U), open_loop(problem.dynamics, problem.x0[:2], U[:2])
         fewer = closed_loop(problem.dynamics, X[:3], U[:3], G[:, :3], alpha[:3])
         kinds = (4, 0) if batch == "planar" else (4,)  # smooth, and white noise
         plans = [MPPI(samples=24, knots=knots, rounds=2).improve(problem, U, key)[1] for knots in kinds]
-        results.append((*rolled, *fewer, *plans))
+        results.append((*rolled, *fewer, *free, *plans))
     for fused, eager in zip(*results, strict=True):
         torch.testing.assert_close(fused, eager, rtol=1e-6, atol=1e-6)
-    for fused, eager in zip(results[0][:4], results[1][:4], strict=True):
+    for fused, eager in zip(results[0][:6], results[1][:6], strict=True):
         torch.testing.assert_close(fused, eager, rtol=1e-12, atol=1e-12)
 
 

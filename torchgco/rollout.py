@@ -13,6 +13,8 @@ STAGES = 5  # compiled into one kernel
 
 def open_loop(dynamics: Dynamics, x0: Tensor, U: Tensor) -> Tensor:
     """X (B, N+1, n) from x0 (B, n) and U (B, N, m)."""
+    if compiling():
+        return _open_loop_rows(dynamics, x0, U)
     x, knots = x0, [x0]
     for k in range(U.shape[1]):
         x = dynamics.step(x, U[:, k])
@@ -40,8 +42,27 @@ def closed_loop(dynamics: Dynamics, X: Tensor, U: Tensor, G: Tensor, alpha: Tens
     return torch.stack(knots, dim=1), torch.stack(controls, dim=1)
 
 
-def _closed_loop_rows(dynamics: Dynamics, X: Tensor, U: Tensor, G: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+def _open_loop_rows(dynamics: Dynamics, x0: Tensor, U: Tensor) -> Tensor:
     """The same, components first and some stages at a time: the form that compiles into few kernels."""
+    controls, x = U.permute(1, 2, 0).contiguous(), x0.mT.contiguous()
+    knots = [x.unsqueeze(0)]
+    for k in range(0, U.shape[1], STAGES):
+        knots.append(_roll(dynamics, knots[-1][-1], controls[k : k + STAGES]))
+    return torch.cat(knots).permute(2, 0, 1).contiguous()
+
+
+@kernel
+def _roll(dynamics: Dynamics, x: Tensor, controls: Tensor) -> Tensor:
+    """States (c, n, B) of c stages from x (n, B) under controls (c, m, B)."""
+    states = []
+    for u in controls.unbind(0):
+        x = dynamics.step_rows(x.unsqueeze(-1), u.unsqueeze(-1)).squeeze(-1)
+        states.append(x)
+    return torch.stack(states)
+
+
+def _closed_loop_rows(dynamics: Dynamics, X: Tensor, U: Tensor, G: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """`closed_loop` in that form."""
     states, controls, gains = X.permute(1, 2, 0).contiguous(), U.permute(1, 2, 0).contiguous(), G.permute(0, 2, 3, 1)
     gains, x = gains.contiguous(), states[0]
     knots, inputs = [x.unsqueeze(0)], []
