@@ -15,7 +15,7 @@ FLOORS = [
     ["rollout", "expansion", "judge"],
     ["lagrangian"],
     ["solution", "guidance.samples"],
-    ["solvers", "guidance.mppi", "guidance.detection", "guidance.region"],
+    ["solvers", "guidance.mppi", "guidance.detection", "guidance.region", "guidance.roadmap"],
     ["guidance"],
     ["scenarios", "baselines", "api"],
     ["plotting"],

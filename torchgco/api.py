@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchgco.guidance.detour import Detour
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.mppi import MPPI
 from torchgco.problem import Problem
@@ -49,11 +50,13 @@ def default_solver(guided: bool = True) -> AugmentedLagrangian:
     sampler = MPPI(samples=256, covariance=None, rounds=16, knots=8, decay=0.9, linger=1.0, elite=5)
     return AugmentedLagrangian(
         inner=ILQR(tolerance=1e-2, max_iterations=20, line_search=LineSearch(accept_last=False)),
-        guidance=GCO(sampler=sampler, adopt=True, patience=4) if guided else None,
+        guidance=GCO(sampler=sampler, adopt=True, patience=4, detour=Detour()) if guided else None,
         max_outer_iterations=20,
         grow_when_feasible=False,
         cost_tolerance=1e-3,
         hold_factor=2.0,
+        attempts=3,
+        arrival=0.015,
         clip=True,
     )
 

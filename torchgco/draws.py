@@ -30,6 +30,7 @@ class DrawKey:
     ids: Tensor  # (B,) int64
     outer: Tensor  # (B,) int64
     began: Tensor | None = None  # (B,) int64: where the present attempt began; None: with the solve
+    attempt: Tensor | None = None  # (B,) int64: which attempt it is, from 1; None: the first. No draw depends on it
 
     @property
     def age(self) -> Tensor:
@@ -38,8 +39,8 @@ class DrawKey:
 
     def take(self, index: Tensor) -> DrawKey:
         """The keys of the elements in `index`."""
-        began = None if self.began is None else self.began[index]
-        return DrawKey(self.seed, self.ids[index], self.outer[index], began)
+        began, attempt = (None if t is None else t[index] for t in (self.began, self.attempt))
+        return DrawKey(self.seed, self.ids[index], self.outer[index], began, attempt)
 
 
 def standard_normal(

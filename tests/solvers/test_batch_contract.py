@@ -20,6 +20,7 @@ from torchgco import (
 )
 from torchgco.baselines import IteratedMPPI
 from torchgco.constraints import ControlBounds, FirstStepRates
+from torchgco.guidance import Detour
 from torchgco.solution import Solution
 from torchgco.status import Status
 
@@ -37,12 +38,15 @@ SOLVERS = {
             sampler=MPPI(samples=40, covariance=4.0, rounds=3, knots=5, decay=0.8, elite=3, linger=1.0),
             adopt=True,
             patience=2,
+            detour=Detour(iterations=4),
+            detour_first=True,
         ),
         max_outer_iterations=5,
         grow_when_feasible=False,
         cost_tolerance=1e-2,
         hold_factor=2.0,
-        attempts=2,
+        attempts=3,
+        arrival=0.02,
         clip=True,
     ),
     "mppi": IteratedMPPI(sampler=SAMPLER, iterations=4),

@@ -246,6 +246,7 @@ ELSEWHERE = {
     (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"),
     (AugmentedLagrangian, "hold_factor"), (AugmentedLagrangian, "cost_tolerance"),
     (AugmentedLagrangian, "grow_when_feasible"), (GCO, "grow_when_idle"), (GCO, "adopt"),
+    (GCO, "detour"), (GCO, "detour_first"), (AugmentedLagrangian, "arrival"),
     (AugmentedLagrangian, "attempts"), (AugmentedLagrangian, "slots"),
 }  # fmt: skip
 PLACES = {
@@ -341,7 +342,7 @@ def test_rungs_side_by_side_are_the_same_rungs() -> None:
     assert one.iterations.tolist() == many.iterations.tolist()
 
 
-class Detour:
+class OnePlan:
     """Guidance that hands over one given plan, once."""
 
     def __init__(self, plan: torch.Tensor) -> None:
@@ -354,7 +355,7 @@ class Detour:
         return Advice(guide, self.plan.expand_as(U), key.outer == 1)
 
 
-class Choices(Detour):
+class Choices(OnePlan):
     """Hands over one plan at the first question and another whenever the caught path comes back."""
 
     def __init__(self, plans: list[torch.Tensor]) -> None:
@@ -384,6 +385,25 @@ def test_attempts_start_from_the_caught_path_and_the_best_is_kept() -> None:
     assert costs["bad, then good"] <= min(costs["bad"], costs["good"]) + 1e-9
 
 
+def test_one_that_arrives_is_kept_and_ends_the_attempts() -> None:
+    """A plan to the goal is worth more than a cheap one that stays, and nothing is tried after it."""
+    problem, U0 = planar_batch(B=1, N=25, obstacles=3, seed=3)
+    cost = QuadraticCost(Q=[1e-3] * 6, R=[5.0, 5.0], Qf=[1, 1, 0, 0, 0, 0], x_ref=[1, 0.4, 0, 0, 0, 0])
+    dear = replace(problem, cost=cost)
+    there, here = torch.full_like(U0, 4.0), torch.full_like(U0, 1e-3)
+    nothing_moves = LineSearch(ratio_min=1e9, ratio_max=2e9, accept_last=False)
+    solver = AugmentedLagrangian(
+        inner=ILQR(max_iterations=1, tolerance=1e-9, line_search=nothing_moves),
+        max_outer_iterations=3, clip=True, violation_tolerance=10.0, penalty_growth=1.0,
+    )  # fmt: skip
+    came = {}
+    for arrival in (None, 0.5):
+        guidance = Choices([there, here])
+        solution = replace(solver, guidance=guidance, attempts=2, arrival=arrival).solve(dear, U0)
+        came[arrival] = len(guidance.asked_at), bool(solution.U.mean() > 3.0)
+    assert came == {None: (2, False), 0.5: (1, True)}
+
+
 @pytest.mark.parametrize("hold_factor", [1.0, 100.0])
 def test_an_adopted_plan_is_held(hold_factor: float) -> None:
     """The path that is left costs hold_factor times what the new one costs more, and the multipliers start again."""
@@ -397,7 +417,7 @@ def test_an_adopted_plan_is_held(hold_factor: float) -> None:
             seen.append((state.U.clone(), state.duals.mu.clone(), [lam.abs().max() for lam in state.duals.lam]))
 
     solver = AugmentedLagrangian(
-        inner=ILQR(max_iterations=1), guidance=Detour(plan), max_outer_iterations=3, hold_factor=hold_factor, clip=True
+        inner=ILQR(max_iterations=1), guidance=OnePlan(plan), max_outer_iterations=3, hold_factor=hold_factor, clip=True
     )
     solver.solve(problem, U0, callback=look)
     U, mu, lam = seen[0]
@@ -418,6 +438,7 @@ def test_an_adopted_plan_is_held(hold_factor: float) -> None:
         (lambda: ILQR(damping=-1.0), "ilqr.damping"),
         (lambda: AugmentedLagrangian(hold_factor=0.5), "solver.hold_factor"),
         (lambda: AugmentedLagrangian(attempts=0), "solver.attempts"),
+        (lambda: AugmentedLagrangian(arrival=1.0), "solver.arrival"),
         (lambda: ILQR(regularisation_first=0.0), "ilqr.regularisation_first"),
         (lambda: ILQR(regularisation_growth=1.0), "ilqr.regularisation_growth"),
         (lambda: LineSearch(shrink=1.0), "line_search.shrink"),

@@ -47,6 +47,10 @@ class Cost(PerElement):
         """Controls (B, N, m) that ask nothing of the vehicle: the references of a quadratic cost, else zero."""
         return torch.zeros_like(like)
 
+    def goal(self, x0: Tensor) -> Tensor | None:
+        """The state (B, n) that the terminal cost asks for, for starts x0 (B, n); None where it isn't known."""
+        return None
+
     def total(self, X: Tensor, U: Tensor) -> Tensor:
         """J_var (B,) of trajectories X (B, N+1, n), U (B, N, m)."""
         k = torch.arange(U.shape[1], device=U.device)

@@ -114,6 +114,9 @@ class BoundQuadratic(Cost):
     def rest_controls(self, like: Tensor) -> Tensor:
         return self.u_ref.expand_as(like).contiguous()
 
+    def goal(self, x0: Tensor) -> Tensor:
+        return self.xf_ref.expand_as(x0)
+
     def terminal(self, x: Tensor) -> Tensor:
         xf_ref, Qf, qf = self.xf_ref, self.Qf, self.qf
         if x.dim() == 3:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchgco.constraints.obstacles import BoundSpheres, GuideRegion
 from torchgco.draws import DrawKey
 from torchgco.guidance.detection import active_counts, caught_knots
+from torchgco.guidance.detour import Detour
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
 from torchgco.problem import Problem
@@ -30,6 +31,9 @@ class GCO:
             that find the element caught, so that late guidance starts as gently as early guidance.
         adopt: where the sampled plan touches nothing, go on from the plan itself instead of being drawn to it.
         afresh: sample around the cost's reference controls (the vehicle at rest), not around the path that is caught.
+        detour: a plan along the shortest way around static spheres, to go on from; None: never (as in the paper).
+        detour_first: detours are the odd attempts and sampled plans the even ones, or the other way round; where no way
+            is found, sampled all the same.
         patience: from this outer iteration on, a single active sphere counts as being caught too; None: never.
 
     Raises:
@@ -44,6 +48,8 @@ class GCO:
     adopt: bool = False
     patience: int | None = None
     afresh: bool = False
+    detour: Detour | None = None
+    detour_first: bool = True
 
     def __post_init__(self) -> None:
         if not self.initial_penalty > 0:
@@ -70,7 +76,13 @@ class GCO:
         growing = torch.ones_like(caught) if self.grow_when_idle else caught
         weight = torch.where(growing, guide.weight * self.penalty_growth, guide.weight)
         new, plan, taken = GuideRegion.inactive(X, weight, guide.position), U.clone(), torch.zeros_like(caught)
-        rows = caught.nonzero().flatten()
+        penalty = torch.full_like(weight, torch.nan)
+        if self.detour is not None:
+            odd = torch.ones_like(caught) if key.attempt is None else key.attempt % 2 == 1
+            turn = (caught & (odd == self.detour_first)).nonzero().flatten()
+            if turn.numel() > 0:
+                plan[turn], taken[turn], penalty[turn] = self.detour.propose(problem.take(turn))
+        rows = (caught & ~taken).nonzero().flatten()
         if rows.numel() > 0:
             part = problem.take(rows)
             X_safe, plan[rows] = self.sampler.improve(part, self._mean(part, U[rows]), key.take(rows))
@@ -78,7 +90,7 @@ class GCO:
                 taken[rows] = ~active_counts(part, X_safe, plan[rows]).any(-1)
             drawn = guide_along(take(new, rows), X_safe, knots[rows], self._radius(problem)[rows])
             put(new, rows[~taken[rows]], take(drawn, (~taken[rows]).nonzero().flatten()))
-        return Advice(new, plan, taken)
+        return Advice(new, plan, taken, penalty)
 
     def _mean(self, problem: Problem, U: Tensor) -> Tensor:
         """What the sampler starts from, (B, N, m)."""

@@ -13,9 +13,17 @@ from torchgco.solvers.state import Advice, Iterate, OuterLoop, State
 from torchgco.status import Status
 
 
-def try_again(s: State, rows: Tensor, duals: Multipliers, status: Tensor, attempts: int) -> None:
+def has_arrived(problem: Problem, iterate: Iterate, share: float, limit: float) -> Tensor:
+    """Whether a feasible iterate has come to the goal (B,): terminal cost at most `share` of the start's."""
+    last, first = problem.cost.terminal(iterate.X[:, -1]), problem.cost.terminal(problem.x0)
+    return (iterate.violation <= limit) & (last <= share * first)
+
+
+def try_again(s: State, rows: Tensor, problem: Problem, duals: Multipliers, status: Tensor, solver: OuterLoop) -> None:
     """Back to the caught path for elements that have ended an attempt and have another left (in place)."""
-    left = (s.attempt[rows] > 0) & (s.attempt[rows] < attempts)
+    left = (s.attempt[rows] > 0) & (s.attempt[rows] < solver.attempts)
+    if solver.arrival is not None:
+        left &= ~has_arrived(problem, take(s.best, rows), solver.arrival, solver.violation_tolerance)
     again = ((status[rows] != Status.RUNNING) & left).nonzero().flatten()
     if again.numel() == 0:
         return
@@ -26,6 +34,7 @@ def try_again(s: State, rows: Tensor, duals: Multipliers, status: Tensor, attemp
     put(duals, again, origin.duals)
     s.attempt[place] += 1
     s.since[place] = s.outer[place]
+    s.led[place] = False
     s.last_cost[place] = torch.inf
     status[place] = Status.RUNNING
 
@@ -36,7 +45,7 @@ def go_on_from(
     """Put the advised controls in place of the iterate where they are taken, and return multipliers for it.
 
     The old ones belong to the path that is left: they start again at zero. The penalty must keep the solver from
-    falling back, so it is raised until the path that is left costs more than the one that is taken.
+    falling back, so it is raised to what was advised, or until the path that is left costs more than the one taken.
     """
     taken = advice.taken.nonzero().flatten()
     if taken.numel() == 0:
@@ -52,7 +61,11 @@ def go_on_from(
     none = Multipliers(tuple(torch.zeros_like(lam[taken]) for lam in duals.lam), torch.ones_like(duals.mu[taken]))
     cost, merit = Lagrangian(part, none, None, True).value(old_X, old_U)
     gain = (part.cost.total(X, U) - cost).clamp(min=0.0) / (merit - cost).clamp(min=1e-12)
-    mu = torch.maximum(duals.mu[taken], solver.hold_factor * gain).clamp(max=solver.penalty_max)
+    keeping = solver.hold_factor * gain
+    if advice.penalty is not None:
+        s.led[place] = ~torch.isnan(advice.penalty[taken])
+        keeping = torch.where(s.led[place], advice.penalty[taken], keeping)
+    mu = torch.maximum(duals.mu[taken], keeping).clamp(max=solver.penalty_max)
     held = copied(duals)
     put(held, taken, Multipliers(none.lam, mu))
     s.X, s.U = s.X.clone(), s.U.clone()

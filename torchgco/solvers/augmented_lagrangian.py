@@ -35,6 +35,9 @@ class AugmentedLagrangian:
             is left costs at least this times what the new one costs more (not in the paper).
         attempts: where guidance puts another path in place of the iterate, so many are tried from the same caught path,
             each to its end, and the best is kept; max_outer_iterations then counts for each (not in the paper).
+        arrival: a feasible iterate has arrived where its terminal cost is at most this share of the start's. One that
+            has is worth more than one that hasn't, whatever they cost, and nothing else is attempted after it. None:
+            cost alone decides, as in the paper.
         clip: inequalities push but never pull (`lagrangian.penalty_weights`); False as printed.
         slots: problems worked on at once; the others wait until a slot falls free. None: all. No result depends on it.
         record: keep the history of every element in `solution.trace`.
@@ -54,6 +57,7 @@ class AugmentedLagrangian:
     cost_tolerance: float | None = None
     hold_factor: float = 10.0
     attempts: int = 1
+    arrival: float | None = None
     clip: bool = False
     slots: int | None = None
     record: bool = False
@@ -71,6 +75,8 @@ class AugmentedLagrangian:
             raise InputError("solver.violation_tolerance", "above 0", self.violation_tolerance)
         if self.attempts < 1:
             raise InputError("solver.attempts", "at least 1", self.attempts)
+        if self.arrival is not None and not 0 < self.arrival < 1:
+            raise InputError("solver.arrival", "between 0 and 1, or null", self.arrival)
         if self.slots is not None and self.slots < 1:
             raise InputError("solver.slots", "at least 1, or null", self.slots)
         if not self.hold_factor >= 1:

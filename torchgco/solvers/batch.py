@@ -13,6 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchgco.constraints.obstacles import GuideRegion
 from torchgco.draws import DrawKey
 from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
@@ -20,7 +21,7 @@ from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.shapes import InputError, copied, put, take
 from torchgco.solution import Solution
-from torchgco.solvers.attempts import go_on_from, try_again
+from torchgco.solvers.attempts import go_on_from, has_arrived, try_again
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import Callback, InnerEnd, Iterate, OuterLoop, Progress, State
 from torchgco.solvers.trace import Recorder
@@ -43,12 +44,13 @@ class Loop:
         ids: Tensor | None,
         warm: Multipliers | None,
         callback: Callback | None,
+        guide: GuideRegion | None = None,
     ) -> None:
         self.ids = check_call(problem, U0, ids)
         if warm is not None:
             warm.check(problem)
         self.solver, self.seed, self.callback = solver, seed, callback
-        self.whole, self.U0, self.warm = problem, U0, warm
+        self.whole, self.U0, self.warm, self.guide = problem, U0, warm, guide
         self.result = _empty_result(problem, U0)
         self.recorder = Recorder() if solver.record else None
         everyone = torch.arange(problem.B, device=U0.device)
@@ -81,7 +83,7 @@ class Loop:
         U = self.U0[rows]
         X = open_loop(problem.dynamics, problem.x0, U)
         duals = Multipliers.zero(problem, solver.initial_penalty) if self.warm is None else take(self.warm, rows)
-        guide = None if solver.guidance is None else solver.guidance.start(problem, X)
+        guide = take(self.guide, rows) if solver.guidance is None else solver.guidance.start(problem, X)
         cost, merit = Lagrangian(problem, duals, guide, solver.clip).value(X, U)
         zero, worst = torch.zeros_like(rows), torch.full_like(cost, torch.inf)
         iterate = Iterate(X, U, duals, cost, worst)
@@ -92,7 +94,7 @@ class Loop:
             inner=zero, outer=zero.clone(), iterations=zero.clone(), guided=zero.clone(),
             last_cost=worst.clone(),
             best=copied(iterate), origin=copied(iterate),
-            attempt=zero.clone(), since=zero.clone(),
+            attempt=zero.clone(), since=zero.clone(), led=torch.zeros_like(rows, dtype=torch.bool),
         )  # fmt: skip
 
     def _bad_starts(self, state: State) -> Tensor:
@@ -193,7 +195,7 @@ class Loop:
         )  # fmt: skip
         status[rows] = solver.verdict(inner_end)
         s.last_cost[rows] = s.cost[rows]
-        try_again(s, rows, updated, status, solver.attempts)
+        try_again(s, rows, problem, updated, status, solver)
         going = (status[rows] == Status.RUNNING).nonzero().flatten()
         if going.numel() > 0:
             self._next_inner(rows[going], take(updated, going))
@@ -202,25 +204,39 @@ class Loop:
         """Keep the best iterate that ended an inner solve: feasible before infeasible, then by cost."""
         old, limit = take(self.state.best, rows), self.solver.violation_tolerance
         better = is_better(new.cost, new.violation, old.cost, old.violation, limit)
+        if self.solver.arrival is not None:
+            problem = self.problem.take(rows)
+            arrived, old_arrived = (has_arrived(problem, it, self.solver.arrival, limit) for it in (new, old))
+            better = (better & ~old_arrived) | (better & arrived) | (arrived & ~old_arrived)
         chosen = better.nonzero().flatten()
         put(self.state.best, rows[chosen], take(new, chosen))
 
     def _next_inner(self, rows: Tensor, duals: Multipliers) -> None:
         """Guidance, new multipliers and penalties, and L_M anew for the elements in `rows`."""
-        s, solver = self.state, self.solver
-        problem, guide = self.problem.take(rows), None
-        if solver.guidance is not None:
-            key = DrawKey(self.seed, self.ids[s.rows[rows]], s.outer[rows], s.since[rows])
-            advice = solver.guidance.update(problem, s.X[rows], s.U[rows], take(s.guide, rows), key)
-            guide = advice.guide
-            put(s.guide, rows, guide)
-            s.guided[rows] += guide.is_active | advice.taken
-            duals = go_on_from(s, rows, problem, advice, duals, solver)
+        s, clip = self.state, self.solver.clip
+        duals = self._guided(rows, duals)
         s.duals = Multipliers(tuple(lam.clone() for lam in s.duals.lam), s.duals.mu.clone())
         put(s.duals, rows, duals)
         s.regularisation[rows] = 0.0
-        s.cost[rows], s.merit[rows] = Lagrangian(problem, duals, guide, solver.clip).value(s.X[rows], s.U[rows])
+        lagrangian = Lagrangian(self.problem.take(rows), duals, take(s.guide, rows), clip)
+        s.cost[rows], s.merit[rows] = lagrangian.value(s.X[rows], s.U[rows])
         s.inner[rows] = 0
+
+    def _guided(self, rows: Tensor, duals: Multipliers) -> Multipliers:
+        """Ask guidance for those in `rows` that don't follow a plan already; returns the multipliers to go on with."""
+        s, guidance = self.state, self.solver.guidance
+        asking = (~s.led[rows]).nonzero().flatten()
+        if guidance is None or asking.numel() == 0:
+            return duals
+        place = rows[asking]
+        problem = self.problem.take(place)
+        key = DrawKey(self.seed, self.ids[s.rows[place]], s.outer[place], s.since[place], s.attempt[place].clamp(min=1))
+        advice = guidance.update(problem, s.X[place], s.U[place], take(s.guide, place), key)
+        put(s.guide, place, advice.guide)
+        s.guided[place] += advice.guide.is_active | advice.taken
+        advised = copied(duals)
+        put(advised, asking, go_on_from(s, place, problem, advice, take(duals, asking), self.solver))
+        return advised
 
     # End ---------------------------------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchgco.constraints.obstacles import GuideRegion
 from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
@@ -70,12 +71,14 @@ class ILQR:
         ids: Tensor | None = None,
         warm: Multipliers | None = None,
         callback: Callback | None = None,
+        guide: GuideRegion | None = None,
     ) -> Solution:
         """One inner solve of every problem, from U0 (B, N, m); `violation` tells what the constraints say of it.
 
-        `warm` multipliers are held fixed, with their own penalties. `seed` is unused: nothing here is random.
+        `warm` multipliers are held fixed, with their own penalties, and so is the region that `guide` draws to. `seed`
+        is unused: nothing here is random.
         """
-        return Loop(_OneInnerSolve(self, self.penalty), problem, U0, seed, ids, warm, callback).run()
+        return Loop(_OneInnerSolve(self, self.penalty), problem, U0, seed, ids, warm, callback, guide).run()
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ class _OneInnerSolve:
     violation_tolerance: float = math.inf
     hold_factor: float = 1.0
     attempts: int = 1
+    arrival: float | None = None
     clip: bool = False
     slots: None = None
     record: bool = False

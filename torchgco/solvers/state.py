@@ -49,6 +49,7 @@ class State:
     origin: Iterate  # the caught path that guidance first replaced
     attempt: Tensor  # plans tried from there, 0 while none was
     since: Tensor  # `outer` when the attempt began
+    led: Tensor  # bool: the attempt goes on from a plan with its own penalty, and guidance keeps silent
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,8 @@ class Advice:
     guide: GuideRegion  # penalty of the next inner solve
     U: Tensor  # (B', N, m): controls to go on from
     taken: Tensor  # (B',) bool: where U replaces the iterate
+    # (B',): mu to go on with where U is taken, to be left alone until the attempt ends; NaN, None: the solver's own.
+    penalty: Tensor | None = None
 
 
 class Guidance(Protocol):
@@ -119,6 +122,8 @@ class OuterLoop(Protocol):
     def hold_factor(self) -> float: ...
     @property
     def attempts(self) -> int: ...
+    @property
+    def arrival(self) -> float | None: ...
     @property
     def clip(self) -> bool: ...
     @property

@@ -1,0 +1,179 @@
+"""The geometric proposal: it leads to the goal, says where it can't, and is followed undisturbed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.problems import planar_batch, quadrotor_batch
+from torchgco import (
+    GCO,
+    ILQR,
+    MPPI,
+    AugmentedLagrangian,
+    ControlBounds,
+    InputError,
+    Planar,
+    Problem,
+    QuadraticCost,
+    Spheres,
+    judge,
+)
+from torchgco.draws import DrawKey
+from torchgco.guidance import Detour, Roadmap
+from torchgco.guidance.detour import Proposal
+
+QUICK = Detour(begin=0.1, end=0.8, iterations=8)
+GOAL = torch.tensor([1.0, 0.4], dtype=torch.float64)
+WEIGHTS = [5, 5, 1e-8, 1, 1, 1e-8]
+
+
+def cup(B: int = 2, N: int = 100, closed: bool = False, **spheres) -> Problem:
+    """A wall of discs on the straight way, bent towards the vehicle; closed: all around its start."""
+    if closed:
+        angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+        centers, radius = np.stack((-1 + 0.5 * np.cos(angle), 0.5 * np.sin(angle)), axis=-1), 0.08
+    else:
+        y = np.linspace(-0.35, 0.55, 5)
+        centers, radius = np.stack((0.2 - 1.2 * (y - 0.1) ** 2, y), axis=-1), 0.14
+    discs = Spheres(np.tile(centers, (B, 1, 1)), np.full((B, len(centers)), radius), 0.06, **spheres)
+    return Problem(
+        dynamics=Planar(dt=0.05),
+        cost=QuadraticCost(Q=WEIGHTS, R=[0.1, 0.1], Qf=WEIGHTS, x_ref=[1, 0.4, 0, 0, 0, 0]),
+        constraints=[discs, ControlBounds([-10, -10], [10, 10])],
+        x0=torch.tensor([[-1.0, 0, 0, 0, 0, 0]], dtype=torch.float64).repeat(B, 1),
+        N=N,
+    )
+
+
+def controls(problem: Problem) -> torch.Tensor:
+    return torch.zeros(problem.B, problem.N, problem.m, dtype=torch.float64)
+
+
+def test_it_leads_around_a_trap_that_catches_the_solver() -> None:
+    problem = cup(B=1, N=120)
+    alone = AugmentedLagrangian(
+        inner=ILQR(tolerance=1e-2, max_iterations=20), max_outer_iterations=12, grow_when_feasible=False, clip=True
+    )
+    guided = replace(alone, guidance=GCO(detour=Detour(begin=0.1, end=0.8), patience=3), cost_tolerance=1e-3)
+    stays, passes = (judge(problem, s.solve(problem, controls(problem)).U, GOAL, 0.3) for s in (alone, guided))
+    assert not bool(stays.reached) and bool(passes.sound)
+
+
+def test_a_plan_ends_near_the_goal_and_has_a_penalty() -> None:
+    U, found, penalty = Detour(begin=0.1, end=0.8).propose(cup())
+    assert bool(found.all()) and bool((penalty > 0).all()) and bool(torch.isfinite(U).all())
+    assert float(judge(cup(), U, GOAL, 0.3).goal_distance.max()) < 0.3
+
+
+def test_units_are_the_problems_own() -> None:
+    """A problem whose cost is counted in cents is led the same way, with penalties in cents."""
+    problem = cup(B=1)
+    cents = replace(problem, cost=QuadraticCost(
+        Q=[100 * w for w in WEIGHTS], R=[10.0, 10.0], Qf=[100 * w for w in WEIGHTS], x_ref=[1, 0.4, 0, 0, 0, 0]
+    ))  # fmt: skip
+    one, hundred = (replace(QUICK, iterations=1).propose(p) for p in (problem, cents))
+    torch.testing.assert_close(hundred.penalty, 100 * one.penalty)
+    torch.testing.assert_close(hundred.U, one.U, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [cup(closed=True), cup(velocities=np.zeros((2, 5, 2))), replace(cup(), constraints=())],
+    ids=["no way", "moving", "no obstacles"],
+)
+def test_where_there_is_no_way_nothing_is_proposed(problem: Problem) -> None:
+    U, found, _ = QUICK.propose(problem)
+    assert not bool(found.any()) and U.shape == (2, 100, 2)
+    advice = GCO(detour=QUICK, sampler=MPPI(samples=4)).update(
+        problem, torch.zeros(2, 101, 6, dtype=torch.float64), U,
+        GCO().start(problem, torch.zeros(2, 101, 6, dtype=torch.float64)),
+        DrawKey(0, torch.arange(2), torch.ones(2, dtype=torch.int64)),
+    )  # fmt: skip
+    assert not bool(advice.taken.any())
+
+
+def test_the_vehicle_rests_first_and_last() -> None:
+    way = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [1.0, 1.0]]], dtype=torch.float64)
+    center = replace(QUICK, begin=0.2, end=0.7, smoothing=0.0)._travel(way, 100)[0]
+    assert torch.equal(center[:21], way[0, :1].expand(21, -1)) and torch.equal(center[70:], way[0, -1:].expand(31, -1))
+    assert float((center[1:] - center[:-1]).square().sum(-1).sqrt().max()) < 1.6 * 2.0 / 50
+    rounded = replace(QUICK, begin=0.2, end=0.7, smoothing=0.1)._travel(way, 100)[0]
+    corner = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    assert float((center - corner).norm(dim=-1).min()) < 0.03 < float((rounded - corner).norm(dim=-1).min())
+
+
+class Turns(Detour):
+    """Notes who asked, and finds nothing."""
+
+    asked: list = []  # noqa: RUF012
+
+    def propose(self, problem: Problem) -> Proposal:
+        self.asked.append(problem.B)
+        U = controls(problem)
+        return Proposal(U, torch.zeros(problem.B, dtype=torch.bool), U[:, 0, 0])
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_detours_and_samples_take_turns(first: bool) -> None:
+    problem, _ = planar_batch(B=4, N=25, obstacles=9, seed=4)
+    X = problem.x0[:, None].repeat(1, 26, 1)
+    X[:, 5:, :2] = torch.as_tensor(problem.geometric[0].centers[:, :1])  # in a disc: caught, at this patience
+    guidance = GCO(detour=Turns(), detour_first=first, sampler=MPPI(samples=4), patience=0)
+    key = DrawKey(0, torch.arange(4), torch.ones(4, dtype=torch.int64), None, torch.tensor([1, 2, 3, 1]))
+    Turns.asked.clear()
+    guidance.update(problem, X, controls(problem), guidance.start(problem, X), key)
+    assert Turns.asked == [3 if first else 1]
+
+
+def test_a_plan_with_its_own_penalty_is_left_alone() -> None:
+    """Guidance isn't asked again while it is followed, and the penalty is the one it came with."""
+    problem, seen = cup(B=2), []
+
+    def look(progress) -> None:
+        state = progress.state
+        if bool(state.led.any()):
+            seen.append((state.outer.clone(), state.guided.clone(), state.duals.mu.clone(), state.rows.clone()))
+
+    guidance = GCO(detour=replace(QUICK, hold=500.0), patience=1)
+    solver = AugmentedLagrangian(
+        inner=ILQR(max_iterations=4), guidance=guidance, max_outer_iterations=4, clip=True, grow_when_feasible=False
+    )
+    solver.solve(problem, controls(problem), callback=look)
+    penalty = replace(QUICK, hold=500.0).propose(problem).penalty
+    assert seen and torch.equal(seen[0][2], penalty[seen[0][3]])
+    assert all(int(guided.max()) == 1 for _, guided, _, _ in seen) and int(seen[-1][0].max()) >= 3
+
+
+CHANGES = dict(
+    roadmap=Roadmap(margin=1.0), begin=0.2, end=0.7, smoothing=0.2, tube=0.2, stiffness=(50.0,), obstacle_penalty=50.0,
+    hold=5.0, iterations=2,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_every_option_is_read(name: str) -> None:
+    problem, base = cup(B=1, N=60), Detour(begin=0.1, end=0.8, iterations=3)
+    one, other = base.propose(problem), replace(base, **{name: CHANGES[name]}).propose(problem)
+    assert not (torch.equal(one.U, other.U) and torch.equal(one.penalty, other.penalty))
+
+
+def test_a_quadrotor_is_led_too() -> None:
+    problem, _ = quadrotor_batch(B=2, N=60)
+    verdict = judge(problem, Detour(smoothing=0.16).propose(problem).U, problem.cost.goal(problem.x0)[:, :3], 2.0)
+    assert float(verdict.goal_distance.max()) < 2.0
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (dict(begin=0.9), "detour.begin"), (dict(begin=-0.1), "detour.begin"), (dict(end=1.1), "detour.begin"),
+        (dict(smoothing=1.0), "detour.smoothing"), (dict(tube=0.0), "detour.tube"), (dict(hold=0.0), "detour.hold"),
+        (dict(obstacle_penalty=0.0), "detour.obstacle_penalty"), (dict(stiffness=()), "detour.stiffness"),
+        (dict(stiffness=(0.0,)), "detour.stiffness"), (dict(iterations=0), "detour.iterations"),
+    ],
+)  # fmt: skip
+def test_options_out_of_range_are_named(change: dict, field: str) -> None:
+    with pytest.raises(InputError, match=field.replace(".", r"\.")):
+        Detour(**change)
