@@ -56,7 +56,7 @@ def default_solver(guided: bool = True) -> AugmentedLagrangian:
         cost_tolerance=1e-3,
         hold_factor=2.0,
         attempts=3,
-        arrival=0.015,
+        arrival=0.09,
         clip=True,
     )
 

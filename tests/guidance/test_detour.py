@@ -115,16 +115,16 @@ class Turns(Detour):
         return Proposal(U, torch.zeros(problem.B, dtype=torch.bool), U[:, 0, 0])
 
 
-@pytest.mark.parametrize("first", [True, False])
-def test_detours_and_samples_take_turns(first: bool) -> None:
+@pytest.mark.parametrize(("at", "askers"), [(1, [2]), (2, [1]), (4, [])])
+def test_one_attempt_is_the_detour(at: int, askers: list[int]) -> None:
     problem, _ = planar_batch(B=4, N=25, obstacles=9, seed=4)
     X = problem.x0[:, None].repeat(1, 26, 1)
     X[:, 5:, :2] = torch.as_tensor(problem.geometric[0].centers[:, :1])  # in a disc: caught, at this patience
-    guidance = GCO(detour=Turns(), detour_first=first, sampler=MPPI(samples=4), patience=0)
+    guidance = GCO(detour=Turns(), detour_at=at, sampler=MPPI(samples=4), patience=0)
     key = DrawKey(0, torch.arange(4), torch.ones(4, dtype=torch.int64), None, torch.tensor([1, 2, 3, 1]))
     Turns.asked.clear()
     guidance.update(problem, X, controls(problem), guidance.start(problem, X), key)
-    assert Turns.asked == [3 if first else 1]
+    assert Turns.asked == askers
 
 
 def test_a_plan_with_its_own_penalty_is_left_alone() -> None:

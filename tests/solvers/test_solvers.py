@@ -246,7 +246,7 @@ ELSEWHERE = {
     (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"),
     (AugmentedLagrangian, "hold_factor"), (AugmentedLagrangian, "cost_tolerance"),
     (AugmentedLagrangian, "grow_when_feasible"), (GCO, "grow_when_idle"), (GCO, "adopt"),
-    (GCO, "detour"), (GCO, "detour_first"), (AugmentedLagrangian, "arrival"),
+    (GCO, "detour"), (GCO, "detour_at"), (AugmentedLagrangian, "arrival"),
     (AugmentedLagrangian, "attempts"), (AugmentedLagrangian, "slots"),
 }  # fmt: skip
 PLACES = {
@@ -351,6 +351,9 @@ class OnePlan:
     def start(self, problem, X):
         return GuideRegion.inactive(X, torch.ones_like(X[:, 0, 0]), slice(0, 2))
 
+    def takes_long(self, problem, X, U, key):
+        return torch.zeros(problem.B, dtype=torch.bool)
+
     def update(self, problem, X, U, guide, key):
         return Advice(guide, self.plan.expand_as(U), key.outer == 1)
 
@@ -439,6 +442,7 @@ def test_an_adopted_plan_is_held(hold_factor: float) -> None:
         (lambda: AugmentedLagrangian(hold_factor=0.5), "solver.hold_factor"),
         (lambda: AugmentedLagrangian(attempts=0), "solver.attempts"),
         (lambda: AugmentedLagrangian(arrival=1.0), "solver.arrival"),
+        (lambda: GCO(detour_at=0), "gco.detour_at"),
         (lambda: ILQR(regularisation_first=0.0), "ilqr.regularisation_first"),
         (lambda: ILQR(regularisation_growth=1.0), "ilqr.regularisation_growth"),
         (lambda: LineSearch(shrink=1.0), "line_search.shrink"),

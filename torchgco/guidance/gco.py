@@ -32,8 +32,7 @@ class GCO:
         adopt: where the sampled plan touches nothing, go on from the plan itself instead of being drawn to it.
         afresh: sample around the cost's reference controls (the vehicle at rest), not around the path that is caught.
         detour: a plan along the shortest way around static spheres, to go on from; None: never (as in the paper).
-        detour_first: detours are the odd attempts and sampled plans the even ones, or the other way round; where no way
-            is found, sampled all the same.
+        detour_at: the attempt, from 1, that is the detour; all others, and this one where there is no way, are sampled.
         patience: from this outer iteration on, a single active sphere counts as being caught too; None: never.
 
     Raises:
@@ -49,13 +48,15 @@ class GCO:
     patience: int | None = None
     afresh: bool = False
     detour: Detour | None = None
-    detour_first: bool = True
+    detour_at: int = 1
 
     def __post_init__(self) -> None:
         if not self.initial_penalty > 0:
             raise InputError("gco.initial_penalty", "above 0", self.initial_penalty)
         if not self.penalty_growth >= 1:
             raise InputError("gco.penalty_growth", "at least 1", self.penalty_growth)
+        if self.detour_at < 1:
+            raise InputError("gco.detour_at", "at least 1", self.detour_at)
         if self.radius is not None and not self.radius > 0:
             raise InputError("gco.radius", "above 0 m, or null", self.radius)
 
@@ -66,20 +67,21 @@ class GCO:
         weight = X.new_full((problem.B,), self.initial_penalty)
         return GuideRegion.inactive(X, weight, problem.dynamics.position)
 
+    def takes_long(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
+        """The elements that are caught, (B,): for them a way is sought."""
+        return self._caught(problem, X, U, key).any(-1)
+
     def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> Advice:
         """CPUF for every element: a region where it is caught, none where it isn't; or the plan itself, where taken."""
-        knots = caught_knots(problem, X, U)
-        if self.patience is not None:
-            # One sphere met dead-centre has no gradient to the side: J stays empty, and only time tells.
-            knots = knots | (caught_knots(problem, X, U, least=1) & (key.age >= self.patience).unsqueeze(-1))
+        knots = self._caught(problem, X, U, key)
         caught = knots.any(-1)
         growing = torch.ones_like(caught) if self.grow_when_idle else caught
         weight = torch.where(growing, guide.weight * self.penalty_growth, guide.weight)
         new, plan, taken = GuideRegion.inactive(X, weight, guide.position), U.clone(), torch.zeros_like(caught)
         penalty = torch.full_like(weight, torch.nan)
         if self.detour is not None:
-            odd = torch.ones_like(caught) if key.attempt is None else key.attempt % 2 == 1
-            turn = (caught & (odd == self.detour_first)).nonzero().flatten()
+            attempt = torch.ones_like(key.ids) if key.attempt is None else key.attempt
+            turn = (caught & (attempt == self.detour_at)).nonzero().flatten()
             if turn.numel() > 0:
                 plan[turn], taken[turn], penalty[turn] = self.detour.propose(problem.take(turn))
         rows = (caught & ~taken).nonzero().flatten()
@@ -91,6 +93,14 @@ class GCO:
             drawn = guide_along(take(new, rows), X_safe, knots[rows], self._radius(problem)[rows])
             put(new, rows[~taken[rows]], take(drawn, (~taken[rows]).nonzero().flatten()))
         return Advice(new, plan, taken, penalty)
+
+    def _caught(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
+        """The knots (B, N+1) that guidance is for: J, and with patience those at a single sphere."""
+        knots = caught_knots(problem, X, U)
+        if self.patience is None:
+            return knots
+        # One sphere met dead-centre has no gradient to the side: J stays empty, and only time tells.
+        return knots | (caught_knots(problem, X, U, least=1) & (key.age >= self.patience).unsqueeze(-1))
 
     def _mean(self, problem: Problem, U: Tensor) -> Tensor:
         """What the sampler starts from, (B, N, m)."""

@@ -14,8 +14,11 @@ from torchgco.status import Status
 
 
 def has_arrived(problem: Problem, iterate: Iterate, share: float, limit: float) -> Tensor:
-    """Whether a feasible iterate has come to the goal (B,): terminal cost at most `share` of the start's."""
-    last, first = problem.cost.terminal(iterate.X[:, -1]), problem.cost.terminal(problem.x0)
+    """Whether a feasible iterate has come to the goal (B,): within `share` of the distance from the start."""
+    goal, at = problem.cost.goal(problem.x0), problem.dynamics.position
+    if goal is None or at is None:
+        return torch.zeros_like(iterate.violation, dtype=torch.bool)
+    last, first = ((x - goal)[:, at].square().sum(-1).sqrt() for x in (iterate.X[:, -1], problem.x0))
     return (iterate.violation <= limit) & (last <= share * first)
 
 

@@ -35,9 +35,9 @@ class AugmentedLagrangian:
             is left costs at least this times what the new one costs more (not in the paper).
         attempts: where guidance puts another path in place of the iterate, so many are tried from the same caught path,
             each to its end, and the best is kept; max_outer_iterations then counts for each (not in the paper).
-        arrival: a feasible iterate has arrived where its terminal cost is at most this share of the start's. One that
-            has is worth more than one that hasn't, whatever they cost, and nothing else is attempted after it. None:
-            cost alone decides, as in the paper.
+        arrival: a feasible iterate has arrived where it ends within this share of the distance from start to goal. One
+            that has is worth more than one that hasn't, whatever they cost, and nothing else is attempted after it.
+            None: cost alone decides, as in the paper.
         clip: inequalities push but never pull (`lagrangian.penalty_weights`); False as printed.
         slots: problems worked on at once; the others wait until a slot falls free. None: all. No result depends on it.
         record: keep the history of every element in `solution.trace`.

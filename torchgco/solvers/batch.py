@@ -19,13 +19,15 @@ from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
-from torchgco.shapes import InputError, copied, put, take
+from torchgco.shapes import InputError, copied, joined, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.attempts import go_on_from, has_arrived, try_again
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import Callback, InnerEnd, Iterate, OuterLoop, Progress, State
 from torchgco.solvers.trace import Recorder
 from torchgco.status import Status
+
+PASSES_ASIDE = 20  # how long an element may wait for company; sampling for a few costs as much as for many
 
 
 class Loop:
@@ -56,7 +58,7 @@ class Loop:
         everyone = torch.arange(problem.B, device=U0.device)
         slots = problem.B if solver.slots is None else min(solver.slots, problem.B)
         self.waiting = everyone[slots:]
-        self.state = self._begin(everyone[:slots])
+        self.state, self.aside, self.passes_aside = self._begin(everyone[:slots]), None, 0
         self.problem = problem if slots == problem.B else problem.take(everyone[:slots])
         # F and H of every pass: memory that is had afresh costs more than what is written into it.
         z, s = problem.n + 1, problem.n + 1 + problem.m
@@ -68,10 +70,11 @@ class Loop:
         passes = 0
         while self.state.rows.numel() > 0:
             self._end(self._pass())
+            self._ask_together()
             passes += 1
             if self.callback is not None:
                 total = self.whole.B
-                left = self.state.rows.numel() + self.waiting.numel()
+                left = self.state.rows.numel() + self.waiting.numel() + _count(self.aside)
                 self.callback(Progress(passes, total - left, total, self.state))
         return self._with_gains()
 
@@ -95,6 +98,7 @@ class Loop:
             last_cost=worst.clone(),
             best=copied(iterate), origin=copied(iterate),
             attempt=zero.clone(), since=zero.clone(), led=torch.zeros_like(rows, dtype=torch.bool),
+            asking=torch.zeros_like(rows, dtype=torch.bool),
         )  # fmt: skip
 
     def _bad_starts(self, state: State) -> Tensor:
@@ -212,31 +216,64 @@ class Loop:
         put(self.state.best, rows[chosen], take(new, chosen))
 
     def _next_inner(self, rows: Tensor, duals: Multipliers) -> None:
-        """Guidance, new multipliers and penalties, and L_M anew for the elements in `rows`."""
-        s, clip = self.state, self.solver.clip
-        duals = self._guided(rows, duals)
+        """New multipliers and penalties for the elements in `rows`; the next inner solve where no advice is awaited."""
+        s, guidance = self.state, self.solver.guidance
         s.duals = Multipliers(tuple(lam.clone() for lam in s.duals.lam), s.duals.mu.clone())
         put(s.duals, rows, duals)
+        if guidance is not None:
+            problem = self.problem.take(rows)
+            long = guidance.takes_long(problem, s.X[rows], s.U[rows], self._key(rows)) & ~s.led[rows]
+            s.asking[rows] = long
+            rows = rows[~long]
+        if rows.numel() > 0:
+            self._begin_inner(rows)
+
+    def _begin_inner(self, rows: Tensor) -> None:
+        """Guidance, and L_M anew."""
+        s = self.state
+        self._be_guided(rows[~s.led[rows]])
         s.regularisation[rows] = 0.0
-        lagrangian = Lagrangian(self.problem.take(rows), duals, take(s.guide, rows), clip)
+        lagrangian = Lagrangian(self.problem.take(rows), take(s.duals, rows), take(s.guide, rows), self.solver.clip)
         s.cost[rows], s.merit[rows] = lagrangian.value(s.X[rows], s.U[rows])
         s.inner[rows] = 0
 
-    def _guided(self, rows: Tensor, duals: Multipliers) -> Multipliers:
-        """Ask guidance for those in `rows` that don't follow a plan already; returns the multipliers to go on with."""
+    def _be_guided(self, rows: Tensor) -> None:
+        """Ask guidance for the elements in `rows`, and go on from the plans that it hands over."""
         s, guidance = self.state, self.solver.guidance
-        asking = (~s.led[rows]).nonzero().flatten()
-        if guidance is None or asking.numel() == 0:
-            return duals
-        place = rows[asking]
-        problem = self.problem.take(place)
-        key = DrawKey(self.seed, self.ids[s.rows[place]], s.outer[place], s.since[place], s.attempt[place].clamp(min=1))
-        advice = guidance.update(problem, s.X[place], s.U[place], take(s.guide, place), key)
-        put(s.guide, place, advice.guide)
-        s.guided[place] += advice.guide.is_active | advice.taken
-        advised = copied(duals)
-        put(advised, asking, go_on_from(s, place, problem, advice, take(duals, asking), self.solver))
-        return advised
+        if guidance is None or rows.numel() == 0:
+            return
+        problem = self.problem.take(rows)
+        advice = guidance.update(problem, s.X[rows], s.U[rows], take(s.guide, rows), self._key(rows))
+        put(s.guide, rows, advice.guide)
+        s.guided[rows] += advice.guide.is_active | advice.taken
+        put(s.duals, rows, go_on_from(s, rows, problem, advice, take(s.duals, rows), self.solver))
+
+    def _key(self, rows: Tensor) -> DrawKey:
+        s = self.state
+        return DrawKey(self.seed, self.ids[s.rows[rows]], s.outer[rows], s.since[rows], s.attempt[rows].clamp(min=1))
+
+    def _ask_together(self) -> None:
+        """Put aside those that wait for long advice, and ask for all of them at once after some passes."""
+        s = self.state
+        if bool(s.asking.any()):
+            if self.aside is None:
+                self.passes_aside = 0
+            asking, others = s.asking.nonzero().flatten(), (~s.asking).nonzero().flatten()
+            self.aside = take(s, asking) if self.aside is None else joined(self.aside, take(s, asking))
+            self._resume(take(s, others))
+        if self.aside is None:
+            return
+        self.passes_aside += 1
+        if self.passes_aside < PASSES_ASIDE and self.state.rows.numel() > 0:
+            return
+        ran = self.state.rows.numel()
+        self._resume(joined(self.state, self.aside))
+        self.aside = None
+        self.state.asking[:] = False
+        self._begin_inner(torch.arange(ran, self.state.rows.numel(), device=self.state.rows.device))
+
+    def _resume(self, state: State) -> None:
+        self.state, self.problem = state, self.whole.take(state.rows)
 
     # End ---------------------------------------------------------------------------------------------------------
 
@@ -284,6 +321,10 @@ class Loop:
             G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
             r.K[rows], r.d[rows] = G[..., :-1], G[..., -1]
         return replace(r, trace=None if self.recorder is None else self.recorder.frame())
+
+
+def _count(state: State | None) -> int:
+    return 0 if state is None else state.rows.numel()
 
 
 def _empty_result(problem: Problem, U0: Tensor) -> Solution:
