@@ -130,6 +130,8 @@ def _fly_side_by_side(
         for shard, rows, U in pool.imap_unordered(_fly_batch, missing):
             records.write_shard(shard, rows, U)
             bar.update(len(rows))
+        pool.close()  # workers that end by themselves leave nothing behind; those that are terminated do
+        pool.join()
     return {shard for shard, *_ in missing}
 
 
