@@ -168,6 +168,7 @@ def test_a_quadrotor_is_led_too() -> None:
 @pytest.mark.parametrize(
     ("change", "field"),
     [
+        (dict(roadmap={"nodes": 64}), "detour.roadmap"),
         (dict(begin=0.9), "detour.begin"), (dict(begin=-0.1), "detour.begin"), (dict(end=1.1), "detour.begin"),
         (dict(smoothing=1.0), "detour.smoothing"), (dict(tube=0.0), "detour.tube"), (dict(hold=0.0), "detour.hold"),
         (dict(obstacle_penalty=0.0), "detour.obstacle_penalty"), (dict(stiffness=()), "detour.stiffness"),

@@ -62,6 +62,8 @@ class Detour:
     iterations: int = 20
 
     def __post_init__(self) -> None:
+        if not isinstance(self.roadmap, Roadmap):
+            raise InputError("detour.roadmap", "a Roadmap", self.roadmap)
         if not 0 <= self.begin < self.end <= 1:
             raise InputError("detour.begin", f"at least 0 and below end, {self.end}", self.begin)
         if not 0 <= self.smoothing < 1:

@@ -211,7 +211,7 @@ class Loop:
         if self.solver.arrival is not None:
             problem = self.problem.take(rows)
             arrived, old_arrived = (has_arrived(problem, it, self.solver.arrival, limit) for it in (new, old))
-            better = (better & ~old_arrived) | (better & arrived) | (arrived & ~old_arrived)
+            better = torch.where(arrived == old_arrived, better, arrived)
         chosen = better.nonzero().flatten()
         put(self.state.best, rows[chosen], take(new, chosen))
 
