@@ -23,6 +23,8 @@ from torchgco import (
 from torchgco.draws import DrawKey
 from torchgco.guidance import Detour, Roadmap
 from torchgco.guidance.detour import Proposal
+from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.rollout import open_loop
 
 QUICK = Detour(begin=0.1, end=0.8, iterations=8)
 GOAL = torch.tensor([1.0, 0.4], dtype=torch.float64)
@@ -73,7 +75,7 @@ def test_units_are_the_problems_own() -> None:
     cents = replace(problem, cost=QuadraticCost(
         Q=[100 * w for w in WEIGHTS], R=[10.0, 10.0], Qf=[100 * w for w in WEIGHTS], x_ref=[1, 0.4, 0, 0, 0, 0]
     ))  # fmt: skip
-    one, hundred = (replace(QUICK, iterations=1).propose(p) for p in (problem, cents))
+    one, hundred = (replace(QUICK, iterations=1, settle=0).propose(p) for p in (problem, cents))
     torch.testing.assert_close(hundred.penalty, 100 * one.penalty)
     torch.testing.assert_close(hundred.U, one.U, rtol=1e-6, atol=1e-6)
 
@@ -109,22 +111,53 @@ class Turns(Detour):
 
     asked: list = []  # noqa: RUF012
 
-    def propose(self, problem: Problem) -> Proposal:
-        self.asked.append(problem.B)
+    def propose(self, problem: Problem, rank: torch.Tensor | None = None) -> Proposal:
+        self.asked.append(rank.tolist())
         U = controls(problem)
         return Proposal(U, torch.zeros(problem.B, dtype=torch.bool), U[:, 0, 0])
 
 
-@pytest.mark.parametrize(("at", "askers"), [(1, [2]), (2, [1]), (4, [])])
-def test_one_attempt_is_the_detour(at: int, askers: list[int]) -> None:
+@pytest.mark.parametrize(
+    ("at", "detours", "ranks"), [(1, 1, [[0, 0]]), (2, 1, [[0]]), (4, 1, []), (1, 2, [[0, 1, 0]]), (2, 5, [[0, 1]])]
+)
+def test_some_attempts_are_detours(at: int, detours: int, ranks: list[list[int]]) -> None:
     problem, _ = planar_batch(B=4, N=25, obstacles=9, seed=4)
     X = problem.x0[:, None].repeat(1, 26, 1)
     X[:, 5:, :2] = torch.as_tensor(problem.geometric[0].centers[:, :1])  # in a disc: caught, at this patience
-    guidance = GCO(detour=Turns(), detour_at=at, sampler=MPPI(samples=4), patience=0)
+    guidance = GCO(detour=Turns(), detour_at=at, detours=detours, sampler=MPPI(samples=4), patience=0)
     key = DrawKey(0, torch.arange(4), torch.ones(4, dtype=torch.int64), None, torch.tensor([1, 2, 3, 1]))
     Turns.asked.clear()
     guidance.update(problem, X, controls(problem), guidance.start(problem, X), key)
-    assert Turns.asked == askers
+    assert Turns.asked == ranks
+
+
+def test_the_way_that_settles_best_is_kept_and_the_others_follow_by_rank() -> None:
+    problem, many = cup(B=1), replace(QUICK, ways=3)
+    plans = [many.propose(problem, torch.tensor([rank])) for rank in range(4)]
+    assert torch.equal(plans[0].U, many.propose(problem).U)
+    assert [bool(plan.found) for plan in plans] == [True, True, True, False]
+    duals = replace(Multipliers.zero(problem, 0.0), mu=plans[0].penalty)
+    paths = [open_loop(problem.dynamics, problem.x0, plan.U) for plan in plans[:3]]
+    merits = [
+        float(Lagrangian(problem, duals, None, True).value(X, p.U)[1]) for X, p in zip(paths, plans, strict=False)
+    ]
+    back = [float((X[0, -1, :2] - GOAL).norm()) > 0.5 for X in paths]
+    ranked = list(zip(back, merits, strict=True))
+    assert ranked == sorted(ranked) and len(set(merits)) > 1
+
+
+def test_a_plan_that_falls_back_into_the_trap_is_not_settled() -> None:
+    """Flying is so dear that waiting is cheaper: the plan stays as it was followed."""
+    problem = replace(cup(B=1), cost=QuadraticCost(Q=WEIGHTS, R=[20.0, 20.0], Qf=WEIGHTS, x_ref=[1, 0.4, 0, 0, 0, 0]))
+    followed, settled = (Detour(begin=0.1, end=0.8, settle=n).propose(problem).U for n in (0, 20))
+    assert torch.equal(followed, settled)
+    assert float(judge(problem, settled, GOAL, 0.3).goal_distance) < 0.3
+
+
+def test_settling_makes_a_plan_cheaper() -> None:
+    problem = cup(N=120)
+    costs = [judge(problem, replace(QUICK, settle=n).propose(problem).U, GOAL, 0.3).cost for n in (0, 3)]
+    assert bool((costs[0] > costs[1]).all())
 
 
 def test_a_plan_with_its_own_penalty_is_left_alone() -> None:
@@ -148,7 +181,7 @@ def test_a_plan_with_its_own_penalty_is_left_alone() -> None:
 
 CHANGES = dict(
     roadmap=Roadmap(margin=1.0), begin=0.2, end=0.7, smoothing=0.2, tube=0.2, stiffness=(50.0,), obstacle_penalty=50.0,
-    hold=5.0, iterations=2,
+    hold=5.0, iterations=2, ways=3, settle=2,
 )  # fmt: skip
 
 
@@ -173,6 +206,7 @@ def test_a_quadrotor_is_led_too() -> None:
         (dict(smoothing=1.0), "detour.smoothing"), (dict(tube=0.0), "detour.tube"), (dict(hold=0.0), "detour.hold"),
         (dict(obstacle_penalty=0.0), "detour.obstacle_penalty"), (dict(stiffness=()), "detour.stiffness"),
         (dict(stiffness=(0.0,)), "detour.stiffness"), (dict(iterations=0), "detour.iterations"),
+        (dict(ways=0), "detour.ways"), (dict(settle=-1), "detour.settle"),
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_named(change: dict, field: str) -> None:

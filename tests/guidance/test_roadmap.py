@@ -9,7 +9,7 @@ import torch
 
 from tests.reference.roadmap import cheapest_cost, point_along, segment_gap, way_length
 from torchgco import InputError
-from torchgco.guidance.roadmap import FAR, Roadmap, Scene, halton, points_along, segment_gaps
+from torchgco.guidance.roadmap import FAR, Roadmap, Scene, _apart_from, _cheapest, halton, points_along, segment_gaps
 
 
 def flat(points, rows):
@@ -44,30 +44,49 @@ def ring(open_at: int | None = None) -> Scene:
 @pytest.mark.parametrize("d", [2, 3])
 def test_ways_are_free_and_lead_from_start_to_goal(d: int) -> None:
     s = random_scene(d)
-    way, found = Roadmap().ways(s)
+    ways, found = Roadmap().ways(s, 3)
     assert bool(found.all())
-    assert torch.equal(way[:, 0], s.start) and torch.equal(way[:, -1], s.goal)
-    for b in range(s.start.shape[0]):
-        for a, c in zip(way[b, :-1].numpy(), way[b, 1:].numpy(), strict=True):
-            assert segment_gap(a, c, s.centers[b].numpy(), s.distances[b].numpy(), 201) > -1e-9
+    for i in range(3):
+        way = ways[:, i]
+        assert torch.equal(way[:, 0], s.start) and torch.equal(way[:, -1], s.goal)
+        for b in range(s.start.shape[0]):
+            for a, c in pairwise(way[b].numpy()):
+                assert segment_gap(a, c, s.centers[b].numpy(), s.distances[b].numpy(), 201) > -1e-9
+
+
+def test_further_ways_are_others() -> None:
+    """Around a disc on the other side; the first is the same however many follow, and lengths grow."""
+    s = scene([[[0.0, 0.1]]], [[0.4]])
+    ways, _ = Roadmap().ways(s, 2)
+    assert torch.equal(ways[:, :1], Roadmap().ways(s)[0])
+    assert float(ways[0, 0, :, 1].min()) < -0.3 and float(ways[0, 1, :, 1].max()) > 0.4
+    assert way_length(ways[0, 0].numpy()) < way_length(ways[0, 1].numpy())
+
+
+def test_where_there_is_one_way_only_it_comes_again() -> None:
+    ways, found = Roadmap().ways(ring(open_at=3), 2)
+    middle = torch.tensor([1.0 + 0.5 * np.cos(0.6 * np.pi), 0.5 * np.sin(0.6 * np.pi)])
+    path = points_along(ways[:, 1], torch.linspace(0, 3, 400, dtype=torch.float64)[None])
+    assert bool(found) and float((path[0] - middle).square().sum(-1).sqrt().min()) < 0.17
 
 
 def test_the_way_around_one_disc_is_a_taut_string() -> None:
     R = 0.4
-    way, found = Roadmap().ways(scene([[[0.0, 0.0]]], [[R]]))
+    ways, found = Roadmap().ways(scene([[[0.0, 0.0]]], [[R]]))
     tangents, arc = 2 * np.sqrt(1 - R**2), R * (np.pi - 2 * np.arccos(R))
-    assert bool(found) and tangents + arc < way_length(way[0].numpy()) < 1.05 * (tangents + arc)
+    assert bool(found) and tangents + arc < way_length(ways[0, 0].numpy()) < 1.05 * (tangents + arc)
 
 
 def test_a_free_line_is_straight() -> None:
-    way, _ = Roadmap().ways(scene([[[0.0, 0.9]]], [[0.2]]))
-    assert way_length(way[0].numpy()) == pytest.approx(2.0, abs=1e-9)
+    ways, _ = Roadmap().ways(scene([[[0.0, 0.9]]], [[0.2]]))
+    assert way_length(ways[0, 0].numpy()) == pytest.approx(2.0, abs=1e-9)
 
 
 def test_no_way_into_a_closed_ring_and_one_through_its_gap() -> None:
     assert not bool(Roadmap().ways(ring())[1])
     for gap in (0, 3, 5):
-        way, found = Roadmap().ways(ring(open_at=gap))
+        ways, found = Roadmap().ways(ring(open_at=gap))
+        way = ways[:, 0]
         middle = torch.tensor([1.0 + 0.5 * np.cos(0.2 * np.pi * gap), 0.5 * np.sin(0.2 * np.pi * gap)])
         assert bool(found)
         path = points_along(way, torch.linspace(0, way_length(way[0].numpy()), 400, dtype=torch.float64)[None])
@@ -77,8 +96,9 @@ def test_no_way_into_a_closed_ring_and_one_through_its_gap() -> None:
 def test_a_way_goes_where_a_metre_is_cheap() -> None:
     o, R = [[[0.0, 0.0]]], [[0.4]]
     for side in (1.0, -1.0):
-        way, _ = Roadmap().ways(scene(o, R, toll=lambda p, rows, side=side: 1.0 + (side * p[..., 1] > 0)))
-        assert float(side * way[0, :, 1].min()) < 0 if side > 0 else float(way[0, :, 1].max()) > 0
+        ways, _ = Roadmap().ways(scene(o, R, toll=lambda p, rows, side=side: 1.0 + (side * p[..., 1] > 0)))
+        across = ways[0, 0, :, 1]
+        assert float(across.min()) < 0 if side > 0 else float(across.max()) > 0
 
 
 def test_no_way_on_the_graph_is_cheaper() -> None:
@@ -89,7 +109,7 @@ def test_no_way_on_the_graph_is_cheaper() -> None:
     points = torch.cat((s.start[:, None], s.goal[:, None], torch.as_tensor(rng.uniform(-1, 1, (3, 50, 2)))), dim=1)
     near = torch.as_tensor(rng.integers(0, 52, (3, 52, 8)))
     price = torch.as_tensor(rng.uniform(0.5, 2.0, (3, 52)))
-    way, found = roadmap._cheapest(points, near, price, s.centers, s.distances)
+    way, found = _cheapest(points, near, roadmap._lengths(points, near, s.centers, s.distances), price)
     for b in range(3):
         p, o, R = points[b].numpy(), s.centers[b].numpy(), s.distances[b].numpy()
         margin = roadmap.margin * R.max()
@@ -126,10 +146,23 @@ def test_gaps_of_segments_and_points_along_a_way() -> None:
     np.testing.assert_allclose(halton(4, 2), [[1 / 2, 1 / 3], [1 / 4, 2 / 3], [3 / 4, 1 / 9], [1 / 8, 4 / 9]])
 
 
-@pytest.mark.parametrize("change", [dict(nodes=3), dict(spread=12), dict(neighbours=2), dict(hubs=1), dict(margin=1.0)])
+def test_distances_from_a_way() -> None:
+    rng = np.random.default_rng(5)
+    way, points = rng.uniform(-1, 1, (2, 5, 2)), rng.uniform(-1, 1, (2, 7, 2))
+    apart = _apart_from(torch.as_tensor(points), torch.as_tensor(way))
+    for b in range(2):
+        along = np.concatenate([a + np.linspace(0, 1, 2001)[:, None] * (c - a) for a, c in pairwise(way[b])])
+        nearest = np.linalg.norm(points[b, :, None] - along, axis=-1).min(-1)
+        np.testing.assert_allclose(apart[b], nearest, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [dict(nodes=3), dict(spread=12), dict(neighbours=2), dict(hubs=1), dict(margin=1.0), dict(novelty=0.1)],
+)
 def test_every_option_is_read(change: dict) -> None:
     s, base = random_scene(2, M=20, seed=6), Roadmap(nodes=60, spread=30)
-    assert not torch.equal(base.ways(s)[0], replace(base, **change).ways(s)[0])
+    assert not torch.equal(base.ways(s, 3)[0], replace(base, **change).ways(s, 3)[0])
 
 
 @pytest.mark.parametrize(
@@ -137,6 +170,7 @@ def test_every_option_is_read(change: dict) -> None:
     [
         (dict(nodes=0), "roadmap.nodes"), (dict(spread=0), "roadmap.spread"), (dict(neighbours=0), "roadmap.neigh"),
         (dict(hubs=0), "roadmap.hubs"), (dict(hubs=65), "roadmap.hubs"), (dict(margin=0.0), "roadmap.margin"),
+        (dict(novelty=-1.0), "roadmap.novelty"),
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_named(change: dict, field: str) -> None:

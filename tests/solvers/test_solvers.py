@@ -246,8 +246,8 @@ ELSEWHERE = {
     (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"),
     (AugmentedLagrangian, "hold_factor"), (AugmentedLagrangian, "cost_tolerance"),
     (AugmentedLagrangian, "grow_when_feasible"), (GCO, "grow_when_idle"), (GCO, "adopt"),
-    (GCO, "detour"), (GCO, "detour_at"), (AugmentedLagrangian, "arrival"),
-    (AugmentedLagrangian, "attempts"), (AugmentedLagrangian, "slots"),
+    (GCO, "detour"), (GCO, "detour_at"), (GCO, "detours"), (AugmentedLagrangian, "arrival"),
+    (AugmentedLagrangian, "thorough"), (AugmentedLagrangian, "attempts"), (AugmentedLagrangian, "slots"),
 }  # fmt: skip
 PLACES = {
     AugmentedLagrangian: lambda s, c: replace(s, **c),
@@ -405,6 +405,12 @@ def test_one_that_arrives_is_kept_and_ends_the_attempts() -> None:
         solution = replace(solver, guidance=guidance, attempts=2, arrival=arrival).solve(dear, U0)
         came[arrival] = len(guidance.asked_at), bool(solution.U.mean() > 3.0)
     assert came == {None: (2, False), 0.5: (1, True)}
+    guidance = Choices([here, there])
+    solution = replace(solver, guidance=guidance, attempts=2, arrival=0.5, thorough=True).solve(dear, U0)
+    assert len(guidance.asked_at) == 2 and bool(solution.U.mean() > 3.0)
+    guidance = Choices([there, there])
+    replace(solver, guidance=guidance, attempts=2, arrival=0.5, thorough=True).solve(dear, U0)
+    assert len(guidance.asked_at) == 2
 
 
 @pytest.mark.parametrize("hold_factor", [1.0, 100.0])
@@ -443,6 +449,7 @@ def test_an_adopted_plan_is_held(hold_factor: float) -> None:
         (lambda: AugmentedLagrangian(attempts=0), "solver.attempts"),
         (lambda: AugmentedLagrangian(arrival=1.0), "solver.arrival"),
         (lambda: GCO(detour_at=0), "gco.detour_at"),
+        (lambda: GCO(detours=0), "gco.detours"),
         (lambda: ILQR(regularisation_first=0.0), "ilqr.regularisation_first"),
         (lambda: ILQR(regularisation_growth=1.0), "ilqr.regularisation_growth"),
         (lambda: LineSearch(shrink=1.0), "line_search.shrink"),

@@ -1,8 +1,10 @@
-"""A plan along the shortest way between the obstacles: the geometric proposal of guidance.
+"""A plan along a short way between the obstacles: the geometric proposal of guidance.
 
-The way says where to pass; iLQR finds the controls that follow it, drawn into a narrow tube that travels along it,
-slowly enough for the vehicle to turn. What comes out is rarely cheap and need not be quite free of contact: it is where
-the solver goes on from, with a penalty that keeps it on this side of every obstacle.
+A way says where to pass; iLQR finds the controls that follow it, drawn into a narrow tube that travels along it, slowly
+enough for the vehicle to turn. Then the tube is dropped, and the path settles beside the obstacles that it has come
+around. The shortest way is often not the cheapest to fly: several are followed, and the one that settles best is handed
+over. It need not be quite free of contact: it is where the solver goes on from, with a penalty that keeps it on this
+side of every obstacle.
 """
 
 from __future__ import annotations
@@ -15,11 +17,15 @@ from torch import Tensor
 
 from torchgco.constraints.obstacles import BoundSpheres, GuideRegion
 from torchgco.guidance.roadmap import FAR, Roadmap, Scene, points_along
-from torchgco.lagrangian import Multipliers
+from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.problem import Problem
+from torchgco.rollout import open_loop
 from torchgco.shapes import InputError
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
+
+SURE = LineSearch(accept_last=False)
+THERE = 0.25  # share of the distance from start to goal; a path that ends farther from it has fallen back
 
 
 class Proposal(NamedTuple):
@@ -32,13 +38,14 @@ class Proposal(NamedTuple):
 
 @dataclass(frozen=True)
 class Detour:
-    """Follow the shortest way around static spheres.
+    """Follow the shortest ways around static spheres, and keep the one that is cheapest to fly.
 
     Penalties are given without units, against q0, the stage cost of resting at the start, L, the distance to the goal,
     and R, the mean r_obs + r_veh.
 
     Args:
-        roadmap: finds the way.
+        roadmap: finds the ways.
+        ways: how many are followed.
         begin, end: the shares of the horizon at which the vehicle sets out and arrives.
         smoothing: the share of the horizon over which the way's corners are averaged.
         tube: radius of the tube, as a share of R.
@@ -46,12 +53,14 @@ class Detour:
         obstacle_penalty: of the spheres meanwhile, in q0 / R^4.
         hold: penalty that the solver is to go on with, in q0 / R^4.
         iterations: of each solve, at most.
+        settle: iterations without the tube, at most, after which the ways are compared; 0 compares them as followed.
 
     Raises:
         InputError: a field out of its range.
     """
 
     roadmap: Roadmap = Roadmap()
+    ways: int = 1
     begin: float = 0.0
     end: float = 0.9
     smoothing: float = 0.08
@@ -60,6 +69,7 @@ class Detour:
     obstacle_penalty: float = 10.0
     hold: float = 80.0
     iterations: int = 20
+    settle: int = 20
 
     def __post_init__(self) -> None:
         if not isinstance(self.roadmap, Roadmap):
@@ -73,36 +83,50 @@ class Detour:
                 raise InputError(f"detour.{name}", "above 0", getattr(self, name))
         if not self.stiffness or not all(value > 0 for value in self.stiffness):
             raise InputError("detour.stiffness", "one or more numbers above 0", self.stiffness)
-        if self.iterations < 1:
-            raise InputError("detour.iterations", "at least 1", self.iterations)
+        for name, least in (("ways", 1), ("iterations", 1), ("settle", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"detour.{name}", f"at least {least}", getattr(self, name))
 
-    def propose(self, problem: Problem) -> Proposal:
-        """A plan for every problem, from the vehicle at rest."""
+    def propose(self, problem: Problem, rank: Tensor | None = None) -> Proposal:
+        """A plan for every problem, from the vehicle at rest, along the best of the ways or that of a rank (B,)."""
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
         scene, goal = _scene(problem, rest), problem.cost.goal(problem.x0)
         if scene is None or goal is None:
             nowhere = torch.zeros(problem.B, dtype=torch.bool, device=rest.device)
             return Proposal(rest, nowhere, torch.full_like(rest[:, 0, 0], torch.nan))
-        way, found = self.roadmap.ways(scene)
-        q0 = _resting_cost(problem, rest, scene.start.unsqueeze(1))[:, 0]
-        L2 = (scene.goal - scene.start).square().sum(-1)
-        here = scene.distances > 0
-        R = torch.where(here, scene.distances, 0.0).sum(-1) / here.sum(-1).clamp(min=1)
-        U, radius, unit = rest, self.tube * R, q0 / R.pow(4)
-        found = found & torch.isfinite(unit) & (q0 > 0)
-        center, mu = self._travel(way, problem.N), torch.where(found, unit, 1.0)
-        inner, duals = self._inner(), replace(Multipliers.zero(problem, 0.0), mu=self.obstacle_penalty * mu)
+        ways, found = self.roadmap.ways(scene, self.ways)
+        R, unit = _scales(problem, scene, rest)
+        found = found & torch.isfinite(unit) & (unit > 0)
+        unit = torch.where(found, unit, 1.0)
+        each = torch.arange(problem.B, device=rest.device).repeat_interleave(self.ways)
+        flown = self._fly(problem.take(each), rest[each], ways.flatten(0, 1), R[each], unit[each])
+        U, merit, there = (t.unflatten(0, (-1, self.ways)) for t in flown)
+        order = merit.nan_to_num(torch.inf).argsort(dim=-1, stable=True)
+        order = order.gather(1, there.gather(1, order).argsort(dim=-1, descending=True, stable=True))
+        rank = torch.zeros_like(each[: problem.B]) if rank is None else rank
+        chosen = order.gather(1, rank.clamp(max=self.ways - 1).unsqueeze(-1)).squeeze(-1)
+        U = U[torch.arange(problem.B, device=rest.device), chosen]
+        return Proposal(U, found & (rank < self.ways), self.hold * unit)
+
+    def _fly(self, problem: Problem, U: Tensor, way: Tensor, R: Tensor, unit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Controls that follow a way each, settled; the penalised cost of what they do; whether they arrive; (B,)."""
+        center, radius = self._travel(way, problem.N), self.tube * R
+        none = Multipliers.zero(problem, 0.0)
+        length2 = (way[:, -1] - way[:, 0]).square().sum(-1)
+        inner = ILQR(tolerance=0.1, max_iterations=self.iterations, damping=1.0, line_search=SURE)
         for stiffness in self.stiffness:
             # Near its surface the tube is as stiff as a spring of 4 weight radius^2.
-            weight = stiffness * q0 / L2.clamp(min=1e-12) / (4.0 * radius.square()).clamp(min=1e-12)
+            weight = stiffness * unit * R.pow(4) / length2.clamp(min=1e-12) / (4.0 * radius.square()).clamp(min=1e-12)
             guide = GuideRegion(center, radius.unsqueeze(-1).repeat(1, problem.N + 1), weight, _position(problem))
-            U = inner.solve(problem, U, warm=duals, guide=guide).U
-        return Proposal(U, found, self.hold * mu)
-
-    def _inner(self) -> ILQR:
-        return ILQR(
-            tolerance=0.1, max_iterations=self.iterations, damping=1.0, line_search=LineSearch(accept_last=False)
-        )
+            U = inner.solve(problem, U, warm=replace(none, mu=self.obstacle_penalty * unit), guide=guide).U
+        held = replace(none, mu=self.hold * unit)
+        if self.settle > 0:
+            settled = replace(inner, max_iterations=self.settle).solve(problem, U, warm=held).U
+            # A path that falls back into the trap, where waiting is cheaper, is none.
+            keeps = _arrives(problem, settled) | ~_arrives(problem, U)
+            U = torch.where(keeps.view(-1, 1, 1), settled, U)
+        X = open_loop(problem.dynamics, problem.x0, U)
+        return U, Lagrangian(problem, held, None, True).value(X, U)[1], _arrives(problem, U)
 
     def _travel(self, way: Tensor, N: int) -> Tensor:
         """Where the tube is at every knot, (B, N+1, d): speeding up and slowing down smoothly, corners rounded."""
@@ -116,6 +140,22 @@ class Detour:
             return center
         padded = torch.cat((center[:, :1].expand(-1, reach, -1), center, center[:, -1:].expand(-1, reach, -1)), dim=1)
         return padded.unfold(1, 2 * reach + 1, 1).mean(-1)
+
+
+def _arrives(problem: Problem, U: Tensor) -> Tensor:
+    """Whether controls end close to the goal, (B,)."""
+    goal = problem.cost.goal(problem.x0)
+    assert goal is not None
+    X = open_loop(problem.dynamics, problem.x0, U)
+    last, first = ((x - goal)[:, _position(problem)].square().sum(-1) for x in (X[:, -1], problem.x0))
+    return last <= THERE**2 * first
+
+
+def _scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """R and q0 / R^4 (B,), the units of lengths and penalties."""
+    here = scene.distances > 0
+    R = torch.where(here, scene.distances, 0.0).sum(-1) / here.sum(-1).clamp(min=1)
+    return R, _resting_cost(problem, rest, scene.start.unsqueeze(1))[:, 0] / R.pow(4)
 
 
 def _position(problem: Problem) -> slice:

@@ -31,8 +31,10 @@ class GCO:
             that find the element caught, so that late guidance starts as gently as early guidance.
         adopt: where the sampled plan touches nothing, go on from the plan itself instead of being drawn to it.
         afresh: sample around the cost's reference controls (the vehicle at rest), not around the path that is caught.
-        detour: a plan along the shortest way around static spheres, to go on from; None: never (as in the paper).
-        detour_at: the attempt, from 1, that is the detour; all others, and this one where there is no way, are sampled.
+        detour: a plan along a short way around static spheres, to go on from; None: never (as in the paper).
+        detour_at: the attempt, from 1, that is the first detour, along the best of the ways.
+        detours: how many attempts from there on are, each along the next best; all others are sampled, and these too
+            where there is no way.
         patience: from this outer iteration on, a single active sphere counts as being caught too; None: never.
 
     Raises:
@@ -49,14 +51,16 @@ class GCO:
     afresh: bool = False
     detour: Detour | None = None
     detour_at: int = 1
+    detours: int = 1
 
     def __post_init__(self) -> None:
         if not self.initial_penalty > 0:
             raise InputError("gco.initial_penalty", "above 0", self.initial_penalty)
         if not self.penalty_growth >= 1:
             raise InputError("gco.penalty_growth", "at least 1", self.penalty_growth)
-        if self.detour_at < 1:
-            raise InputError("gco.detour_at", "at least 1", self.detour_at)
+        for name in ("detour_at", "detours"):
+            if getattr(self, name) < 1:
+                raise InputError(f"gco.{name}", "at least 1", getattr(self, name))
         if self.radius is not None and not self.radius > 0:
             raise InputError("gco.radius", "above 0 m, or null", self.radius)
 
@@ -81,9 +85,10 @@ class GCO:
         penalty = torch.full_like(weight, torch.nan)
         if self.detour is not None:
             attempt = torch.ones_like(key.ids) if key.attempt is None else key.attempt
-            turn = (caught & (attempt == self.detour_at)).nonzero().flatten()
+            rank = attempt - self.detour_at
+            turn = (caught & (rank >= 0) & (rank < self.detours)).nonzero().flatten()
             if turn.numel() > 0:
-                plan[turn], taken[turn], penalty[turn] = self.detour.propose(problem.take(turn))
+                plan[turn], taken[turn], penalty[turn] = self.detour.propose(problem.take(turn), rank[turn])
         rows = (caught & ~taken).nonzero().flatten()
         if rows.numel() > 0:
             part = problem.take(rows)

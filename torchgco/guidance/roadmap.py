@@ -43,6 +43,7 @@ class Roadmap:
         spread: points all over the scene.
         neighbours, hubs: edges of a point, to the nearest of all and to the nearest of those spread.
         margin: distance from an obstacle, as a share of r_obs + r_veh, below which an edge costs more, up to double.
+        novelty: a further way pays so much more, as a share, where it is within r_obs + r_veh of a former one.
 
     Raises:
         InputError: a field out of its range.
@@ -53,6 +54,7 @@ class Roadmap:
     neighbours: int = 12
     hubs: int = 6
     margin: float = 0.15
+    novelty: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("nodes", "spread", "neighbours", "hubs"):
@@ -62,13 +64,19 @@ class Roadmap:
             raise InputError("roadmap.hubs", f"at most the {self.spread} points spread", self.hubs)
         if not self.margin > 0:
             raise InputError("roadmap.margin", "above 0", self.margin)
+        if not self.novelty >= 0:
+            raise InputError("roadmap.novelty", "at least 0", self.novelty)
 
-    def ways(self, scene: Scene) -> tuple[Tensor, Tensor]:
-        """Corners (B, HOPS+1, d) of the cheapest way found, the goal repeated at its end; and whether there is one."""
-        parts = [self._ways(scene, rows) for rows in torch.arange(scene.start.shape[0]).split(AT_ONCE)]
+    def ways(self, scene: Scene, count: int = 1) -> tuple[Tensor, Tensor]:
+        """Different ways, the cheapest first, the others each away from those before it where that isn't too dear.
+
+        Returns:
+            Corners (B, count, HOPS+1, d), the goal repeated at their ends; and whether there is a way (B,).
+        """
+        parts = [self._ways(scene, rows, count) for rows in torch.arange(scene.start.shape[0]).split(AT_ONCE)]
         return torch.cat([way for way, _ in parts]), torch.cat([found for _, found in parts])
 
-    def _ways(self, scene: Scene, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def _ways(self, scene: Scene, rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
         rows = rows.to(scene.start.device)
         start, goal, o, R = (t[rows] for t in (scene.start, scene.goal, scene.centers, scene.distances))
         points, free = self._points(start, goal, o, R)
@@ -80,14 +88,25 @@ class Roadmap:
             apart[..., : 2 + self.spread].topk(self.hubs, largest=False).indices,
         )
         near = torch.cat((*near, to_goal), dim=-1)
-        price = scene.toll(points, rows)
-        way, found = self._cheapest(points, near, price, o, R)
-        # The same once more over the way's own corners and what lies between them, all joined: a taut string.
+        price, lengths = scene.toll(points, rows), self._lengths(points, near, o, R)
+        reach = R.amax(-1, keepdim=True)
+        ways, found = [], torch.ones_like(rows, dtype=torch.bool)
+        for _ in range(count):
+            way, arrives = _cheapest(points, near, lengths, price)
+            found = found & arrives
+            way = self._taut(way, scene, rows, o, R)
+            ways.append(way)
+            price = torch.where(_apart_from(points, way) < reach, (1.0 + self.novelty) * price, price)
+        return torch.stack(ways, dim=1), found
+
+    def _taut(self, way: Tensor, scene: Scene, rows: Tensor, o: Tensor, R: Tensor) -> Tensor:
+        """The same once more over a way's own corners and what lies between them, all joined: a taut string."""
         between = torch.stack((way[:, 1:-1], 0.5 * (way[:, 1:-1] + way[:, 2:])), dim=2).flatten(1, 2)
         middle = torch.cat((way[:, :1], way[:, -1:], 0.5 * (way[:, :1] + way[:, 1:2]), between), dim=1)
         everyone = torch.arange(middle.shape[1], device=o.device).expand(*middle.shape[:2], -1)
-        taut, arrives = self._cheapest(middle, everyone, scene.toll(middle, rows), o, R)
-        return torch.where(arrives.view(-1, 1, 1), taut, way), found
+        lengths = self._lengths(middle, everyone, o, R)
+        taut, arrives = _cheapest(middle, everyone, lengths, scene.toll(middle, rows))
+        return torch.where(arrives.view(-1, 1, 1), taut, way)
 
     def _points(self, start: Tensor, goal: Tensor, o: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
         """Start, goal, spread and obstacle points (B, V, d), and which of them are free."""
@@ -106,8 +125,8 @@ class Roadmap:
         free = (torch.ones_like(ends[..., 0], dtype=torch.bool), _is_free(spread, o, R), torch.isfinite(best.values))
         return torch.cat((ends, spread, kept), dim=1), torch.cat(free, dim=1)
 
-    def _cheapest(self, points: Tensor, near: Tensor, price: Tensor, o: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
-        """The way from point 0 to point 1 over edges to the points `near` (B, V, k), by relaxing all edges at once."""
+    def _lengths(self, points: Tensor, near: Tensor, o: Tensor, R: Tensor) -> Tensor:
+        """Lengths (B, V, k) of the edges to the points `near`, more close to an obstacle, infinite through one."""
         B, V, k = near.shape
         a = points.unsqueeze(2).expand(-1, -1, k, -1).flatten(1, 2)
         b = points.gather(1, near.flatten(1).unsqueeze(-1).expand(-1, -1, points.shape[-1]))
@@ -117,21 +136,33 @@ class Roadmap:
         length = length + 1e-6 * (points[:, 1] - points[:, 0]).square().sum(-1).sqrt().view(-1, 1, 1)
         margin = self.margin * R.amax(-1).clamp(min=1e-9).view(-1, 1, 1)
         close = 1.0 + ((margin - gap) / margin).clamp(0.0, 1.0)
-        paid = 0.5 * (price.unsqueeze(-1) + price.gather(1, near.flatten(1)).view(B, V, k))
-        edges = torch.where(gap > 0, length * close * paid, torch.inf)
-        cost = torch.full_like(price, torch.inf)
-        cost[:, 1] = 0.0
-        through = edges + cost.gather(1, near.flatten(1)).view(B, V, k)
-        for _ in range(HOPS):
-            cost = torch.minimum(cost, through.amin(-1))
-            through = edges + cost.gather(1, near.flatten(1)).view(B, V, k)
-        following = near.gather(2, through.argmin(-1, keepdim=True)).squeeze(-1)
-        following[:, 1] = 1
-        stops = [torch.zeros_like(following[:, :1])]
-        for _ in range(HOPS):
-            stops.append(following.gather(1, stops[-1]))
-        way = points.gather(1, torch.cat(stops, dim=1).unsqueeze(-1).expand(-1, -1, points.shape[-1]))
-        return way, torch.isfinite(cost[:, 0]) & (stops[-1][:, 0] == 1)
+        return torch.where(gap > 0, length * close, torch.inf)
+
+
+def _cheapest(points: Tensor, near: Tensor, lengths: Tensor, price: Tensor) -> tuple[Tensor, Tensor]:
+    """The way from point 0 to point 1 over edges to the points `near` (B, V, k), by relaxing all edges at once."""
+    edges = lengths * 0.5 * (price.unsqueeze(-1) + price.gather(1, near.flatten(1)).view(near.shape))
+    cost = torch.full_like(price, torch.inf)
+    cost[:, 1] = 0.0
+    through = edges + cost.gather(1, near.flatten(1)).view(near.shape)
+    for _ in range(HOPS):
+        cost = torch.minimum(cost, through.amin(-1))
+        through = edges + cost.gather(1, near.flatten(1)).view(near.shape)
+    following = near.gather(2, through.argmin(-1, keepdim=True)).squeeze(-1)
+    following[:, 1] = 1
+    stops = [torch.zeros_like(following[:, :1])]
+    for _ in range(HOPS):
+        stops.append(following.gather(1, stops[-1]))
+    way = points.gather(1, torch.cat(stops, dim=1).unsqueeze(-1).expand(-1, -1, points.shape[-1]))
+    return way, torch.isfinite(cost[:, 0]) & (stops[-1][:, 0] == 1)
+
+
+def _apart_from(points: Tensor, way: Tensor) -> Tensor:
+    """Distance (B, V) of points from a polyline (B, P, d)."""
+    a, b = way[:, None, :-1], way[:, None, 1:]
+    along, toward = b - a, points.unsqueeze(2) - a
+    share = (along * toward).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
+    return (toward - share.clamp(0.0, 1.0).unsqueeze(-1) * along).square().sum(-1).amin(-1).sqrt()
 
 
 def segment_gaps(a: Tensor, b: Tensor, centers: Tensor, distances: Tensor) -> Tensor:
@@ -204,9 +235,9 @@ def _midway(o: Tensor, R: Tensor) -> Tensor:
 
 
 def _is_free(points: Tensor, o: Tensor, R: Tensor) -> Tensor:
-    """Whether points (B, V, d) are clear of all spheres, by a hundredth of the largest."""
+    """Whether points (B, V, d) are clear of all spheres, by a thousandth of the largest."""
     gap = (_distances(points, o) - R.unsqueeze(1)).amin(-1)
-    return gap > 0.01 * R.amax(-1, keepdim=True)
+    return gap > 0.001 * R.amax(-1, keepdim=True)
 
 
 def _distances(a: Tensor, b: Tensor) -> Tensor:

@@ -9,23 +9,24 @@ from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.shapes import copied, put, take
+from torchgco.solution import Solution
 from torchgco.solvers.state import Advice, Iterate, OuterLoop, State
 from torchgco.status import Status
 
 
-def has_arrived(problem: Problem, iterate: Iterate, share: float, limit: float) -> Tensor:
-    """Whether a feasible iterate has come to the goal (B,): within `share` of the distance from the start."""
+def has_arrived(problem: Problem, path: Iterate | Solution, share: float, limit: float) -> Tensor:
+    """Whether a feasible path has come to the goal (B,): within `share` of the distance from the start."""
     goal, at = problem.cost.goal(problem.x0), problem.dynamics.position
     if goal is None or at is None:
-        return torch.zeros_like(iterate.violation, dtype=torch.bool)
-    last, first = ((x - goal)[:, at].square().sum(-1).sqrt() for x in (iterate.X[:, -1], problem.x0))
-    return (iterate.violation <= limit) & (last <= share * first)
+        return torch.zeros_like(path.violation, dtype=torch.bool)
+    last, first = ((x - goal)[:, at].square().sum(-1).sqrt() for x in (path.X[:, -1], problem.x0))
+    return (path.violation <= limit) & (last <= share * first)
 
 
 def try_again(s: State, rows: Tensor, problem: Problem, duals: Multipliers, status: Tensor, solver: OuterLoop) -> None:
     """Back to the caught path for elements that have ended an attempt and have another left (in place)."""
     left = (s.attempt[rows] > 0) & (s.attempt[rows] < solver.attempts)
-    if solver.arrival is not None:
+    if solver.arrival is not None and not solver.thorough:
         left &= ~has_arrived(problem, take(s.best, rows), solver.arrival, solver.violation_tolerance)
     again = ((status[rows] != Status.RUNNING) & left).nonzero().flatten()
     if again.numel() == 0:

@@ -36,8 +36,9 @@ class AugmentedLagrangian:
         attempts: where guidance puts another path in place of the iterate, so many are tried from the same caught path,
             each to its end, and the best is kept; max_outer_iterations then counts for each (not in the paper).
         arrival: a feasible iterate has arrived where it ends within this share of the distance from start to goal. One
-            that has is worth more than one that hasn't, whatever they cost, and nothing else is attempted after it.
+            that has is worth more than one that hasn't, whatever they cost, and ends the attempts.
             None: cost alone decides, as in the paper.
+        thorough: all attempts are made, even after one has arrived; the cheapest path is kept.
         clip: inequalities push but never pull (`lagrangian.penalty_weights`); False as printed.
         slots: problems worked on at once; the others wait until a slot falls free. None: all. No result depends on it.
         record: keep the history of every element in `solution.trace`.
@@ -58,6 +59,7 @@ class AugmentedLagrangian:
     hold_factor: float = 10.0
     attempts: int = 1
     arrival: float | None = None
+    thorough: bool = False
     clip: bool = False
     slots: int | None = None
     record: bool = False

@@ -95,6 +95,7 @@ class _OneInnerSolve:
     hold_factor: float = 1.0
     attempts: int = 1
     arrival: float | None = None
+    thorough: bool = False
     clip: bool = False
     slots: None = None
     record: bool = False
