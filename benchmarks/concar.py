@@ -1,0 +1,139 @@
+"""python -m benchmarks.concar: a car among four hard circles, 100 problems, beside IPOPT.
+
+torchgco flies all as one batch, IPOPT one after the other, both from zero controls, with one thread; `judge` counts for
+both. Model, problems and solver are those of `notebooks/own_model.ipynb`, whose cells tagged `shared` are run as they
+stand there, so that nothing is written twice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from types import SimpleNamespace
+from typing import Any
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from torchgco import Problem, Solution, Status, judge
+from torchgco.baselines import CasADiSolver
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT / "benchmarks" / "data"
+GOAL, GOAL_RADIUS = torch.ones(2, dtype=torch.float64), 0.1  # m
+FEASIBLE, EXACT = 1e-3, 1e-6  # violation of the full radii, m
+DEARER = 1.01  # a cost ratio from which on two paths are told apart
+HEAD = (
+    "solver", "circles", "n", "feasible", "violation <= 1e-6", "reached", "median objective", "ratio of medians",
+    "median ratio", "seconds a problem",
+)  # fmt: skip
+
+
+def own_model() -> SimpleNamespace:
+    """What the notebook defines: Car, problem_of and solver."""
+    notebook = json.loads((ROOT / "notebooks" / "own_model.ipynb").read_text())
+    names: dict[str, Any] = {}
+    for cell in notebook["cells"]:
+        if "shared" in cell["metadata"].get("tags", ()):
+            exec("".join(cell["source"]), names)
+    return SimpleNamespace(**names)
+
+
+def read_layouts() -> pd.DataFrame:
+    """One problem a row."""
+    return pd.read_csv(DATA / "concar.csv")
+
+
+def zero_controls(problem: Problem) -> Tensor:
+    return problem.x0.new_zeros(problem.B, problem.N, problem.m)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What a solver made of the problems, counted by the judge."""
+
+    name: str
+    cost: Tensor  # (B,)
+    violation: Tensor  # (B,), m: circles at knots 1..99 and, in their own units, control limits
+    reached: Tensor  # (B,) bool
+    converged: int  # by the solver's own word
+    seconds: float  # a problem
+
+    @classmethod
+    def judged(cls, name: str, problem: Problem, solution: Solution, seconds: float) -> Flight:
+        verdict = judge(problem, solution.U, GOAL, GOAL_RADIUS)
+        converged = int((solution.status == Status.CONVERGED).sum())
+        return cls(name, verdict.cost, verdict.violation, verdict.reached, converged, seconds / problem.B)
+
+    def cells(self, other: Flight) -> list[str]:
+        """A line of the table; ratios are to `other`."""
+        ratio = float((self.cost / other.cost).quantile(0.5))
+        of_medians = median(self.cost) / median(other.cost)
+        counts = ((self.violation <= FEASIBLE), (self.violation <= EXACT), self.reached)
+        return [
+            self.name, "hard", str(len(self.cost)), *(str(int(count.sum())) for count in counts),
+            f"{median(self.cost):.4f}", f"{of_medians:.4f}", f"{ratio:.4f}", f"{self.seconds:.2f}",
+        ]  # fmt: skip
+
+
+def fly(layouts: pd.DataFrame, seed: int = 0) -> tuple[Flight, Flight]:
+    """torchgco and IPOPT on the same problems."""
+    model = own_model()
+    problem = model.problem_of(layouts)
+    U0 = zero_controls(problem)
+    began = perf_counter()
+    solution = model.solver.solve(problem, U0, seed=seed)
+    ours = Flight.judged("`torchgco`, one batch", problem, solution, perf_counter() - began)
+    prepared = CasADiSolver(plugin="ipopt").prepare(problem)  # on no clock, as in `benchmarks.speed`
+    began = perf_counter()
+    solution = prepared.solve(problem, U0)
+    return ours, Flight.judged("`ipopt`, one by one", problem, solution, perf_counter() - began)
+
+
+def published(seeds: pd.Series) -> list[list[str]]:
+    """Lines for what three solvers made of softened circles, where they say that they converged."""
+    peers = pd.read_csv(DATA / "concar_peers.csv")
+    peers = peers[peers["seed"].isin(seeds) & peers["converged"]]
+    dash = "-"
+    return [
+        [f"{name}, as published", "softened", str(len(rows)), dash, dash, dash, f"{rows['objective'].median():.4f}"]
+        + [dash] * 3
+        for name, rows in peers.groupby("solver")
+    ]
+
+
+def compared(ours: Flight, peer: Flight) -> str:
+    """What the medians don't tell."""
+    ratio = ours.cost / peer.cost
+    return (
+        f"Layout by layout torchgco is more than 1 % cheaper on {int((ratio < 1 / DEARER).sum())} of {len(ratio)} and "
+        f"more than 1 % dearer on {int((ratio > DEARER).sum())} (ratios of {float(ratio.min()):.2f} to "
+        f"{float(ratio.max()):.2f}). By their own word {ours.converged} and {peer.converged} converged."
+    )
+
+
+def median(values: Tensor) -> float:
+    return float(values.quantile(0.5))
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.concar", description="A car among four hard circles.")
+    parser.add_argument("--first", type=int, default=100, help="so many problems only")
+    parser.add_argument("--seed", type=int, default=0, help="of the random draws of guidance")
+    asked = parser.parse_args(words)
+    torch.set_num_threads(1)
+    layouts = read_layouts().head(asked.first)
+    ours, peer = fly(layouts, asked.seed)
+    lines = [list(HEAD), ["---"] * len(HEAD), ours.cells(peer), peer.cells(peer), *published(layouts["seed"])]
+    print("\n".join(f"| {' | '.join(line)} |" for line in lines))
+    print("\n" + compared(ours, peer))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
