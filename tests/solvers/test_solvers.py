@@ -20,6 +20,7 @@ from torchgco import (
     FunctionDynamics,
     InputError,
     LineSearch,
+    Polish,
     Problem,
     QuadraticCost,
     Solution,
@@ -228,7 +229,8 @@ BASE = AugmentedLagrangian(
 CHANGES = {
     AugmentedLagrangian: dict(
         inner=ILQR(max_iterations=2), guidance=None, initial_penalty=50.0, penalty_growth=5.0, penalty_max=60.0,
-        max_outer_iterations=3, violation_tolerance=0.2, clip=True, record=False,
+        max_outer_iterations=3, violation_tolerance=0.2, clip=True, polish=Polish(reach=10.0, cost_rise=10.0),
+        record=False,
     ),
     ILQR: dict(tolerance=1e3, max_iterations=3, line_search=LineSearch(shrink=0.3)),
     LineSearch: dict(shrink=0.25, ratio_min=0.9, ratio_max=0.9),
