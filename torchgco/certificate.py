@@ -110,7 +110,7 @@ def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     nearest = X.new_full((), torch.inf)
     for spheres in problem.constraints:
         if isinstance(spheres, BoundSpheres) and not bool(spheres.absent.all()):
-            k = torch.arange(problem.N + 1, device=X.device).view(-1, 1, 1)
+            k = torch.arange(problem.N + 1, dtype=X.dtype, device=X.device).view(-1, 1, 1)
             relative = X[0, :, None, spheres.position] - spheres.centers[0]  # (N+1, M, d)
             if spheres.velocities is not None:
                 relative = relative - k * spheres.dt * spheres.velocities[0]
@@ -148,19 +148,17 @@ def _acceleration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     with torch.enable_grad():
         x = X.repeat(d, 1, 1).requires_grad_()
         velocity = twins.field(x, U.repeat(d, 1, 1))
-        (slopes,) = torch.autograd.grad(velocity[..., at].diagonal(dim1=0, dim2=2).sum(), x)
+        (slopes,) = _gradients(velocity[..., at].diagonal(dim1=0, dim2=2).sum(), x)
     return (slopes * velocity[:1].detach()).sum(-1).mT
 
 
 def _kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    gradients = [_local(lambda x, u: problem.cost.total(x, u), X, U), *_active_rows(problem, X, U)]
-    equality = [False, *(sense for sense, _ in gradients[1:])]
-    seeds = [gradients[0], *(rows for _, rows in gradients[1:])]
-    gX, gU = (torch.cat([part[i] for part in seeds]) for i in (0, 1))
-    reduced = _reduced(problem, X, U, gX, gU)
-    g, A = reduced[0], reduced[1:]
-    senses = [s for s, (x, _) in zip(equality[1:], seeds[1:], strict=True) for _ in range(x.shape[0])]
-    return X.new_tensor(_fit(g.cpu().numpy(), A.cpu().numpy(), np.array(senses, dtype=bool)))
+    cost = _local(problem.cost.total, X, U)
+    active = _active_rows(problem, X, U)
+    gX, gU = (torch.cat([cost[i], *(rows[i] for _, rows in active)]) for i in (0, 1))
+    reduced = _reduced(problem, X, U, gX, gU).cpu().numpy()
+    senses = [equality for equality, (rows, _) in active for _ in rows]
+    return X.new_tensor(_fit(reduced[0], reduced[1:], np.array(senses, dtype=bool)))
 
 
 def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> float:
@@ -206,8 +204,15 @@ def _local(rows: Any, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of rows(X, U) (q,), row j of repetition j, by X (q, N+1, n) and by U (q, N, m), dynamics left aside."""
     with torch.enable_grad():
         X, U = X.detach().clone().requires_grad_(), U.detach().clone().requires_grad_()
-        gX, gU = torch.autograd.grad(rows(X, U).sum(), (X, U), allow_unused=True)
-    return torch.zeros_like(X) if gX is None else gX, torch.zeros_like(U) if gU is None else gU
+        gX, gU = _gradients(rows(X, U).sum(), X, U)
+    return gX, gU
+
+
+def _gradients(value: Tensor, *by: Tensor) -> tuple[Tensor, ...]:
+    """Gradients of a number, zero where it doesn't depend on the argument."""
+    if not value.requires_grad:
+        return tuple(torch.zeros_like(z) for z in by)
+    return torch.autograd.grad(value, by, allow_unused=True, materialize_grads=True)
 
 
 def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> Tensor:
@@ -217,10 +222,7 @@ def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> 
     with torch.enable_grad():
         x, u = X[:, :-1].repeat(n, 1, 1).requires_grad_(), U.repeat(n, 1, 1).requires_grad_()
         after = twins.step(x, u).diagonal(dim1=0, dim2=2).sum()
-        fx, fu = (
-            torch.zeros_like(z) if f is None else f
-            for f, z in zip(torch.autograd.grad(after, (x, u), allow_unused=True), (x, u), strict=True)
-        )  # (n, N, n), (n, N, m)
+        fx, fu = _gradients(after, x, u)  # (n, N, n), (n, N, m)
     total = torch.empty_like(gU)
     adjoint = gX[:, N]
     for k in range(N - 1, -1, -1):

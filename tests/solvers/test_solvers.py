@@ -20,7 +20,6 @@ from torchgco import (
     FunctionDynamics,
     InputError,
     LineSearch,
-    Polish,
     Problem,
     QuadraticCost,
     Solution,
@@ -229,8 +228,7 @@ BASE = AugmentedLagrangian(
 CHANGES = {
     AugmentedLagrangian: dict(
         inner=ILQR(max_iterations=2), guidance=None, initial_penalty=50.0, penalty_growth=5.0, penalty_max=60.0,
-        max_outer_iterations=3, violation_tolerance=0.2, clip=True, polish=Polish(reach=10.0, cost_rise=10.0),
-        record=False,
+        max_outer_iterations=3, violation_tolerance=0.2, clip=True, record=False,
     ),
     ILQR: dict(tolerance=1e3, max_iterations=3, line_search=LineSearch(shrink=0.3)),
     LineSearch: dict(shrink=0.25, ratio_min=0.9, ratio_max=0.9),
@@ -242,14 +240,14 @@ CHANGES = {
         decay=0.3, elite=4, linger=10.0, dtype="float32",
     ),
 }  # fmt: skip
-# What shows only in other tests, here or in tests/guidance.
+# What shows only in other tests, here, in test_polish or in tests/guidance.
 ELSEWHERE = {
     (ILQR, "regularisation_first"), (ILQR, "regularisation_growth"), (ILQR, "regularisation_max"), (ILQR, "penalty"),
     (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"),
     (AugmentedLagrangian, "hold_factor"), (AugmentedLagrangian, "cost_tolerance"),
     (AugmentedLagrangian, "grow_when_feasible"), (GCO, "grow_when_idle"), (GCO, "adopt"),
     (GCO, "detour"), (GCO, "detour_at"), (AugmentedLagrangian, "arrival"),
-    (AugmentedLagrangian, "attempts"), (AugmentedLagrangian, "slots"),
+    (AugmentedLagrangian, "attempts"), (AugmentedLagrangian, "slots"), (AugmentedLagrangian, "polish"),
 }  # fmt: skip
 PLACES = {
     AugmentedLagrangian: lambda s, c: replace(s, **c),

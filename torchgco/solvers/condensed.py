@@ -112,6 +112,8 @@ class Condensed:
             for constraint, weight in zip(twins.constraints, self.by_constraint(lam), strict=True):
                 value = value + (weight * constraint.value(X, U)).sum()
             (gradient,) = torch.autograd.grad(value, z, create_graph=True)
+            if not gradient.requires_grad:
+                return torch.zeros_like(z).movedim(0, 1)  # all is linear
             (blocks,) = torch.autograd.grad((gradient * directions).sum(), z)
         return blocks.movedim(0, 1)
 
