@@ -12,7 +12,7 @@ FLOORS = [
     ["shapes", "status", "autodiff", "draws", "kernels"],
     ["dynamics", "costs", "constraints"],
     ["problem"],
-    ["rollout", "expansion", "judge"],
+    ["rollout", "expansion", "judge", "certificate"],
     ["lagrangian"],
     ["solution", "guidance.samples"],
     ["solvers", "guidance.mppi", "guidance.detection", "guidance.region", "guidance.roadmap"],

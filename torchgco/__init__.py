@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 from torchgco.api import solve as solve
 from torchgco.baselines import Hold as Hold
 from torchgco.baselines import IteratedMPPI as IteratedMPPI
+from torchgco.certificate import Certificate as Certificate
+from torchgco.certificate import certify as certify
 from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
 from torchgco.constraints import FirstStepRates as FirstStepRates
@@ -38,6 +40,7 @@ from torchgco.solution import Solution as Solution
 from torchgco.solvers import ILQR as ILQR
 from torchgco.solvers import AugmentedLagrangian as AugmentedLagrangian
 from torchgco.solvers import LineSearch as LineSearch
+from torchgco.solvers import Polish as Polish
 from torchgco.solvers import plan_batch as plan_batch
 from torchgco.status import Status as Status
 

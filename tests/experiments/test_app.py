@@ -77,6 +77,9 @@ def test_a_study_writes_what_the_design_says(tmp_path) -> None:
     assert trials.solver.tolist() == ["gco"] * 3 + ["hold"] * 3 and trials.layout.tolist() == [0, 1, 2] * 2
     assert (trials.seed == 3).all() and (trials.version == torchgco.__version__).all()
     assert trials.batch_size.tolist() == [2, 2, 1] * 2 and (trials.threads == 1).all()
+    for name in ("dynamics_residual", "clearance_full", "bound_violation", "kkt_residual"):
+        assert (trials[name].notna() == trials.feasible).all() and trials.feasible.any()
+    assert (trials.dynamics_residual.dropna() < 1e-12).all()
     with np.load(out / "solutions.npz", allow_pickle=False) as held:
         assert held["U"].shape == (2, 3, 12, 4) and held["solver"].tolist() == ["gco", "hold"]
         assert held["layout"].tolist() == [0, 1, 2]
@@ -90,6 +93,12 @@ def test_a_study_writes_what_the_design_says(tmp_path) -> None:
     assert again.returncode == 0 and "nothing was computed anew" in again.stdout
     other = command(*TINY, "hydra.run.dir=out", "study.baselines=[hold,gco]", "seed=4", cwd=tmp_path)
     assert other.returncode == 2 and "seed is 3 there, 4 here" in problem_line(other.stderr)
+
+
+def test_a_solver_is_polished_where_the_config_says_so() -> None:
+    assert torchgco.compose([]).solver.polish is None
+    solver = torchgco.compose(["solver.polish={_target_:torchgco.solvers.Polish,iterations:4}"]).solver
+    assert solver.polish == torchgco.Polish(iterations=4)
 
 
 def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:

@@ -240,7 +240,7 @@ CHANGES = {
         decay=0.3, elite=4, linger=10.0, dtype="float32",
     ),
 }  # fmt: skip
-# What shows only in other tests, here or in tests/guidance.
+# What shows only in other tests, here, in test_polish or in tests/guidance.
 ELSEWHERE = {
     (ILQR, "regularisation_first"), (ILQR, "regularisation_growth"), (ILQR, "regularisation_max"), (ILQR, "penalty"),
     (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"),
@@ -248,6 +248,7 @@ ELSEWHERE = {
     (AugmentedLagrangian, "grow_when_feasible"), (GCO, "grow_when_idle"), (GCO, "adopt"),
     (GCO, "detour"), (GCO, "detour_at"), (GCO, "detours"), (AugmentedLagrangian, "arrival"),
     (AugmentedLagrangian, "thorough"), (AugmentedLagrangian, "attempts"), (AugmentedLagrangian, "slots"),
+    (AugmentedLagrangian, "polish"),
 }  # fmt: skip
 PLACES = {
     AugmentedLagrangian: lambda s, c: replace(s, **c),

@@ -183,6 +183,19 @@ class BoundSpheres(Constraint):
         gap = (p.unsqueeze(2) - o).square().sum(-1).sqrt()
         return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
 
+    def chord_clearance(self, X: Tensor) -> Tensor:
+        """Smallest distance (B,) from the straight ways between knots to where bodies touch, m; negative in contact."""
+        o = self.centers.unsqueeze(1)
+        if self.velocities is not None:
+            t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device) * self.dt
+            o = o + t.view(1, -1, 1, 1) * self.velocities.unsqueeze(1)
+        away = X[:, :, None, self.position] - o
+        a, along = away[:, :-1], away.diff(dim=1)
+        length = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(X.dtype).tiny)
+        nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along
+        gap = nearest.square().sum(-1).sqrt() - CONTACT_FACTOR * self.distances.unsqueeze(1)
+        return torch.where(self.absent.unsqueeze(1), torch.inf, gap).flatten(1).amin(-1)
+
     def is_autonomous(self, N: int) -> bool:
         return self.velocities is None and self.knots == slice(1, N + 1)
 

@@ -24,8 +24,9 @@ from torchgco.shapes import InputError
 
 COLUMNS = (
     "scenario", "layout", "seed", "model", "solver", "status", "feasible", "reached", "success", "cost", "best_cost",
-    "violation", "clearance", "clearance_knots", "goal_distance", "iterations", "outer_iterations", "guided",
-    "seconds", "batch_size", "threads", "device", "dtype", "version",
+    "violation", "clearance", "clearance_knots", "goal_distance", "dynamics_residual", "clearance_full",
+    "bound_violation", "kkt_residual", "iterations", "outer_iterations", "guided", "seconds", "batch_size", "threads",
+    "device", "dtype", "version",
 )  # fmt: skip
 
 

@@ -19,6 +19,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchgco
+from torchgco.certificate import certify
+from torchgco.certificate import frame_columns as certificate_columns
 from torchgco.experiments.build import Setup, allotted_cores, build, solver_of
 from torchgco.experiments.records import COLUMNS, Records
 from torchgco.experiments.report import write_report
@@ -196,10 +198,12 @@ class _Flight:
         U[[status in NOT_FLOWN for status in statuses]] = torch.nan
         checked = setup.vehicle.task(layouts)
         verdict = judge(checked.problem, U, checked.goal, checked.goal_radius)
+        certificate = certify(checked.problem, solution.X.detach().to("cpu", torch.float64), U, verdict.feasible)
         rows = pd.DataFrame(
             {
                 "scenario": layouts.name, "layout": layouts.ids, "seed": setup.seed, "model": setup.vehicle.name,
                 "solver": self.name, "status": statuses, **frame_columns(verdict), "sound": verdict.sound.numpy(),
+                **certificate_columns(certificate),
                 "iterations": solution.iterations.cpu().numpy(),
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),
                 "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": slots,

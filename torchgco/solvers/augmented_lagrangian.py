@@ -13,6 +13,7 @@ from torchgco.shapes import InputError
 from torchgco.solution import Solution
 from torchgco.solvers.batch import Loop
 from torchgco.solvers.ilqr import ILQR
+from torchgco.solvers.polish import Polish
 from torchgco.solvers.state import Callback, Guidance, InnerEnd
 from torchgco.status import Status
 
@@ -41,6 +42,7 @@ class AugmentedLagrangian:
         thorough: all attempts are made, even after one has arrived; the cheapest path is kept.
         clip: inequalities push but never pull (`lagrangian.penalty_weights`); False as printed.
         slots: problems worked on at once; the others wait until a slot falls free. None: all. No result depends on it.
+        polish: a last stage of Newton steps on what was found, elements one by one; None for none, as in the paper.
         record: keep the history of every element in `solution.trace`.
 
     Raises:
@@ -62,6 +64,7 @@ class AugmentedLagrangian:
     thorough: bool = False
     clip: bool = False
     slots: int | None = None
+    polish: Polish | None = None
     record: bool = False
 
     def __post_init__(self) -> None:
@@ -106,9 +109,12 @@ class AugmentedLagrangian:
             callback: told of the progress after every pass.
 
         Raises:
-            InputError: U0, ids or warm don't fit the problem.
+            InputError: U0, ids or warm don't fit the problem, or it isn't float64 and is to be polished.
         """
-        return Loop(self, problem, U0, seed, ids, warm, callback).run()
+        if self.polish is not None:
+            self.polish.check(problem)
+        solution = Loop(self, problem, U0, seed, ids, warm, callback).run()
+        return solution if self.polish is None else self.polish.refine(problem, solution)
 
     def verdict(self, inner: InnerEnd) -> Tensor:
         """CONVERGED or INFEASIBLE at the outer limit, CONVERGED where the early test holds, else RUNNING."""

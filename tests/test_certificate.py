@@ -1,0 +1,247 @@
+"""The certificate against hand-made cases and finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import lsq_linear
+
+from tests.problems import planar_batch, quadrotor_batch
+from torchgco import (
+    ControlBounds,
+    FunctionConstraint,
+    FunctionDynamics,
+    InputError,
+    Planar,
+    Problem,
+    QuadraticCost,
+    QuadrotorPlant,
+    Spheres,
+    StateBounds,
+    certify,
+)
+from torchgco.certificate import frame_columns
+from torchgco.experiments.records import COLUMNS
+from torchgco.judge import judge
+from torchgco.rollout import open_loop
+
+
+def passing(radius: float, integrator: str = "euler", velocity: float | None = None) -> tuple[Problem, torch.Tensor]:
+    """A point that flies along the x axis at 2 m/s with knots 0.2 m apart, and a disc whose centre lies at x = 0.5."""
+    velocities = None if velocity is None else [[0.0, velocity]]
+    problem = Problem(
+        Planar(dt=0.1, drag=0.0, integrator=integrator),
+        QuadraticCost([1] * 6, [1, 1], [1] * 6),
+        [Spheres([[0.5, 0.0]], [radius], 0.0, velocities), ControlBounds([-1, -1], [1, 1])],
+        torch.tensor([[0.0, 0, 0, 2.0, 0, 0]], dtype=torch.float64), 10,
+    )  # fmt: skip
+    return problem, torch.zeros(1, 10, 2, dtype=torch.float64)
+
+
+def certified(problem: Problem, U: torch.Tensor):
+    return certify(problem, open_loop(problem.dynamics, problem.x0, U), U)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "midpoint", "rk4"])
+def test_a_thin_sphere_between_two_knots_is_caught(integrator: str) -> None:
+    problem, U = passing(0.01, integrator)  # knots at 0.4 and 0.6 are ten radii away
+    assert float(judge(problem, U, torch.zeros(2, dtype=torch.float64), 9.0).violation) == 0.0
+    assert float(certified(problem, U).clearance) == pytest.approx(-0.01, abs=1e-12)
+
+
+def test_a_sphere_that_crosses_between_two_knots_is_caught() -> None:
+    """At 0.25 s, between the knots, the disc's centre is where the point is."""
+    problem, U = passing(0.01, velocity=0.4)
+    moved = Problem(
+        problem.dynamics, problem.cost, [Spheres([[0.5, -0.1]], [0.01], 0.0, [[0.0, 0.4]])], problem.x0, problem.N
+    )
+    assert float(certified(moved, U).clearance) == pytest.approx(-0.01, abs=1e-12)
+    assert float(certified(problem, U).clearance) > 0.05
+
+
+def circling(radius: float, integrator: str = "rk4") -> tuple[Problem, torch.Tensor, torch.Tensor]:
+    """A point on the unit circle at 1 rad/s, knots half a radian apart; a small disc just outside one arc's middle."""
+    step = 0.5
+
+    def turn(x, u):
+        return torch.stack((x[..., 2], x[..., 3], -x[..., 3], x[..., 2]), -1) + 0.0 * u
+
+    middle = torch.tensor([np.cos(1.25), np.sin(1.25)]) * 1.01
+    problem = Problem(
+        FunctionDynamics(turn, 4, 1, step, integrator, slice(0, 2)),
+        QuadraticCost([1] * 4, [1], [1] * 4),
+        [Spheres(middle[None].numpy(), [radius])],
+        torch.tensor([[1.0, 0, 0, 1.0]], dtype=torch.float64), 8,
+    )  # fmt: skip
+    U = torch.zeros(1, 8, 1, dtype=torch.float64)
+    return problem, open_loop(problem.dynamics, problem.x0, U), U
+
+
+def test_an_arc_that_bulges_into_a_sphere_is_caught() -> None:
+    """The chord stays 0.041 m away from the disc of 0.02 that the arc itself touches."""
+    problem, X, U = circling(0.02)
+    relative = X[0, 2:4, :2] - problem.constraints[0].centers[0]
+    chord = abs(float(relative[0, 0] * relative[1, 1] - relative[0, 1] * relative[1, 0])) / float(
+        relative.diff(dim=0).norm()
+    )
+    assert chord > 0.02 + 0.015
+    clearance = float(certify(problem, X, U).clearance)
+    # The acceleration is 1 m/s^2 throughout: the bulge is at most dt^2 / 8 and a little for what its samples differ.
+    assert chord - 0.02 - 2 * 0.5**2 / 8 < clearance < chord - 0.02 - 0.5**2 / 8 + 1e-9
+    assert clearance <= 0.01 - 0.02  # as near as the true arc comes
+    straight = circling(0.02, "none")[0]  # a step without a field: the chord is meant
+    assert float(certify(straight, X, U).clearance) == pytest.approx(chord - 0.02)
+
+
+def test_the_plants_bound_holds_for_its_true_path() -> None:
+    """Plant steps a hundred times finer never leave the bound of one step."""
+    start = torch.zeros(1, 17, dtype=torch.float64)
+    start[0, 3], start[0, 6], start[0, 13:] = 3.0, 1.0, 3.9
+    U = 5000.0 + 800.0 * torch.randn(1, 20, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    plant, fine = QuadrotorPlant(dt=0.05), QuadrotorPlant(dt=0.0005)
+    X = open_loop(plant, start, U)
+    centre = X[0, 10, :3] + torch.tensor([0.075, 0.02, 0.3], dtype=torch.float64)
+    cost = QuadraticCost([1] * 17, [1] * 4, [1] * 17)
+    problem = Problem(plant, cost, [Spheres(centre[None].numpy(), [0.2])], start, 20)
+    path = torch.cat([open_loop(fine, X[:, k], U[:, k : k + 1].repeat(1, 100, 1)) for k in range(20)], dim=1)
+    true = float((path[0, :, :3] - centre).norm(dim=-1).min()) - 0.2
+    assert true - 0.02 < float(certify(problem, X, U).clearance) <= true
+
+
+def test_absent_spheres_and_none_at_all_are_no_obstacle() -> None:
+    problem, U = planar_batch(B=2, N=10, obstacles=2, seed=1)
+    empty = Problem(problem.dynamics, problem.cost, [], problem.x0, problem.N)
+    assert certified(empty, U).clearance.tolist() == [float("inf")] * 2
+    assert certified(empty, U).bound_violation.tolist() == [0.0, 0.0]
+    first = Problem(
+        problem.dynamics, problem.cost, [Spheres(problem.constraints[0].centers[:, :1], [0.1], 0.06)],
+        problem.x0, problem.N,
+    )  # fmt: skip
+    gap = (problem.x0[:, :2] - first.constraints[0].centers[:, 0]).norm(dim=-1) - 0.16
+    torch.testing.assert_close(certified(first, U).clearance, gap)  # nothing moves
+
+
+def test_dynamics_and_bounds_are_measured() -> None:
+    problem, U = quadrotor_batch(B=2, N=10)
+    bounded = Problem(
+        problem.dynamics, problem.cost, [*problem.constraints, StateBounds([-9.0] * 14, [9.0] * 13 + [10.0])],
+        problem.x0, problem.N,
+    )  # fmt: skip
+    X = open_loop(problem.dynamics, problem.x0, U)
+    assert certify(bounded, X, U).dynamics_residual.tolist() == [0.0, 0.0]
+    assert certify(bounded, X, U).bound_violation.tolist() == [0.0, 0.0]
+    off, hard = X.clone(), U.clone()
+    off[0, 4, 1] += 0.25
+    hard[1, 3, 2] = -5.5
+    told = certify(bounded, off, hard)
+    assert told.dynamics_residual.tolist()[0] == pytest.approx(0.25)
+    assert told.bound_violation.tolist() == [0.0, 0.5]
+    off = X.clone()
+    off[0, 7, 13] = 11.25
+    assert certify(bounded, off, U).bound_violation.tolist() == [1.25, 0.0]
+    off[0] = X[0] + 0.5 * (torch.arange(14) == 0)  # every state moved along: only the start tells
+    assert float(certify(bounded, off, U).dynamics_residual[0]) == pytest.approx(0.5)
+
+
+def integrator_problem(constraints) -> Problem:
+    """x' = u, one step of 1 s: minimise 1/2 (x_1 - 2)^2 + 1/2 u^2 from 0. Free optimum u = 1."""
+    dynamics = FunctionDynamics(lambda x, u: u, 1, 1, 1.0)
+    x0 = torch.zeros(1, 1, dtype=torch.float64)
+    return Problem(dynamics, QuadraticCost([0.0], [1.0], [1.0], x_ref=[2.0]), constraints, x0, 1)
+
+
+def test_known_optima_have_no_residual() -> None:
+    def residual(u: float, *constraints) -> float:
+        return float(
+            certified(integrator_problem(constraints), torch.full((1, 1, 1), u, dtype=torch.float64)).kkt_residual
+        )
+
+    assert residual(1.0) == pytest.approx(0.0, abs=1e-15)
+    assert residual(0.5) == pytest.approx(1.0 / 2.0)  # gradient 2 u - 2 = -1, by 1 + 1
+    assert residual(0.5, ControlBounds([-1.0], [0.5])) == pytest.approx(0.0, abs=1e-15)
+    assert residual(1.5, ControlBounds([-1.0], [1.5])) == pytest.approx(1.0 / 2.0)  # the bound would have to pull
+    assert residual(0.5, ControlBounds([-1.0], [0.6])) == pytest.approx(1.0 / 2.0)  # too far from the bound
+    wall = FunctionConstraint(lambda x: x - 1.5, sense="equality", knots=[1])
+    assert residual(1.5, wall) == pytest.approx(0.0, abs=1e-15)  # an equality may pull
+
+
+def test_a_fit_that_does_not_end_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*args, **more):
+        raise RuntimeError("Maximum number of iterations reached.")
+
+    monkeypatch.setattr("torchgco.certificate.nnls", never)
+    problem, U = integrator_problem([ControlBounds([-1.0], [0.5])]), torch.full((1, 1, 1), 0.5, dtype=torch.float64)
+    assert float(certified(problem, U).kkt_residual) == pytest.approx(0.0, abs=1e-15)
+
+
+def test_a_velocity_that_is_commanded_has_no_acceleration() -> None:
+    dynamics = FunctionDynamics(lambda x, u: u, 2, 2, 0.5, "rk4", slice(0, 2))
+    x0 = torch.zeros(1, 2, dtype=torch.float64)
+    problem = Problem(dynamics, QuadraticCost([1, 1], [1, 1], [1, 1]), [Spheres([[0.25, 0.2]], [0.1])], x0, 2)
+    U = torch.tensor([[[1.0, 0.0], [1.0, 0.0]]], dtype=torch.float64)
+    assert float(certified(problem, U).clearance) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("batch", [planar_batch, quadrotor_batch])
+def test_the_residual_is_that_of_finite_differences(batch) -> None:
+    """Central differences of cost and rows through the rollout, and another solver for the multipliers."""
+    problem, U = batch(B=2, N=8)
+    U = U + 0.5 * torch.randn(U.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    problem = problem.take(torch.tensor([1]))
+    U = U[[1]]
+    X = open_loop(problem.dynamics, problem.x0, U)
+    centre = X[0, 5, problem.dynamics.position].numpy() + 0.1  # a sphere that knot 5 touches
+    R = float(np.linalg.norm(X[0, 5, problem.dynamics.position].numpy() - centre))
+    lower, upper = U[0].amin(0).numpy(), U[0].amax(0).numpy()  # every control is at a bound somewhere
+    spheres, bounds = Spheres(centre[None], [R - 1e-4]), ControlBounds(lower, upper)
+    problem = Problem(problem.dynamics, problem.cost, [spheres, bounds], problem.x0, problem.N)
+
+    def values(u):
+        V = torch.from_numpy(u).view_as(U)
+        Y = open_loop(problem.dynamics, problem.x0, V)
+        rows = [part.value(Y, V).flatten() for part in problem.constraints]
+        return torch.cat((problem.cost.total(Y, V), *rows)).numpy()
+
+    u = U.flatten().numpy().copy()
+    eye, h = np.eye(len(u)), 1e-6
+    slopes = np.stack([(values(u + h * e) - values(u - h * e)) / (2 * h) for e in eye], axis=1)
+    c = values(u)[1:]
+    gap = np.linalg.norm(X[0, 1:, problem.dynamics.position].numpy() - centre, axis=1) - (R - 1e-4)
+    spare = np.concatenate((gap, -c[problem.N :]))
+    g, A = slopes[0], slopes[1:][spare <= 1e-3]
+    assert len(A) > 2 * problem.m
+    A = A[np.linalg.norm(A, axis=1) > 1e-6]
+    fit = lsq_linear(A.T, -g, bounds=(0, np.inf), tol=1e-14)
+    expected = np.abs(g + A.T @ fit.x).max() / (1 + np.abs(g).max())
+    assert float(certify(problem, X, U).kkt_residual) == pytest.approx(expected, rel=1e-4)
+
+
+def test_only_what_is_asked_is_certified_and_alone_as_in_company() -> None:
+    problem, U = planar_batch(B=3, N=10)
+    U = U.clone()
+    X = open_loop(problem.dynamics, problem.x0, U)
+    whole = certify(problem, X, U)
+    some = certify(problem, X, U, torch.tensor([True, False, True]))
+    X[2] = torch.nan
+    broken = certify(problem, X, U)
+    for name, column in vars(whole).items():
+        assert torch.isnan(getattr(some, name)).tolist() == [False, True, False]
+        assert torch.isnan(getattr(broken, name)).tolist() == [False, False, True]
+        assert float(getattr(some, name)[0]) == float(column[0])
+        alone = certify(problem.take(torch.tensor([1])), X[[1]], U[[1]])
+        assert float(getattr(alone, name)) == float(column[1])
+    assert set(frame_columns(whole)) <= set(COLUMNS) and len(frame_columns(whole)) == 4
+
+
+def test_bad_calls_are_named() -> None:
+    problem, U = planar_batch(B=2, N=5)
+    X = open_loop(problem.dynamics, problem.x0, U)
+    with pytest.raises(InputError, match="U: expected"):
+        certify(problem, X, U[:1])
+    with pytest.raises(InputError, match="X: expected"):
+        certify(problem, X[:, 1:], U)
+    with pytest.raises(InputError, match="asked: expected"):
+        certify(problem, X, U, torch.tensor([True]))
+    with pytest.raises(InputError, match="float64"):
+        certify(problem.cast(torch.float32), X.float(), U.float())

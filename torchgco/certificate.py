@@ -1,0 +1,231 @@
+"""What a returned plan proves of itself: it obeys its dynamics, it clears the obstacles between the knots too, it keeps
+its bounds, and it is a stationary point, or by how much each of these fails.
+
+Nothing here is the solvers': derivatives come from autograd through the model's own `step`, multipliers from a
+least-squares fit of their own. The words have one meaning everywhere (README, "What the words mean").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.problem import Problem
+from torchgco.shapes import InputError, check_shape
+
+ACTIVE_WITHIN = 1e-3  # an inequality with at most this to spare (m for lengths) may have a multiplier
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """One value per problem, (B,); NaN where nothing was asked or nothing can be said."""
+
+    # Largest |x_{k+1} - step(x_k, u_k)| and |X_0 - x_0| over all states, in their units. Rounding alone (some 1e-12 in
+    # float64) proves that X is what U does in the planning model; it says nothing of how good that model is.
+    dynamics_residual: Tensor
+    # m to the surface of the full r_obs + r_veh, anywhere from the first knot to the last, at most; infinite without
+    # spheres. At 0 or more, no sphere is touched between the knots either, on the conditions that `certify` tells.
+    clearance: Tensor
+    # Largest excess over control and state bounds, in their units; 0 proves that they hold at every knot.
+    bound_violation: Tensor
+    # Largest component of the gradient of the Lagrangian by U, by 1 + the largest of the gradient of J_var alone, with
+    # the multipliers (inequalities: at least 0) that make it smallest in the least-squares sense. Near 0 it proves a
+    # stationary point to first order, not a minimum, and says nothing of rows that are violated.
+    kkt_residual: Tensor
+
+
+def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None) -> Certificate:
+    """Certify trajectories X (B, N+1, n), U (B, N, m).
+
+    The clearance can't miss a collision between knots that lie outside a sphere. Positions of an Euler plan move
+    straight from knot to knot, and so do obstacles, hence its distances are exact. For midpoint and rk4 the path leaves
+    the chord by at most dt^2 / 8 times the largest acceleration, which is subtracted. That acceleration is the field's,
+    at both ends of the interval and at half a step, plus the largest change between these: a bound as long as it
+    changes no more from one of the three to its neighbour's side than they differ. Steps without a known field
+    (`integrator="none"`, a class that overrides `step` alone) have no path between knots; the chord is meant. Geometric
+    constraints other than spheres count at their knots only, as violations.
+
+    A row may have a multiplier where it is an equality, or an inequality with at most 1e-3 to spare (m for spheres).
+
+    Args:
+        problem: the planning problems, float64.
+        X, U: what a solver returned.
+        asked: (B,) bool, the problems to certify; NaN for the others. None: all.
+
+    Raises:
+        InputError: X, U or asked don't fit the problem, or the problem isn't float64.
+    """
+    problem.check_controls(U, "U")
+    check_shape(X, (problem.B, problem.N + 1, problem.n), "X")
+    if problem.x0.dtype != torch.float64 or X.dtype != torch.float64:
+        raise InputError("X", "torch.float64 for the certificate", X.dtype)
+    asked = torch.ones(problem.B, dtype=torch.bool, device=U.device) if asked is None else asked
+    check_shape(asked, (problem.B,), "asked")
+    columns = torch.full((4, problem.B), torch.nan, dtype=X.dtype, device=X.device)
+    finite = torch.isfinite(X).flatten(1).all(-1) & torch.isfinite(U).flatten(1).all(-1)
+    for b in (asked & finite).nonzero().flatten():
+        # One at a time: no number depends on its companions, and memory stays that of one problem.
+        row = b.view(1)
+        part, x, u = problem.take(row), X[row], U[row]
+        columns[:, b] = torch.stack(
+            (_dynamics_residual(part, x, u), _clearance(part, x, u), _bound_violation(part, x, u), _kkt(part, x, u))
+        )
+    return Certificate(*columns)
+
+
+def frame_columns(certificate: Certificate) -> dict[str, Any]:
+    """The certificate as arrays, by the names of a study's columns."""
+    names = {"clearance": "clearance_full"}
+    parts = vars(certificate).items()
+    return {names.get(name, name): value.cpu().numpy() for name, value in parts}
+
+
+# One problem: every tensor below has a batch of one ---------------------------------------------------------------
+
+
+def _dynamics_residual(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    gap = (X[:, 1:] - problem.dynamics.step(X[:, :-1], U)).abs().amax()
+    return torch.maximum(gap, (X[:, 0] - problem.x0).abs().amax())
+
+
+def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    worst = X.new_zeros(())
+    for bounds in problem.constraints:
+        if isinstance(bounds, (ControlBounds, StateBounds)):
+            z = (U if bounds.of == "u" else X)[:, bounds.knots]
+            excess = torch.maximum(z - bounds.upper.unsqueeze(1), bounds.lower.unsqueeze(1) - z)
+            worst = torch.maximum(worst, excess.amax())
+    return worst
+
+
+def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    nearest = X.new_full((), torch.inf)
+    for spheres in problem.constraints:
+        if isinstance(spheres, BoundSpheres) and not bool(spheres.absent.all()):
+            k = torch.arange(problem.N + 1, dtype=X.dtype, device=X.device).view(-1, 1, 1)
+            relative = X[0, :, None, spheres.position] - spheres.centers[0]  # (N+1, M, d)
+            if spheres.velocities is not None:
+                relative = relative - k * spheres.dt * spheres.velocities[0]
+            chord = _segment_distance(relative[:-1], relative[1:]) - spheres.distances[0]
+            path = chord - _bulge(problem, X, U).unsqueeze(-1)
+            nearest = torch.minimum(nearest, path[:, ~spheres.absent[0]].amin())
+    return nearest
+
+
+def _segment_distance(a: Tensor, b: Tensor) -> Tensor:
+    """Distance (...) of the origin from the segment between a and b (..., d)."""
+    along = b - a
+    length = along.square().sum(-1).clamp(min=torch.finfo(a.dtype).tiny)
+    share = (-(a * along).sum(-1) / length).clamp(0.0, 1.0)
+    return (a + share.unsqueeze(-1) * along).norm(dim=-1)
+
+
+def _bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """How far the path may leave the chord of each interval, (N,), m."""
+    dynamics = problem.dynamics
+    if dynamics.integrator not in ("midpoint", "rk4"):
+        return X.new_zeros(problem.N)
+    half = X[:, :-1] + 0.5 * dynamics.dt * dynamics.field(X[:, :-1], U)
+    samples = torch.stack([_acceleration(problem, x, U) for x in (X[:, :-1], half, X[:, 1:])])  # (3, N, d)
+    change = samples.diff(dim=0).norm(dim=-1).amax(0)
+    return dynamics.dt**2 / 8.0 * (samples.norm(dim=-1).amax(0) + change)
+
+
+def _acceleration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """Second derivative (N, d) of the position by time at x (1, N, n), u (1, N, m): d field_p / dx times field."""
+    at = problem.dynamics.position
+    assert at is not None  # or there would be no spheres
+    d = at.stop - at.start
+    twins = problem.dynamics.take(torch.zeros(d, dtype=torch.int64, device=X.device))
+    with torch.enable_grad():
+        x = X.repeat(d, 1, 1).requires_grad_()
+        velocity = twins.field(x, U.repeat(d, 1, 1))
+        (slopes,) = _gradients(velocity[..., at].diagonal(dim1=0, dim2=2).sum(), x)
+    return (slopes * velocity[:1].detach()).sum(-1).mT
+
+
+def _kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    cost = _local(problem.cost.total, X, U)
+    active = _active_rows(problem, X, U)
+    gX, gU = (torch.cat([cost[i], *(rows[i] for _, rows in active)]) for i in (0, 1))
+    reduced = _reduced(problem, X, U, gX, gU).cpu().numpy()
+    senses = [equality for equality, (rows, _) in active for _ in rows]
+    return X.new_tensor(_fit(reduced[0], reduced[1:], np.array(senses, dtype=bool)))
+
+
+def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> float:
+    """|g + A'lam|_inf / (1 + |g|_inf) with least-squares lam, at least 0 where not an equality."""
+    length = np.linalg.norm(A, axis=1)
+    moves = length > 1e-12 * max(1.0, length.max(initial=0.0))
+    A, equality = A[moves] / length[moves, None], equality[moves]
+    cone = np.concatenate((A, -A[equality]))  # an equality pushes to either side
+    rest = g
+    if len(cone):
+        try:
+            lam = nnls(cone.T, -g, maxiter=10 * len(cone))[0]
+        except RuntimeError:  # no end among nearly dependent rows: the unbounded fit, cut off, is an upper bound too
+            lam = np.linalg.lstsq(cone.T, -g, rcond=None)[0].clip(min=0.0)
+        rest = g + lam @ cone
+    return float(np.abs(rest).max() / (1.0 + np.abs(g).max()))
+
+
+def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tuple[Tensor, Tensor]]]:
+    """For each constraint with rows that may push: whether it is an equality, and their gradients by X and U."""
+    found = []
+    for constraint in problem.constraints:
+        equality = constraint.sense == "equality"
+        spare = _spare(constraint, X, U)[0]
+        knots, columns = (spare <= (torch.inf if equality else ACTIVE_WITHIN)).nonzero(as_tuple=True)
+        q = knots.numel()
+        if q > 0:
+            twins = constraint.take(torch.zeros(q, dtype=torch.int64, device=X.device))
+            which = torch.arange(q, device=X.device), knots, columns
+            rows = lambda x, u, twins=twins, which=which: twins.value(x, u)[which]
+            found.append((equality, _local(rows, X.repeat(q, 1, 1), U.repeat(q, 1, 1))))
+    return found
+
+
+def _spare(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
+    """What each row (1, K, p) has to spare: m for spheres, else the units of c."""
+    if isinstance(constraint, BoundSpheres):
+        return constraint.gaps(X) - constraint.distances.unsqueeze(1)
+    return -constraint.value(X, U)
+
+
+def _local(rows: Any, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of rows(X, U) (q,), row j of repetition j, by X (q, N+1, n) and by U (q, N, m), dynamics left aside."""
+    with torch.enable_grad():
+        X, U = X.detach().clone().requires_grad_(), U.detach().clone().requires_grad_()
+        gX, gU = _gradients(rows(X, U).sum(), X, U)
+    return gX, gU
+
+
+def _gradients(value: Tensor, *by: Tensor) -> tuple[Tensor, ...]:
+    """Gradients of a number, zero where it doesn't depend on the argument."""
+    if not value.requires_grad:
+        return tuple(torch.zeros_like(z) for z in by)
+    return torch.autograd.grad(value, by, allow_unused=True, materialize_grads=True)
+
+
+def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> Tensor:
+    """Total derivatives (q, N m) by U through the dynamics, by the adjoint recursion for q rows at once."""
+    n, N = problem.n, problem.N
+    twins = problem.dynamics.take(torch.zeros(n, dtype=torch.int64, device=X.device))
+    with torch.enable_grad():
+        x, u = X[:, :-1].repeat(n, 1, 1).requires_grad_(), U.repeat(n, 1, 1).requires_grad_()
+        after = twins.step(x, u).diagonal(dim1=0, dim2=2).sum()
+        fx, fu = _gradients(after, x, u)  # (n, N, n), (n, N, m)
+    total = torch.empty_like(gU)
+    adjoint = gX[:, N]
+    for k in range(N - 1, -1, -1):
+        total[:, k] = gU[:, k] + adjoint @ fu[:, k]
+        adjoint = gX[:, k] + adjoint @ fx[:, k]
+    return total.flatten(1)

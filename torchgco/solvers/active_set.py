@@ -1,0 +1,58 @@
+"""Strictly convex quadratic programs by their dual: which rows push, and how hard."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+BLOCK_TRIES = 10  # exchanges of whole blocks without progress before rows are exchanged one at a time
+EXCHANGES = 200
+SLACK = 1e-12  # share of a row's own scale below which nothing is exchanged, and by which dependent rows are told apart
+
+
+def multipliers(S: Tensor, b: Tensor, free: Tensor, start: Tensor) -> Tensor | None:
+    """lam (q,) with b - S lam <= 0, lam >= 0, complementary; on `free` rows b - S lam = 0 and lam of any sign.
+
+    None where so many exchanges found none: rows that contradict each other, or nearly.
+
+    Rows change sides in blocks: those that pull let go, those that are violated join. Where that makes no progress they
+    change one at a time, the last first, which ends for every positive definite S.
+
+    Args:
+        S: (q, q) positive semidefinite, b: (q,), free: (q,) bool, start: (q,) bool, rows that are tried first.
+    """
+    scale = S.diagonal().clamp(min=torch.finfo(S.dtype).tiny)
+    S = S + torch.diag(SLACK * scale)
+    working = start | free
+    fewest, tries = b.numel() + 1, BLOCK_TRIES
+    for _ in range(EXCHANGES):
+        lam = _on(S, b, working)
+        slack = b - S @ lam
+        # Both measured as multipliers, so that one tolerance serves rows of any unit.
+        wrong = torch.where(working, (lam < 0) & ~free, slack / scale > SLACK * (1.0 + lam.abs().max()))
+        count = int(wrong.sum())
+        if count == 0:
+            return torch.where(free, lam, lam.clamp(min=0.0))
+        if count < fewest:
+            fewest, tries = count, BLOCK_TRIES
+        elif tries > 0:
+            tries -= 1
+        else:
+            wrong = _last(wrong)
+        working = working ^ wrong
+    return None
+
+
+def _on(S: Tensor, b: Tensor, working: Tensor) -> Tensor:
+    """lam with b - S lam = 0 on the working rows, zero elsewhere."""
+    rows, lam = working.nonzero().flatten(), torch.zeros_like(b)
+    if rows.numel() > 0:
+        L, _ = torch.linalg.cholesky_ex(S[rows][:, rows])
+        lam[rows] = torch.cholesky_solve(b[rows].unsqueeze(-1), L).squeeze(-1)
+    return lam
+
+
+def _last(wrong: Tensor) -> Tensor:
+    only = torch.zeros_like(wrong)
+    only[wrong.nonzero()[-1]] = True
+    return only

@@ -1,0 +1,272 @@
+"""The last stage: from a good trajectory to one that meets its constraints and is stationary, to many digits.
+
+An augmented Lagrangian comes to a millimetre and stops. From there Newton's method on the optimality conditions needs
+a handful of steps: the states are eliminated, so that the dynamics hold exactly throughout; the rows that push are
+found by the dual of a quadratic program; and every step is a real rollout with a line search.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.expansion import linearise
+from torchgco.lagrangian import Lagrangian, Multipliers, violation
+from torchgco.problem import Problem
+from torchgco.rollout import open_loop
+from torchgco.shapes import InputError, copied, put
+from torchgco.solution import Solution
+from torchgco.solvers.active_set import multipliers
+from torchgco.solvers.condensed import Condensed
+from torchgco.solvers.riccati import backward
+
+STIFFNESS = 1e4  # curvature put across the rows that push, as a share of the Hessian's mean: it changes no solution
+SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)  # shares of the same mean put on the diagonal until the model is convex
+NEAR = 1e-2  # rows this near to their limit, measured as a length of their slope, are in the program from the start
+PIVOT = 1e-3  # the smallest pivot that is convex enough, as a share of the same mean
+ACTIVE = 1e-3  # rows that are so near count as active in the KKT residual, in the same measure
+ROUNDS = 10  # times that rows which a step would violate are added to a program
+SMALLEST = 1e-3  # step length at which the line search gives up
+NOISE = 1e-12  # rounding of a merit, as a share of it
+
+
+@dataclass(frozen=True)
+class Polish:
+    """Active-set Newton in the controls alone: violation below 1e-8, and a small KKT residual.
+
+    Elements are taken one at a time, so no result depends on its companions, and memory is that of one dense problem:
+    some (N m)^2 numbers. On a GPU that is slow: the work of one element is too little for it.
+
+    Args:
+        iterations: Newton steps at most.
+        tolerance: violation that is aimed at (metres for lengths, all else in the units of its constraint).
+        stationarity: relative KKT residual that is aimed at. Steps end where both are met.
+        reach: elements with a larger violation are left alone, and those whose start was bad or that aren't finite.
+        cost_rise: share by which J_var may rise; giving back a millimetre of violation has its price.
+        curvature: use second derivatives of constraints and dynamics, where the model stays convex on the rows that
+            push; False: those of the cost alone (Gauss-Newton), whose steps converge linearly.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    iterations: int = 15
+    tolerance: float = 1e-8
+    stationarity: float = 1e-8
+    reach: float = 1e-2
+    cost_rise: float = 1e-2
+    curvature: bool = True
+
+    def __post_init__(self) -> None:
+        if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
+            raise InputError("polish.iterations", "at least 1", repr(self.iterations))
+        for name in ("tolerance", "stationarity", "reach"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"polish.{name}", "above 0", getattr(self, name))
+        if not self.cost_rise >= 0:
+            raise InputError("polish.cost_rise", "at least 0", self.cost_rise)
+
+    def refine(self, problem: Problem, solution: Solution) -> Solution:
+        """The solution with the elements that could be improved replaced: X, U, gains, multipliers, cost, violation.
+
+        An element is replaced where its violation falls below the tolerance, or stays within it (or within what it was)
+        while the KKT residual falls; never where its cost would rise by more than `cost_rise`, or the straight way
+        between two knots would meet an obstacle that it kept clear of. Statuses and counts of iterations stay those of
+        the solver.
+
+        Raises:
+            InputError: a problem that isn't float64, or a solution of others.
+        """
+        self.check(problem)
+        problem.check_controls(solution.U, "solution.U")
+        solution.multipliers.check(problem)
+        result = copied(replace(solution, trace=None))
+        near = (violation(problem, solution.X, solution.U) <= self.reach) & torch.isfinite(solution.cost)
+        for b in (near & problem.start_is_clear).nonzero().flatten():
+            rows = b.view(1)
+            part, before = problem.take(rows), solution.take(rows)
+            after = self._polished(part, before)
+            if after is not before:
+                put(result, rows, after)
+        return replace(result, trace=solution.trace)
+
+    def check(self, problem: Problem) -> None:
+        """Raise InputError where rounding is above any tolerance of use here."""
+        if problem.x0.dtype != torch.float64:
+            raise InputError("polish", "a problem in torch.float64", problem.x0.dtype)
+
+    def _polished(self, problem: Problem, solution: Solution) -> Solution:
+        """One element; `solution` itself where nothing better was found."""
+        lam = torch.cat([solution.cost.new_zeros(0), *(part.flatten() for part in solution.multipliers.lam)])
+        first = best = now = _Point.at(problem, solution.X, solution.U, lam)
+        weight = 0.0
+        for _ in range(self.iterations):
+            if now.worst <= self.tolerance and now.residual <= self.stationarity:
+                break
+            moved = self._step(now, weight)
+            if moved is None:
+                break
+            now, weight = moved
+            if self._is_better(now, best, first):
+                best = now
+        return solution if best is first else best.put_into(solution)
+
+    def _is_better(self, new: _Point, old: _Point, first: _Point) -> bool:
+        if not new.cost <= first.cost + self.cost_rise * abs(first.cost):
+            return False
+        if new.clearance < min(0.0, first.clearance):
+            return False  # a long step may leap over an obstacle between two knots
+        gained = new.worst <= self.tolerance < old.worst
+        return gained or (new.worst <= max(self.tolerance, old.worst) and new.fitted < old.fitted)
+
+    def _step(self, point: _Point, weight: float) -> tuple[_Point, float] | None:
+        """The next point and the weight of its merit; None where neither model of the problem leads anywhere."""
+        for exact in (True, False) if self.curvature else (False,):
+            convex = _convex(point, exact)
+            found = None if convex is None else _program(point, *convex)
+            if found is None:
+                continue
+            step, lam = found
+            heavier = max(weight, 2.0 * float(lam.abs().max())) if lam.numel() else weight
+            moved = _search(point, step, heavier)
+            if moved is not None:
+                return _Point.at(point.model.problem, *moved, lam), heavier
+        return None
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A trajectory of one problem, linearised, and what it is worth."""
+
+    model: Condensed
+    lam: Tensor  # (r,)
+    cost: float
+    worst: float  # violation
+    residual: float  # relative KKT residual with lam
+    clearance: float  # smallest distance along the chords to where bodies touch, m
+
+    @classmethod
+    def at(cls, problem: Problem, X: Tensor, U: Tensor, lam: Tensor) -> _Point:
+        model = Condensed.around(problem, X, U)
+        cost = float(problem.cost.total(X, U))
+        slack = float((lam * model.c).abs().max()) / (1.0 + abs(cost)) if lam.numel() else 0.0
+        clearance = min([float(part.chord_clearance(X)) for part in _spheres(problem)], default=torch.inf)
+        worst = float(violation(problem, X, U))
+        return cls(model, lam, cost, worst, max(_slope(model, lam), slack), clearance)
+
+    @cached_property
+    def fitted(self) -> float:
+        """The KKT residual with least-squares multipliers: those of a solver that stopped early fit nothing yet."""
+        model = self.model
+        rows = (model.equality | (model.c >= -ACTIVE * model.slopes.norm(dim=-1))).nonzero().flatten()
+        A = model.dense(rows)
+        A = A / A.norm(dim=-1, keepdim=True).clamp(min=torch.finfo(A.dtype).tiny)
+        none = torch.zeros_like(rows, dtype=torch.bool)
+        pushes = multipliers(A @ A.mT, -(A @ model.gradient), model.equality[rows], none)
+        if pushes is None:
+            return self.residual
+        rest = model.gradient + pushes @ A
+        return min(self.residual, float(rest.abs().max()) / (1.0 + float(model.gradient.abs().max())))
+
+    def merit(self, X: Tensor, U: Tensor, weight: float) -> float:
+        """J_var + weight |violated rows|_1: exact where the weight is above every multiplier."""
+        problem = self.model.problem
+        total = problem.cost.total(X, U)
+        for constraint in problem.constraints:
+            c = constraint.value(X, U)
+            total = total + weight * (c.abs() if constraint.sense == "equality" else c.clamp(min=0.0)).sum()
+        return float(total)
+
+    def put_into(self, solution: Solution) -> Solution:
+        """The solution with this trajectory in place of its own, and gains along it."""
+        problem, X, U = self.model.problem, self.model.X, self.model.U
+        duals = Multipliers(self.model.by_constraint(self.lam), solution.multipliers.mu)
+        H = Lagrangian(problem, duals, None, True).expand(X, U)
+        step = backward(linearise(problem, X, U), H, torch.zeros_like(duals.mu))
+        G = step.gains.movedim(0, 1).masked_fill(step.failed.view(-1, 1, 1, 1), torch.nan)
+        return replace(
+            solution, X=X, U=U, K=G[..., :-1], d=G[..., -1], multipliers=duals,
+            cost=torch.full_like(solution.cost, self.cost), violation=torch.full_like(solution.violation, self.worst),
+        )  # fmt: skip
+
+
+def _slope(model: Condensed, lam: Tensor) -> float:
+    """The largest component of the Lagrangian's gradient, by 1 + that of the cost's."""
+    return float(model.lagrangian_gradient(lam).abs().max()) / (1.0 + float(model.gradient.abs().max()))
+
+
+def _spheres(problem: Problem) -> list[BoundSpheres]:
+    return [part for part in problem.constraints if isinstance(part, BoundSpheres)]
+
+
+def _convex(point: _Point, exact: bool) -> tuple[Tensor, Tensor] | None:
+    """Factor L (v, v) of a positive definite Hessian and the gradient (v,) that goes with it; None where there is none.
+
+    Across the rows that push, the program fixes the step anyway: there curvature may be added without changing it.
+    What is indefinite along them too is shifted.
+    """
+    model, lam = point.model, point.lam
+    H = model.hessian(lam if exact else None)
+    mean = H.diagonal().abs().mean()
+    if _holds(factor := torch.linalg.cholesky_ex(H), mean):
+        return factor[0], model.gradient
+    pushing = ((lam > 0) | model.equality) & (model.slopes.abs().amax(-1) > 0)
+    rows = pushing.nonzero().flatten()
+    A = model.dense(rows)
+    length = A.norm(dim=-1).clamp(min=torch.finfo(A.dtype).tiny)
+    A, c = A / length.unsqueeze(-1), model.c[rows] / length
+    H = H + STIFFNESS * mean * (A.mT @ A)
+    for shift in SHIFTS:
+        if _holds(factor := torch.linalg.cholesky_ex(H + torch.diag((shift * mean).expand(H.shape[0]))), mean):
+            return factor[0], model.gradient + STIFFNESS * mean * (c @ A)
+    return None
+
+
+def _holds(factor: tuple[Tensor, Tensor], mean: Tensor) -> bool:
+    """Whether a factorisation succeeded, with pivots so large that no step runs away."""
+    return not bool(factor[1]) and bool(factor[0].diagonal().square().min() > PIVOT * mean)
+
+
+def _program(point: _Point, L: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Step (v,) and multipliers (r,) of min g'd + 1/2 d'LL'd with A d + c <= 0 (or = 0); None where none was found.
+
+    Rows that can't matter are left out at first, and join where the step found without them would violate them.
+    """
+    model, lam = point.model, point.lam
+    size = model.slopes.norm(dim=-1)
+    member = (model.equality | (lam > 0) | (model.c > -NEAR * size)) & (size > 0)
+    g = torch.linalg.solve_triangular(L, gradient.unsqueeze(-1), upper=False).squeeze(-1)
+    for _ in range(ROUNDS):
+        rows = member.nonzero().flatten()
+        if rows.numel() > 2 * gradient.numel():
+            return None  # the linearised rows contradict each other, or the model is flat
+        A = model.dense(rows)
+        moves = A.abs().amax(-1) > 1e-12 * size[rows]  # the first knots of some models can't be moved at all
+        rows, A = rows[moves], A[moves]
+        V = torch.linalg.solve_triangular(L, A.mT.contiguous(), upper=False)
+        pushes = multipliers(V.mT @ V, model.c[rows] - V.mT @ g, model.equality[rows], lam[rows] > 0)
+        if pushes is None:
+            return None
+        step = -torch.linalg.solve_triangular(L.mT, (g + V @ pushes).unsqueeze(-1), upper=True).squeeze(-1)
+        broken = (model.c + model.change(step) > NOISE * size) & ~member & (size > 0)
+        if not bool(broken.any()):
+            return step, torch.zeros_like(lam).index_put((rows,), pushes)
+        member = member | broken
+    return None
+
+
+def _search(point: _Point, step: Tensor, weight: float) -> tuple[Tensor, Tensor] | None:
+    """States and controls (1, ...) along the step that lower the merit; None where no step length does."""
+    problem, X, U = point.model.problem, point.model.X, point.model.U
+    before, alpha = point.merit(X, U, weight), 1.0
+    while alpha >= SMALLEST:
+        trial = U + alpha * step.view_as(U)
+        states = open_loop(problem.dynamics, problem.x0, trial)
+        if point.merit(states, trial, weight) <= before + NOISE * (1.0 + abs(before)):
+            return states, trial
+        alpha *= 0.5
+    return None
