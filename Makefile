@@ -1,5 +1,7 @@
 # make study   the default study, in an environment of its own (ARGS="experiment=planar_trap seed=1" for others)
 # make families   every solver on the public layouts (an hour or more)
+# make quality   how often gco reaches the goal on the public layouts, and how well (ARGS="--solvers gco gco_max" for more
+#                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
 # make benchmark   speed, side by side with the peers (a quarter of an hour; ARGS="families --compile" for some or more);
 #                  benchmark-gpu: the same on a GPU
 # make test    the quick tests; test-slow: those that compile; lint, types: the static checks; clean: start afresh
@@ -20,7 +22,7 @@ FAMILIES ?= forest30 forest60 walls planar_trap planar_random
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-slow lint types clean benchmark benchmark-gpu families $(FAMILIES:%=family-%)
+.PHONY: study test test-slow lint types clean quality oracle benchmark benchmark-gpu families $(FAMILIES:%=family-%)
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -39,6 +41,12 @@ family-%: $(RUNTIME)
 	$(BIN)/torchgco scenario=layouts scenario.path=benchmarks/data/$*.npz \
 	    model=$(if $(filter planar%,$*),planar,quadrotor) \
 	    study.baselines=[gco_paper,al_ilqr,mppi,hold] hydra.run.dir=outputs/families/$* $(ARGS)
+
+quality: $(RUNTIME)
+	$(BIN)/python -m benchmarks.quality --write $(ARGS)
+
+oracle: $(RUNTIME)
+	$(BIN)/python -m benchmarks.oracle $(ARGS)
 
 benchmark: $(PEERS)
 	$(SPEED) $(ARGS)

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from benchmarks import oracle, quality
+from benchmarks.families import FAMILIES, Family
 from benchmarks.speed import batch, families, growth, latency, mppi, share
 from benchmarks.speed.__main__ import main
 from benchmarks.speed.bench import Bench
@@ -16,6 +20,8 @@ from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
 from benchmarks.speed.tables import BEGIN, END, rewrite, section_table
+from torchgco import compose
+from torchgco.scenarios import Layouts
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = Sizes(
@@ -131,3 +137,42 @@ def test_without_a_gpu_nothing_is_measured(monkeypatch, capsys, tmp_path: Path) 
     monkeypatch.setattr("benchmarks.speed.__main__._one_core", lambda: None)
     assert main(["--device", "cuda", "--results", str(tmp_path / "results.csv")]) == 0
     assert "No CUDA device" in capsys.readouterr().out and not (tmp_path / "results.csv").exists()
+
+
+def test_the_oracle_only_ever_lowers_a_cost(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("benchmarks.families.DATA", tmp_path)
+    family = Family("planar_random", "planar", (), 32, 30)
+    replace(Layouts.load(ROOT / "benchmarks/data/planar_random.npz").take([0, 1, 2]), best_cost=None).save(family.path)
+    nan = float("nan")
+    for costs, best in (
+        ([500.0, nan, nan], [500.0, nan, nan]),
+        ([600.0, 300.0, nan], [500.0, 300.0, nan]),
+        ([400.0, nan, nan], [400.0, 300.0, nan]),
+    ):
+        oracle.keep(family, np.array(costs), "here")
+        np.testing.assert_array_equal(Layouts.load(family.path).best_cost, best)
+
+
+def test_no_best_cost_is_above_a_peers() -> None:
+    for family in FAMILIES.values():
+        best, theirs = Layouts.load(family.path).best_cost, oracle.reference(family)
+        assert best is not None and not bool((best > theirs).any())
+
+
+def test_the_quality_of_one_family(tmp_path: Path, capsys) -> None:
+    words = ["--families", "planar_trap", "--solvers", "hold", "--fresh", "3", "--outputs", str(tmp_path)]
+    assert quality.main([*words, "study.workers=1"]) == 0
+    row = capsys.readouterr().out.splitlines()[-1].split(" | ")
+    assert row[0] == "| planar_trap" and row[1:4] == ["`hold`", "3", "3 [44, 100]"] and row[4] == "0 [0, 56]"
+
+
+def test_families_are_what_the_generators_draw() -> None:
+    """Fresh layouts are of the files' kind: as many obstacles of the same size, the same ends."""
+    for family in FAMILIES.values():
+        drawn, held = compose(family.overrides(fresh=2)).layouts(), Layouts.load(family.path)
+        task, other = (compose(family.overrides(fresh=f)).task(layouts) for f, layouts in ((2, drawn), (0, held)))
+        assert (task.problem.N, task.goal_radius) == (other.problem.N, other.goal_radius)
+        torch.testing.assert_close(task.problem.x0[0], other.problem.x0[0])
+        np.testing.assert_allclose(np.nanmax(drawn.radii), np.nanmax(held.radii))
+        if family.name != "walls":
+            assert drawn.centers.shape[1:] == held.centers.shape[1:]

@@ -79,14 +79,19 @@ def _source(row: Row) -> str:
 
 
 def rewrite(readme: Path, rows: list[Row]) -> None:
-    """Put the tables between the marks; everything else of the file stays as it is.
+    """Put the tables between their marks."""
+    put_between(readme, BEGIN, END, speed_text(rows))
+
+
+def put_between(file: Path, begin: str, end: str, new: str) -> None:
+    """Put text between two marks; everything else of the file stays as it is.
 
     Raises:
         ValueError: the marks aren't there, once each and in order.
     """
-    text = readme.read_text()
-    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
-        raise ValueError(f"{readme} has no part between {BEGIN} and {END}")
-    head, rest = text.split(BEGIN)
-    tail = rest.split(END)[1]
-    readme.write_text(f"{head}{BEGIN}\n{speed_text(rows)}\n\n{END}{tail}")
+    text = file.read_text()
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise ValueError(f"{file} has no part between {begin} and {end}")
+    head, rest = text.split(begin)
+    tail = rest.split(end)[1]
+    file.write_text(f"{head}{begin}\n{new}\n\n{end}{tail}")

@@ -1,0 +1,44 @@
+"""The five families: where their layouts are, how they are drawn afresh, and what `gco` is to make of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+DATA = Path(__file__).resolve().parent / "data"
+
+
+@dataclass(frozen=True)
+class Family:
+    """A family of layouts: 32 in a file, and as many as are wanted from its generator."""
+
+    name: str
+    model: str
+    drawn: tuple[str, ...]  # overrides of the generator
+    reached: int  # of the file's 32, at least
+    success: int
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return DATA / f"{self.name}.npz"
+
+    def overrides(self, fresh: int = 0, seed: int = 0) -> list[str]:
+        """What `torchgco` is told: the file's layouts, or `fresh` new ones of a seed."""
+        if fresh == 0:
+            source = ["scenario=layouts", f"scenario.path={self.path}"]
+        else:
+            source = [*self.drawn, f"study.layouts={fresh}"]
+        return [*source, f"model={self.model}", f"seed={seed}"]
+
+
+FAMILIES = {
+    family.name: family
+    for family in (
+        Family("forest30", "quadrotor", ("scenario=forest",), 32, 31),
+        Family("forest60", "quadrotor", ("scenario=forest", "scenario.num_obstacles=60"), 32, 31),
+        Family("walls", "quadrotor", ("scenario=walls",), 31, 29),
+        Family("planar_trap", "planar", ("scenario=planar_trap",), 32, 30),
+        Family("planar_random", "planar", ("scenario=planar_random",), 32, 30),
+    )
+}  # fmt: skip

@@ -1,0 +1,103 @@
+"""python -m benchmarks.quality: how often the goal is reached, and how well, on the public families.
+
+Every family is a study of its own below outputs/quality, so that a run that was stopped goes on where it was. The table
+is printed and, where all families flew, written into benchmarks/README.md with date and commit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from benchmarks.families import FAMILIES, Family
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.tables import put_between
+from torchgco.experiments.statistics import summarise
+
+ROOT = Path(__file__).resolve().parents[1]
+MARKS = {False: ("<!-- quality -->", "<!-- end quality -->"), True: ("<!-- fresh -->", "<!-- end fresh -->")}
+HEAD = (
+    "family", "solver", "n", "feasible", "reached", "success", "violation <= 1e-3", "median cost", "iterations",
+    "seconds", "asked: reached, success",
+)  # fmt: skip
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    asked = _parser().parse_args(words)
+    trials = pd.concat([fly(FAMILIES[name], asked) for name in asked.families], ignore_index=True)
+    text = table(trials, asked.fresh)
+    print(text)
+    if set(asked.families) == set(FAMILIES) and asked.write:
+        put_between(ROOT / "benchmarks" / "README.md", *MARKS[asked.fresh > 0], f"{_source(asked)}\n\n{text}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.quality", description="Fly the families, and count.")
+    parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(FAMILIES), metavar="NAME")
+    parser.add_argument("--solvers", nargs="+", default=["gco"], metavar="NAME", help="configs; default: gco")
+    parser.add_argument("--fresh", type=int, default=0, metavar="N", help="N drawn layouts a family, not the public 32")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/README.md")
+    parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "quality")
+    parser.add_argument("overrides", nargs="*", help="of the configuration, for all studies")
+    return parser
+
+
+def fly(family: Family, asked: argparse.Namespace) -> pd.DataFrame:
+    """The trials of one study, under the family's name."""
+    first, *others = asked.solvers
+    folder = asked.outputs / f"{family.name}-{asked.fresh}-{asked.seed}-{'-'.join(asked.solvers)}"
+    command = [
+        sys.executable, "-m", "torchgco", *family.overrides(asked.fresh, asked.seed), f"solver={first}",
+        f"study.baselines=[{','.join(others)}]", "study.shard_size=32", f"hydra.run.dir={folder}", *asked.overrides,
+    ]  # fmt: skip
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    return pd.read_parquet(folder / "trials.parquet").assign(scenario=family.name)
+
+
+def table(trials: pd.DataFrame, fresh: int) -> str:
+    """Markdown: a row per family and solver, rates with 95 % Wilson intervals in percent."""
+    lines = ["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|"]
+    for row in summarise(trials).to_dict(orient="records"):
+        family = FAMILIES[str(row["scenario"])]
+        asked = "" if fresh or row["solver"] != "gco" else f"{family.reached}, {family.success}"
+        rates = (_rate(row, name) for name in ("feasible", "reached", "success"))
+        cells = [
+            family.name, f"`{row['solver']}`", row["n"], *rates,
+            round(row["violation_ok"] * row["n"]), _number(row["cost_median_reached"], ",.0f"),
+            _number(row["iterations_mean"], ".0f"), _number(row["seconds_mean"], ".2f"), asked,
+        ]  # fmt: skip
+        lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
+    return "\n".join(lines)
+
+
+def _rate(row: dict[str, float], name: str) -> str:
+    if row[f"{name}_n"] == 0:
+        return "-"
+    low, high = (100 * row[f"{name}_{end}"] for end in ("low", "high"))
+    return f"{row[f'{name}_count']:.0f} [{low:.0f}, {high:.0f}]"
+
+
+def _number(value: float, form: str) -> str:
+    return "-" if value != value else format(value, form)
+
+
+def _source(asked: argparse.Namespace) -> str:
+    origin, layouts = (
+        provenance("cpu"),
+        f"{asked.fresh} drawn layouts a family" if asked.fresh else "the public layouts",
+    )
+    return (
+        f"Flown on {origin['date']} at commit {origin['commit']}, {layouts}, seed {asked.seed}, 95 % Wilson intervals "
+        f"in percent; one thread a process, {origin['processor']}, shared and busy."
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""Many guesses: the best is kept, the budget is kept to, and an element's guesses are its own."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+
+from tests.problems import planar_batch
+from torchgco import ILQR, AugmentedLagrangian, InputError
+from torchgco.baselines import MultiStart
+from torchgco.lagrangian import is_better
+
+LOCAL = AugmentedLagrangian(inner=ILQR(max_iterations=4), max_outer_iterations=3, clip=True)
+MANY = MultiStart(solver=LOCAL, starts=4, covariance=9.0, knots=5, arrival=0.2)
+
+
+def test_the_best_of_all_starts_is_kept() -> None:
+    problem, U0 = planar_batch(B=4, N=25, obstacles=8, seed=2)
+    results = [replace(MANY, starts=n).solve(problem, U0, seed=3) for n in (1, 2, 4)]
+    alone = LOCAL.solve(problem, U0, seed=3)
+    assert torch.equal(results[0].U, alone.U) and torch.equal(results[0].iterations, alone.iterations)
+    for few, many in pairwise(results):
+        assert bool((many.iterations > few.iterations).all())
+        worse = is_better(few.cost, few.violation, many.cost, many.violation, LOCAL.violation_tolerance)
+        assert not bool(worse.any())
+    assert not torch.equal(results[0].U, results[2].U)
+
+
+def test_an_element_has_its_own_guesses_whatever_its_company() -> None:
+    problem, U0 = planar_batch(B=4, N=25, obstacles=8, seed=2)
+    whole = MANY.solve(problem, U0, seed=1)
+    rows = torch.tensor([3, 1])
+    part = MANY.solve(problem.take(rows), U0[rows], seed=1, ids=rows)
+    assert torch.equal(part.U, whole.U[rows]) and torch.equal(part.iterations, whole.iterations[rows])
+
+
+def test_a_spent_budget_ends_the_starts() -> None:
+    problem, U0 = planar_batch(B=3, N=25, obstacles=8, seed=2)
+    first = LOCAL.solve(problem, U0)
+    limit = int(first.iterations.min())
+    bounded = replace(MANY, budget=limit).solve(problem, U0)
+    spent = first.iterations >= limit
+    assert bool(spent.any()) and torch.equal(bounded.iterations[spent], first.iterations[spent])
+    generous = replace(MANY, budget=limit + 1).solve(problem, U0)
+    assert bool((generous.iterations >= limit + 1).all())
+
+
+@pytest.mark.parametrize(
+    "change", [dict(covariance=1.0), dict(covariance=[9.0, 1.0]), dict(knots=3), dict(solver=ILQR)]
+)
+def test_every_option_is_read(change: dict) -> None:
+    problem, U0 = planar_batch(B=4, N=25, obstacles=8, seed=2)
+    if "solver" in change:
+        change = dict(solver=replace(LOCAL, inner=ILQR(max_iterations=2)))
+    one, other = (m.solve(problem, U0) for m in (MANY, replace(MANY, **change)))
+    assert not torch.equal(one.U, other.U)
+
+
+def test_one_that_arrives_is_worth_more_than_a_cheaper_one() -> None:
+    """With a goal a hand's breadth wide, nothing counts as arrived, and the cheaper path is kept."""
+    problem, U0 = planar_batch(B=8, N=25, obstacles=10, seed=7)
+    near, far = (replace(MANY, arrival=share).solve(problem, U0) for share in (1e-9, 0.999))
+    fits = (near.violation <= LOCAL.violation_tolerance) & (far.violation <= LOCAL.violation_tolerance)
+    assert bool((near.cost <= far.cost)[fits].all())
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (dict(starts=0), "multistart.starts"), (dict(knots=1), "multistart.knots"),
+        (dict(budget=0), "multistart.budget"), (dict(arrival=1.0), "multistart.arrival"),
+    ],
+)  # fmt: skip
+def test_options_out_of_range_are_named(change: dict, field: str) -> None:
+    with pytest.raises(InputError, match=field.replace(".", r"\.")):
+        MultiStart(**change)
+
+
+@pytest.mark.parametrize("covariance", [-1.0, [1.0, 1.0, 1.0], "wide"])
+def test_a_covariance_that_fits_nothing_is_named(covariance) -> None:
+    problem, U0 = planar_batch(B=1, N=10)
+    with pytest.raises(InputError, match=r"multistart\.covariance"):
+        replace(MANY, covariance=covariance).solve(problem, U0)
