@@ -181,7 +181,7 @@ def test_a_plan_with_its_own_penalty_is_left_alone() -> None:
 
 CHANGES = dict(
     roadmap=Roadmap(margin=1.0), begin=0.2, end=0.7, smoothing=0.2, tube=0.2, stiffness=(50.0,), obstacle_penalty=50.0,
-    hold=5.0, iterations=2, ways=3, settle=2,
+    hold=5.0, iterations=2, settle=2,
 )  # fmt: skip
 
 
