@@ -18,6 +18,7 @@ from torch import Tensor
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.judge import segment_distance
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, check_shape
 
@@ -114,18 +115,10 @@ def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
             relative = X[0, :, None, spheres.position] - spheres.centers[0]  # (N+1, M, d)
             if spheres.velocities is not None:
                 relative = relative - k * spheres.dt * spheres.velocities[0]
-            chord = _segment_distance(relative[:-1], relative[1:]) - spheres.distances[0]
+            chord = segment_distance(relative[:-1], relative[1:]) - spheres.distances[0]
             path = chord - _bulge(problem, X, U).unsqueeze(-1)
             nearest = torch.minimum(nearest, path[:, ~spheres.absent[0]].amin())
     return nearest
-
-
-def _segment_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Distance (...) of the origin from the segment between a and b (..., d)."""
-    along = b - a
-    length = along.square().sum(-1).clamp(min=torch.finfo(a.dtype).tiny)
-    share = (-(a * along).sum(-1) / length).clamp(0.0, 1.0)
-    return (a + share.unsqueeze(-1) * along).norm(dim=-1)
 
 
 def _bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:

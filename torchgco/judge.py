@@ -102,12 +102,12 @@ def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
             relative = relative - k * spheres.dt * spheres.velocities
         at_knots = torch.minimum(at_knots, (relative.norm(dim=-1) - contact).amin(-1))
         if before is not None:
-            between = torch.minimum(between, (_segment_distance(before, relative) - contact).amin(-1))
+            between = torch.minimum(between, (segment_distance(before, relative) - contact).amin(-1))
         before = relative
     return at_knots, torch.minimum(between, at_knots)
 
 
-def _segment_distance(a: Tensor, b: Tensor) -> Tensor:
+def segment_distance(a: Tensor, b: Tensor) -> Tensor:
     """Distance (...) of the origin from the segment between a and b (..., d)."""
     along = b - a
     length = along.square().sum(-1)

@@ -90,8 +90,8 @@ class Detour:
     def propose(self, problem: Problem, rank: Tensor | None = None) -> Proposal:
         """A plan for every problem, from the vehicle at rest, along the best of the ways or that of a rank (B,)."""
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-        scene, goal = _scene(problem, rest), problem.cost.goal(problem.x0)
-        if scene is None or goal is None:
+        scene = _scene(problem, rest)
+        if scene is None:
             nowhere = torch.zeros(problem.B, dtype=torch.bool, device=rest.device)
             return Proposal(rest, nowhere, torch.full_like(rest[:, 0, 0], torch.nan))
         ways, found = self.roadmap.ways(scene, self.ways)

@@ -143,7 +143,7 @@ class Layouts:
         part = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
         try:
             with open(part, "xb") as handle:
-                np.savez(handle, **self.arrays())  # type: ignore[arg-type]
+                np.savez_compressed(handle, **self.arrays())  # type: ignore[arg-type]
                 handle.flush()
                 os.fsync(handle.fileno())
             os.replace(part, path)
