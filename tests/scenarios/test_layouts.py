@@ -151,7 +151,7 @@ def test_interrupted_save_leaves_the_old_file(tmp_path, monkeypatch):
     def fail(*_, **__):
         raise OSError("disk full")
 
-    for module, call in ((np, "savez"), (os, "fsync"), (os, "replace")):
+    for module, call in ((np, "savez_compressed"), (os, "fsync"), (os, "replace")):
         with monkeypatch.context() as patch, pytest.raises(OSError, match="disk full"):
             patch.setattr(module, call, fail)
             example(dt=0.1).save(path)
