@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.problems import planar_batch, quadrotor_batch, random_trajectory
-from torchgco.constraints import FunctionConstraint, GuideRegion, StateBounds
+from torchgco.constraints import FunctionConstraint, GuidePath, GuideRegion, StateBounds
 from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian, Multipliers, penalty_weights, update, worst_rows
 from torchgco.problem import Problem
@@ -35,6 +35,25 @@ def _guide(X, position) -> GuideRegion:
     guide.radius[:, 2:6] = 0.1
     guide.center[:, 2:6] += 0.4
     return guide
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_a_path_adds_the_derivatives_of_its_springs(batch: str) -> None:
+    problem = BATCHES[batch](B=3, N=9)[0]
+    X, U = random_trajectory(problem)
+    at = problem.dynamics.position
+    guide = GuidePath(X[..., at] + torch.rand_like(X[..., at]), torch.tensor([1.0, 2.0, 3.0]).double(), at)
+    duals = Multipliers.zero(problem, 7.0)
+    with_guide, without = (Lagrangian(problem, duals, g, True) for g in (guide, None))
+    added = (with_guide.expand(X, U) - without.expand(X, U)).transpose(0, 1)
+    gradient = torch.autograd.functional.jacobian(lambda X: guide.value(X).sum(), X)
+    n = problem.n
+    torch.testing.assert_close(added[..., :n, n], gradient, rtol=1e-9, atol=1e-7)
+    torch.testing.assert_close(added[..., n, :n], gradient, rtol=1e-9, atol=1e-7)
+    flat = torch.autograd.functional.hessian(lambda x: guide.value(x.view_as(X)).sum(), X.flatten())
+    exact = flat.view(*X.shape, *X.shape)
+    for b, k in ((0, 0), (1, 4), (2, 9)):
+        torch.testing.assert_close(added[b, k, :n, :n], exact[b, k, :, b, k], rtol=1e-9, atol=1e-7)
 
 
 @pytest.mark.parametrize("clip", [False, True])

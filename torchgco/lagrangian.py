@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.obstacles import GuideRegion
+from torchgco.constraints.guides import Guide
 from torchgco.expansion import quadratise
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, take
@@ -62,7 +62,7 @@ class Lagrangian:
 
     problem: Problem
     duals: Multipliers
-    guide: GuideRegion | None
+    guide: Guide | None
     clip: bool
 
     def take(self, index: Tensor) -> Lagrangian:

@@ -26,7 +26,7 @@ from torchgco.guidance.detour import Proposal
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.rollout import open_loop
 
-QUICK = Detour(begin=0.1, end=0.8, iterations=8)
+QUICK = Detour(begin=0.1, end=0.8, iterations=8, depth=1.0)
 GOAL = torch.tensor([1.0, 0.4], dtype=torch.float64)
 WEIGHTS = [5, 5, 1e-8, 1, 1, 1e-8]
 
@@ -64,7 +64,7 @@ def test_it_leads_around_a_trap_that_catches_the_solver() -> None:
 
 
 def test_a_plan_ends_near_the_goal_and_has_a_penalty() -> None:
-    U, found, penalty = Detour(begin=0.1, end=0.8).propose(cup())
+    U, found, penalty = Detour(begin=0.1, end=0.8, depth=0.5).propose(cup())
     assert bool(found.all()) and bool((penalty > 0).all()) and bool(torch.isfinite(U).all())
     assert float(judge(cup(), U, GOAL, 0.3).goal_distance.max()) < 0.3
 
@@ -160,6 +160,26 @@ def test_settling_makes_a_plan_cheaper() -> None:
     assert bool((costs[0] > costs[1]).all())
 
 
+def test_a_plan_deep_within_an_obstacle_is_refused() -> None:
+    problem = cup(B=1)
+    plans = [replace(QUICK, depth=depth).propose(problem) for depth in (1e-4, 1.0)]
+    assert [bool(plan.found) for plan in plans] == [False, True]
+    X = open_loop(problem.dynamics, problem.x0, plans[1].U)
+    assert float(problem.constraints[0].violation(X, plans[1].U).max()) > 1e-4 * 0.2
+
+
+def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
+    problem, off = cup(B=1, N=120), []
+    for tube, stiffness in ((0.05, 20.0), (None, 500.0)):
+        detour = replace(QUICK, tube=tube, stiffness=(stiffness,), iterations=4, settle=0, depth=9.0)
+        way = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
+        R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
+        U, _, _ = detour._fly(problem, controls(problem), way, R, unit)
+        X = open_loop(problem.dynamics, problem.x0, U)
+        off.append(float((X[..., :2] - detour._travel(way, 120)).norm(dim=-1).mean()))
+    assert off[1] < 0.5 * off[0]
+
+
 def test_a_plan_with_its_own_penalty_is_left_alone() -> None:
     """Guidance isn't asked again while it is followed, and the penalty is the one it came with."""
     problem, seen = cup(B=2), []
@@ -181,7 +201,7 @@ def test_a_plan_with_its_own_penalty_is_left_alone() -> None:
 
 CHANGES = dict(
     roadmap=Roadmap(margin=1.0), begin=0.2, end=0.7, smoothing=0.2, tube=0.2, stiffness=(50.0,), obstacle_penalty=50.0,
-    hold=5.0, iterations=2, settle=2,
+    hold=5.0, tolerance=1e3, iterations=2, settle=2,
 )  # fmt: skip
 
 
@@ -206,7 +226,8 @@ def test_a_quadrotor_is_led_too() -> None:
         (dict(smoothing=1.0), "detour.smoothing"), (dict(tube=0.0), "detour.tube"), (dict(hold=0.0), "detour.hold"),
         (dict(obstacle_penalty=0.0), "detour.obstacle_penalty"), (dict(stiffness=()), "detour.stiffness"),
         (dict(stiffness=(0.0,)), "detour.stiffness"), (dict(iterations=0), "detour.iterations"),
-        (dict(ways=0), "detour.ways"), (dict(settle=-1), "detour.settle"),
+        (dict(ways=0), "detour.ways"), (dict(settle=-1), "detour.settle"), (dict(depth=0.0), "detour.depth"),
+        (dict(tolerance=0.0), "detour.tolerance"),
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_named(change: dict, field: str) -> None:

@@ -1,4 +1,4 @@
-"""Spherical obstacles, static or moving, and the spherical guide region.
+"""Spherical obstacles, static or moving.
 
 All obstacles of a trajectory are evaluated by one small matrix product per problem: with t = k dt and
 features q = [p, |p|^2, 1 | t p, t, t^2], the constraint c = R^2 - |p - o - t v|^2 is linear in q. Gradient and
@@ -229,49 +229,6 @@ class BoundSpheres(Constraint):
             fixed, linear, square = s.split(d * d, dim=-1)
             s = fixed + t * linear + t.square() * square
         return s.unflatten(-1, (d, d))
-
-
-@dataclass(frozen=True)
-class GuideRegion:
-    """Balls that knots are drawn into: a pure penalty on f_k = |p_k - center_k|^2 - radius_k^2 (Equations 62-65).
-
-    A knot without guidance has an infinite radius (the paper's r_F, larger than the whole scene).
-    """
-
-    center: Tensor  # (B, N+1, d), m
-    radius: Tensor  # (B, N+1), m
-    weight: Tensor  # (B,): mu_gco
-    position: slice
-
-    @classmethod
-    def inactive(cls, X: Tensor, weight: Tensor, position: slice) -> GuideRegion:
-        """No guidance along X (B, N+1, n)."""
-        center = X[..., position].clone()
-        return cls(center, torch.full_like(center[..., 0], torch.inf), weight, position)
-
-    @property
-    def is_active(self) -> Tensor:
-        """Whether any knot is guided, (B,) bool."""
-        return torch.isfinite(self.radius).any(-1)
-
-    def value(self, X: Tensor) -> Tensor:
-        """J_gco (B,) = sum_k 1/2 mu_gco f_k^2 over the knots outside their ball."""
-        f = self._excess(X).clamp(min=0.0)
-        return 0.5 * self.weight * f.square().sum(-1)
-
-    def accumulate(self, X: Tensor, H: Tensor) -> None:
-        """Add gradient and Gauss-Newton Hessian to H (B, N+1, s, s)."""
-        n, at = X.shape[-1], self.position
-        f = self._excess(X)
-        rho = torch.where(f > 0, self.weight.unsqueeze(-1), 0.0).unsqueeze(-1)
-        fx = 2.0 * (X[..., at] - self.center)
-        gradient = rho * f.clamp(min=0.0).unsqueeze(-1) * fx
-        H[..., at, n] += gradient
-        H[..., n, at] += gradient
-        H[..., at, at] += rho.unsqueeze(-1) * fx.unsqueeze(-1) * fx.unsqueeze(-2)
-
-    def _excess(self, X: Tensor) -> Tensor:
-        return (X[..., self.position] - self.center).square().sum(-1) - self.radius.square()
 
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:

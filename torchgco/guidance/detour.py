@@ -1,10 +1,11 @@
 """A plan along a short way between the obstacles: the geometric proposal of guidance.
 
-A way says where to pass; iLQR finds the controls that follow it, drawn into a narrow tube that travels along it, slowly
-enough for the vehicle to turn. Then the tube is dropped, and the path settles beside the obstacles that it has come
-around. The shortest way is often not the cheapest to fly: several are followed, and the one that settles best is handed
-over. It need not be quite free of contact: it is where the solver goes on from, with a penalty that keeps it on this
-side of every obstacle.
+A way says where to pass; iLQR finds the controls that follow it, drawn to a point, or into a narrow tube, that travels
+along it slowly enough for the vehicle to turn. Then nothing draws any more, and the path settles beside the obstacles
+that it has come around. The shortest way is often not the cheapest to fly: several are followed, and the one that
+settles best is handed over. It need not be quite free of contact: it is where the solver goes on from, with a penalty
+that keeps it on this side of every obstacle. One that lies deep within obstacles is handed over to nobody: the solver
+would spend a whole attempt on squeezing it out.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.constraints.obstacles import BoundSpheres, GuideRegion
+from torchgco.constraints.guides import Guide, GuidePath, GuideRegion
+from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.guidance.roadmap import FAR, Roadmap, Scene, points_along
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.problem import Problem
@@ -48,12 +50,15 @@ class Detour:
         ways: how many are followed.
         begin, end: the shares of the horizon at which the vehicle sets out and arrives.
         smoothing: the share of the horizon over which the way's corners are averaged.
-        tube: radius of the tube, as a share of R.
-        stiffness: one solve after the other, how strongly the tube draws, in q0 / L^2.
+        tube: radius of the tube, as a share of R; None: no tube, but a spring to the point that travels. A spring is
+            followed in half the iterations; for vehicles that can't move sideways the tube ends closer to the way.
+        stiffness: one solve after the other, how strongly tube or spring draws, in q0 / L^2.
         obstacle_penalty: of the spheres meanwhile, in q0 / R^4.
         hold: penalty that the solver is to go on with, in q0 / R^4.
+        tolerance: a solve ends where the penalised cost changes by less.
         iterations: of each solve, at most.
-        settle: iterations without the tube, at most, after which the ways are compared; 0 compares them as followed.
+        settle: iterations that nothing draws, at most, after which the ways are compared; 0 compares them as followed.
+        depth: how far into an obstacle a settled path may reach, as a share of R; one that lies deeper is refused.
 
     Raises:
         InputError: a field out of its range.
@@ -64,12 +69,14 @@ class Detour:
     begin: float = 0.0
     end: float = 0.9
     smoothing: float = 0.08
-    tube: float = 0.05
+    tube: float | None = 0.05
     stiffness: tuple[float, ...] = (20.0, 200.0)
     obstacle_penalty: float = 10.0
     hold: float = 80.0
+    tolerance: float = 0.1
     iterations: int = 20
     settle: int = 20
+    depth: float = 0.1
 
     def __post_init__(self) -> None:
         if not isinstance(self.roadmap, Roadmap):
@@ -78,7 +85,9 @@ class Detour:
             raise InputError("detour.begin", f"at least 0 and below end, {self.end}", self.begin)
         if not 0 <= self.smoothing < 1:
             raise InputError("detour.smoothing", "at least 0 and below 1", self.smoothing)
-        for name in ("tube", "obstacle_penalty", "hold"):
+        if self.tube is not None and not self.tube > 0:
+            raise InputError("detour.tube", "above 0, or null", self.tube)
+        for name in ("obstacle_penalty", "hold", "tolerance", "depth"):
             if not getattr(self, name) > 0:
                 raise InputError(f"detour.{name}", "above 0", getattr(self, name))
         if not self.stiffness or not all(value > 0 for value in self.stiffness):
@@ -100,24 +109,23 @@ class Detour:
         unit = torch.where(found, unit, 1.0)
         each = torch.arange(problem.B, device=rest.device).repeat_interleave(self.ways)
         flown = self._fly(problem.take(each), rest[each], ways.flatten(0, 1), R[each], unit[each])
-        U, merit, there = (t.unflatten(0, (-1, self.ways)) for t in flown)
+        U, merit, sound = (t.unflatten(0, (-1, self.ways)) for t in flown)
         order = merit.nan_to_num(torch.inf).argsort(dim=-1, stable=True)
-        order = order.gather(1, there.gather(1, order).argsort(dim=-1, descending=True, stable=True))
+        order = order.gather(1, sound.gather(1, order).argsort(dim=-1, descending=True, stable=True))
         rank = torch.zeros_like(each[: problem.B]) if rank is None else rank
-        chosen = order.gather(1, rank.clamp(max=self.ways - 1).unsqueeze(-1)).squeeze(-1)
-        U = U[torch.arange(problem.B, device=rest.device), chosen]
-        return Proposal(U, found & (rank < self.ways), self.hold * unit)
+        chosen = order.gather(1, rank.clamp(max=self.ways - 1).unsqueeze(-1))
+        found = found & (rank < self.ways) & sound.gather(1, chosen).squeeze(-1)
+        return Proposal(U[torch.arange(problem.B, device=rest.device), chosen.squeeze(-1)], found, self.hold * unit)
 
     def _fly(self, problem: Problem, U: Tensor, way: Tensor, R: Tensor, unit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Controls that follow a way each, settled; the penalised cost of what they do; whether they arrive; (B,)."""
-        center, radius = self._travel(way, problem.N), self.tube * R
+        """Controls that follow a way each, settled; the penalised cost of what they do; whether they are sound; (B,).
+
+        Sound are those that arrive, and lie not too deep within obstacles.
+        """
         none = Multipliers.zero(problem, 0.0)
-        length2 = (way[:, -1] - way[:, 0]).square().sum(-1)
-        inner = ILQR(tolerance=0.1, max_iterations=self.iterations, damping=1.0, line_search=SURE)
+        inner = ILQR(tolerance=self.tolerance, max_iterations=self.iterations, damping=1.0, line_search=SURE)
         for stiffness in self.stiffness:
-            # Near its surface the tube is as stiff as a spring of 4 weight radius^2.
-            weight = stiffness * unit * R.pow(4) / length2.clamp(min=1e-12) / (4.0 * radius.square()).clamp(min=1e-12)
-            guide = GuideRegion(center, radius.unsqueeze(-1).repeat(1, problem.N + 1), weight, _position(problem))
+            guide = self._guide(problem, way, R, stiffness * unit)
             U = inner.solve(problem, U, warm=replace(none, mu=self.obstacle_penalty * unit), guide=guide).U
         held = replace(none, mu=self.hold * unit)
         if self.settle > 0:
@@ -126,10 +134,23 @@ class Detour:
             keeps = _arrives(problem, settled) | ~_arrives(problem, U)
             U = torch.where(keeps.view(-1, 1, 1), settled, U)
         X = open_loop(problem.dynamics, problem.x0, U)
-        return U, Lagrangian(problem, held, None, True).value(X, U)[1], _arrives(problem, U)
+        sound = _arrives(problem, U) & (_depth(problem, X, U) <= self.depth * R)
+        return U, Lagrangian(problem, held, None, True).value(X, U)[1], sound
+
+    def _guide(self, problem: Problem, way: Tensor, R: Tensor, stiffness: Tensor) -> Guide:
+        """What draws along the way; stiffness (B,) in units of q0 / (R^4 L^2)."""
+        center, at = self._travel(way, problem.N), _position(problem)
+        length2 = (way[:, -1] - way[:, 0]).square().sum(-1)
+        spring = stiffness * R.pow(4) / length2.clamp(min=1e-12)
+        if self.tube is None:
+            return GuidePath(center, spring, at)
+        radius = self.tube * R
+        # Near its surface the tube is as stiff as a spring of 4 weight radius^2.
+        weight = spring / (4.0 * radius.square()).clamp(min=1e-12)
+        return GuideRegion(center, radius.unsqueeze(-1).repeat(1, problem.N + 1), weight, at)
 
     def _travel(self, way: Tensor, N: int) -> Tensor:
-        """Where the tube is at every knot, (B, N+1, d): speeding up and slowing down smoothly, corners rounded."""
+        """What is followed, at every knot, (B, N+1, d): speeding up and slowing down smoothly, corners rounded."""
         share = torch.arange(N + 1, dtype=way.dtype, device=way.device) / N
         share = ((share - self.begin) / (self.end - self.begin)).clamp(0.0, 1.0)
         share = share.square() * (3.0 - 2.0 * share)
@@ -149,6 +170,12 @@ def _arrives(problem: Problem, U: Tensor) -> Tensor:
     X = open_loop(problem.dynamics, problem.x0, U)
     last, first = ((x - goal)[:, _position(problem)].square().sum(-1) for x in (X[:, -1], problem.x0))
     return last <= THERE**2 * first
+
+
+def _depth(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """How deep a path reaches into an obstacle, (B,), m."""
+    rows = [c.violation(X, U).flatten(1).amax(-1) for c in problem.geometric]
+    return torch.stack(rows).amax(0)
 
 
 def _scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor]:

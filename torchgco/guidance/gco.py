@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.constraints.obstacles import BoundSpheres, GuideRegion
+from torchgco.constraints.guides import GuideRegion
+from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.draws import DrawKey
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.detour import Detour

@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchgco.constraints.obstacles import GuideRegion
+from torchgco.constraints.guides import Guide
 from torchgco.draws import DrawKey
 from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
@@ -46,7 +46,7 @@ class Loop:
         ids: Tensor | None,
         warm: Multipliers | None,
         callback: Callback | None,
-        guide: GuideRegion | None = None,
+        guide: Guide | None = None,
     ) -> None:
         self.ids = check_call(problem, U0, ids)
         if warm is not None:

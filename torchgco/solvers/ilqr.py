@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.constraints.obstacles import GuideRegion
+from torchgco.constraints.guides import Guide
 from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
@@ -71,7 +71,7 @@ class ILQR:
         ids: Tensor | None = None,
         warm: Multipliers | None = None,
         callback: Callback | None = None,
-        guide: GuideRegion | None = None,
+        guide: Guide | None = None,
     ) -> Solution:
         """One inner solve of every problem, from U0 (B, N, m); `violation` tells what the constraints say of it.
 

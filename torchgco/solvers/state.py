@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from torch import Tensor
 
-from torchgco.constraints.obstacles import GuideRegion
+from torchgco.constraints.guides import Guide, GuideRegion
 from torchgco.draws import DrawKey
 from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
@@ -38,7 +38,7 @@ class State:
     cost: Tensor
     merit: Tensor
     duals: Multipliers
-    guide: GuideRegion | None
+    guide: Guide | None
     regularisation: Tensor  # mu_r
     inner: Tensor  # iterations of this inner solve
     outer: Tensor  # inner solves ended
