@@ -146,6 +146,25 @@ def test_the_way_that_settles_best_is_kept_and_the_others_follow_by_rank() -> No
     assert ranked == sorted(ranked) and len(set(merits)) > 1
 
 
+class Settles(Detour):
+    """Notes how many it settles."""
+
+    settled: list = []  # noqa: RUF012
+
+    def _settle(self, problem: Problem, *rest) -> tuple[torch.Tensor, torch.Tensor]:
+        self.settled.append(problem.B)
+        return super()._settle(problem, *rest)
+
+
+def test_ways_that_are_not_kept_are_not_settled() -> None:
+    problem, three = cup(B=2, N=60), Settles(ways=3, iterations=2, settle=1, depth=9.0)
+    plans = [replace(three, keep=keep).propose(problem) for keep in (None, 9, 2)]
+    assert Settles.settled == [6, 6, 4] and torch.equal(plans[0].U, plans[1].U)
+    assert not bool(replace(three, keep=2).propose(problem, torch.tensor([2, 2])).found.any())
+    followed = [replace(three, keep=keep, settle=0).propose(problem).U for keep in (None, 1)]
+    assert torch.equal(*followed)
+
+
 def test_a_plan_that_falls_back_into_the_trap_is_not_settled() -> None:
     """Flying is so dear that waiting is cheaper: the plan stays as it was followed."""
     problem = replace(cup(B=1), cost=QuadraticCost(Q=WEIGHTS, R=[20.0, 20.0], Qf=WEIGHTS, x_ref=[1, 0.4, 0, 0, 0, 0]))
@@ -174,7 +193,7 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
         detour = replace(QUICK, tube=tube, stiffness=(stiffness,), iterations=4, settle=0, depth=9.0)
         way = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
         R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
-        U, _, _ = detour._fly(problem, controls(problem), way, R, unit)
+        U = detour._follow(problem, controls(problem), way, R, unit)
         X = open_loop(problem.dynamics, problem.x0, U)
         off.append(float((X[..., :2] - detour._travel(way, 120)).norm(dim=-1).mean()))
     assert off[1] < 0.5 * off[0]
@@ -226,7 +245,8 @@ def test_a_quadrotor_is_led_too() -> None:
         (dict(smoothing=1.0), "detour.smoothing"), (dict(tube=0.0), "detour.tube"), (dict(hold=0.0), "detour.hold"),
         (dict(obstacle_penalty=0.0), "detour.obstacle_penalty"), (dict(stiffness=()), "detour.stiffness"),
         (dict(stiffness=(0.0,)), "detour.stiffness"), (dict(iterations=0), "detour.iterations"),
-        (dict(ways=0), "detour.ways"), (dict(settle=-1), "detour.settle"), (dict(depth=0.0), "detour.depth"),
+        (dict(ways=0), "detour.ways"), (dict(keep=0), "detour.keep"),
+        (dict(settle=-1), "detour.settle"), (dict(depth=0.0), "detour.depth"),
         (dict(tolerance=0.0), "detour.tolerance"),
     ],
 )  # fmt: skip

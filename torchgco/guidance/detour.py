@@ -48,6 +48,7 @@ class Detour:
     Args:
         roadmap: finds the ways.
         ways: how many are followed.
+        keep: how many of these are settled, the cheapest as followed; None: all.
         begin, end: the shares of the horizon at which the vehicle sets out and arrives.
         smoothing: the share of the horizon over which the way's corners are averaged.
         tube: radius of the tube, as a share of R; None: no tube, but a spring to the point that travels. A spring is
@@ -66,6 +67,7 @@ class Detour:
 
     roadmap: Roadmap = Roadmap()
     ways: int = 1
+    keep: int | None = None
     begin: float = 0.0
     end: float = 0.9
     smoothing: float = 0.08
@@ -92,8 +94,8 @@ class Detour:
                 raise InputError(f"detour.{name}", "above 0", getattr(self, name))
         if not self.stiffness or not all(value > 0 for value in self.stiffness):
             raise InputError("detour.stiffness", "one or more numbers above 0", self.stiffness)
-        for name, least in (("ways", 1), ("iterations", 1), ("settle", 0)):
-            if getattr(self, name) < least:
+        for name, least in (("ways", 1), ("keep", 1), ("iterations", 1), ("settle", 0)):
+            if getattr(self, name) is not None and getattr(self, name) < least:
                 raise InputError(f"detour.{name}", f"at least {least}", getattr(self, name))
 
     def propose(self, problem: Problem, rank: Tensor | None = None) -> Proposal:
@@ -107,35 +109,57 @@ class Detour:
         R, unit = _scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
         unit = torch.where(found, unit, 1.0)
-        each = torch.arange(problem.B, device=rest.device).repeat_interleave(self.ways)
-        flown = self._fly(problem.take(each), rest[each], ways.flatten(0, 1), R[each], unit[each])
-        U, merit, sound = (t.unflatten(0, (-1, self.ways)) for t in flown)
-        order = merit.nan_to_num(torch.inf).argsort(dim=-1, stable=True)
-        order = order.gather(1, sound.gather(1, order).argsort(dim=-1, descending=True, stable=True))
-        rank = torch.zeros_like(each[: problem.B]) if rank is None else rank
-        chosen = order.gather(1, rank.clamp(max=self.ways - 1).unsqueeze(-1))
-        found = found & (rank < self.ways) & sound.gather(1, chosen).squeeze(-1)
-        return Proposal(U[torch.arange(problem.B, device=rest.device), chosen.squeeze(-1)], found, self.hold * unit)
+        rows = torch.arange(problem.B, device=rest.device)
+        each = rows.repeat_interleave(self.ways)
+        part = problem.take(each)
+        U = self._follow(part, rest[each], ways.flatten(0, 1), R[each], unit[each])
+        best = self._order(part, U, unit[each], _arrives(part, U), self.ways)[:, : self._kept]
+        U = U[(rows.unsqueeze(-1) * self.ways + best).flatten()]
+        each = rows.repeat_interleave(self._kept)
+        part = problem.take(each)
+        U, sound = self._settle(part, U, R[each], unit[each])
+        order = self._order(part, U, unit[each], sound, self._kept)
+        rank = torch.zeros_like(rows) if rank is None else rank
+        chosen = rows * self._kept + order[rows, rank.clamp(max=self._kept - 1)]
+        return Proposal(U[chosen], found & (rank < self._kept) & sound[chosen], self.hold * unit)
 
-    def _fly(self, problem: Problem, U: Tensor, way: Tensor, R: Tensor, unit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Controls that follow a way each, settled; the penalised cost of what they do; whether they are sound; (B,).
+    @property
+    def _kept(self) -> int:
+        return self.ways if self.keep is None else min(self.keep, self.ways)
 
-        Sound are those that arrive, and lie not too deep within obstacles.
-        """
-        none = Multipliers.zero(problem, 0.0)
-        inner = ILQR(tolerance=self.tolerance, max_iterations=self.iterations, damping=1.0, line_search=SURE)
+    def _follow(self, problem: Problem, U: Tensor, way: Tensor, R: Tensor, unit: Tensor) -> Tensor:
+        """Controls that follow a way each, from U."""
+        inner, none = self._inner(self.iterations), Multipliers.zero(problem, 0.0)
         for stiffness in self.stiffness:
             guide = self._guide(problem, way, R, stiffness * unit)
             U = inner.solve(problem, U, warm=replace(none, mu=self.obstacle_penalty * unit), guide=guide).U
-        held = replace(none, mu=self.hold * unit)
+        return U
+
+    def _settle(self, problem: Problem, U: Tensor, R: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
+        """Controls that nothing draws any more, and whether their paths arrive and lie not too deep in obstacles."""
         if self.settle > 0:
-            settled = replace(inner, max_iterations=self.settle).solve(problem, U, warm=held).U
+            held = replace(Multipliers.zero(problem, 0.0), mu=self.hold * unit)
+            settled = self._inner(self.settle).solve(problem, U, warm=held).U
             # A path that falls back into the trap, where waiting is cheaper, is none.
             keeps = _arrives(problem, settled) | ~_arrives(problem, U)
             U = torch.where(keeps.view(-1, 1, 1), settled, U)
         X = open_loop(problem.dynamics, problem.x0, U)
-        sound = _arrives(problem, U) & (_depth(problem, X, U) <= self.depth * R)
-        return U, Lagrangian(problem, held, None, True).value(X, U)[1], sound
+        return U, _arrives(problem, U) & (_depth(problem, X, U) <= self.depth * R)
+
+    def _inner(self, iterations: int) -> ILQR:
+        return ILQR(tolerance=self.tolerance, max_iterations=iterations, damping=1.0, line_search=SURE)
+
+    def _order(self, problem: Problem, U: Tensor, unit: Tensor, first: Tensor, count: int) -> Tensor:
+        """Each problem's `count` controls (rows beside each other) as places in their order, (B, count).
+
+        Those in `first` come before the others; then the penalised cost decides.
+        """
+        held = replace(Multipliers.zero(problem, 0.0), mu=self.hold * unit)
+        X = open_loop(problem.dynamics, problem.x0, U)
+        merit = Lagrangian(problem, held, None, True).value(X, U)[1]
+        order = merit.nan_to_num(torch.inf).view(-1, count).argsort(dim=-1, stable=True)
+        later = (~first).view(-1, count).gather(1, order)
+        return order.gather(1, later.to(torch.int8).argsort(dim=-1, stable=True))
 
     def _guide(self, problem: Problem, way: Tensor, R: Tensor, stiffness: Tensor) -> Guide:
         """What draws along the way; stiffness (B,) in units of q0 / (R^4 L^2)."""
