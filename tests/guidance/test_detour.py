@@ -146,6 +146,14 @@ def test_the_way_that_settles_best_is_kept_and_the_others_follow_by_rank() -> No
     assert ranked == sorted(ranked) and len(set(merits)) > 1
 
 
+def test_many_ways_are_followed_by_chunks_that_nobody_notices(monkeypatch) -> None:
+    x0 = torch.tensor([[-1.0, y, 0, 0, 0, 0] for y in (-0.2, 0.0, 0.1)], dtype=torch.float64)
+    problem, two = replace(cup(B=3, N=40), x0=x0), replace(QUICK, ways=2, iterations=2, settle=1)
+    whole = two.propose(problem)
+    monkeypatch.setattr("torchgco.guidance.detour.AT_ONCE", 4)
+    assert all(torch.equal(a, b) for a, b in zip(whole, two.propose(problem), strict=True))
+
+
 class Settles(Detour):
     """Notes how many it settles."""
 

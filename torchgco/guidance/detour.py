@@ -27,6 +27,7 @@ from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
 
 SURE = LineSearch(accept_last=False)
+AT_ONCE = 1536  # ways followed at once: memory stays bounded, however large the batch
 THERE = 0.25  # share of the distance from start to goal; a path that ends farther from it has fallen back
 
 
@@ -100,6 +101,14 @@ class Detour:
 
     def propose(self, problem: Problem, rank: Tensor | None = None) -> Proposal:
         """A plan for every problem, from the vehicle at rest, along the best of the ways or that of a rank (B,)."""
+        rank = torch.zeros(problem.B, dtype=torch.int64, device=problem.x0.device) if rank is None else rank
+        chunks = torch.arange(problem.B, device=rank.device).split(max(1, AT_ONCE // self.ways))
+        if len(chunks) == 1:
+            return self._propose(problem, rank)
+        parts = [self._propose(problem.take(rows), rank[rows]) for rows in chunks]
+        return Proposal(*(torch.cat(t) for t in zip(*parts, strict=True)))
+
+    def _propose(self, problem: Problem, rank: Tensor) -> Proposal:
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
         scene = _scene(problem, rest)
         if scene is None:
@@ -119,7 +128,6 @@ class Detour:
         part = problem.take(each)
         U, sound = self._settle(part, U, R[each], unit[each])
         order = self._order(part, U, unit[each], sound, self._kept)
-        rank = torch.zeros_like(rows) if rank is None else rank
         chosen = rows * self._kept + order[rows, rank.clamp(max=self._kept - 1)]
         return Proposal(U[chosen], found & (rank < self._kept) & sound[chosen], self.hold * unit)
 
