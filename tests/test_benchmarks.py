@@ -166,6 +166,19 @@ def test_the_quality_of_one_family(tmp_path: Path, capsys) -> None:
     assert row[0] == "| planar_trap" and row[1:4] == ["`hold`", "3", "3 [44, 100]"] and row[4] == "0 [0, 56]"
 
 
+def test_success_is_told_against_the_best_cost_of_today(tmp_path: Path) -> None:
+    family = FAMILIES["planar_trap"]
+    asked = quality._parser().parse_args(["--solvers", "hold", "--outputs", str(tmp_path)])
+    asked.overrides = ["study.layouts=2", "study.workers=1"]
+    flown = quality.fly(family, asked)
+    assert flown["solver"].unique().tolist() == ["hold"] and not flown["success"].any()
+    there = flown.assign(reached=True, violation=[0.0, 2e-3], clearance=0.1, cost=flown["best_cost"])
+    layouts = Layouts.load(family.path).take([0, 1])
+    assert quality.succeeded(there, layouts)["success"].tolist() == [True, False]
+    lower = replace(layouts, best_cost=0.9 * layouts.best_cost)
+    assert quality.succeeded(there, lower)["success"].tolist() == [False, False]
+
+
 def test_families_are_what_the_generators_draw() -> None:
     """Fresh layouts are of the files' kind: as many obstacles of the same size, the same ends."""
     for family in FAMILIES.values():
