@@ -38,7 +38,7 @@ SOLVERS = {
             sampler=MPPI(samples=40, covariance=4.0, rounds=3, knots=5, decay=0.8, elite=3, linger=1.0),
             adopt=True,
             patience=2,
-            detour=Detour(iterations=4, ways=2, settle=3),
+            detour=Detour(iterations=4, ways=3, keep=2, settle=3, depth=9.0),
             detour_at=1,
             detours=2,
         ),
