@@ -22,7 +22,7 @@ from torchgco import (
 )
 from torchgco.draws import DrawKey
 from torchgco.guidance import Detour, Roadmap
-from torchgco.guidance.detour import Proposal
+from torchgco.guidance.detour import Plans, Proposal
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.rollout import open_loop
 
@@ -64,8 +64,8 @@ def test_it_leads_around_a_trap_that_catches_the_solver() -> None:
 
 
 def test_a_plan_ends_near_the_goal_and_has_a_penalty() -> None:
-    U, found, penalty = Detour(begin=0.1, end=0.8, depth=0.5).propose(cup())
-    assert bool(found.all()) and bool((penalty > 0).all()) and bool(torch.isfinite(U).all())
+    U, found, duals = Detour(begin=0.1, end=0.8, depth=0.5).propose(cup())
+    assert bool(found.all()) and bool((duals.mu > 0).all()) and bool(torch.isfinite(U).all())
     assert float(judge(cup(), U, GOAL, 0.3).goal_distance.max()) < 0.3
 
 
@@ -76,7 +76,7 @@ def test_units_are_the_problems_own() -> None:
         Q=[100 * w for w in WEIGHTS], R=[10.0, 10.0], Qf=[100 * w for w in WEIGHTS], x_ref=[1, 0.4, 0, 0, 0, 0]
     ))  # fmt: skip
     one, hundred = (replace(QUICK, iterations=1, settle=0).propose(p) for p in (problem, cents))
-    torch.testing.assert_close(hundred.penalty, 100 * one.penalty)
+    torch.testing.assert_close(hundred.duals.mu, 100 * one.duals.mu)
     torch.testing.assert_close(hundred.U, one.U, rtol=1e-6, atol=1e-6)
 
 
@@ -114,7 +114,7 @@ class Turns(Detour):
     def propose(self, problem: Problem, rank: torch.Tensor | None = None) -> Proposal:
         self.asked.append(rank.tolist())
         U = controls(problem)
-        return Proposal(U, torch.zeros(problem.B, dtype=torch.bool), U[:, 0, 0])
+        return Proposal(U, torch.zeros(problem.B, dtype=torch.bool), Multipliers.zero(problem, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_the_way_that_settles_best_is_kept_and_the_others_follow_by_rank() -> No
     plans = [many.propose(problem, torch.tensor([rank])) for rank in range(4)]
     assert torch.equal(plans[0].U, many.propose(problem).U)
     assert [bool(plan.found) for plan in plans] == [True, True, True, False]
-    duals = replace(Multipliers.zero(problem, 0.0), mu=plans[0].penalty)
+    duals = plans[0].duals
     paths = [open_loop(problem.dynamics, problem.x0, plan.U) for plan in plans[:3]]
     merits = [
         float(Lagrangian(problem, duals, None, True).value(X, p.U)[1]) for X, p in zip(paths, plans, strict=False)
@@ -151,7 +151,9 @@ def test_many_ways_are_followed_by_chunks_that_nobody_notices(monkeypatch) -> No
     problem, two = replace(cup(B=3, N=40), x0=x0), replace(QUICK, ways=2, iterations=2, settle=1)
     whole = two.propose(problem)
     monkeypatch.setattr("torchgco.guidance.detour.AT_ONCE", 4)
-    assert all(torch.equal(a, b) for a, b in zip(whole, two.propose(problem), strict=True))
+    parts = two.propose(problem)
+    assert torch.equal(whole.U, parts.U) and torch.equal(whole.found, parts.found)
+    assert torch.equal(whole.duals.mu, parts.duals.mu)
 
 
 class Settles(Detour):
@@ -159,9 +161,9 @@ class Settles(Detour):
 
     settled: list = []  # noqa: RUF012
 
-    def _settle(self, problem: Problem, *rest) -> tuple[torch.Tensor, torch.Tensor]:
-        self.settled.append(problem.B)
-        return super()._settle(problem, *rest)
+    def _settle(self, plans: Plans) -> tuple[Plans, torch.Tensor]:
+        self.settled.append(plans.problem.B)
+        return super()._settle(plans)
 
 
 def test_ways_that_are_not_kept_are_not_settled() -> None:
@@ -201,10 +203,39 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
         detour = replace(QUICK, tube=tube, stiffness=(stiffness,), iterations=4, settle=0, depth=9.0)
         way = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
         R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
-        U = detour._follow(problem, controls(problem), way, R, unit)
+        U = detour._follow(Plans(problem, controls(problem), R, unit, 1), way).U
         X = open_loop(problem.dynamics, problem.x0, U)
         off.append(float((X[..., :2] - detour._travel(way, 120)).norm(dim=-1).mean()))
     assert off[1] < 0.5 * off[0]
+
+
+def test_finalists_are_solved_to_their_end_and_the_cheapest_there_is_handed_over() -> None:
+    problem, four = cup(B=2, N=120), replace(QUICK, ways=4, iterations=20)
+    settled, ended = (replace(four, finalists=n).propose(problem) for n in (1, 3))
+    rest = replace(four, finalists=3).propose(problem, torch.tensor([1, 2]))
+    verdicts = [judge(problem, plan.U, GOAL, 0.3) for plan in (settled, ended, rest)]
+    assert not bool(verdicts[0].sound.any()) and bool(verdicts[1].sound.all())
+    assert bool((verdicts[1].cost < verdicts[2].cost).all())
+    assert not any(bool(lam.any()) for lam in settled.duals.lam) and bool(ended.duals.lam[0].any())
+    counts = []
+    for finalists in (1, 3):
+        guidance = GCO(detour=replace(four, finalists=finalists), patience=1)
+        solver = AugmentedLagrangian(
+            inner=ILQR(tolerance=1e-2, max_iterations=20), guidance=guidance, max_outer_iterations=20,
+            grow_when_feasible=False, clip=True, cost_tolerance=1e-3,
+        )  # fmt: skip
+        counts.append(int(solver.solve(problem, controls(problem)).iterations.sum()))
+    assert counts[1] < counts[0]
+
+
+def test_paths_that_are_alike_count_once() -> None:
+    problem = cup(B=1)
+    R, unit = torch.ones(2, 3, dtype=torch.float64)
+    plans = Plans(problem.take(torch.zeros(3, dtype=torch.int64)), controls(problem).repeat(3, 1, 1), R, unit, 3)
+    plans.U[2] = -1.0  # drives away, which costs more
+    first = torch.ones(3, dtype=torch.bool)
+    assert QUICK._order(plans, first).tolist() == [[0, 1, 2]]
+    assert QUICK._order(plans, first, alike=1e-3).tolist() == [[0, 2, 1]]
 
 
 def test_a_plan_with_its_own_penalty_is_left_alone() -> None:
@@ -221,14 +252,14 @@ def test_a_plan_with_its_own_penalty_is_left_alone() -> None:
         inner=ILQR(max_iterations=4), guidance=guidance, max_outer_iterations=4, clip=True, grow_when_feasible=False
     )
     solver.solve(problem, controls(problem), callback=look)
-    penalty = replace(QUICK, hold=500.0).propose(problem).penalty
+    penalty = replace(QUICK, hold=500.0).propose(problem).duals.mu
     assert seen and torch.equal(seen[0][2], penalty[seen[0][3]])
     assert all(int(guided.max()) == 1 for _, guided, _, _ in seen) and int(seen[-1][0].max()) >= 3
 
 
 CHANGES = dict(
     roadmap=Roadmap(margin=1.0), begin=0.2, end=0.7, smoothing=0.2, tube=0.2, stiffness=(50.0,), obstacle_penalty=50.0,
-    hold=5.0, tolerance=1e3, iterations=2, settle=2,
+    hold=5.0, tolerance=1e3, iterations=2, settle=2, dtype="float32",
 )  # fmt: skip
 
 
@@ -236,7 +267,7 @@ CHANGES = dict(
 def test_every_option_is_read(name: str) -> None:
     problem, base = cup(B=1, N=60), Detour(begin=0.1, end=0.8, iterations=3)
     one, other = base.propose(problem), replace(base, **{name: CHANGES[name]}).propose(problem)
-    assert not (torch.equal(one.U, other.U) and torch.equal(one.penalty, other.penalty))
+    assert not (torch.equal(one.U, other.U) and torch.equal(one.duals.mu, other.duals.mu))
 
 
 def test_a_quadrotor_is_led_too() -> None:
@@ -255,7 +286,8 @@ def test_a_quadrotor_is_led_too() -> None:
         (dict(stiffness=(0.0,)), "detour.stiffness"), (dict(iterations=0), "detour.iterations"),
         (dict(ways=0), "detour.ways"), (dict(keep=0), "detour.keep"),
         (dict(settle=-1), "detour.settle"), (dict(depth=0.0), "detour.depth"),
-        (dict(tolerance=0.0), "detour.tolerance"),
+        (dict(tolerance=0.0), "detour.tolerance"), (dict(finalists=0), "detour.finalists"),
+        (dict(dtype="float16"), "detour.dtype"),
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_named(change: dict, field: str) -> None:

@@ -11,24 +11,25 @@ would spend a whole attempt on squeezing it out.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchgco.constraints.guides import Guide, GuidePath, GuideRegion
-from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.guidance.roadmap import FAR, Roadmap, Scene, points_along
+from torchgco.guidance import scene as seen
+from torchgco.guidance.roadmap import Roadmap, points_along
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
-from torchgco.shapes import InputError
+from torchgco.shapes import InputError, cast, put, take
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
 
 SURE = LineSearch(accept_last=False)
 AT_ONCE = 1536  # ways followed at once: memory stays bounded, however large the batch
-THERE = 0.25  # share of the distance from start to goal; a path that ends farther from it has fallen back
+ALIKE = 2e-3  # settled paths whose penalised costs differ by less, as a share, are taken for one
 
 
 class Proposal(NamedTuple):
@@ -36,7 +37,31 @@ class Proposal(NamedTuple):
 
     U: Tensor  # (B, N, m)
     found: Tensor  # (B,) bool: whether there is a way; where not, U means nothing
-    penalty: Tensor  # (B,): mu that keeps the solver from falling back
+    duals: Multipliers  # to go on with: a penalty that keeps the solver from falling back
+
+
+@dataclass(frozen=True)
+class Plans:
+    """Some plans for each of B problems, those of one beside each other: every tensor has a row for each plan."""
+
+    problem: Problem
+    U: Tensor
+    R: Tensor  # m
+    unit: Tensor  # q0 / R^4
+    count: int  # for each problem
+
+    def pick(self, order: Tensor) -> Plans:
+        """The plans at the places `order` (B, c) among those of their problem."""
+        rows = self.rows(order).flatten()
+        return Plans(self.problem.take(rows), self.U[rows], self.R[rows], self.unit[rows], order.shape[1])
+
+    def rows(self, order: Tensor) -> Tensor:
+        """Rows (B, c) of the plans at the places `order` (B, c)."""
+        return torch.arange(order.shape[0], device=order.device).unsqueeze(-1) * self.count + order
+
+    def duals(self, penalty: float) -> Multipliers:
+        """No multipliers yet, and a penalty in q0 / R^4."""
+        return replace(Multipliers.zero(self.problem, 0.0), mu=penalty * self.unit)
 
 
 @dataclass(frozen=True)
@@ -61,6 +86,9 @@ class Detour:
         iterations: of each solve, at most.
         settle: iterations that nothing draws, at most, after which the ways are compared; 0 compares them as followed.
         depth: how far into an obstacle a settled path may reach, as a share of R; one that lies deeper is refused.
+        finalists: how many of those that settled best, and differ, are solved to their end before one is handed over,
+            by what they cost there; 1: none is, and the best settled is handed over.
+        dtype: "float32" to follow and settle in single precision; None: in the problem's own.
 
     Raises:
         InputError: a field out of its range.
@@ -80,6 +108,8 @@ class Detour:
     iterations: int = 20
     settle: int = 20
     depth: float = 0.1
+    finalists: int = 1
+    dtype: Literal["float32", "float64"] | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.roadmap, Roadmap):
@@ -93,85 +123,114 @@ class Detour:
         for name in ("obstacle_penalty", "hold", "tolerance", "depth"):
             if not getattr(self, name) > 0:
                 raise InputError(f"detour.{name}", "above 0", getattr(self, name))
+        if self.dtype not in ("float32", "float64", None):
+            raise InputError("detour.dtype", "float32, float64 or null", repr(self.dtype))
         if not self.stiffness or not all(value > 0 for value in self.stiffness):
             raise InputError("detour.stiffness", "one or more numbers above 0", self.stiffness)
-        for name, least in (("ways", 1), ("keep", 1), ("iterations", 1), ("settle", 0)):
+        for name, least in (("ways", 1), ("keep", 1), ("iterations", 1), ("settle", 0), ("finalists", 1)):
             if getattr(self, name) is not None and getattr(self, name) < least:
                 raise InputError(f"detour.{name}", f"at least {least}", getattr(self, name))
 
     def propose(self, problem: Problem, rank: Tensor | None = None) -> Proposal:
         """A plan for every problem, from the vehicle at rest, along the best of the ways or that of a rank (B,)."""
         rank = torch.zeros(problem.B, dtype=torch.int64, device=problem.x0.device) if rank is None else rank
-        chunks = torch.arange(problem.B, device=rank.device).split(max(1, AT_ONCE // self.ways))
-        if len(chunks) == 1:
-            return self._propose(problem, rank)
-        parts = [self._propose(problem.take(rows), rank[rows]) for rows in chunks]
-        return Proposal(*(torch.cat(t) for t in zip(*parts, strict=True)))
-
-    def _propose(self, problem: Problem, rank: Tensor) -> Proposal:
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-        scene = _scene(problem, rest)
+        U, found, duals = rest.clone(), torch.zeros_like(rank, dtype=torch.bool), Multipliers.zero(problem, torch.nan)
+        for rows in torch.arange(problem.B, device=rank.device).split(max(1, AT_ONCE // self.ways)):
+            part = self._propose(problem.take(rows), rest[rows], rank[rows])
+            if part is not None:
+                U[rows], found[rows] = part.U, part.found
+                put(duals, rows, part.duals)
+        return Proposal(U, found, duals)
+
+    def _propose(self, problem: Problem, rest: Tensor, rank: Tensor) -> Proposal | None:
+        scene = seen.scene_of(problem, rest)
         if scene is None:
-            nowhere = torch.zeros(problem.B, dtype=torch.bool, device=rest.device)
-            return Proposal(rest, nowhere, torch.full_like(rest[:, 0, 0], torch.nan))
+            return None
         ways, found = self.roadmap.ways(scene, self.ways)
-        R, unit = _scales(problem, scene, rest)
+        R, unit = seen.scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
+        everyone = torch.arange(problem.B, device=rest.device).repeat_interleave(self.ways)
         unit = torch.where(found, unit, 1.0)
-        rows = torch.arange(problem.B, device=rest.device)
-        each = rows.repeat_interleave(self.ways)
-        part = problem.take(each)
-        U = self._follow(part, rest[each], ways.flatten(0, 1), R[each], unit[each])
-        best = self._order(part, U, unit[each], _arrives(part, U), self.ways)[:, : self._kept]
-        U = U[(rows.unsqueeze(-1) * self.ways + best).flatten()]
-        each = rows.repeat_interleave(self._kept)
-        part = problem.take(each)
-        U, sound = self._settle(part, U, R[each], unit[each])
-        order = self._order(part, U, unit[each], sound, self._kept)
-        chosen = rows * self._kept + order[rows, rank.clamp(max=self._kept - 1)]
-        return Proposal(U[chosen], found & (rank < self._kept) & sound[chosen], self.hold * unit)
+        plans = Plans(problem.take(everyone), rest[everyone], R[everyone], unit[everyone], self.ways)
+        plans = self._follow(plans, ways.flatten(0, 1))
+        best = self._order(plans, seen.arrives(plans.problem, plans.U))
+        plans = plans.pick(best[:, : self.ways if self.keep is None else self.keep])
+        plans, sound = self._settle(plans)
+        plans, sound, duals, order = self._refine(plans, sound, self._order(plans, sound, alike=ALIKE))
+        chosen = plans.rows(order.gather(1, rank.clamp(max=plans.count - 1).unsqueeze(-1)))[:, 0]
+        return Proposal(plans.U[chosen], found & (rank < plans.count) & sound[chosen], take(duals, chosen))
 
-    @property
-    def _kept(self) -> int:
-        return self.ways if self.keep is None else min(self.keep, self.ways)
-
-    def _follow(self, problem: Problem, U: Tensor, way: Tensor, R: Tensor, unit: Tensor) -> Tensor:
-        """Controls that follow a way each, from U."""
-        inner, none = self._inner(self.iterations), Multipliers.zero(problem, 0.0)
+    def _follow(self, plans: Plans, way: Tensor) -> Plans:
+        """Each plan a way's."""
         for stiffness in self.stiffness:
-            guide = self._guide(problem, way, R, stiffness * unit)
-            U = inner.solve(problem, U, warm=replace(none, mu=self.obstacle_penalty * unit), guide=guide).U
-        return U
+            guide = self._guide(plans.problem, way, plans.R, stiffness * plans.unit)
+            U = self._solved(plans, self.iterations, plans.duals(self.obstacle_penalty), guide)
+            plans = replace(plans, U=U)
+        return plans
 
-    def _settle(self, problem: Problem, U: Tensor, R: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
-        """Controls that nothing draws any more, and whether their paths arrive and lie not too deep in obstacles."""
+    def _settle(self, plans: Plans) -> tuple[Plans, Tensor]:
+        """Plans that nothing draws any more, and whether their paths arrive and lie not too deep in obstacles."""
+        problem = plans.problem
         if self.settle > 0:
-            held = replace(Multipliers.zero(problem, 0.0), mu=self.hold * unit)
-            settled = self._inner(self.settle).solve(problem, U, warm=held).U
+            settled = self._solved(plans, self.settle, plans.duals(self.hold))
             # A path that falls back into the trap, where waiting is cheaper, is none.
-            keeps = _arrives(problem, settled) | ~_arrives(problem, U)
-            U = torch.where(keeps.view(-1, 1, 1), settled, U)
-        X = open_loop(problem.dynamics, problem.x0, U)
-        return U, _arrives(problem, U) & (_depth(problem, X, U) <= self.depth * R)
+            keeps = seen.arrives(problem, settled) | ~seen.arrives(problem, plans.U)
+            plans = replace(plans, U=torch.where(keeps.view(-1, 1, 1), settled, plans.U))
+        X = open_loop(problem.dynamics, problem.x0, plans.U)
+        return plans, seen.arrives(problem, plans.U) & (seen.depth(problem, X, plans.U) <= self.depth * plans.R)
+
+    def _refine(self, plans: Plans, sound: Tensor, order: Tensor) -> tuple[Plans, Tensor, Multipliers, Tensor]:
+        """The first in the order (B, count) are solved to their end, and ordered anew by what they cost there."""
+        duals = plans.duals(self.hold)
+        last = min(self.finalists, plans.count)
+        if last == 1:
+            return plans, sound, duals, order
+        rows = plans.rows(order[:, :last]).flatten()
+        rows = rows[sound[rows]]
+        if rows.numel() == 0:
+            return plans, sound, duals, order
+        part, warm = plans.problem.take(rows), take(duals, rows)
+        solver = AugmentedLagrangian(
+            self._inner(self.iterations), max_outer_iterations=20, cost_tolerance=1e-3, grow_when_feasible=False,
+            clip=True,
+        )  # fmt: skip
+        end = solver.solve(part, plans.U[rows], warm=warm)
+        good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.U)
+        U, cost = plans.U.clone(), torch.full_like(plans.unit, torch.inf)
+        won = rows[good]
+        U[won], cost[won] = end.U[good], end.cost[good]
+        put(duals, won, take(end.multipliers, good.nonzero().flatten()))
+        best = cost.view(-1, plans.count).gather(1, order[:, :last]).argsort(dim=-1, stable=True)
+        order = torch.cat((order[:, :last].gather(1, best), order[:, last:]), dim=1)
+        return replace(plans, U=U), sound, duals, order
+
+    def _solved(self, plans: Plans, iterations: int, duals: Multipliers, guide: Guide | None = None) -> Tensor:
+        """Controls after one inner solve of every plan."""
+        dtype = plans.U.dtype if self.dtype is None else getattr(torch, self.dtype)
+        problem, U, duals, guide = cast((plans.problem, plans.U, duals, guide), dtype)
+        return self._inner(iterations).solve(problem, U, warm=duals, guide=guide).U.to(plans.U.dtype)
 
     def _inner(self, iterations: int) -> ILQR:
         return ILQR(tolerance=self.tolerance, max_iterations=iterations, damping=1.0, line_search=SURE)
 
-    def _order(self, problem: Problem, U: Tensor, unit: Tensor, first: Tensor, count: int) -> Tensor:
-        """Each problem's `count` controls (rows beside each other) as places in their order, (B, count).
+    def _order(self, plans: Plans, first: Tensor, alike: float | None = None) -> Tensor:
+        """Each problem's plans as places in their order, (B, count).
 
-        Those in `first` come before the others; then the penalised cost decides.
+        Those in `first` come before the others; then the penalised cost decides, and of those that are alike all but
+        the cheapest come last.
         """
-        held = replace(Multipliers.zero(problem, 0.0), mu=self.hold * unit)
-        X = open_loop(problem.dynamics, problem.x0, U)
-        merit = Lagrangian(problem, held, None, True).value(X, U)[1]
-        order = merit.nan_to_num(torch.inf).view(-1, count).argsort(dim=-1, stable=True)
-        later = (~first).view(-1, count).gather(1, order)
-        return order.gather(1, later.to(torch.int8).argsort(dim=-1, stable=True))
+        X = open_loop(plans.problem.dynamics, plans.problem.x0, plans.U)
+        merit = Lagrangian(plans.problem, plans.duals(self.hold), None, True).value(X, plans.U)[1]
+        merit, order = merit.nan_to_num(torch.inf).view(-1, plans.count).sort(dim=-1, stable=True)
+        later = (~first).view(-1, plans.count).gather(1, order).to(torch.int8)
+        if alike is not None:
+            later[:, 1:] += (merit[:, 1:] - merit[:, :-1] <= alike * merit[:, :-1].abs()).to(torch.int8)
+        return order.gather(1, later.argsort(dim=-1, stable=True))
 
     def _guide(self, problem: Problem, way: Tensor, R: Tensor, stiffness: Tensor) -> Guide:
         """What draws along the way; stiffness (B,) in units of q0 / (R^4 L^2)."""
-        center, at = self._travel(way, problem.N), _position(problem)
+        center, at = self._travel(way, problem.N), seen.position(problem)
         length2 = (way[:, -1] - way[:, 0]).square().sum(-1)
         spring = stiffness * R.pow(4) / length2.clamp(min=1e-12)
         if self.tube is None:
@@ -193,61 +252,3 @@ class Detour:
             return center
         padded = torch.cat((center[:, :1].expand(-1, reach, -1), center, center[:, -1:].expand(-1, reach, -1)), dim=1)
         return padded.unfold(1, 2 * reach + 1, 1).mean(-1)
-
-
-def _arrives(problem: Problem, U: Tensor) -> Tensor:
-    """Whether controls end close to the goal, (B,)."""
-    goal = problem.cost.goal(problem.x0)
-    assert goal is not None
-    X = open_loop(problem.dynamics, problem.x0, U)
-    last, first = ((x - goal)[:, _position(problem)].square().sum(-1) for x in (X[:, -1], problem.x0))
-    return last <= THERE**2 * first
-
-
-def _depth(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """How deep a path reaches into an obstacle, (B,), m."""
-    rows = [c.violation(X, U).flatten(1).amax(-1) for c in problem.geometric]
-    return torch.stack(rows).amax(0)
-
-
-def _scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """R and q0 / R^4 (B,), the units of lengths and penalties."""
-    here = scene.distances > 0
-    R = torch.where(here, scene.distances, 0.0).sum(-1) / here.sum(-1).clamp(min=1)
-    return R, _resting_cost(problem, rest, scene.start.unsqueeze(1))[:, 0] / R.pow(4)
-
-
-def _position(problem: Problem) -> slice:
-    position = problem.dynamics.position
-    if position is None:
-        raise InputError("guidance", "dynamics with a position", type(problem.dynamics).__name__)
-    return position
-
-
-def _scene(problem: Problem, rest: Tensor) -> Scene | None:
-    """Start, goal and spheres; None where there are none, or others, or they move."""
-    spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres) and c.velocities is None]
-    goal = problem.cost.goal(problem.x0)
-    if not spheres or len(spheres) < len(problem.geometric) or goal is None:
-        return None
-    at = _position(problem)
-
-    def toll(points: Tensor, rows: Tensor) -> Tensor:
-        part = problem.take(rows)
-        price, first = (_resting_cost(part, rest[rows], p) for p in (points, part.x0[:, None, at]))
-        return price.clamp(min=0.0) / first.clamp(min=1e-12) + 0.1
-
-    return Scene(
-        problem.x0[:, at], goal[:, at],
-        torch.cat([c.centers for c in spheres], dim=1),
-        torch.cat([torch.where(c.absent, FAR, c.distances) for c in spheres], dim=1),
-        toll,
-    )  # fmt: skip
-
-
-def _resting_cost(problem: Problem, rest: Tensor, points: Tensor) -> Tensor:
-    """Stage cost (B, V) of resting at points (B, V, d)."""
-    x = problem.x0.unsqueeze(1).repeat(1, points.shape[1], 1)
-    x[..., _position(problem)] = points
-    u = rest[:, :1].expand(-1, points.shape[1], -1)
-    return problem.cost.stage(x, u, 0)

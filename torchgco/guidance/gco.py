@@ -14,6 +14,7 @@ from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.detour import Detour
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
+from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, put, take
 from torchgco.solvers.state import Advice
@@ -83,13 +84,15 @@ class GCO:
         growing = torch.ones_like(caught) if self.grow_when_idle else caught
         weight = torch.where(growing, guide.weight * self.penalty_growth, guide.weight)
         new, plan, taken = GuideRegion.inactive(X, weight, guide.position), U.clone(), torch.zeros_like(caught)
-        penalty = torch.full_like(weight, torch.nan)
+        duals = None
         if self.detour is not None:
             attempt = torch.ones_like(key.ids) if key.attempt is None else key.attempt
             rank = attempt - self.detour_at
             turn = (caught & (rank >= 0) & (rank < self.detours)).nonzero().flatten()
             if turn.numel() > 0:
-                plan[turn], taken[turn], penalty[turn] = self.detour.propose(problem.take(turn), rank[turn])
+                plan[turn], taken[turn], given = self.detour.propose(problem.take(turn), rank[turn])
+                duals = Multipliers.zero(problem, torch.nan)
+                put(duals, turn[taken[turn]], take(given, taken[turn].nonzero().flatten()))
         rows = (caught & ~taken).nonzero().flatten()
         if rows.numel() > 0:
             part = problem.take(rows)
@@ -98,7 +101,7 @@ class GCO:
                 taken[rows] = ~active_counts(part, X_safe, plan[rows]).any(-1)
             drawn = guide_along(take(new, rows), X_safe, knots[rows], self._radius(problem)[rows])
             put(new, rows[~taken[rows]], take(drawn, (~taken[rows]).nonzero().flatten()))
-        return Advice(new, plan, taken, penalty)
+        return Advice(new, plan, taken, duals)
 
     def _caught(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
         """The knots (B, N+1) that guidance is for: J, and with patience those at a single sphere."""

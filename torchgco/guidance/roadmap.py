@@ -18,6 +18,7 @@ from torchgco.shapes import InputError
 
 AT_ONCE = 4  # problems searched together: the distances of all edges from all obstacles are what memory must hold
 HOPS = 32  # edges of a way, at most
+CLASS = 8  # ways are sorted by so many edges more or less
 NEIGHBOURS = 4  # obstacles whose gap to another is given a point
 PRIMES = (2, 3, 5)  # bases of the low-discrepancy sequence
 FAR = -1e9  # the radius of an obstacle that isn't there
@@ -101,12 +102,23 @@ class Roadmap:
 
     def _taut(self, way: Tensor, scene: Scene, rows: Tensor, o: Tensor, R: Tensor) -> Tensor:
         """The same once more over a way's own corners and what lies between them, all joined: a taut string."""
+        # All corners are joined to all: ways of few corners aren't to pay for the rare ones of many.
+        edges = (way != way[:, -1:]).any(-1).sum(-1)
+        taut = way.clone()
+        for most in range(CLASS, HOPS + 1, CLASS):
+            part = ((edges > most - CLASS) & (edges <= most)).nonzero().flatten()
+            if part.numel() > 0:
+                taut[part] = self._tightened(way[part, : most + 1], scene, rows[part], o[part], R[part])
+        return taut
+
+    def _tightened(self, way: Tensor, scene: Scene, rows: Tensor, o: Tensor, R: Tensor) -> Tensor:
         between = torch.stack((way[:, 1:-1], 0.5 * (way[:, 1:-1] + way[:, 2:])), dim=2).flatten(1, 2)
         middle = torch.cat((way[:, :1], way[:, -1:], 0.5 * (way[:, :1] + way[:, 1:2]), between), dim=1)
         everyone = torch.arange(middle.shape[1], device=o.device).expand(*middle.shape[:2], -1)
         lengths = self._lengths(middle, everyone, o, R)
         taut, arrives = _cheapest(middle, everyone, lengths, scene.toll(middle, rows))
-        return torch.where(arrives.view(-1, 1, 1), taut, way)
+        rest = way[:, -1:].expand(-1, HOPS + 1 - way.shape[1], -1)
+        return torch.where(arrives.view(-1, 1, 1), taut, torch.cat((way, rest), dim=1))
 
     def _points(self, start: Tensor, goal: Tensor, o: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
         """Start, goal, spread and obstacle points (B, V, d), and which of them are free."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -62,16 +64,18 @@ def go_on_from(
     s.attempt[place[first]] = 1
     U = advice.U[taken]
     X = open_loop(part.dynamics, part.x0, U)
-    none = Multipliers(tuple(torch.zeros_like(lam[taken]) for lam in duals.lam), torch.ones_like(duals.mu[taken]))
-    cost, merit = Lagrangian(part, none, None, True).value(old_X, old_U)
+    fresh = Multipliers(tuple(torch.zeros_like(lam[taken]) for lam in duals.lam), torch.ones_like(duals.mu[taken]))
+    cost, merit = Lagrangian(part, fresh, None, True).value(old_X, old_U)
     gain = (part.cost.total(X, U) - cost).clamp(min=0.0) / (merit - cost).clamp(min=1e-12)
     keeping = solver.hold_factor * gain
-    if advice.penalty is not None:
-        s.led[place] = ~torch.isnan(advice.penalty[taken])
-        keeping = torch.where(s.led[place], advice.penalty[taken], keeping)
+    if advice.duals is not None:
+        given = take(advice.duals, taken)
+        s.led[place] = ~torch.isnan(given.mu)
+        keeping = torch.where(s.led[place], given.mu, keeping)
+        fresh = replace(fresh, lam=given.lam)  # zero where the penalty is the solver's own
     mu = torch.maximum(duals.mu[taken], keeping).clamp(max=solver.penalty_max)
     held = copied(duals)
-    put(held, taken, Multipliers(none.lam, mu))
+    put(held, taken, replace(fresh, mu=mu))
     s.X, s.U = s.X.clone(), s.U.clone()
     s.X[place], s.U[place] = X, U
     return held

@@ -86,8 +86,8 @@ class Advice:
     guide: GuideRegion  # penalty of the next inner solve
     U: Tensor  # (B', N, m): controls to go on from
     taken: Tensor  # (B',) bool: where U replaces the iterate
-    # (B',): mu to go on with where U is taken, to be left alone until the attempt ends; NaN, None: the solver's own.
-    penalty: Tensor | None = None
+    # To go on with where U is taken, and left alone until the attempt ends; NaN in mu, or None: the solver's own.
+    duals: Multipliers | None = None
 
 
 class Guidance(Protocol):

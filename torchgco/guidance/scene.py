@@ -1,0 +1,80 @@
+"""What the geometric proposal sees of a problem: where it begins and ends, the spheres between, and their scales."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.guidance.roadmap import FAR, Scene
+from torchgco.problem import Problem
+from torchgco.rollout import open_loop
+from torchgco.shapes import InputError
+
+THERE = 0.25  # share of the distance from start to goal; a path that ends farther from it has fallen back
+
+
+def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
+    """Start, goal and spheres, with what it costs to be at a point under the controls `rest` (B, N, m).
+
+    None where there are no spheres, or other obstacles too, or they move.
+    """
+    spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres) and c.velocities is None]
+    goal = problem.cost.goal(problem.x0)
+    if not spheres or len(spheres) < len(problem.geometric) or goal is None:
+        return None
+    at = position(problem)
+
+    def toll(points: Tensor, rows: Tensor) -> Tensor:
+        part = problem.take(rows)
+        price, first = (_resting_cost(part, rest[rows], p) for p in (points, part.x0[:, None, at]))
+        return price.clamp(min=0.0) / first.clamp(min=1e-12) + 0.1
+
+    return Scene(
+        problem.x0[:, at], goal[:, at],
+        torch.cat([c.centers for c in spheres], dim=1),
+        torch.cat([torch.where(c.absent, FAR, c.distances) for c in spheres], dim=1),
+        toll,
+    )  # fmt: skip
+
+
+def scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """R and q0 / R^4 (B,), the units of lengths and penalties."""
+    here = scene.distances > 0
+    R = torch.where(here, scene.distances, 0.0).sum(-1) / here.sum(-1).clamp(min=1)
+    return R, _resting_cost(problem, rest, scene.start.unsqueeze(1))[:, 0] / R.pow(4)
+
+
+def position(problem: Problem) -> slice:
+    """Where the position stands in the state.
+
+    Raises:
+        InputError: dynamics without one.
+    """
+    where = problem.dynamics.position
+    if where is None:
+        raise InputError("guidance", "dynamics with a position", type(problem.dynamics).__name__)
+    return where
+
+
+def arrives(problem: Problem, U: Tensor) -> Tensor:
+    """Whether controls end close to the goal, (B,)."""
+    goal = problem.cost.goal(problem.x0)
+    assert goal is not None
+    X = open_loop(problem.dynamics, problem.x0, U)
+    last, first = ((x - goal)[:, position(problem)].square().sum(-1) for x in (X[:, -1], problem.x0))
+    return last <= THERE**2 * first
+
+
+def depth(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """How deep a path reaches into an obstacle, (B,), m."""
+    rows = [c.violation(X, U).flatten(1).amax(-1) for c in problem.geometric]
+    return torch.stack(rows).amax(0)
+
+
+def _resting_cost(problem: Problem, rest: Tensor, points: Tensor) -> Tensor:
+    """Stage cost (B, V) of resting at points (B, V, d)."""
+    x = problem.x0.unsqueeze(1).repeat(1, points.shape[1], 1)
+    x[..., position(problem)] = points
+    u = rest[:, :1].expand(-1, points.shape[1], -1)
+    return problem.cost.stage(x, u, 0)
