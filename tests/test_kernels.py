@@ -8,6 +8,7 @@ from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian
 from torchgco.draws import DrawKey
 from torchgco.kernels import compile_kernels, compiling, kernel
 from torchgco.rollout import closed_loop, open_loop
+from torchgco.solvers.riccati import _fused_stage, _stage, backward
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
 
@@ -43,6 +44,34 @@ def test_compiled_kernels_equal_eager_ones(batch: str, compiled) -> None:
         torch.testing.assert_close(fused, eager, rtol=1e-6, atol=1e-6)
     for fused, eager in zip(results[0][:6], results[1][:6], strict=True):
         torch.testing.assert_close(fused, eager, rtol=1e-12, atol=1e-12)
+
+
+def test_the_fused_stage_of_the_backward_pass_equals_the_plain_one() -> None:
+    """As it stands, before any compiling: in elements with mu_r, without, and where the pivots turn negative."""
+    A = torch.randn(6, 9, 9, generator=torch.Generator().manual_seed(3)).double()
+    Q = A @ A.mT + torch.eye(9)
+    Q[5] -= 40.0 * torch.eye(9)
+    mu, G = torch.tensor([0.0, 0.5, 0.0, 3.0, 0.0, 0.0]).double(), torch.empty(6, 2, 7).double()
+    gains, *fused = _fused_stage(Q, mu, G)
+    plain = _stage(Q, mu, True, torch.empty(6, 2, 9).double(), G)
+    for one, other in zip((gains, *fused), (G, *plain), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+    assert (plain[-1] > 0).tolist() == [True] * 5 + [False]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_compiled_backward_pass_equals_the_eager_one(compiled) -> None:
+    draw = torch.Generator().manual_seed(1)
+    for B in (5, 3):
+        F = 0.3 * torch.randn(6, B, 5, 7, generator=draw).double()
+        A = torch.randn(7, B, 7, 7, generator=draw).double()
+        H, mu = A @ A.mT + torch.eye(7), torch.linspace(0.0, 1.0, B).double()
+        compile_kernels(True)
+        fused = backward(F, H, mu)
+        compile_kernels(False)
+        for one, other in zip(fused, backward(F, H, mu), strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.slow

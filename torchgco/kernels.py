@@ -33,8 +33,11 @@ def compiling() -> bool:
     return _Switch.on
 
 
-def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """A function that is compiled once its process compiles kernels; eager where no compiler is found."""
+def kernel(function: Callable[P, R], dynamic: bool | None = True) -> Callable[P, R]:
+    """A function that is compiled once its process compiles kernels; eager where no compiler is found.
+
+    `dynamic` is torch.compile's: True compiles once for all sizes, None takes those for fixed that never change.
+    """
     compiled: Any = None
 
     @functools.wraps(function)
@@ -45,7 +48,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
         from torch._dynamo.exc import BackendCompilerFailed  # loaded by those who compile
 
         if compiled is None:
-            compiled = torch.compile(function, dynamic=True)
+            compiled = torch.compile(function, dynamic=dynamic)
         try:
             return compiled(*args, **kwargs)
         except BackendCompilerFailed as error:  # no C++ compiler, or none that works

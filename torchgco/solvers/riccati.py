@@ -8,10 +8,13 @@ Then V = Qzz + Quz' G - mu_r G'G, which is the general value recursion.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from torchgco.kernels import compiling, kernel
 
 
 class BackwardPass(NamedTuple):
@@ -32,35 +35,65 @@ def backward(F: Tensor, H: Tensor, regularisation: Tensor) -> BackwardPass:
         F: (N, B, n+1, s) dynamics, H: (N+1, B, s, s) quadratic model, regularisation: mu_r (B,).
     """
     N, B, z, s = F.shape
-    n, m = z - 1, s - z
-    mu = regularisation.view(B, 1, 1)
-    any_mu = bool((regularisation > 0).any())
-    gains = F.new_empty(N, B, m, z)
+    gains = F.new_empty(N, B, s - z, z)
     linear, quadratic = F.new_zeros(B), F.new_zeros(B)
     lowest = torch.full_like(linear, torch.inf)
-    VF, Q, T = F.new_empty(B, z, s), F.new_empty(B, s, s), F.new_empty(B, m, s)
+    VF, Q, T = F.new_empty(B, z, s), F.new_empty(B, s, s), F.new_empty(B, s - z, s)
+    any_mu, fused = bool((regularisation > 0).any()), compiling()
     V = H[N, :, :z, :z]
     for k in range(N - 1, -1, -1):
         # Written into the same memory at every stage: fresh pages would cost as much as the products.
         torch.bmm(V, F[k], out=VF)
         torch.baddbmm(H[k], F[k].mT, VF, out=Q)
-        T.copy_(Q[:, z:])
-        if any_mu:
-            T.diagonal(offset=z, dim1=-2, dim2=-1).add_(regularisation.unsqueeze(-1))
-        lowest = torch.minimum(lowest, _eliminate(T, z))
-        G = torch.neg(T[..., :z], out=gains[k])
-        Quz = Q[:, z:, :z]
-        V = torch.baddbmm(Q[:, :z, :z], Quz.mT, G)
-        d = G[..., n]
-        change = (Quz[..., n] * d).sum(-1)
-        linear += change
-        quadratic -= change
-        if any_mu:
-            # Elements with mu_r = 0 subtract an exact zero: their bits don't depend on who else is regularised.
-            V -= mu * torch.bmm(G.mT, G)
-            quadratic -= mu[:, 0, 0] * d.square().sum(-1)
-        V = (V + V.mT).mul_(0.5)
+        if fused:
+            gains[k], V, slope, curvature, pivot = _fused_stage(Q, regularisation, gains[k])
+        else:
+            V, slope, curvature, pivot = _stage(Q, regularisation, any_mu, T, gains[k])
+        linear += slope
+        quadratic += curvature
+        lowest = torch.minimum(lowest, pivot)
     return BackwardPass(gains, linear, quadratic, ~(lowest > 0))
+
+
+def _stage(Q: Tensor, mu: Tensor, any_mu: bool, T: Tensor, G: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """From Q (B, s, s) of a stage its gains, written to G (B, m, z), and V, Qu'd, d'Quu d and the smallest pivot."""
+    z, n = G.shape[-1], G.shape[-1] - 1
+    T.copy_(Q[:, z:])
+    if any_mu:
+        T.diagonal(offset=z, dim1=-2, dim2=-1).add_(mu.unsqueeze(-1))
+    pivot = _eliminate(T, z)
+    torch.neg(T[..., :z], out=G)
+    Quz, d = Q[:, z:, :z], G[..., n]
+    V = torch.baddbmm(Q[:, :z, :z], Quz.mT, G)
+    slope = (Quz[..., n] * d).sum(-1)
+    curvature = -slope
+    if any_mu:
+        # Elements with mu_r = 0 subtract an exact zero: their bits don't depend on who else is regularised.
+        V -= mu.view(-1, 1, 1) * torch.bmm(G.mT, G)
+        curvature = curvature - mu * d.square().sum(-1)
+    return (V + V.mT).mul_(0.5), slope, curvature, pivot
+
+
+@partial(kernel, dynamic=None)
+def _fused_stage(Q: Tensor, mu: Tensor, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The same in the form that compiles into few kernels, the gains first; `like` (B, m, z) tells their shape."""
+    m, z = like.shape[1:]
+    quu = [[Q[:, z + i, z + j] + (mu if i == j else 0.0) for j in range(m)] for i in range(m)]
+    quz, pivots = [Q[:, z + i, :z] for i in range(m)], []
+    for j in range(m):
+        pivots.append(quu[j][j])
+        quz[j], quu[j] = quz[j] / pivots[j].unsqueeze(-1), [entry / pivots[j] for entry in quu[j]]
+        for i in range(m):
+            if i != j:
+                quz[i] = quz[i] - quu[i][j].unsqueeze(-1) * quz[j]
+                quu[i] = [a - quu[i][j] * b for a, b in zip(quu[i], quu[j], strict=True)]
+    G = -torch.stack(quz, dim=1)
+    d, Quz, V = G[..., z - 1], Q[:, z:, :z], Q[:, :z, :z]
+    for i in range(m):
+        V = V + (Quz[:, i] - mu.unsqueeze(-1) * G[:, i]).unsqueeze(-1) * G[:, i].unsqueeze(-2)
+    slope = (Quz[..., z - 1] * d).sum(-1)
+    curvature = -slope - mu * d.square().sum(-1)
+    return G, 0.5 * (V + V.mT), slope, curvature, torch.stack(pivots).amin(0)
 
 
 def _eliminate(T: Tensor, z: int) -> Tensor:
