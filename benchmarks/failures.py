@@ -1,0 +1,201 @@
+"""python -m benchmarks.failures: why the paper's guidance fails where it does, counted, with one picture a cause.
+
+`gco_paper` flies the public layouts while a witness notes, after every inner solve, what guidance saw and what it
+answered. Every layout whose goal isn't reached gets one cause, told from its last outer iterations; the table and the
+pictures go to benchmarks/failures.md and failures.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from benchmarks.failures_picture import Example, picture
+from benchmarks.families import FAMILIES, Family
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.tables import put_between
+from torchgco import compose, judge
+from torchgco.draws import DrawKey
+from torchgco.guidance.detection import active_counts, caught_knots
+from torchgco.guidance.gco import GCO
+from torchgco.lagrangian import violation
+from torchgco.problem import Problem
+
+HERE = Path(__file__).resolve().parent
+LAST = 3  # outer iterations that tell the cause
+CAUSES = {
+    "thrown away": "the penalty has outgrown the model: the last iterate costs over five times the first",
+    "one sphere": "caught dead-centre on one sphere: it violates, but J stays empty and guidance silent",
+    "waits": "feasible, free of contact, and stopped in front: waiting is cheaper than the way around",
+    "noise too weak": "the plan lies within half a sphere's radius of the caught path",
+    "guide infeasible": "the plan itself touches obstacles where it is to guide",
+    "guide stops": "the plan ends farther from the goal than a quarter of the way: it stops before the obstacle",
+    "guide changes": "plans of successive outer iterations lie over a sphere's radius apart",
+    "other class": "plan and path pass a sphere on different sides: the guide draws through it",
+    "not in time": "none of these: the guide is good and stays, and the limits end the solve",
+}
+
+
+@dataclass
+class Witness:
+    """Guidance that notes what passes through it, and changes nothing. It is its own sampler's witness, too."""
+
+    guidance: GCO
+    rows: list[pd.DataFrame] = field(default_factory=list)
+    last: dict[int, Tensor] = field(default_factory=dict)  # of a layout: path and plan (2, N+1, d), when last caught
+    plan: tuple[Tensor, Tensor] | None = None  # ids and plans of the last call of the sampler
+
+    def start(self, problem: Problem, X: Tensor) -> Any:
+        return self.guidance.start(problem, X)
+
+    def takes_long(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
+        return self.guidance.takes_long(problem, X, U, key)
+
+    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: Any, key: DrawKey) -> Any:
+        self.plan = None
+        advice = replace(self.guidance, sampler=_Listening(self.guidance.sampler, self)).update(
+            problem, X, U, guide, key
+        )
+        self._note(problem, X, U, key)
+        return advice
+
+    def _note(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> None:
+        caught = caught_knots(problem, X, U)
+        at = problem.dynamics.position
+        frame = {
+            "id": key.ids, "outer": key.outer, "cost": problem.cost.total(X, U),
+            "violation": violation(problem, X, U), "caught": caught.any(-1),
+        }  # fmt: skip
+        for name in ("near", "deep", "ends", "moved", "crosses"):
+            frame[name] = torch.full_like(frame["cost"], torch.nan)
+        if self.plan is not None:
+            ids, plans = self.plan
+            for i, plan in zip(ids.tolist(), plans, strict=True):
+                row = int((key.ids == i).nonzero())
+                path, part = X[row, :, at], problem.take(torch.tensor([row]))
+                frame["near"][row] = (plan[:, at] - path)[caught[row]].norm(dim=-1).mean()
+                hits = active_counts(part, plan[None], U[row : row + 1])[0] > 0
+                frame["deep"][row] = float((hits & caught[row]).any())
+                goal = part.cost.goal(part.x0)[0, at]
+                frame["ends"][row] = (plan[-1, at] - goal).norm() / (part.x0[0, at] - goal).norm()
+                if i in self.last:
+                    frame["moved"][row] = (plan[:, at] - self.last[i][1]).norm(dim=-1).mean()
+                frame["crosses"][row] = float(_crosses(part, path, plan[:, at]))
+                self.last[i] = torch.stack((path, plan[:, at])).clone()
+        self.rows.append(pd.DataFrame({name: value.numpy() for name, value in frame.items()}))
+
+
+@dataclass(frozen=True)
+class _Listening:
+    """The sampler, overheard."""
+
+    sampler: Any
+    witness: Witness
+
+    def improve(self, problem: Problem, U: Tensor, key: DrawKey) -> tuple[Tensor, Tensor]:
+        X, plan = self.sampler.improve(problem, U, key)
+        self.witness.plan = (key.ids, X)
+        return X, plan
+
+
+def _crosses(problem: Problem, path: Tensor, plan: Tensor) -> bool:
+    """Whether the band between path and plan (N+1, d) sweeps over the middle of a sphere."""
+    spheres = problem.geometric[0]
+    along = plan - path
+    toward = spheres.centers[0].unsqueeze(1) - path
+    share = (toward * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
+    off = (toward - share.unsqueeze(-1) * along).norm(dim=-1)
+    return bool(((share > 0) & (share < 1) & (off < 0.25 * spheres.distances[0].unsqueeze(1))).any())
+
+
+def cause(history: pd.DataFrame, feasible: bool, R: float) -> str:
+    """Of one layout that wasn't reached, from the notes of its outer iterations; R the mean r_obs + r_veh, m."""
+    last = history.tail(LAST)
+    if last.cost.iloc[-1] > 5 * history.cost.iloc[0] or not np.isfinite(last.cost.iloc[-1]):
+        return "thrown away"
+    if not last.caught.any():
+        return "waits" if feasible and last.violation.iloc[-1] <= 1e-3 else "one sphere"
+    caught = last[last.caught]
+    tests = {
+        "noise too weak": (caught.near < 0.5 * R).mean(),
+        "guide infeasible": caught.deep.mean(),
+        "guide stops": (caught.ends > 0.25).mean(),
+        "guide changes": (caught.moved > R).mean(),
+        "other class": caught.crosses.mean(),
+    }
+    return next((name for name, share in tests.items() if share > 0.5), "not in time")
+
+
+def fly(family: Family, count: int, seed: int) -> tuple[pd.DataFrame, dict[str, Example]]:
+    """A row for each layout with its cause, and an example of every cause."""
+    setup = compose([*family.overrides(seed=seed), "solver=gco_paper", "device.threads=1"])
+    task = setup.task(setup.layouts(count))
+    witness = Witness(setup.solver.guidance)
+    solver = replace(setup.solver, guidance=witness)
+    solution = solver.solve(task.problem, task.U0, seed=seed)
+    verdict = judge(task.problem, solution.U, task.goal, task.goal_radius)
+    notes, spheres = pd.concat(witness.rows).sort_values("outer"), task.problem.geometric[0]
+    rows, examples = [], {}
+    for i in range(task.problem.B):
+        name, distances = None, spheres.distances[i]
+        if not verdict.reached[i]:
+            R = float(distances[distances > 0].mean())
+            name = cause(notes[notes.id == i], bool(verdict.feasible[i]), R)
+            path = solution.X[i, :, task.problem.dynamics.position]
+            plan = witness.last[i][1] if i in witness.last else None
+            goal = task.problem.cost.goal(task.problem.x0)[i, task.problem.dynamics.position]
+            examples.setdefault(name, Example(family.name, i, spheres.centers[i], distances, path, plan, goal))
+        rows.append({"family": family.name, "layout": i, "cause": name, "reached": bool(verdict.reached[i])})
+    return pd.DataFrame(rows), examples
+
+
+def table(trials: pd.DataFrame) -> str:
+    """Markdown: a row for each cause with its count in every family."""
+    families = list(dict.fromkeys(trials.family))
+    counts = pd.crosstab(trials.cause, trials.family).reindex(list(CAUSES), fill_value=0)
+    lines = [f"| cause | what it means | {' | '.join(families)} |", "|---" * (2 + len(families)) + "|"]
+    for name, meaning in CAUSES.items():
+        cells = " | ".join(str(counts.loc[name].get(family, 0)) for family in families)
+        lines.append(f"| {name} | {meaning} | {cells} |")
+    flown = trials.groupby("family").reached
+    missed = " | ".join(f"{(~flown.get_group(f)).sum()} of {flown.get_group(f).size}" for f in families)
+    return "\n".join([*lines, f"| **not reached** | | {missed} |"])
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.failures", description="Sort the failures of gco_paper."
+    )
+    parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(FAMILIES), metavar="NAME")
+    parser.add_argument("--first", type=int, default=32, help="so many layouts of each family")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--outputs", type=Path, default=HERE)
+    asked = parser.parse_args(words)
+    parts, examples = [], {}
+    for name in asked.families:
+        trials, found = fly(FAMILIES[name], asked.first, asked.seed)
+        parts.append(trials)
+        examples = {**found, **examples}
+        print(table(pd.concat(parts)), flush=True)
+    origin = provenance("cpu")
+    head = (
+        f"`gco_paper` on {origin['date']} at commit {origin['commit']}, seed {asked.seed}, the first {asked.first} "
+        "layouts of each family."
+    )
+    marks = "<!-- failures -->", "<!-- end failures -->"
+    put_between(asked.outputs / "failures.md", *marks, f"{head}\n\n{table(pd.concat(parts))}")
+    picture({name: examples[name] for name in CAUSES if name in examples}, asked.outputs / "failures.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

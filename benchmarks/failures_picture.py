@@ -1,0 +1,49 @@
+"""The pictures of failures.md: one layout for every cause, seen from above."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from torch import Tensor
+
+from torchgco.plotting.style import FAINT, INK, PALETTE, legend, panels, save, tidy
+
+PATH, PLAN = PALETTE[0], PALETTE[1]
+
+
+@dataclass(frozen=True)
+class Example:
+    """One layout that wasn't reached; lengths in metres."""
+
+    family: str
+    layout: int
+    centers: Tensor  # (M, d)
+    distances: Tensor  # (M,) r_obs + r_veh
+    path: Tensor  # (N+1, d): what was returned
+    plan: Tensor | None  # (N+1, d): the last sampled plan, where there was one
+    goal: Tensor  # (d,)
+
+
+def picture(examples: dict[str, Example], file: Path) -> Path:
+    """A panel for every cause."""
+    figure, axes = panels(len(examples), 3, (3.4, 2.2))
+    for ax, (cause, example) in zip(axes, examples.items(), strict=True):
+        for center, distance in zip(example.centers, example.distances, strict=True):
+            if distance > 0:
+                ax.add_patch(Circle(center[:2].tolist(), float(distance), facecolor="#E4DFD4", edgecolor=FAINT, lw=0.5))
+        if example.plan is not None:
+            ax.plot(*example.plan[:, :2].T, color=PLAN, linewidth=1.2)
+        ax.plot(*example.path[:, :2].T, color=PATH, linewidth=1.5)
+        ax.plot(*example.goal[:2], marker="*", color=INK, markersize=8, linestyle="")
+        ax.set_aspect("equal")
+        tidy(ax, f"{cause}: {example.family}, {example.layout}", grid=None)
+    handles = [
+        Line2D([], [], color=PATH, label="path returned"),
+        Line2D([], [], color=PLAN, label="last sampled plan"),
+        Line2D([], [], color=INK, marker="*", linestyle="", label="goal"),
+    ]
+    legend(figure, handles)
+    return save(figure, file)
