@@ -13,6 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
+VARIANTS = 32  # of a kernel that may be compiled: one for each precision, each for no, one and many problems, and so on
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -48,6 +49,8 @@ def kernel(function: Callable[P, R], dynamic: bool | None = True) -> Callable[P,
         from torch._dynamo.exc import BackendCompilerFailed  # loaded by those who compile
 
         if compiled is None:
+            # Over its own limit torch would run further variants eagerly, with a warning that nobody reads.
+            torch._dynamo.config.recompile_limit = max(VARIANTS, torch._dynamo.config.recompile_limit)
             compiled = torch.compile(function, dynamic=dynamic)
         try:
             return compiled(*args, **kwargs)

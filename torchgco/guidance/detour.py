@@ -82,7 +82,7 @@ class Detour:
         stiffness: one solve after the other, how strongly tube or spring draws, in q0 / L^2.
         obstacle_penalty: of the spheres meanwhile, in q0 / R^4.
         hold: penalty that the solver is to go on with, in q0 / R^4.
-        tolerance: a solve ends where the penalised cost changes by less.
+        tolerance: a solve ends where the penalised cost changes by less; one of a finalist at a tenth of it.
         iterations: of each solve, at most.
         settle: iterations that nothing draws, at most, after which the ways are compared; 0 compares them as followed.
         depth: how far into an obstacle a settled path may reach, as a share of R; one that lies deeper is refused.
@@ -191,10 +191,10 @@ class Detour:
         if rows.numel() == 0:
             return plans, sound, duals, order
         part, warm = plans.problem.take(rows), take(duals, rows)
+        inner = replace(self._inner(self.iterations), tolerance=0.1 * self.tolerance)
         solver = AugmentedLagrangian(
-            self._inner(self.iterations), max_outer_iterations=20, cost_tolerance=1e-3, grow_when_feasible=False,
-            clip=True,
-        )  # fmt: skip
+            inner, max_outer_iterations=20, cost_tolerance=1e-3, grow_when_feasible=False, clip=True
+        )
         end = solver.solve(part, plans.U[rows], warm=warm)
         good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.U)
         U, cost = plans.U.clone(), torch.full_like(plans.unit, torch.inf)
