@@ -236,6 +236,8 @@ def test_paths_that_are_alike_count_once() -> None:
     first = torch.ones(3, dtype=torch.bool)
     assert QUICK._order(plans, first).tolist() == [[0, 1, 2]]
     assert QUICK._order(plans, first, alike=1e-3).tolist() == [[0, 2, 1]]
+    first[0] = False  # what isn't sound stands for nobody
+    assert QUICK._order(plans, first, alike=1e-3).tolist() == [[1, 2, 0]]
 
 
 def test_a_plan_with_its_own_penalty_is_left_alone() -> None:

@@ -3,9 +3,10 @@
 A way says where to pass; iLQR finds the controls that follow it, drawn to a point, or into a narrow tube, that travels
 along it slowly enough for the vehicle to turn. Then nothing draws any more, and the path settles beside the obstacles
 that it has come around. The shortest way is often not the cheapest to fly: several are followed, and the one that
-settles best is handed over. It need not be quite free of contact: it is where the solver goes on from, with a penalty
-that keeps it on this side of every obstacle. One that lies deep within obstacles is handed over to nobody: the solver
-would spend a whole attempt on squeezing it out.
+settles best is handed over, or the one of the best few that is cheapest when it is solved to its end. It need not be
+quite free of contact: it is where the solver goes on from, with a penalty that keeps it on this side of every obstacle.
+One that lies deep within obstacles is handed over to nobody: the solver would spend a whole attempt on squeezing it
+out.
 """
 
 from __future__ import annotations
@@ -157,7 +158,7 @@ class Detour:
         best = self._order(plans, seen.arrives(plans.problem, plans.U))
         plans = plans.pick(best[:, : self.ways if self.keep is None else self.keep])
         plans, sound = self._settle(plans)
-        plans, sound, duals, order = self._refine(plans, sound, self._order(plans, sound, alike=ALIKE))
+        plans, duals, order = self._refine(plans, sound, self._order(plans, sound, alike=ALIKE))
         chosen = plans.rows(order.gather(1, rank.clamp(max=plans.count - 1).unsqueeze(-1)))[:, 0]
         return Proposal(plans.U[chosen], found & (rank < plans.count) & sound[chosen], take(duals, chosen))
 
@@ -180,16 +181,19 @@ class Detour:
         X = open_loop(problem.dynamics, problem.x0, plans.U)
         return plans, seen.arrives(problem, plans.U) & (seen.depth(problem, X, plans.U) <= self.depth * plans.R)
 
-    def _refine(self, plans: Plans, sound: Tensor, order: Tensor) -> tuple[Plans, Tensor, Multipliers, Tensor]:
-        """The first in the order (B, count) are solved to their end, and ordered anew by what they cost there."""
+    def _refine(self, plans: Plans, sound: Tensor, order: Tensor) -> tuple[Plans, Multipliers, Tensor]:
+        """The first sound ones in the order (B, count) are solved to their end, and ordered anew by their costs there.
+
+        Returns the plans, what each is to go on with, and their order.
+        """
         duals = plans.duals(self.hold)
         last = min(self.finalists, plans.count)
         if last == 1:
-            return plans, sound, duals, order
+            return plans, duals, order
         rows = plans.rows(order[:, :last]).flatten()
         rows = rows[sound[rows]]
         if rows.numel() == 0:
-            return plans, sound, duals, order
+            return plans, duals, order
         part, warm = plans.problem.take(rows), take(duals, rows)
         inner = replace(self._inner(self.iterations), tolerance=0.1 * self.tolerance)
         solver = AugmentedLagrangian(
@@ -203,7 +207,7 @@ class Detour:
         put(duals, won, take(end.multipliers, good.nonzero().flatten()))
         best = cost.view(-1, plans.count).gather(1, order[:, :last]).argsort(dim=-1, stable=True)
         order = torch.cat((order[:, :last].gather(1, best), order[:, last:]), dim=1)
-        return replace(plans, U=U), sound, duals, order
+        return replace(plans, U=U), duals, order
 
     def _solved(self, plans: Plans, iterations: int, duals: Multipliers, guide: Guide | None = None) -> Tensor:
         """Controls after one inner solve of every plan."""
@@ -217,16 +221,20 @@ class Detour:
     def _order(self, plans: Plans, first: Tensor, alike: float | None = None) -> Tensor:
         """Each problem's plans as places in their order, (B, count).
 
-        Those in `first` come before the others; then the penalised cost decides, and of those that are alike all but
-        the cheapest come last.
+        Those in `first` come before the others; then the penalised cost decides. Of those in `first` that are alike
+        all but the cheapest are put behind.
         """
         X = open_loop(plans.problem.dynamics, plans.problem.x0, plans.U)
         merit = Lagrangian(plans.problem, plans.duals(self.hold), None, True).value(X, plans.U)[1]
         merit, order = merit.nan_to_num(torch.inf).view(-1, plans.count).sort(dim=-1, stable=True)
         later = (~first).view(-1, plans.count).gather(1, order).to(torch.int8)
+        later, again = later.sort(dim=-1, stable=True)
+        merit, order = merit.gather(1, again), order.gather(1, again)
         if alike is not None:
-            later[:, 1:] += (merit[:, 1:] - merit[:, :-1] <= alike * merit[:, :-1].abs()).to(torch.int8)
-        return order.gather(1, later.argsort(dim=-1, stable=True))
+            same = merit[:, 1:] - merit[:, :-1] <= alike * merit[:, :-1].abs()
+            later[:, 1:] += same & (later[:, 1:] == 0)
+            order = order.gather(1, later.argsort(dim=-1, stable=True))
+        return order
 
     def _guide(self, problem: Problem, way: Tensor, R: Tensor, stiffness: Tensor) -> Guide:
         """What draws along the way; stiffness (B,) in units of q0 / (R^4 L^2)."""
