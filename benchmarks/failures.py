@@ -34,7 +34,7 @@ HERE = Path(__file__).resolve().parent
 LAST = 3  # outer iterations that tell the cause
 CAUSES = {
     "thrown away": "the penalty has outgrown the model: the last iterate costs over five times the first",
-    "one sphere": "caught dead-centre on one sphere: it violates, but J stays empty and guidance silent",
+    "silent": "spheres are touched, but no two at a knot: J is empty, guidance silent (dead-centre, or spoilt before)",
     "waits": "feasible, free of contact, and stopped in front: waiting is cheaper than the way around",
     "noise too weak": "the plan lies within half a sphere's radius of the caught path",
     "guide infeasible": "the plan itself touches obstacles where it is to guide",
@@ -123,7 +123,7 @@ def cause(history: pd.DataFrame, feasible: bool, R: float) -> str:
     if last.cost.iloc[-1] > 5 * history.cost.iloc[0] or not np.isfinite(last.cost.iloc[-1]):
         return "thrown away"
     if not last.caught.any():
-        return "waits" if feasible and last.violation.iloc[-1] <= 1e-3 else "one sphere"
+        return "waits" if feasible and last.violation.iloc[-1] <= 1e-3 else "silent"
     caught = last[last.caught]
     tests = {
         "noise too weak": (caught.near < 0.5 * R).mean(),

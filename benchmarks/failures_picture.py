@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from torch import Tensor
@@ -27,9 +29,21 @@ class Example:
     goal: Tensor  # (d,)
 
 
+def _frame(ax: Axes, example: Example) -> None:
+    """Start, goal and obstacles with some room: a plan that flies off is cut."""
+    here = example.distances > 0
+    reach = example.distances[here].unsqueeze(-1)
+    centers = example.centers[here, :2]
+    points = torch.cat((centers - reach, centers + reach, example.path[:1, :2], example.goal[None, :2]))
+    low, high = points.amin(0), points.amax(0)
+    room = 0.12 * float((high - low).max())
+    ax.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+    ax.set_aspect("equal")
+
+
 def picture(examples: dict[str, Example], file: Path) -> Path:
     """A panel for every cause."""
-    figure, axes = panels(len(examples), 3, (3.4, 2.2))
+    figure, axes = panels(len(examples), 2, (4.2, 2.2))
     for ax, (cause, example) in zip(axes, examples.items(), strict=True):
         for center, distance in zip(example.centers, example.distances, strict=True):
             if distance > 0:
@@ -38,7 +52,7 @@ def picture(examples: dict[str, Example], file: Path) -> Path:
             ax.plot(*example.plan[:, :2].T, color=PLAN, linewidth=1.2)
         ax.plot(*example.path[:, :2].T, color=PATH, linewidth=1.5)
         ax.plot(*example.goal[:2], marker="*", color=INK, markersize=8, linestyle="")
-        ax.set_aspect("equal")
+        _frame(ax, example)
         tidy(ax, f"{cause}: {example.family}, {example.layout}", grid=None)
     handles = [
         Line2D([], [], color=PATH, label="path returned"),

@@ -197,6 +197,22 @@ def test_a_plan_deep_within_an_obstacle_is_refused() -> None:
     assert float(problem.constraints[0].violation(X, plans[1].U).max()) > 1e-4 * 0.2
 
 
+def test_where_a_plan_is_refused_the_sampled_one_is_held_by_its_penalty() -> None:
+    problem = cup(B=2)
+    guidance = GCO(
+        detour=replace(QUICK, depth=1e-4), sampler=MPPI(samples=64, knots=4, linger=1.0), adopt=True, patience=0
+    )
+    X = problem.x0[:, None].repeat(1, 101, 1)
+    X[:, 5:, :2] = torch.as_tensor(problem.geometric[0].centers[:, :1])  # in a disc: caught, at this patience
+    key = DrawKey(0, torch.arange(2), torch.ones(2, dtype=torch.int64))
+    advice = guidance.update(problem, X, controls(problem), guidance.start(problem, X), key)
+    refused = guidance.detour.propose(problem)
+    assert not bool(refused.found.any()) and bool(advice.taken.all())
+    assert torch.equal(advice.duals.mu, refused.duals.mu) and not bool(advice.duals.mu.isnan().any())
+    nowhere = QUICK.propose(cup(closed=True))
+    assert bool(nowhere.duals.mu.isnan().all())
+
+
 def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
     problem, off = cup(B=1, N=120), []
     for tube, stiffness in ((0.05, 20.0), (None, 500.0)):

@@ -38,7 +38,9 @@ class Proposal(NamedTuple):
 
     U: Tensor  # (B, N, m)
     found: Tensor  # (B,) bool: whether there is a way; where not, U means nothing
-    duals: Multipliers  # to go on with: a penalty that keeps the solver from falling back
+    # To go on with: a penalty that keeps the solver from falling back, also onto another plan where this one is refused;
+    # NaN where there is no way at all.
+    duals: Multipliers
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,9 @@ class Detour:
         plans, sound = self._settle(plans)
         plans, duals, order = self._refine(plans, sound, self._order(plans, sound, alike=ALIKE))
         chosen = plans.rows(order.gather(1, rank.clamp(max=plans.count - 1).unsqueeze(-1)))[:, 0]
-        return Proposal(plans.U[chosen], found & (rank < plans.count) & sound[chosen], take(duals, chosen))
+        duals = take(duals, chosen)
+        duals = replace(duals, mu=torch.where(found, duals.mu, torch.nan))
+        return Proposal(plans.U[chosen], found & (rank < plans.count) & sound[chosen], duals)
 
     def _follow(self, plans: Plans, way: Tensor) -> Plans:
         """Each plan a way's."""

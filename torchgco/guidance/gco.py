@@ -92,7 +92,7 @@ class GCO:
             if turn.numel() > 0:
                 plan[turn], taken[turn], given = self.detour.propose(problem.take(turn), rank[turn])
                 duals = Multipliers.zero(problem, torch.nan)
-                put(duals, turn[taken[turn]], take(given, taken[turn].nonzero().flatten()))
+                put(duals, turn, given)
         rows = (caught & ~taken).nonzero().flatten()
         if rows.numel() > 0:
             part = problem.take(rows)
