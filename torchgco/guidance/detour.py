@@ -38,8 +38,8 @@ class Proposal(NamedTuple):
 
     U: Tensor  # (B, N, m)
     found: Tensor  # (B,) bool: whether there is a way; where not, U means nothing
-    # To go on with: a penalty that keeps the solver from falling back, also onto another plan where this one is refused;
-    # NaN where there is no way at all.
+    # To go on with: a penalty that keeps the solver from falling back, also with another plan where this one is
+    # refused; NaN where there is no way at all.
     duals: Multipliers
 
 
