@@ -51,7 +51,7 @@ class Witness:
 
     guidance: GCO
     rows: list[pd.DataFrame] = field(default_factory=list)
-    last: dict[int, Tensor] = field(default_factory=dict)  # of a layout: path and plan (2, N+1, d), when last caught
+    last: dict[int, Tensor] = field(default_factory=dict)  # of a layout: the plan (N+1, d) when last caught
     plan: tuple[Tensor, Tensor] | None = None  # ids and plans of the last call of the sampler
 
     def start(self, problem: Problem, X: Tensor) -> Any:
@@ -88,9 +88,9 @@ class Witness:
                 goal = part.cost.goal(part.x0)[0, at]
                 frame["ends"][row] = (plan[-1, at] - goal).norm() / (part.x0[0, at] - goal).norm()
                 if i in self.last:
-                    frame["moved"][row] = (plan[:, at] - self.last[i][1]).norm(dim=-1).mean()
+                    frame["moved"][row] = (plan[:, at] - self.last[i]).norm(dim=-1).mean()
                 frame["crosses"][row] = float(_crosses(part, path, plan[:, at]))
-                self.last[i] = torch.stack((path, plan[:, at])).clone()
+                self.last[i] = plan[:, at].clone()
         self.rows.append(pd.DataFrame({name: value.numpy() for name, value in frame.items()}))
 
 
@@ -151,7 +151,7 @@ def fly(family: Family, count: int, seed: int) -> tuple[pd.DataFrame, dict[str, 
             R = float(distances[distances > 0].mean())
             name = cause(notes[notes.id == i], bool(verdict.feasible[i]), R)
             path = solution.X[i, :, task.problem.dynamics.position]
-            plan = witness.last[i][1] if i in witness.last else None
+            plan = witness.last.get(i)
             goal = task.problem.cost.goal(task.problem.x0)[i, task.problem.dynamics.position]
             examples.setdefault(name, Example(family.name, i, spheres.centers[i], distances, path, plan, goal))
         rows.append({"family": family.name, "layout": i, "cause": name, "reached": bool(verdict.reached[i])})

@@ -14,6 +14,7 @@ from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.detour import Detour
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
+from torchgco.guidance.scene import position
 from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, put, take
@@ -68,10 +69,8 @@ class GCO:
 
     def start(self, problem: Problem, X: Tensor) -> GuideRegion:
         """No guidance yet, for any element (Algorithm 4, lines 3-4)."""
-        if problem.dynamics.position is None:
-            raise InputError("guidance", "dynamics with a position", type(problem.dynamics).__name__)
         weight = X.new_full((problem.B,), self.initial_penalty)
-        return GuideRegion.inactive(X, weight, problem.dynamics.position)
+        return GuideRegion.inactive(X, weight, position(problem))
 
     def takes_long(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
         """The elements that are caught, (B,): for them a way is sought."""

@@ -18,7 +18,7 @@ from torchgco.shapes import InputError
 
 AT_ONCE = 4  # problems searched together: the distances of all edges from all obstacles are what memory must hold
 HOPS = 32  # edges of a way, at most
-CLASS = 8  # ways are sorted by so many edges more or less
+CLASS = 8  # ways are drawn taut together with those of as many eights of edges
 NEIGHBOURS = 4  # obstacles whose gap to another is given a point
 PRIMES = (2, 3, 5)  # bases of the low-discrepancy sequence
 FAR = -1e9  # the radius of an obstacle that isn't there
