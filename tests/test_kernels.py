@@ -8,7 +8,7 @@ from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian
 from torchgco.draws import DrawKey
 from torchgco.kernels import compile_kernels, compiling, kernel
 from torchgco.rollout import closed_loop, open_loop
-from torchgco.solvers.riccati import _fused_stage, _stage, backward
+from torchgco.solvers.riccati import _fused_stage, _Stage, backward
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
 
@@ -53,7 +53,9 @@ def test_the_fused_stage_of_the_backward_pass_equals_the_plain_one() -> None:
     Q[5] -= 40.0 * torch.eye(9)
     mu, G = torch.tensor([0.0, 0.5, 0.0, 3.0, 0.0, 0.0]).double(), torch.empty(6, 2, 7).double()
     gains, *fused = _fused_stage(Q, mu, G)
-    plain = _stage(Q, mu, True, torch.empty(6, 2, 9).double(), G)
+    stage = _Stage(torch.empty(1, 6, 7, 9).double())
+    stage.Q.copy_(Q)
+    plain = stage.eliminate(mu, G)
     for one, other in zip((gains, *fused), (G, *plain), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
     assert (plain[-1] > 0).tolist() == [True] * 5 + [False]

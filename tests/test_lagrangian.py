@@ -168,7 +168,7 @@ def test_a_large_batch_is_valued_and_expanded_in_pieces(monkeypatch) -> None:
     whole = (*lagrangian.value(X, U), lagrangian.expand(X, U), linearise(problem, X, U))
     for module in ("lagrangian", "expansion"):
         monkeypatch.setattr(f"torchgco.{module}.AT_ONCE", 2)
-    F = torch.full_like(whole[3], torch.nan)  # memory that a pass before has left
+    F = linearise(problem, 2 * X, 2 * U)  # memory that a pass before has left
     pieces = (*lagrangian.value(X, U), lagrangian.expand(X, U), linearise(problem, X, U, F))
     for a, b in zip(whole, pieces, strict=True):
         assert torch.equal(a, b)

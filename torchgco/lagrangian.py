@@ -12,7 +12,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.constraints.guides import Guide
 from torchgco.expansion import quadratise
 from torchgco.problem import Problem
-from torchgco.shapes import InputError, take
+from torchgco.shapes import InputError, Rows, pieces, take
 
 AT_ONCE = 64  # problems that are valued and expanded together on a CPU
 
@@ -46,11 +46,11 @@ def penalty_weights(constraint: Constraint, c: Tensor, lam: Tensor, mu: Tensor, 
     As printed, an inequality lets go once c < 0 and lam = 0. With `clip` it lets go where lam + mu c < 0, so that a
     multiplier pushes away from an obstacle but never holds the path to its surface.
     """
-    rho = mu.view(-1, 1, 1).expand_as(c)
+    rho = mu.view(-1, 1, 1)
     if constraint.sense == "equality":
-        return rho
-    idle = (lam + rho * c < 0) if clip else ((c < 0) & (lam == 0))
-    return rho.masked_fill(idle, 0.0)
+        return rho.expand_as(c)
+    idle = (torch.addcmul(lam, rho, c) < 0) if clip else ((c < 0) & (lam == 0))
+    return torch.where(idle, 0.0, rho)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Lagrangian:
     guide: Guide | None
     clip: bool
 
-    def take(self, index: Tensor) -> Lagrangian:
+    def take(self, index: Rows) -> Lagrangian:
         """The same for the problems in `index`."""
         return Lagrangian(self.problem.take(index), take(self.duals, index), take(self.guide, index), self.clip)
 
@@ -82,10 +82,10 @@ class Lagrangian:
         for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
             c = constraint.value(X, U)
             rho = penalty_weights(constraint, c, lam, self.duals.mu, self.clip)
-            terms = (lam + 0.5 * rho * c) * c
+            terms = torch.addcmul(lam, rho, c, value=0.5).mul_(c)
             if self.clip and constraint.sense == "inequality":
                 # Continued by its minimum over c where the row lets go, so that L_M stays continuous.
-                terms = torch.where(rho == 0, -0.5 * lam.square() / self.duals.mu.view(-1, 1, 1), terms)
+                terms = torch.where(rho == 0, lam.square().mul_(-0.5 / self.duals.mu.view(-1, 1, 1)), terms)
             # Two sums, knots last: one over both axes would be split among threads by batch size.
             merit = merit + terms.sum(-1).sum(-1)
         return cost, merit if self.guide is None else merit + self.guide.value(X)
@@ -97,28 +97,28 @@ class Lagrangian:
         """
         s = self.problem.n + 1 + self.problem.m
         H = X.new_empty(X.shape[1], X.shape[0], s, s) if out is None else out
-        for rows in _split(X):
-            part = self if rows.numel() == X.shape[0] else self.take(rows)
-            H[:, rows[0] : rows[-1] + 1] = part._expand(X[rows], U[rows]).transpose(0, 1)
+        everyone = _split(X)
+        for rows in everyone:
+            part = self if len(everyone) == 1 else self.take(rows)
+            part._expand(X[rows], U[rows], H[:, rows].transpose(0, 1))
         return H
 
-    def _expand(self, X: Tensor, U: Tensor) -> Tensor:
-        H = quadratise(self.problem, X, U)
+    def _expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        quadratise(self.problem, X, U, out=H)
         for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
             c = constraint.value(X, U)
             rho = penalty_weights(constraint, c, lam, self.duals.mu, self.clip)
-            g = lam + rho * c
+            g = torch.addcmul(lam, rho, c)
             if self.clip and constraint.sense == "inequality":
-                g = g.masked_fill(rho == 0, 0.0)
+                g.masked_fill_(rho == 0, 0.0)
             constraint.accumulate(X, U, g, rho, H)
         if self.guide is not None:
             self.guide.accumulate(X, H)
-        return H
 
 
-def _split(X: Tensor) -> tuple[Tensor, ...]:
+def _split(X: Tensor) -> list[slice]:
     """Rows of a batch, a few problems at a time: what is at work then stays in the cache."""
-    return torch.arange(X.shape[0], device=X.device).split(AT_ONCE if X.device.type == "cpu" else X.shape[0])
+    return pieces(X.shape[0], AT_ONCE if X.device.type == "cpu" else X.shape[0])
 
 
 def update(

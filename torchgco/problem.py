@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.constraints.base import Constraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
-from torchgco.shapes import Dimensions, InputError, cast
+from torchgco.shapes import Dimensions, InputError, Rows, cast
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class Problem:
             clear &= constraint.start_is_clear(self.x0)
         return clear
 
-    def take(self, index: Tensor) -> Self:
-        """The problems in `index` (int64, (B',)); a row may occur more than once."""
+    def take(self, index: Rows) -> Self:
+        """The problems in `index` (int64, (B',), or a slice); a row may occur more than once."""
         parts = {
             "dynamics": self.dynamics.take(index),
             "cost": self.cost.take(index),

@@ -16,8 +16,8 @@ def open_loop(dynamics: Dynamics, x0: Tensor, U: Tensor) -> Tensor:
     if compiling():
         return _open_loop_rows(dynamics, x0, U)
     x, knots = x0, [x0]
-    for k in range(U.shape[1]):
-        x = dynamics.step(x, U[:, k])
+    for u in U.unbind(1):
+        x = dynamics.step(x, u)
         knots.append(x)
     return torch.stack(knots, dim=1)
 
@@ -33,9 +33,9 @@ def closed_loop(dynamics: Dynamics, X: Tensor, U: Tensor, G: Tensor, alpha: Tens
         return _closed_loop_rows(dynamics, X, U, G, alpha)
     x, knots, controls = X[:, 0], [X[:, 0]], []
     step = alpha.unsqueeze(-1)
-    for k in range(U.shape[1]):
-        deviation = torch.cat((x - X[:, k], step), dim=-1).unsqueeze(-1)  # K and alpha d in one product
-        u = U[:, k] + torch.bmm(G[k], deviation).squeeze(-1)
+    for old_x, old_u, gains in zip(X[:, :-1].unbind(1), U.unbind(1), G.unbind(0), strict=True):
+        deviation = torch.cat((x - old_x, step), dim=-1).unsqueeze(-1)  # K and alpha d in one product
+        u = old_u + torch.bmm(gains, deviation).squeeze(-1)
         x = dynamics.step(x, u)
         knots.append(x)
         controls.append(u)

@@ -13,10 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias
 
 import torch
 from torch import Tensor
+
+Rows: TypeAlias = Tensor | slice
 
 
 class InputError(ValueError):
@@ -40,8 +42,8 @@ class PerElement:
     batched: ClassVar[tuple[str, ...]] = ()
     per_element: ClassVar[tuple[str, ...]] = ()
 
-    def take(self, index: Tensor) -> Self:
-        """The same part for the problems in `index` (int64, (B',))."""
+    def take(self, index: Rows) -> Self:
+        """The same part for the problems in `index` (int64, (B',), or a slice)."""
         changes = {name: take(getattr(self, name), index) for name in self.batched}
         for name in self.per_element:
             value = getattr(self, name)
@@ -50,7 +52,12 @@ class PerElement:
         return replace(self, **changes) if changes else self  # type: ignore[type-var]
 
 
-def take(tree: Any, index: Tensor) -> Any:
+def pieces(count: int, size: int) -> list[slice]:
+    """0..count in slices of at most `size`: views, where an index would copy."""
+    return [slice(first, min(first + size, count)) for first in range(0, count, size)]
+
+
+def take(tree: Any, index: Rows) -> Any:
     """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged."""
     if isinstance(tree, Tensor):
         return tree[index]

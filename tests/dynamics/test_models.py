@@ -5,7 +5,18 @@ import pytest
 import torch
 
 from tests.reference import models as reference
-from torchgco import Airframe, FunctionDynamics, InputError, Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking
+from torchgco import (
+    Airframe,
+    FunctionDynamics,
+    InputError,
+    Planar,
+    Problem,
+    QuadraticCost,
+    QuadrotorPlanning,
+    QuadrotorPlant,
+    RotorTracking,
+)
+from torchgco.expansion import linearise
 
 MODELS = [Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking]
 FIELDS = {
@@ -33,6 +44,32 @@ def test_jacobians_equal_autodiff(cls, integrator) -> None:
     x, u = states_of(model)
     for analytic, auto in zip(model.jacobians(x, u), model.autodiff_jacobians(x, u), strict=True):
         torch.testing.assert_close(analytic, auto, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+@pytest.mark.parametrize("cls", [Planar, QuadrotorPlanning])
+def test_what_is_known_to_be_zero_is_left_out_of_the_linearisation(cls, integrator) -> None:
+    """F from the entries of a sparse model, in memory that a pass with other states has left, equals autodiff."""
+    model = cls(integrator=integrator, **{cls.per_element[0]: torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)})
+    x, u = states_of(model)
+    n, other = model.n, torch.cat((x, x[:, :1]), dim=1)
+    cost = QuadraticCost(Q=[1.0] * n, R=[1.0] * model.m, Qf=[1.0] * n)
+    problem = Problem(model, cost, [], x[:, 0], N=5)
+    F = linearise(problem, other, u, out=linearise(problem, -other, 2.0 * u))
+    fx, fu = model.autodiff_jacobians(x, u)
+    torch.testing.assert_close(F[:, :, :n, :n].transpose(0, 1), fx, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(F[:, :, :n, n + 1 :].transpose(0, 1), fu, rtol=1e-10, atol=1e-12)
+    assert torch.equal(F[:, :, n], torch.eye(n + 1 + model.m).double()[n].expand(5, 3, -1))
+    assert not F[:, :, :n, n].any()
+
+
+@pytest.mark.parametrize("lead", [(4,), (4, 5)])
+def test_the_quadrotor_of_few_operations_is_the_one_of_components(lead) -> None:
+    T_w = torch.tensor([0.5, 1.0, 1.5, 2.0], dtype=torch.float64)
+    for model in (QuadrotorPlanning(), QuadrotorPlanning(rate_time_constant=T_w, thrust_time_constant=2 * T_w)):
+        x, u = states_of(model, lead)
+        rates = torch.stack(model.rates(x.unbind(-1), u.unbind(-1)), dim=-1)
+        torch.testing.assert_close(model.field(x, u), rates, rtol=1e-14, atol=1e-14)
 
 
 def test_plant_jacobians_at_a_thrust_limit() -> None:

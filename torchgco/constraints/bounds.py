@@ -25,8 +25,8 @@ class _Bounds(Constraint):
     lower: Any
     upper: Any
     knots: Any = None
-    above: Tensor | None = field(default=None, repr=False)  # components with an upper bound, once bound
-    below: Tensor | None = field(default=None, repr=False)
+    above: slice | Tensor | None = field(default=None, repr=False)  # components with an upper bound, once bound
+    below: slice | Tensor | None = field(default=None, repr=False)
 
     per_element: ClassVar[tuple[str, ...]] = ("lower", "upper")
     of: ClassVar[Literal["x", "u"]]
@@ -39,14 +39,13 @@ class _Bounds(Constraint):
         if bool((lower > upper).any()):
             raise InputError(f"{name}.lower", "at most the upper bound", f"{lower.tolist()} over {upper.tolist()}")
         default = slice(0, dims.N) if self.of == "u" else slice(1, dims.N + 1)
-        above = torch.isfinite(upper).any(dim=0).nonzero().flatten()
-        below = torch.isfinite(lower).any(dim=0).nonzero().flatten()
+        above, below = (torch.isfinite(bound).any(dim=0).nonzero().flatten() for bound in (upper, lower))
         if above.numel() + below.numel() == 0:
             raise InputError(name, "at least one finite bound", "none")
         # A component bounded in one problem and free in the next: 0 * infinity would poison the free one.
         lower, upper = lower.nan_to_num(neginf=-1e20), upper.nan_to_num(posinf=1e20)
         knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", lower.device)
-        return replace(self, lower=lower, upper=upper, knots=knots, above=above, below=below)
+        return replace(self, lower=lower, upper=upper, knots=knots, above=_range(above), below=_range(below))
 
     def _checked(self, value: Any, name: str, size: int, dims: Dimensions) -> Tensor:
         bound = tensor(value, name, dims.like)
@@ -62,20 +61,27 @@ class _Bounds(Constraint):
         return torch.cat((z[..., self.above] - upper, lower - z[..., self.below]), dim=-1)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        assert self.above is not None and self.below is not None
-        n, offset = X.shape[-1], X.shape[-1] + 1 if self.of == "u" else 0
-        split = self.above.numel()
-        add = H.new_zeros(*g.shape[:2], H.shape[-1], 2)  # gradient, and diagonal of the Hessian
-        add[..., self.above + offset, 0] += g[..., :split]
-        add[..., self.below + offset, 0] -= g[..., split:]
-        add[..., self.above + offset, 1] += h[..., :split]
-        add[..., self.below + offset, 1] += h[..., split:]
-        H[:, self.knots, :, n] += add[..., 0]
-        H[:, self.knots, n, :] += add[..., 0]
+        n, size = X.shape[-1], self.upper.shape[-1]
+        at = slice(n + 1, n + 1 + size) if self.of == "u" else slice(0, n)
+        gradient, diagonal = H.new_zeros(2, *g.shape[:2], size)
+        split = gradient[..., self.above].shape[-1]
+        gradient[..., self.above] += g[..., :split]
+        gradient[..., self.below] -= g[..., split:]
+        diagonal[..., self.above] += h[..., :split]
+        diagonal[..., self.below] += h[..., split:]
+        H[:, self.knots, at, n] += gradient
+        H[:, self.knots, n, at] += gradient
         if isinstance(self.knots, slice):
-            H[:, self.knots].diagonal(dim1=-2, dim2=-1).add_(add[..., 1])
+            H[:, self.knots, at, at].diagonal(dim1=-2, dim2=-1).add_(diagonal)
         else:
-            H[:, self.knots] += torch.diag_embed(add[..., 1])
+            H[:, self.knots, at, at] += torch.diag_embed(diagonal)
+
+
+def _range(components: Tensor) -> slice | Tensor:
+    """Components as a slice where they follow each other: views are had for nothing."""
+    first, count = int(components[0]) if components.numel() else 0, components.numel()
+    adjacent = components.tolist() == list(range(first, first + count))
+    return slice(first, first + count) if adjacent else components
 
 
 @dataclass(frozen=True)

@@ -57,8 +57,9 @@ class Cost(PerElement):
         return self.stage(X[:, :-1], U, k).sum(-1) + self.terminal(X[:, -1])
 
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
-        """Add gradient and Hessian at X, U to the homogeneous blocks H (B, N+1, s, s), order [x, 1, u]."""
+        """Write gradient and Hessian at X, U into the homogeneous blocks H (B, N+1, s, s), order [x, 1, u]."""
         n, N = X.shape[-1], U.shape[1]
+        H.zero_()
         k = torch.arange(N, device=U.device)
         g, h = gradient_and_hessian(lambda z: self.stage(z[..., :n], z[..., n:], k), torch.cat((X[:, :-1], U), dim=-1))
         add_blocks(H[:, :-1], n, g[..., :n], g[..., n:], h[..., :n, :n], h[..., n:, n:], h[..., n:, :n])

@@ -148,15 +148,25 @@ class BoundQuadratic(Cost):
         if self.H is not None:
             lx = lx + (self.H * eu.unsqueeze(-1)).sum(-2)
             lu = lu + (self.H * ex.unsqueeze(-2)).sum(-1)
-        if self.diagonal:
-            add_blocks(H[:, :-1], n, lx, lu, None, None)
-            add_blocks(H[:, -1], n, lf, None, None, None)
-            H[:, :-1].diagonal(dim1=-2, dim2=-1)[..., :n] += self.Q
-            H[:, :-1].diagonal(dim1=-2, dim2=-1)[..., n + 1 :] += self.R
-            H[:, -1].diagonal(dim1=-2, dim2=-1)[..., :n] += self.Qf
-        else:
-            add_blocks(H[:, :-1], n, lx, lu, self.Q, self.R, self.H)
-            add_blocks(H[:, -1], n, lf, None, self.Qf, None)
+        stage, terminal = self._hessians(H)
+        H[:, :-1], H[:, -1] = stage, terminal
+        H[:, :-1, :n, n] = H[:, :-1, n, :n] = lx
+        H[:, :-1, n + 1 :, n] = H[:, :-1, n, n + 1 :] = lu
+        H[:, -1, :n, n] = H[:, -1, n, :n] = lf
+
+    def _hessians(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """The second derivatives in homogeneous blocks: of the stages (B|1, N|1, s, s), of the last knot (B|1, s, s).
+
+        As many as there are different ones, so that most problems fill H with copies of a single block.
+        """
+        n, s = self.Q.shape[-1], like.shape[-1]
+        parts = [part for part in (self.Q, self.R, self.H) if part is not None]
+        lead = [max(part.shape[axis] for part in parts) for axis in (0, 1)]
+        stage, terminal = like.new_zeros(*lead, s, s), like.new_zeros(self.Qf.shape[0], s, s)
+        Q, R, Qf = (torch.diag_embed(W) if self.diagonal else W for W in (self.Q, self.R, self.Qf))
+        add_blocks(stage, n, None, None, Q, R, self.H)
+        add_blocks(terminal, n, None, None, Qf, None)
+        return stage, terminal
 
     def _times(self, W: Tensor, e: Tensor) -> Tensor:
         # Products and sums keep each problem's bits independent of the batch; a shared matrix in one GEMM would not.

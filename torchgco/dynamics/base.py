@@ -18,7 +18,8 @@ class Dynamics(PerElement):
     """x_{k+1} = step(x_k, u_k) on (..., n), (..., m).
 
     Subclass it with `n`, `m` and either `step`, or `field` with the attributes `dt` (s) and `integrator`
-    ("euler", "midpoint" or "rk4"). Derivatives come from `torch.func` unless the model brings `field_jacobians`.
+    ("euler", "midpoint" or "rk4"). Derivatives come from `torch.func` unless the model brings `field_jacobians`, or
+    `field_entries` with `sparsity`: only what isn't zero, which is several times as fast for most vehicles.
     `position` says which states are the position in metres that obstacles are compared with, or is None.
 
     A model that brings `rates` in place of `field` is written on components, sequences of n and m tensors of one
@@ -30,6 +31,7 @@ class Dynamics(PerElement):
     dt: float
     integrator: str = "euler"
     position: slice | None = None
+    sparsity: tuple[tuple[int, int], ...] = ()  # (row, column) of [ax, au] (n, n+m) for each of `field_entries`
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         """Time derivative of x, (..., n)."""
@@ -38,6 +40,7 @@ class Dynamics(PerElement):
         return torch.stack(self.rates(x.unbind(-1), u.unbind(-1)), dim=-1)
 
     field_jacobians: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
+    field_entries: Callable[[Tensor, Tensor], Tensor] | None = None  # (..., e), by (..., n), (..., m)
     rates: Callable[[Sequence[Tensor], Sequence[Tensor]], tuple[Tensor, ...]] | None = None
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
@@ -54,9 +57,25 @@ class Dynamics(PerElement):
 
     def jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of `step`: fx (..., n, n) and fu (..., n, m)."""
-        if self.field_jacobians is None:
+        jacobians = self.field_jacobians or (None if self.field_entries is None else self._dense)
+        if jacobians is None:
             return self.autodiff_jacobians(x, u)
-        return INTEGRATORS[self.integrator][1](self.field, self.field_jacobians, x, u, self.dt)
+        return INTEGRATORS[self.integrator][1](self.field, jacobians, x, u, self.dt)
+
+    def step_entries(self, x: Tensor, u: Tensor) -> Tensor | None:
+        """[fx, fu] at the places of `sparsity`, (..., e), else the identity; None where all of it must be written."""
+        if self.field_entries is None or self.integrator != "euler":
+            return None
+        stays = [float(row == column) for row, column in self.sparsity]
+        return x.new_tensor(stays).add(self.field_entries(x, u), alpha=self.dt)
+
+    def _dense(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """`field_entries` in their places, and zeros."""
+        assert self.field_entries is not None
+        whole = x.new_zeros(*x.shape[:-1], self.n, self.n + self.m)
+        rows, columns = zip(*self.sparsity, strict=True)
+        whole[..., rows, columns] = self.field_entries(x, u)
+        return whole[..., : self.n], whole[..., self.n :]
 
     def autodiff_jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """The same by `torch.func`; the analytic ones are tested against it."""

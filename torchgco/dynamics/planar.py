@@ -37,6 +37,9 @@ class Planar(Dynamics):
     m: ClassVar[int] = 2
     position: ClassVar[slice] = slice(0, 2)
     per_element: ClassVar[tuple[str, ...]] = ("drag", "thrust_gain", "turn_drag", "turn_gain")
+    sparsity: ClassVar[tuple[tuple[int, int], ...]] = (
+        (0, 3), (1, 4), (2, 5), (3, 2), (4, 2), (3, 3), (4, 4), (5, 5), (3, 6), (3, 7), (4, 6), (4, 7), (5, 6), (5, 7),
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_model(self, "planar")
@@ -54,23 +57,17 @@ class Planar(Dynamics):
             k4 * (u[1] - u[0]) - k3 * x[5],
         )
 
-    def field_jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    def field_entries(self, x: Tensor, u: Tensor) -> Tensor:
         theta = x[..., 2].contiguous()
-        k1, k2, k3, k4 = self._coefficients(theta)
-        cos, sin = torch.cos(theta), torch.sin(theta)
-        push = k2 * (u[..., 0] + u[..., 1])
-        ax = x.new_zeros(*x.shape[:-1], 6, 6)
-        ax[..., 0, 3] = ax[..., 1, 4] = ax[..., 2, 5] = 1.0
-        ax[..., 3, 2] = -push * sin
-        ax[..., 4, 2] = push * cos
-        ax[..., 3, 3] = ax[..., 4, 4] = -k1
-        ax[..., 5, 5] = -k3
-        au = x.new_zeros(*x.shape[:-1], 6, 2)
-        au[..., 3, 0] = au[..., 3, 1] = k2 * cos
-        au[..., 4, 0] = au[..., 4, 1] = k2 * sin
-        au[..., 5, 0] = -k4
-        au[..., 5, 1] = k4
-        return ax, au
+        one = torch.ones_like(theta)
+        k1, k2, k3, k4 = (one * k for k in self._coefficients(theta))
+        along, across = k2 * torch.cos(theta), k2 * torch.sin(theta)
+        thrust = u[..., 0] + u[..., 1]
+        entries = (
+            one, one, one, -thrust * across, thrust * along, -k1, -k1, -k3,
+            along, along, across, across, -k4, k4,
+        )  # fmt: skip
+        return torch.stack(entries, dim=-1)
 
     def _coefficients(self, component: Tensor) -> tuple[Tensor | float, ...]:
         return tuple(lead(k, component) for k in (self.drag, self.thrust_gain, self.turn_drag, self.turn_gain))

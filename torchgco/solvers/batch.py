@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgco.constraints.guides import Guide
 from torchgco.draws import DrawKey
-from torchgco.expansion import linearise
+from torchgco.expansion import linearise, standing
 from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
@@ -61,8 +61,8 @@ class Loop:
         self.state, self.aside, self.passes_aside = self._begin(everyone[:slots]), None, 0
         self.problem = problem if slots == problem.B else problem.take(everyone[:slots])
         # F and H of every pass: memory that is had afresh costs more than what is written into it.
-        z, s = problem.n + 1, problem.n + 1 + problem.m
-        self.space = (U0.new_empty(problem.N, slots, z, s), U0.new_empty(problem.N + 1, slots, s, s))
+        s = problem.n + 1 + problem.m
+        self.space = (standing(problem, slots), U0.new_empty(problem.N + 1, slots, s, s))
 
     def run(self) -> Solution:
         """Pass after pass until every element has ended."""

@@ -35,48 +35,77 @@ def backward(F: Tensor, H: Tensor, regularisation: Tensor) -> BackwardPass:
         F: (N, B, n+1, s) dynamics, H: (N+1, B, s, s) quadratic model, regularisation: mu_r (B,).
     """
     N, B, z, s = F.shape
-    gains = F.new_empty(N, B, s - z, z)
-    linear, quadratic = F.new_zeros(B), F.new_zeros(B)
-    lowest = torch.full_like(linear, torch.inf)
-    VF, Q, T = F.new_empty(B, z, s), F.new_empty(B, s, s), F.new_empty(B, s - z, s)
-    any_mu, fused = bool((regularisation > 0).any()), compiling()
+    gains, slopes, lowest = F.new_empty(N, B, s - z, z), F.new_empty(N, B, s - z), F.new_full((B,), torch.inf)
+    work, any_mu, fused = _Stage(F), bool((regularisation > 0).any()), compiling()
+    # Slices of all stages at once: taken one by one, they would cost as much as the arithmetic of a small batch.
+    Fs, transposed, Hs, Gs = F.unbind(0), F.mT.unbind(0), H.unbind(0), gains.unbind(0)
     V = H[N, :, :z, :z]
     for k in range(N - 1, -1, -1):
         # Written into the same memory at every stage: fresh pages would cost as much as the products.
-        torch.bmm(V, F[k], out=VF)
-        torch.baddbmm(H[k], F[k].mT, VF, out=Q)
+        torch.bmm(V, Fs[k], out=work.VF)
+        torch.baddbmm(Hs[k], transposed[k], work.VF, out=work.Q)
+        slopes[k] = work.Qu
         if fused:
-            gains[k], V, slope, curvature, pivot = _fused_stage(Q, regularisation, gains[k])
+            gains[k], V, pivot = _fused_stage(work.Q, regularisation, Gs[k])
         else:
-            V, slope, curvature, pivot = _stage(Q, regularisation, any_mu, T, gains[k])
-        linear += slope
-        quadratic += curvature
+            V, pivot = work.eliminate(regularisation if any_mu else None, Gs[k])
         lowest = torch.minimum(lowest, pivot)
-    return BackwardPass(gains, linear, quadratic, ~(lowest > 0))
+    d = gains[..., z - 1]
+    linear, squares = _over_stages(slopes * d), _over_stages(d.square())
+    # d'Quu d = -Qu'd - mu_r d'd, as (Quu + mu_r I) d = -Qu.
+    return BackwardPass(gains, linear, -linear - regularisation * squares, ~(lowest > 0))
 
 
-def _stage(Q: Tensor, mu: Tensor, any_mu: bool, T: Tensor, G: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """From Q (B, s, s) of a stage its gains, written to G (B, m, z), and V, Qu'd, d'Quu d and the smallest pivot."""
-    z, n = G.shape[-1], G.shape[-1] - 1
-    T.copy_(Q[:, z:])
-    if any_mu:
-        T.diagonal(offset=z, dim1=-2, dim2=-1).add_(mu.unsqueeze(-1))
-    pivot = _eliminate(T, z)
-    torch.neg(T[..., :z], out=G)
-    Quz, d = Q[:, z:, :z], G[..., n]
-    V = torch.baddbmm(Q[:, :z, :z], Quz.mT, G)
-    slope = (Quz[..., n] * d).sum(-1)
-    curvature = -slope
-    if any_mu:
-        # Elements with mu_r = 0 subtract an exact zero: their bits don't depend on who else is regularised.
-        V -= mu.view(-1, 1, 1) * torch.bmm(G.mT, G)
-        curvature = curvature - mu * d.square().sum(-1)
-    return (V + V.mT).mul_(0.5), slope, curvature, pivot
+def _over_stages(terms: Tensor) -> Tensor:
+    """Sum of (N, B, m) over controls and stages, (B,), in an order that doesn't depend on B."""
+    return terms.sum(-1).mT.contiguous().sum(-1)
+
+
+class _Stage:
+    """The memory in which every stage works, and the parts of it that it reads and writes."""
+
+    def __init__(self, F: Tensor) -> None:
+        _, B, z, s = F.shape
+        m = s - z
+        self.VF, self.Q = F.new_empty(B, z, s), F.new_empty(B, s, s)
+        self.Qzz, self.Quz, self.Qu = self.Q[:, :z, :z], self.Q[:, z:, :z], self.Q[:, z:, z - 1]
+        self.T, self.half, self.V = F.new_empty(B, m, s), F.new_empty(B, z, z), F.new_empty(B, z, z)
+        self.Quu = self.T[:, :, z:].diagonal(dim1=-2, dim2=-1)
+        self.row, self.columns = F.new_empty(B, 1, s), F.new_empty(m, B, m, 1)
+        self.pivots = self.columns[..., 0].diagonal(dim1=0, dim2=2)  # (B, m)
+        # One control after the other: its row of T, its column, a place for that, and the pivot there.
+        self.steps = [
+            (self.T[:, j : j + 1], self.T[:, :, z + j : z + j + 1], self.columns[j], self.columns[j, :, j : j + 1])
+            for j in range(m)
+        ]
+
+    def eliminate(self, mu: Tensor | None, G: Tensor) -> tuple[Tensor, Tensor]:
+        """From Q of a stage its gains, written to G (B, m, z), and V (B, z, z) and the smallest pivot (B,).
+
+        T = [Quz, Quu + mu_r I] becomes [-G, I]. For so few controls that is far faster than a library's factorisation
+        of every small matrix.
+        """
+        z = G.shape[-1]
+        self.T.copy_(self.Q[:, z:])
+        if mu is not None:
+            self.Quu.add_(mu.unsqueeze(-1))
+        for own, beside, column, pivot in self.steps:
+            column.copy_(beside)
+            torch.div(own, pivot, out=self.row)
+            self.T.addcmul_(column, self.row, value=-1.0)
+            own.copy_(self.row)
+        torch.neg(self.T[..., :z], out=G)
+        torch.baddbmm(self.Qzz, self.Quz.mT, G, out=self.half)
+        if mu is not None:
+            # Elements with mu_r = 0 subtract an exact zero: their bits don't depend on who else is regularised.
+            self.half.sub_(mu.view(-1, 1, 1) * torch.bmm(G.mT, G))
+        torch.add(self.half, self.half.mT, out=self.V).mul_(0.5)
+        return self.V, self.pivots.amin(-1)
 
 
 @partial(kernel, dynamic=None)
-def _fused_stage(Q: Tensor, mu: Tensor, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The same in the form that compiles into few kernels, the gains first; `like` (B, m, z) tells their shape."""
+def _fused_stage(Q: Tensor, mu: Tensor, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`_Stage.eliminate` in the form that compiles into few kernels: gains, V, pivot; `like` (B, m, z) tells sizes."""
     m, z = like.shape[1:]
     quu = [[Q[:, z + i, z + j] + (mu if i == j else 0.0) for j in range(m)] for i in range(m)]
     quz, pivots = [Q[:, z + i, :z] for i in range(m)], []
@@ -88,24 +117,7 @@ def _fused_stage(Q: Tensor, mu: Tensor, like: Tensor) -> tuple[Tensor, Tensor, T
                 quz[i] = quz[i] - quu[i][j].unsqueeze(-1) * quz[j]
                 quu[i] = [a - quu[i][j] * b for a, b in zip(quu[i], quu[j], strict=True)]
     G = -torch.stack(quz, dim=1)
-    d, Quz, V = G[..., z - 1], Q[:, z:, :z], Q[:, :z, :z]
+    Quz, V = Q[:, z:, :z], Q[:, :z, :z]
     for i in range(m):
         V = V + (Quz[:, i] - mu.unsqueeze(-1) * G[:, i]).unsqueeze(-1) * G[:, i].unsqueeze(-2)
-    slope = (Quz[..., z - 1] * d).sum(-1)
-    curvature = -slope - mu * d.square().sum(-1)
-    return G, 0.5 * (V + V.mT), slope, curvature, torch.stack(pivots).amin(0)
-
-
-def _eliminate(T: Tensor, z: int) -> Tensor:
-    """T = [Quz, Quu] (B, m, z+m) becomes [Quu^-1 Quz, I], in place; returns the smallest pivot (B,).
-
-    Control by control: for so few of them, far faster than a library's factorisation of every small matrix.
-    """
-    pivots = []
-    for j in range(T.shape[1]):
-        pivot = T[:, j, z + j].clone()
-        row = T[:, j] / pivot.unsqueeze(-1)
-        T -= T[:, :, z + j].unsqueeze(-1) * row.unsqueeze(1)
-        T[:, j] = row
-        pivots.append(pivot)
-    return torch.stack(pivots).amin(0)
+    return G, 0.5 * (V + V.mT), torch.stack(pivots).amin(0)
