@@ -37,7 +37,8 @@ class Dynamics(PerElement):
         """Time derivative of x, (..., n)."""
         if self.rates is None:
             raise NotImplementedError(f"{type(self).__name__} defines neither `step` nor `field` nor `rates`")
-        return torch.stack(self.rates(x.unbind(-1), u.unbind(-1)), dim=-1)
+        # Components stay apart in memory, which the next step reads as they are.
+        return torch.stack(self.rates(x.unbind(-1), u.unbind(-1))).movedim(0, -1)
 
     field_jacobians: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
     field_entries: Callable[[Tensor, Tensor], Tensor] | None = None  # (..., e), by (..., n), (..., m)
