@@ -27,7 +27,7 @@ SEARCH = {
     "gco_max": ["solver=gco_max"],
     "ways": [
         "solver=gco_max", "solver.attempts=10", "solver.guidance.detours=10", "solver.guidance.detour.ways=16",
-        "solver.guidance.detour.roadmap.spread=128",
+        "solver.guidance.detour.roadmap.spread=256",
     ],
 }  # fmt: skip
 
