@@ -63,6 +63,21 @@ def test_what_is_known_to_be_zero_is_left_out_of_the_linearisation(cls, integrat
     assert not F[:, :, :n, n].any()
 
 
+def test_a_subclass_with_derivatives_of_its_own_is_linearised_by_them() -> None:
+    class Towed(Planar):
+        def step(self, x, u):
+            return super().step(0.5 * x, u)
+
+        def jacobians(self, x, u):
+            return self.autodiff_jacobians(x, u)
+
+    model = Towed()
+    x, u = states_of(model)
+    problem = Problem(model, QuadraticCost(Q=[1.0] * 6, R=[1.0] * 2, Qf=[1.0] * 6), [], x[:, 0], N=5)
+    F = linearise(problem, torch.cat((x, x[:, :1]), dim=1), u)
+    torch.testing.assert_close(F[:, :, :6, :6].transpose(0, 1), model.autodiff_jacobians(x, u)[0], rtol=1e-10, atol=0)
+
+
 @pytest.mark.parametrize("lead", [(4,), (4, 5)])
 def test_the_quadrotor_of_few_operations_is_the_one_of_components(lead) -> None:
     T_w = torch.tensor([0.5, 1.0, 1.5, 2.0], dtype=torch.float64)

@@ -65,7 +65,9 @@ class Dynamics(PerElement):
 
     def step_entries(self, x: Tensor, u: Tensor) -> Tensor | None:
         """[fx, fu] at the places of `sparsity`, (..., e), else the identity; None where all of it must be written."""
-        if self.field_entries is None or self.integrator != "euler":
+        # A subclass of a model may have derivatives of its own.
+        own = self.field_jacobians is not None or type(self).jacobians is not Dynamics.jacobians
+        if own or self.field_entries is None or self.integrator != "euler":
             return None
         stays = [float(row == column) for row, column in self.sparsity]
         return x.new_tensor(stays).add(self.field_entries(x, u), alpha=self.dt)

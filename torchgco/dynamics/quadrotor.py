@@ -5,7 +5,6 @@ Quaternions are scalar first; q' = 1/2 Qx(w) q, and R(q) e3 is the body's thrust
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco.dynamics.base import Dynamics, check_model
+from torchgco.dynamics.pose import POSE_SPARSITY, attitude_rate, pose_entries, pose_rates, thrust_axis
 from torchgco.shapes import InputError, lead
 
 GRAVITY = 9.81  # m/s^2
@@ -98,84 +98,6 @@ def _skew(w: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
-def _thrust_axis(q0: Tensor, q1: Tensor, q2: Tensor, q3: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """R(q) e3, of length |q|^2."""
-    return 2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3
-
-
-def _attitude_rate(q: tuple[Tensor, ...], w: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """q' = 1/2 Qx(w) q."""
-    q0, q1, q2, q3 = q
-    w1, w2, w3 = w
-    return (
-        -0.5 * (q1 * w1 + q2 * w2 + q3 * w3),
-        0.5 * (q0 * w1 + q2 * w3 - q3 * w2),
-        0.5 * (q0 * w2 - q1 * w3 + q3 * w1),
-        0.5 * (q0 * w3 + q1 * w2 - q2 * w1),
-    )
-
-
-# R(q) e3 and q' are sums of products of two states. As tables: the state, and its sign, that stands with q0, q1, q2, q3
-# (with w1, w2, w3 for _TURN) in each row; 0 where nothing does. A few operations then do for all rows together.
-Table = tuple[tuple[int, ...], ...]
-_AXIS: Table = ((8, 9, 6, 7), (-7, -6, 9, 8), (6, -7, -8, 9))  # R(q) e3, and half its derivative by q
-_SPIN: Table = ((0, -10, -11, -12), (10, 0, 12, -11), (11, -12, 0, 10), (12, 11, -10, 0))  # 2 q', 2 dq'/dq
-_TURN: Table = ((-7, -8, -9), (6, -9, 8), (9, 6, -7), (-8, 7, 6))  # 2 dq'/dw
-_BY_AXIS, _BY_SPIN, _BY_TURN = (
-    tuple((first + i, column + j) for i, row in enumerate(table) for j, state in enumerate(row) if state)
-    for table, first, column in ((_AXIS, 3, 6), (_SPIN, 6, 6), (_TURN, 6, 10))
-)
-POSE_SPARSITY = (*((i, 3 + i) for i in range(3)), *_BY_AXIS, *_BY_SPIN, *_BY_TURN)
-
-
-@functools.cache
-def _sums(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The states and factors (28,), (28, 1) of R(q) e3 and q' that q0 stands with, then q1, q2, q3."""
-    flat = [(i, state) for column in zip(*_AXIS, *_SPIN, strict=True) for i, state in enumerate(column)]
-    return _states_and_factors([(state, 1.0 if i < 3 else 0.5) for i, state in flat], dtype, device)
-
-
-@functools.cache
-def _derivatives(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The states and factors (36,), (36, 1) of their derivatives, table by table."""
-    tables = ((_AXIS, 2.0), (_SPIN, 0.5), (_TURN, 0.5))
-    flat = [(state, factor) for table, factor in tables for row in table for state in row if state]
-    return _states_and_factors(flat, dtype, device)
-
-
-def _states_and_factors(
-    flat: list[tuple[int, float]], dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Where nothing stands, state 0 with the factor 0."""
-    states, factors = (
-        [abs(state) for state, _ in flat],
-        [math.copysign(factor * (state != 0), state) for state, factor in flat],
-    )
-    return torch.tensor(states, device=device), torch.tensor(factors, dtype=dtype, device=device).unsqueeze(-1)
-
-
-def _pose_rates(x: Tensor) -> tuple[Tensor, Tensor]:
-    """R(q) e3 (3, ...) and q' (4, ...) of states (n, ...)."""
-    states, factors = _sums(x.dtype, x.device)
-    flat = x.reshape(x.shape[0], -1)
-    terms = flat.index_select(0, states).mul_(factors).view(4, 7, -1) * flat[6:10].unsqueeze(1)
-    first, second = terms.view(2, 14, -1).unbind(0)
-    first, second = (first + second).view(2, 7, *x.shape[1:]).unbind(0)
-    return (first + second).split((3, 4))  # type: ignore[return-value]
-
-
-def _pose_entries(x: Tensor, lift: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives (..., 39) of p', v', q' at POSE_SPARSITY, and R(q) e3 (..., 3), of states (..., n).
-
-    `lift` is the thrust acceleration (..., 1), m/s^2. Its own column of v' is left to the caller.
-    """
-    states, factors = _derivatives(x.dtype, x.device)
-    entries = x.index_select(-1, states) * factors[:, 0]
-    by_q = entries[..., :12]
-    axis = 0.5 * (by_q.unflatten(-1, (3, 4)) * x[..., None, 6:10]).sum(-1)
-    return torch.cat((torch.ones_like(x[..., :3]), lift * by_q, entries[..., 12:]), dim=-1), axis
-
-
 @dataclass(frozen=True)
 class QuadrotorPlanning(Dynamics):
     """Planning model: x = [p (m), v (m/s), q, w (rad/s), a (m/s^2)], u = [w_c, a_c], n = 14, m = 4 (section 5.2).
@@ -209,17 +131,17 @@ class QuadrotorPlanning(Dynamics):
     def rates(self, x: Sequence[Tensor], u: Sequence[Tensor]) -> tuple[Tensor, ...]:
         vx, vy, vz, q0, q1, q2, q3, w1, w2, w3, a = x[3:]
         T_w, T_a = lead(self.rate_time_constant, a), lead(self.thrust_time_constant, a)
-        bx, by, bz = _thrust_axis(q0, q1, q2, q3)
-        dq = _attitude_rate((q0, q1, q2, q3), (w1, w2, w3))
+        bx, by, bz = thrust_axis(q0, q1, q2, q3)
+        dq = attitude_rate((q0, q1, q2, q3), (w1, w2, w3))
         dw = ((u[0] - w1) / T_w, (u[1] - w2) / T_w, (u[2] - w3) / T_w)
         return (vx, vy, vz, a * bx, a * by, a * bz - self.gravity, *dq, *dw, (u[3] - a) / T_a)
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
-        # The same as `rates` for a few trajectories, where the number of operations counts, not what each has to do.
+        # `rates` with fewer operations.
         x, u = (x.mT, u.mT) if x.dim() == 2 else (x.movedim(-1, 0), u.movedim(-1, 0))
         _, v, _, w, a = x.split((3, 3, 4, 3, 1))
         w_c, a_c = u.split((3, 1))
-        axis, dq = _pose_rates(x)
+        axis, dq = pose_rates(x)
         dv = axis * a
         dv[2] -= self.gravity
         T_w, T_a = (lead(T, x[0]) for T in (self.rate_time_constant, self.thrust_time_constant))
@@ -227,7 +149,7 @@ class QuadrotorPlanning(Dynamics):
         return rates.mT if rates.dim() == 2 else rates.movedim(0, -1)
 
     def field_entries(self, x: Tensor, u: Tensor) -> Tensor:
-        pose, axis = _pose_entries(x, x[..., 13:])
+        pose, axis = pose_entries(x, x[..., 13:])
         one = torch.ones_like(x[..., :1])
         w, a = (one / lead(T, one) for T in (self.rate_time_constant, self.thrust_time_constant))
         w = w.expand_as(axis)
@@ -256,7 +178,7 @@ class QuadrotorPlant(Dynamics):
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         w, F = x[..., 10:13], x[..., 13:]
-        axis, dq = (rows.movedim(0, -1) for rows in _pose_rates(x.movedim(-1, 0)))
+        axis, dq = (rows.movedim(0, -1) for rows in pose_rates(x.movedim(-1, 0)))
         dv = axis * (F.sum(-1, keepdim=True) / self.airframe.mass)
         dw = self.airframe.angular_acceleration(w, F)
         parts = (x[..., 3:6], dv[..., :2], dv[..., 2:] - self.gravity, dq, dw, self.airframe.thrust_rate(F, u))
@@ -273,7 +195,7 @@ class QuadrotorPlant(Dynamics):
         w, F = x[..., 10:13], x[..., 13:]
         ax = x.new_zeros(*x.shape[:-1], 17, 17)
         rows, columns = zip(*POSE_SPARSITY, strict=True)
-        ax[..., rows, columns], axis = _pose_entries(x, F.sum(-1, keepdim=True) / self.airframe.mass)
+        ax[..., rows, columns], axis = pose_entries(x, F.sum(-1, keepdim=True) / self.airframe.mass)
         ax[..., 3:6, 13:] = axis.unsqueeze(-1) / self.airframe.mass
         ax[..., 10:13, 10:13], ax[..., 10:13, 13:] = self.airframe.angular_jacobians(w, F)
         by_F, by_speed = self.airframe.thrust_jacobians(F, u)
