@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from tests.reference.roadmap import cheapest_cost, point_along, segment_gap, way_length
-from torchgco import InputError
+from torchgco import InputError, compose
 from torchgco.guidance.roadmap import FAR, Roadmap, Scene, _apart_from, _cheapest, halton, points_along, segment_gaps
+from torchgco.guidance.scene import scene_of
 
 
 def flat(points, rows):
@@ -176,3 +177,13 @@ def test_every_option_is_read(change: dict) -> None:
 def test_options_out_of_range_are_named(change: dict, field: str) -> None:
     with pytest.raises(InputError, match=field.replace(".", r"\.")):
         Roadmap(**change)
+
+
+def test_the_default_roadmap_finds_the_holes_of_the_walls() -> None:
+    """Around a wall of 12 m by 6 m it is over 26 m from start to goal, through the holes at most 25."""
+    setup = compose(["scenario=walls", "seed=5"])
+    problem = setup.task(setup.layouts(8)).problem
+    found = scene_of(problem, problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m)))
+    ways, arrives = setup.solver.guidance.detour.roadmap.ways(found, 1)
+    lengths = [way_length(way) for way in ways[:, 0].numpy()]
+    assert arrives.all() and max(lengths) < 25.0
