@@ -158,7 +158,9 @@ def _cheapest(points: Tensor, near: Tensor, lengths: Tensor, price: Tensor) -> t
     cost[:, 1] = 0.0
     through = edges + cost.gather(1, near.flatten(1)).view(near.shape)
     for _ in range(HOPS):
-        cost = torch.minimum(cost, through.amin(-1))
+        before, cost = cost, torch.minimum(cost, through.amin(-1))
+        if torch.equal(before, cost):
+            break  # nor would further rounds change anything
         through = edges + cost.gather(1, near.flatten(1)).view(near.shape)
     following = near.gather(2, through.argmin(-1, keepdim=True)).squeeze(-1)
     following[:, 1] = 1
@@ -174,18 +176,20 @@ def _apart_from(points: Tensor, way: Tensor) -> Tensor:
     a, b = way[:, None, :-1], way[:, None, 1:]
     along, toward = b - a, points.unsqueeze(2) - a
     share = (along * toward).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
-    return (toward - share.clamp(0.0, 1.0).unsqueeze(-1) * along).square().sum(-1).amin(-1).sqrt()
+    return toward.sub_(share.clamp(0.0, 1.0).unsqueeze(-1) * along).square_().sum(-1).amin(-1).sqrt()
 
 
 def segment_gaps(a: Tensor, b: Tensor, centers: Tensor, distances: Tensor) -> Tensor:
     """Smallest distance (B, E) of the segments a to b (B, E, d) from spheres of radius `distances` (B, M)."""
     along, toward = b - a, centers.mT
     length = along.square().sum(-1, keepdim=True).clamp(min=1e-12)
-    lead = torch.bmm(along, toward) - (a * along).sum(-1, keepdim=True)  # (o - a)'(b - a)
-    share = (lead / length).clamp(0.0, 1.0)
-    apart = a.square().sum(-1, keepdim=True) + centers.square().sum(-1).unsqueeze(1) - 2.0 * torch.bmm(a, toward)
-    square = apart + share * (share * length - 2.0 * lead)
-    return (square.clamp(min=0.0).sqrt() - distances.unsqueeze(1)).amin(-1)
+    # In place: these are the largest arrays of the search, and new pages would cost more than what is done in them.
+    lead = torch.bmm(along, toward).sub_((a * along).sum(-1, keepdim=True))  # (o - a)'(b - a)
+    share = (lead / length).clamp_(0.0, 1.0)
+    square = a.square().sum(-1, keepdim=True) + centers.square().sum(-1).unsqueeze(1)
+    square.sub_(torch.bmm(a, toward).mul_(2.0))
+    square.add_((share * length).sub_(lead.mul_(2.0)).mul_(share))
+    return square.clamp_(min=0.0).sqrt_().sub_(distances.unsqueeze(1)).amin(-1)
 
 
 def points_along(way: Tensor, length: Tensor) -> Tensor:
@@ -254,7 +258,7 @@ def _is_free(points: Tensor, o: Tensor, R: Tensor) -> Tensor:
 
 def _distances(a: Tensor, b: Tensor) -> Tensor:
     """|a_i - b_j| (B, V, W)."""
-    return (a.unsqueeze(2) - b.unsqueeze(1)).square().sum(-1).sqrt()
+    return (a.unsqueeze(2) - b.unsqueeze(1)).square_().sum(-1).sqrt_()
 
 
 def _unit(v: Tensor) -> Tensor:
