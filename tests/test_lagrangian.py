@@ -82,7 +82,7 @@ def test_hessian_is_gauss_newton(batch: str) -> None:
     expected = Lagrangian(plain, Multipliers((), duals.mu), None, False).expand(X, U).transpose(0, 1)
     for constraint, lam in zip(problem.constraints, duals.lam, strict=True):
         c = constraint.value(X, U)
-        rho = penalty_weights(constraint, c, lam, duals.mu, False)
+        rho = penalty_weights(constraint.sense, c, lam, duals.mu, False)
         knots = torch.arange(problem.N + 1)[constraint.knots]
         for b in range(problem.B):
             for j, k in enumerate(knots.tolist()):
@@ -108,13 +108,11 @@ def test_hessian_is_gauss_newton(batch: str) -> None:
 
 def test_printed_rule_of_the_penalty() -> None:
     """rho = 0 only where an inequality has c < 0 and lam = 0 (Equation 18)."""
-    problem, _ = planar_batch(B=1, N=3, obstacles=1)
     c = torch.tensor([[[-1.0], [-1.0], [0.0], [2.0]]], dtype=torch.float64)
     lam = torch.tensor([[[0.0], [0.5], [0.0], [0.0]]], dtype=torch.float64)
     mu = torch.tensor([4.0], dtype=torch.float64)
-    spheres = problem.constraints[0]
-    assert penalty_weights(spheres, c, lam, mu, clip=False).flatten().tolist() == [0, 4, 4, 4]
-    assert penalty_weights(spheres, c, lam, mu, clip=True).flatten().tolist() == [0, 0, 4, 4]
+    assert penalty_weights("inequality", c, lam, mu, clip=False).flatten().tolist() == [0, 4, 4, 4]
+    assert penalty_weights("inequality", c, lam, mu, clip=True).flatten().tolist() == [0, 0, 4, 4]
 
 
 def test_clipped_value_is_continuous_where_a_row_lets_go() -> None:

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import Constraint
+from torchgco.constraints.base import Sense
 from torchgco.constraints.guides import Guide
 from torchgco.expansion import quadratise
+from torchgco.kernels import kernel
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, Rows, pieces, take
 
@@ -40,17 +41,37 @@ class Multipliers:
             raise InputError("warm", f"multipliers of shapes {expected}", got)
 
 
-def penalty_weights(constraint: Constraint, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> Tensor:
+def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> Tensor:
     """rho: mu where a row pulls, else 0 (Equation 18).
 
     As printed, an inequality lets go once c < 0 and lam = 0. With `clip` it lets go where lam + mu c < 0, so that a
     multiplier pushes away from an obstacle but never holds the path to its surface.
     """
     rho = mu.view(-1, 1, 1)
-    if constraint.sense == "equality":
+    if sense == "equality":
         return rho.expand_as(c)
     idle = (torch.addcmul(lam, rho, c) < 0) if clip else ((c < 0) & (lam == 0))
     return torch.where(idle, 0.0, rho)
+
+
+@kernel
+def _worth(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> Tensor:
+    """What the rows of a constraint add to L_M, (B,)."""
+    rho = penalty_weights(sense, c, lam, mu, clip)
+    terms = torch.addcmul(lam, rho, c, value=0.5).mul_(c)
+    if clip and sense == "inequality":
+        # Continued by its minimum over c where the row lets go, so that L_M stays continuous.
+        terms = torch.where(rho == 0, lam.square().mul_(-0.5 / mu.view(-1, 1, 1)), terms)
+    # Two sums, knots last: one over both axes would be split among threads by batch size.
+    return terms.sum(-1).sum(-1)
+
+
+@kernel
+def _pull(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> tuple[Tensor, Tensor]:
+    """First and second derivative of that by c, (B, K, p) each."""
+    rho = penalty_weights(sense, c, lam, mu, clip)
+    g = torch.addcmul(lam, rho, c)
+    return (g.masked_fill_(rho == 0, 0.0) if clip and sense == "inequality" else g), rho
 
 
 @dataclass(frozen=True)
@@ -80,14 +101,7 @@ class Lagrangian:
         cost = self.problem.cost.total(X, U)
         merit = cost
         for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
-            c = constraint.value(X, U)
-            rho = penalty_weights(constraint, c, lam, self.duals.mu, self.clip)
-            terms = torch.addcmul(lam, rho, c, value=0.5).mul_(c)
-            if self.clip and constraint.sense == "inequality":
-                # Continued by its minimum over c where the row lets go, so that L_M stays continuous.
-                terms = torch.where(rho == 0, lam.square().mul_(-0.5 / self.duals.mu.view(-1, 1, 1)), terms)
-            # Two sums, knots last: one over both axes would be split among threads by batch size.
-            merit = merit + terms.sum(-1).sum(-1)
+            merit = merit + _worth(constraint.sense, constraint.value(X, U), lam, self.duals.mu, self.clip)
         return cost, merit if self.guide is None else merit + self.guide.value(X)
 
     def expand(self, X: Tensor, U: Tensor, out: Tensor | None = None) -> Tensor:
@@ -106,11 +120,7 @@ class Lagrangian:
     def _expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         quadratise(self.problem, X, U, out=H)
         for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
-            c = constraint.value(X, U)
-            rho = penalty_weights(constraint, c, lam, self.duals.mu, self.clip)
-            g = torch.addcmul(lam, rho, c)
-            if self.clip and constraint.sense == "inequality":
-                g.masked_fill_(rho == 0, 0.0)
+            g, rho = _pull(constraint.sense, constraint.value(X, U), lam, self.duals.mu, self.clip)
             constraint.accumulate(X, U, g, rho, H)
         if self.guide is not None:
             self.guide.accumulate(X, H)
