@@ -82,7 +82,8 @@ def pose_rates(x: Tensor) -> tuple[Tensor, Tensor]:
     terms = flat.index_select(0, states).mul_(factors).view(4, 7, -1) * flat[6:10].unsqueeze(1)
     first, second = terms.view(2, 14, -1).unbind(0)
     first, second = (first + second).view(2, 7, *x.shape[1:]).unbind(0)
-    return (first + second).split((3, 4))  # type: ignore[return-value]
+    axis, dq = (first + second).split_with_sizes((3, 4))
+    return axis, dq
 
 
 def pose_entries(x: Tensor, lift: Tensor) -> tuple[Tensor, Tensor]:

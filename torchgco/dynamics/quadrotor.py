@@ -139,8 +139,8 @@ class QuadrotorPlanning(Dynamics):
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         # `rates` with fewer operations.
         x, u = (x.mT, u.mT) if x.dim() == 2 else (x.movedim(-1, 0), u.movedim(-1, 0))
-        _, v, _, w, a = x.split((3, 3, 4, 3, 1))
-        w_c, a_c = u.split((3, 1))
+        _, v, _, w, a = x.split_with_sizes((3, 3, 4, 3, 1))
+        w_c, a_c = u.split_with_sizes((3, 1))
         axis, dq = pose_rates(x)
         dv = axis * a
         dv[2] -= self.gravity
