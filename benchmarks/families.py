@@ -18,15 +18,14 @@ class Family:
     reached: int  # of the file's 32, at least
     success: int
 
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return DATA / f"{self.name}.npz"
+    def file(self, fresh: int = 0, seed: int = 0) -> Path:
+        """Where the public layouts are, or the first drawn ones of a seed, with the best costs known."""
+        return DATA / (f"drawn/{self.name}-seed{seed}.npz" if fresh else f"{self.name}.npz")
 
     def overrides(self, fresh: int = 0, seed: int = 0) -> list[str]:
         """What `torchgco` is told: the file's layouts, or `fresh` new ones of a seed."""
         if fresh == 0:
-            source = ["scenario=layouts", f"scenario.path={self.path}"]
+            source = ["scenario=layouts", f"scenario.path={self.file()}"]
         else:
             source = [*self.drawn, f"study.layouts={fresh}"]
         return [*source, f"model={self.model}", f"seed={seed}"]

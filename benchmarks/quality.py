@@ -67,11 +67,15 @@ def _flown(family: Family, solver: str, asked: argparse.Namespace) -> pd.DataFra
     ]  # fmt: skip
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     trials = pd.read_parquet(folder / "trials.parquet").assign(scenario=family.name)
-    return trials if asked.fresh else succeeded(trials, Layouts.load(family.path))
+    best = family.file(asked.fresh, asked.seed)
+    return succeeded(trials, Layouts.load(best)) if best.exists() else trials
 
 
 def succeeded(trials: pd.DataFrame, layouts: Layouts) -> pd.DataFrame:
-    """The trials with their success against the best cost known today, which may be lower than when they flew."""
+    """The trials with their success against the best cost known today, which may be lower than when they flew.
+
+    Of drawn layouts it is known for the first ones alone, those that the oracle has seen.
+    """
     sound = trials["reached"] & (trials["violation"] <= SUCCESS_VIOLATION) & (trials["clearance"] >= 0)
     return with_success(trials.assign(sound=sound), layouts, 1)
 
@@ -96,7 +100,8 @@ def _rate(row: dict[str, float], name: str) -> str:
     if row[f"{name}_n"] == 0:
         return "-"
     low, high = (100 * row[f"{name}_{end}"] for end in ("low", "high"))
-    return f"{row[f'{name}_count']:.0f} [{low:.0f}, {high:.0f}]"
+    of = "" if row[f"{name}_n"] == row["n"] else f" of {row[f'{name}_n']:.0f}"
+    return f"{row[f'{name}_count']:.0f}{of} [{low:.0f}, {high:.0f}]"
 
 
 def _number(value: float, form: str) -> str:

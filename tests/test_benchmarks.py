@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks import oracle, quality
-from benchmarks.families import FAMILIES, Family
+from benchmarks.families import FAMILIES
 from benchmarks.speed import batch, families, growth, latency, mppi, share
 from benchmarks.speed.__main__ import main
 from benchmarks.speed.bench import Bench
@@ -22,6 +22,7 @@ from benchmarks.speed.sizes import Sizes
 from benchmarks.speed.tables import BEGIN, END, rewrite, section_table
 from torchgco import compose
 from torchgco.scenarios import Layouts
+from torchgco.shapes import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = Sizes(
@@ -139,23 +140,39 @@ def test_without_a_gpu_nothing_is_measured(monkeypatch, capsys, tmp_path: Path) 
     assert "No CUDA device" in capsys.readouterr().out and not (tmp_path / "results.csv").exists()
 
 
-def test_the_oracle_only_ever_lowers_a_cost(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("benchmarks.families.DATA", tmp_path)
-    family = Family("planar_random", "planar", (), 32, 30)
-    replace(Layouts.load(ROOT / "benchmarks/data/planar_random.npz").take([0, 1, 2]), best_cost=None).save(family.path)
-    nan = float("nan")
+def test_the_oracle_only_ever_lowers_a_cost(tmp_path: Path) -> None:
+    path, nan = tmp_path / "layouts.npz", float("nan")
+    replace(Layouts.load(ROOT / "benchmarks/data/planar_random.npz").take([0, 1, 2]), best_cost=None).save(path)
     for costs, best in (
         ([500.0, nan, nan], [500.0, nan, nan]),
         ([600.0, 300.0, nan], [500.0, 300.0, nan]),
         ([400.0, nan, nan], [400.0, 300.0, nan]),
     ):
-        oracle.keep(family, np.array(costs), "here")
-        np.testing.assert_array_equal(Layouts.load(family.path).best_cost, best)
+        oracle.keep(path, np.array(costs), "here")
+        np.testing.assert_array_equal(Layouts.load(path).best_cost, best)
+
+
+def test_the_oracle_keeps_drawn_layouts_and_success_is_told_for_them(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("benchmarks.families.DATA", tmp_path)
+    monkeypatch.setattr(oracle, "SEARCH", {"hold": ["solver=hold"]})
+    words = ["--families", "planar_random", "--fresh", "2", "--seed", "7"]
+    for _ in range(2):  # the second finds the file
+        assert oracle.main([*words, "--search", "hold"]) == 0
+    family = FAMILIES["planar_random"]
+    drawn = Layouts.load(family.file(2, 7))
+    np.testing.assert_array_equal(drawn.centers, compose(family.overrides(3, 7)).layouts(2).centers)
+    assert drawn.best_cost is None  # nothing arrives by holding still
+    with pytest.raises(InputError, match="fresh: expected the layouts that"):
+        oracle.held(family, 3, 7)
+    oracle.keep(family.file(2, 7), np.array([100.0, np.nan]), "here")
+    flown = ["--solvers", "hold", "--outputs", str(tmp_path / "quality"), "study.workers=1"]
+    assert quality.main(["--families", "planar_random", "--fresh", "3", "--seed", "7", *flown]) == 0
+    assert "| 0 of 1 [0, 79] |" in capsys.readouterr().out
 
 
 def test_no_best_cost_is_above_a_peers() -> None:
     for family in FAMILIES.values():
-        best, theirs = Layouts.load(family.path).best_cost, oracle.reference(family)
+        best, theirs = Layouts.load(family.file()).best_cost, oracle.reference(family)
         assert best is not None and not bool((best > theirs).any())
 
 
@@ -166,23 +183,28 @@ def test_the_quality_of_one_family(tmp_path: Path, capsys) -> None:
     assert row[0] == "| planar_trap" and row[1:4] == ["`hold`", "3", "3 [44, 100]"] and row[4] == "0 [0, 56]"
 
 
-def test_success_is_told_against_the_best_cost_of_today(tmp_path: Path) -> None:
+def test_success_is_told_against_the_best_cost_of_today(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("benchmarks.families.DATA", tmp_path)
     family = FAMILIES["planar_trap"]
-    asked = quality._parser().parse_args(["--solvers", "hold", "--outputs", str(tmp_path)])
+    layouts = Layouts.load(ROOT / "benchmarks/data/planar_trap.npz").take([0, 1])
+    layouts.save(family.file())
+    asked = quality._parser().parse_args(["--solvers", "hold", "--outputs", str(tmp_path / "quality")])
     asked.overrides = ["study.layouts=2", "study.workers=1"]
     flown = quality.fly(family, asked)
     assert flown["solver"].unique().tolist() == ["hold"] and not flown["success"].any()
-    there = flown.assign(reached=True, violation=[0.0, 2e-3], clearance=0.1, cost=flown["best_cost"])
-    layouts = Layouts.load(family.path).take([0, 1])
-    assert quality.succeeded(there, layouts)["success"].tolist() == [True, False]
     lower = replace(layouts, best_cost=0.9 * layouts.best_cost)
+    lower.save(family.file())
+    again = quality.fly(family, asked)  # the study that has flown isn't refused
+    np.testing.assert_array_equal(again["best_cost"], lower.best_cost)
+    there = flown.assign(reached=True, violation=[0.0, 2e-3], clearance=0.1, cost=flown["best_cost"])
+    assert quality.succeeded(there, layouts)["success"].tolist() == [True, False]
     assert quality.succeeded(there, lower)["success"].tolist() == [False, False]
 
 
 def test_families_are_what_the_generators_draw() -> None:
     """Fresh layouts are of the files' kind: as many obstacles of the same size, the same ends."""
     for family in FAMILIES.values():
-        drawn, held = compose(family.overrides(fresh=2)).layouts(), Layouts.load(family.path)
+        drawn, held = compose(family.overrides(fresh=2)).layouts(), Layouts.load(family.file())
         task, other = (compose(family.overrides(fresh=f)).task(layouts) for f, layouts in ((2, drawn), (0, held)))
         assert (task.problem.N, task.goal_radius) == (other.problem.N, other.goal_radius)
         torch.testing.assert_close(task.problem.x0[0], other.problem.x0[0])

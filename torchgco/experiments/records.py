@@ -11,7 +11,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import IO, Any
@@ -102,9 +102,9 @@ class Records:
 
 
 def digest(layouts: Layouts) -> str:
-    """A hash of what is flown: a changed file under the same name is another study."""
+    """A hash of what is flown: a changed file under the same name is another study, a lower best cost in it isn't."""
     total = sha256()
-    for name, array in sorted(layouts.arrays().items()):
+    for name, array in sorted(replace(layouts, best_cost=None).arrays().items()):
         total.update(f"{name}{array.shape}{array.dtype}".encode() + np.ascontiguousarray(array).tobytes())
     return total.hexdigest()
 
