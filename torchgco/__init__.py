@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 from torchgco.api import solve as solve
@@ -48,6 +49,10 @@ if TYPE_CHECKING:
     from torchgco.experiments.build import compose as compose
 
 __version__ = "0.1.0"
+
+# On some processors the library behind PyTorch's products picks a kernel by where in memory a matrix lies, and so by
+# its place in the batch; an element's bits would depend on its companions. Read at the library's first use.
+os.environ.setdefault("MKL_CBWR", "AUTO")
 
 
 def __getattr__(name: str) -> Any:
