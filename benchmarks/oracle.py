@@ -24,19 +24,21 @@ from torchgco import compose, judge
 from torchgco.scenarios import Layouts
 from torchgco.shapes import InputError
 
-# Solver configs with overrides. `ways` refines each of the ten best of sixteen ways: different homotopy classes.
+# Solver configs with overrides. `ways` solves 32 plans along up to 24 ways to their end, `early` with another timing.
+WAYS = (
+    "solver=gco_max", "solver.guidance.detour.finalists=32", "solver.guidance.detour.ways=24",
+    "solver.guidance.detour.roadmap.spread=256",
+)  # fmt: skip
 SEARCH = {
     "gco": ["solver=gco"],
     "gco_max": ["solver=gco_max"],
-    "ways": [
-        "solver=gco_max", "solver.attempts=10", "solver.guidance.detours=10", "solver.guidance.detour.ways=16",
-        "solver.guidance.detour.roadmap.spread=256",
-    ],
+    "ways": [*WAYS],
+    "early": [*WAYS, "solver.guidance.detour.end=0.6", "solver.guidance.detour.dtype=float32", "solver.attempts=1"],
     "multistart": ["solver=multistart"],
     "gco_paper": ["solver=gco_paper"],
     "fatrop": ["solver=fatrop"],
     "ipopt": ["solver=ipopt"],
-}  # fmt: skip
+}
 PEERS = ("fatrop", "ipopt")  # need the extra `peers`; on the public layouts reference.csv has flown them
 
 

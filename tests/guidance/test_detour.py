@@ -23,6 +23,7 @@ from torchgco import (
 from torchgco.draws import DrawKey
 from torchgco.guidance import Detour, Roadmap
 from torchgco.guidance.detour import Plans, Proposal
+from torchgco.guidance.scene import depth_between
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.rollout import open_loop
 
@@ -135,9 +136,9 @@ def test_the_way_that_settles_best_is_kept_and_the_others_follow_by_rank() -> No
     problem, many = cup(B=1), replace(QUICK, ways=3)
     plans = [many.propose(problem, torch.tensor([rank])) for rank in range(4)]
     assert torch.equal(plans[0].U, many.propose(problem).U)
-    assert [bool(plan.found) for plan in plans] == [True, True, True, False]
+    assert [bool(plan.found) for plan in plans] == [True, True, False, False]  # on the left or on the right
     duals = plans[0].duals
-    paths = [open_loop(problem.dynamics, problem.x0, plan.U) for plan in plans[:3]]
+    paths = [open_loop(problem.dynamics, problem.x0, plan.U) for plan in plans[:2]]
     merits = [
         float(Lagrangian(problem, duals, None, True).value(X, p.U)[1]) for X, p in zip(paths, plans, strict=False)
     ]
@@ -219,7 +220,8 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
         detour = replace(QUICK, tube=tube, stiffness=(stiffness,), iterations=4, settle=0, depth=9.0)
         way = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
         R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
-        U = detour._follow(Plans(problem, controls(problem), R, unit, 1), way).U
+        live = torch.ones(1, dtype=torch.bool)
+        U = detour._follow(Plans(problem, controls(problem), R, unit, live, 1), way).U
         X = open_loop(problem.dynamics, problem.x0, U)
         off.append(float((X[..., :2] - detour._travel(way, 120)).norm(dim=-1).mean()))
     assert off[1] < 0.5 * off[0]
@@ -246,14 +248,72 @@ def test_finalists_are_solved_to_their_end_and_the_cheapest_there_is_handed_over
 
 def test_paths_that_are_alike_count_once() -> None:
     problem = cup(B=1)
-    R, unit = torch.ones(2, 3, dtype=torch.float64)
-    plans = Plans(problem.take(torch.zeros(3, dtype=torch.int64)), controls(problem).repeat(3, 1, 1), R, unit, 3)
+    R, unit, live = *torch.ones(2, 3, dtype=torch.float64), torch.ones(3, dtype=torch.bool)
+    plans = Plans(problem.take(torch.zeros(3, dtype=torch.int64)), controls(problem).repeat(3, 1, 1), R, unit, live, 3)
     plans.U[2] = -1.0  # drives away, which costs more
     first = torch.ones(3, dtype=torch.bool)
     assert QUICK._order(plans, first).tolist() == [[0, 1, 2]]
     assert QUICK._order(plans, first, alike=1e-3).tolist() == [[0, 2, 1]]
     first[0] = False  # what isn't sound stands for nobody
     assert QUICK._order(plans, first, alike=1e-3).tolist() == [[1, 2, 0]]
+
+
+def test_what_is_not_live_is_left_as_it_is_and_comes_last() -> None:
+    problem = cup(B=1, N=60)
+    R, unit, live = (
+        torch.full((2,), 0.2, dtype=torch.float64),
+        torch.full((2,), 1e4, dtype=torch.float64),
+        [False, True],
+    )
+    U = controls(problem).repeat(2, 1, 1)
+    U[1] = -1.0  # drives away, which costs more
+    plans = Plans(problem.take(torch.zeros(2, dtype=torch.int64)), U, R, unit, torch.tensor(live), 2)
+    assert QUICK._order(plans, torch.ones(2, dtype=torch.bool)).tolist() == [[1, 0]]
+    settled, sound = replace(QUICK, settle=2)._settle(plans)
+    assert torch.equal(settled.U[0], U[0]) and not torch.equal(settled.U[1], U[1]) and not bool(sound[0])
+
+
+def test_ways_of_one_class_are_followed_once(monkeypatch) -> None:
+    """The cup has a left and a right side: of five ways two are followed, from rest and after each push."""
+    counts = []
+    solve = ILQR.solve
+    monkeypatch.setattr(
+        ILQR, "solve", lambda self, problem, *a, **k: counts.append(problem.B) or solve(self, problem, *a, **k)
+    )
+    five = replace(QUICK, ways=5, stiffness=(20.0,), iterations=1, settle=1)
+    for pushes, rows in (((), 2), (((7.0, -7.0), (-7.0, 7.0)), 6)):
+        counts.clear()
+        replace(five, pushes=pushes).propose(cup(B=1, N=60))
+        assert counts == [rows, rows]
+
+
+def test_a_push_turns_the_vehicle_before_it_sets_out() -> None:
+    rest = torch.zeros(3, 40, 2, dtype=torch.float64)
+    starts = replace(QUICK, pushes=((7.0, -7.0), (0.0, 2.0)))._begun(rest)
+    assert starts.shape == (3, 3, 40, 2) and not bool(starts[:, 0].any()) and not bool(starts[:, :, 4:].any())
+    assert starts[2, 1, 3].tolist() == [7.0, -7.0] and starts[0, 2, 0].tolist() == [0.0, 2.0]
+    with pytest.raises(InputError, match=r"detour\.pushes: expected shape \(1, 2\)"):
+        replace(QUICK, pushes=((1.0,),)).propose(cup())
+
+
+def test_a_finalist_that_cuts_through_an_obstacle_between_two_knots_is_refused(monkeypatch) -> None:
+    problem, one = cup(B=1, N=120), replace(QUICK, ways=2, iterations=20, finalists=2)
+    assert bool(one.propose(problem).found)
+    plan = one.propose(problem)
+    monkeypatch.setattr("torchgco.guidance.detour.BETWEEN", -9.0)  # nobody keeps such a distance
+    refused = one.propose(problem)
+    assert not torch.equal(plan.U, refused.U) and not any(bool(lam.any()) for lam in refused.duals.lam)
+
+
+def test_depth_between_the_knots() -> None:
+    """A step across a disc is as deep as its middle, whatever lies at its ends; an absent disc counts for nothing."""
+    problem = cup(B=1, N=2)
+    X = torch.zeros(1, 3, 6, dtype=torch.float64)
+    X[0, :, 0] = torch.tensor([-5.0, 5.0, 6.0])
+    X[0, :, 1] = 0.1  # through the middle of the third disc
+    torch.testing.assert_close(depth_between(problem, X), torch.tensor([0.2], dtype=torch.float64))
+    X[0, :, 1] = 5.0
+    assert float(depth_between(problem, X)) < 0
 
 
 def test_a_plan_with_its_own_penalty_is_left_alone() -> None:

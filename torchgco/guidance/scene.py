@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.guidance.roadmap import FAR, Scene
+from torchgco.guidance.roadmap import FAR, Scene, segment_gaps
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.shapes import InputError
@@ -70,6 +70,16 @@ def depth(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """How deep a path reaches into an obstacle, (B,), m."""
     rows = [c.violation(X, U).flatten(1).amax(-1) for c in problem.geometric]
     return torch.stack(rows).amax(0)
+
+
+def depth_between(problem: Problem, X: Tensor) -> Tensor:
+    """How deep the straight segments between the knots of paths X (B, N+1, n) reach into a sphere, (B,), m."""
+    p = X[..., position(problem)]
+    spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres)]
+    gaps = [
+        segment_gaps(p[:, :-1], p[:, 1:], c.centers, torch.where(c.absent, FAR, c.distances)).amin(-1) for c in spheres
+    ]
+    return -torch.stack(gaps).amin(0)
 
 
 def _resting_cost(problem: Problem, rest: Tensor, points: Tensor) -> Tensor:
