@@ -28,6 +28,7 @@ from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.rollout import open_loop
 
 QUICK = Detour(begin=0.1, end=0.8, iterations=8, depth=1.0)
+END = torch.tensor([0.7], dtype=torch.float64)
 GOAL = torch.tensor([1.0, 0.4], dtype=torch.float64)
 WEIGHTS = [5, 5, 1e-8, 1, 1, 1e-8]
 
@@ -99,10 +100,10 @@ def test_where_there_is_no_way_nothing_is_proposed(problem: Problem) -> None:
 
 def test_the_vehicle_rests_first_and_last() -> None:
     way = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [1.0, 1.0]]], dtype=torch.float64)
-    center = replace(QUICK, begin=0.2, end=0.7, smoothing=0.0)._travel(way, 100)[0]
+    center = replace(QUICK, begin=0.2, end=0.7, smoothing=0.0)._travel(way, END, 100)[0]
     assert torch.equal(center[:21], way[0, :1].expand(21, -1)) and torch.equal(center[70:], way[0, -1:].expand(31, -1))
     assert float((center[1:] - center[:-1]).square().sum(-1).sqrt().max()) < 1.6 * 2.0 / 50
-    rounded = replace(QUICK, begin=0.2, end=0.7, smoothing=0.1)._travel(way, 100)[0]
+    rounded = replace(QUICK, begin=0.2, end=0.7, smoothing=0.1)._travel(way, END, 100)[0]
     corner = torch.tensor([1.0, 0.0], dtype=torch.float64)
     assert float((center - corner).norm(dim=-1).min()) < 0.03 < float((rounded - corner).norm(dim=-1).min())
 
@@ -221,9 +222,9 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
         way = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
         R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
         live = torch.ones(1, dtype=torch.bool)
-        U = detour._follow(Plans(problem, controls(problem), R, unit, live, 1), way).U
+        U = detour._follow(Plans(problem, controls(problem), R, unit, live, 1), way, 0.8 * torch.ones_like(R)).U
         X = open_loop(problem.dynamics, problem.x0, U)
-        off.append(float((X[..., :2] - detour._travel(way, 120)).norm(dim=-1).mean()))
+        off.append(float((X[..., :2] - detour._travel(way, 0.8 * torch.ones_like(R), 120)).norm(dim=-1).mean()))
     assert off[1] < 0.5 * off[0]
 
 
@@ -274,16 +275,20 @@ def test_what_is_not_live_is_left_as_it_is_and_comes_last() -> None:
 
 
 def test_ways_of_one_class_are_followed_once(monkeypatch) -> None:
-    """The cup has a left and a right side: of five ways two are followed, from rest and after each push."""
+    """The cup has a left and a right side: of five ways two are followed, from every start to each end."""
     counts = []
     solve = ILQR.solve
     monkeypatch.setattr(
         ILQR, "solve", lambda self, problem, *a, **k: counts.append(problem.B) or solve(self, problem, *a, **k)
     )
     five = replace(QUICK, ways=5, stiffness=(20.0,), iterations=1, settle=1)
-    for pushes, rows in (((), 2), (((7.0, -7.0), (-7.0, 7.0)), 6)):
+    for pushes, end, rows in (
+        ((), 0.8, 2),
+        (((7.0, -7.0), (-7.0, 7.0)), 0.8, 6),
+        (((7.0, -7.0),), (0.8, 0.6, 0.7), 12),
+    ):
         counts.clear()
-        replace(five, pushes=pushes).propose(cup(B=1, N=60))
+        replace(five, pushes=pushes, end=end).propose(cup(B=1, N=60))
         assert counts == [rows, rows]
 
 
@@ -359,6 +364,7 @@ def test_a_quadrotor_is_led_too() -> None:
     [
         (dict(roadmap={"nodes": 64}), "detour.roadmap"),
         (dict(begin=0.9), "detour.begin"), (dict(begin=-0.1), "detour.begin"), (dict(end=1.1), "detour.begin"),
+        (dict(end=(0.5, 1.1)), "detour.begin"), (dict(end=()), "detour.begin"),
         (dict(smoothing=1.0), "detour.smoothing"), (dict(tube=0.0), "detour.tube"), (dict(hold=0.0), "detour.hold"),
         (dict(obstacle_penalty=0.0), "detour.obstacle_penalty"), (dict(stiffness=()), "detour.stiffness"),
         (dict(stiffness=(0.0,)), "detour.stiffness"), (dict(iterations=0), "detour.iterations"),

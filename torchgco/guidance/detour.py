@@ -12,6 +12,7 @@ out.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -87,7 +88,8 @@ class Detour:
             is followed from rest, and from each of these too. Whatever the way, a vehicle that has been made to spin
             turns by another angle, and drives parts of it backwards.
         keep: how many of these are settled, the cheapest as followed; None: all.
-        begin, end: the shares of the horizon at which the vehicle sets out and arrives.
+        begin, end: the shares of the horizon at which the vehicle sets out and arrives. Several ends: every way is
+            followed to arrive at each.
         smoothing: the share of the horizon over which the way's corners are averaged.
         tube: radius of the tube, as a share of R; None: no tube, but a spring to the point that travels. A spring is
             followed in half the iterations; for vehicles that can't move sideways the tube ends closer to the way.
@@ -111,7 +113,7 @@ class Detour:
     pushes: tuple[tuple[float, ...], ...] = ()
     keep: int | None = None
     begin: float = 0.0
-    end: float = 0.9
+    end: float | tuple[float, ...] = 0.9
     smoothing: float = 0.08
     tube: float | None = 0.05
     stiffness: tuple[float, ...] = (20.0, 200.0)
@@ -127,7 +129,7 @@ class Detour:
     def __post_init__(self) -> None:
         if not isinstance(self.roadmap, Roadmap):
             raise InputError("detour.roadmap", "a Roadmap", self.roadmap)
-        if not 0 <= self.begin < self.end <= 1:
+        if not self.ends or not all(0 <= self.begin < end <= 1 for end in self.ends):
             raise InputError("detour.begin", f"at least 0 and below end, {self.end}", self.begin)
         if not 0 <= self.smoothing < 1:
             raise InputError("detour.smoothing", "at least 0 and below 1", self.smoothing)
@@ -143,6 +145,11 @@ class Detour:
         for name, least in (("ways", 1), ("keep", 1), ("iterations", 1), ("settle", 0), ("finalists", 1)):
             if getattr(self, name) is not None and getattr(self, name) < least:
                 raise InputError(f"detour.{name}", f"at least {least}", getattr(self, name))
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """All of `end`."""
+        return tuple(self.end) if isinstance(self.end, Sequence) else (self.end,)
 
     def propose(self, problem: Problem, rank: Tensor | None = None) -> Proposal:
         """A plan for every problem, from the vehicle at rest, along the best of the ways or that of a rank (B,)."""
@@ -164,13 +171,15 @@ class Detour:
         R, unit = seen.scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
         begun = self._begun(rest)
+        begun = begun.repeat_interleave(len(self.ends), dim=1)
         starts, count = begun.shape[1], self.ways * begun.shape[1]
         everyone = torch.arange(problem.B, device=rest.device).repeat_interleave(count)
         unit = torch.where(found, unit, 1.0)
         live = (distinct(ways, scene) & found.unsqueeze(-1)).repeat_interleave(starts, dim=1).flatten()
         U = begun.repeat(1, self.ways, 1, 1).flatten(0, 1)
         plans = Plans(problem.take(everyone), U, R[everyone], unit[everyone], live, count)
-        plans = self._follow(plans, ways.repeat_interleave(starts, dim=1).flatten(0, 1))
+        end = rest.new_tensor(self.ends).repeat(everyone.numel() // len(self.ends))
+        plans = self._follow(plans, ways.repeat_interleave(starts, dim=1).flatten(0, 1), end)
         best = self._order(plans, seen.arrives(plans.problem, plans.U))
         plans = plans.pick(best[:, : count if self.keep is None else self.keep])
         plans, sound = self._settle(plans)
@@ -190,10 +199,12 @@ class Detour:
             starts[:, 1:, : math.ceil(PUSHED * N)] += pushes.unsqueeze(1)
         return starts
 
-    def _follow(self, plans: Plans, way: Tensor) -> Plans:
-        """Each plan a way's."""
+    def _follow(self, plans: Plans, way: Tensor, end: Tensor) -> Plans:
+        """Each plan a way's, followed to arrive at its share of the horizon."""
         for stiffness in self.stiffness:
-            guide = self._guide(plans.problem, way, plans.R, stiffness * plans.unit)
+            guide = self._guide(
+                plans.problem, self._travel(way, end, plans.problem.N), way, plans.R, stiffness * plans.unit
+            )
             U = self._solved(plans, self.iterations, plans.duals(self.obstacle_penalty), guide)
             plans = replace(plans, U=U)
         return plans
@@ -274,9 +285,9 @@ class Detour:
             order = order.gather(1, later.argsort(dim=-1, stable=True))
         return order
 
-    def _guide(self, problem: Problem, way: Tensor, R: Tensor, stiffness: Tensor) -> Guide:
-        """What draws along the way; stiffness (B,) in units of q0 / (R^4 L^2)."""
-        center, at = self._travel(way, problem.N), seen.position(problem)
+    def _guide(self, problem: Problem, center: Tensor, way: Tensor, R: Tensor, stiffness: Tensor) -> Guide:
+        """What draws to the points of the way that are to be passed; stiffness (B,) in units of q0 / (R^4 L^2)."""
+        at = seen.position(problem)
         length2 = (way[:, -1] - way[:, 0]).square().sum(-1)
         spring = stiffness * R.pow(4) / length2.clamp(min=1e-12)
         if self.tube is None:
@@ -286,10 +297,10 @@ class Detour:
         weight = spring / (4.0 * radius.square()).clamp(min=1e-12)
         return GuideRegion(center, radius.unsqueeze(-1).repeat(1, problem.N + 1), weight, at)
 
-    def _travel(self, way: Tensor, N: int) -> Tensor:
+    def _travel(self, way: Tensor, end: Tensor, N: int) -> Tensor:
         """What is followed, at every knot, (B, N+1, d): speeding up and slowing down smoothly, corners rounded."""
         share = torch.arange(N + 1, dtype=way.dtype, device=way.device) / N
-        share = ((share - self.begin) / (self.end - self.begin)).clamp(0.0, 1.0)
+        share = ((share - self.begin) / (end.unsqueeze(-1) - self.begin)).clamp(0.0, 1.0)
         share = share.square() * (3.0 - 2.0 * share)
         length = (way[:, 1:] - way[:, :-1]).square().sum(-1).sqrt().sum(-1, keepdim=True)
         center = points_along(way, share * length)
