@@ -1,7 +1,7 @@
 """A plan along a short way between the obstacles: the geometric proposal of guidance.
 
 A way says where to pass; iLQR finds the controls that follow it, drawn to a point, or into a narrow tube, that travels
-along it slowly enough for the vehicle to turn. Then nothing draws any more, and the path settles beside the obstacles
+along it slowly enough for the vehicle to turn; from rest, and from some spins (`pushes`). Then nothing draws any more, and the path settles beside the obstacles
 that it has come around. The shortest way is often not the cheapest to fly: several are followed, and the one that
 settles best is handed over, or the one of the best few that is cheapest when it is solved to its end. It need not be
 quite free of contact: it is where the solver goes on from, with a penalty that keeps it on this side of every obstacle.
@@ -62,8 +62,8 @@ class Plans:
     def pick(self, order: Tensor) -> Plans:
         """The plans at the places `order` (B, c) among those of their problem."""
         rows = self.rows(order).flatten()
-        problem, rest = self.problem.take(rows), (t[rows] for t in (self.U, self.R, self.unit, self.live))
-        return Plans(problem, *rest, order.shape[1])
+        U, R, unit, live = (t[rows] for t in (self.U, self.R, self.unit, self.live))
+        return Plans(self.problem.take(rows), U, R, unit, live, order.shape[1])
 
     def rows(self, order: Tensor) -> Tensor:
         """Rows (B, c) of the plans at the places `order` (B, c)."""
@@ -170,8 +170,7 @@ class Detour:
         ways, found = self.roadmap.ways(scene, self.ways)
         R, unit = seen.scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
-        begun = self._begun(rest)
-        begun = begun.repeat_interleave(len(self.ends), dim=1)
+        begun = self._begun(rest).repeat_interleave(len(self.ends), dim=1)
         starts, count = begun.shape[1], self.ways * begun.shape[1]
         everyone = torch.arange(problem.B, device=rest.device).repeat_interleave(count)
         unit = torch.where(found, unit, 1.0)
