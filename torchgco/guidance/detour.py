@@ -1,12 +1,12 @@
 """A plan along a short way between the obstacles: the geometric proposal of guidance.
 
 A way says where to pass; iLQR finds the controls that follow it, drawn to a point, or into a narrow tube, that travels
-along it slowly enough for the vehicle to turn; from rest, and from some spins (`pushes`). Then nothing draws any more, and the path settles beside the obstacles
-that it has come around. The shortest way is often not the cheapest to fly: several are followed, and the one that
-settles best is handed over, or the one of the best few that is cheapest when it is solved to its end. It need not be
-quite free of contact: it is where the solver goes on from, with a penalty that keeps it on this side of every obstacle.
-One that lies deep within obstacles is handed over to nobody: the solver would spend a whole attempt on squeezing it
-out.
+along it slowly enough for the vehicle to turn, from rest and from some spins. Then nothing draws any more, and the path
+settles beside the obstacles that it has come around. The shortest way is often not the cheapest to fly: several are
+followed, and the one that settles best is handed over, or the one of the best few that is cheapest when it is solved to
+its end. It need not be quite free of contact: it is where the solver goes on from, with a penalty that keeps it on this
+side of every obstacle. One that lies deep within obstacles is handed over to nobody: the solver would spend a whole
+attempt on squeezing it out.
 """
 
 from __future__ import annotations
