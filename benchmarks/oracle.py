@@ -21,6 +21,7 @@ import torch
 
 from benchmarks.families import DATA, FAMILIES, Family
 from torchgco import compose, judge
+from torchgco.judge import SUCCESS_COST
 from torchgco.scenarios import Layouts
 from torchgco.shapes import InputError
 
@@ -114,7 +115,7 @@ def keep(path: Path, costs: np.ndarray, source: str) -> None:
     if lowered.any():
         replace(layouts, best_cost=best).save(path)
     ways, median = int((~np.isnan(best)).sum()), np.nanmedian(best) if not np.isnan(best).all() else np.nan
-    missed = int((old > 1.05 * costs).sum())
+    missed = int((old > SUCCESS_COST * costs).sum())
     print(
         f"{path.stem}: {source} lowers {lowered.sum()} of {layouts.count}, {missed} by over 5 %; "
         f"ways on {ways}, median {median:,.1f}",

@@ -371,7 +371,7 @@ def test_a_quadrotor_is_led_too() -> None:
         (dict(ways=0), "detour.ways"), (dict(keep=0), "detour.keep"),
         (dict(settle=-1), "detour.settle"), (dict(depth=0.0), "detour.depth"),
         (dict(tolerance=0.0), "detour.tolerance"), (dict(finalists=0), "detour.finalists"),
-        (dict(dtype="float16"), "detour.dtype"),
+        (dict(dtype="float16"), "detour.dtype"), (dict(pushes=7), "detour.pushes"),
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_named(change: dict, field: str) -> None:

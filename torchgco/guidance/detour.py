@@ -131,6 +131,8 @@ class Detour:
             raise InputError("detour.roadmap", "a Roadmap", self.roadmap)
         if not self.ends or not all(0 <= self.begin < end <= 1 for end in self.ends):
             raise InputError("detour.begin", f"at least 0 and below end, {self.end}", self.begin)
+        if not isinstance(self.pushes, Sequence):
+            raise InputError("detour.pushes", "a list of offsets of the controls", self.pushes)
         if not 0 <= self.smoothing < 1:
             raise InputError("detour.smoothing", "at least 0 and below 1", self.smoothing)
         if self.tube is not None and not self.tube > 0:
