@@ -10,6 +10,8 @@ from tests.reference import models
 from tests.reference.problem import ReferenceProblem
 from torchgco import ControlBounds, Planar, Problem, QuadraticCost, QuadrotorPlanning, Spheres
 
+# Tolerances and penalties in units of cost, as the paper prints them.
+PRINTED = dict(tolerance=0.0, normalise=False)
 HOVER = [0.0, 0.0, 0.0, 9.81]
 START = [-1.0, 1.0, 0.0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 9.81]
 

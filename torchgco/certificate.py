@@ -22,6 +22,7 @@ from torchgco.judge import segment_distance
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, check_shape
 
+NEGLIGIBLE = 1e-9  # share of the largest scale of all controls that each control's scale has at least
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this to spare (m for lengths) may have a multiplier
 
 
@@ -37,9 +38,10 @@ class Certificate:
     clearance: Tensor
     # Largest excess over control and state bounds, in their units; 0 proves that they hold at every knot.
     bound_violation: Tensor
-    # Largest component of the gradient of the Lagrangian by U, by 1 + the largest of the gradient of J_var alone, with
-    # the multipliers (inequalities: at least 0) that make it smallest in the least-squares sense. Near 0 it proves a
-    # stationary point to first order, not a minimum, and says nothing of rows that are violated.
+    # Largest component of the gradient of the Lagrangian by U, with the multipliers (inequalities: at least 0) that make
+    # it smallest in the least-squares sense, as a share of the largest terms that cancel in the gradient of J_var by
+    # the same control: no unit of cost or control changes it. Near 0 it proves a stationary point to first order, not a
+    # minimum, and says nothing of rows that are violated.
     kkt_residual: Tensor
 
 
@@ -149,13 +151,17 @@ def _kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     cost = _local(problem.cost.total, X, U)
     active = _active_rows(problem, X, U)
     gX, gU = (torch.cat([cost[i], *(rows[i] for _, rows in active)]) for i in (0, 1))
-    reduced = _reduced(problem, X, U, gX, gU).cpu().numpy()
+    reduced, terms = _reduced(problem, X, U, gX, gU)
+    gradients = reduced.flatten(1).cpu().numpy()
     senses = [equality for equality, (rows, _) in active for _ in rows]
-    return X.new_tensor(_fit(reduced[0], reduced[1:], np.array(senses, dtype=bool)))
+    rest = X.new_tensor(_fit(gradients[0], gradients[1:], np.array(senses, dtype=bool))).abs().view_as(U[0]).amax(0)
+    scale = terms.amax(0)
+    scale = torch.maximum(scale, NEGLIGIBLE * scale.amax())
+    return torch.where(rest > 0, rest / scale, 0.0).amax()
 
 
-def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> float:
-    """|g + A'lam|_inf / (1 + |g|_inf) with least-squares lam, at least 0 where not an equality."""
+def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> np.ndarray:
+    """g + A'lam with least-squares lam, at least 0 where not an equality."""
     length = np.linalg.norm(A, axis=1)
     moves = length > 1e-12 * max(1.0, length.max(initial=0.0))
     A, equality = A[moves] / length[moves, None], equality[moves]
@@ -167,7 +173,7 @@ def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> float:
         except RuntimeError:  # no end among nearly dependent rows: the unbounded fit, cut off, is an upper bound too
             lam = np.linalg.lstsq(cone.T, -g, rcond=None)[0].clip(min=0.0)
         rest = g + lam @ cone
-    return float(np.abs(rest).max() / (1.0 + np.abs(g).max()))
+    return rest
 
 
 def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tuple[Tensor, Tensor]]]:
@@ -208,17 +214,21 @@ def _gradients(value: Tensor, *by: Tensor) -> tuple[Tensor, ...]:
     return torch.autograd.grad(value, by, allow_unused=True, materialize_grads=True)
 
 
-def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> Tensor:
-    """Total derivatives (q, N m) by U through the dynamics, by the adjoint recursion for q rows at once."""
+def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> tuple[Tensor, Tensor]:
+    """Total derivatives (q, N, m) by U through the dynamics, by the adjoint recursion for q rows at once.
+
+    And, for the first row, the sizes (N, m) of the terms that are added up in it.
+    """
     n, N = problem.n, problem.N
     twins = problem.dynamics.take(torch.zeros(n, dtype=torch.int64, device=X.device))
     with torch.enable_grad():
         x, u = X[:, :-1].repeat(n, 1, 1).requires_grad_(), U.repeat(n, 1, 1).requires_grad_()
         after = twins.step(x, u).diagonal(dim1=0, dim2=2).sum()
         fx, fu = _gradients(after, x, u)  # (n, N, n), (n, N, m)
-    total = torch.empty_like(gU)
+    total, terms = torch.empty_like(gU), torch.empty_like(gU[0])
     adjoint = gX[:, N]
     for k in range(N - 1, -1, -1):
         total[:, k] = gU[:, k] + adjoint @ fu[:, k]
+        terms[k] = gU[0, k].abs() + adjoint[0].abs() @ fu[:, k].abs()
         adjoint = gX[:, k] + adjoint @ fx[:, k]
-    return total.flatten(1)
+    return total, terms

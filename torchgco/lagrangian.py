@@ -15,6 +15,7 @@ from torchgco.kernels import kernel
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, Rows, pieces, take
 
+VIOLATION_TOLERANCE = 1e-3  # metres for lengths, all else in the units of its constraint
 AT_ONCE = 64  # problems that are valued and expanded together on a CPU
 
 
@@ -32,6 +33,10 @@ class Multipliers:
         U = problem.x0.new_zeros(problem.B, problem.N, problem.m)
         lam = tuple(torch.zeros_like(c.value(X, U)) for c in problem.constraints)
         return cls(lam, problem.x0.new_full((problem.B,), mu))
+
+    def scaled(self, factor: Tensor) -> Multipliers:
+        """The multipliers and penalties of the same problems with their costs times `factor` (B,)."""
+        return Multipliers(tuple(factor.view(-1, 1, 1) * lam for lam in self.lam), factor * self.mu)
 
     def check(self, problem: Problem) -> None:
         """Raise InputError unless these multipliers belong to a problem of this form (a warm start)."""
@@ -116,6 +121,19 @@ class Lagrangian:
             part = self if len(everyone) == 1 else self.take(rows)
             part._expand(X[rows], U[rows], H[:, rows].transpose(0, 1))
         return H
+
+    def expand_optimality(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+        """H (N+1, B, s, s) of J_var + lam'c, with the penalty's curvature on the rows that push; and sum |lam c| (B,)
+        of the inequalities that push without being met, which complementarity leaves open.
+        """
+        H = quadratise(self.problem, X, U)
+        slack = X.new_zeros(X.shape[0])
+        for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
+            rho = torch.where(lam == 0, 0.0, self.duals.mu.view(-1, 1, 1))
+            constraint.accumulate(X, U, lam, rho.expand_as(lam), H)
+            if constraint.sense == "inequality":
+                slack = slack - (lam * constraint.value(X, U).clamp(max=0.0)).sum(-1).sum(-1)
+        return H.transpose(0, 1), slack
 
     def _expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         quadratise(self.problem, X, U, out=H)

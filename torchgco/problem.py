@@ -15,6 +15,8 @@ from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
 from torchgco.shapes import Dimensions, InputError, Rows, cast
 
+LEAST_UNIT = 1e-3  # share of the controls' curvature in the unit of cost
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -70,6 +72,26 @@ class Problem:
         for constraint in self.constraints:
             clear &= constraint.start_is_clear(self.x0)
         return clear
+
+    @cached_property
+    def cost_unit(self) -> Tensor:
+        """A scale of each problem's cost, (B,), above 0: the mean cost per stage of staying at the start at rest.
+
+        A thousandth of the controls' mean curvature is added, which alone is left where the start is the goal.
+        """
+        like = self.x0.new_zeros(self.B, self.N, self.m)
+        X, U = self.x0.unsqueeze(1).repeat(1, self.N + 1, 1), self.cost.rest_controls(like)
+        s = self.n + 1 + self.m
+        H = self.x0.new_empty(self.B, self.N + 1, s, s)
+        self.cost.expand(X, U, H)
+        diagonal = H[:, :-1, self.n + 1 :, self.n + 1 :].diagonal(dim1=-2, dim2=-1)
+        curvature = diagonal.abs().contiguous().sum(-1).sum(-1) / (self.N * self.m)  # sums that keep their order
+        unit = self.cost.total(X, U).abs() / self.N + LEAST_UNIT * curvature
+        return torch.where(torch.isfinite(unit) & (unit > 0), unit, 1.0)
+
+    def in_cost_units(self) -> Self:
+        """The same problems with their costs divided by `cost_unit`: no number of a solver then depends on its scale."""
+        return self._with({"cost": self.cost.scaled(1.0 / self.cost_unit)})
 
     def take(self, index: Rows) -> Self:
         """The problems in `index` (int64, (B',), or a slice); a row may occur more than once."""

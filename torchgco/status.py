@@ -16,6 +16,7 @@ class Status(IntEnum):
     NON_FINITE = 5
     INFEASIBLE = 6
     INVALID_START = 7
+    FEASIBLE = 8
 
     @property
     def sentence(self) -> str:
@@ -24,12 +25,14 @@ class Status(IntEnum):
 
 _SENTENCES = {
     Status.RUNNING: "The solve has not ended.",
-    Status.CONVERGED: "The solver's own test holds and the violation is under its tolerance.",
-    Status.MAX_ITERATIONS: "The iteration limit was reached before the cost settled; try a higher limit.",
-    Status.LINE_SEARCH_FAILED: "No step length gave an acceptable decrease; the problem may be badly scaled.",
+    Status.CONVERGED: "The trajectory is stationary and its violation is under the tolerance.",
+    Status.FEASIBLE: "The violation is under the tolerance, but the trajectory is not stationary: its cost can be lowered.",
+    Status.MAX_ITERATIONS: "The solve ended, by an iteration limit or its tolerance, before the trajectory was stationary; "
+    "try a higher limit or a smaller tolerance.",
+    Status.LINE_SEARCH_FAILED: "No step length gave an acceptable decrease before the trajectory was stationary; the "
+    "problem may be badly scaled.",
     Status.NOT_POSITIVE_DEFINITE: "The regularised control Hessian stayed indefinite up to the largest regularisation.",
     Status.NON_FINITE: "A state, cost or derivative became NaN or infinite.",
-    Status.INFEASIBLE: "The outer limit was reached and no iterate met the constraints; the least violated one is "
-    "returned.",
+    Status.INFEASIBLE: "No iterate met the constraints; the least violated trajectory is returned.",
     Status.INVALID_START: "The start lies inside an obstacle; nothing was solved.",
 }

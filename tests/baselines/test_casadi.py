@@ -171,7 +171,7 @@ def test_every_option_is_read(plugin: str) -> None:
     base = CasADiSolver(plugin)
     full = base.solve(problem, U0)
     stopped = replace(base, max_iterations=3, violation_tolerance=10.0).solve(problem, U0)
-    assert stopped.statuses == [Status.MAX_ITERATIONS] and stopped.iterations.item() in (3, 4)  # FATROP: one more
+    assert stopped.statuses == [Status.FEASIBLE] and stopped.iterations.item() in (3, 4)  # FATROP: one more
     assert replace(base, violation_tolerance=1e-12).solve(problem, U0).statuses == [Status.INFEASIBLE]
     assert replace(base, tolerance=1e-2).solve(problem, U0).iterations < full.iterations
     assert not torch.equal(replace(base, options={"mu_init": 10.0}).solve(problem, U0).U, full.U)

@@ -335,14 +335,14 @@ def test_a_plan_with_its_own_penalty_is_left_alone() -> None:
         inner=ILQR(max_iterations=4), guidance=guidance, max_outer_iterations=4, clip=True, grow_when_feasible=False
     )
     solver.solve(problem, controls(problem), callback=look)
-    penalty = replace(QUICK, hold=500.0).propose(problem).duals.mu
+    penalty = replace(QUICK, hold=500.0).propose(problem.in_cost_units()).duals.mu
     assert seen and torch.equal(seen[0][2], penalty[seen[0][3]])
     assert all(int(guided.max()) == 1 for _, guided, _, _ in seen) and int(seen[-1][0].max()) >= 3
 
 
 CHANGES = dict(
     roadmap=Roadmap(margin=1.0), begin=0.2, end=0.7, smoothing=0.2, tube=0.2, stiffness=(50.0,), obstacle_penalty=50.0,
-    hold=5.0, tolerance=1e3, iterations=2, settle=2, dtype="float32",
+    hold=5.0, tolerance=0.5, iterations=2, settle=2, dtype="float32",
 )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.problems import planar_batch, quadrotor_batch, reference_of
+from tests.problems import PRINTED, planar_batch, quadrotor_batch, reference_of
 from tests.reference.augmented_lagrangian import Schedule
 from tests.reference.augmented_lagrangian import solve as reference_solve
 from tests.reference.guidance import cpuf_hook
@@ -59,7 +59,7 @@ def test_iterates_follow_the_nested_loops(case: str, guided: bool) -> None:
     make, tolerance, limit = CASES[case]
     problem, U0 = make()
     guidance = GCO(sampler=MPPI(samples=SAMPLES)) if guided else None
-    inner = ILQR(tolerance=tolerance, max_iterations=limit)
+    inner = ILQR(absolute_tolerance=tolerance, max_iterations=limit, **PRINTED)
     solver = AugmentedLagrangian(inner=inner, guidance=guidance, max_outer_iterations=OUTER, record=True)
     snapshots = Snapshots()
     solution = solver.solve(problem, U0, callback=snapshots)

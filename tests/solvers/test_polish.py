@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.problems import planar_batch, quadrotor_batch
+from tests.problems import PRINTED, planar_batch, quadrotor_batch
 from tests.reference.active_set import quadratic_program
 from torchgco import (
     GCO,
@@ -34,7 +34,9 @@ from torchgco.solvers.active_set import multipliers
 from torchgco.solvers.condensed import Condensed
 
 SOLVER = AugmentedLagrangian(
-    inner=ILQR(tolerance=1e-2, max_iterations=10, damping=1.0, line_search=LineSearch(accept_last=False)),
+    inner=ILQR(
+        absolute_tolerance=1e-2, max_iterations=10, damping=1.0, line_search=LineSearch(accept_last=False), **PRINTED
+    ),
     guidance=GCO(sampler=MPPI(samples=40, rounds=3, knots=5), adopt=True),
     max_outer_iterations=12,
     grow_when_feasible=False,
@@ -182,7 +184,7 @@ def test_equalities_and_functions_are_polished() -> None:
     ring = FunctionConstraint(lambda x: (x[..., :2] ** 2).sum(-1, keepdim=True) - 0.7, sense="equality", knots=[-1])
     wall = FunctionConstraint(lambda x: x[..., 1:2] - 0.25 - 0.1 * x[..., :1].square(), knots=slice(1, None))
     problem = Problem(problem.dynamics, problem.cost, [*problem.constraints, ring, wall], problem.x0, problem.N)
-    solver = AugmentedLagrangian(inner=ILQR(tolerance=1e-3), max_outer_iterations=12, clip=True)
+    solver = AugmentedLagrangian(inner=ILQR(absolute_tolerance=1e-3, **PRINTED), max_outer_iterations=12, clip=True)
     before = solver.solve(problem, U0)
     after = Polish().refine(problem, before)
     assert float(before.violation.max()) > 1e-7 and float(after.violation.max()) < 1e-8

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import optimize
 
-from tests.problems import planar_batch, quadrotor_batch
+from tests.problems import PRINTED, planar_batch, quadrotor_batch
 from torchgco import (
     GCO,
     ILQR,
@@ -155,8 +155,9 @@ def test_statuses() -> None:
     hopeless = ILQR(regularisation_max=1e-4).solve(saddle(1.0), zeros(saddle(1.0)))
     assert hopeless.statuses == [Status.NOT_POSITIVE_DEFINITE] * 2
     problem, U0 = planar_batch(B=2, N=20)
-    assert ILQR(max_iterations=1).solve(problem, U0).statuses == [Status.MAX_ITERATIONS] * 2
-    stubborn = ILQR(line_search=LineSearch(ratio_min=5.0, accept_last=False)).solve(problem, U0)
+    free, U0 = replace(problem, constraints=[]), U0
+    assert ILQR(max_iterations=1).solve(free, U0).statuses == [Status.MAX_ITERATIONS] * 2
+    stubborn = ILQR(line_search=LineSearch(ratio_min=5.0, accept_last=False)).solve(free, U0)
     assert stubborn.statuses == [Status.LINE_SEARCH_FAILED] * 2
     assert torch.equal(stubborn.U, U0)
     impossible = FunctionConstraint(lambda x: x[..., :1].square() + 1.0, sense="equality", knots=[-1])
@@ -218,7 +219,7 @@ def test_save_and_load(tmp_path) -> None:
 
 
 BASE = AugmentedLagrangian(
-    inner=ILQR(max_iterations=10, tolerance=1e-2),
+    inner=ILQR(max_iterations=10, absolute_tolerance=1e-2, **PRINTED),
     guidance=GCO(sampler=MPPI(samples=12, rounds=2, knots=5)),
     max_outer_iterations=7,
     violation_tolerance=0.05,
@@ -230,7 +231,9 @@ CHANGES = {
         inner=ILQR(max_iterations=2), guidance=None, initial_penalty=50.0, penalty_growth=5.0, penalty_max=60.0,
         max_outer_iterations=3, violation_tolerance=0.2, clip=True, record=False,
     ),
-    ILQR: dict(tolerance=1e3, max_iterations=3, line_search=LineSearch(shrink=0.3)),
+    ILQR: dict(
+        tolerance=0.5, absolute_tolerance=1e3, normalise=True, max_iterations=3, line_search=LineSearch(shrink=0.3)
+    ),
     LineSearch: dict(shrink=0.25, ratio_min=0.9, ratio_max=0.9),
     GCO: dict(
         sampler=MPPI(samples=5), initial_penalty=2.0, penalty_growth=1.0, radius=0.5, patience=1, afresh=True,
@@ -427,12 +430,13 @@ def test_an_adopted_plan_is_held(hold_factor: float) -> None:
             seen.append((state.U.clone(), state.duals.mu.clone(), [lam.abs().max() for lam in state.duals.lam]))
 
     solver = AugmentedLagrangian(
-        inner=ILQR(max_iterations=1), guidance=OnePlan(plan), max_outer_iterations=3, hold_factor=hold_factor, clip=True
-    )
+        inner=ILQR(max_iterations=1, **PRINTED), guidance=OnePlan(plan), max_outer_iterations=3, hold_factor=hold_factor,
+        clip=True,
+    )  # fmt: skip
     solver.solve(problem, U0, callback=look)
     U, mu, lam = seen[0]
     assert torch.equal(U, plan.expand_as(U)) and all(float(m) == 0 for m in lam)
-    left = ILQR(max_iterations=1, penalty=20.0).solve(problem, U0)
+    left = ILQR(max_iterations=1, penalty=20.0, **PRINTED).solve(problem, U0)
     new_X = open_loop(problem.dynamics, problem.x0, U)
     squares = sum(c.value(left.X, left.U).clamp(min=0).square().sum((1, 2)) for c in problem.constraints)
     gain = (problem.cost.total(new_X, U) - left.cost).clamp(min=0) / (0.5 * squares)

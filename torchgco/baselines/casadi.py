@@ -186,8 +186,9 @@ def _refused(plugin: str, error: RuntimeError) -> InputError:
 
 
 def _with_ends(solution: Solution, ends: list[_End]) -> Solution:
-    """The solver's word where the trajectory has nothing against it."""
+    """CONVERGED where the plugin says so of a feasible trajectory."""
     status = solution.status
-    told = status.new_tensor([int(end) for end, _ in ends])
+    ended = status.new_tensor([int(end) for end, _ in ends])
     iterations = status.new_tensor([count for _, count in ends])
-    return replace(solution, status=torch.where(status == Status.CONVERGED, told, status), iterations=iterations)
+    status = torch.where((status == Status.FEASIBLE) & (ended == Status.CONVERGED), ended, status)
+    return replace(solution, status=status, iterations=iterations)

@@ -41,10 +41,10 @@ class Hold:
 
 
 def rolled_out(problem: Problem, U: Tensor, violation_tolerance: float, iterations: int) -> Solution:
-    """A solution without gains or multipliers from controls that no local solver refined."""
+    """A solution without gains or multipliers from controls that no local solver refined: FEASIBLE at best."""
     X = open_loop(problem.dynamics, problem.x0, U)
     cost, worst = problem.cost.total(X, U), violation(problem, X, U)
-    status = torch.full((problem.B,), int(Status.CONVERGED), device=U.device)
+    status = torch.full((problem.B,), int(Status.FEASIBLE), device=U.device)
     status[worst > violation_tolerance] = Status.INFEASIBLE
     status[~problem.start_is_clear] = Status.INVALID_START
     status[~torch.isfinite(cost)] = Status.NON_FINITE

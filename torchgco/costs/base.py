@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Self
+from dataclasses import dataclass
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from torchgco.autodiff import gradient_and_hessian
-from torchgco.shapes import Dimensions, PerElement
+from torchgco.shapes import Dimensions, PerElement, lead
 
 
 class Cost(PerElement):
@@ -51,6 +52,10 @@ class Cost(PerElement):
         """The state (B, n) that the terminal cost asks for, for starts x0 (B, n); None where it isn't known."""
         return None
 
+    def scaled(self, factor: Tensor) -> Cost:
+        """The same cost times `factor` (B,), one positive number per problem."""
+        return ScaledCost(self, factor)
+
     def total(self, X: Tensor, U: Tensor) -> Tensor:
         """J_var (B,) of trajectories X (B, N+1, n), U (B, N, m)."""
         k = torch.arange(U.shape[1], device=U.device)
@@ -65,6 +70,44 @@ class Cost(PerElement):
         add_blocks(H[:, :-1], n, g[..., :n], g[..., n:], h[..., :n, :n], h[..., n:, n:], h[..., n:, :n])
         g, h = gradient_and_hessian(self.terminal, X[:, -1])
         add_blocks(H[:, -1], n, g, None, h, None)
+
+
+@dataclass(frozen=True)
+class ScaledCost(Cost):
+    """A cost times one positive number per problem."""
+
+    cost: Cost
+    factor: Tensor  # (B,)
+
+    batched: ClassVar[tuple[str, ...]] = ("cost", "factor")
+
+    @property
+    def is_autonomous(self) -> bool:  # type: ignore[override]
+        return self.cost.is_autonomous
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        value = self.cost.stage(x, u, k)
+        return lead(self.factor, value) * value
+
+    def terminal(self, x: Tensor) -> Tensor:
+        value = self.cost.terminal(x)
+        return lead(self.factor, value) * value
+
+    def stage_rows(self, x: Tensor, u: Tensor, k: int) -> Tensor:
+        return self.factor.unsqueeze(-1) * self.cost.stage_rows(x, u, k)
+
+    def terminal_rows(self, x: Tensor) -> Tensor:
+        return self.factor.unsqueeze(-1) * self.cost.terminal_rows(x)
+
+    def rest_controls(self, like: Tensor) -> Tensor:
+        return self.cost.rest_controls(like)
+
+    def goal(self, x0: Tensor) -> Tensor | None:
+        return self.cost.goal(x0)
+
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        self.cost.expand(X, U, H)
+        H.mul_(self.factor.view(-1, 1, 1, 1))
 
 
 def add_blocks(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from torchgco.costs.base import Cost, add_blocks
-from torchgco.shapes import Dimensions, InputError, check_shape, sum_rows, tensor
+from torchgco.shapes import Dimensions, InputError, check_shape, lead, sum_rows, tensor
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,10 @@ class BoundQuadratic(Cost):
 
     def bind(self, dims: Dimensions) -> BoundQuadratic:
         return self
+
+    def scaled(self, factor: Tensor) -> BoundQuadratic:
+        weights = {name: getattr(self, name) for name in ("Q", "R", "Qf", "q", "r", "qf", "H")}
+        return replace(self, **{name: lead(factor, W) * W for name, W in weights.items() if W is not None})
 
     @property
     def is_autonomous(self) -> bool:  # type: ignore[override]

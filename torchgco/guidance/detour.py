@@ -34,6 +34,7 @@ from torchgco.solvers.line_search import LineSearch
 SURE = LineSearch(accept_last=False)
 AT_ONCE = 1536  # ways followed at once: memory stays bounded, however large the batch
 BETWEEN = 0.049  # of r_obs + r_veh: how deep a finalist may cut into an obstacle between knots; the judge bears 0.05
+DAMPING = 0.02  # of all solves, in units of cost
 PUSHED = 0.1  # share of the horizon that a push lasts
 ALIKE = 2e-3  # settled paths whose penalised costs differ by less, as a share, are taken for one
 
@@ -96,7 +97,7 @@ class Detour:
         stiffness: one solve after the other, how strongly tube or spring draws, in q0 / L^2.
         obstacle_penalty: of the spheres meanwhile, in q0 / R^4.
         hold: penalty that the solver is to go on with, in q0 / R^4.
-        tolerance: a solve ends where the penalised cost changes by less; one of a finalist at a tenth of it.
+        tolerance: of each solve, as a share of the penalised cost; a finalist is solved to a tenth of it.
         iterations: of each solve, at most.
         settle: iterations that nothing draws, at most, after which the ways are compared; 0 compares them as followed.
         depth: how far into an obstacle a settled path may reach, as a share of R; one that lies deeper is refused.
@@ -119,7 +120,7 @@ class Detour:
     stiffness: tuple[float, ...] = (20.0, 200.0)
     obstacle_penalty: float = 10.0
     hold: float = 80.0
-    tolerance: float = 0.1
+    tolerance: float = 5e-5
     iterations: int = 20
     settle: int = 20
     depth: float = 0.1
@@ -238,7 +239,7 @@ class Detour:
         part, warm = plans.problem.take(rows), take(duals, rows)
         inner = replace(self._inner(self.iterations), tolerance=0.1 * self.tolerance)
         solver = AugmentedLagrangian(
-            inner, max_outer_iterations=20, cost_tolerance=1e-3, grow_when_feasible=False, clip=True
+            inner, initial_penalty=1.0, max_outer_iterations=20, cost_tolerance=1e-3, grow_when_feasible=False, clip=True
         )
         end = solver.solve(part, plans.U[rows], warm=warm)
         good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.U)
@@ -263,7 +264,7 @@ class Detour:
         return U
 
     def _inner(self, iterations: int) -> ILQR:
-        return ILQR(tolerance=self.tolerance, max_iterations=iterations, damping=1.0, line_search=SURE)
+        return ILQR(tolerance=self.tolerance, max_iterations=iterations, damping=DAMPING, line_search=SURE)
 
     def _order(self, plans: Plans, first: Tensor, alike: float | None = None) -> Tensor:
         """Each problem's plans as places in their order, (B, count).

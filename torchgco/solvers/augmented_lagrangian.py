@@ -117,12 +117,11 @@ class AugmentedLagrangian:
         return solution if self.polish is None else self.polish.refine(problem, solution)
 
     def verdict(self, inner: InnerEnd) -> Tensor:
-        """CONVERGED or INFEASIBLE at the outer limit, CONVERGED where the early test holds, else RUNNING."""
-        fits = inner.best_violation <= self.violation_tolerance
+        """Why an element ends: its outer limit, or the early test (CONVERGED); else RUNNING."""
         status = torch.full_like(inner.outer, Status.RUNNING)
         over = inner.outer >= self.max_outer_iterations
-        status[over & fits] = Status.CONVERGED
-        status[over & ~fits] = Status.INFEASIBLE
+        status[over & inner.refused] = Status.LINE_SEARCH_FAILED
+        status[over & ~inner.refused] = Status.MAX_ITERATIONS
         if self.cost_tolerance is not None:
             settled = (inner.cost - inner.last_cost).abs() <= self.cost_tolerance * inner.cost.abs()
             done = inner.converged & settled & (inner.violation <= self.violation_tolerance)

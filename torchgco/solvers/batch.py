@@ -25,8 +25,10 @@ from torchgco.solvers.attempts import go_on_from, has_arrived, try_again
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import Callback, InnerEnd, Iterate, OuterLoop, Progress, State
 from torchgco.solvers.trace import Recorder
+from torchgco.solvers.verdict import final_status, optimality
 from torchgco.status import Status
 
+ROUNDING = 1e-14  # share of L_M: an expected change below it means nothing
 PASSES_ASIDE = 20  # how long an element may wait for company; sampling for a few costs as much as for many
 
 
@@ -51,7 +53,12 @@ class Loop:
         self.ids = check_call(problem, U0, ids)
         if warm is not None:
             warm.check(problem)
-        self.solver, self.seed, self.callback = solver, seed, callback
+        self.solver, self.seed, self.callback, self.given = solver, seed, callback, problem
+        self.unit = problem.cost_unit if solver.inner.normalise else torch.ones_like(problem.x0[:, 0])
+        if solver.inner.normalise:
+            problem = problem.in_cost_units()
+            warm = None if warm is None else warm.scaled(1.0 / self.unit)
+            guide = None if guide is None else replace(guide, weight=guide.weight / self.unit)
         self.whole, self.U0, self.warm, self.guide = problem, U0, warm, guide
         self.result = _empty_result(problem, U0)
         self.recorder = Recorder() if solver.record else None
@@ -76,7 +83,7 @@ class Loop:
                 total = self.whole.B
                 left = self.state.rows.numel() + self.waiting.numel() + _count(self.aside)
                 self.callback(Progress(passes, total - left, total, self.state))
-        return self._with_gains()
+        return self._finished()
 
     # Start -------------------------------------------------------------------------------------------------------
 
@@ -121,18 +128,20 @@ class Loop:
         lagrangian.expand(s.X, s.U, out=H)
         step = backward(F, H, s.regularisation)
         status = torch.full_like(s.rows, Status.RUNNING)
-        settled = step.expected_change(torch.ones_like(s.merit)).abs() <= 1e-14 * s.merit.abs().clamp(min=1.0)
+        expected = step.expected_change(torch.ones_like(s.merit)).abs()
+        settled = expected <= ROUNDING * s.merit.abs()
         moving = ~step.failed & ~settled
         if bool(step.failed.any()):
             self._raise_regularisation(step, F, H, status)
         old_merit, alpha, refused = self._move(lagrangian, step, moving)
-        change = (s.merit - old_merit).abs()
+        change, damped = (s.merit - old_merit).abs(), s.regularisation > inner.damping
         s.inner, s.iterations = s.inner + ~step.failed, s.iterations + ~step.failed
         if self.recorder is not None:
             self.recorder.add(self.problem, s, alpha, step.failed)
         s.regularisation = torch.where(step.failed, s.regularisation, self._damping(refused))
         stuck = refused & (s.regularisation == 0)
-        converged = settled | (moving & ~refused & (change < inner.tolerance))
+        flat = (torch.maximum(change, expected) <= inner.tolerance * s.merit.abs()) & ~damped
+        converged = settled | (moving & ~refused & (flat | (change < inner.absolute_tolerance)))
         ended = ~step.failed & (converged | stuck | (s.inner >= inner.max_iterations))
         if bool(ended.any()):
             self._end_inner(ended, converged, stuck, status)
@@ -194,9 +203,8 @@ class Loop:
         self._remember(rows, Iterate(X, U, updated, s.cost[rows], now))
         s.outer[rows] += 1
         inner_end = InnerEnd(
-            converged[rows], refused[rows], s.outer[rows] - s.since[rows], s.cost[rows], s.last_cost[rows], now,
-            s.best.violation[rows],
-        )  # fmt: skip
+            converged[rows], refused[rows], s.outer[rows] - s.since[rows], s.cost[rows], s.last_cost[rows], now
+        )
         status[rows] = solver.verdict(inner_end)
         s.last_cost[rows] = s.cost[rows]
         try_again(s, rows, problem, updated, status, solver)
@@ -310,17 +318,18 @@ class Loop:
         r.iterations[place], r.outer_iterations[place] = s.iterations[rows], s.outer[rows]
         r.guided[place] = s.guided[rows]
 
-    def _with_gains(self) -> Solution:
-        """Feedback gains along what is returned, from one more backward pass with its multipliers."""
-        r, slots = self.result, self.solver.slots or self.whole.B
-        for rows in torch.arange(self.whole.B, device=self.U0.device).split(slots):
-            part = self.whole.take(rows)
-            lagrangian = Lagrangian(part, take(r.multipliers, rows), None, self.solver.clip)
-            X, U = r.X[rows], r.U[rows]
-            step = backward(linearise(part, X, U), lagrangian.expand(X, U), torch.zeros_like(r.cost[rows]))
-            G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
-            r.K[rows], r.d[rows] = G[..., :-1], G[..., -1]
-        return replace(r, trace=None if self.recorder is None else self.recorder.frame())
+    def _finished(self) -> Solution:
+        """The result in the units that the problem was given in, with gains and final statuses."""
+        r, solver = self.result, self.solver
+        left = torch.zeros_like(r.cost)
+        for rows in torch.arange(self.whole.B, device=self.U0.device).split(solver.slots or self.whole.B):
+            lagrangian = Lagrangian(self.whole.take(rows), take(r.multipliers, rows), None, solver.clip)
+            r.K[rows], r.d[rows], left[rows] = optimality(lagrangian, r.X[rows], r.U[rows])
+        status = final_status(r.status, left, r.violation, solver.violation_tolerance, bool(self.whole.constraints))
+        return replace(
+            r, status=status, cost=self.given.cost.total(r.X, r.U), multipliers=r.multipliers.scaled(self.unit),
+            trace=None if self.recorder is None else self.recorder.frame(self.unit),
+        )  # fmt: skip
 
 
 def _count(state: State | None) -> int:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.guides import Guide
-from torchgco.lagrangian import Multipliers
+from torchgco.lagrangian import VIOLATION_TOLERANCE, Multipliers
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 from torchgco.solution import Solution
@@ -21,13 +21,17 @@ from torchgco.status import Status
 
 @dataclass(frozen=True)
 class ILQR:
-    """Iterative LQR: expansions, backward pass, line search, until |J - J_prev| < tolerance.
+    """Iterative LQR: expansions, backward pass, line search, until L_M no longer falls.
 
     Alone it leaves constraints out (`penalty` = 0) or holds them by a fixed quadratic penalty; inside
     `AugmentedLagrangian` it is the inner solver.
 
     Args:
-        tolerance: on the change of L_M, in units of cost.
+        tolerance: share of L_M. The solve ends where a full step changed L_M by less and the quadratic model expects
+            no more than that from the step.
+        absolute_tolerance: ends the solve where |L_M - L_M,prev| is below it, in units of cost (as printed); 0: never.
+        normalise: work in units of `Problem.cost_unit`, so that scaling all weights changes no iterate: penalties and
+            regularisation are then relative to the cost. False as printed.
         max_iterations: inner limit.
         line_search: how step lengths are chosen.
         regularisation_first, regularisation_growth, regularisation_max: mu_r after a failed Cholesky: its first
@@ -40,7 +44,9 @@ class ILQR:
         InputError: a field out of its range.
     """
 
-    tolerance: float = 0.10
+    tolerance: float = 1e-6
+    absolute_tolerance: float = 0.0
+    normalise: bool = True
     max_iterations: int = 50
     line_search: LineSearch = LineSearch()
     regularisation_first: float = 1e-6
@@ -50,8 +56,9 @@ class ILQR:
     penalty: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.tolerance >= 0:
-            raise InputError("ilqr.tolerance", "at least 0", self.tolerance)
+        for name in ("tolerance", "absolute_tolerance"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"ilqr.{name}", "at least 0", getattr(self, name))
         if self.max_iterations < 1:
             raise InputError("ilqr.max_iterations", "at least 1", self.max_iterations)
         if not 0 < self.regularisation_first <= self.regularisation_max:
@@ -91,7 +98,7 @@ class _OneInnerSolve:
     penalty_growth: float = 1.0
     penalty_max: float = math.inf
     grow_when_feasible: bool = True
-    violation_tolerance: float = math.inf
+    violation_tolerance: float = VIOLATION_TOLERANCE
     hold_factor: float = 1.0
     attempts: int = 1
     arrival: float | None = None
@@ -101,7 +108,4 @@ class _OneInnerSolve:
     record: bool = False
 
     def verdict(self, inner: InnerEnd) -> Tensor:
-        status = torch.full_like(inner.outer, Status.MAX_ITERATIONS)
-        status[inner.refused] = Status.LINE_SEARCH_FAILED
-        status[inner.converged] = Status.CONVERGED
-        return status
+        return torch.where(inner.refused, int(Status.LINE_SEARCH_FAILED), int(Status.MAX_ITERATIONS))

@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.expansion import linearise
-from torchgco.lagrangian import Lagrangian, Multipliers, violation
+from torchgco.lagrangian import VIOLATION_TOLERANCE, Lagrangian, Multipliers, violation
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.shapes import InputError, copied, put
 from torchgco.solution import Solution
 from torchgco.solvers.active_set import multipliers
 from torchgco.solvers.condensed import Condensed
-from torchgco.solvers.riccati import backward
+from torchgco.solvers.verdict import final_status, optimality
+from torchgco.status import Status
 
 STIFFNESS = 1e4  # curvature put across the rows that push, as a share of the Hessian's mean: it changes no solution
 SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)  # shares of the same mean put on the diagonal until the model is convex
@@ -75,8 +75,8 @@ class Polish:
 
         An element is replaced where its violation falls below the tolerance, or stays within it (or within what it was)
         while the KKT residual falls; never where its cost would rise by more than `cost_rise`, or the straight way
-        between two knots would meet an obstacle that it kept clear of. Statuses and counts of iterations stay those of
-        the solver.
+        between two knots would meet an obstacle that it kept clear of. The status of a replaced element is that of its new
+        trajectory; counts of iterations stay those of the solver.
 
         Raises:
             InputError: a problem that isn't float64, or a solution of others.
@@ -185,13 +185,14 @@ class _Point:
         """The solution with this trajectory in place of its own, and gains along it."""
         problem, X, U = self.model.problem, self.model.X, self.model.U
         duals = Multipliers(self.model.by_constraint(self.lam), solution.multipliers.mu)
-        H = Lagrangian(problem, duals, None, True).expand(X, U)
-        step = backward(linearise(problem, X, U), H, torch.zeros_like(duals.mu))
-        G = step.gains.movedim(0, 1).masked_fill(step.failed.view(-1, 1, 1, 1), torch.nan)
+        K, d, left = optimality(Lagrangian(problem, duals, None, True), X, U)
+        cost, worst = torch.full_like(solution.cost, self.cost), torch.full_like(solution.violation, self.worst)
+        # Optimality is that of what is returned; the outer limit no longer is the reason for anything.
+        ended = torch.full_like(solution.status, Status.MAX_ITERATIONS)
+        status = final_status(ended, left, worst, VIOLATION_TOLERANCE, bool(problem.constraints))
         return replace(
-            solution, X=X, U=U, K=G[..., :-1], d=G[..., -1], multipliers=duals,
-            cost=torch.full_like(solution.cost, self.cost), violation=torch.full_like(solution.violation, self.worst),
-        )  # fmt: skip
+            solution, X=X, U=U, K=K, d=d, multipliers=duals, cost=cost, violation=worst, status=status
+        )
 
 
 def _slope(model: Condensed, lam: Tensor) -> float:

@@ -76,7 +76,6 @@ class InnerEnd:
     cost: Tensor
     last_cost: Tensor  # when the inner solve before ended; infinite at first
     violation: Tensor
-    best_violation: Tensor
 
 
 @dataclass(frozen=True)

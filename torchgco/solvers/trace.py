@@ -37,8 +37,8 @@ class Recorder:
         }
         self._passes.append({name: value[~failed].clone() for name, value in row.items()})
 
-    def frame(self) -> pd.DataFrame:
-        """The table, sorted by element and iteration."""
+    def frame(self, unit: Tensor) -> pd.DataFrame:
+        """The table, sorted by element and iteration; `unit` (B,) is what costs were divided by."""
         import pandas as pd
 
         columns = (
@@ -47,4 +47,8 @@ class Recorder:
             else {}
         )
         frame = pd.DataFrame(columns)
+        if self._passes:
+            scale = unit.cpu().numpy()[frame["element"]]
+            for name in ("cost", "merit", "regularisation"):
+                frame[name] *= scale
         return frame.sort_values(["element", "iteration"], ignore_index=True) if self._passes else frame

@@ -1,0 +1,68 @@
+"""What the solver says of a trajectory that it returns: feedback gains, how far from stationary it is, and the status.
+
+The test asks how much cost the quadratic model could still save: the expected decrease of one full step on J_var + lam'c,
+and what complementarity leaves open, as a share of the cost. It depends on no scale of cost, controls or constraints.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchgco.expansion import linearise
+from torchgco.lagrangian import Lagrangian
+from torchgco.solvers.riccati import BackwardPass, backward
+from torchgco.status import Status
+
+STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
+LEAST_COST = 1e-6  # the cost counts at least this share of the cost of staying at the start
+FIRST, GROWTH, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
+
+
+class Optimality(NamedTuple):
+    K: Tensor  # (B, N, m, n): u = U + K (x - X) + d
+    d: Tensor  # (B, N, m)
+    left: Tensor  # (B,): share of the cost that could still be saved; infinite where no backward pass succeeds
+
+
+def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
+    """Gains along X (B, N+1, n), U (B, N, m), and the first-order optimality of the trajectory with its multipliers."""
+    problem = lagrangian.problem
+    F, (H, slack) = linearise(problem, X, U), lagrangian.expand_optimality(X, U)
+    mu = torch.zeros_like(slack)
+    step = backward(F, H, mu)
+    for i in range(TRIES):
+        # A control that costs nothing, or values beyond the precision: gains all the same, by regularisation.
+        if not bool(step.failed.any()):
+            break
+        mu = torch.where(step.failed, FIRST * GROWTH**i * problem.cost_unit, mu)
+        step = _merged(step, backward(F, H, mu))
+    saved = -step.expected_change(torch.ones_like(slack)) + slack
+    cost = problem.cost.total(X, U).abs() + LEAST_COST * problem.N * problem.cost_unit
+    G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
+    return Optimality(G[..., :-1], G[..., -1], torch.where(step.failed, torch.inf, saved / cost))
+
+
+def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:
+    """The first pass where it succeeded, the second elsewhere."""
+    again = first.failed
+    gains = torch.where(again.view(1, -1, 1, 1), second.gains, first.gains)
+    linear, quadratic = (torch.where(again, b, a) for a, b in zip(first[1:3], second[1:3], strict=True))
+    return BackwardPass(gains, linear, quadratic, again & second.failed)
+
+
+def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: float, constrained: bool) -> Tensor:
+    """The status (B,) of what is returned, for statuses `ended` that say why the solve stopped.
+
+    CONVERGED: stationary and feasible; FEASIBLE: feasible alone, of a problem that has constraints; INFEASIBLE:
+    stationary alone. Where neither holds, and where a solve failed, the reason stays.
+    """
+    stationary, fits = left <= STATIONARY, violation <= tolerance
+    reason = torch.where(ended == Status.CONVERGED, int(Status.MAX_ITERATIONS), ended)
+    status = torch.where(fits & constrained, int(Status.FEASIBLE), reason)
+    status = torch.where(stationary, torch.where(fits, int(Status.CONVERGED), int(Status.INFEASIBLE)), status)
+    status = torch.where(torch.isinf(left), int(Status.NOT_POSITIVE_DEFINITE), status)
+    failed = (ended == Status.NON_FINITE) | (ended == Status.NOT_POSITIVE_DEFINITE) | (ended == Status.INVALID_START)
+    return torch.where(failed, ended, status)
