@@ -85,9 +85,9 @@ class Detour:
     Args:
         roadmap: finds the ways.
         ways: how many are followed.
-        pushes: offsets (m,) of the controls over the first tenth of the horizon, in the units of the inputs; every way
-            is followed from rest, and from each of these too. Whatever the way, a vehicle that has been made to spin
-            turns by another angle, and drives parts of it backwards.
+        pushes: offsets (m,) of the controls over the first tenth of the horizon, as shares of the range from rest to the
+            control bounds; every way is followed from rest, and once from each offset. An initial turn lets a vehicle
+            that turns slowly find reversing and three-point turns.
         keep: how many of these are settled, the cheapest as followed; None: all.
         begin, end: the shares of the horizon at which the vehicle sets out and arrives. Several ends: every way is
             followed to arrive at each.
@@ -128,6 +128,10 @@ class Detour:
     dtype: Literal["float32", "float64"] | None = None
 
     def __post_init__(self) -> None:
+        for name in ("end", "stiffness", "pushes"):  # lists of a configuration file equal tuples
+            if isinstance(value := getattr(self, name), Sequence) and not isinstance(value, str):
+                rows = (tuple(row) if isinstance(row, list) else row for row in value)
+                object.__setattr__(self, name, tuple(rows))
         if not isinstance(self.roadmap, Roadmap):
             raise InputError("detour.roadmap", "a Roadmap", self.roadmap)
         if not self.ends or not all(0 <= self.begin < end <= 1 for end in self.ends):
@@ -173,7 +177,7 @@ class Detour:
         ways, found = self.roadmap.ways(scene, self.ways)
         R, unit = seen.scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
-        begun = self._begun(rest).repeat_interleave(len(self.ends), dim=1)
+        begun = self._begun(problem, rest).repeat_interleave(len(self.ends), dim=1)
         starts, count = begun.shape[1], self.ways * begun.shape[1]
         everyone = torch.arange(problem.B, device=rest.device).repeat_interleave(count)
         unit = torch.where(found, unit, 1.0)
@@ -191,14 +195,15 @@ class Detour:
         duals = replace(duals, mu=torch.where(found, duals.mu, torch.nan))
         return Proposal(plans.U[chosen], found & (rank < plans.count) & sound[chosen], duals)
 
-    def _begun(self, rest: Tensor) -> Tensor:
+    def _begun(self, problem: Problem, rest: Tensor) -> Tensor:
         """What a way is followed from, (B, 1 + pushes, N, m): rest, and rest after each push."""
         _, N, m = rest.shape
         starts = rest.unsqueeze(1).repeat(1, 1 + len(self.pushes), 1, 1)
         if self.pushes:
             pushes = tensor(self.pushes, "detour.pushes", rest)
             check_shape(pushes, (len(self.pushes), m), "detour.pushes")
-            starts[:, 1:, : math.ceil(PUSHED * N)] += pushes.unsqueeze(1)
+            reach = seen.control_reach(problem, rest, pushes)
+            starts[:, 1:, : math.ceil(PUSHED * N)] += (reach * pushes).unsqueeze(2)
         return starts
 
     def _follow(self, plans: Plans, way: Tensor, end: Tensor) -> Plans:

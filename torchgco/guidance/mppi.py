@@ -17,6 +17,7 @@ from torchgco.rollout import open_loop
 from torchgco.shapes import InputError, check_shape, tensor
 
 CHUNK = 8192  # samples flown side by side: what a stage needs of them stays in a core's cache
+OPEN = 1e10  # a range of controls that is no range
 KEPT = 2**25  # numbers: controls of more samples than this are drawn again rather than kept
 
 
@@ -32,8 +33,9 @@ class MPPI:
 
     Args:
         samples: S per problem and round.
-        covariance: diagonal of Sigma (m,), or one number for all controls; in squared units of u. None: a standard
-            deviation of a quarter of the range that the control bounds leave, 1 where they leave it open.
+        covariance: diagonal of Sigma (m,), or one number for all controls; in squared units of u. None: from `spread`.
+        spread: standard deviation as a share of the range between the control bounds, and 1 where there are none; where
+            `covariance` is None.
         temperature: lambda, in units of cost.
         collision_penalty: rho_mp, per knot and obstacle touched.
         saturation: "bounds" clamps samples to the problem's control bounds; "symmetric" to [-upper, upper], wider
@@ -53,6 +55,7 @@ class MPPI:
 
     samples: int = 100
     covariance: Any = 1.0
+    spread: float = 0.25
     temperature: float = 1.0
     collision_penalty: float = 1e8
     saturation: Literal["bounds", "symmetric"] | None = "bounds"
@@ -73,6 +76,8 @@ class MPPI:
             raise InputError("mppi.knots", "0, or at least 2", self.knots)
         if not 0 < self.decay <= 1:
             raise InputError("mppi.decay", "above 0, at most 1", self.decay)
+        if not self.spread > 0:
+            raise InputError("mppi.spread", "above 0", self.spread)
         if not self.temperature > 0:
             raise InputError("mppi.temperature", "above 0", self.temperature)
         if not self.linger >= 0:
@@ -159,7 +164,7 @@ class MPPI:
     def _sigma(self, problem: Problem) -> Tensor:
         """Diagonal of Sigma, (m, B|1, 1)."""
         if self.covariance is None:
-            return _from_bounds(problem)
+            return self._from_bounds(problem)
         sigma = tensor(self.covariance, "mppi.covariance", problem.x0)
         sigma = sigma.expand(problem.m) if sigma.dim() == 0 else sigma
         check_shape(sigma, (problem.m,), "mppi.covariance")
@@ -167,10 +172,9 @@ class MPPI:
             raise InputError("mppi.covariance", "variances above 0", sigma.tolist())
         return sigma.view(-1, 1, 1)
 
-
-def _from_bounds(problem: Problem) -> Tensor:
-    for constraint in problem.constraints:
-        if isinstance(constraint, ControlBounds):
-            spread = 0.25 * (constraint.upper - constraint.lower)
-            return torch.where(spread < 1e10, spread.square(), 1.0).mT.unsqueeze(-1)
-    return problem.x0.new_ones(problem.m, 1, 1)
+    def _from_bounds(self, problem: Problem) -> Tensor:
+        for constraint in problem.constraints:
+            if isinstance(constraint, ControlBounds):
+                deviation = self.spread * (constraint.upper - constraint.lower)
+                return torch.where(deviation < OPEN, deviation.square(), 1.0).mT.unsqueeze(-1)
+        return problem.x0.new_ones(problem.m, 1, 1)

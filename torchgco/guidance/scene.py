@@ -5,12 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bounds import ControlBounds
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.guidance.roadmap import FAR, Scene, segment_gaps
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.shapes import InputError
 
+OPEN = 1e10  # a range of controls that is no range
 THERE = 0.25  # share of the distance from start to goal; a path that ends farther from it has fallen back
 
 
@@ -80,6 +82,16 @@ def depth_between(problem: Problem, X: Tensor) -> Tensor:
         segment_gaps(p[:, :-1], p[:, 1:], c.centers, torch.where(c.absent, FAR, c.distances)).amin(-1) for c in spheres
     ]
     return -torch.stack(gaps).amin(0)
+
+
+def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:
+    """Range (B, P, m) of the controls from rest (B, N, m), stage 0, to the bound that a sign (P, m) points to; 1 if open."""
+    first = rest[:, :1]
+    for constraint in problem.constraints:
+        if isinstance(constraint, ControlBounds):
+            reach = torch.where(signs > 0, constraint.upper.unsqueeze(1) - first, first - constraint.lower.unsqueeze(1))
+            return torch.where(reach < OPEN, reach.clamp(min=0.0), 1.0)
+    return torch.ones_like(signs).expand(first.shape[0], *signs.shape)
 
 
 def _resting_cost(problem: Problem, rest: Tensor, points: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from torchgco.rollout import open_loop
 from torchgco.shapes import InputError, copied, joined, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.attempts import go_on_from, has_arrived, try_again
+from torchgco.solvers.lifted import LOST, lifted_search
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import Callback, InnerEnd, Iterate, OuterLoop, Progress, State
 from torchgco.solvers.trace import Recorder
@@ -134,6 +135,7 @@ class Loop:
         if bool(step.failed.any()):
             self._raise_regularisation(step, F, H, status)
         old_merit, alpha, refused = self._move(lagrangian, step, moving)
+        refused = self._lift(lagrangian, refused, expected)
         change, damped = (s.merit - old_merit).abs(), s.regularisation > inner.damping
         s.inner, s.iterations = s.inner + ~step.failed, s.iterations + ~step.failed
         if self.recorder is not None:
@@ -187,6 +189,20 @@ class Loop:
         alpha[rows] = found.alpha
         refused[rows] = ~found.accepted
         return old_merit, alpha, refused
+
+    def _lift(self, lagrangian: Lagrangian, refused: Tensor, expected: Tensor) -> Tensor:
+        """Another search for elements that no step length helped though much is left to save; who is still refused."""
+        s = self.state
+        rows = (refused & (expected > LOST * s.merit.abs())).nonzero().flatten()
+        if self.solver.inner.damping == 0 or rows.numel() == 0:
+            return refused
+        found = lifted_search(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows])
+        won = rows[found.accepted]
+        for name in ("X", "U", "cost", "merit"):
+            getattr(s, name)[won] = getattr(found, name)[found.accepted]
+        refused = refused.clone()
+        refused[won] = False
+        return refused
 
     # Outer iteration ---------------------------------------------------------------------------------------------
 

@@ -1,0 +1,64 @@
+"""A way on where the shortest step fails: Gauss-Newton steps in states and controls together (multiple shooting).
+
+Where the dynamics are unstable and the gains around an iterate don't hold them, rollouts diverge whatever the step
+length. Steps that take the states as variables of their own, with gaps between them that the linearised dynamics close,
+lead to a trajectory whose gains do.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.expansion import linearise
+from torchgco.lagrangian import Lagrangian
+from torchgco.rollout import closed_loop
+from torchgco.solvers.line_search import Candidates
+from torchgco.solvers.riccati import backward
+
+ROUNDS = 20  # steps at most
+GAIN = 1e-2  # share of L_M by which a rollout must lower it
+LOST = 1e-3  # share of L_M that the quadratic model expects to save where no step length saves anything
+
+
+def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Candidates:
+    """The first rollout that lowers L_M = merit (B,) markedly, from X (B, N+1, n), U (B, N, m); else not accepted."""
+    found = Candidates(X.clone(), U.clone(), merit.clone(), merit.clone(), torch.ones_like(merit), torch.zeros_like(merit, dtype=torch.bool))
+    rows = torch.arange(X.shape[0], device=X.device)
+    for i in range(ROUNDS):
+        part, dynamics = lagrangian.take(rows), lagrangian.problem.dynamics.take(rows)
+        n, F = X.shape[-1], linearise(part.problem, X, U)
+        F[:, :, :n, n] = (dynamics.step(X[:, :-1], U) - X[:, 1:]).transpose(0, 1)
+        step = backward(F, part.expand(X, U), torch.zeros_like(X[:, 0, 0]))
+        if i > 0:  # the first gains are those that failed
+            _keep(found, rows, part, *closed_loop(dynamics, X, U, step.gains, torch.ones_like(X[:, 0, 0])))
+        X, U = _linear_step(F, step.gains, X, U)
+        going = ~found.accepted[rows] & ~step.failed & torch.isfinite(X).flatten(1).all(-1)
+        if not bool(going.any()):
+            break
+        rows, X, U = rows[going], X[going], U[going]
+    return found
+
+
+def _keep(found: Candidates, rows: Tensor, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> None:
+    """Write the trajectories that are low enough into `found`."""
+    cost, value = lagrangian.value(X, U)
+    low = torch.isfinite(value) & (value < found.merit[rows] - GAIN * found.merit[rows].abs())
+    won = rows[low]
+    for tensor, new in ((found.X, X), (found.U, U), (found.cost, cost), (found.merit, value)):
+        tensor[won] = new[low]
+    found.accepted[won] = True
+
+
+def _linear_step(F: Tensor, G: Tensor, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+    """States and controls after a full step of the linearised dynamics F (N, B, n+1, s) under the gains G."""
+    n, one = X.shape[-1], torch.ones_like(X[:, 0, :1])
+    dx = torch.zeros_like(X[:, 0])
+    new_X, new_U = [X[:, 0]], []
+    for k in range(U.shape[1]):
+        z = torch.cat((dx, one), dim=-1).unsqueeze(-1)
+        du = torch.bmm(G[k], z)
+        dx = torch.bmm(F[k, :, :n], torch.cat((z, du), dim=1)).squeeze(-1)
+        new_X.append(X[:, k + 1] + dx)
+        new_U.append(U[:, k] + du.squeeze(-1))
+    return torch.stack(new_X, dim=1), torch.stack(new_U, dim=1)
