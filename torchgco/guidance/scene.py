@@ -68,14 +68,14 @@ def arrives(problem: Problem, U: Tensor) -> Tensor:
 
 def depth(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """How deep a path reaches into an obstacle, (B,), m."""
-    rows = [c.violation(X, U).flatten(1).amax(-1) for c in problem.geometric]
+    rows = [c.worst(X, U) for c in problem.geometric]
     return torch.stack(rows).amax(0)
 
 
 def depth_between(problem: Problem, X: Tensor) -> Tensor:
     """How deep the straight segments between the knots of paths X (B, N+1, n) reach into a sphere, (B,), m."""
     p = X[..., position(problem)]
-    spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres)]
+    spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres) and c.distances.shape[1] > 0]
     gaps = [
         segment_gaps(p[:, :-1], p[:, 1:], c.centers, torch.where(c.absent, FAR, c.distances)).amin(-1) for c in spheres
     ]
