@@ -36,6 +36,7 @@ from torchgco.guidance import MPPI as MPPI
 from torchgco.judge import judge as judge
 from torchgco.problem import Problem as Problem
 from torchgco.scenarios import Layouts as Layouts
+from torchgco.shapes import GuidanceWarning as GuidanceWarning
 from torchgco.shapes import InputError as InputError
 from torchgco.solution import Solution as Solution
 from torchgco.solvers import ILQR as ILQR

@@ -17,13 +17,15 @@ THERE = 0.25  # share of the distance from start to goal; a path that ends farth
 def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     """Start, goal and spheres, with what it costs to be at a point under the controls `rest` (B, N, m).
 
-    None where there are no spheres, or other obstacles too, or they move.
+    None where there are no spheres, or other obstacles too, or they move, or space is neither 2-D nor 3-D.
     """
     spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres) and c.velocities is None]
     goal = problem.cost.goal(problem.x0)
-    if not spheres or len(spheres) < len(problem.geometric) or goal is None:
+    if sum(c.distances.shape[1] for c in spheres) == 0 or len(spheres) < len(problem.geometric) or goal is None:
         return None
     at = position(problem)
+    if at.stop - at.start not in (2, 3):
+        return None
 
     def toll(points: Tensor, rows: Tensor) -> Tensor:
         part = problem.take(rows)

@@ -52,6 +52,7 @@ class Loop:
         if warm is not None:
             warm.check(problem)
         self.solver, self.seed, self.callback = solver, seed, callback
+        self.guidance = None if solver.guidance is None else solver.guidance.suited(problem)
         self.whole, self.U0, self.warm, self.guide = problem, U0, warm, guide
         self.result = _empty_result(problem, U0)
         self.recorder = Recorder() if solver.record else None
@@ -86,7 +87,7 @@ class Loop:
         U = self.U0[rows]
         X = open_loop(problem.dynamics, problem.x0, U)
         duals = Multipliers.zero(problem, solver.initial_penalty) if self.warm is None else take(self.warm, rows)
-        guide = take(self.guide, rows) if solver.guidance is None else solver.guidance.start(problem, X)
+        guide = take(self.guide, rows) if self.guidance is None else self.guidance.start(problem, X)
         cost, merit = Lagrangian(problem, duals, guide, solver.clip).value(X, U)
         zero, worst = torch.zeros_like(rows), torch.full_like(cost, torch.inf)
         iterate = Iterate(X, U, duals, cost, worst)
@@ -217,7 +218,7 @@ class Loop:
 
     def _next_inner(self, rows: Tensor, duals: Multipliers) -> None:
         """New multipliers and penalties for the elements in `rows`; the next inner solve where no advice is awaited."""
-        s, guidance = self.state, self.solver.guidance
+        s, guidance = self.state, self.guidance
         s.duals = Multipliers(tuple(lam.clone() for lam in s.duals.lam), s.duals.mu.clone())
         put(s.duals, rows, duals)
         if guidance is not None:
@@ -239,7 +240,7 @@ class Loop:
 
     def _be_guided(self, rows: Tensor) -> None:
         """Ask guidance for the elements in `rows`, and go on from the plans that it hands over."""
-        s, guidance = self.state, self.solver.guidance
+        s, guidance = self.state, self.guidance
         if guidance is None or rows.numel() == 0:
             return
         problem = self.problem.take(rows)
