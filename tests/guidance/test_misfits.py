@@ -142,7 +142,7 @@ def test_dynamics_that_bear_no_samples_are_solved_without_guidance() -> None:
     assert told == ["solved without guidance: no plan can be sampled (no samples here)"]
     want = torchgco.solve(posed(2, spheres(2)), solver=replace(SINGLE, guidance=None))
     assert torch.equal(solution.U, want.U) and solution.guided.tolist() == [0, 0]
-    with pytest.raises(InputError, match="problem: expected parts .*, got no plan can be sampled"):
+    with pytest.raises(InputError, match="got no plan can be sampled"):
         torchgco.solve(problem, solver=IteratedMPPI(iterations=1))
 
 
@@ -170,8 +170,8 @@ def test_the_radius_without_spheres_is_a_share_of_the_way() -> None:
         def goal(self, x0):
             return None
 
-    cost = problem.cost
-    aimless = replace(problem, cost=Unaimed(cost.Q, cost.R, cost.Qf))
+    unaimed = Unaimed(Q=[1.0] * 4, R=[0.1] * 2, Qf=[50.0] * 4)
+    aimless = Problem(problem.dynamics, unaimed, problem.constraints, problem.x0, problem.N)
     torch.testing.assert_close(GCO()._radius(aimless, X), X.new_tensor([REACH * 5.0, 0.0]))
 
 
