@@ -16,6 +16,7 @@ from torchgco import (
     GCO,
     MPPI,
     ControlBounds,
+    Cost,
     FunctionConstraint,
     FunctionDynamics,
     GuidanceWarning,
@@ -135,11 +136,17 @@ class Fussy(FunctionDynamics):
         raise IndexError("no samples here")
 
 
-def test_dynamics_that_bear_no_samples_are_solved_without_guidance() -> None:
+def test_dynamics_that_bear_no_samples_are_led_by_detours_alone() -> None:
     plain = vehicle(2)
-    problem = posed(2, spheres(2), dynamics=Fussy(plain.function, 4, 2, 0.1, "euler", plain.position))
-    solution, told = solved(problem)
-    assert told == ["solved without guidance: no plan can be sampled (no samples here)"]
+    fussy = Fussy(plain.function, 4, 2, 0.1, "euler", plain.position)
+    problem, lost = posed(2, spheres(2), dynamics=fussy), "no plan can be sampled (no samples here)"
+    solution, told = solved(problem, replace(SINGLE, attempts=3))
+    assert told == [f"guided in part: {lost}"]
+    assert int(solution.guided[0]) == 1 and solution.status.tolist() == [1, 1]
+    assert SINGLE.guidance is not None
+    bare = replace(SINGLE, guidance=replace(SINGLE.guidance, detour=None))
+    solution, told = solved(problem, bare)
+    assert told == [f"solved without guidance: {lost}"]
     want = torchgco.solve(posed(2, spheres(2)), solver=replace(SINGLE, guidance=None))
     assert torch.equal(solution.U, want.U) and solution.guided.tolist() == [0, 0]
     with pytest.raises(InputError, match="got no plan can be sampled"):
@@ -166,12 +173,7 @@ def test_the_radius_without_spheres_is_a_share_of_the_way() -> None:
     assert GCO(radius=0.3)._radius(problem, X).tolist() == [0.3, 0.3]
     assert GCO()._radius(posed(2, spheres(2)), X).tolist() == [0.1, 0.1]
 
-    class Unaimed(QuadraticCost):
-        def goal(self, x0):
-            return None
-
-    unaimed = Unaimed(Q=[1.0] * 4, R=[0.1] * 2, Qf=[50.0] * 4)
-    aimless = Problem(problem.dynamics, unaimed, problem.constraints, problem.x0, problem.N)
+    aimless = Problem(problem.dynamics, Cost(), problem.constraints, problem.x0, problem.N)
     torch.testing.assert_close(GCO()._radius(aimless, X), X.new_tensor([REACH * 5.0, 0.0]))
 
 

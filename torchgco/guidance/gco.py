@@ -30,7 +30,7 @@ class GCO:
     """Where a solved trajectory is caught between obstacles, draw it to where MPPI found a way.
 
     Args:
-        sampler: finds the way, from the present controls.
+        sampler: finds the way, from the present controls; None: no way but that of `detour`.
         initial_penalty, penalty_growth: mu_gco and its factor nu per outer iteration; nu above the solver's eta lets
             the guide prevail.
         radius: r_guide, m; None takes the vehicle's radius, or without spheres `REACH` times the distance from start to
@@ -49,7 +49,7 @@ class GCO:
         InputError: a field out of its range; on `suited`, a covariance or pushes that don't fit the controls.
     """
 
-    sampler: MPPI = MPPI()
+    sampler: MPPI | None = MPPI()
     initial_penalty: float = 20.0
     penalty_growth: float = 4.84
     radius: float | None = None
@@ -86,9 +86,9 @@ class GCO:
             detour, unsought = suited_detour(self.detour, problem)
             lost = [why for why in (unsampled, unsought) if why is not None]
         if lost:
-            what = "solved without guidance" if sampler is None else "guided in part"
+            what = "solved without guidance" if sampler is None and detour is None else "guided in part"
             warnings.warn(f"{what}: {'; '.join(lost)}", GuidanceWarning, stacklevel=4)
-        return None if sampler is None else replace(self, sampler=sampler, detour=detour)
+        return None if sampler is None and detour is None else replace(self, sampler=sampler, detour=detour)
 
     def start(self, problem: Problem, X: Tensor) -> GuideRegion:
         """No guidance yet, for any element (Algorithm 4, lines 3-4)."""
@@ -116,7 +116,7 @@ class GCO:
                 duals = Multipliers.zero(problem, torch.nan)
                 put(duals, turn, given)
         rows = (caught & ~taken).nonzero().flatten()
-        if rows.numel() > 0:
+        if rows.numel() > 0 and self.sampler is not None:
             part = problem.take(rows)
             X_safe, plan[rows] = self.sampler.improve(part, self._mean(part, U[rows]), key.take(rows))
             if self.adopt:

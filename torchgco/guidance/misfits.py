@@ -23,12 +23,14 @@ from torchgco.problem import Problem
 SAMPLES = 2  # flown as a trial
 
 
-def suited_sampler(sampler: MPPI, problem: Problem) -> tuple[MPPI | None, str | None]:
+def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None, str | None]:
     """The sampler that a problem can have, or None, and a sentence on what is lost; None where nothing is.
 
     Raises:
         InputError: a covariance that doesn't fit the controls.
     """
+    if sampler is None:
+        return None, None
     sampler.check(problem)
     own, wanted, why = _tried(_sample, problem, sampler.dtype)
     if why is None:
