@@ -54,6 +54,9 @@ class Witness:
     last: dict[int, Tensor] = field(default_factory=dict)  # of a layout: the plan (N+1, d) when last caught
     plan: tuple[Tensor, Tensor] | None = None  # ids and plans of the last call of the sampler
 
+    def suited(self, problem: Problem) -> Any:
+        return self
+
     def start(self, problem: Problem, X: Tensor) -> Any:
         return self.guidance.start(problem, X)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
+from torchgco import presets as presets
 from torchgco.api import solve as solve
 from torchgco.baselines import Hold as Hold
 from torchgco.baselines import IteratedMPPI as IteratedMPPI
@@ -36,6 +37,7 @@ from torchgco.guidance import MPPI as MPPI
 from torchgco.judge import judge as judge
 from torchgco.problem import Problem as Problem
 from torchgco.scenarios import Layouts as Layouts
+from torchgco.shapes import GuidanceWarning as GuidanceWarning
 from torchgco.shapes import InputError as InputError
 from torchgco.solution import Solution as Solution
 from torchgco.solvers import ILQR as ILQR

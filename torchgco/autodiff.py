@@ -25,6 +25,15 @@ def jacobian(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ..
     return tuple(columns)
 
 
+def gradients(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
+    """Gradients of function(*args).sum() by each argument; zero where it doesn't depend on that argument.
+
+    `torch.func` differentiates within `torch.no_grad()` and `torch.inference_mode()` too, and through tensors that were
+    created there, where `torch.autograd.grad` raises or sees constants.
+    """
+    return torch.func.grad(lambda *z: function(*z).sum(), argnums=tuple(range(len(args))))(*args)
+
+
 def gradient_and_hessian(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Tensor]:
     """Gradient (..., s) and Hessian (..., s, s) of function(z) (...), which maps each row of z (..., s) to a number."""
     gradient = torch.func.grad(lambda rows: function(rows).sum())

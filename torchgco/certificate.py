@@ -15,6 +15,7 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
+from torchgco.autodiff import gradients
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.obstacles import BoundSpheres
@@ -140,11 +141,9 @@ def _acceleration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     assert at is not None  # or there would be no spheres
     d = at.stop - at.start
     twins = problem.dynamics.take(torch.zeros(d, dtype=torch.int64, device=X.device))
-    with torch.enable_grad():
-        x = X.repeat(d, 1, 1).requires_grad_()
-        velocity = twins.field(x, U.repeat(d, 1, 1))
-        (slopes,) = _gradients(velocity[..., at].diagonal(dim1=0, dim2=2).sum(), x)
-    return (slopes * velocity[:1].detach()).sum(-1).mT
+    u = U.repeat(d, 1, 1)
+    (slopes,) = gradients(lambda x: twins.field(x, u)[..., at].diagonal(dim1=0, dim2=2), X.repeat(d, 1, 1))
+    return (slopes * problem.dynamics.field(X, U)).sum(-1).mT
 
 
 def _kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
@@ -152,9 +151,9 @@ def _kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     active = _active_rows(problem, X, U)
     gX, gU = (torch.cat([cost[i], *(rows[i] for _, rows in active)]) for i in (0, 1))
     reduced, terms = _reduced(problem, X, U, gX, gU)
-    gradients = reduced.flatten(1).cpu().numpy()
+    slopes = reduced.flatten(1).cpu().numpy()
     senses = [equality for equality, (rows, _) in active for _ in rows]
-    rest = X.new_tensor(_fit(gradients[0], gradients[1:], np.array(senses, dtype=bool))).abs().view_as(U[0]).amax(0)
+    rest = X.new_tensor(_fit(slopes[0], slopes[1:], np.array(senses, dtype=bool))).abs().view_as(U[0]).amax(0)
     scale = terms.amax(0)
     scale = torch.maximum(scale, NEGLIGIBLE * scale.amax())
     return torch.where(rest > 0, rest / scale, 0.0).amax()
@@ -201,17 +200,8 @@ def _spare(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
 
 def _local(rows: Any, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of rows(X, U) (q,), row j of repetition j, by X (q, N+1, n) and by U (q, N, m), dynamics left aside."""
-    with torch.enable_grad():
-        X, U = X.detach().clone().requires_grad_(), U.detach().clone().requires_grad_()
-        gX, gU = _gradients(rows(X, U).sum(), X, U)
+    gX, gU = gradients(rows, X, U)
     return gX, gU
-
-
-def _gradients(value: Tensor, *by: Tensor) -> tuple[Tensor, ...]:
-    """Gradients of a number, zero where it doesn't depend on the argument."""
-    if not value.requires_grad:
-        return tuple(torch.zeros_like(z) for z in by)
-    return torch.autograd.grad(value, by, allow_unused=True, materialize_grads=True)
 
 
 def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> tuple[Tensor, Tensor]:
@@ -221,10 +211,8 @@ def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> 
     """
     n, N = problem.n, problem.N
     twins = problem.dynamics.take(torch.zeros(n, dtype=torch.int64, device=X.device))
-    with torch.enable_grad():
-        x, u = X[:, :-1].repeat(n, 1, 1).requires_grad_(), U.repeat(n, 1, 1).requires_grad_()
-        after = twins.step(x, u).diagonal(dim1=0, dim2=2).sum()
-        fx, fu = _gradients(after, x, u)  # (n, N, n), (n, N, m)
+    x, u = X[:, :-1].repeat(n, 1, 1), U.repeat(n, 1, 1)
+    fx, fu = gradients(lambda x, u: twins.step(x, u).diagonal(dim1=0, dim2=2), x, u)  # (n, N, n), (n, N, m)
     total, terms = torch.empty_like(gU), torch.empty_like(gU[0])
     adjoint = gX[:, N]
     for k in range(N - 1, -1, -1):

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import Constraint
 from torchgco.constraints.obstacles import CONTACT_FACTOR, BoundSpheres
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
@@ -70,7 +69,7 @@ def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor,
     far = torch.full_like(cost, torch.inf)
     clearance_knots, clearance, violation, others = far, far, torch.zeros_like(cost), torch.zeros_like(cost)
     for constraint in problem.constraints:
-        worst = _worst(constraint, X, U)
+        worst = constraint.worst(X, U)
         violation = torch.maximum(violation, worst)
         if isinstance(constraint, BoundSpheres):
             at_knots, between = sphere_clearance(constraint, X)
@@ -90,11 +89,14 @@ def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor,
 def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest distance (B,) to a surface of 0.95 (r_obs + r_veh), at the knots and along the segments between, m.
 
+    Infinite where there is no obstacle.
     All knots count, the given start too. Both vehicle and obstacle move straight from knot to knot, so the nearest
     point of a segment to the obstacle's centre is exact; for an integrator other than Euler, the chord is meant.
     """
     contact = torch.where(spheres.absent, -torch.inf, CONTACT_FACTOR * spheres.distances)
     at_knots = between = torch.full_like(X[:, 0, 0], torch.inf)
+    if contact.shape[1] == 0:
+        return at_knots, between
     before = None
     for k in range(X.shape[1]):
         relative = X[:, k, None, spheres.position] - spheres.centers
@@ -113,10 +115,6 @@ def segment_distance(a: Tensor, b: Tensor) -> Tensor:
     length = along.square().sum(-1)
     share = (-(a * along).sum(-1) / length.clamp(min=torch.finfo(a.dtype).tiny)).clamp(0.0, 1.0)
     return (a + share.unsqueeze(-1) * along).norm(dim=-1)
-
-
-def _worst(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
-    return constraint.violation(X, U).flatten(1).amax(-1)
 
 
 def frame_columns(verdict: Verdict) -> dict[str, Any]:

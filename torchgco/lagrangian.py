@@ -164,7 +164,7 @@ def violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """The largest violation (B,): lengths in metres, all else in the units of its constraint."""
     worst = X.new_zeros(X.shape[0])
     for constraint in problem.constraints:
-        worst = torch.maximum(worst, constraint.violation(X, U).flatten(1).amax(-1))
+        worst = torch.maximum(worst, constraint.worst(X, U))
     return worst
 
 
@@ -179,6 +179,8 @@ def worst_rows(problem: Problem, X: Tensor, U: Tensor) -> list[dict[str, Any]]:
     report: list[dict[str, Any]] = [{"violation": 0.0, "constraint": None} for _ in range(X.shape[0])]
     for constraint in problem.constraints:
         rows = constraint.violation(X, U)
+        if rows.numel() == 0:
+            continue
         knots = torch.arange(problem.N + 1)[constraint.knots]
         worst, place = rows.flatten(1).max(-1)
         for b, (value, flat) in enumerate(zip(worst.tolist(), place.tolist(), strict=True)):

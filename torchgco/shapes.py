@@ -32,6 +32,10 @@ class InputError(ValueError):
         return type(self), (self.field, self.expected, str(self.got))  # a worker process hands it on whole
 
 
+class GuidanceWarning(UserWarning):
+    """Guidance, or a part of it, can't serve a problem: it is solved without."""
+
+
 class PerElement:
     """Mixin for problem parts that may hold one value per problem.
 

@@ -352,6 +352,9 @@ class OnePlan:
     def __init__(self, plan: torch.Tensor) -> None:
         self.plan = plan
 
+    def suited(self, problem):
+        return self
+
     def start(self, problem, X):
         return GuideRegion.inactive(X, torch.ones_like(X[:, 0, 0]), slice(0, 2))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import torch
@@ -9,10 +10,11 @@ from torch import Tensor
 
 from torchgco.baselines.hold import rolled_out
 from torchgco.draws import DrawKey
+from torchgco.guidance.misfits import suited_sampler
 from torchgco.guidance.mppi import MPPI
 from torchgco.lagrangian import Multipliers, is_better, violation
 from torchgco.problem import Problem
-from torchgco.shapes import InputError
+from torchgco.shapes import GuidanceWarning, InputError
 from torchgco.solution import Solution
 from torchgco.solvers.batch import check_call
 from torchgco.solvers.state import Callback
@@ -55,13 +57,18 @@ class IteratedMPPI:
         """Sample around U0 (B, N, m); draws are keyed by (seed, id, iteration). warm and callback change nothing.
 
         Raises:
-            InputError: U0 or ids don't fit the problem.
+            InputError: U0 or ids don't fit the problem, or its parts can't be evaluated for samples.
         """
         ids = check_call(problem, U0, ids)
+        sampler, lost = suited_sampler(self.sampler, problem)
+        if sampler is None:
+            raise InputError("problem", "parts that can be evaluated for many samples at once", lost)
+        if lost is not None:
+            warnings.warn(lost, GuidanceWarning, stacklevel=2)
         U, best = U0, U0
         best_cost = best_violation = torch.full_like(problem.x0[:, 0], torch.inf)
         for i in range(self.iterations):
-            X, U = self.sampler.improve(problem, U, DrawKey(seed, ids, torch.full_like(ids, i)))
+            X, U = sampler.improve(problem, U, DrawKey(seed, ids, torch.full_like(ids, i)))
             cost, worst = problem.cost.total(X, U), violation(problem, X, U)
             better = is_better(cost, worst, best_cost, best_violation, self.violation_tolerance)
             best = torch.where(better.view(-1, 1, 1), U, best)

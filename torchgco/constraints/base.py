@@ -45,6 +45,11 @@ class Constraint(PerElement):
         c = self.value(X, U)
         return c.abs() if self.sense == "equality" else c.clamp(min=0.0)
 
+    def worst(self, X: Tensor, U: Tensor) -> Tensor:
+        """The largest violation of each problem, (B,); 0 for a constraint without rows."""
+        rows = self.violation(X, U).flatten(1)
+        return rows.amax(-1) if rows.shape[1] > 0 else rows.new_zeros(rows.shape[0])
+
     def at(self, x: Tensor, k: int) -> Tensor:
         """Rows (B, S, p) for samples x (B, S, n) of one knot; geometric constraints only."""
         raise NotImplementedError

@@ -24,7 +24,8 @@ class Spheres(Constraint):
     """(r_obs,i + r_veh)^2 - |p_obs,i(k) - p_k|^2 <= 0 for every obstacle i (Equation 52).
 
     Args:
-        centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent obstacles (padding).
+        centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent obstacles (padding); M may be 0,
+            and an empty list stands for (0, d).
         radii: (M,) or (B, M), m; NaN where the centre is.
         vehicle_radius: number or (B,), m.
         velocities: as centers, m/s; the obstacle is at centers + velocities * k dt. None: static.
@@ -45,7 +46,10 @@ class Spheres(Constraint):
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
-        centers = _batched(self.centers, "obstacles.centers", 3, dims)
+        centers = tensor(self.centers, "obstacles.centers", dims.like)
+        if tuple(centers.shape) == (0,) and dims.position is not None:
+            centers = centers.reshape(0, dims.position.stop - dims.position.start)
+        centers = _batched(centers, "obstacles.centers", 3, dims)
         d = centers.shape[-1]
         if dims.position is None or dims.position.stop - dims.position.start != d:
             raise InputError("obstacles.centers", "the dimension of the vehicle's position", f"{d}-D centres")
@@ -57,7 +61,8 @@ class Spheres(Constraint):
         if bool((absent != torch.isnan(radii)).any()) or bool(torch.isnan(centers[~absent]).any()):
             raise InputError("obstacles.radii", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
         if bool((radii < 0).any()) or bool((vehicle < 0).any()):
-            raise InputError("obstacles.radii", "radii of at least 0 m", float(radii.nan_to_num(0.0).min()))
+            lowest = min(float(sizes.nan_to_num(0.0).min()) for sizes in (radii, vehicle) if sizes.numel() > 0)
+            raise InputError("obstacles.radii", "radii of at least 0 m", lowest)
         velocities = None
         if self.velocities is not None:
             velocities = _batched(self.velocities, "obstacles.velocities", 3, dims)
@@ -184,7 +189,12 @@ class BoundSpheres(Constraint):
         return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
 
     def chord_clearance(self, X: Tensor) -> Tensor:
-        """Smallest distance (B,) from the straight ways between knots to where bodies touch, m; negative in contact."""
+        """Smallest distance (B,) from the straight ways between knots to where bodies touch, m; negative in contact.
+
+        Infinite where there is no obstacle.
+        """
+        if self.centers.shape[1] == 0:
+            return torch.full_like(X[:, 0, 0], torch.inf)
         o = self.centers.unsqueeze(1)
         if self.velocities is not None:
             t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device) * self.dt

@@ -106,7 +106,7 @@ class Detour:
         dtype: "float32" to follow and settle in single precision; None: in the problem's own.
 
     Raises:
-        InputError: a field out of its range.
+        InputError: a field out of its range; on `check` and `propose`, pushes that don't fit the controls.
     """
 
     roadmap: Roadmap = Roadmap()
@@ -157,6 +157,10 @@ class Detour:
     def ends(self) -> tuple[float, ...]:
         """All of `end`."""
         return tuple(self.end) if isinstance(self.end, Sequence) else (self.end,)
+
+    def check(self, problem: Problem) -> None:
+        """Raise InputError where the pushes don't fit the controls."""
+        self._begun(problem, problem.x0.new_zeros(problem.B, problem.N, problem.m))
 
     def propose(self, problem: Problem, rank: Tensor | None = None) -> Proposal:
         """A plan for every problem, from the vehicle at rest, along the best of the ways or that of a rank (B,)."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -12,13 +13,17 @@ from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.draws import DrawKey
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.detour import Detour
+from torchgco.guidance.misfits import suited_detour, suited_sampler
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
 from torchgco.guidance.scene import position
 from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
-from torchgco.shapes import InputError, put, take
+from torchgco.shapes import GuidanceWarning, InputError, put, take
 from torchgco.solvers.state import Advice
+
+REACH = 0.02  # r_guide as a share of the distance to be flown; the paper's vehicles have radii of 0.017 and 0.03 of it
+DIVERGED = 1e3  # times what staying at the start costs: a plan that costs more leads nowhere
 
 
 @dataclass(frozen=True)
@@ -26,10 +31,11 @@ class GCO:
     """Where a solved trajectory is caught between obstacles, draw it to where MPPI found a way.
 
     Args:
-        sampler: finds the way, from the present controls.
+        sampler: finds the way, from the present controls; None: no way but that of `detour`.
         initial_penalty, penalty_growth: mu_gco and its factor nu per outer iteration; nu above the solver's eta lets
             the guide prevail.
-        radius: r_guide, m; None takes the vehicle's radius.
+        radius: r_guide, m; None takes the vehicle's radius, or without spheres `REACH` times the distance from start to
+            goal (to the farthest knot of the path where the cost names no goal).
         grow_when_idle: mu_gco grows in every outer iteration (as Algorithm 4, line 11, prints it), or only in those
             that find the element caught, so that late guidance starts as gently as early guidance.
         adopt: where the sampled plan touches nothing, go on from the plan itself instead of being drawn to it.
@@ -41,10 +47,10 @@ class GCO:
         patience: from this outer iteration on, a single active sphere counts as being caught too; None: never.
 
     Raises:
-        InputError: a field out of its range; on `start`, dynamics without a position.
+        InputError: a field out of its range; on `suited`, a covariance or pushes that don't fit the controls.
     """
 
-    sampler: MPPI = MPPI()
+    sampler: MPPI | None = MPPI()
     initial_penalty: float = 20.0
     penalty_growth: float = 4.84
     radius: float | None = None
@@ -66,6 +72,24 @@ class GCO:
                 raise InputError(f"gco.{name}", "at least 1", getattr(self, name))
         if self.radius is not None and not self.radius > 0:
             raise InputError("gco.radius", "above 0 m, or null", self.radius)
+
+    def suited(self, problem: Problem) -> GCO | None:
+        """This guidance without the parts that can't serve a problem, which a GuidanceWarning names; None: nothing can.
+
+        Without geometric constraints nothing is ever caught, and none is needed.
+        """
+        if not problem.geometric:
+            return None
+        if problem.dynamics.position is None:
+            sampler, detour, lost = None, None, ["the dynamics have no position"]
+        else:
+            sampler, unsampled = suited_sampler(self.sampler, problem)
+            detour, unsought = suited_detour(self.detour, problem)
+            lost = [why for why in (unsampled, unsought) if why is not None]
+        if lost:
+            what = "solved without guidance" if sampler is None and detour is None else "guided in part"
+            warnings.warn(f"{what}: {'; '.join(lost)}", GuidanceWarning, stacklevel=4)
+        return None if sampler is None and detour is None else replace(self, sampler=sampler, detour=detour)
 
     def start(self, problem: Problem, X: Tensor) -> GuideRegion:
         """No guidance yet, for any element (Algorithm 4, lines 3-4)."""
@@ -93,14 +117,21 @@ class GCO:
                 duals = Multipliers.zero(problem, torch.nan)
                 put(duals, turn, given)
         rows = (caught & ~taken).nonzero().flatten()
-        if rows.numel() > 0:
+        if rows.numel() > 0 and self.sampler is not None:
             part = problem.take(rows)
             X_safe, plan[rows] = self.sampler.improve(part, self._mean(part, U[rows]), key.take(rows))
+            holds = self._holds(part, X_safe, plan[rows])
             if self.adopt:
-                taken[rows] = ~active_counts(part, X_safe, plan[rows]).any(-1)
-            drawn = guide_along(take(new, rows), X_safe, knots[rows], self._radius(problem)[rows])
+                taken[rows] = ~active_counts(part, X_safe, plan[rows]).any(-1) & holds
+            drawn = guide_along(
+                take(new, rows), X_safe, knots[rows] & holds.unsqueeze(-1), self._radius(problem, X)[rows]
+            )
             put(new, rows[~taken[rows]], take(drawn, (~taken[rows]).nonzero().flatten()))
         return Advice(new, plan, taken, duals)
+
+    def _holds(self, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+        """Whether a sampled plan stays with the task, (B,): under unstable dynamics samples diverge, clear of everything."""
+        return problem.cost.total(X, U).abs() <= DIVERGED * problem.N * problem.cost_unit
 
     def _caught(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
         """The knots (B, N+1) that guidance is for: J, and with patience those at a single sphere."""
@@ -114,11 +145,13 @@ class GCO:
         """What the sampler starts from, (B, N, m)."""
         return problem.cost.rest_controls(U) if self.afresh else U
 
-    def _radius(self, problem: Problem) -> Tensor:
+    def _radius(self, problem: Problem, X: Tensor) -> Tensor:
         """r_guide (B,), m."""
         if self.radius is not None:
             return problem.x0.new_full((problem.B,), self.radius)
         for constraint in problem.geometric:
             if isinstance(constraint, BoundSpheres):
                 return constraint.vehicle_radius
-        raise InputError("gco.radius", "a radius in metres, for obstacles that are no spheres", None)
+        goal = problem.cost.goal(problem.x0)
+        ends = X[:, 1:] if goal is None else goal.unsqueeze(1)
+        return REACH * (ends - problem.x0.unsqueeze(1))[..., position(problem)].square().sum(-1).sqrt().amax(-1)

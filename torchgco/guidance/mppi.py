@@ -50,7 +50,7 @@ class MPPI:
         elite: the temperature is raised to the gap between the best sample and the elite-th best; 0 leaves it.
 
     Raises:
-        InputError: a field out of its range; on `improve`, a covariance that doesn't fit the controls.
+        InputError: a field out of its range; on `check` and `improve`, a covariance that doesn't fit the controls.
     """
 
     samples: int = 100
@@ -88,6 +88,10 @@ class MPPI:
             raise InputError("mppi.dtype", "float32, float64 or null", repr(self.dtype))
         if self.saturation not in ("bounds", "symmetric", None):
             raise InputError("mppi.saturation", "bounds, symmetric or null", repr(self.saturation))
+
+    def check(self, problem: Problem) -> None:
+        """Raise InputError where the covariance doesn't fit the controls."""
+        self._sigma(problem)
 
     def improve(self, problem: Problem, U: Tensor, key: DrawKey, stream: int = 0) -> tuple[Tensor, Tensor]:
         """X (B, N+1, n) and U (B, N, m): the mean of the last round's samples, the first drawn around U."""

@@ -19,13 +19,15 @@ THERE = 0.25  # share of the distance from start to goal; a path that ends farth
 def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     """Start, goal and spheres, with what it costs to be at a point under the controls `rest` (B, N, m).
 
-    None where there are no spheres, or other obstacles too, or they move.
+    None where there are no spheres, or other obstacles too, or they move, or space is neither 2-D nor 3-D.
     """
     spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres) and c.velocities is None]
     goal = problem.cost.goal(problem.x0)
-    if not spheres or len(spheres) < len(problem.geometric) or goal is None:
+    if sum(c.distances.shape[1] for c in spheres) == 0 or len(spheres) < len(problem.geometric) or goal is None:
         return None
     at = position(problem)
+    if at.stop - at.start not in (2, 3):
+        return None
 
     def toll(points: Tensor, rows: Tensor) -> Tensor:
         part = problem.take(rows)
@@ -70,14 +72,14 @@ def arrives(problem: Problem, U: Tensor) -> Tensor:
 
 def depth(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """How deep a path reaches into an obstacle, (B,), m."""
-    rows = [c.violation(X, U).flatten(1).amax(-1) for c in problem.geometric]
+    rows = [c.worst(X, U) for c in problem.geometric]
     return torch.stack(rows).amax(0)
 
 
 def depth_between(problem: Problem, X: Tensor) -> Tensor:
     """How deep the straight segments between the knots of paths X (B, N+1, n) reach into a sphere, (B,), m."""
     p = X[..., position(problem)]
-    spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres)]
+    spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres) and c.distances.shape[1] > 0]
     gaps = [
         segment_gaps(p[:, :-1], p[:, 1:], c.centers, torch.where(c.absent, FAR, c.distances)).amin(-1) for c in spheres
     ]

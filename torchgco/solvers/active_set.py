@@ -22,7 +22,7 @@ def multipliers(S: Tensor, b: Tensor, free: Tensor, start: Tensor) -> Tensor | N
         S: (q, q) positive semidefinite, b: (q,), free: (q,) bool, start: (q,) bool, rows that are tried first.
     """
     if b.numel() == 0:
-        return b
+        return torch.zeros_like(b)
     scale = S.diagonal().clamp(min=torch.finfo(S.dtype).tiny)
     S = S + torch.diag(SLACK * scale)
     working = start | free

@@ -22,7 +22,7 @@ from torchgco.rollout import open_loop
 from torchgco.shapes import InputError, copied, joined, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.attempts import go_on_from, has_arrived, try_again
-from torchgco.solvers.lifted import LOST, lifted_search
+from torchgco.solvers.lifted import diverges, lifted_search
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import Callback, InnerEnd, Iterate, OuterLoop, Progress, State
 from torchgco.solvers.trace import Recorder
@@ -60,6 +60,7 @@ class Loop:
             problem = problem.in_cost_units()
             warm = None if warm is None else warm.scaled(1.0 / self.unit)
             guide = None if guide is None else replace(guide, weight=guide.weight / self.unit)
+        self.guidance = None if solver.guidance is None else solver.guidance.suited(problem)
         self.whole, self.U0, self.warm, self.guide = problem, U0, warm, guide
         self.result = _empty_result(problem, U0)
         self.recorder = Recorder() if solver.record else None
@@ -94,7 +95,7 @@ class Loop:
         U = self.U0[rows]
         X = open_loop(problem.dynamics, problem.x0, U)
         duals = Multipliers.zero(problem, solver.initial_penalty) if self.warm is None else take(self.warm, rows)
-        guide = take(self.guide, rows) if solver.guidance is None else solver.guidance.start(problem, X)
+        guide = take(self.guide, rows) if self.guidance is None else self.guidance.start(problem, X)
         cost, merit = Lagrangian(problem, duals, guide, solver.clip).value(X, U)
         zero, worst = torch.zeros_like(rows), torch.full_like(cost, torch.inf)
         iterate = Iterate(X, U, duals, cost, worst)
@@ -135,7 +136,7 @@ class Loop:
         if bool(step.failed.any()):
             self._raise_regularisation(step, F, H, status)
         old_merit, alpha, refused = self._move(lagrangian, step, moving)
-        refused = self._lift(lagrangian, refused, expected)
+        refused = self._lift(lagrangian, step, refused)
         change, damped = (s.merit - old_merit).abs(), s.regularisation > inner.damping
         s.inner, s.iterations = s.inner + ~step.failed, s.iterations + ~step.failed
         if self.recorder is not None:
@@ -190,14 +191,17 @@ class Loop:
         refused[rows] = ~found.accepted
         return old_merit, alpha, refused
 
-    def _lift(self, lagrangian: Lagrangian, refused: Tensor, expected: Tensor) -> Tensor:
-        """Another search for elements that no step length helped though much is left to save; who is still refused."""
-        s = self.state
-        rows = (refused & (expected > LOST * s.merit.abs())).nonzero().flatten()
-        if self.solver.inner.damping == 0 or rows.numel() == 0:
+    def _lift(self, lagrangian: Lagrangian, step: BackwardPass, refused: Tensor) -> Tensor:
+        """Another search for elements whose rollouts diverge whatever the step length; returns who is still refused."""
+        s, inner, rows = self.state, self.solver.inner, refused.nonzero().flatten()
+        if inner.damping == 0 or rows.numel() == 0:
             return refused
-        found = lifted_search(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows])
-        won = rows[found.accepted]
+        part, X, U, merit = lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows]
+        lost = diverges(part, X, U, merit, step.gains[:, rows], inner.line_search.smallest).nonzero().flatten()
+        if lost.numel() == 0:
+            return refused
+        found = lifted_search(part.take(lost), X[lost], U[lost], merit[lost])
+        won = rows[lost[found.accepted]]
         for name in ("X", "U", "cost", "merit"):
             getattr(s, name)[won] = getattr(found, name)[found.accepted]
         refused = refused.clone()
@@ -241,7 +245,7 @@ class Loop:
 
     def _next_inner(self, rows: Tensor, duals: Multipliers) -> None:
         """New multipliers and penalties for the elements in `rows`; the next inner solve where no advice is awaited."""
-        s, guidance = self.state, self.solver.guidance
+        s, guidance = self.state, self.guidance
         s.duals = Multipliers(tuple(lam.clone() for lam in s.duals.lam), s.duals.mu.clone())
         put(s.duals, rows, duals)
         if guidance is not None:
@@ -263,7 +267,7 @@ class Loop:
 
     def _be_guided(self, rows: Tensor) -> None:
         """Ask guidance for the elements in `rows`, and go on from the plans that it hands over."""
-        s, guidance = self.state, self.solver.guidance
+        s, guidance = self.state, self.guidance
         if guidance is None or rows.numel() == 0:
             return
         problem = self.problem.take(rows)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchgco.autodiff import gradients
 from torchgco.constraints.base import Constraint
 from torchgco.expansion import linearise, quadratise
 from torchgco.problem import Problem
@@ -105,16 +106,17 @@ class Condensed:
         costate = torch.stack(costates[::-1])
         twins = self.problem.take(torch.zeros(s, dtype=torch.int64, device=lam.device))
         directions = torch.eye(s, dtype=lam.dtype, device=lam.device).unsqueeze(1)
-        with torch.enable_grad():
-            z = torch.cat((self.X, _padded(self.U, 1)), dim=-1).repeat(s, 1, 1).requires_grad_()
+        weights = self.by_constraint(lam)
+
+        def value(z: Tensor) -> Tensor:
             X, U = z[..., :n], z[:, :-1, n:]
-            value = twins.cost.total(X, U).sum() + (costate * twins.dynamics.step(X[:, :-1], U)).sum()
-            for constraint, weight in zip(twins.constraints, self.by_constraint(lam), strict=True):
-                value = value + (weight * constraint.value(X, U)).sum()
-            (gradient,) = torch.autograd.grad(value, z, create_graph=True)
-            if not gradient.requires_grad:
-                return torch.zeros_like(z).movedim(0, 1)  # all is linear
-            (blocks,) = torch.autograd.grad((gradient * directions).sum(), z)
+            total = twins.cost.total(X, U).sum() + (costate * twins.dynamics.step(X[:, :-1], U)).sum()
+            for constraint, weight in zip(twins.constraints, weights, strict=True):
+                total = total + (weight * constraint.value(X, U)).sum()
+            return total
+
+        z = torch.cat((self.X, _padded(self.U, 1)), dim=-1).repeat(s, 1, 1)
+        (blocks,) = gradients(lambda z: gradients(value, z)[0] * directions, z)
         return blocks.movedim(0, 1)
 
     def by_constraint(self, rows: Tensor) -> tuple[Tensor, ...]:
@@ -143,13 +145,13 @@ def _slopes(constraint: Constraint, z: Tensor, n: int) -> tuple[Tensor, Tensor]:
 
     The problem is repeated p times, and row j of repetition j differentiated: a row depends on its own knot alone.
     """
-    p = constraint.value(z[..., :n], z[:, :-1, n:]).shape[-1]
+    c = constraint.value(z[..., :n], z[:, :-1, n:])[0]
+    p = c.shape[-1]
+    if p == 0:
+        return c, z.new_zeros(*c.shape, z.shape[-1])
     twins = constraint.take(torch.zeros(p, dtype=torch.int64, device=z.device))
-    with torch.enable_grad():
-        z = z.repeat(p, 1, 1).requires_grad_()
-        c = twins.value(z[..., :n], z[:, :-1, n:])  # (p, K, p)
-        (slopes,) = torch.autograd.grad(c.diagonal(dim1=0, dim2=2).sum(), z)
-    return c[0].detach(), slopes[:, constraint.knots].transpose(0, 1)
+    (slopes,) = gradients(lambda z: twins.value(z[..., :n], z[:, :-1, n:]).diagonal(dim1=0, dim2=2), z.repeat(p, 1, 1))
+    return c, slopes[:, constraint.knots].transpose(0, 1)
 
 
 def _padded(U: Tensor, dim: int = 0) -> Tensor:

@@ -18,7 +18,13 @@ from torchgco.solvers.riccati import backward
 
 ROUNDS = 20  # steps at most
 GAIN = 1e-2  # share of L_M by which a rollout must lower it
-LOST = 1e-3  # share of L_M that the quadratic model expects to save where no step length saves anything
+LOST = 2.0  # times L_M before: the shortest step makes so much of it where rollouts diverge
+
+
+def diverges(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor, G: Tensor, shortest: float) -> Tensor:
+    """Whether even the shortest step along the gains G (N, B, m, n+1) raises L_M = merit (B,) beyond measure, (B,)."""
+    value = lagrangian.value(*closed_loop(lagrangian.problem.dynamics, X, U, G, torch.full_like(merit, shortest)))[1]
+    return ~(value <= merit + (LOST - 1.0) * merit.abs())
 
 
 def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Candidates:
@@ -26,6 +32,8 @@ def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -
     found = Candidates(X.clone(), U.clone(), merit.clone(), merit.clone(), torch.ones_like(merit), torch.zeros_like(merit, dtype=torch.bool))
     rows = torch.arange(X.shape[0], device=X.device)
     for i in range(ROUNDS):
+        if rows.numel() == 0:
+            break
         part, dynamics = lagrangian.take(rows), lagrangian.problem.dynamics.take(rows)
         n, F = X.shape[-1], linearise(part.problem, X, U)
         F[:, :, :n, n] = (dynamics.step(X[:, :-1], U) - X[:, 1:]).transpose(0, 1)
@@ -34,8 +42,6 @@ def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -
             _keep(found, rows, part, *closed_loop(dynamics, X, U, step.gains, torch.ones_like(X[:, 0, 0])))
         X, U = _linear_step(F, step.gains, X, U)
         going = ~found.accepted[rows] & ~step.failed & torch.isfinite(X).flatten(1).all(-1)
-        if not bool(going.any()):
-            break
         rows, X, U = rows[going], X[going], U[going]
     return found
 

@@ -92,6 +92,13 @@ class Advice:
 class Guidance(Protocol):
     """Plug-in of the outer loop, asked after every inner solve."""
 
+    def suited(self, problem: Problem) -> Guidance | None:
+        """The guidance that can serve these problems, asked once, when a solve starts; None: they are solved without.
+
+        Guidance that can't be had is no error: a GuidanceWarning says which part is missing and why.
+        """
+        ...
+
     def start(self, problem: Problem, X: Tensor) -> GuideRegion:
         """The penalty that is no penalty yet, for every element."""
         ...

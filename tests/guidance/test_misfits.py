@@ -1,0 +1,191 @@
+"""Guidance that a problem can't have: the solve goes ahead without it, and one warning says why."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco import (
+    GCO,
+    MPPI,
+    ControlBounds,
+    Cost,
+    FunctionConstraint,
+    FunctionDynamics,
+    GuidanceWarning,
+    InputError,
+    IteratedMPPI,
+    Problem,
+    QuadraticCost,
+    Solution,
+    Spheres,
+)
+from torchgco.api import default_solver
+from torchgco.guidance import Detour
+from torchgco.guidance.gco import REACH
+from torchgco.guidance.misfits import suited_sampler
+
+BASE = default_solver()
+assert BASE.guidance is not None
+SAMPLER = replace(BASE.guidance.sampler, samples=64, rounds=4)
+SINGLE = replace(
+    BASE,
+    attempts=2,
+    guidance=replace(BASE.guidance, sampler=replace(SAMPLER, dtype="float32"), detour=Detour(dtype="float32")),
+)
+
+
+def vehicle(d: int, kind: str = "plain") -> FunctionDynamics:
+    """A point in d dimensions that is accelerated."""
+    turn, gain = torch.eye(d, dtype=torch.float64), torch.ones(d, dtype=torch.float64)
+    force = {"plain": lambda u: u, "product": lambda u: u @ turn, "promoted": lambda u: u * gain}[kind]
+    return FunctionDynamics(lambda x, u: torch.cat((x[..., d:], force(u)), -1), 2 * d, d, 0.1, "euler", slice(0, d))
+
+
+def posed(d: int, obstacles: Any, kind: str = "plain", dynamics: FunctionDynamics | None = None) -> Problem:
+    """Two starts: obstacles stand before the first, and the second has a free way in more than one dimension."""
+    x0 = torch.zeros(2, 2 * d, dtype=torch.float64)
+    x0[1, 1 if d > 1 else 0] = 3.0
+    cost = QuadraticCost(Q=[1.0] * 2 * d, R=[0.1] * d, Qf=[50.0] * 2 * d, x_ref=[2.0] + [0.0] * (2 * d - 1))
+    bounds = ControlBounds([-5.0] * d, [5.0] * d)
+    return Problem(vehicle(d, kind) if dynamics is None else dynamics, cost, [obstacles, bounds], x0, 40)
+
+
+def spheres(d: int) -> Spheres:
+    """Two that overlap across the way; on a line, two that overlap along it."""
+    centers = torch.zeros(2, d, dtype=torch.float64)
+    centers[:, 0] = 1.0
+    centers[:, min(1, d - 1)] += torch.tensor([0.2, -0.2], dtype=torch.float64)
+    return Spheres(centers, [0.4, 0.4], 0.1)
+
+
+def pillars(x: Tensor) -> Tensor:
+    """The same in the plane, as a function."""
+    centers = x.new_tensor([[1.0, 0.2], [1.0, -0.2]])
+    return 0.25 - (x[..., None, :2] - centers).square().sum(-1)
+
+
+def solved(problem: Problem, solver: Any = SINGLE) -> tuple[Solution, list[str]]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", GuidanceWarning)
+        solution = torchgco.solve(problem, solver=solver)
+    return solution, [str(w.message) for w in caught if w.category is GuidanceWarning]
+
+
+def alone(problem: Problem, b: int, solver: Any = SINGLE) -> Tensor:
+    rows = torch.tensor([b])
+    part = problem.take(rows)
+    U0 = torch.zeros(1, problem.N, problem.m, dtype=torch.float64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GuidanceWarning)
+        return solver.solve(part, U0, ids=rows).U[0]
+
+
+CASES = {
+    "a function for obstacles": (lambda: posed(2, FunctionConstraint(pillars, geometric=True)), None),
+    "a product with float64": (lambda: posed(2, spheres(2), "product"), "samples are drawn in float64.*; ways are"),
+    "promoted to float64": (lambda: posed(2, spheres(2), "promoted"), "samples are drawn in float64.*; ways are"),
+    "a line": (lambda: posed(1, spheres(1)), "no way is sought around spheres in 1-D"),
+    "four dimensions": (lambda: posed(4, spheres(4)), "no way is sought around spheres in 4-D"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_can_be_had_is_had(case: str) -> None:
+    """The caught element is guided, the other left alone, each as if it were by itself, and one warning is given."""
+    make, why = CASES[case]
+    problem = make()
+    solution, told = solved(problem)
+    assert int(solution.guided[0]) > 0 and solution.status.tolist() == [1, 1]
+    assert bool((solution.violation <= 1e-3).all())
+    assert all(torch.equal(solution.U[b], alone(problem, b)) for b in (0, 1))
+    if why is None:
+        assert told == []
+    else:
+        assert len(told) == 1 and told[0].startswith("guided in part: ")
+        assert re.search(why, told[0])
+
+
+def test_without_a_position_nothing_is_guided() -> None:
+    problem = posed(2, FunctionConstraint(pillars, geometric=True))
+    nowhere = replace(problem, dynamics=replace(problem.dynamics, position=None))
+    solution, told = solved(nowhere)
+    assert told == ["solved without guidance: the dynamics have no position"]
+    assert solution.guided.tolist() == [0, 0]
+    want = torchgco.solve(nowhere, solver=replace(SINGLE, guidance=None))
+    assert torch.equal(solution.U, want.U)
+
+
+def test_without_obstacles_no_guidance_is_missed() -> None:
+    problem = posed(2, FunctionConstraint(pillars), dynamics=replace(vehicle(2), position=None))
+    solution, told = solved(problem)
+    assert told == [] and solution.guided.tolist() == [0, 0]
+
+
+class Fussy(FunctionDynamics):
+    """Bears trajectories, but no samples."""
+
+    def step_rows(self, x: Tensor, u: Tensor) -> Tensor:
+        raise IndexError("no samples here")
+
+
+def test_dynamics_that_bear_no_samples_are_led_by_detours_alone() -> None:
+    plain = vehicle(2)
+    fussy = Fussy(plain.function, 4, 2, 0.1, "euler", plain.position)
+    problem, lost = posed(2, spheres(2), dynamics=fussy), "no plan can be sampled (no samples here)"
+    solution, told = solved(problem, replace(SINGLE, attempts=3))
+    assert told == [f"guided in part: {lost}"]
+    assert int(solution.guided[0]) == 1 and solution.status.tolist() == [1, 1]
+    assert SINGLE.guidance is not None
+    bare = replace(SINGLE, guidance=replace(SINGLE.guidance, detour=None))
+    solution, told = solved(problem, bare)
+    assert told == [f"solved without guidance: {lost}"]
+    want = torchgco.solve(posed(2, spheres(2)), solver=replace(SINGLE, guidance=None))
+    assert torch.equal(solution.U, want.U) and solution.guided.tolist() == [0, 0]
+    with pytest.raises(InputError, match="got no plan can be sampled"):
+        torchgco.solve(problem, solver=IteratedMPPI(iterations=1))
+
+
+@pytest.mark.parametrize("kind", ["product", "promoted"])
+def test_the_sampler_alone_falls_back_to_the_problems_precision(kind: str) -> None:
+    problem, sampler = posed(2, spheres(2), kind), replace(SAMPLER, dtype="float32")
+    solution, told = solved(problem, IteratedMPPI(sampler, iterations=2))
+    assert len(told) == 1 and "samples are drawn in float64" in told[0]
+    want = torchgco.solve(problem, solver=IteratedMPPI(replace(sampler, dtype="float64"), iterations=2))
+    assert torch.equal(solution.U, want.U)
+    suited, why = suited_sampler(sampler, posed(2, spheres(2)))
+    assert suited is sampler and why is None
+
+
+def test_the_radius_without_spheres_is_a_share_of_the_way() -> None:
+    problem = posed(2, FunctionConstraint(pillars, geometric=True))
+    X = problem.x0.unsqueeze(1).repeat(1, 41, 1)
+    X[0, 7, :2] = torch.tensor([3.0, 4.0], dtype=torch.float64)
+    far = torch.tensor([2.0, 13.0**0.5], dtype=torch.float64)
+    torch.testing.assert_close(GCO()._radius(problem, X), REACH * far)
+    assert GCO(radius=0.3)._radius(problem, X).tolist() == [0.3, 0.3]
+    assert GCO()._radius(posed(2, spheres(2)), X).tolist() == [0.1, 0.1]
+
+    aimless = Problem(problem.dynamics, Cost(), problem.constraints, problem.x0, problem.N)
+    torch.testing.assert_close(GCO()._radius(aimless, X), X.new_tensor([REACH * 5.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("guidance", "field"),
+    [
+        (GCO(sampler=MPPI(covariance=[1.0, 1.0, 1.0])), "mppi.covariance"),
+        (GCO(detour=Detour(pushes=((1.0,),))), "detour.pushes"),
+    ],
+)
+def test_options_that_do_not_fit_are_named_before_any_element_is_caught(guidance: GCO, field: str) -> None:
+    far = Spheres([[50.0, 50.0]], [0.1])
+    with pytest.raises(InputError) as error:
+        torchgco.solve(posed(2, far), solver=replace(SINGLE, guidance=guidance))
+    assert error.value.field == field

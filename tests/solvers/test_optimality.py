@@ -1,0 +1,196 @@
+"""What CONVERGED is worth: stationary and feasible, on any scale of the cost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.problems import planar_batch, quadrotor_batch
+from torchgco import (
+    ILQR,
+    AugmentedLagrangian,
+    ControlBounds,
+    FunctionDynamics,
+    LineSearch,
+    Planar,
+    Polish,
+    Problem,
+    QuadraticCost,
+    Spheres,
+    Status,
+    certify,
+    compose,
+    presets,
+    solve,
+)
+from torchgco.baselines import Hold, IteratedMPPI
+from torchgco.costs.base import Cost
+from torchgco.lagrangian import Lagrangian
+from torchgco.solvers.verdict import STATIONARY, optimality
+
+CAREFUL = ILQR(max_iterations=300, damping=0.02, line_search=LineSearch(accept_last=False))
+
+
+def pendulum(scale: float = 1.0, constraints: tuple = ()) -> Problem:
+    """Swing up from hanging, u bounded by its price alone."""
+
+    def field(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return torch.stack((x[..., 1], 9.81 * torch.sin(x[..., 0]) - 0.1 * x[..., 1] + u[..., 0]), dim=-1)
+
+    cost = QuadraticCost(
+        Q=[scale * 0.1, scale * 0.01], R=[scale * 0.01], Qf=[scale * 100.0, scale * 10.0], x_ref=[0.0, 0.0]
+    )
+    start = torch.tensor([[torch.pi, 0.0], [2.5, 0.0]], dtype=torch.float64)
+    return Problem(FunctionDynamics(field, 2, 1, dt=0.05, integrator="rk4"), cost, constraints, start, 60)
+
+
+def rest(problem: Problem) -> torch.Tensor:
+    return problem.x0.new_zeros(problem.B, problem.N, problem.m)
+
+
+def scaled(problem: Problem, factor: float) -> Problem:
+    """The same problem with all weights times a factor."""
+    return problem._with({"cost": problem.cost.scaled(torch.full_like(problem.x0[:, 0], factor))})
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_the_scale_of_the_cost_changes_no_iterate(factor: float) -> None:
+    one, other = (CAREFUL.solve(p, rest(p)) for p in (pendulum(), pendulum(factor)))
+    assert torch.equal(one.iterations, other.iterations) and one.statuses == other.statuses
+    torch.testing.assert_close(one.U, other.U, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(factor * one.cost, other.cost, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
+@pytest.mark.parametrize("batch", [planar_batch, quadrotor_batch])
+def test_nor_does_it_where_there_are_obstacles_and_guidance(batch, factor: float) -> None:
+    problem = batch(B=2, N=25, obstacles=6, seed=4)[0]
+    one, other = (solve(p) for p in (problem, scaled(problem, factor)))
+    assert torch.equal(one.iterations, other.iterations) and one.statuses == other.statuses
+    assert torch.equal(one.guided, other.guided)
+    torch.testing.assert_close(one.U, other.U, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(factor * one.cost, other.cost, rtol=1e-9, atol=0)
+    for a, b in zip(one.multipliers.lam, other.multipliers.lam, strict=True):
+        torch.testing.assert_close(factor * a, b, rtol=1e-5, atol=1e-6 * factor)
+
+
+def test_a_user_cost_scales_as_a_quadratic_one_does() -> None:
+    class Bowl(Cost):
+        def stage(self, x, u, k):
+            return (x.square().sum(-1) + 1.0).sqrt() + 0.1 * u.square().sum(-1)
+
+        def terminal(self, x):
+            return 5.0 * x.square().sum(-1)
+
+    base = pendulum()
+    problem = Problem(base.dynamics, Bowl(), [], base.x0, base.N)
+    one, other = (CAREFUL.solve(p, rest(p)) for p in (problem, scaled(problem, 1e-4)))
+    torch.testing.assert_close(one.U, other.U, rtol=1e-6, atol=1e-6)
+    H, h = (problem.x0.new_zeros(2, 61, 4, 4) for _ in range(2))
+    problem.cost.expand(one.X, one.U, H)
+    scaled(problem, 3.0).cost.expand(one.X, one.U, h)
+    torch.testing.assert_close(3.0 * H, h)
+    x = torch.randn(2, 2, 5, dtype=torch.float64)
+    u = torch.randn(1, 2, 5, dtype=torch.float64)
+    triple = scaled(problem, 3.0).cost
+    torch.testing.assert_close(triple.stage_rows(x, u, 0), 3.0 * problem.cost.stage_rows(x, u, 0))
+    torch.testing.assert_close(triple.terminal_rows(x), 3.0 * problem.cost.terminal_rows(x))
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0])
+def test_a_swing_up_that_converged_is_at_its_optimum(scale: float) -> None:
+    problem = pendulum(scale)
+    solution = CAREFUL.solve(problem, rest(problem))
+    tight = replace(CAREFUL, tolerance=1e-13, max_iterations=2000).solve(problem, solution.U)
+    assert solution.statuses == [Status.CONVERGED] * 2
+    assert bool((solution.cost <= 1.001 * tight.cost).all())
+    assert float(certify(problem, solution.X, solution.U).kkt_residual.max()) < 0.05
+    early = replace(CAREFUL, max_iterations=3).solve(problem, rest(problem))
+    assert early.statuses == [Status.MAX_ITERATIONS] * 2
+
+
+def test_the_status_is_one_of_four_by_stationarity_and_violation() -> None:
+    """Controls that nothing refined are feasible at best; a violated bound is seen by a solver that leaves it out."""
+    tight = (ControlBounds([-3.0], [3.0]),)
+    problem = pendulum(constraints=tight)
+    assert Hold().solve(problem, rest(problem)).statuses == [Status.FEASIBLE] * 2
+    assert Hold().solve(problem, rest(problem) + 4.0).statuses == [Status.INFEASIBLE] * 2
+    assert IteratedMPPI(iterations=2).solve(problem, rest(problem)).statuses == [Status.FEASIBLE] * 2
+    free = CAREFUL.solve(problem, rest(problem))
+    assert free.statuses == [Status.INFEASIBLE] * 2 and float(free.violation.min()) > 1.0
+    hasty = AugmentedLagrangian(inner=replace(CAREFUL, max_iterations=1), max_outer_iterations=2, clip=True)
+    assert hasty.solve(problem, rest(problem)).statuses != [Status.CONVERGED] * 2
+    soft = replace(hasty, initial_penalty=1e-9, penalty_growth=1.0).solve(problem, rest(problem))
+    assert soft.statuses == [Status.MAX_ITERATIONS] * 2 and float(soft.violation.min()) > 1e-3
+    thorough = replace(hasty, inner=CAREFUL, max_outer_iterations=30)
+    done = thorough.solve(problem, rest(problem))
+    assert done.statuses == [Status.CONVERGED] * 2
+    lagrangian = Lagrangian(problem, done.multipliers, None, True)
+    assert bool((optimality(lagrangian, done.X, done.U).left <= STATIONARY).all())
+
+
+def test_a_polished_trajectory_has_its_own_status() -> None:
+    problem, U0 = planar_batch(B=2, N=30, obstacles=1, seed=1)
+    short = AugmentedLagrangian(inner=ILQR(max_iterations=6), max_outer_iterations=2, initial_penalty=1e-4)
+    rough = short.solve(problem, U0)
+    assert Status.CONVERGED not in rough.statuses
+    assert Polish(reach=10.0).refine(problem, rough).statuses == [Status.CONVERGED] * 2
+
+
+def test_unstable_dynamics_are_solved_from_rest() -> None:
+    """Euler steps of 0.5 s make the drag unstable: every rollout diverges until the gains hold all of the states."""
+    problem = Problem(
+        dynamics=Planar(dt=0.5),
+        cost=QuadraticCost(Q=[5, 5, 0, 1, 1, 0], R=[0.1, 0.1], Qf=[50, 50, 0, 1, 1, 0], x_ref=[1, 0.4, 0, 0, 0, 0]),
+        constraints=[Spheres([[0.2, 0.1]], [0.1], vehicle_radius=0.06), ControlBounds([-10, -10], [10, 10])],
+        x0=torch.tensor([[-1.0, 0, 0, 0, 0, 0], [-1.0, 0.3, 0, 0, 0, 0]], dtype=torch.float64),
+        N=60,
+    )
+    solution = solve(problem)
+    assert solution.statuses == [Status.CONVERGED] * 2 and float(solution.cost.max()) < 67.0
+    torch.testing.assert_close(solution.cost, problem.cost.total(solution.X, solution.U))
+    stuck = AugmentedLagrangian(inner=ILQR(line_search=LineSearch(accept_last=False)), clip=True).solve(problem, rest(problem))
+    assert stuck.statuses == [Status.FEASIBLE] * 2  # without damping nothing moves, and nobody says that it converged
+
+
+def test_gains_are_finite_where_the_plain_backward_pass_fails() -> None:
+    base = pendulum()
+    free = Problem(base.dynamics, QuadraticCost(Q=[1.0, 1.0], R=[0.0], Qf=[0.0, 0.0]), [], base.x0, base.N)
+    solution = ILQR(max_iterations=30, damping=0.02, line_search=LineSearch(accept_last=False)).solve(free, rest(free))
+    assert bool(torch.isfinite(solution.K).all()) and bool(torch.isfinite(solution.d).all())
+
+
+def test_the_kkt_residual_knows_no_scale() -> None:
+    problem, U0 = planar_batch(B=2, N=20, obstacles=3)
+    X = Hold().solve(problem, U0).X
+    residuals = [certify(scaled(problem, factor), X, U0).kkt_residual for factor in (1e-8, 1.0, 1e8)]
+    torch.testing.assert_close(residuals[0], residuals[1])
+    torch.testing.assert_close(residuals[2], residuals[1])
+    assert float(residuals[1].min()) > 0.5
+
+
+@pytest.mark.parametrize(("scenario", "model"), [("forest", "quadrotor"), ("planar_trap", "planar")])
+def test_solve_is_the_configuration_gco(scenario: str, model: str) -> None:
+    setup = compose([f"scenario={scenario}", f"model={model}"])
+    task = setup.task(setup.layouts(1))
+    assert presets.gco(task.problem) == setup.solver
+
+
+def test_solve_gives_the_bits_of_that_solver() -> None:
+    problem, U0 = planar_batch(B=2, N=25)
+    setup = compose(["scenario=planar_trap", "model=planar"])
+    one, other = solve(problem), setup.solver.solve(problem, U0)
+    assert torch.equal(one.U, other.U) and torch.equal(one.status, other.status)
+
+
+def test_offsets_are_for_two_controls() -> None:
+    one = pendulum()
+    assert presets.gco(one).guidance is None
+    three = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u[..., :2]), -1), 4, 3, dt=0.1, position=slice(0, 2))
+    problem = Problem(
+        three, QuadraticCost(Q=[1.0] * 4, R=[1.0] * 3, Qf=[1.0] * 4), [Spheres([[1.0, 1.0]], [0.1])],
+        torch.zeros(1, 4, dtype=torch.float64), 10,
+    )  # fmt: skip
+    assert presets.gco(problem).guidance.detour.pushes == ()

@@ -1,0 +1,145 @@
+"""No obstacle at all is a problem like any other, and a constraint without rows is satisfied."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+import torchgco
+from tests.problems import planar_batch
+from torchgco import (
+    ControlBounds,
+    FunctionConstraint,
+    Hold,
+    InputError,
+    IteratedMPPI,
+    Layouts,
+    Polish,
+    Problem,
+    Spheres,
+    certify,
+    judge,
+)
+from torchgco.api import default_solver
+from torchgco.baselines import MultiStart
+from torchgco.experiments import app
+from torchgco.guidance import Detour
+from torchgco.lagrangian import worst_rows
+
+GOAL = torch.tensor([1.0, 0.4], dtype=torch.float64)
+BOUNDS = ControlBounds([-10, -10], [10, 10])
+EMPTY = {
+    "a list": Spheres([], [], 0.06),
+    "shared": Spheres(np.zeros((0, 2)), np.zeros(0), 0.06),
+    "one set each": Spheres(np.zeros((2, 0, 2)), np.zeros((2, 0)), 0.06),
+    "moving": Spheres(np.zeros((2, 0, 2)), np.zeros((2, 0)), 0.06, np.zeros((2, 0, 2))),
+    "absent": Spheres(np.full((3, 2), np.nan), np.full(3, np.nan), 0.06),
+    "rows of x": FunctionConstraint(lambda x: x[..., :0]),
+    "geometric": FunctionConstraint(lambda x: x[..., :0], geometric=True),
+    "rows of u": FunctionConstraint(lambda u: u.new_zeros(*u.shape[:-1], 0), of="u"),
+    "equality": FunctionConstraint(lambda x, u: x[..., :0], of="xu", sense="equality"),
+}
+SOLVERS = {
+    "polished": replace(default_solver(), polish=Polish(iterations=2)),
+    "multistart": MultiStart(replace(default_solver(guided=False), max_outer_iterations=2), starts=2),
+    "mppi": IteratedMPPI(iterations=2),
+    "hold": Hold(),
+}
+
+
+def planar(*constraints) -> tuple[Problem, torch.Tensor]:
+    problem, U0 = planar_batch(B=2, N=25)
+    return Problem(problem.dynamics, problem.cost, constraints, problem.x0, problem.N), U0
+
+
+@pytest.mark.parametrize("kind", EMPTY)
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_nothing_in_the_way_changes_nothing(kind: str, solver: str) -> None:
+    free, U0 = planar(BOUNDS)
+    problem, _ = planar(EMPTY[kind], BOUNDS)
+    want, got = (torchgco.solve(p, U0, SOLVERS[solver]) for p in (free, problem))
+    assert torch.equal(got.U, want.U) and got.status.tolist() == want.status.tolist()
+    assert got.violation.tolist() == want.violation.tolist() and got.guided.tolist() == [0, 0]
+    wanted, verdict = (judge(p, got.U, GOAL, 0.3) for p in (free, problem))
+    for mine, theirs in zip(vars(verdict).values(), vars(wanted).values(), strict=True):
+        assert mine.tolist() == theirs.tolist()
+    assert verdict.clearance.tolist() == verdict.clearance_knots.tolist() == [torch.inf] * 2
+    certificate = certify(problem, got.X, got.U)
+    assert certificate.clearance.tolist() == [torch.inf] * 2
+    assert certificate.kkt_residual.tolist() == certify(free, got.X, got.U).kkt_residual.tolist()
+    assert worst_rows(problem, got.X, got.U) == worst_rows(free, got.X, got.U)
+
+
+def test_polish_needs_no_constraint() -> None:
+    """Nor one that depends on anything."""
+    free, U0 = planar()
+    constant, _ = planar(FunctionConstraint(lambda x: torch.full_like(x[..., :1], -1.0)))
+    want, got = (torchgco.solve(p, U0, SOLVERS["polished"]) for p in (free, constant))
+    assert float(certify(free, want.X, want.U).kkt_residual.max()) < 1e-8
+    torch.testing.assert_close(got.U, want.U)
+
+
+@pytest.mark.parametrize("kind", ["shared", "absent", "geometric"])
+def test_no_detour_is_proposed(kind: str) -> None:
+    problem, _ = planar(EMPTY[kind], BOUNDS)
+    assert not bool(Detour().propose(problem).found.any())
+
+
+def test_empty_spheres_next_to_others_are_as_good_as_none() -> None:
+    problem, U0 = planar_batch(B=2, N=25, obstacles=6, seed=4)
+    more = Problem(problem.dynamics, problem.cost, [EMPTY["shared"], *problem.constraints], problem.x0, problem.N)
+    want, got = (torchgco.solve(p, U0) for p in (problem, more))
+    assert int(want.guided.sum()) > 0 and torch.equal(got.U, want.U)
+    (alone, alone_found, _), (company, company_found, _) = (Detour(finalists=2).propose(p) for p in (problem, more))
+    assert torch.equal(alone_found, company_found) and torch.equal(alone, company)
+
+
+def test_a_negative_radius_is_named_where_there_is_no_obstacle() -> None:
+    with pytest.raises(InputError, match="at least 0 m, got -"):
+        planar(Spheres(np.zeros((0, 2)), np.zeros(0), -0.5))
+
+
+def test_a_constraint_that_is_no_sphere_decides_feasibility() -> None:
+    """Its clearance is infinite, as no distance is known; its violation counts all the same."""
+    wall = FunctionConstraint(lambda x: x[..., :1] - 0.5, geometric=True)  # the goal lies behind it
+    problem, U0 = planar(wall, BOUNDS)
+    there = torchgco.solve(planar(BOUNDS)[0], U0).U
+    beyond, before = judge(problem, there, GOAL, 0.3), judge(problem, U0, GOAL, 0.3)
+    assert beyond.clearance.tolist() == before.clearance.tolist() == [torch.inf] * 2
+    assert float(beyond.violation.min()) > 0.1
+    assert beyond.feasible.tolist() == [False] * 2 and before.feasible.tolist() == [True] * 2
+
+
+PEERS = ["hold", "mppi", "gco_paper", "al_ilqr", "multistart", "ipopt", "fatrop"]
+QUICK = ["scenario.stages=12", "study.layouts=2", "study.workers=1", f"study.baselines=[{','.join(PEERS)}]"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["model=planar", "scenario=planar_random", "scenario.num_obstacles=0"],
+        ["scenario=forest_moving", "scenario.density=0.001"],
+        ["model=planar", "scenario=layouts", "scenario.path=none.npz"],
+        ["model=planar", "scenario=layouts", "scenario.path=absent.npz"],
+    ],
+)
+def test_every_solver_flies_an_empty_scene(words: list[str], tmp_path: Path, monkeypatch, capsys) -> None:
+    state = np.array([-1.0, 0, 0, 0, 0, 0])
+    for name, M in (("none", 0), ("absent", 2)):
+        centers, radii = np.full((2, M, 2), np.nan), np.full((2, M), np.nan)
+        layouts = Layouts(centers, radii, start=state, goal=-state, goal_radius=0.3, dt=0.1, stages=12)
+        layouts.save(tmp_path / f"{name}.npz")
+    quick = QUICK if "scenario=layouts" not in words else QUICK[1:]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["torchgco", *words, *quick, "hydra.run.dir=out"])
+    assert app.main() == 0, capsys.readouterr().err
+    trials = pd.read_parquet(tmp_path / "out" / "trials.parquet")
+    assert trials.solver.nunique() == len(PEERS) + 1 and np.isinf(trials.clearance).all()
+    assert np.isinf(trials.clearance_full[trials.feasible]).all() and (trials.guided == 0).all()
+    assert len(list((tmp_path / "out" / "figures").iterdir())) > 0
