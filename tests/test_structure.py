@@ -12,6 +12,7 @@ FLOORS = [
     ["shapes", "status", "autodiff", "draws", "kernels"],
     ["dynamics", "costs", "constraints"],
     ["problem"],
+    ["tracing"],
     ["rollout", "expansion", "judge"],
     ["lagrangian", "certificate"],
     ["solution", "guidance.samples"],
@@ -75,6 +76,15 @@ def test_importing_torchgco_loads_neither_hydra_nor_matplotlib_nor_casadi() -> N
     code = f"import sys, torchgco, torchgco.baselines; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_function_is_recorded_without_casadi() -> None:
+    code = (
+        "import sys, torch; from torchgco import Planar; from torchgco.tracing import Traced; x = torch.zeros(1, 6);"
+        "Traced('step', lambda i, x, u: Planar().step(x, u), x, x[:, :2]); print('casadi' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    assert done.stdout.strip() == "False"
 
 
 def test_instantiate_is_called_in_one_place() -> None:
