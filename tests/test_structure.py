@@ -13,6 +13,7 @@ FLOORS = [
     ["dynamics", "costs", "constraints"],
     ["problem"],
     ["tracing"],
+    ["native"],
     ["rollout", "expansion", "judge"],
     ["lagrangian", "certificate"],
     ["solution", "guidance.samples"],
