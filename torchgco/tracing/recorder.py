@@ -72,6 +72,10 @@ class Recorder(TorchDispatchMode):
         self._seen[id(tensor)] = Slot(next(self._numbers)), tensor
         return self._seen[id(tensor)][0]
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # PyTorch would load its compiler, which takes seconds, to say that this isn't to be compiled
+
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         if func is torch.ops.aten._local_scalar_dense.default:
@@ -79,9 +83,11 @@ class Recorder(TorchDispatchMode):
                 raise _LooksAtValues
             return func(*args, **kwargs)  # a constant's value may be looked at
         if name_of(func) not in OPERATIONS:
-            made_of: Any = _decompositions().get(func, func.decompose)
             with self:  # the parts come here in their turn
-                parts = made_of(*args, **kwargs)
+                parts = func.decompose(*args, **kwargs)
+                # The table takes half a second to load.
+                if parts is NotImplemented and func in _decompositions():
+                    parts = _decompositions()[func](*args, **kwargs)
             if parts is not NotImplemented:
                 return parts
         inputs, options = tree_map(lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs))
