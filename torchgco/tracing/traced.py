@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchgco.shapes import InputError
 from torchgco.tracing.arrays import NoCounterpart, boxed
+from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.operations import OPERATIONS
 from torchgco.tracing.recorder import Call, Slot, name_of, record
 
@@ -59,6 +60,7 @@ class Traced:
         computed = self._computed(index)
         self._own_shapes = [tuple(computed[slot].shape) for slot in self._own]
         self._constants = {slot: _array(computed[slot]) for slot in border if slot not in varying}
+        self._shapes = [tuple(example.shape) for example in examples]
 
     @property
     def count(self) -> int:
@@ -71,6 +73,32 @@ class Traced:
             return np.zeros(0)
         computed = self._computed(index)
         return torch.cat([computed[slot].double().flatten() for slot in self._own]).detach().cpu().numpy()
+
+    def parameters_of(self, index: Tensor) -> Tensor:
+        """The same for many problems at once: (B, count) float64 for index (B,) int64, on its device.
+
+        A problem's numbers don't depend on which others are asked for.
+        """
+        if not self._own:
+            return torch.zeros(len(index), 0, dtype=torch.float64, device=index.device)
+
+        def one(i: Tensor) -> Tensor:
+            computed = self._computed(i.unsqueeze(0))
+            return torch.cat([computed[slot].double().flatten() for slot in self._own]).detach()
+
+        try:
+            return torch.func.vmap(one)(index)
+        except RuntimeError:  # an operation that can't be done for many at once
+            return torch.stack([one(i) for i in index])
+
+    def fingerprint(self) -> str:
+        """Digits that stand for what `__call__` computes, the same in every process. CasADi isn't needed for them.
+
+        The values of the numbers that differ from problem to problem have no part in it.
+        """
+        variables = dict(zip(self._variables, self._shapes, strict=True))
+        own = dict(zip(self._own, self._own_shapes, strict=True))
+        return fingerprint(variables, own, self._constants, self._symbolic, self._result)
 
     def __call__(self, parameters: np.ndarray, *variables: np.ndarray) -> np.ndarray:
         """The function on arrays of numbers or expressions: `parameters` (count,), variables shaped as the examples.
