@@ -194,6 +194,7 @@ OPERATIONS: dict[str, Callable] = {
     "aten.mm": _matmul,
     "aten.bmm": _matmul,
     "aten.addmm": _addmm,
+    "aten.linalg_cross": lambda a, b, dim=-1: boxed(np.cross(*np.broadcast_arrays(a, b), axis=dim)),
     "aten.sum": _sum,
     "aten.mean": _mean,
     "aten.prod": _fold(_mul),

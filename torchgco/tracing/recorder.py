@@ -85,8 +85,8 @@ class Recorder(TorchDispatchMode):
         if name_of(func) not in OPERATIONS:
             with self:  # the parts come here in their turn
                 parts = func.decompose(*args, **kwargs)
-                # The table takes half a second to load.
-                if parts is NotImplemented and func in _decompositions():
+                # The table takes half a second to load, and what PyTorch will compute itself may stay whole.
+                if parts is NotImplemented and self._follows(args, kwargs) and func in _decompositions():
                     parts = _decompositions()[func](*args, **kwargs)
             if parts is not NotImplemented:
                 return parts
@@ -98,6 +98,10 @@ class Recorder(TorchDispatchMode):
         if not self._followers.isdisjoint(call.inputs):
             self._followers.update(call.outputs)
         return out
+
+    def _follows(self, *tree: Any) -> bool:
+        """Whether a tensor in there depends on the function's arguments."""
+        return any(isinstance(leaf, Tensor) and self.slot(leaf) in self._followers for leaf in tree_leaves(tree))
 
 
 class _LooksAtValues(Exception):
