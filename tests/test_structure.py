@@ -80,10 +80,10 @@ def test_importing_torchgco_loads_neither_hydra_nor_matplotlib_nor_casadi() -> N
 
 
 def test_a_model_is_recorded_without_what_takes_seconds_to_load() -> None:
-    heavy = ("casadi", "sympy", "torch._dynamo", "torch._decomp")
+    heavy = ("casadi", "sympy", "torch._dynamo")
     code = (
-        "import sys, torch; from torchgco import QuadrotorPlanning, QuadrotorPlant; from torchgco.tracing import Traced\n"
-        "for model in (QuadrotorPlanning(), QuadrotorPlant()):\n"
+        "import sys, torch, torchgco; from torchgco.tracing import Traced\n"
+        "for model in (torchgco.QuadrotorPlanning(), torchgco.QuadrotorPlant()):\n"
         "    x, u = torch.zeros(1, model.n), torch.zeros(1, model.m)\n"
         "    Traced('step', lambda i, x, u: model.step(x, u), x, u).fingerprint()\n"
         f"print([m for m in {heavy} if m in sys.modules])"

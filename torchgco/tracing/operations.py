@@ -117,6 +117,11 @@ def _norm(a: np.ndarray, ord: float = 2, dim: Any = None, keepdim: bool = False,
     return _sqrt(_sum(_mul(a, a), dim, keepdim))
 
 
+def _cross(a: np.ndarray, b: np.ndarray, dim: int = -1) -> np.ndarray:
+    a, b = np.broadcast_arrays(a, b)
+    return np.cross(a, b, axis=dim)
+
+
 def _cumsum(a: np.ndarray, dim: int, **_: Any) -> np.ndarray:
     return np.cumsum(a, axis=dim)
 
@@ -194,7 +199,7 @@ OPERATIONS: dict[str, Callable] = {
     "aten.mm": _matmul,
     "aten.bmm": _matmul,
     "aten.addmm": _addmm,
-    "aten.linalg_cross": lambda a, b, dim=-1: boxed(np.cross(*np.broadcast_arrays(a, b), axis=dim)),
+    "aten.linalg_cross": _cross,
     "aten.sum": _sum,
     "aten.mean": _mean,
     "aten.prod": _fold(_mul),
