@@ -56,7 +56,6 @@ def test_a_section_gives_whole_rows(section, tmp_path: Path) -> None:
 
 
 def test_ratios_are_those_of_their_rows(tmp_path: Path) -> None:
-    pytest.importorskip("casadi")
     bench = tiny(tmp_path)
     families.run(bench)
     seconds = {r["solver"]: float(r["value"]) for r in bench.results.rows if r["quantity"] == "seconds a problem"}

@@ -12,11 +12,14 @@ FLOORS = [
     ["shapes", "status", "autodiff", "draws", "kernels"],
     ["dynamics", "costs", "constraints"],
     ["problem"],
+    ["tracing"],
     ["rollout", "expansion", "judge"],
     ["lagrangian", "certificate"],
     ["solution", "guidance.samples"],
+    ["native"],
     ["solvers", "guidance.mppi", "guidance.detection", "guidance.region", "guidance.roadmap"],
     ["guidance"],
+    ["presets"],
     ["scenarios", "baselines", "api"],
     ["plotting"],
     ["experiments"],
@@ -73,6 +76,19 @@ def test_only_experiments_know_hydra() -> None:
 def test_importing_torchgco_loads_neither_hydra_nor_matplotlib_nor_casadi() -> None:
     heavy = ("hydra", "matplotlib", "pandas", "casadi")
     code = f"import sys, torchgco, torchgco.baselines; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_model_is_recorded_without_what_takes_seconds_to_load() -> None:
+    heavy = ("casadi", "sympy", "torch._dynamo")
+    code = (
+        "import sys, torch, torchgco; from torchgco.tracing import Traced\n"
+        "for model in (torchgco.QuadrotorPlanning(), torchgco.QuadrotorPlant()):\n"
+        "    x, u = torch.zeros(1, model.n), torch.zeros(1, model.m)\n"
+        "    Traced('step', lambda i, x, u: model.step(x, u), x, u).fingerprint()\n"
+        f"print([m for m in {heavy} if m in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
     assert done.stdout.strip() == "[]"
 

@@ -66,7 +66,6 @@ def test_some_are_feasible_in_one_batch(model) -> None:
 
 
 def test_the_table_stands_beside_ipopt(capsys) -> None:
-    pytest.importorskip("casadi")
     assert main(["--first", "1"]) == 0
     table = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
     ours, peer, *published = table[2:]

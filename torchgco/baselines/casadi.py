@@ -1,7 +1,7 @@
 """IPOPT and FATROP through CasADi, for any Problem: the yardsticks of constrained trajectory optimisation.
 
-The model isn't written a second time: its step, cost and constraints are traced (`tracing`) and become one nonlinear
-program with exact derivatives (`nlp`), of which every problem of the batch is a set of parameters.
+The model isn't written a second time: its step, cost and constraints are traced (`torchgco.tracing`) and become one
+nonlinear program with exact derivatives (`nlp`), of which every problem of the batch is a set of parameters.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class CasADiSolver:
             if not getattr(self, name) > 0:
                 raise InputError(f"solver.{name}", "above 0", getattr(self, name))
         if find_spec("casadi") is None:
-            raise InputError("solver", "CasADi, which `pip install torchgco[peers]` brings", "no such module")
+            raise InputError("solver", "CasADi, which `pip install casadi` brings", "no such module")
 
     def prepare(self, problem: Problem) -> PreparedCasADi:
         """The program and the solver built for one batch; solving it then costs the solver's time alone.

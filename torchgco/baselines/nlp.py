@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.baselines.tracing import Traced
 from torchgco.problem import Problem
 from torchgco.shapes import PerElement
+from torchgco.tracing import Traced
 
 UNBOUNDED = 1e19  # and above: a bound that is there for other problems of the batch only
 

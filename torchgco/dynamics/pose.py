@@ -79,7 +79,7 @@ def pose_rates(x: Tensor) -> tuple[Tensor, Tensor]:
     """R(q) e3 (3, ...) and q' (4, ...) of states (n, ...)."""
     states, factors = _sums(x.dtype, x.device)
     flat = x.reshape(x.shape[0], -1)
-    terms = flat.index_select(0, states).mul_(factors).view(4, 7, -1) * flat[6:10].unsqueeze(1)
+    terms = (flat.index_select(0, states) * factors).view(4, 7, -1) * flat[6:10].unsqueeze(1)
     first, second = terms.view(2, 14, -1).unbind(0)
     first, second = (first + second).view(2, 7, *x.shape[1:]).unbind(0)
     axis, dq = (first + second).split_with_sizes((3, 4))

@@ -143,9 +143,8 @@ class QuadrotorPlanning(Dynamics):
         w_c, a_c = u.split_with_sizes((3, 1))
         axis, dq = pose_rates(x)
         dv = axis * a
-        dv[2] -= self.gravity
         T_w, T_a = (lead(T, x[0]) for T in (self.rate_time_constant, self.thrust_time_constant))
-        rates = torch.cat((v, dv, dq, (w_c - w) / T_w, (a_c - a) / T_a))
+        rates = torch.cat((v, dv[:2], dv[2:] - self.gravity, dq, (w_c - w) / T_w, (a_c - a) / T_a))
         return rates.mT if rates.dim() == 2 else rates.movedim(0, -1)
 
     def field_entries(self, x: Tensor, u: Tensor) -> Tensor:

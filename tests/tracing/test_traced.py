@@ -25,7 +25,7 @@ from torchgco import (
     Spheres,
     StateBounds,
 )
-from torchgco.baselines.tracing import Traced
+from torchgco.tracing import Traced
 
 DOUBLE = dict(dtype=torch.float64)
 

@@ -2,6 +2,8 @@
 
 An array is a NumPy array of objects, each a number or a scalar `casadi.SX`: NumPy brings shapes, broadcasting and
 indexing, CasADi the arithmetic. Where all arguments are numbers the result is a number.
+
+To record a function the names in `OPERATIONS` are enough: CasADi is loaded by the first replay that computes something.
 """
 
 from __future__ import annotations
@@ -12,38 +14,51 @@ import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import torch
 
-from torchgco.baselines import arrays
-from torchgco.baselines.arrays import NoCounterpart, boxed
+from torchgco.tracing import arrays
+from torchgco.tracing.arrays import NoCounterpart, boxed
+
+Scalar = Callable | str  # a function of scalars, or the name of CasADi's
 
 
-def _elementwise(function: Callable, inputs: int) -> Callable:
+@functools.cache
+def _casadi() -> Any:
+    import casadi
+
+    return casadi
+
+
+def _elementwise(function: Scalar, inputs: int) -> Callable:
     """`function` of scalars, on arrays that are broadcast to one shape."""
-    over = np.frompyfunc(function, inputs, 1)
-    return lambda *arrays: boxed(over(*arrays))
+    over = functools.cache(lambda: np.frompyfunc(_function(function), inputs, 1))
+    return lambda *arrays: boxed(over()(*arrays))
 
 
-def _unary(function: Callable) -> Callable:
+def _function(function: Scalar) -> Callable:
+    return getattr(_casadi(), function) if isinstance(function, str) else function
+
+
+def _unary(function: Scalar) -> Callable:
     return _elementwise(function, 1)
 
 
-def _binary(function: Callable) -> Callable:
+def _binary(function: Scalar) -> Callable:
     return _elementwise(function, 2)
 
 
 def _choose(condition: Any, a: Any, b: Any) -> Any:
     # CasADi's own choice drops the branch not taken, so that a NaN there does no harm.
+    ca = _casadi()
     return ca.if_else(condition, a, b) if isinstance(condition, ca.SX) else (a if condition else b)
 
 
 _where = _elementwise(_choose, 3)
 _add, _sub, _mul = _binary(operator.add), _binary(operator.sub), _binary(operator.mul)
-_truediv, _floor = _binary(operator.truediv), _unary(ca.floor)
-_sqrt = _unary(ca.sqrt)
-_fmin, _fmax = _binary(ca.fmin), _binary(ca.fmax)
+_truediv, _floor = _binary(operator.truediv), _unary("floor")
+_sqrt = _unary("sqrt")
+_fmin, _fmax = _binary("fmin"), _binary("fmax")
 
 
 def _divide(a: Any, b: Any, rounding_mode: str | None = None) -> np.ndarray:
@@ -59,13 +74,15 @@ def _clamp(a: Any, min: Any = None, max: Any = None) -> np.ndarray:
 
 def _matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     # CasADi's own product: one by one, the thousands of entries of an obstacle constraint would take their time.
+    ca = _casadi()
     if a.ndim == 2:
         product = ca.mtimes(_matrix(a), _matrix(b))
         return np.array(ca.densify(product).nonzeros(), dtype=object).reshape(b.shape[1], a.shape[0]).T
     return np.stack([_matmul(first, second) for first, second in zip(a, b, strict=True)])
 
 
-def _matrix(a: np.ndarray) -> ca.SX:
+def _matrix(a: np.ndarray) -> Any:
+    ca = _casadi()
     return ca.reshape(ca.vertcat(ca.SX(0, 1), *a.T.reshape(-1)), *a.shape)
 
 
@@ -98,6 +115,11 @@ def _norm(a: np.ndarray, ord: float = 2, dim: Any = None, keepdim: bool = False,
     if ord != 2:
         raise NoCounterpart
     return _sqrt(_sum(_mul(a, a), dim, keepdim))
+
+
+def _cross(a: np.ndarray, b: np.ndarray, dim: int = -1) -> np.ndarray:
+    a, b = np.broadcast_arrays(a, b)
+    return np.cross(a, b, axis=dim)
 
 
 def _cumsum(a: np.ndarray, dim: int, **_: Any) -> np.ndarray:
@@ -139,25 +161,25 @@ OPERATIONS: dict[str, Callable] = {
     "aten.pow": _binary(operator.pow),
     "aten.square": _unary(lambda x: x * x),
     "aten.sqrt": _sqrt,
-    "aten.rsqrt": _unary(lambda x: 1.0 / ca.sqrt(x)),
-    "aten.abs": _unary(ca.fabs),
-    "aten.sign": _unary(ca.sign),
+    "aten.rsqrt": _unary(lambda x: 1.0 / _casadi().sqrt(x)),
+    "aten.abs": _unary("fabs"),
+    "aten.sign": _unary("sign"),
     "aten.floor": _floor,
-    "aten.ceil": _unary(ca.ceil),
-    "aten.fmod": _binary(ca.fmod),
+    "aten.ceil": _unary("ceil"),
+    "aten.fmod": _binary("fmod"),
     "aten.remainder": lambda a, b: _sub(a, _mul(_floor(_truediv(a, b)), b)),
     # functions
     **{
-        f"aten.{name}": _unary(getattr(ca, name))
+        f"aten.{name}": _unary(name)
         for name in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
     },
-    **{f"aten.{name}": _unary(getattr(ca, name)) for name in ("exp", "expm1", "log", "log1p", "log10", "erf")},
-    "aten.log2": _unary(lambda x: ca.log(x) / math.log(2.0)),
-    "aten.atan2": _binary(ca.atan2),
-    "aten.sigmoid": _unary(lambda x: 0.5 + 0.5 * ca.tanh(0.5 * x)),
-    "aten.relu": _unary(lambda x: ca.fmax(x, 0.0)),
+    **{f"aten.{name}": _unary(name) for name in ("exp", "expm1", "log", "log1p", "log10", "erf")},
+    "aten.log2": _unary(lambda x: _casadi().log(x) / math.log(2.0)),
+    "aten.atan2": _binary("atan2"),
+    "aten.sigmoid": _unary(lambda x: 0.5 + 0.5 * _casadi().tanh(0.5 * x)),
+    "aten.relu": _unary(lambda x: _casadi().fmax(x, 0.0)),
     "aten.leaky_relu": lambda a, slope=0.01: _where(_binary(operator.gt)(a, 0.0), a, _mul(a, slope)),
-    "aten.gelu": _unary(lambda x: 0.5 * x * (1.0 + ca.erf(x / math.sqrt(2.0)))),
+    "aten.gelu": _unary(lambda x: 0.5 * x * (1.0 + _casadi().erf(x / math.sqrt(2.0)))),
     # choices
     "aten.where": _where,
     "aten.clamp": _clamp,
@@ -167,24 +189,25 @@ OPERATIONS: dict[str, Callable] = {
     "aten.maximum": _fmax,
     "aten.minimum": _fmin,
     **{f"aten.{name}": _binary(getattr(operator, name)) for name in ("lt", "le", "gt", "ge", "eq", "ne")},
-    "aten.logical_and": _binary(ca.logic_and),
-    "aten.logical_or": _binary(ca.logic_or),
-    "aten.logical_not": _unary(ca.logic_not),
-    "aten.bitwise_and": _binary(ca.logic_and),
-    "aten.bitwise_or": _binary(ca.logic_or),
-    "aten.bitwise_not": _unary(ca.logic_not),
+    "aten.logical_and": _binary("logic_and"),
+    "aten.logical_or": _binary("logic_or"),
+    "aten.logical_not": _unary("logic_not"),
+    "aten.bitwise_and": _binary("logic_and"),
+    "aten.bitwise_or": _binary("logic_or"),
+    "aten.bitwise_not": _unary("logic_not"),
     # products and reductions
     "aten.mm": _matmul,
     "aten.bmm": _matmul,
     "aten.addmm": _addmm,
+    "aten.linalg_cross": _cross,
     "aten.sum": _sum,
     "aten.mean": _mean,
     "aten.prod": _fold(_mul),
     "aten.linalg_vector_norm": _norm,
     "aten.amax": _fold(_fmax),
     "aten.amin": _fold(_fmin),
-    "aten.any": _fold(_binary(ca.logic_or)),
-    "aten.all": _fold(_binary(ca.logic_and)),
+    "aten.any": _fold(_binary("logic_or")),
+    "aten.all": _fold(_binary("logic_and")),
     "aten.cumsum": _cumsum,
     # shapes
     "aten.view": lambda a, shape: a.reshape(tuple(shape)),

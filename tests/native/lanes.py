@@ -1,0 +1,77 @@
+"""Emitted functions, called with problems one by one or in any company."""
+
+import ctypes
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.native.compiler import build
+from torchgco.native.emit import PRELUDE
+from torchgco.native.model import JACOBIAN, STEP, DynamicsSource
+
+LANES = 8
+
+
+class Emitted:
+    """A C function `name` of inputs and outputs with so many entries each, on arrays (B, size) of numbers."""
+
+    def __init__(
+        self, code: str, name: str, inputs: list[int], outputs: list[int], real: str = "double", lanes: int = LANES
+    ) -> None:
+        sizes = [max(size, 1) for size in (*inputs, *outputs)]
+        arguments = [f"a{i}" for i in range(len(sizes))]
+        given = ", ".join(f"REAL *{argument}" for argument in arguments)
+        local = " ".join(f"V v{i}[{size}];" for i, size in enumerate(sizes))
+        copies = [f"memcpy(v{i}, a{i}, sizeof v{i});" for i in range(len(inputs))]
+        copies += [f"{name}({', '.join(f'v{i}' for i in range(len(sizes)))});"]
+        copies += [f"memcpy(a{i}, v{i}, sizeof v{i});" for i in range(len(inputs), len(sizes))]
+        driver = f"#include <string.h>\nvoid tgco_run({given}) {{ {local} {' '.join(copies)} }}\n"
+        header = f"#define REAL {real}\n#define LANES {lanes}\n"
+        self._run = build(header + PRELUDE + code + driver).tgco_run
+        self._dtype, self._lanes, self._outputs, self._sizes = (
+            np.dtype(real.replace("float", "f4")),
+            lanes,
+            outputs,
+            sizes,
+        )
+
+    def __call__(self, *values: np.ndarray) -> list[np.ndarray]:
+        """Outputs (B, size). The last group is filled with its first problem."""
+        B = len(values[0])
+        made = [np.zeros((B, size), self._dtype) for size in self._outputs]
+        for first in range(0, B, self._lanes):
+            rows = np.resize(np.arange(first, min(first + self._lanes, B)), self._lanes)
+            arrays = [np.zeros((size, self._lanes), self._dtype) for size in self._sizes]
+            for array, value in zip(arrays, values, strict=False):
+                array[: value.shape[1]] = value[rows].T
+            self._run(*(ctypes.c_void_p(array.ctypes.data) for array in arrays))
+            for out, array in zip(made, arrays[len(values) :], strict=True):
+                out[rows] = array[: out.shape[1]].T
+        return made
+
+
+class Model:
+    """Step and Jacobian of a model in C."""
+
+    def __init__(self, source: DynamicsSource, real: str = "double", lanes: int = LANES) -> None:
+        inputs = [source.n, source.m, source.count]
+        self._source = source
+        self._step = Emitted(source.code, STEP, inputs, [source.n], real, lanes)
+        self._jacobian = Emitted(source.code, JACOBIAN, inputs, [source.computed], real, lanes)
+
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        """(B, n) by (B, n), (B, m), for the problems 0 to B - 1."""
+        return torch.from_numpy(self._step(*self._inputs(x, u))[0])
+
+    def jacobian(self, x: Tensor, u: Tensor) -> Tensor:
+        """[fx, fu] (B, n, n+m), put together by the pattern."""
+        source, (entries,) = self._source, self._jacobian(*self._inputs(x, u))
+        whole = torch.zeros(len(x), source.n, source.n + source.m, dtype=torch.from_numpy(entries).dtype)
+        places = zip(source.rows, source.columns, source.places, source.values, strict=True)
+        for row, column, place, value in places:
+            whole[:, row, column] = torch.from_numpy(entries)[:, place] if place >= 0 else value
+        return whole
+
+    def _inputs(self, x: Tensor, u: Tensor) -> tuple[np.ndarray, ...]:
+        return x.numpy(), u.numpy(), self._source.parameters(torch.arange(len(x))).numpy()

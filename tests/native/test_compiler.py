@@ -1,0 +1,232 @@
+"""What is compiled is kept, and nothing that happens to the cache folder can change a result."""
+
+import ctypes
+import multiprocessing
+import os
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from torchgco.native import compiler, store
+from torchgco.native.compiler import NativeError, build, find_compiler
+
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+
+
+def source(factor: int) -> str:
+    return f"double tgco_times(double x) {{ return {factor}.0 * x; }}"
+
+
+def times(factor: int, x: float = 3.0) -> float:
+    """factor * x, by a library."""
+    function = build(source(factor)).tgco_times
+    function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double]
+    return function(x)
+
+
+def next_process() -> None:
+    """Forget what this process has loaded."""
+    compiler._loaded.clear()
+
+
+@pytest.fixture
+def compiled(monkeypatch) -> list[str]:
+    """The sources that were compiled."""
+    seen, plain = [], compiler._compile
+
+    def counting(which, source, flags, room):
+        seen.append(source)
+        return plain(which, source, flags, room)
+
+    monkeypatch.setattr(compiler, "_compile", counting)
+    return seen
+
+
+@needs_compiler
+def test_compiled_once(cache: Path, compiled: list[str]) -> None:
+    assert times(2) == 6.0 and times(2, 4.0) == 8.0 and len(compiled) == 1
+    next_process()
+    assert times(2) == 6.0 and len(compiled) == 1
+    assert times(5) == 15.0 and times(2) == 6.0 and len(compiled) == 2  # two libraries with one name inside
+    assert len(list(cache.iterdir())) == 2
+
+
+@needs_compiler
+def test_flags_make_another_library(compiled: list[str]) -> None:
+    text = "int tgco_fast(void) { return\n#ifdef FAST\n 1\n#else\n 0\n#endif\n; }"
+    assert [build(text, flags).tgco_fast() for flags in ((), ("-DFAST", "-O2"), ())] == [0, 1, 0]
+    assert len(compiled) == 2
+
+
+@needs_compiler
+@pytest.mark.parametrize("harm", ["flipped", "truncated", "empty", "foreign", "renamed", "folder"])
+def test_a_bad_entry_is_made_again(cache: Path, compiled: list[str], harm: str) -> None:
+    times(7)
+    (other,) = cache.iterdir()
+    other_content = other.read_bytes()
+    next_process()
+    times(2)
+    (entry,) = set(cache.iterdir()) - {other}
+    content = entry.read_bytes()
+    entry.unlink()  # what is mapped into this process keeps its own
+    if harm == "flipped":
+        entry.write_bytes(content[:5000] + bytes([content[5000] ^ 1]) + content[5001:])
+    elif harm == "truncated":
+        entry.write_bytes(content[: len(content) // 2])
+    elif harm == "empty":
+        entry.touch()
+    elif harm == "foreign":
+        entry.write_bytes(other_content)
+    elif harm == "renamed":  # a library that is sound, under the key of another
+        key, checksum = entry.name.split("-")[0], other.name.split("-")[1]
+        (cache / f"{key}-{checksum}").write_bytes(other_content)
+    else:
+        entry.mkdir()
+    next_process()
+    assert times(2) == 6.0 and len(compiled) == 3
+    if harm != "folder":
+        next_process()  # finds a sound one
+        assert times(2) == 6.0 and len(compiled) == 3
+
+
+@needs_compiler
+@pytest.mark.parametrize("place", ["file", "below a file", "nowhere"])
+def test_without_a_folder_it_is_compiled_every_time(
+    tmp_path: Path, monkeypatch, compiled: list[str], place: str
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    name = {"file": str(tmp_path / "file"), "below a file": str(tmp_path / "file" / "cache"), "nowhere": "/proc/no"}[
+        place
+    ]
+    monkeypatch.setenv("TORCHGCO_CACHE", name)
+    for count in (1, 2):
+        next_process()
+        assert times(2) == 6.0 and len(compiled) == count
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@needs_compiler
+def test_a_full_or_forbidding_disk(monkeypatch, cache: Path) -> None:
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(store.os, "replace", full)
+    assert times(2) == 6.0 and list(cache.iterdir()) == []
+
+
+@needs_compiler
+def test_a_folder_that_nothing_may_be_run_from(monkeypatch, cache: Path) -> None:
+    plain = ctypes.CDLL
+
+    def forbidding(name: str) -> ctypes.CDLL:
+        if name.startswith(str(cache)):
+            raise OSError("failed to map segment from shared object")
+        return plain(name)
+
+    monkeypatch.setattr(compiler.ctypes, "CDLL", forbidding)
+    for _ in range(2):
+        next_process()
+        assert times(2) == 6.0
+
+
+def at_once(barrier, results) -> None:
+    barrier.wait()
+    results.put((times(2), times(3)))
+
+
+@needs_compiler
+def test_eight_processes_at_once(cache: Path, compiled: list[str]) -> None:
+    context = multiprocessing.get_context("fork")
+    barrier, results = context.Barrier(8), context.Queue()
+    processes = [context.Process(target=at_once, args=(barrier, results)) for _ in range(8)]
+    for process in processes:
+        process.start()
+    assert [results.get(timeout=60) for _ in processes] == [(6.0, 9.0)] * 8
+    for process in processes:
+        process.join()
+    assert not list(cache.glob("*.part"))
+    assert times(2) == 6.0 and times(3) == 9.0 and not compiled
+
+
+@needs_compiler
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_in_children(method: str) -> None:
+    assert times(2) == 6.0
+    context = multiprocessing.get_context(method)
+    with context.Pool(2) as pool:
+        assert pool.starmap(times, [(2, 1.0), (3, 1.0), (2, 4.0), (3, 4.0)]) == [2.0, 3.0, 8.0, 12.0]
+    assert times(3) == 9.0
+
+
+@needs_compiler
+def test_errors_are_the_compilers_own(cache: Path) -> None:
+    with pytest.raises(NativeError, match="no_such_type") as caught:
+        build("no_such_type tgco_times;")
+    assert len(str(caught.value).splitlines()) <= 6
+    assert not cache.exists()
+
+
+@pytest.mark.parametrize("word", ["none", "/no/such/cc -O2", "false"])
+def test_no_compiler(monkeypatch, word: str) -> None:
+    monkeypatch.setenv("TORCHGCO_CC", word)
+    assert find_compiler() is None
+    with pytest.raises(NativeError, match="no C compiler"):
+        build(source(2))
+
+
+def test_where_compilers_are_looked_for(monkeypatch, tmp_path: Path) -> None:
+    def script(name: str) -> str:
+        path = tmp_path / name
+        path.write_text(f"#!/bin/sh\necho {name} 1.0 $*\n")
+        path.chmod(0o755)
+        return str(path)
+
+    monkeypatch.delenv("TORCHGCO_CC", raising=False)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
+    monkeypatch.setenv("CC", "missing")
+    cc, own, usual = script("cc"), script("own"), script("usual")
+    assert find_compiler().command == (cc,)
+    monkeypatch.setenv("CC", "usual -m64")
+    assert find_compiler().command == (usual, "-m64")
+    assert find_compiler().identity.strip() == f"{usual}\nusual 1.0 -m64 --version"
+    monkeypatch.setenv("TORCHGCO_CC", own)
+    assert find_compiler().command == (own,)
+
+
+@pytest.mark.skipif(find_spec("ziglang") is None, reason="no ziglang")
+def test_zig(monkeypatch) -> None:
+    monkeypatch.setenv("TORCHGCO_CC", f"{sys.executable} -m ziglang cc")
+    assert times(2) == 6.0
+
+
+def test_old_files_go_and_used_ones_stay(cache: Path, monkeypatch) -> None:
+    monkeypatch.setattr(store, "FILES", 5)
+    keys = [store.key_of(("key", str(i))) for i in range(8)]
+    for i, key in enumerate(keys[:5]):
+        path = store.save(key, ".json", b"%d" % i)
+        os.utime(path, (1000.0 + i, 1000.0 + i))
+    (cache / "mine-and-old.txt").write_text("")
+    (cache / "torchgco-killed.part").write_text("")
+    for name in ("mine-and-old.txt", "torchgco-killed.part"):
+        os.utime(cache / name, (0.0, 0.0))
+    assert store.read(keys[0], ".json") == b"0"  # so it is the latest
+    store.save(keys[5], ".json", b"5")
+    store.save(keys[6], ".json", b"6")
+    assert [store.read(key, ".json") for key in keys] == [b"0", None, None, b"3", b"4", b"5", b"6", None]
+    assert (cache / "mine-and-old.txt").exists() and not (cache / "torchgco-killed.part").exists()
+
+
+def test_the_folder(monkeypatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
+    monkeypatch.setenv("TORCHGCO_CACHE", "/here")
+    assert store.folder() == Path("/here")
+    monkeypatch.delenv("TORCHGCO_CACHE")
+    assert store.folder() == Path("/somewhere/torchgco")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert store.folder() == Path.home() / ".cache/torchgco"
+
+
+def test_keys_tell_their_parts_apart() -> None:
+    assert store.key_of(("ab", "c")) != store.key_of(("a", "bc")) != store.key_of(("abc",))

@@ -1,0 +1,113 @@
+"""What is emitted computes what CasADi computes, lane by lane."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from tests.native.lanes import Emitted
+from torchgco.native.compiler import find_compiler
+from torchgco.native.emit import emit, literal
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+
+inf, nan = np.inf, np.nan
+EXACT = {
+    "arithmetic": lambda x, y: [x + y, x - y, x * y, x / y, -x, x * x, 2 * x, 1 / x, x + 0.1, x * 1e30],
+    "comparisons": lambda x, y: [x < y, x <= y, ca.eq(x, y), ca.ne(x, y)],
+    "logic": lambda x, y: [ca.logic_not(x < y), ca.logic_and(x < 1, y < 1), ca.logic_or(x < 1, y < 1)],
+    "choices": lambda x, y: [ca.if_else(x < y, 1 / x, y), ca.if_else(x > 0, ca.sqrt(x), -x), ca.if_else(x, y, x)],
+    "least": lambda x, y: [ca.fmin(x, y), ca.fmax(x, y), ca.fmin(x, 1.0), ca.fmax(0.5, y)],
+    "signs": lambda x, y: [ca.fabs(x), ca.sign(x), ca.copysign(x, y)],
+    "rounding": lambda x, y: [ca.floor(x), ca.ceil(x), ca.fmod(x, y), ca.remainder(x, y)],
+    "roots": lambda x, y: [ca.sqrt(x), ca.sqrt(ca.fabs(y))],
+    "constants": lambda x, y: [ca.SX(c) for c in (0.1, -1e-310, 5e-324, -inf, inf, nan, 1 / 3, 1.7976931348623157e308)],
+}
+CLOSE = {
+    "circular": lambda x, y: [ca.sin(x), ca.cos(x), ca.tan(x), ca.asin(x), ca.acos(x), ca.atan(x), ca.atan2(x, y)],
+    "hyperbolic": lambda x, y: [f(x) for f in (ca.sinh, ca.cosh, ca.tanh, ca.asinh, ca.acosh, ca.atanh)],
+    "exponential": lambda x, y: [f(x) for f in (ca.exp, ca.expm1, ca.log, ca.log1p, ca.erf)],
+    "powers": lambda x, y: [x**y, x**2.5, x**3, 2**x, x**-2, ca.hypot(x, y)],
+}
+NUMBERS = [0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 3.75, 1e-300, -1e6, 1e200, inf, -inf, nan]
+
+
+def functions(name: str, real: str = "double") -> tuple[ca.Function, Emitted]:
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    made = ({**EXACT, **CLOSE})[name](x, y)
+    function = ca.Function("made", [x, y], [ca.densify(ca.vertcat(*made))])
+    return function, Emitted(emit("tgco_made", function), "tgco_made", [1, 1], [len(made)], real)
+
+
+def pairs() -> tuple[np.ndarray, np.ndarray]:
+    x, y = (a.reshape(-1, 1) for a in np.meshgrid(NUMBERS, NUMBERS))
+    return x, y
+
+
+def by_casadi(function: ca.Function, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.array([np.array(function(a, b)).reshape(-1) for a, b in zip(x, y, strict=True)])
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_exact_operations(name: str) -> None:
+    function, emitted = functions(name)
+    expected, (made,) = by_casadi(function, *pairs()), emitted(*pairs())
+    np.testing.assert_array_equal(made, expected)
+    unlike = np.signbit(made) != np.signbit(expected)
+    assert not np.any(unlike & ~np.isnan(expected)) or name in ("least", "choices")  # either zero will do there
+
+
+@pytest.mark.parametrize("name", CLOSE)
+def test_functions_of_the_library(name: str) -> None:
+    function, emitted = functions(name)
+    x, y = pairs()
+    np.testing.assert_allclose(emitted(x, y)[0], by_casadi(function, x, y), rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", [*EXACT, *CLOSE])
+def test_single_precision(name: str) -> None:
+    function, emitted = functions(name, "float")
+    few = [i for i, number in enumerate(NUMBERS) if (abs(number) < 10 and abs(number) != 1e-300) or np.isnan(number)]
+    x, y = (z.reshape(len(NUMBERS), -1)[np.ix_(few, few)].reshape(-1, 1) for z in pairs())
+    with np.errstate(over="ignore", under="ignore"):
+        expected = by_casadi(function, x, y).astype(np.float32)
+    np.testing.assert_allclose(emitted(x, y)[0], expected, rtol=1e-6, atol=1e-30)
+
+
+@pytest.mark.parametrize("name", [*EXACT, *CLOSE])
+@pytest.mark.parametrize("lanes", [1, 4, 16])
+def test_lanes_know_nothing_of_each_other(name: str, lanes: int) -> None:
+    function, emitted = functions(name)
+    code, size = emit("tgco_made", function), function.numel_out()
+    x, y = pairs()
+    (expected,) = emitted(x, y)
+    (narrow,) = Emitted(code, "tgco_made", [1, 1], [size], lanes=lanes)(x, y)
+    np.testing.assert_array_equal(narrow.view(np.int64), expected.view(np.int64))
+    order = np.random.default_rng(1).permutation(len(x))
+    (shuffled,) = emitted(x[order], y[order])
+    np.testing.assert_array_equal(shuffled.view(np.int64), expected[order].view(np.int64))
+
+
+def test_sparse_outputs_and_several_inputs() -> None:
+    x, y = ca.SX.sym("x", 2), ca.SX.sym("y", 3)
+    sparse = ca.SX(3, 3)
+    sparse[0, 0], sparse[2, 1], sparse[1, 2] = x[0] * y[2], y[1], x[1]
+    function = ca.Function("made", [x, y], [sparse, ca.SX(0, 1), x[0] - y[0]])
+    values = np.arange(10.0).reshape(2, 5)
+    first, _, last = Emitted(emit("tgco_made", function), "tgco_made", [2, 3], [3, 0, 1])(values[:, :2], values[:, 2:])
+    np.testing.assert_array_equal(first, [[0.0, 3.0, 1.0], [45.0, 8.0, 6.0]])
+    np.testing.assert_array_equal(last, [[-2.0], [-2.0]])
+
+
+def test_what_has_no_counterpart_is_named() -> None:
+    x = ca.SX.sym("x")
+    with pytest.raises(ValueError, match="ERFINV"):
+        emit("tgco_made", ca.Function("made", [x], [ca.erfinv(x)]))
+    z = ca.MX.sym("z")
+    with pytest.raises(ValueError, match="scalar expressions"):
+        emit("tgco_made", ca.Function("made", [z], [z]))
+
+
+def test_literals() -> None:
+    for value in (0.1, -3.0, 1e-310, 0.0, -0.0):
+        assert float.fromhex(literal(value)).hex() == value.hex()
+    assert [literal(v) for v in (inf, -inf, nan)] == ["__builtin_inf()", "-__builtin_inf()", '__builtin_nan("")']

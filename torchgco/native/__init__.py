@@ -1,0 +1,7 @@
+"""Kernels in C for the CPU: made from traced functions, compiled at first use, kept in the user's cache folder.
+
+find_compiler    the C compiler of this machine, or None
+build            C source -> a loaded library
+emit             a CasADi function -> C over vectors whose lanes are problems
+trace_dynamics   a model -> C of its step and Jacobian, and what differs from problem to problem
+"""

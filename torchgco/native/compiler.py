@@ -1,0 +1,161 @@
+"""C source to a loaded library, compiled for this processor and kept for the next process."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import platform
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from torchgco.native import store
+
+# NaN and infinity carry meaning here, so no -ffast-math: only what doesn't touch them.
+FLAGS = ("-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
+# A vector type may be wider than the registers. Within one library that is nobody's concern.
+_QUIET = ("-Wno-psabi",)
+_ERROR_LINES = 5
+
+
+class NativeError(RuntimeError):
+    """No native kernel can be had: no compiler, source that doesn't compile, or a library that doesn't load."""
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A C compiler: the words that call it, and its path and version, which libraries depend on."""
+
+    command: tuple[str, ...]
+    identity: str
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        is_zig = "ziglang" in self.command or Path(self.command[0]).stem == "zig"
+        return (*FLAGS, "-mcpu=native" if is_zig else "-march=native", *_QUIET)
+
+
+def find_compiler() -> Compiler | None:
+    """The first that works of CC, cc, gcc, clang, and zig as the package ziglang brings it; None where there is none.
+
+    TORCHGCO_CC names the only one that is tried, a word such as "none" turns native kernels off.
+    """
+    return _find_compiler(*map(os.environ.get, ("TORCHGCO_CC", "CC", "PATH")))
+
+
+def build(source: str, flags: Sequence[str] = ()) -> ctypes.CDLL:
+    """The library that `source` is compiled to; names it exports begin with tgco_.
+
+    Args:
+        source: one file of C11.
+        flags: further ones. They come last, so that -O2 here replaces the -O3 of `FLAGS`.
+
+    Raises:
+        NativeError: there is no compiler, it refuses the source (its first errors are named), or what it makes can't be
+            loaded.
+    """
+    compiler = find_compiler()
+    known = (source, tuple(flags), compiler)
+    # No lock: two threads that compile the same do no harm, and a lock held across a fork would.
+    if known not in _loaded:
+        if compiler is None:
+            raise NativeError(
+                "no C compiler found: install gcc or clang, or `pip install ziglang`, or name one in TORCHGCO_CC"
+            )
+        _loaded[known] = _load(compiler, source, (*compiler.flags, *flags))
+    return _loaded[known]
+
+
+_loaded: dict[tuple[str, tuple[str, ...], Compiler | None], ctypes.CDLL] = {}
+
+
+def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
+    key = store.key_of(("library 1", source, *flags, compiler.identity, _processor()))
+    kept = store.find(key, ".so")
+    if kept is not None:
+        try:
+            return ctypes.CDLL(str(kept))
+        except OSError:  # removed this moment, or in a folder that nothing may be run from
+            pass
+    try:
+        with TemporaryDirectory(prefix="torchgco-") as room:
+            made = _compile(compiler, source, flags, Path(room))
+            kept = store.save(key, ".so", made.read_bytes())
+            try:
+                return ctypes.CDLL(str(kept or made))
+            except OSError:
+                return ctypes.CDLL(str(made))  # stays loaded when its file goes
+    except OSError as error:
+        raise NativeError(f"a compiled library can't be written or loaded: {error}") from error
+
+
+def _compile(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) -> Path:
+    (room / "kernels.c").write_text(source)
+    # Run in its folder: no path gets into the library, which then has the same bytes wherever it is made.
+    done = subprocess.run(
+        [*compiler.command, *flags, "-o", "kernels.so", "kernels.c", "-lm"],
+        cwd=room, env={**os.environ, "LC_ALL": "C"}, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+        errors="replace",
+    )  # fmt: skip
+    if done.returncode:
+        said = done.stderr.splitlines() or [_ended(done.returncode)]
+        errors = [line for line in said if "error" in line] or said
+        raise NativeError(f"{shlex.join(compiler.command)} failed:\n" + "\n".join(errors[:_ERROR_LINES]))
+    return room / "kernels.so"
+
+
+def _ended(returncode: int) -> str:
+    return f"signal {signal.Signals(-returncode).name}" if returncode < 0 else f"exit status {returncode}"
+
+
+@functools.cache
+def _find_compiler(named: str | None, usual: str | None, path: str | None) -> Compiler | None:
+    for words in _candidates(named, usual):
+        place = shutil.which(words[0], path=path)
+        if place is None:
+            continue
+        try:
+            version = subprocess.run(
+                [place, *words[1:], "--version"],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+            )
+        except OSError:
+            continue
+        if version.returncode == 0:
+            return Compiler((place, *words[1:]), f"{os.path.realpath(place)}\n{version.stdout}{version.stderr}")
+    return None
+
+
+def _candidates(named: str | None, usual: str | None) -> Iterator[list[str]]:
+    if named and named.strip():
+        yield shlex.split(named)
+        return
+    if usual and usual.strip():
+        yield shlex.split(usual)
+    yield from (["cc"], ["gcc"], ["clang"])
+    if find_spec("ziglang") is not None:
+        yield [sys.executable, "-m", "ziglang", "cc"]
+
+
+@functools.cache
+def _processor() -> str:
+    """What -march=native depends on."""
+    words = {platform.machine(), platform.processor()}
+    try:
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+    except OSError:
+        lines = []
+    wanted = ("model name", "flags", "features", "cpu implementer", "cpu part", "cpu variant")
+    words |= {line for line in lines if line.lower().startswith(wanted)}
+    return "\n".join(sorted(words))

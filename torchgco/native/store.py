@@ -1,0 +1,109 @@
+"""The user's cache folder: what was generated or compiled once, under keys that hold all it depends on.
+
+A file is called KEY-CHECKSUM and a suffix, with the checksum of its content. It comes into being whole, by being
+renamed, so processes that write the same one at once do no harm; one that was damaged, cut short or swapped is deleted.
+A folder that can't be written or isn't there costs time, never correctness: nothing here raises OSError.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from tempfile import mkstemp
+
+FILES = 200  # at most, the least recently used go
+_ABANDONED = 3600.0  # s after which a half-written file belongs to a process that was killed
+_PART = ("torchgco-", ".part")
+_OURS = re.compile(r"[0-9a-f]{32}-[0-9a-f]{32}\.[a-z]+")
+
+
+def folder() -> Path:
+    """TORCHGCO_CACHE, else torchgco in XDG_CACHE_HOME, else ~/.cache/torchgco; it need not exist."""
+    own, shared = os.environ.get("TORCHGCO_CACHE"), os.environ.get("XDG_CACHE_HOME")
+    if own:
+        return Path(own)
+    # Without a home expanduser leaves the ~, which would make a folder of that name here.
+    return Path(shared or os.path.expanduser("~/.cache")) / "torchgco"
+
+
+def key_of(parts: Iterable[str]) -> str:
+    """A key that no other sequence of texts has."""
+    digest = hashlib.sha256()
+    for part in parts:
+        text = part.encode(errors="surrogateescape")
+        digest.update(f"{len(text)}:".encode() + text)
+    return digest.hexdigest()[:32]
+
+
+def find(key: str, suffix: str) -> Path | None:
+    """The sound file under a key, or None. It may be gone before the caller opens it."""
+    return next((path for path, _ in _sound(key, suffix)), None)
+
+
+def read(key: str, suffix: str) -> bytes | None:
+    """The content of the sound file under a key, or None."""
+    return next((content for _, content in _sound(key, suffix)), None)
+
+
+def _sound(key: str, suffix: str) -> Iterator[tuple[Path, bytes]]:
+    """Files under a key that hold what their checksum says, and their content; the others are removed."""
+    paths: list[Path] = []
+    with suppress(OSError):
+        paths = sorted(folder().glob(f"{key}-*{suffix}"))
+    for path in paths:
+        with suppress(OSError):
+            content = path.read_bytes()
+            if path.name != _name(key, suffix, content):
+                path.unlink()
+                continue
+            with suppress(OSError):  # another user's file may be read, not touched
+                os.utime(path)
+            yield path, content
+
+
+def save(key: str, suffix: str, content: bytes) -> Path | None:
+    """Keep `content` under a key; None where the folder takes nothing."""
+    place = folder()
+    if str(place).startswith("~"):
+        return None
+    path = place / _name(key, suffix, content)
+    part = None
+    try:
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle, part = mkstemp(_PART[1], _PART[0], place)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.replace(part, path)
+    except OSError:
+        if part is not None:
+            with suppress(OSError):
+                os.unlink(part)
+        return None
+    _tidy(place)
+    return path
+
+
+def _name(key: str, suffix: str, content: bytes) -> str:
+    # The key is part of the checksum: a file that was renamed to another key isn't sound.
+    return f"{key}-{hashlib.sha256(key.encode() + content).hexdigest()[:32]}{suffix}"
+
+
+def _tidy(place: Path) -> None:
+    """Remove the least recently used files over the limit; another process may do the same, or use one meanwhile."""
+    ages: list[tuple[float, str]] = []
+    with suppress(OSError), os.scandir(place) as entries:
+        for entry in entries:
+            with suppress(OSError):
+                age = time.time() - entry.stat().st_mtime
+                if _OURS.fullmatch(entry.name):  # whatever else somebody keeps there is left alone
+                    ages.append((age, entry.path))
+                elif entry.name.startswith(_PART[0]) and entry.name.endswith(_PART[1]) and age > _ABANDONED:
+                    os.unlink(entry.path)
+    for _, path in sorted(ages)[FILES:]:
+        with suppress(OSError):
+            os.unlink(path)

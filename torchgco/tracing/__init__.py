@@ -1,0 +1,3 @@
+"""Functions of PyTorch tensors, recorded once and replayed with CasADi expressions."""
+
+from torchgco.tracing.traced import Traced as Traced

@@ -1,0 +1,59 @@
+"""A text that says what a traced function computes, the same in every process."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from itertools import count
+from typing import Any
+
+import numpy as np
+
+from torchgco.tracing.recorder import Call, Slot
+
+FORMAT = 1  # changes with what is written here, and with what a replay makes of it
+
+
+def fingerprint(
+    variables: Mapping[Slot, tuple[int, ...]],
+    own: Mapping[Slot, tuple[int, ...]],
+    constants: Mapping[Slot, np.ndarray],
+    calls: Sequence[Call],
+    result: Slot,
+) -> str:
+    """Hexadecimal digits that two functions share only where they have the same operations, constants and shapes.
+
+    Args:
+        variables, own: shapes of what the function is called with, and of the numbers that differ between problems.
+        constants: all other tensors that no call makes.
+        calls: in order, with slots in the place of tensors.
+        result: the slot of the result.
+    """
+    # Slots are numbered in the order of a process; here, in the order in which they stand.
+    order = count()
+    made = (slot for call in calls for slot in call.outputs)
+    names = {slot: f"${next(order)}" for slot in (*variables, *own, *constants, *made)}
+    digest = hashlib.sha256(f"format {FORMAT}\n".encode())
+    for kind, shapes in (("variable", variables), ("own", own)):
+        for slot, shape in shapes.items():
+            digest.update(f"{kind} {names[slot]} {shape}\n".encode())
+    for slot, value in constants.items():
+        plain = value.astype(np.float64) if value.dtype == object else value
+        digest.update(f"constant {names[slot]} {plain.dtype.str} {plain.shape}\n".encode() + plain.tobytes() + b"\n")
+    for call in calls:
+        words = (call.operation, call.args, call.kwargs, call.result)
+        digest.update(" ".join(_word(word, names) for word in words).encode() + b"\n")
+    digest.update(names[result].encode())
+    return digest.hexdigest()
+
+
+def _word(value: Any, names: Mapping[Slot, str]) -> str:
+    if isinstance(value, Slot):
+        return names[value]
+    if isinstance(value, float):
+        return value.hex()
+    if isinstance(value, (list, tuple)):
+        return f"({', '.join(_word(item, names) for item in value)})"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key}: {_word(value[key], names)}' for key in sorted(value))}}}"
+    return f"{type(value).__name__} {value}"

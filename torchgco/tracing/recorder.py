@@ -1,0 +1,140 @@
+"""Writes down the operations that a function of PyTorch tensors consists of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
+from itertools import count
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+from torchgco.shapes import InputError
+from torchgco.tracing.operations import OPERATIONS
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Stands for a tensor in what was recorded."""
+
+    number: int
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """One operation, with slots in the place of tensors."""
+
+    operation: Any
+    args: tuple
+    kwargs: dict[str, Any]
+    result: Any  # a slot, or a sequence of them
+
+    @property
+    def inputs(self) -> list[Slot]:
+        return [leaf for leaf in tree_leaves((self.args, self.kwargs)) if isinstance(leaf, Slot)]
+
+    @property
+    def outputs(self) -> list[Slot]:
+        return [leaf for leaf in tree_leaves(self.result) if isinstance(leaf, Slot)]
+
+    def replay(self, operation: Callable, known: dict[Slot, Any]) -> None:
+        """Apply `operation` to what is known, which afterwards holds the result too."""
+        args, kwargs = tree_map(lambda leaf: known[leaf] if isinstance(leaf, Slot) else leaf, (self.args, self.kwargs))
+        made = operation(*args, **kwargs)
+        for slot, value in zip(self.outputs, made if isinstance(made, (list, tuple)) else [made], strict=True):
+            known[slot] = value
+
+
+class Recorder(TorchDispatchMode):
+    """Writes down every operation that reaches PyTorch's kernels, and takes apart those that CasADi doesn't know."""
+
+    def __init__(self, inputs: Iterable[Tensor]) -> None:
+        super().__init__()
+        self._seen: dict[int, tuple[Slot, Tensor]] = {}  # with the tensor, so that its id stays its own
+        self._numbers = count()
+        self.calls: list[Call] = []
+        self.captured: dict[Slot, Tensor] = {}
+        self.inputs = [self._new(tensor) for tensor in inputs]
+        self._followers = set(self.inputs)
+        self.result = self.inputs[0]
+
+    def slot(self, tensor: Tensor) -> Slot:
+        """The slot of a tensor; one that no recorded operation made comes from outside, and is a constant."""
+        if id(tensor) not in self._seen:
+            self.captured[self._new(tensor)] = tensor
+        return self._seen[id(tensor)][0]
+
+    def _new(self, tensor: Tensor) -> Slot:
+        self._seen[id(tensor)] = Slot(next(self._numbers)), tensor
+        return self._seen[id(tensor)][0]
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # PyTorch would load its compiler, which takes seconds, to say that this isn't to be compiled
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        if func is torch.ops.aten._local_scalar_dense.default:
+            if self.slot(args[0]) in self._followers:
+                raise _LooksAtValues
+            return func(*args, **kwargs)  # a constant's value may be looked at
+        if name_of(func) not in OPERATIONS:
+            with self:  # the parts come here in their turn
+                parts = func.decompose(*args, **kwargs)
+                # The table takes half a second to load, and what PyTorch will compute itself may stay whole.
+                if parts is NotImplemented and self._follows(args, kwargs) and func in _decompositions():
+                    parts = _decompositions()[func](*args, **kwargs)
+            if parts is not NotImplemented:
+                return parts
+        inputs, options = tree_map(lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs))
+        out = func(*args, **kwargs)
+        made = tree_map(lambda leaf: self._new(leaf) if isinstance(leaf, Tensor) else leaf, out)
+        call = Call(func, inputs, options, made)
+        self.calls.append(call)
+        if not self._followers.isdisjoint(call.inputs):
+            self._followers.update(call.outputs)
+        return out
+
+    def _follows(self, *tree: Any) -> bool:
+        """Whether a tensor in there depends on the function's arguments."""
+        return any(isinstance(leaf, Tensor) and self.slot(leaf) in self._followers for leaf in tree_leaves(tree))
+
+
+class _LooksAtValues(Exception):
+    def __str__(self) -> str:
+        return "one that looks at the values of its arguments"
+
+
+def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Recorder:
+    """What function(*examples) consists of; `field` says what the function is, for errors.
+
+    Raises:
+        InputError: it can't be traced.
+    """
+    recorder = Recorder(examples)
+    # Writing in place becomes writing into a copy: PyTorch's part and CasADi's must not share memory.
+    pure = torch.func.functionalize(function, remove="mutations")
+    try:
+        with torch.no_grad(), recorder:
+            result = pure(*examples)
+    except Exception as error:  # whatever a function runs into
+        told = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise InputError(field, "a function that can be traced", told) from error
+    recorder.result = recorder.slot(result)
+    return recorder
+
+
+@cache
+def _decompositions() -> dict[Any, Callable]:
+    from torch._decomp import core_aten_decompositions
+
+    return dict(core_aten_decompositions())
+
+
+def name_of(operation: Any) -> str:
+    """An ATen operation's name without its overload, as `OPERATIONS` has it."""
+    return str(getattr(operation, "overloadpacket", operation))

@@ -1,0 +1,156 @@
+"""A function of PyTorch tensors, recorded once and replayed with CasADi expressions.
+
+What doesn't depend on the variables, PyTorch computes itself: constants once, and what belongs to one problem of the
+batch for each problem. Only the rest needs a counterpart in CasADi.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.shapes import InputError
+from torchgco.tracing.arrays import NoCounterpart, boxed
+from torchgco.tracing.fingerprint import fingerprint
+from torchgco.tracing.operations import OPERATIONS
+from torchgco.tracing.recorder import Call, Slot, name_of, record
+
+
+class Traced:
+    """function(index, *variables), where index (1,) int64 says which problem of the batch is meant.
+
+    Args:
+        field: what the function is, for errors.
+        function: tensors in, one tensor out.
+        examples: variables of the shapes that it is called with.
+        own: tensors that are treated as one problem's own even where all problems of the batch share them: the
+            expressions, and with them the last bits, then don't depend on who else is in the batch.
+
+    Raises:
+        InputError: the function can't be traced (it branches on values of its arguments, say), or holds an operation
+            that CasADi has no counterpart for; the error names it.
+    """
+
+    def __init__(
+        self, field: str, function: Callable[..., Tensor], *examples: Tensor, own: Iterable[Tensor] = ()
+    ) -> None:
+        self.field = field
+        index = torch.zeros(1, dtype=torch.int64, device=examples[0].device)
+        recorder = record(field, function, index, *examples)
+        self._index, *self._variables = recorder.inputs
+        self._result, self._captured = recorder.result, recorder.captured
+        calls = _needed(recorder.calls, self._result)
+        followers = _followers(calls, self._variables)
+        self._symbolic = [call for call in calls if followers.issuperset(call.outputs)]
+        self._plain = [call for call in calls if not followers.issuperset(call.outputs)]
+        for call in self._symbolic:
+            if name_of(call.operation) not in OPERATIONS:
+                raise _unknown(field, call)
+        # Where PyTorch's part ends and CasADi's begins.
+        border = dict.fromkeys(slot for call in self._symbolic for slot in call.inputs) | {self._result: None}
+        border = [slot for slot in border if slot not in followers]
+        own_ids = {id(tensor) for tensor in own}
+        named = [slot for slot, tensor in self._captured.items() if id(tensor) in own_ids]
+        varying = _followers(self._plain, [self._index, *named])
+        self._own = [slot for slot in border if slot in varying]
+        computed = self._computed(index)
+        self._own_shapes = [tuple(computed[slot].shape) for slot in self._own]
+        self._constants = {slot: _array(computed[slot]) for slot in border if slot not in varying}
+        self._shapes = [tuple(example.shape) for example in examples]
+
+    @property
+    def count(self) -> int:
+        """How many numbers differ from problem to problem."""
+        return sum(int(np.prod(shape)) for shape in self._own_shapes)
+
+    def parameters(self, index: Tensor) -> np.ndarray:
+        """Those numbers (count,) for the problem that index (1,) int64 names."""
+        if not self._own:
+            return np.zeros(0)
+        computed = self._computed(index)
+        return torch.cat([computed[slot].double().flatten() for slot in self._own]).detach().cpu().numpy()
+
+    def parameters_of(self, index: Tensor) -> Tensor:
+        """The same for many problems at once: (B, count) float64 for index (B,) int64, on its device.
+
+        A problem's numbers don't depend on which others are asked for.
+        """
+        if not self._own:
+            return torch.zeros(len(index), 0, dtype=torch.float64, device=index.device)
+
+        def one(i: Tensor) -> Tensor:
+            computed = self._computed(i.unsqueeze(0))
+            return torch.cat([computed[slot].double().flatten() for slot in self._own]).detach()
+
+        try:
+            return torch.func.vmap(one)(index)
+        except RuntimeError:  # an operation that can't be done for many at once
+            return torch.stack([one(i) for i in index])
+
+    def fingerprint(self) -> str:
+        """Digits that stand for what `__call__` computes, the same in every process. CasADi isn't needed for them.
+
+        The values of the numbers that differ from problem to problem have no part in it.
+        """
+        variables = dict(zip(self._variables, self._shapes, strict=True))
+        own = dict(zip(self._own, self._own_shapes, strict=True))
+        return fingerprint(variables, own, self._constants, self._symbolic, self._result)
+
+    def __call__(self, parameters: np.ndarray, *variables: np.ndarray) -> np.ndarray:
+        """The function on arrays of numbers or expressions: `parameters` (count,), variables shaped as the examples.
+
+        Raises:
+            InputError: an operation that CasADi has no counterpart for with these arguments.
+        """
+        known: dict[Slot, Any] = dict(zip(self._variables, variables, strict=True)) | self._constants
+        place = 0
+        for slot, shape in zip(self._own, self._own_shapes, strict=True):
+            known[slot] = parameters[place : place + int(np.prod(shape))].reshape(shape)
+            place += int(np.prod(shape))
+        for call in self._symbolic:
+            try:
+                call.replay(OPERATIONS[name_of(call.operation)], known)
+            except (NoCounterpart, TypeError) as error:
+                raise _unknown(self.field, call) from error
+        return boxed(known[self._result])
+
+    def _computed(self, index: Tensor) -> dict[Slot, Any]:
+        """PyTorch's part, for one problem."""
+        known: dict[Slot, Any] = {self._index: index} | self._captured
+        with torch.no_grad():
+            for call in self._plain:
+                call.replay(call.operation, known)
+        return known
+
+
+def _needed(calls: list[Call], result: Slot) -> list[Call]:
+    """The calls that the result depends on."""
+    wanted, kept = {result}, []
+    for call in reversed(calls):
+        if not wanted.isdisjoint(call.outputs):
+            wanted.update(call.inputs)
+            kept.append(call)
+    return kept[::-1]
+
+
+def _followers(calls: Iterable[Call], sources: Iterable[Slot]) -> set[Slot]:
+    """`sources`, and what depends on them."""
+    reached = set(sources)
+    for call in calls:
+        if not reached.isdisjoint(call.inputs):
+            reached.update(call.outputs)
+    return reached
+
+
+def _array(value: Tensor) -> np.ndarray:
+    """Numbers as objects; whole numbers and truth values stay what they are, to index with."""
+    plain = value.detach().cpu()
+    return plain.double().numpy().astype(object) if value.is_floating_point() else plain.numpy()
+
+
+def _unknown(field: str, call: Call) -> InputError:
+    return InputError(field, "operations that CasADi has a counterpart for", str(call.operation))
