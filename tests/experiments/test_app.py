@@ -90,7 +90,7 @@ def test_a_study_writes_what_the_design_says(tmp_path) -> None:
     assert "gco" in done.stdout and "McNemar" in done.stdout and "3/3" in done.stdout
     assert "trial" in done.stderr  # a progress bar
     again = command(*TINY, "hydra.run.dir=out", "study.baselines=[hold,gco]", "seed=3", cwd=tmp_path)
-    assert again.returncode == 0 and "nothing was computed anew" in again.stdout
+    assert again.returncode == 0 and "nothing was flown again" in again.stdout
     other = command(*TINY, "hydra.run.dir=out", "study.baselines=[hold,gco]", "seed=4", cwd=tmp_path)
     assert other.returncode == 2 and "seed is 3 there, 4 here" in problem_line(other.stderr)
 
