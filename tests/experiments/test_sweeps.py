@@ -167,7 +167,7 @@ def test_many_settings_make_a_short_label(tmp_path) -> None:
     assert len(names) == 3 and all("d=" in name and "1 more" in name and "a=" not in name for name in names)
 
 
-def test_layouts_that_differ_without_a_reason_are_told_apart_by_folder(tmp_path) -> None:
+def test_layouts_that_differ_without_a_reason_are_distinguished_by_folder(tmp_path) -> None:
     """A layout file that was changed in place, say."""
     study(tmp_path / "a", {"gco": [HIT] * 2}, scene="old")
     study(tmp_path / "b", {"al_ilqr": [HIT] * 2}, scene="new")
@@ -220,7 +220,7 @@ def test_runs_of_an_older_version_are_named_and_never_paired_with_new_ones(tmp_p
     assert counts(table) == {"gco": (2, 2), "gco [old]": (2, 2), "al_ilqr": (2, 2)}
     assert main([str(tmp_path)]) == 0
     text = capsys.readouterr().out
-    assert f"of an older version, told apart by configuration and results alone: {old}" in text
+    assert f"of an older version, distinguished by configuration and results alone: {old}" in text
     assert [row[2] for row in pairs(table) if "al_ilqr" in row and "gco" in row] == [0]
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import IO, Any, Protocol
 
 import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 import torchgco
 from torchgco.certificate import certify
@@ -68,6 +67,28 @@ def _count(value: object, name: str, otherwise: str = "") -> int:
     return value
 
 
+class Bar(Protocol):
+    """The part of a tqdm bar that a flight uses."""
+
+    def update(self, n: float) -> Any: ...
+    def set_postfix(self, ordered_dict: Any, refresh: bool) -> Any: ...
+    def write(self, s: str, file: IO[str]) -> Any: ...
+
+
+class NoBar:
+    """Shows nothing but warnings: for worker processes, where even a disabled tqdm makes a semaphore that a kill leaks."""
+
+    def update(self, n: float) -> None:
+        """Nothing is shown."""
+
+    def set_postfix(self, ordered_dict: Any, refresh: bool) -> None:
+        """Nothing is shown."""
+
+    def write(self, s: str, file: IO[str]) -> None:
+        """The line as it is."""
+        print(s, file=file)
+
+
 @dataclass
 class Flight:
     """A batch of layouts flown by one solver."""
@@ -77,7 +98,7 @@ class Flight:
     layouts: Layouts
     name: str
     solver: Any
-    bar: tqdm
+    bar: Bar
     shown: int = 0
 
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:

@@ -1,7 +1,7 @@
 """One table from the trials of many runs, never mixing under one name what differs.
 
 A layout is known by its digest and a solver by the digest of its settings, both columns of a study's trials. Runs of
-older versions have neither: they are told apart by their configurations and results alone.
+older versions have neither: they are distinguished by their configurations and results alone.
 """
 
 from __future__ import annotations

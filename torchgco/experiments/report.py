@@ -86,7 +86,7 @@ def write_report(folder: str | os.PathLike[str], trajectories: Trajectories | No
     if repeated := trials.attrs.get(REPEATED, 0):
         text += f"\n\n{repeated} rows left out: another run has the same flight, and each counts once"
     if older := trials.attrs.get(OLDER, []):
-        text += f"\n\nof an older version, told apart by configuration and results alone: {', '.join(older)}"
+        text += f"\n\nof an older version, distinguished by configuration and results alone: {', '.join(older)}"
     return text
 
 

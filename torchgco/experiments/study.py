@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 import torchgco
 from torchgco.experiments.build import Setup, build, solver_of
-from torchgco.experiments.flight import Flight, Plan, plan_of
+from torchgco.experiments.flight import Bar, Flight, NoBar, Plan, plan_of
 from torchgco.experiments.identity import Manifest, layout_digests, plain, settings_of
 from torchgco.experiments.records import COLUMNS, JUDGED, TRIALS, Records
 from torchgco.experiments.report import write_report
@@ -133,7 +133,7 @@ def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
     return batches
 
 
-def _flight(study: _Study, name: str, ids: Sequence[int], bar: tqdm) -> Flight:
+def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight:
     # A study's ids are positions, 0..L-1 (`Setup.layouts`).
     return Flight(study.setup, study.plan, study.layouts.take(ids), name, study.solvers[name], bar)
 
@@ -150,7 +150,7 @@ def _fly_side_by_side(
     bar.set_description(f"{workers} processes")
     run_all(
         _fly,
-        [_flight(study, name, ids, tqdm(disable=True)) for name, ids in batches],
+        [_flight(study, name, ids, NoBar()) for name, ids in batches],
         workers,
         prepare=_prepare,
         options=(torch.get_num_threads(), compiling()),

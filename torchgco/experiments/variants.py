@@ -25,7 +25,7 @@ def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
     """For each run the columns that its rows get: the swept variables of each row's (scenario, model).
 
     A key is swept where all runs of a (scenario, model) have it, with different values. `scenario.path` is not, as
-    long as the layouts agree. Runs that differ in their layouts without such a key are told apart by their folder.
+    long as the layouts agree. Runs that differ in their layouts without such a key are distinguished by their folder.
     """
     given = [_keys(run) for run in runs]
     tasks = [list(run.trials[TASK].drop_duplicates().itertuples(index=False, name=None)) for run in runs]
