@@ -194,3 +194,5 @@ def test_a_folder_that_may_not_be_written_to_gets_one_line(run, tmp_path) -> Non
     (tmp_path / "out" / "shards").write_text("in the way")
     code, _, err = run(*WORDS)
     assert code == 2 and "shards" in problem_line(err)
+    code, _, err = run(*HOLD, "hydra.run.dir=out/shards/deeper")
+    assert code == 2 and "hydra.run.dir" in problem_line(err)

@@ -78,7 +78,7 @@ def test_the_folder_of_an_older_version_is_refused(run, tmp_path) -> None:
     held = json.dumps({"configuration": {"version": "0.1.0", "seed": 0}, "layouts": "1f"})
     (tmp_path / "out" / "study.json").write_text(held)
     code, _, err = run(*HOLD, "hydra.run.dir=out")
-    assert code == 2 and "an older version of torchgco wrote" in problem_line(err)
+    assert code == 2 and "written by an older version of torchgco" in problem_line(err)
     assert (tmp_path / "out" / "study.json").read_text() == held
 
 

@@ -28,7 +28,8 @@ def study_folder(_root_: Any) -> str:
     held = plain(OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"]))
     solvers = {held["solver"]["name"]: {key: value for key, value in held["solver"].items() if key != "name"}}
     recompose = _recomposer(_root_.hydra)
-    for name in held["study"]["baselines"] or ():
+    baselines = held["study"]["baselines"]
+    for name in baselines if isinstance(baselines, list) else ():
         try:
             solvers.setdefault(str(name), settings_of(recompose(str(name))))
         except InputError:  # an unknown solver, say: the study itself refuses it in one line
@@ -89,6 +90,9 @@ def main() -> int:
         _run()
     except (HydraException, OmegaConfBaseException) as error:
         print(f"torchgco: {as_input_error(error)}", file=sys.stderr)
+        return 2
+    except OSError as error:  # of the study's folder, which Hydra makes; the study's files have their own line
+        print(f"torchgco: {InputError('hydra.run.dir', 'a folder that can be made', error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("\ntorchgco: interrupted; the same command resumes from here", file=sys.stderr)

@@ -76,7 +76,7 @@ class Bar(Protocol):
 
 
 class NoBar:
-    """Shows nothing but warnings: for worker processes, where even a disabled tqdm makes a semaphore that a kill leaks."""
+    """Shows warnings only, in worker processes: even a disabled tqdm makes a semaphore, which would leak in a kill."""
 
     def update(self, n: float) -> None:
         """Nothing is shown."""

@@ -62,7 +62,7 @@ class Records:
                     raise
             else:
                 if held is None:
-                    raise self._another("that an older version of torchgco wrote")
+                    raise self._another("(written by an older version of torchgco)")
                 if held.identity() == self.manifest.identity():
                     return
                 raise self._another(f"({difference(held.identity(), self.manifest.identity())})")
