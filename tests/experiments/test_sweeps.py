@@ -14,6 +14,7 @@ from tests.experiments.commands import TINY, command
 from tests.trials import PLAIN, trials
 from torchgco.experiments.identity import Manifest, digest, layout_digests
 from torchgco.experiments.merge import merge
+from torchgco.experiments.records import read_manifest
 from torchgco.experiments.report import compare, format_table, main
 from torchgco.experiments.statistics import summarise
 from torchgco.scenarios import Layouts
@@ -154,6 +155,29 @@ def test_versions_and_devices_are_rows_of_their_own(key: str, label: str, tmp_pa
             solver={"gco": {"new": name}} if key == "version" else None,
         )
     assert set(counts(merge([tmp_path]))) == {f"gco [{label}=one]", f"gco [{label}=two]"}
+
+
+def test_settings_are_known_by_their_digest_where_a_manifest_is_lost(tmp_path) -> None:
+    study(tmp_path / "a", {"gco": [HIT]})
+    study(tmp_path / "b", {"gco": [HIT]}, seed=1, manifest=False)
+    study(tmp_path / "c", {"gco": [HIT]}, seed=2, manifest=False, solver={"gco": {"samples": 3}})
+    found = counts(merge([tmp_path]))
+    assert sorted(found.values()) == [(1, 1), (2, 2)] and all(name.startswith("gco [") for name in found)
+
+
+def test_a_file_that_moved_is_the_same_and_one_that_differs_gets_a_column(tmp_path) -> None:
+    def flown(name: str, path: str, scene: str, solver: str) -> None:
+        folder = study(tmp_path / name, {solver: [HIT]}, scene=scene)
+        held = read_manifest(folder / "study.json")
+        assert held is not None
+        held.configuration["scenario"]["path"] = path
+        (folder / "study.json").write_bytes(held.to_json())
+
+    flown("a", "here/walls.npz", "walls", "gco")
+    flown("b", "there/walls.npz", "walls", "al_ilqr")
+    assert pairs(merge([tmp_path])) == [("gco", "al_ilqr", 1, 0)]
+    flown("c", "elsewhere/walls.npz", "other walls", "ipopt")
+    assert set(merge([tmp_path])["scenario.path"]) == {f"{name}/walls.npz" for name in ("here", "there", "elsewhere")}
 
 
 def test_many_settings_make_a_short_label(tmp_path) -> None:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from torchgco.experiments.identity import ARITHMETIC, flat
+from torchgco.experiments.identity import ARITHMETIC, digest, flat
 from torchgco.experiments.runs import MERGED, ROW, Run, find_runs
 from torchgco.experiments.statistics import PAIR, TASK, task_columns
 from torchgco.experiments.success import judged, sound
@@ -49,7 +49,8 @@ def merge(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
             for one flight.
     """
     runs = find_runs(folders)
-    rows = pd.concat([_tagged(run, swept) for run, swept in zip(runs, task_of_runs(runs), strict=True)])
+    settings = {digest(held): held for run in runs for held in run.solvers.values()}
+    rows = pd.concat([_tagged(run, swept, settings) for run, swept in zip(runs, task_of_runs(runs), strict=True)])
     rows = _named(_without_repetitions(rows.reset_index(drop=True)))
     merged = _sorted(_judged_together(rows)).drop(columns=OWN)
     older = [run.folder.as_posix() for run in runs if _is_older(run.trials)]
@@ -62,28 +63,26 @@ def _is_older(trials: pd.DataFrame) -> bool:
     return not set(DIGESTS) <= set(trials.columns)
 
 
-def _tagged(run: Run, swept: pd.DataFrame) -> pd.DataFrame:
-    """The rows of a run with its swept variables, its folder, and what tells its solvers' variants apart."""
+def _tagged(run: Run, swept: pd.DataFrame, settings: Mapping[str, dict[str, Any]]) -> pd.DataFrame:
+    """The rows of a run with its swept variables, its folder, and the variants of its solvers.
+
+    settings  of all solvers whose manifest was found, by digest
+    """
     rows = run.trials.assign(**{name: swept[name].array for name in swept.columns})
     configuration = json.dumps(run.configuration, sort_keys=True, default=str) if run.configuration else ""
     rows[FOLDER], rows[CONFIGURATION] = run.folder.as_posix(), configuration
     if _is_older(rows):
         return rows.assign(**{VARIANT: UNKNOWN})
-    compiled = run.configuration.get("device", {}).get("compile")
-    names = ["solver", "settings_digest", "device", "dtype", "version"]
-    made = {
-        key: _variant(run.solvers.get(key[0]), dict(zip(names, key, strict=True)), compiled)
-        for key in rows[names].drop_duplicates().itertuples(index=False, name=None)
-    }
+    compiled = bool(run.configuration.get("device", {}).get("compile"))
+    names = ["settings_digest", "device", "dtype", "version"]
+    made = {}
+    for key in rows[names].drop_duplicates().itertuples(index=False, name=None):
+        code, device, dtype, version = key
+        arithmetic = zip(ARITHMETIC, (device, dtype, compiled), strict=True)
+        held = flat(settings.get(code, {"settings": code}))
+        held |= {f"device.{name}": value for name, value in arithmetic} | {"version": version}
+        made[key] = json.dumps(held, sort_keys=True, default=str)
     return rows.assign(**{VARIANT: [made[key] for key in rows[names].itertuples(index=False, name=None)]})
-
-
-def _variant(settings: dict[str, Any] | None, row: dict[str, str], compiled: Any) -> str:
-    """All that decides what a solver does with a layout and a seed, as text: flat settings by their keys."""
-    held = {"settings": row["settings_digest"]} if settings is None else flat(settings)
-    device = dict(zip(ARITHMETIC, (row["device"], row["dtype"], compiled), strict=True))
-    held |= {f"device.{name}": value for name, value in device.items()}
-    return json.dumps({**held, "version": row["version"]}, default=str)
 
 
 def _without_repetitions(rows: pd.DataFrame) -> pd.DataFrame:

@@ -27,24 +27,12 @@ def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
     A key is swept where all runs of a (scenario, model) have it, with different values. `scenario.path` is not, as
     long as the layouts agree. Runs that differ in their layouts without such a key are distinguished by their folder.
     """
-    given = [_keys(run) for run in runs]
     tasks = [list(run.trials[TASK].drop_duplicates().itertuples(index=False, name=None)) for run in runs]
     chosen: dict[tuple[int, Any], dict[str, Any]] = {}
     for task in dict.fromkeys(task for found in tasks for task in found):
         members = [i for i, found in enumerate(tasks) if task in found]
-        known = [given[i] for i in members if given[i]]
-        shared = [key for key in (known[0] if known else {}) if all(key in keys for keys in known)]
-        swept = [key for key in shared if key != FILE and len({_text(keys[key]) for keys in known}) > 1]
-        cells = {i: {key: given[i].get(key) for key in swept if given[i]} for i in members}
-        held = [runs[i] for i in members]
-        clusters = _clusters(held, list(cells.values()), task)
-        if FILE in shared and any(clusters):
-            for i in members:
-                cells[i] |= {FILE: given[i][FILE]} if given[i] else {}
-            clusters = _clusters(held, list(cells.values()), task)
-        for i, cluster in zip(members, clusters, strict=True):
-            cells[i] |= {RUN: cluster} if cluster else {}
-        chosen |= {(i, task): held for i, held in cells.items()}
+        cells = _swept([runs[i] for i in members], task)
+        chosen |= {(i, task): held for i, held in zip(members, cells, strict=True)}
     columns = list(dict.fromkeys(key for held in chosen.values() for key in held))
     kinds = {key: _kind([held[key] for held in chosen.values() if key in held]) for key in columns}
     frames = []
@@ -56,6 +44,23 @@ def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
         }
         frames.append(pd.DataFrame(held, index=run.trials.index))
     return frames
+
+
+def _swept(runs: Sequence[Run], task: tuple[Any, ...]) -> list[dict[str, Any]]:
+    """The swept variables of each run that flew a task; none for a run whose configuration isn't known."""
+    given = [_keys(run) for run in runs]
+    known = [keys for keys in given if keys]
+    shared = [key for key in (known[0] if known else {}) if all(key in keys for keys in known)]
+    swept = [key for key in shared if key != FILE and len({_text(keys[key]) for keys in known}) > 1]
+    cells = [{key: keys[key] for key in swept if keys} for keys in given]
+    clusters = _clusters(runs, cells, task)
+    if FILE in shared and any(clusters):
+        for cell, keys in zip(cells, given, strict=True):
+            cell |= {FILE: keys[FILE]} if keys else {}
+        clusters = _clusters(runs, cells, task)
+    for cell, cluster in zip(cells, clusters, strict=True):
+        cell |= {RUN: cluster} if cluster else {}
+    return cells
 
 
 def _keys(run: Run) -> dict[str, Any]:
