@@ -94,7 +94,6 @@ class Flight:
     """A batch of layouts flown by one solver."""
 
     setup: Setup
-    plan: Plan
     layouts: Layouts
     name: str
     solver: Any
@@ -137,7 +136,8 @@ class Flight:
             self.solver.solve(problem.take(few), U0[few], seed=self.setup.seed, ids=ids[few])
         at_once = getattr(solver, "at_once", problem.B)
         if hasattr(solver, "slots"):
-            at_once = min(problem.B, self.plan.batch_size or plan_batch(problem, self.setup.device, self.plan.workers))
+            plan = plan_of(self.setup)
+            at_once = min(problem.B, plan.batch_size or plan_batch(problem, self.setup.device, plan.workers))
             solver = replace(solver, slots=at_once)
         while True:
             began = _now(self.setup.device)

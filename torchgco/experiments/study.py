@@ -135,7 +135,7 @@ def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
 
 def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight:
     # A study's ids are positions, 0..L-1 (`Setup.layouts`).
-    return Flight(study.setup, study.plan, study.layouts.take(ids), name, study.solvers[name], bar)
+    return Flight(study.setup, study.layouts.take(ids), name, study.solvers[name], bar)
 
 
 def _fly_side_by_side(
