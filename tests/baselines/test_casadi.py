@@ -25,7 +25,7 @@ from torchgco import (
 from torchgco.baselines import CasADiSolver, Hold
 from torchgco.constraints import Constraint
 from torchgco.experiments.build import compose
-from torchgco.experiments.study import _Flight
+from torchgco.experiments.flight import Flight
 from torchgco.rollout import open_loop
 
 PLUGINS = ["ipopt", "fatrop"]
@@ -235,8 +235,8 @@ def test_a_study_prepares_before_the_clock_starts(monkeypatch) -> None:
             assert problem is self.problem
             return Hold().solve(problem, U0, **call)
 
-    monkeypatch.setattr("torchgco.experiments.study._now", lambda device: float(events.append("clock") or 0.0))
-    _Flight(setup, layouts, "builder", Builder(), tqdm(disable=True)).fly()
+    monkeypatch.setattr("torchgco.experiments.flight._now", lambda device: float(events.append("clock") or 0.0))
+    Flight(setup, layouts, "builder", Builder(), tqdm(disable=True)).fly()
     assert events == ["prepare", "clock", "solve", "clock"]
 
 
@@ -244,5 +244,5 @@ def test_a_flight_in_a_study() -> None:
     setup = compose(["scenario=layouts", f"scenario.path={DATA / 'planar_trap.npz'}", "model=planar", "solver=fatrop"])
     layouts = replace(setup.layouts(2), stages=20)
     with tqdm(total=2, disable=True) as bar:
-        rows, U = _Flight(setup, layouts, "fatrop", setup.solver, bar).fly()
+        rows, U = Flight(setup, layouts, "fatrop", setup.solver, bar).fly()
     assert rows["status"].tolist() == ["CONVERGED"] * 2 and U.shape == (2, 20, 2) and bool(rows["feasible"].all())

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -16,56 +15,17 @@ import pytest
 import torch
 
 import torchgco
-from torchgco.experiments import app
+from tests.experiments.commands import ROOT, TINY, command, problem_line
 from torchgco.experiments.build import compose, config_dir
 from torchgco.experiments.records import COLUMNS
 from torchgco.scenarios import Layouts
 from torchgco.solvers.batch import Loop
 
-ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
-TINY = [
-    "study.layouts=3",
-    "scenario.stages=12",
-    "study.batch_size=2",
-    "study.shard_size=2",
-    "solver.max_outer_iterations=2",
-    "study.workers=1",
-]
 SCENARIOS = sorted(p.stem for p in (ROOT / "conf" / "scenario").glob("*.yaml"))
 SOLVERS = sorted(p.stem for p in (ROOT / "conf" / "solver").glob("*.yaml"))
 EXPERIMENTS = sorted(p.stem for p in (ROOT / "conf" / "experiment").glob("*.yaml"))
-
-
-def command(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    line = [sys.executable, "-m", "torchgco", *words]
-    return subprocess.run(line, cwd=cwd, env=env, capture_output=True, text=True, timeout=300)
-
-
-@pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """torchgco in this process: (exit code, stdout, stderr). Quicker than a new one for every case."""
-
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["torchgco", *words])
-        try:
-            code = app.main()
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
-
-
-def problem_line(err: str) -> str:
-    """The one line of an error; the progress bar aside, nothing else may stand there."""
-    lines = [line for line in err.splitlines() if line.strip() and "trial/s" not in line]
-    assert len(lines) == 1, err
-    return lines[0]
 
 
 def test_a_study_writes_what_the_design_says(tmp_path) -> None:
@@ -90,7 +50,7 @@ def test_a_study_writes_what_the_design_says(tmp_path) -> None:
     assert "gco" in done.stdout and "McNemar" in done.stdout and "3/3" in done.stdout
     assert "trial" in done.stderr  # a progress bar
     again = command(*TINY, "hydra.run.dir=out", "study.baselines=[hold,gco]", "seed=3", cwd=tmp_path)
-    assert again.returncode == 0 and "nothing was computed anew" in again.stdout
+    assert again.returncode == 0 and "nothing was flown again" in again.stdout
     other = command(*TINY, "hydra.run.dir=out", "study.baselines=[hold,gco]", "seed=4", cwd=tmp_path)
     assert other.returncode == 2 and "seed is 3 there, 4 here" in problem_line(other.stderr)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -51,6 +51,7 @@ class CasADiSolver:
     tolerance: float = 1e-8
     violation_tolerance: float = 1e-3
     options: Mapping[str, Any] | None = None
+    at_once: ClassVar[int] = 1  # problems worked on at the same time
 
     def __post_init__(self) -> None:
         if self.plugin not in ("ipopt", "fatrop"):
@@ -127,6 +128,7 @@ class PreparedCasADi:
     problem: Problem
     program: Program
     run: Any  # casadi.Function
+    at_once: ClassVar[int] = 1
 
     def solve(
         self,

@@ -1,91 +1,110 @@
-"""One table from the trials of many runs, never mixing what differs under one name."""
+"""One table from the trials of many runs, never mixing under one name what differs.
+
+A layout is known by its digest and a solver by the digest of its settings, both columns of a study's trials. Runs of
+older versions have neither: they are distinguished by their configurations and results alone.
+"""
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
-from torchgco.experiments.statistics import GROUP, PAIR
+from torchgco.experiments.identity import ARITHMETIC, digest, flat
+from torchgco.experiments.runs import MERGED, ROW, Run, find_runs
+from torchgco.experiments.statistics import PAIR, TASK, task_columns
+from torchgco.experiments.success import judged, sound
+from torchgco.experiments.variants import UNKNOWN, labels, task_of_runs
 from torchgco.shapes import InputError
 
-TRIALS = "trials.parquet"
-MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
-REPEATED = "repeated"  # and how many rows were left out because another run had the same
-ROW = [*PAIR, "solver"]
-# Two runs never take the same time, so a time doesn't tell one result from another.
-MEASURED = {"seconds"}
-FOLDER, CONFIGURATION = "_folder", "_configuration"
+REPEATED = "repeated"  # in the attributes of a merged table: rows left out because another run has the same flight
+OLDER = "older"  # and the folders of runs without digests
+DIGESTS = ("layout_digest", "settings_digest")
+# Two runs of one flight may differ in these: in what was measured, how it was flown, and who else flew.
+INCIDENTAL = {"seconds", "batch_size", "threads", "best_cost", "best_from", "success"}
+FOLDER, VARIANT, CONFIGURATION = "_folder", "_variant", "_configuration"
+OWN = [FOLDER, VARIANT, CONFIGURATION]
 
 
 def merge(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
     """All trials found in and below `folders`, as one table with the columns of a study.
 
-    A row that stands in several runs with the same content (`seconds` apart) is kept once, as the first run
-    has it. Where runs of different configurations give different content for the same (scenario, model,
-    solver, layout, seed), the solver's name gets the run's folder as a label, "gco [run]", in every row of
-    that (scenario, model, solver). Tables that a merge wrote are passed over below a folder, and read where
-    the folder itself is given.
+    - Keys of scenario and vehicle in which runs of one (scenario, model) differ become columns, named as they are
+      typed: `scenario.num_obstacles`. Runs that flew other layouts although no key says so get their folder in a
+      column `hydra.run.dir`.
+    - A solver that flew under several settings, versions or devices has a name for each, with what differs:
+      "gco [max_outer_iterations=10]". Seeds don't count: other seeds are more trials of the same thing.
+    - A flight that several runs hold counts once, as the first run has it.
+    - Best costs are those of the merged table: success is judged again where layouts have no best cost in their file.
 
-    The table's `attrs` tell `merged_from`, the folders read, and `repeated`, how many rows were left out.
+    The table's `attrs` hold `merged_from`, the folders read, `repeated`, how many rows were left out, and `older`, the
+    folders of runs without digests. Of those, different results for one trial get the run's folder as label.
 
-    Raises InputError for a folder that isn't there, folders without trials, a file that can't be read, and
-    rows with different content under one name where the configurations are the same or unknown.
+    Raises:
+        InputError: a folder that isn't there, folders without trials, a damaged file, and rows with different content
+            for one flight.
     """
-    runs = _find(folders)
-    rows = pd.concat([_tagged(run, path.parent) for path, run in runs.items()], ignore_index=True)
-    groups = [_resolve(group) for _, group in rows.groupby(GROUP, sort=False, dropna=False)]
-    merged = pd.concat(groups, ignore_index=True).drop(columns=[FOLDER, CONFIGURATION])
-    merged.attrs = {MERGED: [str(path.parent) for path in runs], REPEATED: len(rows) - len(merged)}
+    runs = find_runs(folders)
+    settings = {digest(held): held for run in runs for held in run.solvers.values()}
+    rows = pd.concat([_tagged(run, swept, settings) for run, swept in zip(runs, task_of_runs(runs), strict=True)])
+    rows = _named(_without_repetitions(rows.reset_index(drop=True)))
+    merged = _sorted(_judged_together(rows)).drop(columns=OWN)
+    older = [run.folder.as_posix() for run in runs if _is_older(run.trials)]
+    found = [run.folder.as_posix() for run in runs]
+    merged.attrs = {MERGED: found, REPEATED: sum(len(run.trials) for run in runs) - len(merged), OLDER: older}
     return merged
 
 
-def read_trials(path: str | os.PathLike[str]) -> pd.DataFrame:
-    """The table in a `trials.parquet`; InputError if it can't be read or doesn't name its trials."""
-    try:
-        trials = pd.read_parquet(path)
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError("trials", "a readable parquet file", f"{path} ({reason})") from None
-    missing = [name for name in ROW if name not in trials.columns]
-    if missing:
-        raise InputError("trials", f"columns {', '.join(ROW)}", f"{path} without {', '.join(missing)}")
-    return trials
+def _is_older(trials: pd.DataFrame) -> bool:
+    return not set(DIGESTS) <= set(trials.columns)
 
 
-def is_merged(trials: pd.DataFrame) -> bool:
-    """Whether the table comes out of a merge rather than out of a study."""
-    return MERGED in trials.attrs
+def _tagged(run: Run, swept: pd.DataFrame, settings: Mapping[str, dict[str, Any]]) -> pd.DataFrame:
+    """The rows of a run with its swept variables, its folder, and the variants of its solvers.
+
+    settings  of all solvers whose manifest was found, by digest
+    """
+    rows = run.trials.assign(**{name: swept[name].array for name in swept.columns})
+    configuration = json.dumps(run.configuration, sort_keys=True, default=str) if run.configuration else ""
+    rows[FOLDER], rows[CONFIGURATION] = run.folder.as_posix(), configuration
+    if _is_older(rows):
+        return rows.assign(**{VARIANT: UNKNOWN})
+    compiled = bool(run.configuration.get("device", {}).get("compile"))
+    names = ["settings_digest", "device", "dtype", "version"]
+    made = {}
+    for key in rows[names].drop_duplicates().itertuples(index=False, name=None):
+        code, device, dtype, version = key
+        arithmetic = zip(ARITHMETIC, (device, dtype, compiled), strict=True)
+        held = flat(settings.get(code, {"settings": code}))
+        held |= {f"device.{name}": value for name, value in arithmetic} | {"version": version}
+        made[key] = json.dumps(held, sort_keys=True, default=str)
+    return rows.assign(**{VARIANT: [made[key] for key in rows[names].itertuples(index=False, name=None)]})
 
 
-def _find(folders: Iterable[str | os.PathLike[str]]) -> dict[Path, pd.DataFrame]:
-    """The tables by their path, each once, in the order of the folders and by name below each."""
-    found: dict[Path, pd.DataFrame] = {}
-    given = [Path(folder) for folder in folders]
-    for folder in given:
-        if not folder.is_dir():
-            raise InputError("folders", "a folder that is there", folder)
-        for path in sorted(folder.rglob(TRIALS)):
-            trials = read_trials(path)
-            if path.parent == folder or not is_merged(trials):
-                found.setdefault(path.resolve(), trials)
-    if not found:
-        raise InputError("folders", f"a {TRIALS} in or below them", ", ".join(map(str, given)) or "no folder")
-    return found
+def _without_repetitions(rows: pd.DataFrame) -> pd.DataFrame:
+    """Each flight once: as the first run has it, but one whose success is known before one whose isn't.
+
+    Raises:
+        InputError: two runs give one flight different content.
+    """
+    if "success" in rows.columns:
+        rows = rows.loc[rows["success"].isna().sort_values(kind="stable").index]
+    content = [name for name in rows.columns if name not in INCIDENTAL | {FOLDER, CONFIGURATION}]
+    known = rows[rows[VARIANT] != UNKNOWN].drop_duplicates(content)
+    flight = [*dict.fromkeys([*task_columns(rows), *ROW]), VARIANT, *(n for n in DIGESTS if n in rows.columns)]
+    twice = known.duplicated(flight, keep=False)
+    if twice.any():
+        raise _dispute(known[twice], content)
+    older = rows[rows[VARIANT] == UNKNOWN].groupby([*task_columns(rows), "solver"], sort=False, dropna=False)
+    return pd.concat([known, *(_of_older_runs(group, content) for _, group in older)]).sort_index()
 
 
-def _tagged(trials: pd.DataFrame, folder: Path) -> pd.DataFrame:
-    """The rows of one run with the folder and the configuration they came from; "" where that is unknown."""
-    config = folder / ".hydra" / "config.yaml"
-    known = config.read_text(encoding="utf-8") if config.is_file() else ""
-    return trials.assign(**{FOLDER: folder.as_posix(), CONFIGURATION: known})
-
-
-def _resolve(group: pd.DataFrame) -> pd.DataFrame:
-    """The rows of one (scenario, model, solver) without repetitions, labelled where runs disagree."""
-    content = [name for name in group.columns if name not in MEASURED | {FOLDER, CONFIGURATION}]
+def _of_older_runs(group: pd.DataFrame, content: list[str]) -> pd.DataFrame:
+    """The rows of one solver on one task without repetitions; labelled by their folders where results differ."""
     rows = group.drop_duplicates(content)
     disputed = rows[rows.duplicated(ROW, keep=False)]
     if disputed.empty:
@@ -95,15 +114,28 @@ def _resolve(group: pd.DataFrame) -> pd.DataFrame:
     same = rows[rows.duplicated([*ROW, CONFIGURATION], keep=False)]
     if len(same) or (disputed[CONFIGURATION] == "").any():
         raise _dispute(disputed if same.empty else same, content)
-    labels = _labels(rows.drop_duplicates(CONFIGURATION).set_index(CONFIGURATION)[FOLDER])
-    return rows.assign(solver=rows["solver"] + " [" + rows[CONFIGURATION].map(labels) + "]")
+    first = rows.groupby(CONFIGURATION)[FOLDER].transform("first")
+    return rows.assign(solver=rows["solver"] + " [" + first.map(_short(first.unique())) + "]")
 
 
-def _labels(folders: pd.Series) -> dict[str, str]:
-    """A short name for each configuration: its folder, without what the folders have in common."""
-    common = os.path.commonpath(folders.tolist())
-    names = folders.map(lambda folder: Path(folder).name if folder == common else os.path.relpath(folder, common))
-    return names.to_dict()
+def _named(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows with a label after the name of each solver that flew in several variants."""
+    names = rows["solver"].copy()
+    for _, group in rows.groupby(["model", "solver"], sort=False, dropna=False):
+        known, older = group[group[VARIANT] != UNKNOWN], group[group[VARIANT] == UNKNOWN]
+        found = labels(known[VARIANT].unique().tolist())
+        if len(found) > 1:
+            names[known.index] = known["solver"] + " [" + known[VARIANT].map(found) + "]"
+        if len(known) and len(older):
+            names[older.index] = older["solver"] + " [" + older[FOLDER].map(_short(rows[FOLDER].unique())) + "]"
+    return rows.assign(solver=names)
+
+
+def _short(folders: Iterable[str]) -> dict[str, str]:
+    """A short name for each folder, without what they have in common."""
+    names = list(folders)
+    common = os.path.commonpath(names)
+    return {name: Path(name).name if name == common else os.path.relpath(name, common) for name in names}
 
 
 def _dispute(rows: pd.DataFrame, content: list[str]) -> InputError:
@@ -117,3 +149,32 @@ def _dispute(rows: pd.DataFrame, content: list[str]) -> InputError:
         "one result per trial, or runs whose configurations are known to differ",
         f"two that differ in {', '.join(columns)} for {where}: {' and '.join(twins[FOLDER].iloc[:2])}",
     )
+
+
+def _judged_together(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows with success against one best cost per layout: its file's, else the best of all that flew it."""
+    if "best_from" not in rows.columns:
+        return rows
+    new = rows[rows["layout_digest"].notna() & rows["settings_digest"].notna()]
+    layout = [*task_columns(rows), *PAIR[len(TASK) :], "layout_digest"]
+    best = new["best_cost"].where(new["best_from"] == "file").astype(float)
+    groups = new.assign(_best=best).groupby(layout, sort=False, dropna=False)
+    rivals = groups["solver"].transform("nunique") > 1
+    again = judged(new.assign(sound=sound(new)), groups["_best"].transform("min"), rivals, layout)
+    old = rows[~rows.index.isin(new.index)]
+    return pd.concat([again[rows.columns], old]).sort_index() if len(old) else again[rows.columns]
+
+
+def _sorted(rows: pd.DataFrame) -> pd.DataFrame:
+    """By task and swept variables; solvers that are nobody's baseline first, as a study has its own first."""
+    firsts = rows.groupby(FOLDER, sort=False)["solver"].transform("first")
+    baselines = set(rows.loc[rows["solver"] != firsts, "solver"])
+    rank = {name: i for i, name in enumerate(rows["solver"].unique())}
+    keys = pd.DataFrame(index=rows.index)
+    for name in TASK:
+        keys[name] = pd.factorize(rows[name])[0]
+    for name in task_columns(rows)[len(TASK) :]:
+        keys[name] = rows[name].rank(method="dense", na_option="bottom")
+    keys["baseline"] = rows["solver"].isin(baselines)
+    keys["solver"] = rows["solver"].map(rank)
+    return rows.loc[keys.sort_values(list(keys.columns), kind="stable").index].reset_index(drop=True)

@@ -1,17 +1,19 @@
-"""The files of a study: shards while it runs, tables and arrays when it is done.
+"""The folder of a study: shards while it runs, tables and arrays when it is done.
 
-Every file is written beside its place and then moved there, so that a study killed at any moment leaves whole files,
-and a second start goes on from them.
+Every file is moved to its place whole (`files.write`), so that a study killed at any moment leaves whole files and a
+second start resumes from them. What is read again is checked against the study's manifest first: a damaged or foreign
+file is named, and redone with `study.repair=true`.
 """
 
 from __future__ import annotations
 
+import io
 import json
-import os
+import re
 import shutil
-import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import IO, Any
@@ -19,6 +21,8 @@ from typing import IO, Any
 import numpy as np
 import pandas as pd
 
+from torchgco.experiments.files import PART, checksum, damaged, write
+from torchgco.experiments.identity import Manifest, difference
 from torchgco.scenarios import Layouts
 from torchgco.shapes import InputError
 
@@ -26,93 +30,241 @@ COLUMNS = (
     "scenario", "layout", "seed", "model", "solver", "status", "feasible", "reached", "success", "cost", "best_cost",
     "violation", "clearance", "clearance_knots", "goal_distance", "dynamics_residual", "clearance_full",
     "bound_violation", "kkt_residual", "iterations", "outer_iterations", "guided", "seconds", "batch_size", "threads",
-    "device", "dtype", "version",
+    "device", "dtype", "version", "best_from", "layout_digest", "settings_digest",
 )  # fmt: skip
-
-
-def write(path: Path, save: Callable[[IO[bytes]], Any]) -> None:
-    """`save(file)` beside the place, fsync, then move: nobody sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-        save(file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.chmod(file.name, 0o644)
-    os.replace(file.name, path)
+JUDGED = ("success", "best_cost", "best_from")  # columns that compare rows: not in shards
+MANIFEST, TRIALS, SOLUTIONS, LAYOUTS, DONE = "study.json", "trials.parquet", "solutions.npz", "layouts.npz", "done"
+FILES = (TRIALS, SOLUTIONS, LAYOUTS)  # of a finished study, kept under their checksums
+Flown = tuple[pd.DataFrame, np.ndarray]  # rows without the judged columns, controls (rows, N, m)
+Save = Callable[[IO[bytes]], Any]
 
 
 @dataclass(frozen=True)
 class Records:
-    """One study's folder."""
+    """One study's folder; with `repair`, what is damaged in it is dropped and redone."""
 
     folder: Path
+    manifest: Manifest
+    repair: bool = False
 
-    def claim(self, configuration: dict[str, Any], layouts: Layouts) -> None:
-        """Make the folder this study's, or raise where it holds another's.
+    def claim(self) -> None:
+        """Make the folder this study's, or raise and leave it as it is.
 
         Raises:
-            InputError: results of another configuration or of other layouts lie there.
+            InputError: results of another study lie there, or the study's manifest is damaged or missing.
         """
-        described = {"configuration": configuration, "layouts": digest(layouts)}
-        mark = self.folder / "study.json"
-        if mark.is_file():
-            held = json.loads(mark.read_text())
-            if held != json.loads(json.dumps(described)):
-                raise InputError(
-                    "hydra.run.dir", "an empty folder, or one of this very study",
-                    f"{self.folder}, which holds another ({_difference(held, described)})",
-                )  # fmt: skip
-        elif (self.folder / "trials.parquet").exists():
-            raise InputError("hydra.run.dir", "an empty folder", f"{self.folder}, which holds trials")
-        write(mark, lambda file: file.write(json.dumps(described, indent=1).encode()))
+        path = self.folder / MANIFEST
+        if path.is_file():
+            try:
+                held = read_manifest(path)
+            except InputError:
+                if not self.repair:
+                    raise
+            else:
+                if held is None:
+                    raise self._another("(written by an older version of torchgco)")
+                if held.identity() == self.manifest.identity():
+                    return
+                raise self._another(f"({difference(held.identity(), self.manifest.identity())})")
+        elif not self.repair and ((self.folder / TRIALS).is_file() or any(self.folder.glob("shards/*.npz"))):
+            raise damaged(path, "is missing")
+        self._refuse_foreign()
+        write(path, lambda file: file.write(self.manifest.to_json()))
 
-    def finished(self) -> bool:
-        """Whether all files of the study are there already."""
-        return (self.folder / "done").is_file()
+    def finished(self, layouts: Layouts) -> bool:
+        """Whether all files of the study are there, whole.
 
-    def shard(self, solver: str, start: int) -> Path:
-        """Where the rows of one batch of one solver belong."""
-        return self.folder / "shards" / f"{solver}-{start:06d}.npz"
+        Raises:
+            InputError: one is damaged or missing. With `repair`, `layouts.npz` is written again, and for any other
+                file the study counts as unfinished.
+        """
+        path = self.folder / DONE
+        if not path.is_file():
+            return False
+        for name, sums in (self._checksums() or {TRIALS: []}).items():
+            place = self.folder / name
+            if place.is_file() and checksum(place) in sums:
+                continue
+            if not self.repair:
+                raise damaged(place, "is damaged" if place.is_file() else "is missing")
+            if name != LAYOUTS:
+                path.unlink()
+                return False
+            write(place, _arrays(layouts.arrays()))
+            self.close()
+        return True
 
-    def write_shard(self, path: Path, rows: pd.DataFrame, U: np.ndarray) -> None:
-        """Keep what a batch gave: its rows and its controls."""
+    def missing(self, solver: str) -> list[int]:
+        """Ids of the layouts that a solver has not flown yet.
+
+        Raises:
+            InputError: a shard is damaged or isn't of this study; with `repair` it is removed.
+        """
+        left = dict.fromkeys(self.manifest.layouts)
+        for path in self._shards(solver):
+            try:
+                rows, _ = self._read(path, solver)
+            except InputError:
+                if not self.repair:
+                    raise
+                path.unlink()
+            else:
+                for number in rows["layout"]:
+                    left.pop(number, None)
+        return list(left)
+
+    def keep(self, solver: str, flown: Flown) -> None:
+        """Write what a batch of consecutive layouts gave as a shard, named by solver, first and last layout."""
+        rows, U = flown
+        numbers = rows["layout"].tolist()
+        rows = rows.assign(
+            layout_digest=[self.manifest.layouts[number] for number in numbers],
+            settings_digest=self.manifest.settings[solver],
+        )
         # JSON by way of Python floats keeps every bit, NaN and infinity included.
         columns = json.dumps(rows.to_dict(orient="list"), default=lambda value: value.item())
-        write(path, lambda file: np.savez_compressed(file, U=U, rows=np.array(columns)))
+        path = self.folder / "shards" / f"{solver}-{numbers[0]:06d}-{numbers[-1]:06d}.npz"
+        write(path, _arrays({"U": U, "rows": np.array(columns)}))
 
-    @staticmethod
-    def read_shard(path: Path) -> tuple[pd.DataFrame, np.ndarray]:
-        """What `write_shard` kept."""
-        with np.load(path, allow_pickle=False) as held:
-            return pd.DataFrame(json.loads(str(held["rows"]))), held["U"]
+    def flown(self, solver: str) -> Flown:
+        """All that `keep` kept of a solver, by layout, however it was cut into shards.
 
-    def finish(self, trials: pd.DataFrame, U: np.ndarray, solvers: Sequence[str], layouts: Layouts) -> None:
-        """Write trials.parquet, solutions.npz and layouts.npz; the shards have served."""
-        write(self.folder / "trials.parquet", lambda file: trials.to_parquet(file, index=False))
-        write(
-            self.folder / "solutions.npz",
-            lambda file: np.savez_compressed(file, U=U, solver=np.array(list(solvers)), layout=layouts.ids),
-        )
-        layouts.save(self.folder / "layouts.npz")
+        Raises:
+            InputError: a shard is damaged or isn't of this study.
+        """
+        held = [self._read(path, solver) for path in self._shards(solver)]
+        rows = pd.concat([rows for rows, _ in held], ignore_index=True)
+        place = {number: i for i, number in enumerate(self.manifest.layouts)}
+        order = rows["layout"].map(place).drop_duplicates().sort_values().index
+        return rows.loc[order].reset_index(drop=True), np.concatenate([U for _, U in held])[order.to_numpy()]
+
+    def finish(self, trials: pd.DataFrame, U: np.ndarray, layouts: Layouts) -> None:
+        """Write trials.parquet, solutions.npz and layouts.npz."""
+        solvers = np.array(list(self.manifest.solvers))
+        write(self.folder / TRIALS, _table(trials))
+        write(self.folder / SOLUTIONS, _arrays({"U": U, "solver": solvers, "layout": layouts.ids}))
+        write(self.folder / LAYOUTS, _arrays(layouts.arrays()))
+
+    def replace(self, trials: pd.DataFrame, layouts: Layouts) -> None:
+        """Put other trials and layouts in the place of a finished study's."""
+        new = {TRIALS: _bytes(_table(trials)), LAYOUTS: _bytes(_arrays(layouts.arrays()))}
+        # Both contents count as whole until `close`: a stop in between damages nothing.
+        sums = self._checksums()
+        both = {name: [*held, sha256(new[name]).hexdigest()] if name in new else held for name, held in sums.items()}
+        write(self.folder / DONE, _json(both))
+        for name, content in new.items():
+            write(self.folder / name, lambda file, content=content: file.write(content))
 
     def close(self) -> None:
-        """Mark the study as done and drop its shards."""
-        write(self.folder / "done", lambda file: file.write(b""))
+        """Mark the study as done, with the checksums of its files, and drop its shards."""
+        write(self.folder / DONE, _json({name: [checksum(self.folder / name)] for name in FILES}))
         shutil.rmtree(self.folder / "shards", ignore_errors=True)
+        for part in self.folder.glob(f"*{PART}"):  # of a start that was killed while it wrote
+            part.unlink(missing_ok=True)
+
+    def _shards(self, solver: str) -> list[Path]:
+        name = re.compile(rf"{re.escape(solver)}-\d+-\d+\.npz")
+        return sorted(path for path in self.folder.glob("shards/*.npz") if name.fullmatch(path.name))
+
+    def _read(self, path: Path, solver: str) -> Flown:
+        """A shard's rows and controls; InputError where it is damaged, or holds anything but what its name says."""
+        rows, U = read_shard(path)
+        first, last = map(int, path.stem.split("-")[-2:])
+        numbers = list(range(first, last + 1))
+        if rows["layout"].tolist() != numbers or not set(numbers) <= self.manifest.layouts.keys():
+            raise damaged(path, f"holds layouts {rows['layout'].tolist()}")
+        wanted = {"solver": solver, "settings_digest": self.manifest.settings[solver], **self.manifest.constants}
+        wanted |= {"layout_digest": [self.manifest.layouts[number] for number in numbers]}
+        for name, value in wanted.items():
+            if not (rows[name] == value).all():
+                raise damaged(path, f"is of another study (column {name})")
+        return rows, U
+
+    def _checksums(self) -> dict[str, list[str]]:
+        """By file, the checksums under which it is whole; with `repair`, none where that isn't known."""
+        try:
+            sums = read_checksums(self.folder / DONE)
+            if sums.keys() != set(FILES):
+                raise damaged(self.folder / DONE, "is damaged (it doesn't name all files)")
+        except InputError:
+            if not self.repair:
+                raise
+            return {}
+        return sums
+
+    def _refuse_foreign(self) -> None:
+        """Raise where a readable file in the folder is of another study than the manifest to be written."""
+        wanted = self.manifest.settings
+        for path in [self.folder / TRIALS, *self.folder.glob("shards/*.npz")]:
+            try:
+                rows = pd.read_parquet(path) if path.name == TRIALS else read_shard(path)[0]
+            except Exception:  # unreadable, whatever the reader makes of it: to be redone
+                continue
+            allowed = {"solver": wanted.keys(), "settings_digest": wanted.values()}
+            allowed |= {name: [value] for name, value in self.manifest.constants.items()}
+            for name, values in {**allowed, "layout_digest": self.manifest.layouts.values()}.items():
+                if name not in rows.columns or not set(rows[name]) <= set(values):
+                    raise self._another(f"(column {name} of {path.name})")
+
+    def _another(self, which: str) -> InputError:
+        return InputError(
+            "hydra.run.dir", "an empty folder, or one of this very study", f"{self.folder}, which holds another {which}"
+        )
 
 
-def digest(layouts: Layouts) -> str:
-    """A hash of what is flown: a changed file under the same name is another study, a lower best cost in it isn't."""
-    total = sha256()
-    for name, array in sorted(replace(layouts, best_cost=None).arrays().items()):
-        total.update(f"{name}{array.shape}{array.dtype}".encode() + np.ascontiguousarray(array).tobytes())
-    return total.hexdigest()
+def read_manifest(path: Path) -> Manifest | None:
+    """The manifest in a study.json, None for that of an older version; InputError where it is damaged."""
+    try:
+        return Manifest.from_json(path.read_bytes())
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise damaged(path, f"is damaged ({_first_line(error)})") from None
 
 
-def _difference(held: Any, new: Any, path: str = "") -> str:
-    """The first key where two configurations part, as 'key is this there and that here'."""
-    if isinstance(held, dict) and isinstance(new, dict):
-        for key in sorted({*held, *new}, key=str):
-            if held.get(key) != new.get(key):
-                return _difference(held.get(key), new.get(key), f"{path}.{key}" if path else str(key))
-    return f"{path.removeprefix('configuration.')} is {held} there, {new} here"
+def read_checksums(path: Path) -> dict[str, list[str]]:
+    """By file, the checksums under which it is whole; none for a study of an older version, whose mark is empty."""
+    try:
+        text = path.read_bytes()
+        sums = json.loads(text) if text else {}
+        if not all(isinstance(held, list) for held in sums.values()):
+            raise ValueError("no checksums")
+        return sums
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise damaged(path, f"is damaged ({_first_line(error)})") from None
+
+
+def read_shard(path: Path) -> Flown:
+    """The rows and controls in a shard; InputError where it can't be read."""
+    try:
+        with zipfile.ZipFile(path) as members:
+            if members.testzip() is not None:  # np.load alone doesn't come to the checksum of every member
+                raise ValueError("a checksum differs")
+        with np.load(path, allow_pickle=False) as held:
+            rows, U = pd.DataFrame(json.loads(str(held["rows"]))), held["U"]
+        absent = {*COLUMNS, "sound"} - {*JUDGED, *rows.columns}
+        if absent or U.ndim != 3 or len(U) != len(rows):
+            raise ValueError(f"{len(rows)} rows, controls {U.shape}, no {', '.join(sorted(absent)) or 'more'}")
+    except Exception as error:  # damaged bytes make numpy, zipfile and zlib raise nearly anything
+        raise damaged(path, f"is damaged ({_first_line(error)})") from None
+    return rows, U
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _table(trials: pd.DataFrame) -> Save:
+    return lambda file: trials.to_parquet(file, index=False)
+
+
+def _arrays(arrays: Mapping[str, np.ndarray]) -> Save:
+    return lambda file: np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def _json(held: Mapping[str, Sequence[str]]) -> Save:
+    return lambda file: file.write(json.dumps(held, indent=1).encode())
+
+
+def _bytes(save: Save) -> bytes:
+    held = io.BytesIO()
+    save(held)
+    return held.getvalue()

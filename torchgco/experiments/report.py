@@ -16,8 +16,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from torchgco.experiments.merge import REPEATED, TRIALS, is_merged, merge, read_trials
-from torchgco.experiments.statistics import OUTCOMES, TASK, paired_table, summarise
+from torchgco.experiments.files import write
+from torchgco.experiments.merge import OLDER, REPEATED, merge
+from torchgco.experiments.records import TRIALS
+from torchgco.experiments.runs import is_merged, read_trials
+from torchgco.experiments.statistics import OUTCOMES, TASK, paired_table, summarise, task_columns
 from torchgco.plotting.distributions import clearance_histogram, violation_histogram
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.rates import rates_figure
@@ -33,13 +36,23 @@ Trajectories = Arrays | Callable[[Arrays, Arrays], Arrays]
 
 
 def compare(trials: pd.DataFrame) -> pd.DataFrame:
-    """For each (scenario, model) the solver that comes first, the one under study, against every other.
+    """For each task the solver that comes first, the one under study, against every other.
 
-    Columns as `paired_table` has them; no rows where a solver flew alone.
+    Where it flew in several variants ("gco [...]"), each of them is compared with all that follow. Columns as
+    `paired_table` has them; no rows where a solver flew alone.
     """
-    tasks = [task for _, task in trials.groupby(TASK, sort=False, dropna=False)]
-    tables = [paired_table(task, task["solver"].iloc[0]) for task in tasks]
+    tables = []
+    for _, task in trials.groupby(task_columns(trials), sort=False, dropna=False):
+        names = task["solver"].unique().tolist()
+        for i, name in enumerate(names):
+            if _bare(name) == _bare(names[0]):
+                tables.append(paired_table(task[task["solver"].isin(names[i:])], name))
     return pd.concat(tables, ignore_index=True)
+
+
+def _bare(solver: str) -> str:
+    """A solver's name without the label that a merge gave it."""
+    return solver.split(" [")[0]
 
 
 def write_report(folder: str | os.PathLike[str], trajectories: Trajectories | None = None) -> str:
@@ -56,7 +69,7 @@ def write_report(folder: str | os.PathLike[str], trajectories: Trajectories | No
     folder = Path(folder)
     trials = read_trials(folder / TRIALS)
     summary = summarise(trials)
-    summary.to_csv(folder / "summary.csv", index=False)
+    write(folder / "summary.csv", lambda file: summary.to_csv(file, index=False))
     figures = {
         "rates": rates_figure(summary),
         "clearance": clearance_histogram(trials),
@@ -68,10 +81,12 @@ def write_report(folder: str | os.PathLike[str], trajectories: Trajectories | No
             trajectories = trajectories(layouts, _solutions(folder / "solutions.npz"))
         figures["layouts"] = layout_grid(layouts, trajectories, trials)
     for name, figure in figures.items():
-        save(figure, folder / "figures" / f"{name}.png")
+        write(folder / "figures" / f"{name}.png", lambda file, figure=figure: save(figure, file))
     text = format_table(summary, compare(trials))
     if repeated := trials.attrs.get(REPEATED, 0):
-        text += f"\n\n{repeated} rows left out: another run has the same, and each counts once"
+        text += f"\n\n{repeated} rows left out: another run has the same flight, and each counts once"
+    if older := trials.attrs.get(OLDER, []):
+        text += f"\n\nof an older version, distinguished by configuration and results alone: {', '.join(older)}"
     return text
 
 
@@ -92,18 +107,30 @@ def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
     """
     blocks = []
     for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
-        seeds = ", ".join(task["seed"].unique())
+        seeds = ", ".join(dict.fromkeys(seed for held in task["seed"] for seed in held.split()))
         blocks.append(f"{scenario} ({model}), seed {seeds}")
-        blocks += [_rates(task), _effort(task)]
+        swept = [name for name in task_columns(task)[len(TASK) :] if task[name].notna().any()]
+        blocks += [_rates(task, swept), _effort(task, swept)]
         rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
         if len(rows):
-            blocks.append(_paired(rows))
+            blocks.append(_paired(rows, swept))
     return "\n\n".join(blocks)
 
 
-def _rates(task: pd.DataFrame) -> str:
-    rows = [[row["solver"], *(_rate(row, name) for name in OUTCOMES)] for _, row in task.iterrows()]
-    return _align([["solver", *OUTCOMES], *rows])
+def _headers(swept: Sequence[str]) -> list[str]:
+    """Swept variables as they head a column of the terminal: without the group of the key."""
+    return [name.removeprefix("scenario.").removeprefix("model.vehicle.") for name in swept]
+
+
+def _cells(row: pd.Series, swept: Sequence[str]) -> list[str]:
+    return ["-" if pd.isna(row[name]) else str(row[name]) for name in swept]
+
+
+def _rates(task: pd.DataFrame, swept: Sequence[str]) -> str:
+    rows = [
+        [*_cells(row, swept), row["solver"], *(_rate(row, name) for name in OUTCOMES)] for _, row in task.iterrows()
+    ]
+    return _align([[*_headers(swept), "solver", *OUTCOMES], *rows], len(swept) + 1)
 
 
 def _rate(row: pd.Series, name: str) -> str:
@@ -128,36 +155,37 @@ EFFORT = (
 )
 
 
-def _effort(task: pd.DataFrame) -> str:
-    rows = [["solver", *(header for header, _, _ in EFFORT)]]
+def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
+    rows = [[*_headers(swept), "solver", *(header for header, _, _ in EFFORT)]]
     for _, row in task.iterrows():
         cells = ["-" if isnan(row[name]) else f"{row[name]:{form}}" for _, name, form in EFFORT]
-        rows.append([row["solver"], *cells])
-    return _align(rows)
+        rows.append([*_cells(row, swept), row["solver"], *cells])
+    return _align(rows, len(swept) + 1)
 
 
 COUNTS = {"n": "n", "both": "both", "only_a": "first", "only_b": "second", "neither": "neither"}
 PAIRED = ("paired", "outcome", *COUNTS.values(), "difference", "McNemar p", "left out")
 
 
-def _paired(rows: pd.DataFrame) -> str:
-    lines: list[Sequence[str]] = [PAIRED]
-    for row in rows.itertuples():
+def _paired(rows: pd.DataFrame, swept: Sequence[str]) -> str:
+    lines: list[Sequence[str]] = [[*_headers(swept), *PAIRED]]
+    for _, row in rows.iterrows():
         difference = f"{100 * row.difference:+.0f} points" if row.n else "-"
         p_value = f"{row.p_value:.2g}" if row.n else "-"
         pair, left_out = f"{row.solver_a} - {row.solver_b}", row.undefined + row.unmatched
-        counts = [str(getattr(row, name)) for name in COUNTS]
-        lines.append([pair, row.outcome, *counts, difference, p_value, str(left_out)])
-    return _align(lines)
+        counts = [str(row[name]) for name in COUNTS]
+        lines.append([*_cells(row, swept), pair, row.outcome, *counts, difference, p_value, str(left_out)])
+    return _align(lines, len(swept) + 1)
 
 
-def _align(rows: Sequence[Sequence[str]]) -> str:
-    """Rows as lines of columns: the first flush left, the others flush right."""
+def _align(rows: Sequence[Sequence[str]], left: int) -> str:
+    """Rows as lines of columns: the first `left` flush left, the others flush right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:
-        first, *rest = zip(row, widths, strict=True)
-        lines.append("  ".join([first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in rest)]))
+        cells = list(zip(row, widths, strict=True))
+        names = [cell.ljust(width) for cell, width in cells[:left]]
+        lines.append("  ".join([*names, *(cell.rjust(width) for cell, width in cells[left:])]))
     return "\n".join(lines)
 
 
@@ -172,8 +200,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         merged = merge(options.folders)
         if (output / TRIALS).exists() and not is_merged(read_trials(output / TRIALS)):
             raise InputError("--output", "a folder without the results of a study, which are kept", output)
-        output.mkdir(parents=True, exist_ok=True)
-        merged.to_parquet(output / TRIALS, index=False)
+        write(output / TRIALS, lambda file: merged.to_parquet(file, index=False))
         print(write_report(output))
         print(f"\nwritten to {output}")
     except InputError as error:

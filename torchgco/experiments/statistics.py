@@ -20,7 +20,6 @@ from torchgco.status import Status
 
 OUTCOMES = ("feasible", "reached", "success")
 TASK = ["scenario", "model"]
-GROUP = [*TASK, "solver"]
 PAIR = [*TASK, "layout", "seed"]
 EFFORT = ["iterations", "outer_iterations", "guided", "seconds"]
 COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, "violation", "cost", *EFFORT]
@@ -56,8 +55,16 @@ class PairedResult:
     unmatched: int
 
 
+def task_columns(table: pd.DataFrame) -> list[str]:
+    """What tells one task from another: scenario, model, and the variables swept in a merged table.
+
+    The latter are named by their keys in the configuration, with a dot, as no column of a study is.
+    """
+    return [*TASK, *(str(name) for name in table.columns if "." in str(name))]
+
+
 def summarise(trials: pd.DataFrame) -> pd.DataFrame:
-    """One row per (scenario, model, solver), in order of appearance.
+    """One row per (scenario, model, solver), in order of appearance; in a merged table also per swept variable.
 
     n                   trials; seed: their seeds, as text; invalid: those of invalid start, all failures
     <outcome>_count, _n, _rate, _low, _high
@@ -72,16 +79,17 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
     Raises InputError if `trials` is empty or lacks a column.
     """
     _check(trials)
-    groups = trials.groupby(GROUP, sort=False, dropna=False)
-    return pd.DataFrame([_summary(group) for _, group in groups])
+    names = [*task_columns(trials), "solver"]
+    groups = trials.groupby(names, sort=False, dropna=False)
+    return pd.DataFrame([_summary(group, names) for _, group in groups])
 
 
-def _summary(group: pd.DataFrame) -> dict[str, object]:
+def _summary(group: pd.DataFrame, names: list[str]) -> dict[str, object]:
     valid = group[group["status"] != INVALID]
     violation = np.nan_to_num(_numbers(group["violation"]), nan=np.inf, posinf=np.inf)
     cost = _numbers(group["cost"])
     reached = outcome_of(group, "reached").to_numpy(dtype=bool, na_value=False)
-    row: dict[str, object] = {name: group[name].iloc[0] for name in GROUP}
+    row: dict[str, object] = {name: group[name].iloc[0] for name in names}
     row |= {
         "n": len(group),
         "seed": " ".join(str(seed) for seed in group["seed"].unique()),
@@ -124,7 +132,9 @@ def wilson(count: int, n: int) -> tuple[float, float]:
 
 
 def paired(trials: pd.DataFrame, solver_a: str, solver_b: str, outcome: str = "reached") -> PairedResult:
-    """Compare two solvers on the trials both flew, matched by scenario, model, layout and seed.
+    """Compare two solvers on the trials both flew, matched by scenario, model, swept variables, layout and seed.
+
+    A layout is the same where its digest is, too, if the table has a column `layout_digest`.
 
     Raises InputError for a column that is missing, a solver that isn't in `trials`, an unknown outcome, and a
     solver that has two rows for one trial.
@@ -133,7 +143,7 @@ def paired(trials: pd.DataFrame, solver_a: str, solver_b: str, outcome: str = "r
     if outcome not in OUTCOMES:
         raise InputError("outcome", f"one of {', '.join(OUTCOMES)}", outcome)
     a, b = (_by_trial(trials, solver, outcome) for solver in (solver_a, solver_b))
-    rows = a.merge(b, on=PAIR, how="outer", suffixes=("_a", "_b"), indicator="flown_by")
+    rows = a.merge(b, on=_pair(trials), how="outer", suffixes=("_a", "_b"), indicator="flown_by")
     shared = rows[rows["flown_by"] == "both"]
     defined = shared.dropna(subset=["hit_a", "hit_b"])
     hit_a, hit_b = (defined[name].to_numpy(dtype=bool) for name in ("hit_a", "hit_b"))
@@ -156,26 +166,33 @@ def paired(trials: pd.DataFrame, solver_a: str, solver_b: str, outcome: str = "r
 
 
 def paired_table(trials: pd.DataFrame, solver: str) -> pd.DataFrame:
-    """`solver` against every other solver: a row per (scenario, model), other solver and outcome.
+    """`solver` against every other solver: a row per task (scenario, model, swept variables), other solver and outcome.
 
-    Columns: scenario, model and the fields of PairedResult, `solver` being a. Tasks that `solver` didn't fly
+    Columns: those of the task and the fields of PairedResult, `solver` being a. Tasks that `solver` didn't fly
     and tasks that nobody else flew give no row. Raises InputError as `paired` does.
     """
     _check(trials)
     if solver not in set(trials["solver"]):
         raise InputError("solver", f"one of {', '.join(trials['solver'].unique())}", solver)
     rows = list(_pairs(trials, solver))
-    names = [*TASK, *PairedResult.__dataclass_fields__]
+    names = [*task_columns(trials), *PairedResult.__dataclass_fields__]
     return pd.DataFrame(rows, columns=names)
 
 
 def _pairs(trials: pd.DataFrame, solver: str) -> Iterator[dict[str, object]]:
-    for (scenario, model), task in trials.groupby(TASK, sort=False, dropna=False):
+    names = task_columns(trials)
+    for values, task in trials.groupby(names, sort=False, dropna=False):
         solvers = list(task["solver"].unique())
         others = [other for other in solvers if other != solver] if solver in solvers else []
         for other in others:
             for name in OUTCOMES:
-                yield {"scenario": scenario, "model": model} | asdict(paired(task, solver, other, name))
+                yield dict(zip(names, values, strict=True)) | asdict(paired(task, solver, other, name))
+
+
+def _pair(trials: pd.DataFrame) -> list[str]:
+    """Columns that name a trial whatever the solver."""
+    digest = ["layout_digest"] if "layout_digest" in trials.columns else []
+    return [*task_columns(trials), *PAIR[len(TASK) :], *digest]
 
 
 def _by_trial(trials: pd.DataFrame, solver: str, outcome: str) -> pd.DataFrame:
@@ -183,12 +200,13 @@ def _by_trial(trials: pd.DataFrame, solver: str, outcome: str) -> pd.DataFrame:
     group = trials[trials["solver"] == solver]
     if group.empty:
         raise InputError("solver", f"one of {', '.join(trials['solver'].unique())}", solver)
-    repeated = group.loc[group.duplicated(PAIR), PAIR]
+    pair = _pair(trials)
+    repeated = group.loc[group.duplicated(pair), PAIR]
     if len(repeated):
         first = ", ".join(f"{name} {value}" for name, value in repeated.iloc[0].items())
         raise InputError("trials", f"one row of {solver} for {first}", "two")
-    tasks = group.groupby(TASK, sort=False, dropna=False)
-    return group[PAIR].assign(hit=pd.concat([outcome_of(task, outcome) for _, task in tasks]))
+    tasks = group.groupby(task_columns(trials), sort=False, dropna=False)
+    return group[pair].assign(hit=pd.concat([outcome_of(task, outcome) for _, task in tasks]))
 
 
 def _check(trials: pd.DataFrame) -> None:

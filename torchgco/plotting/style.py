@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from math import ceil
 from pathlib import Path
+from typing import IO
 from zlib import crc32
 
 import pandas as pd
@@ -77,13 +78,24 @@ def legend(figure: Figure, handles: Sequence[Artist]) -> None:
 
 
 def tasks_of(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """The rows of each (scenario, model) in order of appearance, with a title for their panel."""
-    for (scenario, model), rows in table.groupby(["scenario", "model"], sort=False, dropna=False):
-        yield f"{scenario} ({model})", rows
+    """The rows of each task in order of appearance, with a title for their panel.
+
+    A task is (scenario, model) and, in a merged table, the values of the swept variables: the columns with a dot.
+    """
+    swept = [name for name in table.columns if "." in str(name)]
+    for (scenario, model, *values), rows in table.groupby(["scenario", "model", *swept], sort=False, dropna=False):
+        more = [f"{name.split('.')[-1]} {value}" for name, value in zip(swept, values, strict=True) if pd.notna(value)]
+        yield ", ".join([f"{scenario} ({model})", *more]), rows
 
 
-def save(figure: Figure, path: str | os.PathLike[str], dpi: int = 150) -> Path:
-    """Write the figure, in the format that the ending of `path` names, into a folder made if need be."""
+def save(figure: Figure, path: str | os.PathLike[str] | IO[bytes], dpi: int = 150) -> Path | None:
+    """Write the figure, in the format that the ending of `path` names, into a folder made if need be.
+
+    An open file instead of a path gets a PNG; nothing is returned then.
+    """
+    if not isinstance(path, str | os.PathLike):
+        figure.savefig(path, format="png", dpi=dpi, facecolor="white")
+        return None
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=dpi, facecolor="white")

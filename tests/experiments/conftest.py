@@ -1,0 +1,51 @@
+"""Commands in this process, and ways to stop them."""
+
+import sys
+
+import pytest
+
+from torchgco.experiments import app, study
+from torchgco.experiments.records import Records
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """torchgco in this process: (exit code, stdout, stderr). Quicker than a new one for every case."""
+
+    def call(*words: str) -> tuple[int, str, str]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["torchgco", *words])
+        try:
+            code = app.main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
+
+
+@pytest.fixture
+def run_until(run, monkeypatch):
+    """The same, interrupted once so many shards are written."""
+
+    def call(shards: int, *words: str) -> None:
+        written = []
+
+        def keep(self, *flown, real=Records.keep):
+            real(self, *flown)
+            written.append(flown)
+            if len(written) == shards:
+                raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Records, "keep", keep)
+            assert run(*words)[0] == 130
+
+    return call
+
+
+@pytest.fixture
+def without_report(monkeypatch):
+    """Studies write no summary and no figures: these take longer than all else in a study where nothing is solved."""
+    monkeypatch.setattr(study, "write_report", lambda folder, trajectories: "")

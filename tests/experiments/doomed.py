@@ -1,0 +1,48 @@
+"""Work and solvers that kill the process they run in, as the system does where memory is short."""
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchgco.baselines import Hold
+
+
+def prepare(*_: object) -> None:
+    """Nothing to prepare."""
+
+
+def work(job: tuple[int, str]) -> int:
+    """The job's number doubled; a job with a path kills its process as long as there is no file."""
+    number, path = job
+    if path == "always":
+        time.sleep(1.0)  # the others are done by then
+        os.kill(os.getpid(), signal.SIGKILL)
+    if path and not Path(path).exists():
+        Path(path).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if number < 0:
+        raise ValueError(f"job {number}")
+    return 2 * number
+
+
+@dataclass(frozen=True)
+class Doomed(Hold):
+    """Hold, but a process that flies layout 2 or a later one is killed, unless the file `spared` is in its folder."""
+
+    def solve(self, problem, U0, seed=0, ids=None, warm=None, callback=None):
+        if int(ids.max()) >= 2 and not Path("spared").exists():
+            time.sleep(0.5)
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().solve(problem, U0, seed, ids, warm, callback)
+
+
+@dataclass(frozen=True)
+class Slow(Hold):
+    """Hold, but from layout 2 on it takes longer than any test waits."""
+
+    def solve(self, problem, U0, seed=0, ids=None, warm=None, callback=None):
+        if int(ids.max()) >= 2 and not Path("spared").exists():
+            time.sleep(600)
+        return super().solve(problem, U0, seed, ids, warm, callback)

@@ -1,0 +1,57 @@
+"""How an experiment writes and checks a file: whole or not at all, and one line for everything that goes wrong."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+from typing import IO, Any
+
+from torchgco.shapes import InputError
+
+PART = ".part"  # ending of a file that is still being written
+
+
+def write(path: Path, save: Callable[[IO[bytes]], Any]) -> None:
+    """Let `save(file)` write a temporary file in the same folder, fsync it and move it to `path`.
+
+    A reader sees the old file or the new one, never a part. On any failure the temporary file is removed.
+
+    Raises:
+        InputError: the system refuses to write there (disk full, no permission).
+    """
+    part: str | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, part = tempfile.mkstemp(dir=path.parent, suffix=PART)
+        with os.fdopen(handle, "wb") as file:
+            save(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(part, 0o644)
+        os.replace(part, path)
+    except OSError as error:
+        raise InputError(
+            "hydra.run.dir", "a folder with room that may be written to", f"{path} ({error.strerror or error})"
+        ) from None
+    finally:
+        if part is not None:
+            Path(part).unlink(missing_ok=True)  # gone already after a move
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    with open(path, "rb") as file:
+        total = sha256()
+        for block in iter(lambda: file.read(1 << 20), b""):
+            total.update(block)
+    return total.hexdigest()
+
+
+def damaged(path: Path, reason: str) -> InputError:
+    """The line for a file of a study that can't be used as it is: which file, why, and the way out."""
+    return InputError(
+        "hydra.run.dir", "whole files of this study", f"{path}, which {reason} (study.repair=true redoes it)"
+    )

@@ -1,0 +1,172 @@
+"""One solver flies a batch of layouts, and every flight becomes a row."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass, replace
+from typing import IO, Any, Protocol
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco.certificate import certify
+from torchgco.certificate import frame_columns as certificate_columns
+from torchgco.experiments.build import Setup, allotted_cores
+from torchgco.judge import frame_columns, judge
+from torchgco.kernels import compiling
+from torchgco.problem import Problem
+from torchgco.scenarios import Layouts
+from torchgco.shapes import InputError
+from torchgco.solution import Solution
+from torchgco.solvers.memory import is_out_of_memory, plan_batch
+from torchgco.solvers.state import Progress
+from torchgco.status import Status
+
+WARM_UP = 8  # problems that are solved once for what they compile
+NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a study is flown: checked options of `study` that decide no result.
+
+    batch_size  problems worked on at once by a process; None: as many as are fast and fit into memory
+    shard_size  layouts to a file
+    workers     processes
+    repair      damaged files are redone
+    """
+
+    batch_size: int | None
+    shard_size: int
+    workers: int
+    repair: bool
+
+
+def plan_of(setup: Setup) -> Plan:
+    """The plan of a configuration; InputError names the option that is malformed."""
+    given = setup.config.study
+    if not isinstance(given.repair, bool):
+        raise InputError("study.repair", "true or false", repr(given.repair))
+    # On a GPU the batches of several processes would share one device.
+    processes = 1 if setup.device.type == "cuda" else max(1, allotted_cores() // torch.get_num_threads())
+    return Plan(
+        batch_size=None if given.batch_size == "auto" else _count(given.batch_size, "batch_size", ", or auto"),
+        shard_size=_count(given.shard_size, "shard_size"),
+        workers=processes if given.workers is None else _count(given.workers, "workers", ", or null for one a core"),
+        repair=given.repair,
+    )
+
+
+def _count(value: object, name: str, otherwise: str = "") -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise InputError(f"study.{name}", f"at least 1{otherwise}", repr(value))
+    return value
+
+
+class Bar(Protocol):
+    """The part of a tqdm bar that a flight uses."""
+
+    def update(self, n: float) -> Any: ...
+    def set_postfix(self, ordered_dict: Any, refresh: bool) -> Any: ...
+    def write(self, s: str, file: IO[str]) -> Any: ...
+
+
+class NoBar:
+    """Shows warnings only, in worker processes: even a disabled tqdm makes a semaphore, which would leak in a kill."""
+
+    def update(self, n: float) -> None:
+        """Nothing is shown."""
+
+    def set_postfix(self, ordered_dict: Any, refresh: bool) -> None:
+        """Nothing is shown."""
+
+    def write(self, s: str, file: IO[str]) -> None:
+        """The line as it is."""
+        print(s, file=file)
+
+
+@dataclass
+class Flight:
+    """A batch of layouts flown by one solver."""
+
+    setup: Setup
+    layouts: Layouts
+    name: str
+    solver: Any
+    bar: Bar
+    shown: int = 0
+
+    def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
+        """Rows (without success) and controls (L, N, m), NaN where nothing was flown."""
+        setup, layouts = self.setup, self.layouts
+        task = setup.vehicle.task(layouts, setup.device, setup.dtype)
+        ids = torch.as_tensor(layouts.ids, device=setup.device)
+        solution, seconds, at_once = self._solve(task.problem, task.U0, ids)
+        self.bar.update(layouts.count - self.shown)
+        statuses = [status.name for status in solution.statuses]
+        U = solution.U.detach().to("cpu", torch.float64)
+        U[[status in NOT_FLOWN for status in statuses]] = torch.nan
+        checked = setup.vehicle.task(layouts)
+        verdict = judge(checked.problem, U, checked.goal, checked.goal_radius)
+        certificate = certify(checked.problem, solution.X.detach().to("cpu", torch.float64), U, verdict.feasible)
+        rows = pd.DataFrame(
+            {
+                "scenario": layouts.name, "layout": layouts.ids, "seed": setup.seed, "model": setup.vehicle.name,
+                "solver": self.name, "status": statuses, **frame_columns(verdict), "sound": verdict.sound.numpy(),
+                **certificate_columns(certificate),
+                "iterations": solution.iterations.cpu().numpy(),
+                "outer_iterations": solution.outer_iterations.cpu().numpy(),
+                "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": at_once,
+                "threads": torch.get_num_threads(), "device": setup.device.type,
+                "dtype": str(setup.dtype).removeprefix("torch."), "version": torchgco.__version__,
+            }
+        )  # fmt: skip
+        return rows, U.numpy()
+
+    def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, int]:
+        """The solution, seconds per problem, and problems worked on at once: half as many after each lack of memory."""
+        # What a solver builds or compiles for a batch is set-up: the clock starts after it.
+        solver = self.solver.prepare(problem) if hasattr(self.solver, "prepare") else self.solver
+        if compiling():
+            few = torch.arange(min(WARM_UP, problem.B), device=U0.device)
+            self.solver.solve(problem.take(few), U0[few], seed=self.setup.seed, ids=ids[few])
+        at_once = getattr(solver, "at_once", problem.B)
+        if hasattr(solver, "slots"):
+            plan = plan_of(self.setup)
+            at_once = min(problem.B, plan.batch_size or plan_batch(problem, self.setup.device, plan.workers))
+            solver = replace(solver, slots=at_once)
+        while True:
+            began = _now(self.setup.device)
+            try:
+                solution = solver.solve(problem, U0, seed=self.setup.seed, ids=ids, callback=self._progress)
+            except (RuntimeError, MemoryError) as error:
+                smaller = _with_slots(solver, at_once // 2)
+                if at_once == 1 or smaller is None or not is_out_of_memory(error):
+                    raise
+                solver, at_once = smaller, at_once // 2
+                self.bar.write(f"{self.name}: out of memory, on with {at_once} problems at once", sys.stderr)
+                continue
+            return solution, (_now(self.setup.device) - began) / problem.B, at_once
+
+    def _progress(self, progress: Progress) -> None:
+        self.bar.update(max(0, progress.finished - self.shown))
+        self.bar.set_postfix({"pass": progress.passes}, refresh=False)
+        self.shown = max(self.shown, progress.finished)
+
+
+def _with_slots(solver: Any, slots: int) -> Any:
+    """The solver, or the one it wraps as `solver`, with so many slots; None where there are none to set."""
+    if hasattr(solver, "slots"):
+        return replace(solver, slots=max(1, slots))
+    inner: Any = getattr(solver, "solver", None)
+    return replace(solver, solver=replace(inner, slots=max(1, slots))) if hasattr(inner, "slots") else None
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()

@@ -1,0 +1,189 @@
+"""What makes two studies, two layouts or two solvers the same: the content of study.json.
+
+Results depend on the version, the seed, the layouts, the planning model, the settings of the solvers and the
+arithmetic of the device. How a study is cut into batches and processes decides no bit of them (CONTRIBUTING, "The
+batch contract") and is no part of its identity.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+from typing import Any, Self
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from torchgco.scenarios import Layouts
+
+ARITHMETIC = ("name", "dtype", "compile")  # keys of `device` that decide results
+# Keys of `study` and `device` that say how a study is flown.
+FLOWN_BY = (("study", "batch_size"), ("study", "shard_size"), ("study", "workers"), ("device", "threads"))
+# Keys of `model.vehicle` that layouts may overrule, and by which of their fields.
+OVERRULED = {
+    "start": "start", "goal": "goal", "radius": "vehicle_radius", "goal_radius": "goal_radius", "stages": "stages",
+    "control_lower": "control_lower", "control_upper": "control_upper",
+}  # fmt: skip
+DIGITS = 16  # hexadecimal, of a digest: 64 bits
+EXACT = 2**53  # beyond it neighbouring whole numbers, as seeds, are one float
+LONGEST = 40  # letters of a value in a message
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A configuration as plain dicts, lists and numbers, resolved."""
+    held = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(held, dict)
+    return {str(key): value for key, value in held.items()}
+
+
+def settings_of(config: DictConfig) -> dict[str, Any]:
+    """The settings of a configuration's solver, resolved, without its name."""
+    return {key: value for key, value in plain(config)["solver"].items() if key != "name"}
+
+
+def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a resolved configuration that decides results, with the settings of all solvers that fly."""
+    flown_by = {}
+    if any(key.split(".")[-1] == "polish" and value for s in solvers.values() for key, value in _branches(s)):
+        flown_by = {name: configuration[group].get(name) for group, name in FLOWN_BY}
+    return {
+        "scenario": configuration["scenario"],
+        "model": {"vehicle": configuration["model"]["vehicle"]},
+        "device": {name: configuration["device"].get(name) for name in ARITHMETIC},
+        "study": {"solvers": list(solvers), **flown_by},
+        "solvers": dict(solvers),
+    }
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a study flies: the content of its study.json.
+
+    configuration  resolved, with `version`, as the study was first started
+    solvers        resolved settings by name, the solver under study first
+    layouts        digest of each layout by its id
+    """
+
+    configuration: dict[str, Any]
+    solvers: dict[str, Any]
+    layouts: dict[int, str]
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Digest of each solver's settings, by its name."""
+        return {name: digest(settings) for name, settings in self.solvers.items()}
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """What all rows of the study have in common, by column."""
+        device, given = self.configuration["device"], self.configuration
+        return {
+            "seed": given["seed"], "version": given["version"], "device": device["name"], "dtype": device["dtype"]
+        }  # fmt: skip
+
+    def identity(self) -> dict[str, Any]:
+        """Equal for two studies exactly if they compute the same; the clearest differences come first."""
+        held = decisive(self.configuration, self.solvers)
+        study = {"layouts": len(self.layouts), **held.pop("study")}
+        given = {"version": self.configuration["version"], "seed": self.configuration["seed"], "study": study}
+        return _normal({**given, **held, "layouts": {str(i): code for i, code in self.layouts.items()}})
+
+    def to_json(self) -> bytes:
+        """The text of study.json; the digests of the settings stand in it for readers alone."""
+        held = {"configuration": self.configuration, "solvers": self.solvers, "settings": self.settings}
+        held["layouts"] = {str(number): code for number, code in self.layouts.items()}
+        return json.dumps({**held, "checksum": digest(held)}, indent=1, default=str).encode()
+
+    @classmethod
+    def from_json(cls, text: bytes) -> Self | None:
+        """What `to_json` wrote, or None for the study.json of an older version.
+
+        Raises:
+            ValueError, TypeError, KeyError, AttributeError: the text is neither.
+        """
+        held = json.loads(text.decode())
+        if "solvers" not in held and isinstance(held["configuration"], dict) and isinstance(held["layouts"], str):
+            return None
+        layouts = {int(number): str(code) for number, code in held["layouts"].items()}
+        made = cls(held["configuration"], held["solvers"], layouts)
+        if held.pop("checksum") != digest(held):
+            raise ValueError("its checksum differs from its content")
+        return made
+
+
+def digest(value: Any) -> str:
+    """A digest of plain data: 1 and 1.0 are the same, the order of keys doesn't matter."""
+    return sha256(json.dumps(_normal(value), sort_keys=True, default=str).encode()).hexdigest()[:DIGITS]
+
+
+def layout_digests(layouts: Layouts, vehicle: Mapping[str, Any]) -> dict[int, str]:
+    """Digest of each layout by its id: the obstacles with all that a flight among them depends on but the solver.
+
+    vehicle  `model.vehicle` of the resolved configuration; layouts overrule it where they say more. What the best
+             known cost is doesn't count.
+    """
+    model = {key: value for key, value in vehicle.items() if key not in (*OVERRULED, "name")}
+    if layouts.dt is not None:
+        model["dynamics"] = {key: value for key, value in dict(model["dynamics"]).items() if key != "dt"}
+    shared = {"model": model, "dt": layouts.dt}
+    for key, field in OVERRULED.items():
+        given = getattr(layouts, field)
+        shared[key] = vehicle.get(key) if given is None else given
+    moves = layouts.velocities is not None and bool(np.nan_to_num(layouts.velocities).any())
+    codes = {}
+    for i, number in enumerate(layouts.ids.tolist()):
+        there = ~np.isnan(layouts.radii[i])
+        own = {"centers": layouts.centers[i][there], "radii": layouts.radii[i][there]}
+        if moves and layouts.velocities is not None:
+            own["velocities"] = layouts.velocities[i][there]
+        for name in ("start", "goal"):
+            if getattr(layouts, name) is not None:
+                own[name] = getattr(layouts, name)[i]
+        codes[number] = digest({**shared, **own})
+    return codes
+
+
+def difference(held: Any, new: Any, path: str = "") -> str:
+    """The first key in which two identities differ, as 'key is this there, that here'."""
+    if isinstance(held, dict) and isinstance(new, dict):
+        for key in dict.fromkeys([*new, *held]):
+            if held.get(key) != new.get(key):
+                return difference(held.get(key), new.get(key), f"{path}.{key}" if path else str(key))
+    return f"{path} is {_short(held)} there, {_short(new)} here"
+
+
+def flat(tree: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+    """The leaves of nested dicts by their dotted keys; lists are leaves."""
+    return {key: value for key, value in _branches(tree, path) if not (isinstance(value, Mapping) and value)}
+
+
+def _branches(tree: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
+    found = []
+    for key, value in tree.items():
+        name = f"{path}.{key}" if path else str(key)
+        found.append((name, value))
+        if isinstance(value, Mapping):
+            found += _branches(value, name)
+    return found
+
+
+def _normal(value: Any) -> Any:
+    """Plain data in which equal numbers are equal in text: floats alone, no negative zero."""
+    if isinstance(value, Mapping):
+        return {str(key): _normal(held) for key, held in value.items()}
+    if isinstance(value, np.ndarray):
+        return _normal(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_normal(held) for held in value]
+    if isinstance(value, int | float) and not isinstance(value, bool) and not abs(value) > EXACT:
+        return float(value) + 0.0
+    return value
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    text = str(value)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

@@ -1,0 +1,105 @@
+"""The finished runs below some folders, as `torchgco-report` finds them."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from torchgco.experiments.files import checksum, damaged
+from torchgco.experiments.records import DONE, MANIFEST, TRIALS, read_checksums, read_manifest
+from torchgco.experiments.statistics import PAIR
+from torchgco.shapes import InputError
+
+MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
+ROW = [*PAIR, "solver"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One table of trials with what is known of its origin.
+
+    configuration  of the study, from its study.json, else from `.hydra/`; empty where there is neither
+    solvers        resolved settings by name; empty for a run of an older version
+    """
+
+    folder: Path
+    trials: pd.DataFrame
+    configuration: dict[str, Any]
+    solvers: dict[str, Any]
+
+
+def find_runs(folders: Iterable[str | os.PathLike[str]]) -> list[Run]:
+    """The runs in and below `folders`, each once, in the order of the folders and by name below each.
+
+    Tables that a merge wrote are passed over below a folder, and read where the folder itself is given.
+
+    Raises:
+        InputError: a folder that isn't there, folders without trials, a damaged file.
+    """
+    given = [Path(folder) for folder in folders]
+    tables = {path.resolve(): (path.parent, trials) for path, trials in _tables(given)}
+    if not tables:
+        raise InputError("folders", f"a {TRIALS} in or below them", ", ".join(map(str, given)) or "no folder")
+    return [Run(folder, trials, *_origin(folder)) for folder, trials in tables.values()]
+
+
+def read_trials(path: str | os.PathLike[str]) -> pd.DataFrame:
+    """The table in a `trials.parquet`.
+
+    Raises:
+        InputError: it can't be read, doesn't name its trials, or isn't as the study left it.
+    """
+    mark = Path(path).parent / DONE
+    sums = read_checksums(mark).get(TRIALS, []) if mark.is_file() else []
+    if sums and Path(path).is_file() and checksum(Path(path)) not in sums:
+        raise damaged(Path(path), "isn't as the study wrote it")
+    try:
+        trials = pd.read_parquet(path)
+    except Exception as error:  # damaged bytes make the reader raise nearly anything
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError("trials", "a readable parquet file", f"{path} ({reason})") from None
+    missing = [name for name in ROW if name not in trials.columns]
+    if missing:
+        raise InputError("trials", f"columns {', '.join(ROW)}", f"{path} without {', '.join(missing)}")
+    return trials
+
+
+def is_merged(trials: pd.DataFrame) -> bool:
+    """Whether the table comes out of a merge rather than out of a study."""
+    return MERGED in trials.attrs
+
+
+def _tables(folders: list[Path]) -> Iterator[tuple[Path, pd.DataFrame]]:
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError("folders", "a folder that is there", folder)
+        for path in sorted(folder.rglob(TRIALS)):
+            trials = read_trials(path)
+            if path.parent == folder or not is_merged(trials):
+                yield path, trials
+
+
+def _origin(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Configuration and settings of the solvers, as far as they are known."""
+    path = folder / MANIFEST
+    try:
+        if path.is_file():
+            manifest = read_manifest(path)
+            if manifest is not None:
+                return manifest.configuration, manifest.solvers
+            return json.loads(path.read_bytes())["configuration"], {}
+        held = OmegaConf.to_container(OmegaConf.load(folder / ".hydra" / "config.yaml"))
+    except (FileNotFoundError, ValueError, YAMLError, OmegaConfBaseException) as error:
+        if isinstance(error, InputError):
+            raise
+        return {}, {}
+    return ({str(key): value for key, value in held.items()} if isinstance(held, dict) else {}), {}

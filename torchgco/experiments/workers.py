@@ -1,0 +1,110 @@
+"""Work for several processes that survives the death of some of them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from torchgco.shapes import InputError
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+NEW_POOLS = 3  # that take the place of broken ones, before giving up
+
+
+def run_all(
+    work: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    processes: int,
+    prepare: Callable[..., None],
+    options: tuple[Any, ...],
+    keep: Callable[[Result], None],
+    say: Callable[[str], None],
+) -> None:
+    """`keep(work(job))` for every job, `work` in other processes, `keep` in this one, in any order.
+
+    A process that dies (killed, out of memory) breaks its pool: the jobs without a result are given to a new pool, at
+    most NEW_POOLS times. An interruption or an error of `work` or `keep` ends all processes.
+
+    Args:
+        prepare, options: `prepare(*options)` runs first in every process.
+        say: receives a line for each broken pool.
+
+    Raises:
+        InputError: the last pool broke, too.
+    """
+    left = dict(enumerate(jobs))
+    for number in range(NEW_POOLS + 1):
+        _run_pool(work, left, min(processes, len(left)), prepare, options, keep)
+        if not left:
+            return
+        if number < NEW_POOLS:
+            say(f"a worker process died: {len(left)} batches are flown again (new pool {number + 1} of {NEW_POOLS})")
+    raise InputError(
+        "study.workers", "processes that live until their batches are flown",
+        f"{NEW_POOLS + 1} pools in which one died (killed, or out of memory?); finished batches are kept, and the "
+        "same command resumes",
+    )  # fmt: skip
+
+
+def _run_pool(
+    work: Callable[[Job], Result],
+    left: dict[int, Job],
+    processes: int,
+    prepare: Callable[..., None],
+    options: tuple[Any, ...],
+    keep: Callable[[Result], None],
+) -> None:
+    """Run the jobs that are left by one pool and remove those with a result; returns early where it broke."""
+    others = set(multiprocessing.active_children())
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(processes, context, _begin_worker, (prepare, options))
+    try:
+        with _interrupts_held():
+            futures = {pool.submit(work, job): number for number, job in left.items()}
+        for future in as_completed(futures):
+            number = futures.pop(future)  # and with it the memory of the result
+            try:
+                result = future.result()
+            except BrokenProcessPool:
+                continue
+            keep(result)
+            del left[number]
+    except BrokenProcessPool:  # while jobs were still handed over
+        pass
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Ctrl-C waits until the end of the block. Processes started in it never see it: it is the parent's to answer."""
+    held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, held)
+
+
+def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...]) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    prepare(*options)
+
+
+def _end_with_parent() -> None:
+    """A worker whose parent was killed would wait for its next job for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
