@@ -19,14 +19,25 @@ R = TypeVar("R")
 
 
 class _Switch:
-    """Whether kernels are compiled in this process."""
+    """Which kernels this process uses."""
 
     on = False
+    native = True
 
 
 def compile_kernels(on: bool) -> None:
     """Compile all kernels on their next call, or go back to eager ones."""
     _Switch.on = on
+
+
+def use_native(on: bool) -> None:
+    """Kernels in C on a CPU (the default), or PyTorch's there too."""
+    _Switch.native = on
+
+
+def native() -> bool:
+    """Whether this process uses kernels in C on a CPU."""
+    return _Switch.native and not _Switch.on
 
 
 def compiling() -> bool:

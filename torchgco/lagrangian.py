@@ -122,18 +122,21 @@ class Lagrangian:
             part._expand(X[rows], U[rows], H[:, rows].transpose(0, 1))
         return H
 
-    def expand_optimality(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
-        """H (N+1, B, s, s) of J_var + lam'c, with the penalty's curvature on the rows that push; and sum |lam c| (B,)
-        of the inequalities that push without being met, which complementarity leaves open.
-        """
+    def expand_optimality(self, X: Tensor, U: Tensor) -> Tensor:
+        """H (N+1, B, s, s) of J_var + lam'c, with the penalty's curvature on the rows that push."""
         H = quadratise(self.problem, X, U)
-        slack = X.new_zeros(X.shape[0])
         for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
             rho = torch.where(lam == 0, 0.0, self.duals.mu.view(-1, 1, 1))
             constraint.accumulate(X, U, lam, rho.expand_as(lam), H)
+        return H.transpose(0, 1)
+
+    def slack(self, X: Tensor, U: Tensor) -> Tensor:
+        """Sum |lam c| (B,) of the inequalities that push without being met, which complementarity leaves open."""
+        slack = X.new_zeros(X.shape[0])
+        for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
             if constraint.sense == "inequality":
                 slack = slack - (lam * constraint.value(X, U).clamp(max=0.0)).sum(-1).sum(-1)
-        return H.transpose(0, 1), slack
+        return slack
 
     def _expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         quadratise(self.problem, X, U, out=H)

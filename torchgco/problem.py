@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -38,6 +38,9 @@ class Problem:
     x0: Tensor
     N: int
 
+    # What others keep of the problems' form (compiled kernels, say), shared by all subsets of a batch.
+    form: ClassVar[dict[str, Any]]
+
     def __post_init__(self) -> None:
         self._check_border()
         dims = Dimensions(
@@ -47,6 +50,7 @@ class Problem:
         self._check_dynamics()
         object.__setattr__(self, "cost", self.cost.bind(dims))
         object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
+        object.__setattr__(self, "form", {})
 
     @property
     def B(self) -> int:
@@ -91,7 +95,7 @@ class Problem:
 
     def in_cost_units(self) -> Self:
         """The same problems with their costs divided by `cost_unit`: no number of a solver then depends on its scale."""
-        return self._with({"cost": self.cost.scaled(1.0 / self.cost_unit)})
+        return self._with({"cost": self.cost.scaled(1.0 / self.cost_unit)}, form=self.form)
 
     def take(self, index: Rows) -> Self:
         """The problems in `index` (int64, (B',), or a slice); a row may occur more than once."""
@@ -101,7 +105,7 @@ class Problem:
             "constraints": tuple(c.take(index) for c in self.constraints),
             "x0": self.x0[index],
         }
-        return self._with(parts)
+        return self._with(parts, form=self.form)
 
     def cast(self, dtype: torch.dtype) -> Self:
         """The same problems in another precision."""
@@ -117,11 +121,12 @@ class Problem:
         """The same problems with the constraints dropped."""
         return self._with({"constraints": ()})
 
-    def _with(self, parts: dict[str, object]) -> Self:
+    def _with(self, parts: dict[str, object], form: dict[str, Any] | None = None) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.
         copy = object.__new__(type(self))
         for f in fields(self):
             object.__setattr__(copy, f.name, parts.get(f.name, getattr(self, f.name)))
+        object.__setattr__(copy, "form", {} if form is None else form)
         return copy
 
     def check_controls(self, U: Tensor, field: str = "U0") -> None:

@@ -82,7 +82,7 @@ def trace_dynamics(
     named = (getattr(dynamics, name) for name in (*dynamics.batched, *dynamics.per_element))
     own = [value for value in named if isinstance(value, Tensor)]
     traced = Traced("dynamics.step", lambda i, x, u: dynamics.take(i).step(x, u), x, u, own=own)
-    key = store.key_of(("model", traced.fingerprint(), *_makers()))
+    key = store.key_of(("model", traced.fingerprint(), *makers()))
     known = store.read(key, ".json")
     if known is None:
         known = json.dumps(_made(traced, n, m)).encode()
@@ -97,7 +97,7 @@ def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:
     import casadi as ca
 
     x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", traced.count)
-    ahead = traced(_elements(p), _elements(x)[None], _elements(u)[None]).reshape(-1)
+    ahead = traced(elements(p), elements(x)[None], elements(u)[None]).reshape(-1)
     ahead = ca.densify(ca.vertcat(*ahead))
     # Forward only, as `torch.func.jvp`: backwards, a NaN of the branch not taken would come through as 0 * NaN.
     jacobian = ca.sparsify(ca.jacobian(ahead, ca.vertcat(x, u), {"allow_reverse": False}))
@@ -120,7 +120,7 @@ def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:
     }
 
 
-def _elements(column: Any) -> np.ndarray:
+def elements(column: Any) -> np.ndarray:
     """The scalars of a column, (size,) objects."""
     elements = np.empty(column.numel(), dtype=object)
     for i in range(column.numel()):
@@ -129,9 +129,9 @@ def _elements(column: Any) -> np.ndarray:
 
 
 @cache
-def _makers() -> Sequence[str]:
+def makers(*more: str) -> Sequence[str]:
     """The texts of what makes code: when they change, what was made before doesn't count."""
-    files = (operations.__file__, arrays.__file__, emit.__file__, __file__)
+    files = (operations.__file__, arrays.__file__, emit.__file__, __file__, *more)
     try:
         casadi = version("casadi")
     except PackageNotFoundError:

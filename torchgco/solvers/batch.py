@@ -18,7 +18,8 @@ from torchgco.draws import DrawKey
 from torchgco.expansion import linearise, standing
 from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
 from torchgco.problem import Problem
-from torchgco.rollout import open_loop
+from torchgco.native.dispatch import engine_of, open_loop, terms_of, value
+from torchgco.native.engine import Engine
 from torchgco.shapes import InputError, copied, joined, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.attempts import go_on_from, has_arrived, try_again
@@ -69,9 +70,11 @@ class Loop:
         self.waiting = everyone[slots:]
         self.state, self.aside, self.passes_aside = self._begin(everyone[:slots]), None, 0
         self.problem = problem if slots == problem.B else problem.take(everyone[:slots])
-        # F and H of every pass: memory that is had afresh costs more than what is written into it.
+        # F and H of every pass of PyTorch's kernels: new memory costs more than filling it.
         s = problem.n + 1 + problem.m
-        self.space = (standing(problem, slots), U0.new_empty(problem.N + 1, slots, s, s))
+        self.space = None
+        if engine_of(problem) is None:
+            self.space = (standing(problem, slots), U0.new_empty(problem.N + 1, slots, s, s))
 
     def run(self) -> Solution:
         """Pass after pass until every element has ended."""
@@ -93,10 +96,10 @@ class Loop:
         """The state in which the elements `rows` begin."""
         problem, solver = self.whole.take(rows), self.solver
         U = self.U0[rows]
-        X = open_loop(problem.dynamics, problem.x0, U)
+        X = open_loop(problem, U)
         duals = Multipliers.zero(problem, solver.initial_penalty) if self.warm is None else take(self.warm, rows)
         guide = take(self.guide, rows) if self.guidance is None else self.guidance.start(problem, X)
-        cost, merit = Lagrangian(problem, duals, guide, solver.clip).value(X, U)
+        cost, merit = value(Lagrangian(problem, duals, guide, solver.clip), X, U)
         zero, worst = torch.zeros_like(rows), torch.full_like(cost, torch.inf)
         iterate = Iterate(X, U, duals, cost, worst)
         return State(
@@ -122,8 +125,37 @@ class Loop:
     # One pass ----------------------------------------------------------------------------------------------------
 
     def _pass(self) -> Tensor:
-        """One iteration of every running element; returns the statuses it leaves them in."""
+        """Iterations of every running element; returns the statuses it leaves them in."""
+        engine = engine_of(self.problem)
+        return self._iteration() if engine is None else self._inner_solves(engine)
+
+    def _inner_solves(self, engine: Engine) -> Tensor:
+        """By native kernels, the rest of every element's inner solve; one iteration where the history is kept."""
         s, inner = self.state, self.solver.inner
+        for name in ("X", "U", "cost", "merit", "regularisation", "inner", "iterations"):
+            setattr(s, name, getattr(s, name).clone(memory_format=torch.contiguous_format))
+        state = {name: getattr(s, name) for name in ("X", "U", "cost", "merit", "regularisation", "inner", "iterations")}
+        lagrangian = Lagrangian(self.problem, s.duals, s.guide, self.solver.clip)
+        limit = 1 if self.recorder is not None else inner.max_iterations
+        out = engine.iterate(self.problem, state, terms_of(lagrangian), inner.options(ROUNDING), limit)
+        converged, refused, lost = (out[name] != 0 for name in ("converged", "refused", "lost"))
+        ended, failed = out["status"] == 1, out["status"] > 1
+        status = torch.where(failed, out["status"].long(), int(Status.RUNNING))
+        if self.recorder is not None:
+            self.recorder.add(self.problem, s, out["alpha"], out["used"], failed)
+        if bool(lost.any()):
+            rows = lost.nonzero().flatten()
+            found = self._lifted(lagrangian, rows)
+            ended[rows[found]] = s.inner[rows[found]] >= inner.max_iterations
+            s.regularisation[rows[found]] = 0.0
+        if bool(ended.any()):
+            self._end_inner(ended, converged, refused, status)
+        return status
+
+    def _iteration(self) -> Tensor:
+        """One iteration of every running element by PyTorch's kernels."""
+        s, inner = self.state, self.solver.inner
+        assert self.space is not None
         lagrangian = Lagrangian(self.problem, s.duals, s.guide, self.solver.clip)
         F, H = (t[:, : self.problem.B] for t in self.space)
         linearise(self.problem, s.X, s.U, out=F)
@@ -140,7 +172,7 @@ class Loop:
         change, damped = (s.merit - old_merit).abs(), s.regularisation > inner.damping
         s.inner, s.iterations = s.inner + ~step.failed, s.iterations + ~step.failed
         if self.recorder is not None:
-            self.recorder.add(self.problem, s, alpha, step.failed)
+            self.recorder.add(self.problem, s, alpha, s.regularisation, step.failed)
         s.regularisation = torch.where(step.failed, s.regularisation, self._damping(refused))
         stuck = refused & (s.regularisation == 0)
         flat = (torch.maximum(change, expected) <= inner.tolerance * s.merit.abs()) & ~damped
@@ -198,15 +230,19 @@ class Loop:
             return refused
         part, X, U, merit = lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows]
         lost = diverges(part, X, U, merit, step.gains[:, rows], inner.line_search.smallest).nonzero().flatten()
-        if lost.numel() == 0:
-            return refused
-        found = lifted_search(part.take(lost), X[lost], U[lost], merit[lost])
-        won = rows[lost[found.accepted]]
+        refused = refused.clone()
+        if lost.numel() > 0:
+            refused[rows[lost][self._lifted(lagrangian, rows[lost])]] = False
+        return refused
+
+    def _lifted(self, lagrangian: Lagrangian, rows: Tensor) -> Tensor:
+        """Put what a lifted search finds in place of the iterates in `rows`; which of them it found something for."""
+        s = self.state
+        found = lifted_search(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows])
+        won = rows[found.accepted]
         for name in ("X", "U", "cost", "merit"):
             getattr(s, name)[won] = getattr(found, name)[found.accepted]
-        refused = refused.clone()
-        refused[won] = False
-        return refused
+        return found.accepted
 
     # Outer iteration ---------------------------------------------------------------------------------------------
 
@@ -262,7 +298,7 @@ class Loop:
         self._be_guided(rows[~s.led[rows]])
         s.regularisation[rows] = 0.0
         lagrangian = Lagrangian(self.problem.take(rows), take(s.duals, rows), take(s.guide, rows), self.solver.clip)
-        s.cost[rows], s.merit[rows] = lagrangian.value(s.X[rows], s.U[rows])
+        s.cost[rows], s.merit[rows] = value(lagrangian, s.X[rows], s.U[rows])
         s.inner[rows] = 0
 
     def _be_guided(self, rows: Tensor) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgco.constraints.guides import Guide
 from torchgco.lagrangian import VIOLATION_TOLERANCE, Multipliers
+from torchgco.native.engine import Options
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 from torchgco.solution import Solution
@@ -69,6 +70,15 @@ class ILQR:
             raise InputError("ilqr.damping", "at least 0", self.damping)
         if not self.penalty >= 0:
             raise InputError("ilqr.penalty", "at least 0", self.penalty)
+
+    def options(self, rounding: float) -> Options:
+        """The same for native kernels; `rounding` is the share of L_M below which an expected change means nothing."""
+        search = self.line_search
+        return Options(
+            tuple(search.ladder), self.max_iterations, search.accept_last, self.tolerance, self.absolute_tolerance,
+            search.ratio_min, search.ratio_max, search.smallest, self.regularisation_first,
+            self.regularisation_growth, self.regularisation_max, self.damping, rounding,
+        )  # fmt: skip
 
     def solve(
         self,

@@ -20,7 +20,7 @@ class Recorder:
     def __init__(self) -> None:
         self._passes: list[dict[str, Tensor]] = []
 
-    def add(self, problem: Problem, state: Any, alpha: Tensor, failed: Tensor) -> None:
+    def add(self, problem: Problem, state: Any, alpha: Tensor, used: Tensor, failed: Tensor) -> None:
         """Note the iteration just made by every element whose backward pass succeeded."""
         guided = state.guide.is_active if state.guide is not None else torch.zeros_like(failed)
         row = {
@@ -31,7 +31,7 @@ class Recorder:
             "cost": state.cost,
             "merit": state.merit,
             "alpha": alpha,
-            "regularisation": state.regularisation,
+            "regularisation": used,
             "violation": violation(problem, state.X, state.U),
             "guided": guided,
         }

@@ -6,6 +6,7 @@ and what complementarity leaves open, as a share of the cost. It depends on no s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian
+from torchgco.native.dispatch import engine_of, terms_of
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.status import Status
 
@@ -30,19 +32,34 @@ class Optimality(NamedTuple):
 def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
     """Gains along X (B, N+1, n), U (B, N, m), and the first-order optimality of the trajectory with its multipliers."""
     problem = lagrangian.problem
-    F, (H, slack) = linearise(problem, X, U), lagrangian.expand_optimality(X, U)
+    slack = lagrangian.slack(X, U)
+    run = _backward(lagrangian, X, U)
     mu = torch.zeros_like(slack)
-    step = backward(F, H, mu)
+    step = run(mu)
     for i in range(TRIES):
         # A control that costs nothing, or values beyond the precision: gains all the same, by regularisation.
         if not bool(step.failed.any()):
             break
         mu = torch.where(step.failed, FIRST * GROWTH**i * problem.cost_unit, mu)
-        step = _merged(step, backward(F, H, mu))
+        step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
     cost = problem.cost.total(X, U).abs() + LEAST_COST * problem.N * problem.cost_unit
     G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
     return Optimality(G[..., :-1], G[..., -1], torch.where(step.failed, torch.inf, saved / cost))
+
+
+def _backward(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
+    """The backward pass on J_var + lam'c for regularisations mu_r (B,)."""
+    problem, engine = lagrangian.problem, engine_of(lagrangian.problem)
+    if engine is None:
+        F, H = linearise(problem, X, U), lagrangian.expand_optimality(X, U)
+        return lambda mu: backward(F, H, mu)
+
+    def native(mu: Tensor) -> BackwardPass:
+        G, linear, quadratic, failed = engine.gains(problem, X, U, terms_of(lagrangian), mu)
+        return BackwardPass(G.transpose(0, 1), linear, quadratic, failed)
+
+    return native
 
 
 def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:
