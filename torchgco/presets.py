@@ -26,7 +26,6 @@ IN_THE_PLANE = (
         initial_penalty=2.0, adopt=True, patience=3, afresh=True,
         detour=Detour(
             roadmap=Roadmap(slack=0.02), ways=12, pushes=OFFSETS, begin=0.1, end=(0.8, 0.6), settle=40, finalists=8,
-            dtype="float32",
         ),
     ),
     {"penalty": 2.0, "iterations": 20, "attempts": 3},
@@ -40,7 +39,7 @@ IN_SPACE = (
         initial_penalty=0.09, adopt=True, patience=6,
         detour=Detour(
             roadmap=Roadmap(spread=128), ways=6, keep=3, end=(0.9,), smoothing=0.16, tube=None, stiffness=(200.0,),
-            iterations=10, dtype="float32",
+            iterations=10,
         ),
     ),
     {"penalty": 0.09, "iterations": 10, "attempts": 4},

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,8 +25,8 @@ from torchgco.guidance.classes import distinct
 from torchgco.guidance.roadmap import Roadmap, points_along
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.problem import Problem
-from torchgco.rollout import open_loop
-from torchgco.shapes import InputError, cast, check_shape, put, take, tensor
+from torchgco.native.dispatch import open_loop, value
+from torchgco.shapes import InputError, check_shape, put, take, tensor
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
@@ -103,7 +103,6 @@ class Detour:
         depth: how far into an obstacle a settled path may reach, as a share of R; one that lies deeper is refused.
         finalists: how many of those that settled best, and differ, are solved to their end before one is handed over,
             by what they cost there; 1: none is, and the best settled is handed over.
-        dtype: "float32" to follow and settle in single precision; None: in the problem's own.
 
     Raises:
         InputError: a field out of its range; on `check` and `propose`, pushes that don't fit the controls.
@@ -125,7 +124,6 @@ class Detour:
     settle: int = 20
     depth: float = 0.1
     finalists: int = 1
-    dtype: Literal["float32", "float64"] | None = None
 
     def __post_init__(self) -> None:
         for name in ("end", "stiffness", "pushes"):  # lists of a configuration file equal tuples
@@ -145,8 +143,6 @@ class Detour:
         for name in ("obstacle_penalty", "hold", "tolerance", "depth"):
             if not getattr(self, name) > 0:
                 raise InputError(f"detour.{name}", "above 0", getattr(self, name))
-        if self.dtype not in ("float32", "float64", None):
-            raise InputError("detour.dtype", "float32, float64 or null", repr(self.dtype))
         if not self.stiffness or not all(value > 0 for value in self.stiffness):
             raise InputError("detour.stiffness", "one or more numbers above 0", self.stiffness)
         for name, least in (("ways", 1), ("keep", 1), ("iterations", 1), ("settle", 0), ("finalists", 1)):
@@ -228,7 +224,7 @@ class Detour:
             # A path that falls back into the trap, where waiting is cheaper, is none.
             keeps = seen.arrives(problem, settled) | ~seen.arrives(problem, plans.U)
             plans = replace(plans, U=torch.where(keeps.view(-1, 1, 1), settled, plans.U))
-        X = open_loop(problem.dynamics, problem.x0, plans.U)
+        X = open_loop(problem, plans.U)
         sound = plans.live & seen.arrives(problem, plans.U)
         return plans, sound & (seen.depth(problem, X, plans.U) <= self.depth * plans.R)
 
@@ -263,13 +259,12 @@ class Detour:
 
     def _solved(self, plans: Plans, iterations: int, duals: Multipliers, guide: Guide | None = None) -> Tensor:
         """Controls after one inner solve of every live plan."""
-        dtype = plans.U.dtype if self.dtype is None else getattr(torch, self.dtype)
         U = plans.U.clone()
         for rows in plans.live.nonzero().flatten().split(AT_ONCE):
-            parts = plans.problem.take(rows), U[rows], take(duals, rows), take(guide, rows)
-            problem, start, warm, drawn = cast(parts, dtype)
             if rows.numel() > 0:
-                U[rows] = self._inner(iterations).solve(problem, start, warm=warm, guide=drawn).U.to(U.dtype)
+                parts = plans.problem.take(rows), U[rows], take(duals, rows), take(guide, rows)
+                problem, start, warm, drawn = parts
+                U[rows] = self._inner(iterations).solve(problem, start, warm=warm, guide=drawn).U
         return U
 
     def _inner(self, iterations: int) -> ILQR:
@@ -283,9 +278,9 @@ class Detour:
         """
         rows = plans.live.nonzero().flatten()
         problem, U, duals = plans.problem.take(rows), plans.U[rows], take(plans.duals(self.hold), rows)
-        X = open_loop(problem.dynamics, problem.x0, U)
+        X = open_loop(problem, U)
         merit, first = torch.full_like(plans.unit, torch.inf), first & plans.live
-        merit[rows] = Lagrangian(problem, duals, None, True).value(X, U)[1]
+        merit[rows] = value(Lagrangian(problem, duals, None, True), X, U)[1]
         merit, order = merit.nan_to_num(torch.inf).view(-1, plans.count).sort(dim=-1, stable=True)
         later = (~first).view(-1, plans.count).gather(1, order).to(torch.int8)
         later, again = later.sort(dim=-1, stable=True)

@@ -56,12 +56,8 @@ def suited_detour(detour: Detour | None, problem: Problem) -> tuple[Detour | Non
     one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
     if scene_of(one, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))) is None:
         return detour, None
-    own, wanted, why = _tried(_expand, problem, detour.dtype)
-    if why is None:
-        return detour, None
-    if wanted != own and _failure(_expand, problem, own) is None:
-        return replace(detour, dtype=None), f"ways are followed in {_name(own)}, as {_name(wanted)} fails ({why})"
-    return None, f"no way can be followed ({why})"
+    why = _failure(_expand, problem, problem.x0.dtype)
+    return (detour, None) if why is None else (None, f"no way can be followed ({why})")
 
 
 def _tried(

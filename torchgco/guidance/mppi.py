@@ -13,7 +13,7 @@ from torchgco.constraints.bounds import ControlBounds
 from torchgco.draws import DrawKey, standard_normal
 from torchgco.guidance.samples import Flight, Noise, average, draw, fly
 from torchgco.problem import Problem
-from torchgco.rollout import open_loop
+from torchgco.native.dispatch import open_loop
 from torchgco.shapes import InputError, check_shape, tensor
 
 CHUNK = 8192  # samples flown side by side: what a stage needs of them stays in a core's cache
@@ -104,7 +104,7 @@ class MPPI:
             part = quick if rows.numel() == problem.B else quick.take(rows)
             plans.append(self._rounds(part, U[rows].to(dtype), spread.to(dtype), key.take(rows), stream))
         plan = torch.cat(plans).to(U.dtype)
-        return open_loop(problem.dynamics, problem.x0, plan), plan
+        return open_loop(problem, plan), plan
 
     def _rounds(self, problem: Problem, U: Tensor, sigma: Tensor, key: DrawKey, stream: int) -> Tensor:
         """All rounds for one chunk of problems; U (B, N, m), sigma (m, B|1, 1)."""

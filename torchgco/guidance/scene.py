@@ -9,7 +9,7 @@ from torchgco.constraints.bounds import ControlBounds
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.guidance.roadmap import FAR, Scene, segment_gaps
 from torchgco.problem import Problem
-from torchgco.rollout import open_loop
+from torchgco.native.dispatch import open_loop
 from torchgco.shapes import InputError
 
 OPEN = 1e10  # a range of controls that is no range
@@ -65,7 +65,7 @@ def arrives(problem: Problem, U: Tensor) -> Tensor:
     """Whether controls end close to the goal, (B,)."""
     goal = problem.cost.goal(problem.x0)
     assert goal is not None
-    X = open_loop(problem.dynamics, problem.x0, U)
+    X = open_loop(problem, U)
     last, first = ((x - goal)[:, position(problem)].square().sum(-1) for x in (X[:, -1], problem.x0))
     return last <= THERE**2 * first
 

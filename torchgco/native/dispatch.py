@@ -16,6 +16,10 @@ from torchgco.problem import Problem
 from torchgco.shapes import InputError
 
 
+NUDGE = 1e-14  # share of the controls by which a rollout's sensitivity is tried out
+AMPLIFIED = 1e6  # times that: other last bits are no matter below it
+
+
 class EagerWarning(UserWarning):
     """Native kernels can't serve a problem; PyTorch's do, which takes longer."""
 
@@ -42,6 +46,26 @@ def open_loop(problem: Problem, U: Tensor) -> Tensor:
     """X (B, N+1, n) from controls U (B, N, m)."""
     engine = engine_of(problem)
     return rollout.open_loop(problem.dynamics, problem.x0, U) if engine is None else engine.open_loop(problem, U)
+
+
+def reproducible(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """X (B, N+1, n) and U (B, N, m) such that PyTorch's rollout of U is X, from those of native kernels.
+
+    The two differ in the last bits. Where unstable dynamics make much of that, found by a rollout of slightly other
+    controls, PyTorch follows X with the gains K (B, N, m, n), and the controls that it takes are returned.
+    """
+    engine = engine_of(problem)
+    if engine is None:
+        return X, U
+    other = engine.open_loop(problem, U + NUDGE * U.abs().amax(dim=1, keepdim=True))
+    scale = X.abs().flatten(1).amax(-1).clamp(min=NUDGE)
+    rows = (~((other - X).abs().flatten(1).amax(-1) <= AMPLIFIED * NUDGE * scale)).nonzero().flatten()
+    if rows.numel() == 0:
+        return X, U
+    gains = torch.cat((K[rows], torch.zeros_like(K[rows][..., :1])), dim=-1).nan_to_num(0.0).transpose(0, 1)
+    X, U, alpha = X.clone(), U.clone(), torch.zeros_like(scale[rows])
+    X[rows], U[rows] = rollout.closed_loop(problem.dynamics.take(rows), X[rows], U[rows], gains.contiguous(), alpha)
+    return X, U
 
 
 def value(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:

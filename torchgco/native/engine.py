@@ -50,7 +50,7 @@ _ARRAYS = ("parameters", "Q", "R", "Qf", "x_ref", "xf_ref", "u_ref", "q", "r", "
 _CHOICES = ("guide", "clip", "accept_last", "replicas", "optimality")
 _NUMBERS = (
     "tolerance", "absolute_tolerance", "ratio_min", "ratio_max", "smallest", "first", "growth", "most", "damping",
-    "rounding",
+    "rounding", "lost_beyond",
 )  # fmt: skip
 
 
@@ -84,6 +84,7 @@ class Options:
     most: float
     damping: float
     rounding: float
+    lost_beyond: float
 
 
 @dataclass(frozen=True)

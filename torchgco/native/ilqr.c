@@ -50,7 +50,7 @@ typedef struct {
     Array center, radius, weight;
     const double *ladder;
     double tolerance, absolute_tolerance, ratio_min, ratio_max, smallest;
-    double first, growth, most, damping, rounding;
+    double first, growth, most, damping, rounding, lost_beyond;
 } Problem;
 
 /* What a group of lanes works on. */
@@ -566,7 +566,8 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
     V larger = tgco_choose(change > expected, change, expected);
     I flat = (larger <= SET(p->tolerance) * tgco_fabs(s->merit)) & ~(before > SET(p->damping));
     *converged = running & ~failed & (settled | (moving & ~*refused & (flat | (change < SET(p->absolute_tolerance)))));
-    *lost = *refused & ~(shortest <= old + tgco_fabs(old));
+    *lost = *refused & ~(shortest <= SET(p->lost_beyond) * tgco_fabs(old));
+    *lost &= s->inner <= SET(1.0);
     if (p->damping == 0) *lost = *lost & ~*lost;
     I over = running & ~failed & (*converged | stuck | (s->inner >= SET((double)p->max_iterations)));
     *refused = stuck;

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.native.dispatch import open_loop, value
 from torchgco.problem import Problem
-from torchgco.rollout import open_loop
 from torchgco.shapes import copied, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.state import Advice, Iterate, OuterLoop, State
@@ -63,9 +63,9 @@ def go_on_from(
     put(s.origin, place[first], take(left, first))
     s.attempt[place[first]] = 1
     U = advice.U[taken]
-    X = open_loop(part.dynamics, part.x0, U)
+    X = open_loop(part, U)
     fresh = Multipliers(tuple(torch.zeros_like(lam[taken]) for lam in duals.lam), torch.ones_like(duals.mu[taken]))
-    cost, merit = Lagrangian(part, fresh, None, True).value(old_X, old_U)
+    cost, merit = value(Lagrangian(part, fresh, None, True), old_X, old_U)
     gain = (part.cost.total(X, U) - cost).clamp(min=0.0) / (merit - cost).clamp(min=1e-12)
     keeping = solver.hold_factor * gain
     if advice.duals is not None:

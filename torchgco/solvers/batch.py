@@ -1,4 +1,4 @@
-"""The one loop: every pass is one iLQR iteration for all problems that still run.
+"""The one loop: every pass is one iLQR iteration, or the rest of an inner solve, for all problems that still run.
 
 In nested loops a batch would wait for its slowest member at three levels. Here each element carries its own phase:
 inner and outer iteration, regularisation, penalty, guidance. Those whose inner solve has ended get their multiplier
@@ -15,22 +15,18 @@ from torch import Tensor
 
 from torchgco.constraints.guides import Guide
 from torchgco.draws import DrawKey
-from torchgco.expansion import linearise, standing
 from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
+from torchgco.native.dispatch import engine_of, open_loop, reproducible, value
 from torchgco.problem import Problem
-from torchgco.native.dispatch import engine_of, open_loop, terms_of, value
-from torchgco.native.engine import Engine
 from torchgco.shapes import InputError, copied, joined, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.attempts import go_on_from, has_arrived, try_again
-from torchgco.solvers.lifted import diverges, lifted_search
-from torchgco.solvers.riccati import BackwardPass, backward
+from torchgco.solvers.iteration import EagerIterations, NativeIterations, PassEnd
 from torchgco.solvers.state import Callback, InnerEnd, Iterate, OuterLoop, Progress, State
 from torchgco.solvers.trace import Recorder
 from torchgco.solvers.verdict import final_status, optimality
 from torchgco.status import Status
 
-ROUNDING = 1e-14  # share of L_M: an expected change below it means nothing
 PASSES_ASIDE = 20  # how long an element may wait for company; sampling for a few costs as much as for many
 
 
@@ -70,11 +66,9 @@ class Loop:
         self.waiting = everyone[slots:]
         self.state, self.aside, self.passes_aside = self._begin(everyone[:slots]), None, 0
         self.problem = problem if slots == problem.B else problem.take(everyone[:slots])
-        # F and H of every pass of PyTorch's kernels: new memory costs more than filling it.
-        s = problem.n + 1 + problem.m
-        self.space = None
-        if engine_of(problem) is None:
-            self.space = (standing(problem, slots), U0.new_empty(problem.N + 1, slots, s, s))
+        limit = 1 if solver.record else solver.inner.max_iterations
+        kernels = NativeIterations if engine_of(problem) is not None else EagerIterations
+        self.iterations = kernels(solver.inner, self.problem, limit)
 
     def run(self) -> Solution:
         """Pass after pass until every element has ended."""
@@ -126,130 +120,21 @@ class Loop:
 
     def _pass(self) -> Tensor:
         """Iterations of every running element; returns the statuses it leaves them in."""
-        engine = engine_of(self.problem)
-        return self._iteration() if engine is None else self._inner_solves(engine)
-
-    def _inner_solves(self, engine: Engine) -> Tensor:
-        """By native kernels, the rest of every element's inner solve; one iteration where the history is kept."""
-        s, inner = self.state, self.solver.inner
-        for name in ("X", "U", "cost", "merit", "regularisation", "inner", "iterations"):
-            setattr(s, name, getattr(s, name).clone(memory_format=torch.contiguous_format))
-        state = {name: getattr(s, name) for name in ("X", "U", "cost", "merit", "regularisation", "inner", "iterations")}
-        lagrangian = Lagrangian(self.problem, s.duals, s.guide, self.solver.clip)
-        limit = 1 if self.recorder is not None else inner.max_iterations
-        out = engine.iterate(self.problem, state, terms_of(lagrangian), inner.options(ROUNDING), limit)
-        converged, refused, lost = (out[name] != 0 for name in ("converged", "refused", "lost"))
-        ended, failed = out["status"] == 1, out["status"] > 1
-        status = torch.where(failed, out["status"].long(), int(Status.RUNNING))
-        if self.recorder is not None:
-            self.recorder.add(self.problem, s, out["alpha"], out["used"], failed)
-        if bool(lost.any()):
-            rows = lost.nonzero().flatten()
-            found = self._lifted(lagrangian, rows)
-            ended[rows[found]] = s.inner[rows[found]] >= inner.max_iterations
-            s.regularisation[rows[found]] = 0.0
-        if bool(ended.any()):
-            self._end_inner(ended, converged, refused, status)
-        return status
-
-    def _iteration(self) -> Tensor:
-        """One iteration of every running element by PyTorch's kernels."""
-        s, inner = self.state, self.solver.inner
-        assert self.space is not None
-        lagrangian = Lagrangian(self.problem, s.duals, s.guide, self.solver.clip)
-        F, H = (t[:, : self.problem.B] for t in self.space)
-        linearise(self.problem, s.X, s.U, out=F)
-        lagrangian.expand(s.X, s.U, out=H)
-        step = backward(F, H, s.regularisation)
-        status = torch.full_like(s.rows, Status.RUNNING)
-        expected = step.expected_change(torch.ones_like(s.merit)).abs()
-        settled = expected <= ROUNDING * s.merit.abs()
-        moving = ~step.failed & ~settled
-        if bool(step.failed.any()):
-            self._raise_regularisation(step, F, H, status)
-        old_merit, alpha, refused = self._move(lagrangian, step, moving)
-        refused = self._lift(lagrangian, step, refused)
-        change, damped = (s.merit - old_merit).abs(), s.regularisation > inner.damping
-        s.inner, s.iterations = s.inner + ~step.failed, s.iterations + ~step.failed
-        if self.recorder is not None:
-            self.recorder.add(self.problem, s, alpha, s.regularisation, step.failed)
-        s.regularisation = torch.where(step.failed, s.regularisation, self._damping(refused))
-        stuck = refused & (s.regularisation == 0)
-        flat = (torch.maximum(change, expected) <= inner.tolerance * s.merit.abs()) & ~damped
-        converged = settled | (moving & ~refused & (flat | (change < inner.absolute_tolerance)))
-        ended = ~step.failed & (converged | stuck | (s.inner >= inner.max_iterations))
-        if bool(ended.any()):
-            self._end_inner(ended, converged, stuck, status)
-        return status
-
-    def _damping(self, refused: Tensor) -> Tensor:
-        """mu_r of the next pass (B,): zero as printed; with damping, up where the search failed and down elsewhere."""
-        now, first = self.state.regularisation, self.solver.inner.damping
-        if first == 0:
-            return torch.zeros_like(now)
-        up, down = (10.0 * now).clamp(min=first), now / 3.0
-        up = torch.where(up > self.solver.inner.regularisation_max, 0.0, up)
-        return torch.where(refused, up, torch.where(down < first, 0.0, down))
-
-    def _raise_regularisation(self, step: BackwardPass, F: Tensor, H: Tensor, status: Tensor) -> None:
-        """mu_r up for elements whose Cholesky failed (Algorithm 2, line 9): they try again in the next pass."""
-        s, inner = self.state, self.solver.inner
-        higher = (s.regularisation * inner.regularisation_growth).clamp(min=inner.regularisation_first)
-        s.regularisation = torch.where(step.failed, higher, s.regularisation)
-        finite = torch.isfinite(F).all(-1).all(-1).all(0) & torch.isfinite(H).all(-1).all(-1).all(0)
-        status[step.failed & (s.regularisation > inner.regularisation_max)] = Status.NOT_POSITIVE_DEFINITE
-        status[step.failed & ~finite] = Status.NON_FINITE
-
-    def _move(self, lagrangian: Lagrangian, step: BackwardPass, moving: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Forward pass of the elements in `moving`; returns the merit before, the step lengths, and who was refused."""
-        s, old_merit = self.state, self.state.merit
-        alpha, refused = torch.zeros_like(old_merit), torch.zeros_like(moving)
-        rows = moving.nonzero().flatten()
-        if rows.numel() == 0:
-            return old_merit, alpha, refused
-        if rows.numel() == moving.numel():
-            found = self.solver.inner.line_search.search(lagrangian, s.X, s.U, s.merit, step)
-        else:
-            part = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
-            found = self.solver.inner.line_search.search(
-                lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows], part
-            )
-        won = rows[found.accepted]
-        for name in ("X", "U", "cost", "merit"):
-            values = getattr(s, name).clone()
-            values[won] = getattr(found, name)[found.accepted]
-            setattr(s, name, values)
-        alpha[rows] = found.alpha
-        refused[rows] = ~found.accepted
-        return old_merit, alpha, refused
-
-    def _lift(self, lagrangian: Lagrangian, step: BackwardPass, refused: Tensor) -> Tensor:
-        """Another search for elements whose rollouts diverge whatever the step length; returns who is still refused."""
-        s, inner, rows = self.state, self.solver.inner, refused.nonzero().flatten()
-        if inner.damping == 0 or rows.numel() == 0:
-            return refused
-        part, X, U, merit = lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows]
-        lost = diverges(part, X, U, merit, step.gains[:, rows], inner.line_search.smallest).nonzero().flatten()
-        refused = refused.clone()
-        if lost.numel() > 0:
-            refused[rows[lost][self._lifted(lagrangian, rows[lost])]] = False
-        return refused
-
-    def _lifted(self, lagrangian: Lagrangian, rows: Tensor) -> Tensor:
-        """Put what a lifted search finds in place of the iterates in `rows`; which of them it found something for."""
         s = self.state
-        found = lifted_search(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows])
-        won = rows[found.accepted]
-        for name in ("X", "U", "cost", "merit"):
-            getattr(s, name)[won] = getattr(found, name)[found.accepted]
-        return found.accepted
+        lagrangian = Lagrangian(self.problem, s.duals, s.guide, self.solver.clip)
+        end = self.iterations.run(s, lagrangian)
+        if self.recorder is not None:
+            self.recorder.add(self.problem, s, end)
+        if bool(end.ended.any()):
+            self._end_inner(end)
+        return end.status
 
     # Outer iteration ---------------------------------------------------------------------------------------------
 
-    def _end_inner(self, ended: Tensor, converged: Tensor, refused: Tensor, status: Tensor) -> None:
+    def _end_inner(self, end: PassEnd) -> None:
         """Algorithm 4, lines 7-12, for the elements whose inner solve has ended."""
-        s, solver = self.state, self.solver
-        rows = ended.nonzero().flatten()
+        s, solver, status = self.state, self.solver, end.status
+        rows = end.ended.nonzero().flatten()
         problem, X, U, duals = self.problem.take(rows), s.X[rows], s.U[rows], take(s.duals, rows)
         now = violation(problem, X, U)
         growth = torch.full_like(now, solver.penalty_growth)
@@ -259,7 +144,7 @@ class Loop:
         self._remember(rows, Iterate(X, U, updated, s.cost[rows], now))
         s.outer[rows] += 1
         inner_end = InnerEnd(
-            converged[rows], refused[rows], s.outer[rows] - s.since[rows], s.cost[rows], s.last_cost[rows], now
+            end.converged[rows], end.stuck[rows], s.outer[rows] - s.since[rows], s.cost[rows], s.last_cost[rows], now
         )
         status[rows] = solver.verdict(inner_end)
         s.last_cost[rows] = s.cost[rows]
@@ -381,6 +266,7 @@ class Loop:
         for rows in torch.arange(self.whole.B, device=self.U0.device).split(solver.slots or self.whole.B):
             lagrangian = Lagrangian(self.whole.take(rows), take(r.multipliers, rows), None, solver.clip)
             r.K[rows], r.d[rows], left[rows] = optimality(lagrangian, r.X[rows], r.U[rows])
+            r.X[rows], r.U[rows] = reproducible(lagrangian.problem, r.X[rows], r.U[rows], r.K[rows])
         status = final_status(r.status, left, r.violation, solver.violation_tolerance, bool(self.whole.constraints))
         return replace(
             r, status=status, cost=self.given.cost.total(r.X, r.U), multipliers=r.multipliers.scaled(self.unit),

@@ -71,13 +71,14 @@ class ILQR:
         if not self.penalty >= 0:
             raise InputError("ilqr.penalty", "at least 0", self.penalty)
 
-    def options(self, rounding: float) -> Options:
-        """The same for native kernels; `rounding` is the share of L_M below which an expected change means nothing."""
+    def options(self, rounding: float, lost_beyond: float) -> Options:
+        """The same for native kernels; `rounding` is the share of L_M below which an expected change means
+        nothing, `lost_beyond` how many times L_M the shortest step makes of it where rollouts diverge."""
         search = self.line_search
         return Options(
             tuple(search.ladder), self.max_iterations, search.accept_last, self.tolerance, self.absolute_tolerance,
             search.ratio_min, search.ratio_max, search.smallest, self.regularisation_first,
-            self.regularisation_growth, self.regularisation_max, self.damping, rounding,
+            self.regularisation_growth, self.regularisation_max, self.damping, rounding, lost_beyond,
         )  # fmt: skip
 
     def solve(

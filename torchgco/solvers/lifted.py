@@ -18,13 +18,13 @@ from torchgco.solvers.riccati import backward
 
 ROUNDS = 20  # steps at most
 GAIN = 1e-2  # share of L_M by which a rollout must lower it
-LOST = 2.0  # times L_M before: the shortest step makes so much of it where rollouts diverge
+LOST = 1e6  # times L_M before: the shortest step makes so much of it where rollouts diverge
 
 
 def diverges(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor, G: Tensor, shortest: float) -> Tensor:
     """Whether even the shortest step along the gains G (N, B, m, n+1) raises L_M = merit (B,) beyond measure, (B,)."""
     value = lagrangian.value(*closed_loop(lagrangian.problem.dynamics, X, U, G, torch.full_like(merit, shortest)))[1]
-    return ~(value <= merit + (LOST - 1.0) * merit.abs())
+    return ~(value <= LOST * merit.abs())
 
 
 def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Candidates:

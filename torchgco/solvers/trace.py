@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchgco.lagrangian import violation
 from torchgco.problem import Problem
+from torchgco.solvers.iteration import PassEnd
+from torchgco.solvers.state import State
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,9 +22,9 @@ class Recorder:
     def __init__(self) -> None:
         self._passes: list[dict[str, Tensor]] = []
 
-    def add(self, problem: Problem, state: Any, alpha: Tensor, used: Tensor, failed: Tensor) -> None:
+    def add(self, problem: Problem, state: State, end: PassEnd) -> None:
         """Note the iteration just made by every element whose backward pass succeeded."""
-        guided = state.guide.is_active if state.guide is not None else torch.zeros_like(failed)
+        guided = state.guide.is_active if state.guide is not None else torch.zeros_like(end.failed)
         row = {
             "element": state.rows,
             "iteration": state.iterations - 1,
@@ -30,12 +32,12 @@ class Recorder:
             "inner": state.inner - 1,
             "cost": state.cost,
             "merit": state.merit,
-            "alpha": alpha,
-            "regularisation": used,
+            "alpha": end.alpha,
+            "regularisation": end.used,
             "violation": violation(problem, state.X, state.U),
             "guided": guided,
         }
-        self._passes.append({name: value[~failed].clone() for name, value in row.items()})
+        self._passes.append({name: value[~end.failed].clone() for name, value in row.items()})
 
     def frame(self, unit: Tensor) -> pd.DataFrame:
         """The table, sorted by element and iteration; `unit` (B,) is what costs were divided by."""
