@@ -151,7 +151,8 @@ def test_unstable_dynamics_are_solved_from_rest() -> None:
     solution = solve(problem)
     assert solution.statuses == [Status.CONVERGED] * 2 and float(solution.cost.max()) < 67.0
     torch.testing.assert_close(solution.cost, problem.cost.total(solution.X, solution.U))
-    stuck = AugmentedLagrangian(inner=ILQR(line_search=LineSearch(accept_last=False)), clip=True).solve(problem, rest(problem))
+    undamped = ILQR(line_search=LineSearch(accept_last=False))
+    stuck = AugmentedLagrangian(inner=undamped, clip=True).solve(problem, rest(problem))
     assert stuck.statuses == [Status.FEASIBLE] * 2  # without damping nothing moves, and nobody says that it converged
 
 

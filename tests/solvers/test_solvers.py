@@ -433,7 +433,10 @@ def test_an_adopted_plan_is_held(hold_factor: float) -> None:
             seen.append((state.U.clone(), state.duals.mu.clone(), [lam.abs().max() for lam in state.duals.lam]))
 
     solver = AugmentedLagrangian(
-        inner=ILQR(max_iterations=1, **PRINTED), guidance=OnePlan(plan), max_outer_iterations=3, hold_factor=hold_factor,
+        inner=ILQR(max_iterations=1, **PRINTED),
+        guidance=OnePlan(plan),
+        max_outer_iterations=3,
+        hold_factor=hold_factor,
         clip=True,
     )  # fmt: skip
     solver.solve(problem, U0, callback=look)

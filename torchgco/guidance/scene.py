@@ -87,7 +87,10 @@ def depth_between(problem: Problem, X: Tensor) -> Tensor:
 
 
 def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:
-    """Range (B, P, m) of the controls from rest (B, N, m), stage 0, to the bound that a sign (P, m) points to; 1 if open."""
+    """Range (B, P, m) of the controls from rest (B, N, m), stage 0, to the bound that a sign (P, m) points to.
+
+    Where there is no bound, 1.
+    """
     first = rest[:, :1]
     for constraint in problem.constraints:
         if isinstance(constraint, ControlBounds):
