@@ -26,20 +26,11 @@ from torchgco import (
     QuadraticCost,
     Solution,
     Spheres,
+    presets,
 )
-from torchgco.api import default_solver
 from torchgco.guidance import Detour
 from torchgco.guidance.gco import REACH
 from torchgco.guidance.misfits import suited_sampler
-
-BASE = default_solver()
-assert BASE.guidance is not None
-SAMPLER = replace(BASE.guidance.sampler, samples=64, rounds=4)
-SINGLE = replace(
-    BASE,
-    attempts=2,
-    guidance=replace(BASE.guidance, sampler=replace(SAMPLER, dtype="float32"), detour=Detour(dtype="float32")),
-)
 
 
 def vehicle(d: int, kind: str = "plain") -> FunctionDynamics:
@@ -64,6 +55,12 @@ def spheres(d: int) -> Spheres:
     centers[:, 0] = 1.0
     centers[:, min(1, d - 1)] += torch.tensor([0.2, -0.2], dtype=torch.float64)
     return Spheres(centers, [0.4, 0.4], 0.1)
+
+
+BASE = presets.gco(posed(2, spheres(2)))
+assert BASE.guidance is not None
+SAMPLER = replace(BASE.guidance.sampler, samples=64, rounds=4)
+SINGLE = replace(BASE, attempts=2, guidance=replace(BASE.guidance, sampler=SAMPLER, detour=Detour(dtype="float32")))
 
 
 def pillars(x: Tensor) -> Tensor:
