@@ -148,7 +148,7 @@ def test_unstable_dynamics_are_solved_from_rest() -> None:
         x0=torch.tensor([[-1.0, 0, 0, 0, 0, 0], [-1.0, 0.3, 0, 0, 0, 0]], dtype=torch.float64),
         N=60,
     )
-    solution = solve(problem)
+    solution = solve(problem, solver=quick_gco(problem))
     assert solution.statuses == [Status.CONVERGED] * 2 and float(solution.cost.max()) < 67.0
     torch.testing.assert_close(solution.cost, problem.cost.total(solution.X, solution.U))
     undamped = ILQR(line_search=LineSearch(accept_last=False))
