@@ -9,12 +9,9 @@ import torch
 from torch import Tensor
 
 import torchgco
-from tests.problems import planar_batch, quadrotor_batch
+from tests.problems import planar_batch, quadrotor_batch, quick_gco
 from torchgco import Cost, FunctionConstraint, FunctionDynamics, Hold, Polish, Problem, certify, judge
-from torchgco.api import default_solver
 from torchgco.autodiff import gradients
-
-SOLVER = replace(default_solver(), max_outer_iterations=4, polish=Polish(iterations=2))
 
 
 class Race(Cost):
@@ -54,7 +51,8 @@ MAKERS = {
 
 def everything(problem: Problem, U0: Tensor) -> list[Tensor]:
     """What solve, Polish, judge and certify say."""
-    solution, held = torchgco.solve(problem, U0, SOLVER), Hold().solve(problem, U0)
+    solver = replace(quick_gco(problem), max_outer_iterations=4, polish=Polish(iterations=2))
+    solution, held = torchgco.solve(problem, U0, solver), Hold().solve(problem, U0)
     goal = problem.x0.new_zeros(problem.dynamics.position.stop)
     reports = [certify(problem, s.X, s.U) for s in (solution, held)] + [judge(problem, solution.U, goal, 0.3)]
     refined = Polish(iterations=1).refine(problem, held)

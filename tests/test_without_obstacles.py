@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import torchgco
-from tests.problems import planar_batch
+from tests.problems import planar_batch, quick_gco
 from torchgco import (
     ControlBounds,
     FunctionConstraint,
@@ -26,7 +26,6 @@ from torchgco import (
     certify,
     judge,
 )
-from torchgco.api import default_solver
 from torchgco.baselines import MultiStart
 from torchgco.experiments import app
 from torchgco.guidance import Detour
@@ -45,9 +44,10 @@ EMPTY = {
     "rows of u": FunctionConstraint(lambda u: u.new_zeros(*u.shape[:-1], 0), of="u"),
     "equality": FunctionConstraint(lambda x, u: x[..., :0], of="xu", sense="equality"),
 }
+GUIDED = quick_gco(planar_batch()[0])
 SOLVERS = {
-    "polished": replace(default_solver(), polish=Polish(iterations=2)),
-    "multistart": MultiStart(replace(default_solver(guided=False), max_outer_iterations=2), starts=2),
+    "polished": replace(GUIDED, polish=Polish(iterations=2)),
+    "multistart": MultiStart(replace(GUIDED, guidance=None, max_outer_iterations=2), starts=2),
     "mppi": IteratedMPPI(iterations=2),
     "hold": Hold(),
 }
@@ -94,7 +94,7 @@ def test_no_detour_is_proposed(kind: str) -> None:
 def test_empty_spheres_next_to_others_are_as_good_as_none() -> None:
     problem, U0 = planar_batch(B=2, N=25, obstacles=6, seed=4)
     more = Problem(problem.dynamics, problem.cost, [EMPTY["shared"], *problem.constraints], problem.x0, problem.N)
-    want, got = (torchgco.solve(p, U0) for p in (problem, more))
+    want, got = (torchgco.solve(p, U0, GUIDED) for p in (problem, more))
     assert int(want.guided.sum()) > 0 and torch.equal(got.U, want.U)
     (alone, alone_found, _), (company, company_found, _) = (Detour(finalists=2).propose(p) for p in (problem, more))
     assert torch.equal(alone_found, company_found) and torch.equal(alone, company)

@@ -39,10 +39,10 @@ class Certificate:
     clearance: Tensor
     # Largest excess over control and state bounds, in their units; 0 proves that they hold at every knot.
     bound_violation: Tensor
-    # Largest component of the gradient of the Lagrangian by U, with the multipliers (inequalities: at least 0) that make
-    # it smallest in the least-squares sense, as a share of the largest terms that cancel in the gradient of J_var by
-    # the same control: no unit of cost or control changes it. Near 0 it proves a stationary point to first order, not a
-    # minimum, and says nothing of rows that are violated.
+    # Largest component of the gradient of the Lagrangian by U, with the multipliers (inequalities: at least 0) that
+    # make it smallest in the least-squares sense, as a share of the largest terms that cancel in the gradient of J_var
+    # by the same control: no unit of cost or control changes it. Near 0 it proves a stationary point to first order,
+    # not a minimum, and says nothing of rows that are violated.
     kkt_residual: Tensor
 
 

@@ -59,7 +59,10 @@ def gco(problem: Problem) -> AugmentedLagrangian:
         guidance = _without_offsets(guidance)
     return AugmentedLagrangian(
         inner=ILQR(
-            tolerance=5e-6, max_iterations=numbers["iterations"], damping=0.02, line_search=LineSearch(accept_last=False)
+            tolerance=5e-6,
+            max_iterations=numbers["iterations"],
+            damping=0.02,
+            line_search=LineSearch(accept_last=False),
         ),
         guidance=guidance,
         initial_penalty=numbers["penalty"],

@@ -94,7 +94,7 @@ class Problem:
         return torch.where(torch.isfinite(unit) & (unit > 0), unit, 1.0)
 
     def in_cost_units(self) -> Self:
-        """The same problems with their costs divided by `cost_unit`: no number of a solver then depends on its scale."""
+        """The same problems with their costs divided by `cost_unit`: no option of a solver depends on its scale."""
         return self._with({"cost": self.cost.scaled(1.0 / self.cost_unit)}, form=self.form)
 
     def take(self, index: Rows) -> Self:

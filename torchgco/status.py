@@ -26,9 +26,10 @@ class Status(IntEnum):
 _SENTENCES = {
     Status.RUNNING: "The solve has not ended.",
     Status.CONVERGED: "The trajectory is stationary and its violation is under the tolerance.",
-    Status.FEASIBLE: "The violation is under the tolerance, but the trajectory is not stationary: its cost can be lowered.",
-    Status.MAX_ITERATIONS: "The solve ended, by an iteration limit or its tolerance, before the trajectory was stationary; "
-    "try a higher limit or a smaller tolerance.",
+    Status.FEASIBLE: "The violation is under the tolerance, but the trajectory is not stationary: its cost can be "
+    "lowered.",
+    Status.MAX_ITERATIONS: "The solve ended, by an iteration limit or its tolerance, before the trajectory was "
+    "stationary; try a higher limit or a smaller tolerance.",
     Status.LINE_SEARCH_FAILED: "No step length gave an acceptable decrease before the trajectory was stationary; the "
     "problem may be badly scaled.",
     Status.NOT_POSITIVE_DEFINITE: "The regularised control Hessian stayed indefinite up to the largest regularisation.",

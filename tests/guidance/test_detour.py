@@ -284,8 +284,8 @@ def test_ways_of_one_class_are_followed_once(monkeypatch) -> None:
     five = replace(QUICK, ways=5, stiffness=(20.0,), iterations=1, settle=1)
     for pushes, end, rows in (
         ((), 0.8, 2),
-        (((7.0, -7.0), (-7.0, 7.0)), 0.8, 6),
-        (((7.0, -7.0),), (0.8, 0.6, 0.7), 12),
+        (((0.7, -0.7), (-0.7, 0.7)), 0.8, 6),
+        (((0.7, -0.7),), (0.8, 0.6, 0.7), 12),
     ):
         counts.clear()
         replace(five, pushes=pushes, end=end).propose(cup(B=1, N=60))
@@ -293,10 +293,18 @@ def test_ways_of_one_class_are_followed_once(monkeypatch) -> None:
 
 
 def test_a_push_turns_the_vehicle_before_it_sets_out() -> None:
-    rest = torch.zeros(3, 40, 2, dtype=torch.float64)
-    starts = replace(QUICK, pushes=((7.0, -7.0), (0.0, 2.0)))._begun(rest)
+    """By shares of the range from rest to the bound on that side, or by 1 where there is none."""
+    problem, begin = cup(B=3, N=40), replace(QUICK, pushes=((0.75, -0.5), (0.0, 0.25)))._begun
+    limits = ControlBounds([[-10.0, -4.0], [-10.0, -4.0], [-10.0, -torch.inf]], [10.0, 10.0])
+    problem = Problem(problem.dynamics, problem.cost, [problem.constraints[0], limits], problem.x0, problem.N)
+    starts = begin(problem, controls(problem))
     assert starts.shape == (3, 3, 40, 2) and not bool(starts[:, 0].any()) and not bool(starts[:, :, 4:].any())
-    assert starts[2, 1, 3].tolist() == [7.0, -7.0] and starts[0, 2, 0].tolist() == [0.0, 2.0]
+    assert starts[0, 1, 3].tolist() == [7.5, -2.0] and starts[0, 2, 0].tolist() == [0.0, 2.5]
+    assert starts[2, 1, 3].tolist() == [7.5, -0.5]
+    off_centre = begin(problem, controls(problem) + 2.0)  # rest lies nearer to the upper bounds
+    assert off_centre[0, 1, 3].tolist() == [8.0, -1.0]
+    free = Problem(problem.dynamics, problem.cost, [problem.constraints[0]], problem.x0, problem.N)
+    assert begin(free, controls(free))[0, 1, 3].tolist() == [0.75, -0.5]
     with pytest.raises(InputError, match=r"detour\.pushes: expected shape \(1, 2\)"):
         replace(QUICK, pushes=((1.0,),)).propose(cup())
 

@@ -27,10 +27,15 @@ from torchgco.status import Status
 SAMPLER = MPPI(samples=20)
 SOLVERS = {
     "gco": AugmentedLagrangian(
-        inner=ILQR(absolute_tolerance=0.1, max_iterations=8, **PRINTED), guidance=GCO(sampler=SAMPLER), max_outer_iterations=6, clip=True
+        inner=ILQR(absolute_tolerance=0.1, max_iterations=8, **PRINTED),
+        guidance=GCO(sampler=SAMPLER),
+        max_outer_iterations=6,
+        clip=True,
     ),
     "gco as printed": AugmentedLagrangian(
-        inner=ILQR(absolute_tolerance=0.1, max_iterations=15, **PRINTED), guidance=GCO(sampler=SAMPLER), max_outer_iterations=4
+        inner=ILQR(absolute_tolerance=0.1, max_iterations=15, **PRINTED),
+        guidance=GCO(sampler=SAMPLER),
+        max_outer_iterations=4,
     ),
     "gco with plans": AugmentedLagrangian(
         inner=ILQR(max_iterations=6, damping=1.0, line_search=LineSearch(accept_last=False)),

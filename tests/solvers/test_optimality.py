@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.problems import planar_batch, quadrotor_batch
+from tests.problems import planar_batch, quadrotor_batch, quick_gco
 from torchgco import (
     ILQR,
     AugmentedLagrangian,
@@ -68,9 +68,9 @@ def test_the_scale_of_the_cost_changes_no_iterate(factor: float) -> None:
 @pytest.mark.parametrize("batch", [planar_batch, quadrotor_batch])
 def test_nor_does_it_where_there_are_obstacles_and_guidance(batch, factor: float) -> None:
     problem = batch(B=2, N=25, obstacles=6, seed=4)[0]
-    one, other = (solve(p) for p in (problem, scaled(problem, factor)))
+    one, other = (solve(p, solver=quick_gco(p)) for p in (problem, scaled(problem, factor)))
     assert torch.equal(one.iterations, other.iterations) and one.statuses == other.statuses
-    assert torch.equal(one.guided, other.guided)
+    assert torch.equal(one.guided, other.guided) and int(one.guided.sum()) > 0
     torch.testing.assert_close(one.U, other.U, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(factor * one.cost, other.cost, rtol=1e-9, atol=0)
     for a, b in zip(one.multipliers.lam, other.multipliers.lam, strict=True):
@@ -154,7 +154,8 @@ def test_unstable_dynamics_are_solved_from_rest() -> None:
     verdict = judge(problem, solution.U, torch.tensor([1.0, 0.4], dtype=torch.float64), 0.3)
     assert bool(verdict.reached.all())
     torch.testing.assert_close(solution.cost, verdict.cost)
-    stuck = AugmentedLagrangian(inner=ILQR(line_search=LineSearch(accept_last=False)), clip=True).solve(problem, rest(problem))
+    undamped = ILQR(line_search=LineSearch(accept_last=False))
+    stuck = AugmentedLagrangian(inner=undamped, clip=True).solve(problem, rest(problem))
     assert stuck.statuses == [Status.FEASIBLE] * 2  # without damping nothing moves, and nobody says that it converged
 
 
@@ -181,11 +182,15 @@ def test_solve_is_the_configuration_gco(scenario: str, model: str) -> None:
     assert presets.gco(task.problem) == setup.solver
 
 
-def test_solve_gives_the_bits_of_that_solver() -> None:
+def test_solve_hands_the_problem_to_that_solver(monkeypatch) -> None:
+    asked = []
+    notice = lambda self, problem, U0, **words: asked.append((self, U0, words))
+    monkeypatch.setattr(AugmentedLagrangian, "solve", notice)
     problem, U0 = planar_batch(B=2, N=25)
-    setup = compose(["scenario=planar_trap", "model=planar"])
-    one, other = solve(problem), setup.solver.solve(problem, U0)
-    assert torch.equal(one.U, other.U) and torch.equal(one.status, other.status)
+    solve(problem, seed=3)
+    ((solver, begun, words),) = asked
+    assert solver == compose(["scenario=planar_trap", "model=planar"]).solver
+    assert torch.equal(begun, U0) and words == {"seed": 3, "ids": None, "warm": None}
 
 
 def test_offsets_are_for_two_controls() -> None:

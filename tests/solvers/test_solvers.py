@@ -220,7 +220,7 @@ def test_save_and_load(tmp_path) -> None:
 
 BASE = AugmentedLagrangian(
     inner=ILQR(max_iterations=10, absolute_tolerance=1e-2, **PRINTED),
-    guidance=GCO(sampler=MPPI(samples=12, rounds=2, knots=5)),
+    guidance=GCO(sampler=MPPI(samples=12, covariance=None, spread=0.05, rounds=2, knots=5)),
     max_outer_iterations=7,
     violation_tolerance=0.05,
     record=True,
@@ -239,8 +239,8 @@ CHANGES = {
         sampler=MPPI(samples=5), initial_penalty=2.0, penalty_growth=1.0, radius=0.5, patience=1, afresh=True,
     ),
     MPPI: dict(
-        samples=7, covariance=4.0, temperature=100.0, collision_penalty=0.1, saturation=None, rounds=1, knots=3,
-        decay=0.3, elite=4, linger=10.0, dtype="float32",
+        samples=7, covariance=4.0, spread=0.2, temperature=100.0, collision_penalty=0.1, saturation=None, rounds=1,
+        knots=3, decay=0.3, elite=4, linger=10.0, dtype="float32",
     ),
 }  # fmt: skip
 # What shows only in other tests, here, in test_polish or in tests/guidance.
@@ -433,7 +433,10 @@ def test_an_adopted_plan_is_held(hold_factor: float) -> None:
             seen.append((state.U.clone(), state.duals.mu.clone(), [lam.abs().max() for lam in state.duals.lam]))
 
     solver = AugmentedLagrangian(
-        inner=ILQR(max_iterations=1, **PRINTED), guidance=OnePlan(plan), max_outer_iterations=3, hold_factor=hold_factor,
+        inner=ILQR(max_iterations=1, **PRINTED),
+        guidance=OnePlan(plan),
+        max_outer_iterations=3,
+        hold_factor=hold_factor,
         clip=True,
     )  # fmt: skip
     solver.solve(problem, U0, callback=look)

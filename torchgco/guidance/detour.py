@@ -24,8 +24,8 @@ from torchgco.guidance import scene as seen
 from torchgco.guidance.classes import distinct
 from torchgco.guidance.roadmap import Roadmap, points_along
 from torchgco.lagrangian import Lagrangian, Multipliers
-from torchgco.problem import Problem
 from torchgco.native.dispatch import open_loop, value
+from torchgco.problem import Problem
 from torchgco.shapes import InputError, check_shape, put, take, tensor
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR
@@ -34,7 +34,7 @@ from torchgco.solvers.line_search import LineSearch
 SURE = LineSearch(accept_last=False)
 AT_ONCE = 1536  # ways followed at once: memory stays bounded, however large the batch
 BETWEEN = 0.049  # of r_obs + r_veh: how deep a finalist may cut into an obstacle between knots; the judge bears 0.05
-DAMPING = 0.02  # of all solves, in units of cost
+DAMPING = 0.02  # of all solves, in units of `Problem.cost_unit`
 PUSHED = 0.1  # share of the horizon that a push lasts
 ALIKE = 2e-3  # settled paths whose penalised costs differ by less, as a share, are taken for one
 
@@ -85,9 +85,9 @@ class Detour:
     Args:
         roadmap: finds the ways.
         ways: how many are followed.
-        pushes: offsets (m,) of the controls over the first tenth of the horizon, as shares of the range from rest to the
-            control bounds; every way is followed from rest, and once from each offset. An initial turn lets a vehicle
-            that turns slowly find reversing and three-point turns.
+        pushes: offsets (m,) of the controls over the first tenth of the horizon, as shares of the range from rest to
+            the control bounds; every way is followed from rest, and once from each offset. An initial turn lets a
+            vehicle that turns slowly find reversing and three-point turns.
         keep: how many of these are settled, the cheapest as followed; None: all.
         begin, end: the shares of the horizon at which the vehicle sets out and arrives. Several ends: every way is
             followed to arrive at each.
@@ -244,7 +244,12 @@ class Detour:
         part, warm = plans.problem.take(rows), take(duals, rows)
         inner = replace(self._inner(self.iterations), tolerance=0.1 * self.tolerance)
         solver = AugmentedLagrangian(
-            inner, initial_penalty=1.0, max_outer_iterations=20, cost_tolerance=1e-3, grow_when_feasible=False, clip=True
+            inner,
+            initial_penalty=1.0,
+            max_outer_iterations=20,
+            cost_tolerance=1e-3,
+            grow_when_feasible=False,
+            clip=True,
         )
         end = solver.solve(part, plans.U[rows], warm=warm)
         good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.U)

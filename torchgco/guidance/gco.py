@@ -130,7 +130,7 @@ class GCO:
         return Advice(new, plan, taken, duals)
 
     def _holds(self, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-        """Whether a sampled plan stays with the task, (B,): under unstable dynamics samples diverge, clear of everything."""
+        """Whether a sampled plan keeps to its task, (B,): unstable dynamics let samples diverge, away from all else."""
         return problem.cost.total(X, U).abs() <= DIVERGED * problem.N * problem.cost_unit
 
     def _caught(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.draws import DrawKey, standard_normal
 from torchgco.guidance.samples import Flight, Noise, average, draw, fly
-from torchgco.problem import Problem
 from torchgco.native.dispatch import open_loop
+from torchgco.problem import Problem
 from torchgco.shapes import InputError, check_shape, tensor
 
 CHUNK = 8192  # samples flown side by side: what a stage needs of them stays in a core's cache

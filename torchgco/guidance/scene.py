@@ -8,8 +8,8 @@ from torch import Tensor
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.guidance.roadmap import FAR, Scene, segment_gaps
-from torchgco.problem import Problem
 from torchgco.native.dispatch import open_loop
+from torchgco.problem import Problem
 from torchgco.shapes import InputError
 
 OPEN = 1e10  # a range of controls that is no range
@@ -87,7 +87,10 @@ def depth_between(problem: Problem, X: Tensor) -> Tensor:
 
 
 def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:
-    """Range (B, P, m) of the controls from rest (B, N, m), stage 0, to the bound that a sign (P, m) points to; 1 if open."""
+    """Range (B, P, m) of the controls from rest (B, N, m), stage 0, to the bound that a sign (P, m) points to.
+
+    Where there is no bound, 1.
+    """
     first = rest[:, :1]
     for constraint in problem.constraints:
         if isinstance(constraint, ControlBounds):

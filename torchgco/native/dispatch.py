@@ -15,7 +15,6 @@ from torchgco.native.engine import Engine, Terms
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 
-
 NUDGE = 1e-14  # share of the controls by which a rollout's sensitivity is tried out
 AMPLIFIED = 1e6  # times that: other last bits are no matter below it
 

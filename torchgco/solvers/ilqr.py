@@ -30,7 +30,8 @@ class ILQR:
     Args:
         tolerance: share of L_M. The solve ends where a full step changed L_M by less and the quadratic model expects
             no more than that from the step.
-        absolute_tolerance: ends the solve where |L_M - L_M,prev| is below it, in units of cost (as printed); 0: never.
+        absolute_tolerance: ends the solve where |L_M - L_M,prev| is below it, in units of cost (as printed), or of
+            `Problem.cost_unit` where `normalise`; 0: never.
         normalise: work in units of `Problem.cost_unit`, so that scaling all weights changes no iterate: penalties and
             regularisation are then relative to the cost. False as printed.
         max_iterations: inner limit.

@@ -29,7 +29,8 @@ def diverges(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor, G: Ten
 
 def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Candidates:
     """The first rollout that lowers L_M = merit (B,) markedly, from X (B, N+1, n), U (B, N, m); else not accepted."""
-    found = Candidates(X.clone(), U.clone(), merit.clone(), merit.clone(), torch.ones_like(merit), torch.zeros_like(merit, dtype=torch.bool))
+    none = torch.zeros_like(merit, dtype=torch.bool)
+    found = Candidates(X.clone(), U.clone(), merit.clone(), merit.clone(), torch.ones_like(merit), none)
     rows = torch.arange(X.shape[0], device=X.device)
     for i in range(ROUNDS):
         if rows.numel() == 0:

@@ -75,8 +75,8 @@ class Polish:
 
         An element is replaced where its violation falls below the tolerance, or stays within it (or within what it was)
         while the KKT residual falls; never where its cost would rise by more than `cost_rise`, or the straight way
-        between two knots would meet an obstacle that it kept clear of. The status of a replaced element is that of its new
-        trajectory; counts of iterations stay those of the solver.
+        between two knots would meet an obstacle that it kept clear of. The status of a replaced element is that of its
+        new trajectory; counts of iterations stay those of the solver.
 
         Raises:
             InputError: a problem that isn't float64, or a solution of others.

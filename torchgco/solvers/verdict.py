@@ -1,7 +1,8 @@
 """What the solver says of a trajectory that it returns: feedback gains, how far from stationary it is, and the status.
 
-The test asks how much cost the quadratic model could still save: the expected decrease of one full step on J_var + lam'c,
-and what complementarity leaves open, as a share of the cost. It depends on no scale of cost, controls or constraints.
+The test asks how much cost the quadratic model could still save: the expected decrease of one full step on
+J_var + lam'c, and what complementarity leaves open, as a share of the cost. It depends on no scale of cost, controls or
+constraints.
 """
 
 from __future__ import annotations
