@@ -99,18 +99,6 @@ def copied(tree: Any) -> Any:
     return tree
 
 
-def joined(first: Any, second: Any) -> Any:
-    """The rows of two trees of one structure, one after the other; what is no tensor is the first's."""
-    if isinstance(first, Tensor):
-        return torch.cat((first, second))
-    if isinstance(first, tuple):
-        return tuple(joined(a, b) for a, b in zip(first, second, strict=True))
-    if is_dataclass(first) and not isinstance(first, type):
-        names = [f.name for f in fields(first)]
-        return replace(first, **{name: joined(getattr(first, name), getattr(second, name)) for name in names})
-    return first
-
-
 def put(tree: Any, index: Tensor, rows: Any) -> None:
     """Write `rows` into rows `index` of every tensor of `tree`, in place; the two have the same structure."""
     if isinstance(tree, Tensor):

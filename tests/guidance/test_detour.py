@@ -350,7 +350,7 @@ def test_a_plan_with_its_own_penalty_is_left_alone() -> None:
 
 CHANGES = dict(
     roadmap=Roadmap(margin=1.0), begin=0.2, end=0.7, smoothing=0.2, tube=0.2, stiffness=(50.0,), obstacle_penalty=50.0,
-    hold=5.0, tolerance=0.5, iterations=2, settle=2, dtype="float32",
+    hold=5.0, tolerance=0.5, iterations=2, settle=2
 )  # fmt: skip
 
 
@@ -379,7 +379,7 @@ def test_a_quadrotor_is_led_too() -> None:
         (dict(ways=0), "detour.ways"), (dict(keep=0), "detour.keep"),
         (dict(settle=-1), "detour.settle"), (dict(depth=0.0), "detour.depth"),
         (dict(tolerance=0.0), "detour.tolerance"), (dict(finalists=0), "detour.finalists"),
-        (dict(dtype="float16"), "detour.dtype"), (dict(pushes=7), "detour.pushes"),
+        (dict(pushes=7), "detour.pushes"),
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_named(change: dict, field: str) -> None:

@@ -65,7 +65,7 @@ SINGLE = replace(
     BASE,
     attempts=2,
     max_outer_iterations=6,
-    guidance=replace(BASE.guidance, sampler=SAMPLER, detour=Detour(dtype="float32")),
+    guidance=replace(BASE.guidance, sampler=SAMPLER, detour=Detour()),
 )
 
 

@@ -79,25 +79,6 @@ def test_freed_slots_are_taken_by_those_that_wait(batch: str, solver: str) -> No
 KEPT = torch.tensor([0, 1, 2, 3, 5, 6])
 
 
-@pytest.mark.parametrize("batch", BATCHES)
-def test_waiting_for_company_changes_nothing(batch: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, U0 = BATCHES[batch]()
-    solver = SOLVERS["gco with plans"]
-    asked: list[int] = []
-    update = GCO.update
-    monkeypatch.setattr(
-        GCO, "update", lambda self, problem, *rest: (asked.append(problem.B), update(self, problem, *rest))[1]
-    )
-    alone, counts = {}, {}
-    for passes in (1, 20, 1000):
-        monkeypatch.setattr("torchgco.solvers.batch.PASSES_ASIDE", passes)
-        asked.clear()
-        alone[passes], counts[passes] = solver.solve(problem, U0, seed=3), len(asked)
-    assert counts[1] > counts[20] >= counts[1000]
-    for passes in (20, 1000):
-        assert_same_bits(alone[passes], alone[1])
-
-
 def assert_same_bits(a: Solution, b: Solution) -> None:
     for name in FIELDS:
         assert torch.equal(getattr(a, name), getattr(b, name)), name

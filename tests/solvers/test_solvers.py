@@ -358,9 +358,6 @@ class OnePlan:
     def start(self, problem, X):
         return GuideRegion.inactive(X, torch.ones_like(X[:, 0, 0]), slice(0, 2))
 
-    def takes_long(self, problem, X, U, key):
-        return torch.zeros(problem.B, dtype=torch.bool)
-
     def update(self, problem, X, U, guide, key):
         return Advice(guide, self.plan.expand_as(U), key.outer == 1)
 

@@ -18,6 +18,7 @@ from torchgco.certificate import frame_columns as certificate_columns
 from torchgco.experiments.build import Setup, allotted_cores
 from torchgco.judge import frame_columns, judge
 from torchgco.kernels import compiling
+from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
 from torchgco.scenarios import Layouts
 from torchgco.shapes import InputError
@@ -130,6 +131,7 @@ class Flight:
     def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, int]:
         """The solution, seconds per problem, and problems worked on at once: half as many after each lack of memory."""
         # What a solver builds or compiles for a batch is set-up: the clock starts after it.
+        engine_of(problem)
         solver = self.solver.prepare(problem) if hasattr(self.solver, "prepare") else self.solver
         if compiling():
             few = torch.arange(min(WARM_UP, problem.B), device=U0.device)

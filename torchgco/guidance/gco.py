@@ -96,10 +96,6 @@ class GCO:
         weight = X.new_full((problem.B,), self.initial_penalty)
         return GuideRegion.inactive(X, weight, position(problem))
 
-    def takes_long(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
-        """The elements that are caught, (B,): for them a way is sought."""
-        return self._caught(problem, X, U, key).any(-1)
-
     def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> Advice:
         """CPUF for every element: a region where it is caught, none where it isn't; or the plan itself, where taken."""
         knots = self._caught(problem, X, U, key)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -138,7 +139,7 @@ class Engine:
     def gains(
         self, problem: Problem, X: Tensor, U: Tensor, terms: Terms, mu_r: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """G = [K d] (B, N, m, n+1) for J_var + lam'c, the sums of its expected change (B,), and where the pass failed."""
+        """G = [K d] (B, N, m, n+1) for J_var + lam'c, sums of its expected change (B,), and where the pass failed."""
         N, m, z = problem.N, problem.m, problem.n + 1
         tensors = {"X": X.contiguous(), "U": U.contiguous(), "regularisation": mu_r.contiguous()}
         tensors |= {name: torch.zeros_like(mu_r) for name in ("cost", "merit")}
@@ -175,6 +176,8 @@ class Engine:
     def _run(self, name: str, problem: Problem, packed: _Problem) -> None:
         """Call a function of the library on all elements, by as many threads as PyTorch has."""
         function, count = getattr(self.library, name), problem.B
+        if count == 0:
+            return
         groups = -(-count // LANES)
         parts = min(torch.get_num_threads(), groups)
         if parts <= 1:
@@ -184,7 +187,7 @@ class Engine:
             with ThreadPoolExecutor(parts) as pool:
                 calls = [
                     pool.submit(function, ctypes.byref(packed), ctypes.c_int64(a), ctypes.c_int64(b))
-                    for a, b in zip(edges[:-1], edges[1:], strict=True)
+                    for a, b in pairwise(edges)
                 ]
                 done = [call.result() for call in calls]
         if not all(done):
@@ -223,6 +226,8 @@ class Engine:
     def _fixed(self, problem: Problem) -> tuple[_Problem, Any, list[Any]]:
         """What doesn't change from call to call: model, cost and constraints, without multipliers."""
         packed, keep, cost = _Problem(), [], problem.cost
+        if problem.B == 0:
+            return packed, (_Constraint * max(1, len(problem.constraints)))(), keep
         assert isinstance(cost, BoundQuadratic)
         packed.N, packed.elements, packed.constraints = problem.N, problem.B, len(problem.constraints)
         shared = {"Q": cost.Q, "R": cost.R, "x_ref": cost.x_ref, "u_ref": cost.u_ref, "q": cost.q, "r": cost.r}

@@ -75,7 +75,8 @@ def _switches(functions: Iterable[tuple[int, RowsSource]]) -> str:
         [
             "static inline void tgco_rows(int i, const V *x, const V *u, V *c) {", "    switch (i) {", *values,
             "    }", "}",
-            "static inline void tgco_add_rows(int i, const V *x, const V *u, const V *by_c, const V *by_cc, V *g, V *H) {",
+            "static inline void tgco_add_rows(",
+            "    int i, const V *x, const V *u, const V *by_c, const V *by_cc, V *g, V *H) {",
             "    switch (i) {", *adds, "    }", "}",
         ]
     )  # fmt: skip

@@ -18,7 +18,7 @@ from torchgco.draws import DrawKey
 from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
 from torchgco.native.dispatch import engine_of, open_loop, reproducible, value
 from torchgco.problem import Problem
-from torchgco.shapes import InputError, copied, joined, put, take
+from torchgco.shapes import InputError, copied, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.attempts import go_on_from, has_arrived, try_again
 from torchgco.solvers.iteration import EagerIterations, NativeIterations, PassEnd
@@ -26,8 +26,6 @@ from torchgco.solvers.state import Callback, InnerEnd, Iterate, OuterLoop, Progr
 from torchgco.solvers.trace import Recorder
 from torchgco.solvers.verdict import final_status, optimality
 from torchgco.status import Status
-
-PASSES_ASIDE = 20  # how long an element may wait for company; sampling for a few costs as much as for many
 
 
 class Loop:
@@ -64,7 +62,7 @@ class Loop:
         everyone = torch.arange(problem.B, device=U0.device)
         slots = problem.B if solver.slots is None else min(solver.slots, problem.B)
         self.waiting = everyone[slots:]
-        self.state, self.aside, self.passes_aside = self._begin(everyone[:slots]), None, 0
+        self.state = self._begin(everyone[:slots])
         self.problem = problem if slots == problem.B else problem.take(everyone[:slots])
         limit = 1 if solver.record else solver.inner.max_iterations
         kernels = NativeIterations if engine_of(problem) is not None else EagerIterations
@@ -76,11 +74,10 @@ class Loop:
         passes = 0
         while self.state.rows.numel() > 0:
             self._end(self._pass())
-            self._ask_together()
             passes += 1
             if self.callback is not None:
                 total = self.whole.B
-                left = self.state.rows.numel() + self.waiting.numel() + _count(self.aside)
+                left = self.state.rows.numel() + self.waiting.numel()
                 self.callback(Progress(passes, total - left, total, self.state))
         return self._finished()
 
@@ -104,7 +101,6 @@ class Loop:
             last_cost=worst.clone(),
             best=copied(iterate), origin=copied(iterate),
             attempt=zero.clone(), since=zero.clone(), led=torch.zeros_like(rows, dtype=torch.bool),
-            asking=torch.zeros_like(rows, dtype=torch.bool),
         )  # fmt: skip
 
     def _bad_starts(self, state: State) -> Tensor:
@@ -165,21 +161,10 @@ class Loop:
         put(self.state.best, rows[chosen], take(new, chosen))
 
     def _next_inner(self, rows: Tensor, duals: Multipliers) -> None:
-        """New multipliers and penalties for the elements in `rows`; the next inner solve where no advice is awaited."""
-        s, guidance = self.state, self.guidance
+        """The next inner solve of the elements in `rows`: multipliers, penalties, guidance, and L_M with them."""
+        s = self.state
         s.duals = Multipliers(tuple(lam.clone() for lam in s.duals.lam), s.duals.mu.clone())
         put(s.duals, rows, duals)
-        if guidance is not None:
-            problem = self.problem.take(rows)
-            long = guidance.takes_long(problem, s.X[rows], s.U[rows], self._key(rows)) & ~s.led[rows]
-            s.asking[rows] = long
-            rows = rows[~long]
-        if rows.numel() > 0:
-            self._begin_inner(rows)
-
-    def _begin_inner(self, rows: Tensor) -> None:
-        """Guidance, and L_M anew."""
-        s = self.state
         self._be_guided(rows[~s.led[rows]])
         s.regularisation[rows] = 0.0
         lagrangian = Lagrangian(self.problem.take(rows), take(s.duals, rows), take(s.guide, rows), self.solver.clip)
@@ -200,29 +185,6 @@ class Loop:
     def _key(self, rows: Tensor) -> DrawKey:
         s = self.state
         return DrawKey(self.seed, self.ids[s.rows[rows]], s.outer[rows], s.since[rows], s.attempt[rows].clamp(min=1))
-
-    def _ask_together(self) -> None:
-        """Put aside those that wait for long advice, and ask for all of them at once after some passes."""
-        s = self.state
-        if bool(s.asking.any()):
-            if self.aside is None:
-                self.passes_aside = 0
-            asking, others = s.asking.nonzero().flatten(), (~s.asking).nonzero().flatten()
-            self.aside = take(s, asking) if self.aside is None else joined(self.aside, take(s, asking))
-            self._resume(take(s, others))
-        if self.aside is None:
-            return
-        self.passes_aside += 1
-        if self.passes_aside < PASSES_ASIDE and self.state.rows.numel() > 0:
-            return
-        ran = self.state.rows.numel()
-        self._resume(joined(self.state, self.aside))
-        self.aside = None
-        self.state.asking[:] = False
-        self._begin_inner(torch.arange(ran, self.state.rows.numel(), device=self.state.rows.device))
-
-    def _resume(self, state: State) -> None:
-        self.state, self.problem = state, self.whole.take(state.rows)
 
     # End ---------------------------------------------------------------------------------------------------------
 
@@ -272,10 +234,6 @@ class Loop:
             r, status=status, cost=self.given.cost.total(r.X, r.U), multipliers=r.multipliers.scaled(self.unit),
             trace=None if self.recorder is None else self.recorder.frame(self.unit),
         )  # fmt: skip
-
-
-def _count(state: State | None) -> int:
-    return 0 if state is None else state.rows.numel()
 
 
 def _empty_result(problem: Problem, U0: Tensor) -> Solution:

@@ -116,7 +116,9 @@ class EagerIterations:
         status[step.failed & (s.regularisation > inner.regularisation_max)] = Status.NOT_POSITIVE_DEFINITE
         status[step.failed & ~finite] = Status.NON_FINITE
 
-    def _move(self, s: State, lagrangian: Lagrangian, step: BackwardPass, moving: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _move(
+        self, s: State, lagrangian: Lagrangian, step: BackwardPass, moving: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Forward pass of the elements in `moving`; returns the merit before, the step lengths, and who was refused."""
         old_merit = s.merit
         alpha, refused = torch.zeros_like(old_merit), torch.zeros_like(moving)

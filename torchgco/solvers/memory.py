@@ -7,6 +7,7 @@ import os
 import torch
 
 from torchgco.lagrangian import Multipliers
+from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 
@@ -21,9 +22,11 @@ def element_bytes(problem: Problem) -> int:
     z, s = n + 1, n + 1 + m
     one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
     rows = sum(lam.numel() for lam in Multipliers.zero(one, 0.0).lam)
-    expansion = N * (2 * z * s + 2 * s * s + 2 * m * z)  # F, H and gains, with what they are made of
+    gains = N * 2 * m * z
+    # F and H, with what they are made of: native kernels need them for eight problems at a time.
+    expansion = 0 if engine_of(problem) is not None else N * (2 * z * s + 2 * s * s)
     trajectories = N * (n + m) * 16  # iterate, best, origin, result, and those tried by a line search
-    return NUMBER * (expansion + trajectories + 12 * rows)
+    return NUMBER * (gains + expansion + trajectories + 12 * rows)
 
 
 def plan_batch(problem: Problem, device: str | torch.device | None = None, processes: int = 1) -> int:

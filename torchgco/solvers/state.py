@@ -50,7 +50,6 @@ class State:
     attempt: Tensor  # plans tried from there, 0 while none was
     since: Tensor  # `outer` when the attempt began
     led: Tensor  # bool: the attempt goes on from a plan with its own penalty, and guidance keeps silent
-    asking: Tensor  # bool: put aside until guidance is asked for several at once
 
 
 @dataclass(frozen=True)
@@ -101,10 +100,6 @@ class Guidance(Protocol):
 
     def start(self, problem: Problem, X: Tensor) -> GuideRegion:
         """The penalty that is no penalty yet, for every element."""
-        ...
-
-    def takes_long(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
-        """For which elements (B',) `update` is so slow that it is better asked for many at once."""
         ...
 
     def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> Advice:
