@@ -16,13 +16,12 @@ SECTION = "share"
 
 # Share, and the functions (module, then attributes) whose own time it is.
 KERNELS = {
-    "backward pass": ("torchgco.solvers.batch:backward",),
-    "rollouts of the line search": ("torchgco.solvers.line_search:closed_loop",),
-    "rest of the line search": ("torchgco.solvers.line_search:LineSearch.search",),
-    "linearise": ("torchgco.solvers.batch:linearise",),
-    "value of the Lagrangian": ("torchgco.lagrangian:Lagrangian.value",),
-    "expansion of the Lagrangian": ("torchgco.lagrangian:Lagrangian.expand",),
+    "inner solves": ("torchgco.native.engine:Engine.iterate", "torchgco.solvers.iteration:EagerIterations.run"),
+    "rollouts and values": ("torchgco.native.engine:Engine.open_loop", "torchgco.native.engine:Engine.value"),
+    "gains and optimality": ("torchgco.solvers.batch:optimality",),
     "sampling": ("torchgco.guidance.mppi:MPPI.improve",),
+    "roadmap": ("torchgco.guidance.roadmap:Roadmap.ways",),
+    "rest of the candidates": ("torchgco.guidance.detour:Detour.propose",),
     "outer updates": ("torchgco.solvers.batch:Loop._end_inner",),
 }
 
