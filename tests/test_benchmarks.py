@@ -67,7 +67,7 @@ def test_shares_add_up(tmp_path: Path) -> None:
     bench = tiny(tmp_path)
     share.run(bench)
     shares = [float(row["value"]) for row in bench.results.rows if row["unit"] == "%"]
-    assert sum(shares) == pytest.approx(100, abs=1) and numbers(bench, "backward pass")[0] > 0
+    assert sum(shares) == pytest.approx(100, abs=1) and numbers(bench, "inner solves")[0] > 0
 
 
 def test_what_takes_too_long_is_left_out_and_named(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from torchgco.native.source import LANES, Form
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 
-ABSENT = -1e30  # squared distance of an obstacle that isn't there
+ABSENT = -1.0  # squared distance of an obstacle that isn't there
 BOX, SPHERES, FUNCTION = range(3)
 NO_GUIDE, REGION, PATH = range(3)
 _Doubles = ctypes.POINTER(ctypes.c_double)
@@ -285,7 +285,7 @@ def _array(value: Tensor | None, keep: list[Any], knots: bool) -> _Array:
     """A tensor (B|1, [N|1,] ...) with strides of 0 where an axis has length 1."""
     if value is None or value.numel() == 0:
         return _Array(None, 0, 0, 0)
-    value = value.contiguous()
+    value = value.to(torch.float64).contiguous()
     keep.append(value)
     per_knot = value[0, 0].numel() if knots else value[0].numel()
     many = value.shape[1] if knots else 1

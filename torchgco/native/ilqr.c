@@ -186,9 +186,11 @@ static inline void sphere(const Lanes *s, int64_t i, int64_t j, const V *x, int6
     const Constraint *con = s->of->constraint + i;
     const V *o = s->bound[i] + j * DIM;
     V square = SET(0.0);
+    I here = s->squares[i][j] >= SET(0.0); /* an absent one is c = -1 everywhere */
     for (int a = 0; a < DIM; a++) {
         away[a] = x[POSITION + a] - o[a];
         if (con->velocities.data) away[a] -= SET(k * con->dt) * s->velocities[i][j * DIM + a];
+        away[a] = tgco_if(here, away[a]);
         square += away[a] * away[a];
     }
     *c = s->squares[i][j] - square;

@@ -1,0 +1,288 @@
+"""Inner solves in C against those of PyTorch, on all that a problem may be made of."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.problems import PRINTED, planar_batch, quadrotor_batch
+from torchgco import (
+    ILQR,
+    AugmentedLagrangian,
+    ControlBounds,
+    FunctionConstraint,
+    FunctionDynamics,
+    LineSearch,
+    Planar,
+    Problem,
+    QuadraticCost,
+    Spheres,
+    StateBounds,
+    kernels,
+)
+from torchgco.constraints.guides import GuidePath, GuideRegion
+from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.native.dispatch import EagerWarning, engine_of, terms_of
+from torchgco.rollout import open_loop
+from torchgco.solvers.iteration import EagerIterations, NativeIterations
+from torchgco.solvers.state import State
+from torchgco.solvers.verdict import optimality
+
+DAMPED = ILQR(max_iterations=50, damping=0.1, line_search=LineSearch(accept_last=False))
+
+
+@pytest.fixture(autouse=True)
+def one_thread_and_native_again() -> Iterator[None]:
+    yield
+    kernels.use_native(True)
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def user_problem(B: int = 5, N: int = 12) -> Problem:
+    """A car given as a function, with weights that are matrices, functions as constraints, and bounded states."""
+
+    def field(x: Tensor, u: Tensor) -> Tensor:
+        speed = torch.tanh(x[..., 3])
+        return torch.stack((speed * x[..., 2].cos(), speed * x[..., 2].sin(), u[..., 1], u[..., 0]), dim=-1)
+
+    W = normal(6, 6, seed=2)
+    W = W @ W.T / 6 + 0.1 * torch.eye(6, dtype=torch.float64)
+    return Problem(
+        FunctionDynamics(field, 4, 2, dt=0.1, integrator="rk4", position=slice(0, 2)),
+        QuadraticCost(
+            Q=W[:4, :4], R=W[4:, 4:], Qf=10 * W[:4, :4], H=W[4:, :4], x_ref=normal(N + 1, 4, seed=3),
+            q=[0.1, 0, 0, 0.2], r=[0.3, -0.1], qf=[1.0, 0, 0, 0], u_ref=normal(N, 2, seed=4),
+        ),
+        [
+            FunctionConstraint(lambda x: 0.3 - (x[..., :2] - 0.5).square().sum(-1, keepdim=True), geometric=True),
+            FunctionConstraint(lambda x, u: (u * x[..., :2]).sum(-1, keepdim=True) - 1.0, of="xu", knots=[0, 3, 7]),
+            FunctionConstraint(lambda x: x[..., 3:] - 0.1, sense="equality", knots=[-1]),
+            StateBounds([-torch.inf, -0.5, -1.0, -torch.inf], [torch.inf, 0.5, torch.inf, 0.8]),
+            ControlBounds([-1.0, -torch.inf], [torch.inf, 2.0]),
+        ],
+        0.3 * normal(B, 4),
+        N,
+    )  # fmt: skip
+
+
+def moving_problem(B: int = 5, N: int = 15) -> Problem:
+    """Planar vehicles of different drag among moving discs, one of them absent, with goals per problem."""
+    centers, radii = 0.5 * normal(B, 3, 2, seed=5), torch.full((B, 3), 0.2, dtype=torch.float64)
+    centers[1, 2], radii[1, 2] = torch.nan, torch.nan
+    goal = torch.zeros(B, 1, 6, dtype=torch.float64)
+    goal[:, 0, :2] = 1.0 + 0.2 * normal(B, 2, seed=6)
+    start = torch.zeros(B, 6, dtype=torch.float64)
+    start[:, 0] = -1.0
+    return Problem(
+        Planar(dt=0.05, drag=8.0 + normal(B).abs()),
+        QuadraticCost(Q=[5, 5, 0, 1, 1, 0], R=[0.1, 0.1], Qf=[50, 50, 0, 1, 1, 0], x_ref=goal),
+        [Spheres(centers, radii, 0.05, velocities=0.3 * normal(B, 3, 2, seed=7)), ControlBounds([-10, -10], [10, 10])],
+        start, N,
+    )  # fmt: skip
+
+
+def linear_problem(n: int, m: int, N: int, B: int = 3) -> Problem:
+    A, C = torch.eye(n, dtype=torch.float64) + 0.1 * normal(n, n, seed=8), normal(n, m, seed=9)
+    dynamics = FunctionDynamics(
+        lambda x, u: (A * x.unsqueeze(-2)).sum(-1) + (C * u.unsqueeze(-2)).sum(-1), n, m, dt=1.0, integrator="none"
+    )
+    cost = QuadraticCost(Q=[1.0] * n, R=[0.5] * m, Qf=[2.0] * n)
+    return Problem(dynamics, cost, [ControlBounds([-0.1] * m, [0.1] * m)], normal(B, n), N)
+
+
+PROBLEMS: dict[str, Callable[[], Problem]] = {
+    "planar": lambda: planar_batch(B=5, N=20, obstacles=5)[0],
+    "quadrotor": lambda: quadrotor_batch(B=5, N=15, obstacles=5)[0],
+    "a user's own": user_problem,
+    "moving": moving_problem,
+    "one stage": lambda: planar_batch(B=3, N=1, obstacles=2)[0],
+}
+
+
+def begun(problem: Problem, guided: str | None = None, clip: bool = True, seed: int = 0) -> tuple[State, Lagrangian]:
+    """A state as a loop holds it, along random controls, with multipliers and penalties at work."""
+    B = problem.B
+    U = problem.cost.rest_controls(problem.x0.new_zeros(B, problem.N, problem.m)) + 0.5 * normal(
+        B, problem.N, problem.m, seed=seed
+    )
+    X = open_loop(problem.dynamics, problem.x0, U)
+    duals = Multipliers.zero(problem, 3.0)
+    lam = []
+    for constraint, zero in zip(problem.constraints, duals.lam, strict=True):
+        drawn = normal(*zero.shape, seed=11)
+        lam.append(drawn if constraint.sense == "equality" else drawn.clamp(min=0.0))
+    at = problem.dynamics.position
+    guide = None
+    if guided is not None:
+        center, weight = X[..., at] + 0.1 * normal(*X[..., at].shape, seed=12), torch.full((B,), 4.0, dtype=X.dtype)
+        radius = torch.where(normal(B, problem.N + 1, seed=13) > 0, 0.05, torch.inf)
+        guide = GuidePath(center, weight, at) if guided == "path" else GuideRegion(center, radius, weight, at)
+    lagrangian = Lagrangian(problem, Multipliers(tuple(lam), duals.mu), guide, clip)
+    cost, merit = lagrangian.value(X, U)
+    zero = torch.zeros(B, dtype=torch.int64)
+    blank = dict.fromkeys(State.__dataclass_fields__)
+    state = State(
+        **{
+            **blank, "rows": torch.arange(B), "X": X, "U": U, "cost": cost, "merit": merit, "inner": zero,
+            "iterations": zero.clone(), "regularisation": torch.zeros_like(cost), "outer": zero.clone(),
+        }
+    )  # fmt: skip
+    return state, lagrangian
+
+
+def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict[int, tuple[bool, bool, int]]:
+    """Iterations by PyTorch until every element has ended or made `count`; how each ended."""
+    ends: dict[int, tuple[bool, bool, int]] = {}
+    for _ in range(3 * count):
+        frozen = replace(state)
+        end = EagerIterations(inner, lagrangian.problem, 1).run(state, lagrangian)
+        for b in range(lagrangian.problem.B):
+            if b in ends:  # an element that had ended before stays where it was
+                for name in ("X", "U", "cost", "merit", "inner", "iterations", "regularisation"):
+                    getattr(state, name)[b] = getattr(frozen, name)[b]
+            elif bool(end.ended[b]) or int(state.iterations[b]) == count:
+                ends[b] = bool(end.converged[b]), bool(end.stuck[b]), int(state.iterations[b])
+        if len(ends) == lagrangian.problem.B:
+            break
+    return ends
+
+
+@pytest.mark.parametrize("clip", [True, False], ids=["clipped", "printed"])
+@pytest.mark.parametrize("guided", [None, "region", "path"])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None, clip: bool) -> None:
+    problem = PROBLEMS[name]()
+    state, lagrangian = begun(problem, guided, clip)
+    engine = engine_of(problem)
+    assert engine is not None
+    for mine, theirs in zip(engine.value(problem, state.X, state.U, terms_of(lagrangian)), lagrangian.value(
+        state.X, state.U
+    ), strict=True):  # fmt: skip
+        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(engine.open_loop(problem, state.U), state.X, rtol=1e-10, atol=1e-12)
+    for count in (1, 4):
+        (a, first), (b, second) = begun(problem, guided, clip), begun(problem, guided, clip)
+        ends = eager(DAMPED, a, first, count)
+        out = NativeIterations(DAMPED, problem, count).run(b, second)
+        torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
+        assert torch.equal(b.iterations, a.iterations) and torch.equal(b.inner, a.inner)
+        torch.testing.assert_close(b.regularisation, a.regularisation, rtol=1e-10, atol=0)
+        assert [bool(x) for x in out.converged] == [ends[i][0] for i in range(problem.B)]
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_gains_and_optimality_are_pytorchs(name: str) -> None:
+    problem = PROBLEMS[name]()
+    state, lagrangian = begun(problem)
+    native = optimality(lagrangian, state.X, state.U)
+    kernels.use_native(False)
+    plain = optimality(lagrangian, state.X, state.U)
+    torch.testing.assert_close(native.K, plain.K, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(native.d, plain.d, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(native.left, plain.left, rtol=1e-8, atol=0)
+
+
+@pytest.mark.parametrize(("n", "m", "N"), [(1, 1, 1), (2, 3, 4), (5, 1, 9), (20, 20, 3), (13, 4, 1)])
+def test_models_of_any_size(n: int, m: int, N: int) -> None:
+    problem = linear_problem(n, m, N)
+    (a, first), (b, second) = begun(problem), begun(problem)
+    eager(DAMPED, a, first, 5)
+    NativeIterations(DAMPED, problem, 5).run(b, second)
+    torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("B", [1, 2, 3, 7, 8, 9, 40])
+def test_an_element_has_its_bits_in_every_batch(B: int) -> None:
+    whole = planar_batch(B=40, N=15, obstacles=5)[0]
+    all_of_them, lagrangian = begun(whole)
+    NativeIterations(DAMPED, whole, 6).run(all_of_them, lagrangian)
+    state, lagrangian = begun(whole)
+    rows = torch.arange(B).flip(0)
+    part = replace(state, **{
+        name: getattr(state, name)[rows]
+        for name in ("X", "U", "cost", "merit", "inner", "iterations", "regularisation", "rows", "outer")
+    })  # fmt: skip
+    NativeIterations(DAMPED, whole.take(rows), 6).run(part, lagrangian.take(rows))
+    for name in ("X", "U", "cost", "merit", "regularisation", "iterations"):
+        assert torch.equal(getattr(part, name), getattr(all_of_them, name)[rows]), name
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_neighbour_that_is_not_finite_changes_no_bits(threads: int) -> None:
+    problem = quadrotor_batch(B=19, N=10, obstacles=4)[0]
+    want, lagrangian = begun(problem)
+    NativeIterations(DAMPED, problem, 5).run(want, lagrangian)
+    state, lagrangian = begun(problem)
+    state.X[3], state.U[11, 4] = torch.nan, torch.inf
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        end = NativeIterations(DAMPED, problem, 5).run(state, lagrangian)
+    finally:
+        torch.set_num_threads(before)
+    rest = torch.tensor([b for b in range(19) if b not in (3, 11)])
+    assert end.status[3] > 1 and bool((end.status[rest] == 0).all())
+    for name in ("X", "U", "merit", "iterations"):
+        assert torch.equal(getattr(state, name)[rest], getattr(want, name)[rest]), name
+
+
+def test_statuses_are_those_of_pytorch() -> None:
+    """A concave cost without bounds has no minimum to find; one that nothing regularises enough ends with a status."""
+    free = planar_batch(B=2, N=6)[0]
+    concave = replace(free.cost, R=-free.cost.R)
+    problem = free._with({"cost": concave, "constraints": ()})
+    for inner in (replace(DAMPED, regularisation_max=1e-4), replace(DAMPED, max_iterations=3)):
+        (a, first), (b, second) = begun(problem), begun(problem)
+        native = NativeIterations(inner, problem, 3).run(b, second)
+        statuses = torch.zeros(2, dtype=torch.int64)
+        for _ in range(20):
+            end = EagerIterations(inner, problem, 1).run(a, first)
+            statuses = torch.where(statuses == 0, end.status, statuses)
+            if bool((end.ended | (statuses > 0)).all()):
+                break
+        assert torch.equal(native.status, statuses)
+
+
+def test_whole_solves_agree() -> None:
+    problem, U0 = quadrotor_batch(B=3, N=20, obstacles=5, seed=2)
+    for inner in (DAMPED, ILQR(absolute_tolerance=0.1, max_iterations=15, **PRINTED)):
+        solver = AugmentedLagrangian(inner=inner, max_outer_iterations=5, clip=inner is DAMPED)
+        native = solver.solve(problem, U0)
+        kernels.use_native(False)
+        plain = solver.solve(problem, U0)
+        kernels.use_native(True)
+        assert torch.equal(native.iterations, plain.iterations) and native.statuses == plain.statuses
+        torch.testing.assert_close(native.cost, plain.cost, rtol=1e-6, atol=0)
+
+
+def test_a_problem_that_cannot_be_native_says_why_once() -> None:
+    def looks(x: Tensor, u: Tensor) -> Tensor:
+        return x if float(x.sum()) > 1e9 else x + 0.1 * u
+
+    dynamics = FunctionDynamics(looks, 2, 2, dt=1.0, integrator="none")
+    problem = Problem(dynamics, QuadraticCost([1.0] * 2, [1.0] * 2, [1.0] * 2), [], normal(2, 2), 4)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        solution = ILQR().solve(problem, torch.zeros(2, 4, 2, dtype=torch.float64))
+        ILQR().solve(problem, solution.U)
+    messages = [str(w.message) for w in caught if issubclass(w.category, EagerWarning)]
+    assert len(messages) == 1 and "dynamics.step" in messages[0]
+    assert bool(torch.isfinite(solution.cost).all())
+
+
+def test_without_a_compiler_pytorch_solves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHGCO_CC", "none")
+    problem, U0 = planar_batch(B=2, N=10)
+    with pytest.warns(EagerWarning, match="no C compiler"):
+        solution = AugmentedLagrangian(max_outer_iterations=2).solve(problem, U0)
+    assert bool(torch.isfinite(solution.cost).all())
