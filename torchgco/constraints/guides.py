@@ -60,6 +60,11 @@ class GuidePath:
     weight: Tensor  # (B,), cost per m^2
     position: slice
 
+    @property
+    def is_active(self) -> Tensor:
+        """True for all, (B,) bool."""
+        return torch.ones_like(self.weight, dtype=torch.bool)
+
     def value(self, X: Tensor) -> Tensor:
         """What the springs cost, (B,)."""
         return 0.5 * self.weight * (X[..., self.position] - self.center).square().sum(-1).sum(-1)

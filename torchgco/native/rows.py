@@ -52,7 +52,8 @@ def _made(traced: Traced, name: str, n: int, m: int) -> dict[str, Any]:
     c = ca.densify(ca.vertcat(*traced(elements(ca.SX(0, 1)), elements(x)[None], elements(u)[None]).reshape(-1)))
     slopes = ca.sparsify(ca.jacobian(c, ca.vertcat(x, u), {"allow_reverse": False}))
     rows, columns = slopes.sparsity().get_triplet()
-    entries = ca.vertcat(ca.SX(0, 1), *slopes.nonzeros())
+    nonzeros: list[Any] = slopes.nonzeros()
+    entries = ca.vertcat(ca.SX(0, 1), *nonzeros)
     code = [
         emit.emit(f"tgco_{name}_rows", ca.Function("rows", [x, u], [c])),
         emit.emit(f"tgco_{name}_slopes", ca.Function("slopes", [x, u], [entries])),
