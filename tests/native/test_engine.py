@@ -37,7 +37,12 @@ DAMPED = ILQR(max_iterations=50, damping=0.1, line_search=LineSearch(accept_last
 
 
 @pytest.fixture(autouse=True)
-def one_thread_and_native_again() -> Iterator[None]:
+def cache() -> None:
+    """The user's own: libraries are compiled once for all of these tests."""
+
+
+@pytest.fixture(autouse=True)
+def native_again() -> Iterator[None]:
     yield
     kernels.use_native(True)
 
