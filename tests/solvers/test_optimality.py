@@ -12,6 +12,7 @@ from torchgco import (
     ILQR,
     AugmentedLagrangian,
     ControlBounds,
+    FunctionConstraint,
     FunctionDynamics,
     LineSearch,
     Planar,
@@ -202,3 +203,30 @@ def test_offsets_are_for_two_controls() -> None:
         torch.zeros(1, 4, dtype=torch.float64), 10,
     )  # fmt: skip
     assert presets.gco(problem).guidance.detour.pushes == ()
+
+
+def test_bounded_swing_ups_and_parkings_to_an_equality_are_solved_without_options() -> None:
+    for limit in (3.0, 5.0, 8.0):
+        base = pendulum()
+        problem = Problem(base.dynamics, base.cost, [ControlBounds([-limit], [limit])], base.x0, 100)
+        assert solve(problem).statuses == [Status.CONVERGED] * 2
+
+    def car(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return torch.stack((x[..., 3] * x[..., 2].cos(), x[..., 3] * x[..., 2].sin(), u[..., 1], u[..., 0]), dim=-1)
+
+    start = torch.zeros(40, 4, dtype=torch.float64)
+    start[:, :3] = torch.tensor([4.0, 4.0, 6.28]) * (
+        torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+    )
+    parking = Problem(
+        FunctionDynamics(car, 4, 2, dt=0.1, integrator="rk4", position=slice(0, 2)),
+        QuadraticCost(Q=[0.1, 0.1, 0.01, 0.01], R=[0.1, 0.1], Qf=[10, 10, 5, 5]),
+        [
+            ControlBounds([-2.0, -2.0], [2.0, 2.0]),
+            FunctionConstraint(lambda x: x, sense="equality", knots=[-1], name="goal"),
+        ],
+        start, 50,
+    )  # fmt: skip
+    parked = solve(parking)
+    assert parked.statuses == [Status.CONVERGED] * 40
+    assert float(certify(parking, parked.X, parked.U).kkt_residual.max()) < 0.01
