@@ -97,6 +97,10 @@ class Problem:
         """The same problems with their costs divided by `cost_unit`: no option of a solver depends on its scale."""
         return self._with({"cost": self.cost.scaled(1.0 / self.cost_unit)}, form=self.form)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The parts alone: compiled kernels stay in their process."""
+        return {f.name: getattr(self, f.name) for f in fields(self)} | {"form": {}}
+
     def take(self, index: Rows) -> Self:
         """The problems in `index` (int64, (B',), or a slice); a row may occur more than once."""
         parts = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -196,7 +198,7 @@ def test_gains_and_optimality_are_pytorchs(name: str) -> None:
     torch.testing.assert_close(native.left, plain.left, rtol=1e-8, atol=0)
 
 
-@pytest.mark.parametrize(("n", "m", "N"), [(1, 1, 1), (2, 3, 4), (5, 1, 9), (20, 20, 3), (13, 4, 1)])
+@pytest.mark.parametrize(("n", "m", "N"), [(1, 1, 1), (2, 3, 4), (5, 1, 9), (20, 20, 3), (13, 4, 1), (40, 3, 2)])
 def test_models_of_any_size(n: int, m: int, N: int) -> None:
     problem = linear_problem(n, m, N)
     (a, first), (b, second) = begun(problem), begun(problem)
@@ -268,6 +270,14 @@ def test_whole_solves_agree() -> None:
         kernels.use_native(True)
         assert torch.equal(native.iterations, plain.iterations) and native.statuses == plain.statuses
         torch.testing.assert_close(native.cost, plain.cost, rtol=1e-6, atol=0)
+
+
+def test_a_problem_travels_without_its_library() -> None:
+    problem, U0 = planar_batch(B=2, N=8)
+    first = DAMPED.solve(problem, U0)
+    again = pickle.loads(pickle.dumps(problem))
+    assert torch.equal(DAMPED.solve(again, U0).U, first.U)
+    assert torch.equal(DAMPED.solve(copy.deepcopy(problem), U0).U, first.U)
 
 
 def test_a_problem_that_cannot_be_native_says_why_once() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import Constraint, FunctionConstraint
+from torchgco.constraints.base import FunctionConstraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.guides import Guide, GuidePath, GuideRegion
 from torchgco.constraints.obstacles import BoundSpheres
@@ -19,53 +19,13 @@ from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian import Multipliers
 from torchgco.native.compiler import build
 from torchgco.native.model import trace_dynamics
+from torchgco.native.packing import FLAGS, NUMBERS, PATH, REGION, Packed, Rows, array, pack_rows
 from torchgco.native.rows import trace_rows
 from torchgco.native.source import LANES, Form
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 
-ABSENT = -1.0  # squared distance of an obstacle that isn't there
-BOX, SPHERES, FUNCTION = range(3)
-NO_GUIDE, REGION, PATH = range(3)
-_Doubles = ctypes.POINTER(ctypes.c_double)
-
-
-class _Array(ctypes.Structure):
-    _fields_ = [(name, kind) for name, kind in (
-        ("data", ctypes.c_void_p), ("element", ctypes.c_int64), ("knot", ctypes.c_int64), ("size", ctypes.c_int64),
-    )]  # fmt: skip
-
-
-class _Constraint(ctypes.Structure):
-    _fields_ = [
-        ("kind", ctypes.c_int32), ("equality", ctypes.c_int32), ("rows", ctypes.c_int32), ("place", ctypes.c_void_p),
-        ("knots", ctypes.c_int64), ("lam", ctypes.c_void_p), ("variable", ctypes.c_void_p), ("sign", ctypes.c_void_p),
-        ("bound", _Array), ("squares", _Array), ("velocities", _Array), ("dt", ctypes.c_double),
-    ]  # fmt: skip
-
-
-_COUNTS = ("N", "elements", "constraints", "rungs", "limit", "max_iterations")
-_TENSORS = ("X", "U", "cost", "merit", "regularisation", "alpha", "used", "gains", "mu", "inner", "iterations")
-_FLAGS = ("status", "converged", "refused", "lost")
-_ARRAYS = ("parameters", "Q", "R", "Qf", "x_ref", "xf_ref", "u_ref", "q", "r", "qf", "cross")
-_CHOICES = ("guide", "clip", "accept_last", "replicas", "optimality")
-_NUMBERS = (
-    "tolerance", "absolute_tolerance", "ratio_min", "ratio_max", "smallest", "first", "growth", "most", "damping",
-    "rounding", "lost_beyond",
-)  # fmt: skip
-
-
-class _Problem(ctypes.Structure):
-    _fields_ = [
-        *((name, ctypes.c_int64) for name in _COUNTS),
-        *((name, ctypes.c_void_p) for name in (*_TENSORS, *_FLAGS)),
-        *((name, _Array) for name in _ARRAYS),
-        ("constraint", ctypes.POINTER(_Constraint)),
-        *((name, ctypes.c_int32) for name in _CHOICES),
-        *((name, _Array) for name in ("center", "radius", "weight")),
-        ("ladder", ctypes.c_void_p),
-        *((name, ctypes.c_double) for name in _NUMBERS),
-    ]
+MOST = 128  # states and controls: matrices of a stage lie on the stack
 
 
 @dataclass(frozen=True)
@@ -108,6 +68,8 @@ class Engine:
     def __init__(self, problem: Problem) -> None:
         if problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
+        if problem.n + problem.m > MOST:
+            raise InputError("dynamics", f"at most {MOST} states and controls together", problem.n + problem.m)
         if not isinstance(problem.cost, BoundQuadratic):
             raise InputError("cost", "a QuadraticCost for native kernels", type(problem.cost).__name__)
         functions = []
@@ -160,20 +122,20 @@ class Engine:
         Returns:
             status, converged, refused, lost (int32), and alpha and used: step length and mu_r of the last iteration.
         """
-        out = {name: _flags(problem.B) for name in _FLAGS}
+        out = {name: _flags(problem.B) for name in FLAGS}
         out |= {name: torch.zeros(problem.B, dtype=torch.float64) for name in ("alpha", "used")}
         packed = self._packed(problem, {**state, **out}, terms)
         ladder = torch.tensor(options.ladder, dtype=torch.float64)
         packed.rungs, packed.ladder = len(options.ladder), ladder.data_ptr()
         packed.limit, packed.max_iterations = limit, options.max_iterations
         packed.accept_last = options.accept_last
-        for name in _NUMBERS:
+        for name in NUMBERS:
             setattr(packed, name, getattr(options, name))
         packed.replicas = LANES // 2 ** (problem.B - 1).bit_length() if problem.B <= LANES else 1
         self._run("tgco_ilqr", problem, packed)
         return out
 
-    def _run(self, name: str, problem: Problem, packed: _Problem) -> None:
+    def _run(self, name: str, problem: Problem, packed: Packed) -> None:
         """Call a function of the library on all elements, by as many threads as PyTorch has."""
         function, count = getattr(self.library, name), problem.B
         if count == 0:
@@ -193,105 +155,60 @@ class Engine:
         if not all(done):
             raise MemoryError("native kernels: no memory")
 
-    def _packed(self, problem: Problem, tensors: dict[str, Tensor], terms: Terms | None = None) -> _Problem:
+    def _packed(self, problem: Problem, tensors: dict[str, Tensor], terms: Terms | None = None) -> Packed:
         """The problem as the library reads it, which holds what its pointers point to."""
         fixed = problem.__dict__.get("packed")
         if fixed is None:
             fixed = self._fixed(problem)
             object.__setattr__(problem, "packed", fixed)
-        packed, keep = _Problem.from_buffer_copy(fixed[0]), [fixed, tensors, terms]
+        packed, keep = Packed.from_buffer_copy(fixed[0]), [fixed, tensors, terms]
         packed.keep = keep
         for name, tensor in tensors.items():
             setattr(packed, name, tensor.data_ptr())
         if terms is None:
             packed.constraints = 0
             return packed
-        rows = (_Constraint * max(1, len(problem.constraints)))()
+        rows = (Rows * max(1, len(problem.constraints)))()
         ctypes.memmove(rows, fixed[1], ctypes.sizeof(rows))
         for row, lam in zip(rows, terms.duals.lam, strict=False):
             keep.append(lam := lam.contiguous())
             row.lam = lam.data_ptr()
         keep += [rows, mu := terms.duals.mu.contiguous()]
-        packed.constraint, packed.mu = ctypes.cast(rows, ctypes.POINTER(_Constraint)), mu.data_ptr()
+        packed.constraint, packed.mu = ctypes.cast(rows, ctypes.POINTER(Rows)), mu.data_ptr()
         packed.clip = terms.clip
         guide = terms.guide
         if guide is not None:
             packed.guide = PATH if isinstance(guide, GuidePath) else REGION
-            packed.center = _array(guide.center, keep, knots=True)
-            packed.weight = _array(guide.weight.unsqueeze(-1), keep, knots=False)
+            packed.center = array(guide.center, keep, knots=True)
+            packed.weight = array(guide.weight.unsqueeze(-1), keep, knots=False)
             if isinstance(guide, GuideRegion):
-                packed.radius = _array(guide.radius.unsqueeze(-1), keep, knots=True)
+                packed.radius = array(guide.radius.unsqueeze(-1), keep, knots=True)
         return packed
 
-    def _fixed(self, problem: Problem) -> tuple[_Problem, Any, list[Any]]:
+    def _fixed(self, problem: Problem) -> tuple[Packed, Any, list[Any]]:
         """What doesn't change from call to call: model, cost and constraints, without multipliers."""
-        packed, keep, cost = _Problem(), [], problem.cost
+        packed, keep, cost = Packed(), [], problem.cost
         if problem.B == 0:
-            return packed, (_Constraint * max(1, len(problem.constraints)))(), keep
+            return packed, (Rows * max(1, len(problem.constraints)))(), keep
         assert isinstance(cost, BoundQuadratic)
         packed.N, packed.elements, packed.constraints = problem.N, problem.B, len(problem.constraints)
         shared = {"Q": cost.Q, "R": cost.R, "x_ref": cost.x_ref, "u_ref": cost.u_ref, "q": cost.q, "r": cost.r}
         shared["cross"] = cost.H
         for name, value in shared.items():
-            setattr(packed, name, _array(value, keep, knots=True))
+            setattr(packed, name, array(value, keep, knots=True))
         for name, value in (("Qf", cost.Qf), ("xf_ref", cost.xf_ref), ("qf", cost.qf)):
-            setattr(packed, name, _array(value, keep, knots=False))
+            setattr(packed, name, array(value, keep, knots=False))
         if self.model.count > 0:
             own = trace_dynamics(problem.dynamics).parameters(torch.arange(problem.B))
-            packed.parameters = _array(own, keep, knots=False)
-        rows = (_Constraint * max(1, len(problem.constraints)))()
+            packed.parameters = array(own, keep, knots=False)
+        rows = (Rows * max(1, len(problem.constraints)))()
         for row, constraint in zip(rows, problem.constraints, strict=False):
-            _pack(row, constraint, problem, keep)
+            pack_rows(row, constraint, problem, keep)
         return packed, rows, keep
 
 
 def _flags(B: int) -> Tensor:
     return torch.zeros(B, dtype=torch.int32)
-
-
-def _pack(c: _Constraint, constraint: Constraint, problem: Problem, keep: list[Any]) -> None:
-    one = problem.take(slice(0, 1))
-    shape = constraint.take(slice(0, 1)).value(
-        one.x0.unsqueeze(1).expand(-1, problem.N + 1, -1), one.x0.new_zeros(1, problem.N, problem.m)
-    ).shape
-    place = torch.full((problem.N + 1,), -1, dtype=torch.int32)
-    if shape[2] > 0:
-        place[constraint.knots] = torch.arange(shape[1], dtype=torch.int32)
-    keep.append(place)
-    c.equality, c.knots, c.rows = constraint.sense == "equality", shape[1], shape[2]
-    c.place = place.data_ptr()
-    if isinstance(constraint, ControlBounds | StateBounds):
-        size = problem.m if constraint.of == "u" else problem.n
-        variables = torch.arange(size, dtype=torch.int32) + (problem.n if constraint.of == "u" else 0)
-        above, below = variables[constraint.above], variables[constraint.below]
-        variable = torch.cat((above, below))
-        sign = torch.cat((torch.ones(above.numel()), -torch.ones(below.numel()))).double()
-        bound = torch.cat((constraint.upper[:, constraint.above], constraint.lower[:, constraint.below]), dim=1)
-        keep += [variable, sign]
-        c.kind, c.variable, c.sign = BOX, variable.data_ptr(), sign.data_ptr()
-        c.bound = _array(bound, keep, knots=False)
-    elif isinstance(constraint, BoundSpheres):
-        c.kind, c.dt = SPHERES, constraint.dt
-        c.bound = _array(constraint.centers.flatten(1), keep, knots=False)
-        squares = torch.where(constraint.absent, ABSENT, constraint.distances.square())
-        c.squares = _array(squares, keep, knots=False)
-        if constraint.velocities is not None:
-            c.velocities = _array(constraint.velocities.flatten(1), keep, knots=False)
-    else:
-        c.kind = FUNCTION
-
-
-def _array(value: Tensor | None, keep: list[Any], knots: bool) -> _Array:
-    """A tensor (B|1, [N|1,] ...) with strides of 0 where an axis has length 1."""
-    if value is None or value.numel() == 0:
-        return _Array(None, 0, 0, 0)
-    value = value.to(torch.float64).contiguous()
-    keep.append(value)
-    per_knot = value[0, 0].numel() if knots else value[0].numel()
-    many = value.shape[1] if knots else 1
-    return _Array(
-        value.data_ptr(), 0 if value.shape[0] == 1 else many * per_knot, per_knot if many > 1 else 0, per_knot
-    )
 
 
 def _of_knot(constraint: FunctionConstraint) -> Any:

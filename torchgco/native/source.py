@@ -11,6 +11,30 @@ from torchgco.native.model import DynamicsSource
 from torchgco.native.rows import RowsSource
 
 LANES = 8
+WRITTEN_OUT = 400  # nonzeros of a Jacobian that are named one by one
+LOOPS = """
+static inline V entry(int e, const V *f) { return F_place[e] < 0 ? SET(F_value[e]) : f[F_place[e]]; }
+static void tgco_gather(const V *restrict P, const V *restrict f, V *restrict T) {
+    for (int i = 0; i < NX * (NX + NU); i++) T[i] = SET(0.0);
+    for (int e = 0; e < COUNT; e++) {
+        V a = entry(e, f), *to = T + F_column[e] * NX;
+        const V *from = P + F_row[e] * NX;
+        for (int r = 0; r < NX; r++) to[r] += a * from[r];
+    }
+}
+static void tgco_product(const V *restrict f, const V *restrict T, V *restrict H) {
+    for (int i = 0; i < (NX + NU) * (NX + NU); i++) H[i] = SET(0.0);
+    for (int e = 0; e < COUNT; e++) {
+        int c = F_column[e];
+        V a = entry(e, f);
+        for (int l = c; l < NX + NU; l++) H[c * (NX + NU) + l] += a * T[l * NX + F_row[e]];
+    }
+}
+static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict g) {
+    for (int i = 0; i < NX + NU; i++) g[i] = SET(0.0);
+    for (int e = 0; e < COUNT; e++) g[F_column[e]] += entry(e, f) * p[F_row[e]];
+}
+"""
 SOLVER = Path(__file__).with_name("ilqr.c")
 
 
@@ -39,6 +63,18 @@ class Form:
 
 def _products(model: DynamicsSource) -> str:
     """The products of a value function with F = [fx fu], which name its nonzeros alone."""
+    return _looped(model) if len(model.rows) > WRITTEN_OUT else _written_out(model)
+
+
+def _looped(model: DynamicsSource) -> str:
+    """Loops over a table of the nonzeros: of many, the code that names each would take long to compile."""
+    tables = {"row": model.rows, "column": model.columns, "place": model.places}
+    lines = [f"static const int F_{name}[] = {{{', '.join(map(str, values))}}};" for name, values in tables.items()]
+    lines += [f"static const double F_value[] = {{{', '.join(map(literal, model.values))}}};", LOOPS]
+    return "\n".join(lines).replace("COUNT", str(len(model.rows)))
+
+
+def _written_out(model: DynamicsSource) -> str:
     by_column: list[list[tuple[int, str]]] = [[] for _ in range(model.n + model.m)]
     for row, column, place, value in zip(model.rows, model.columns, model.places, model.values, strict=True):
         factor = f"f[{place}] * " if place >= 0 else "" if value == 1.0 else f"SET({literal(value)}) * "

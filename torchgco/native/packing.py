@@ -1,0 +1,101 @@
+"""The structures of the C library (ilqr.c), filled from the parts of a problem."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.problem import Problem
+
+ABSENT = -1.0  # squared distance of an obstacle that isn't there
+BOX, SPHERES, FUNCTION = range(3)
+NO_GUIDE, REGION, PATH = range(3)
+
+
+class Array(ctypes.Structure):
+    _fields_ = [(name, kind) for name, kind in (
+        ("data", ctypes.c_void_p), ("element", ctypes.c_int64), ("knot", ctypes.c_int64), ("size", ctypes.c_int64),
+    )]  # fmt: skip
+
+
+class Rows(ctypes.Structure):
+    _fields_ = [
+        ("kind", ctypes.c_int32), ("equality", ctypes.c_int32), ("rows", ctypes.c_int32), ("place", ctypes.c_void_p),
+        ("knots", ctypes.c_int64), ("lam", ctypes.c_void_p), ("variable", ctypes.c_void_p), ("sign", ctypes.c_void_p),
+        ("bound", Array), ("squares", Array), ("velocities", Array), ("dt", ctypes.c_double),
+    ]  # fmt: skip
+
+
+COUNTS = ("N", "elements", "constraints", "rungs", "limit", "max_iterations")
+TENSORS = ("X", "U", "cost", "merit", "regularisation", "alpha", "used", "gains", "mu", "inner", "iterations")
+FLAGS = ("status", "converged", "refused", "lost")
+ARRAYS = ("parameters", "Q", "R", "Qf", "x_ref", "xf_ref", "u_ref", "q", "r", "qf", "cross")
+CHOICES = ("guide", "clip", "accept_last", "replicas", "optimality")
+NUMBERS = (
+    "tolerance", "absolute_tolerance", "ratio_min", "ratio_max", "smallest", "first", "growth", "most", "damping",
+    "rounding", "lost_beyond",
+)  # fmt: skip
+
+
+class Packed(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in COUNTS),
+        *((name, ctypes.c_void_p) for name in (*TENSORS, *FLAGS)),
+        *((name, Array) for name in ARRAYS),
+        ("constraint", ctypes.POINTER(Rows)),
+        *((name, ctypes.c_int32) for name in CHOICES),
+        *((name, Array) for name in ("center", "radius", "weight")),
+        ("ladder", ctypes.c_void_p),
+        *((name, ctypes.c_double) for name in NUMBERS),
+    ]
+
+
+def pack_rows(c: Rows, constraint: Constraint, problem: Problem, keep: list[Any]) -> None:
+    one = problem.take(slice(0, 1))
+    shape = constraint.take(slice(0, 1)).value(
+        one.x0.unsqueeze(1).expand(-1, problem.N + 1, -1), one.x0.new_zeros(1, problem.N, problem.m)
+    ).shape
+    place = torch.full((problem.N + 1,), -1, dtype=torch.int32)
+    if shape[2] > 0:
+        place[constraint.knots] = torch.arange(shape[1], dtype=torch.int32)
+    keep.append(place)
+    c.equality, c.knots, c.rows = constraint.sense == "equality", shape[1], shape[2]
+    c.place = place.data_ptr()
+    if isinstance(constraint, ControlBounds | StateBounds):
+        size = problem.m if constraint.of == "u" else problem.n
+        variables = torch.arange(size, dtype=torch.int32) + (problem.n if constraint.of == "u" else 0)
+        above, below = variables[constraint.above], variables[constraint.below]
+        variable = torch.cat((above, below))
+        sign = torch.cat((torch.ones(above.numel()), -torch.ones(below.numel()))).double()
+        bound = torch.cat((constraint.upper[:, constraint.above], constraint.lower[:, constraint.below]), dim=1)
+        keep += [variable, sign]
+        c.kind, c.variable, c.sign = BOX, variable.data_ptr(), sign.data_ptr()
+        c.bound = array(bound, keep, knots=False)
+    elif isinstance(constraint, BoundSpheres):
+        c.kind, c.dt = SPHERES, constraint.dt
+        c.bound = array(constraint.centers.flatten(1), keep, knots=False)
+        squares = torch.where(constraint.absent, ABSENT, constraint.distances.square())
+        c.squares = array(squares, keep, knots=False)
+        if constraint.velocities is not None:
+            c.velocities = array(constraint.velocities.flatten(1), keep, knots=False)
+    else:
+        c.kind = FUNCTION
+
+
+def array(value: Tensor | None, keep: list[Any], knots: bool) -> Array:
+    """A tensor (B|1, [N|1,] ...) with strides of 0 where an axis has length 1."""
+    if value is None or value.numel() == 0:
+        return Array(None, 0, 0, 0)
+    value = value.to(torch.float64).contiguous()
+    keep.append(value)
+    per_knot = value[0, 0].numel() if knots else value[0].numel()
+    many = value.shape[1] if knots else 1
+    return Array(
+        value.data_ptr(), 0 if value.shape[0] == 1 else many * per_knot, per_knot if many > 1 else 0, per_knot
+    )
