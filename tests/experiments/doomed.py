@@ -33,7 +33,9 @@ class Doomed(Hold):
 
     def solve(self, problem, U0, seed=0, ids=None, warm=None, callback=None):
         if int(ids.max()) >= 2 and not Path("spared").exists():
-            time.sleep(0.5)
+            deadline = time.monotonic() + 60.0  # until the other process has flown its layouts
+            while not list(Path("out/shards").glob("*.npz")) and time.monotonic() < deadline:
+                time.sleep(0.1)
             os.kill(os.getpid(), signal.SIGKILL)
         return super().solve(problem, U0, seed, ids, warm, callback)
 

@@ -7,15 +7,17 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any, TypeVar
 
 from torchgco.shapes import InputError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+POLL = 1.0  # seconds after which an interrupt is noticed that Python dropped
 NEW_POOLS = 3  # that take the place of broken ones, before giving up
 
 
@@ -69,14 +71,19 @@ def _run_pool(
     try:
         with _interrupts_held():
             futures = {pool.submit(work, job): number for number, job in left.items()}
-        for future in as_completed(futures):
-            number = futures.pop(future)  # and with it the memory of the result
-            try:
-                result = future.result()
-            except BrokenProcessPool:
-                continue
-            keep(result)
-            del left[number]
+        with _interrupts_noted() as noted:
+            while futures:
+                done, _ = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED)
+                if noted:
+                    raise KeyboardInterrupt
+                for future in done:
+                    number = futures.pop(future)  # and with it the memory of the result
+                    try:
+                        result = future.result()
+                    except BrokenProcessPool:
+                        continue
+                    keep(result)
+                    del left[number]
     except BrokenProcessPool:  # while jobs were still handed over
         pass
     except BaseException:
@@ -95,6 +102,25 @@ def _interrupts_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, held)
+
+
+@contextmanager
+def _interrupts_noted() -> Iterator[list[int]]:
+    """A list that is empty until Ctrl-C: Python drops the exception where it is raised within a destructor."""
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield noted
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        noted.append(number)
+        signal.default_int_handler(number, frame)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...]) -> None:
