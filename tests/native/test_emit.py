@@ -63,6 +63,23 @@ def test_functions_of_the_library(name: str) -> None:
     np.testing.assert_allclose(emitted(x, y)[0], by_casadi(function, x, y), rtol=1e-14)
 
 
+@pytest.mark.parametrize(("real", "spacing"), [("double", 2.2e-16), ("float", 1.2e-7)])
+def test_sine_and_cosine_of_all_sizes(real: str, spacing: float) -> None:
+    x = ca.SX.sym("x")
+    function = ca.Function("made", [x], [ca.vertcat(ca.sin(x), ca.cos(x))])
+    emitted = Emitted(emit("tgco_made", function), "tgco_made", [1], [2], real)
+    random = np.random.default_rng(3)
+    sizes = 10.0 ** random.uniform(-12, 8, (4096, 1)) * random.choice([-1.0, 1.0], (4096, 1))
+    quarters = np.pi / 2 * random.integers(-6000, 6000, (512, 1)) + random.uniform(-1e-6, 1e-6, (512, 1))
+    values = np.concatenate((sizes, quarters)).astype(np.float32 if real == "float" else np.float64)
+    exact = values.astype(np.longdouble)
+    np.testing.assert_allclose(
+        emitted(values)[0], np.concatenate((np.sin(exact), np.cos(exact)), axis=1).astype(float), rtol=0, atol=spacing
+    )
+    tiny = np.abs(values[:, 0]) < 1e-5  # the sine keeps its relative precision where it is small
+    np.testing.assert_allclose(emitted(values)[0][tiny, 0], values[tiny, 0], rtol=1e-10)
+
+
 @pytest.mark.parametrize("name", [*EXACT, *CLOSE])
 def test_single_precision(name: str) -> None:
     function, emitted = functions(name, "float")

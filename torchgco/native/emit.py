@@ -8,59 +8,19 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import casadi as ca
 
-# An operation on each lane by a function of the C library.
-_BY_LANE_1 = (
+PRELUDE = Path(__file__).with_name("lanes.h").read_text()
+# Functions of the prelude, on each lane.
+_OF_ONE = (
     "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh",
-    "acosh", "atanh", "erf", "sqrt", "floor", "ceil",
+    "acosh", "atanh", "erf", "sqrt", "floor", "ceil", "fabs", "sign",
 )  # fmt: skip
-_BY_LANE_2 = ("pow", "fmod", "atan2", "hypot", "remainder")
-
-PRELUDE = """
-#include <math.h>
-
-/* The function of the C library for REAL: sin or sinf. */
-#define TGCO_SUFFIX_double
-#define TGCO_SUFFIX_float f
-#define TGCO_JOIN_(a, b) a##b
-#define TGCO_JOIN(a, b) TGCO_JOIN_(a, b)
-#define TGCO_MATH(name) TGCO_JOIN(__builtin_##name, TGCO_JOIN(TGCO_SUFFIX_, REAL))
-
-typedef REAL V __attribute__((vector_size(LANES * sizeof(REAL))));
-typedef __typeof__((V){0} == (V){0}) I; /* all bits of a lane set where true */
-
-static inline V tgco_set(double c) { return (REAL)c - (V){0}; } /* minus, so that -0.0 keeps its sign */
-#define SET(c) tgco_set(c)
-
-static inline V tgco_choose(I where, V a, V b) { return (V)((where & (I)a) | (~where & (I)b)); }
-static inline V tgco_if(I where, V a) { return (V)(where & (I)a); }
-static inline V tgco_truth(I where) { return tgco_if(where, SET(1.0)); }
-static inline I tgco_is(V a) { return a != SET(0.0); } /* NaN is true, as in C */
-
-static inline V tgco_fabs(V a) { return (V)(~(I)SET(-0.0) & (I)a); }
-static inline V tgco_copysign(V a, V b) { return (V)((I)tgco_fabs(a) | ((I)SET(-0.0) & (I)b)); }
-static inline V tgco_sign(V a) { return tgco_choose(tgco_is(a) & (a == a), tgco_copysign(SET(1.0), a), a); }
-/* Of a number and a NaN the number, as C's fmin and fmax. */
-static inline V tgco_fmin(V a, V b) { return tgco_choose((a < b) | (b != b), a, b); }
-static inline V tgco_fmax(V a, V b) { return tgco_choose((a > b) | (b != b), a, b); }
-
-#define TGCO_BY_LANE_1(name) \\
-    static inline V tgco_##name(V a) { \\
-        V r; \\
-        for (int i = 0; i < LANES; i++) r[i] = TGCO_MATH(name)(a[i]); \\
-        return r; \\
-    }
-#define TGCO_BY_LANE_2(name) \\
-    static inline V tgco_##name(V a, V b) { \\
-        V r; \\
-        for (int i = 0; i < LANES; i++) r[i] = TGCO_MATH(name)(a[i], b[i]); \\
-        return r; \\
-    }
-""" + "".join(f"TGCO_BY_LANE_{i}({name})\n" for i, names in ((1, _BY_LANE_1), (2, _BY_LANE_2)) for name in names)
+_OF_TWO = ("pow", "fmod", "atan2", "hypot", "remainder", "copysign", "fmin", "fmax")
 
 
 def emit(name: str, function: ca.Function) -> str:
@@ -119,8 +79,8 @@ _OPERATORS = {
     "NE": "tgco_truth({0} != {1})", "NOT": "tgco_truth(~tgco_is({0}))",
     "AND": "tgco_truth(tgco_is({0}) & tgco_is({1}))", "OR": "tgco_truth(tgco_is({0}) | tgco_is({1}))",
     "IF_ELSE_ZERO": "tgco_if(tgco_is({0}), {1})", "CONSTPOW": "tgco_pow({0}, {1})",
-    **{name.upper(): f"tgco_{name}({{0}})" for name in (*_BY_LANE_1, "fabs", "sign")},
-    **{name.upper(): f"tgco_{name}({{0}}, {{1}})" for name in (*_BY_LANE_2, "copysign", "fmin", "fmax")},
+    **{name.upper(): f"tgco_{name}({{0}})" for name in _OF_ONE},
+    **{name.upper(): f"tgco_{name}({{0}}, {{1}})" for name in _OF_TWO},
 }  # fmt: skip
 
 

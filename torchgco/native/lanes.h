@@ -1,0 +1,100 @@
+/* Vectors V of LANES numbers of type REAL (double or float), a problem or sample to each lane; lanes are never mixed. */
+
+#include <math.h>
+
+/* The function of the C library for REAL: sin or sinf. */
+#define TGCO_SUFFIX_double
+#define TGCO_SUFFIX_float f
+#define TGCO_IS_DOUBLE_double 1
+#define TGCO_IS_DOUBLE_float 0
+#define TGCO_JOIN_(a, b) a##b
+#define TGCO_JOIN(a, b) TGCO_JOIN_(a, b)
+#define TGCO_MATH(name) TGCO_JOIN(__builtin_##name, TGCO_JOIN(TGCO_SUFFIX_, REAL))
+#define TGCO_IS_DOUBLE TGCO_JOIN(TGCO_IS_DOUBLE_, REAL)
+
+typedef REAL V __attribute__((vector_size(LANES * sizeof(REAL))));
+typedef __typeof__((V){0} == (V){0}) I; /* all bits of a lane set where true */
+
+static inline V tgco_set(double c) { return (REAL)c - (V){0}; } /* minus, so that -0.0 keeps its sign */
+#define SET(c) tgco_set(c)
+
+static inline V tgco_choose(I where, V a, V b) { return (V)((where & (I)a) | (~where & (I)b)); }
+static inline V tgco_if(I where, V a) { return (V)(where & (I)a); }
+static inline V tgco_truth(I where) { return tgco_if(where, SET(1.0)); }
+static inline I tgco_is(V a) { return a != SET(0.0); } /* NaN is true, as in C */
+
+static inline V tgco_fabs(V a) { return (V)(~(I)SET(-0.0) & (I)a); }
+static inline V tgco_copysign(V a, V b) { return (V)((I)tgco_fabs(a) | ((I)SET(-0.0) & (I)b)); }
+static inline V tgco_sign(V a) { return tgco_choose(tgco_is(a) & (a == a), tgco_copysign(SET(1.0), a), a); }
+/* Of a number and a NaN the number, as C's fmin and fmax. */
+static inline V tgco_fmin(V a, V b) { return tgco_choose((a < b) | (b != b), a, b); }
+static inline V tgco_fmax(V a, V b) { return tgco_choose((a > b) | (b != b), a, b); }
+
+#define TGCO_BY_LANE_1(name) \
+    static inline V tgco_##name(V a) { \
+        V r; \
+        for (int i = 0; i < LANES; i++) r[i] = TGCO_MATH(name)(a[i]); \
+        return r; \
+    }
+#define TGCO_BY_LANE_2(name) \
+    static inline V tgco_##name(V a, V b) { \
+        V r; \
+        for (int i = 0; i < LANES; i++) r[i] = TGCO_MATH(name)(a[i], b[i]); \
+        return r; \
+    }
+TGCO_BY_LANE_1(exp) TGCO_BY_LANE_1(expm1) TGCO_BY_LANE_1(log) TGCO_BY_LANE_1(log1p)
+TGCO_BY_LANE_1(tan) TGCO_BY_LANE_1(asin) TGCO_BY_LANE_1(acos) TGCO_BY_LANE_1(atan)
+TGCO_BY_LANE_1(sinh) TGCO_BY_LANE_1(cosh) TGCO_BY_LANE_1(tanh)
+TGCO_BY_LANE_1(asinh) TGCO_BY_LANE_1(acosh) TGCO_BY_LANE_1(atanh)
+TGCO_BY_LANE_1(erf) TGCO_BY_LANE_1(sqrt) TGCO_BY_LANE_1(floor) TGCO_BY_LANE_1(ceil)
+TGCO_BY_LANE_2(pow) TGCO_BY_LANE_2(fmod) TGCO_BY_LANE_2(atan2) TGCO_BY_LANE_2(hypot) TGCO_BY_LANE_2(remainder)
+
+/* Sine and cosine of all lanes at once: x = k pi/2 + r with |r| <= pi/4, and the Taylor series of both in r up to the
+   first term that no longer counts. pi/2 comes in three parts, of which the first two are short enough for their
+   products with k to be exact. Where |x| is too large for that, or not finite, the C library does it lane by lane. */
+#if TGCO_IS_DOUBLE
+#define TGCO_WHOLE 0x1.8p52 /* adding it leaves the nearest whole number in the lowest bits */
+#define TGCO_FAR 1e5
+#define TGCO_QUARTER_1 0x1.921fb544p+0
+#define TGCO_QUARTER_2 0x1.0b4611a6p-34
+#define TGCO_QUARTER_3 0x1.3198a2e037073p-69
+#define TGCO_TERMS 8
+#else
+#define TGCO_WHOLE 0x1.8p23
+#define TGCO_FAR 1e4
+#define TGCO_QUARTER_1 0x1.92p+0
+#define TGCO_QUARTER_2 0x1.fb4p-12
+#define TGCO_QUARTER_3 0x1.4442dp-24
+#define TGCO_TERMS 4
+#endif
+
+static inline V tgco_wave(V x, int shift) {
+    V t = x * SET(0x1.45f306dc9c883p-1) + SET(TGCO_WHOLE), k = t - SET(TGCO_WHOLE);
+    I quarter = (I)t + shift;
+    V r = x - k * SET(TGCO_QUARTER_1);
+    r = r - k * SET(TGCO_QUARTER_2);
+    r = r - k * SET(TGCO_QUARTER_3);
+    /* sin r = r (1 - s/(2 3) (1 - s/(4 5) (...))), cos r = 1 - s/(1 2) (1 - s/(3 4) (...)), s = r^2 */
+    V s = r * r, sine = SET(1.0), cosine = SET(1.0);
+    for (int i = TGCO_TERMS; i > 0; i--) {
+        sine = SET(1.0) - s * SET(1.0 / (2 * i * (2 * i + 1))) * sine;
+        cosine = SET(1.0) - s * SET(1.0 / ((2 * i - 1) * (2 * i))) * cosine;
+    }
+    V value = tgco_choose((quarter & 1) != 0, cosine, r * sine);
+    I sign = (quarter & 2) << (8 * (int)sizeof(REAL) - 2);
+    return (V)((I)value ^ sign);
+}
+#define TGCO_WAVE(name, shift) \
+    __attribute__((noinline)) static V tgco_far_##name(V x, V near) { \
+        for (int i = 0; i < LANES; i++) \
+            if (!(TGCO_MATH(fabs)(x[i]) <= (REAL)TGCO_FAR)) near[i] = TGCO_MATH(name)(x[i]); \
+        return near; \
+    } \
+    static inline V tgco_##name(V x) { \
+        V value = tgco_wave(x, shift); \
+        I far = ~(tgco_fabs(x) <= SET(TGCO_FAR)); \
+        for (int i = 0; i < LANES; i++) if (far[i]) return tgco_far_##name(x, value); \
+        return value; \
+    }
+TGCO_WAVE(sin, 0)
+TGCO_WAVE(cos, 1)
