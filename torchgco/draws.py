@@ -43,6 +43,11 @@ class DrawKey:
         return DrawKey(self.seed, self.ids[index], self.outer[index], began, attempt)
 
 
+def words(key: DrawKey, stream: int = 0) -> Tensor:
+    """What the draws of each element depend on, (B,) int64: two words of 32 bits."""
+    return _mix64(_mix64(_mix64(torch.full_like(key.ids, key.seed)) + key.ids) + key.outer * 1_000_003 + stream)
+
+
 def standard_normal(
     key: DrawKey, rows: int, samples: range, dtype: torch.dtype = torch.float32, stream: int = 0
 ) -> Tensor:
@@ -52,7 +57,7 @@ def standard_normal(
     separates draws of one key that serve different purposes. Row i and row i + ceil(rows / 2) are a Box-Muller pair.
     """
     half, width = (rows + 1) // 2, len(samples)
-    mixed = _mix64(_mix64(_mix64(torch.full_like(key.ids, key.seed)) + key.ids) + key.outer * 1_000_003 + stream)
+    mixed = words(key, stream)
     high, low = ((mixed >> 32).to(torch.int32).view(1, -1, 1), mixed.to(torch.int32).view(1, -1, 1))
     # Counted by sample first, so that a sample keeps its numbers however many are drawn beside it.
     place = torch.arange(half, dtype=torch.int32, device=key.ids.device).view(half, 1, 1)

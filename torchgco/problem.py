@@ -39,7 +39,7 @@ class Problem:
     N: int
 
     # What others keep of the problems' form (compiled kernels, say), shared by all subsets of a batch.
-    form: ClassVar[dict[str, Any]]
+    form: ClassVar[dict[Any, Any]]
 
     def __post_init__(self) -> None:
         self._check_border()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -27,11 +28,21 @@ from torchgco import (
     Solution,
     Spheres,
     Status,
+    kernels,
     presets,
 )
 from torchgco.guidance import Detour
 from torchgco.guidance.gco import REACH
 from torchgco.guidance.misfits import suited_sampler
+from torchgco.native.compiler import find_compiler
+
+
+@pytest.fixture
+def in_pytorch() -> Iterator[None]:
+    """Guidance by PyTorch's kernels, which call the users' functions with samples, in single precision too."""
+    kernels.use_native(False)
+    yield
+    kernels.use_native(True)
 
 
 def vehicle(d: int, kind: str = "plain") -> FunctionDynamics:
@@ -101,7 +112,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_what_can_be_had_is_had(case: str) -> None:
+def test_what_can_be_had_is_had(case: str, in_pytorch: None) -> None:
     """The caught element is guided, the other left alone, each as if it were by itself, and one warning is given."""
     make, why = CASES[case]
     problem = make()
@@ -115,6 +126,15 @@ def test_what_can_be_had_is_had(case: str) -> None:
     else:
         assert len(told) == 1 and told[0].startswith("guided in part: ")
         assert re.search(why, told[0])
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("kind", ["product", "promoted"])
+def test_native_samples_ask_nothing_of_the_users_functions(kind: str) -> None:
+    problem = posed(2, spheres(2), kind)
+    solution, told = solved(problem)
+    assert told == [] and int(solution.guided[0]) > 0
+    assert all(torch.equal(solution.U[b], alone(problem, b)) for b in (0, 1))
 
 
 def test_without_a_position_nothing_is_guided() -> None:
@@ -140,7 +160,7 @@ class Fussy(FunctionDynamics):
         raise IndexError("no samples here")
 
 
-def test_dynamics_that_bear_no_samples_are_led_by_detours_alone() -> None:
+def test_dynamics_that_bear_no_samples_are_led_by_detours_alone(in_pytorch: None) -> None:
     plain = vehicle(2)
     fussy = Fussy(plain.function, 4, 2, 0.1, "euler", plain.position)
     problem, lost = posed(2, spheres(2), dynamics=fussy), "no plan can be sampled (no samples here)"
@@ -158,7 +178,7 @@ def test_dynamics_that_bear_no_samples_are_led_by_detours_alone() -> None:
 
 
 @pytest.mark.parametrize("kind", ["product", "promoted"])
-def test_the_sampler_alone_falls_back_to_the_problems_precision(kind: str) -> None:
+def test_the_sampler_alone_falls_back_to_the_problems_precision(kind: str, in_pytorch: None) -> None:
     problem, sampler = posed(2, spheres(2), kind), replace(SAMPLER, dtype="float32")
     solution, told = solved(problem, IteratedMPPI(sampler, iterations=2))
     assert len(told) == 1 and "samples are drawn in float64" in told[0]

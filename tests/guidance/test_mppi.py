@@ -1,5 +1,6 @@
 """MPPI, detection and region against the NumPy reference; the draws by their promises."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -7,14 +8,16 @@ import pytest
 import torch
 from scipy import stats
 
+from tests.native.lanes import drawn
 from tests.problems import planar_batch, quadrotor_batch, reference_of
 from tests.reference.guidance import active_spheres, cpuf, stuck_knots
 from tests.reference.mppi import MppiSettings, mppi
-from torchgco import GCO, MPPI, InputError
+from torchgco import GCO, MPPI, InputError, kernels
 from torchgco.constraints import GuideRegion
 from torchgco.draws import DrawKey, standard_normal
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.samples import Flight, Noise, draw, fly
+from torchgco.native.compiler import find_compiler
 from torchgco.rollout import open_loop
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
@@ -24,21 +27,32 @@ def key(B: int, seed: int = 0, outer: int = 1) -> DrawKey:
     return DrawKey(seed, torch.arange(B), torch.full((B,), outer))
 
 
-def white_noise(problem, key_: DrawKey, samples: int) -> np.ndarray:
+@pytest.fixture(params=["native", "PyTorch"])
+def native(request) -> Iterator[bool]:
+    """Both kinds of kernels, one after the other."""
+    if request.param == "native" and find_compiler() is None:
+        pytest.skip("no C compiler")
+    kernels.use_native(request.param == "native")
+    yield request.param == "native"
+    kernels.use_native(True)
+
+
+def white_noise(problem, key_: DrawKey, samples: int, native: bool) -> np.ndarray:
     """z (B, S, N, m) as the sampler draws it."""
-    z = standard_normal(key_, problem.N * problem.m, range(samples), torch.float64)
+    rows = problem.N * problem.m
+    z = drawn(key_, rows, samples) if native else standard_normal(key_, rows, range(samples), torch.float64)
     return z.unflatten(0, (problem.N, problem.m)).permute(2, 3, 0, 1).numpy()
 
 
 @pytest.mark.parametrize("saturation", ["bounds", "symmetric"])
 @pytest.mark.parametrize("batch", BATCHES)
-def test_improve_equals_algorithm_3(batch: str, saturation: str) -> None:
+def test_improve_equals_algorithm_3(batch: str, saturation: str, native: bool) -> None:
     problem, U = BATCHES[batch](B=3, N=20)
     U = U + 0.2 * torch.randn(U.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     sampler = MPPI(samples=30, covariance=torch.linspace(0.5, 9.0, problem.m).tolist(), temperature=5.0,
                    collision_penalty=50.0, saturation=saturation)  # fmt: skip
     X, mean = sampler.improve(problem, U, key(3))
-    z = white_noise(problem, key(3), 30)
+    z = white_noise(problem, key(3), 30, native)
     for b in range(3):
         twin = reference_of(problem, b)
         lower = twin.u_lower if saturation == "bounds" else -twin.u_upper
@@ -65,14 +79,14 @@ def through_the_obstacles(problem):
 
 
 @pytest.mark.parametrize("batch", BATCHES)
-def test_detection_and_region_equal_algorithm_5(batch: str) -> None:
+def test_detection_and_region_equal_algorithm_5(batch: str, native: bool) -> None:
     problem, U = BATCHES[batch](B=4, N=30, obstacles=14)
     X = through_the_obstacles(problem)
     counts, caught = active_counts(problem, X, U), caught_knots(problem, X, U)
     gco = GCO(sampler=MPPI(samples=20))
     start = GuideRegion.inactive(X, torch.full((4,), 20.0, dtype=torch.float64), problem.dynamics.position)
     guide = gco.update(problem, X, U, start, key(4)).guide
-    z = white_noise(problem, key(4), 20)
+    z = white_noise(problem, key(4), 20, native)
     for b in range(4):
         twin = reference_of(problem, b)
         active = [len(row) for row in active_spheres(twin, X[b].numpy())]

@@ -1,11 +1,14 @@
 """Emitted functions, called with problems one by one or in any company."""
 
 import ctypes
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.draws import DrawKey, words
+from torchgco.native import model
 from torchgco.native.compiler import build
 from torchgco.native.emit import PRELUDE
 from torchgco.native.model import JACOBIAN, STEP, DynamicsSource
@@ -49,6 +52,25 @@ class Emitted:
             for out, array in zip(made, arrays[len(values) :], strict=True):
                 out[rows] = array[: out.shape[1]].T
         return made
+
+
+def drawn(key: DrawKey, rows: int, samples: int, stream: int = 0) -> Tensor:
+    """Normal draws (rows, B, samples) float64, as the native sampler makes them."""
+    code = Path(model.__file__).with_name("normal.c").read_text() + """
+void tgco_draw(uint64_t key, int64_t samples, int64_t rows, double *z) {
+    V block[rows];
+    for (int64_t first = 0; first < samples; first += LANES) {
+        normal(key, first, rows, block);
+        for (int64_t i = 0; i < rows; i++)
+            for (int l = 0; l < LANES && first + l < samples; l++) z[i * samples + first + l] = block[i][l];
+    }
+}
+"""
+    library = build(f"#define REAL double\n#define LANES {LANES}\n#include <stdint.h>\n{PRELUDE}{code}")
+    made = torch.empty(key.ids.numel(), rows, samples, dtype=torch.float64)
+    for z, word in zip(made, words(key, stream).tolist(), strict=True):
+        library.tgco_draw(*(ctypes.c_int64(number) for number in (word, samples, rows)), ctypes.c_void_p(z.data_ptr()))
+    return made.transpose(0, 1)
 
 
 class Model:

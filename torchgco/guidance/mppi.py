@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.bounds import ControlBounds
-from torchgco.draws import DrawKey, standard_normal
+from torchgco.draws import DrawKey, standard_normal, words
 from torchgco.guidance.samples import Flight, Noise, average, draw, fly
-from torchgco.native.dispatch import open_loop
+from torchgco.native.dispatch import open_loop, sampler_of
+from torchgco.native.sampler import Rounds
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, check_shape, tensor
 
@@ -95,16 +96,35 @@ class MPPI:
 
     def improve(self, problem: Problem, U: Tensor, key: DrawKey, stream: int = 0) -> tuple[Tensor, Tensor]:
         """X (B, N+1, n) and U (B, N, m): the mean of the last round's samples, the first drawn around U."""
-        sigma = self._sigma(problem)
         dtype = U.dtype if self.dtype is None else getattr(torch, self.dtype)
-        quick, plans = problem.cast(dtype), []
+        sampler = sampler_of(problem, dtype)
+        if sampler is not None:
+            plan = sampler.improve(problem, U, self._native(problem, key, stream))
+        else:
+            plan = self._in_chunks(problem, U, key, stream, dtype)
+        return open_loop(problem, plan), plan
+
+    def _native(self, problem: Problem, key: DrawKey, stream: int) -> Rounds:
+        """The same for the native library."""
+        bounds = self._bounds(problem)
+        if bounds is None:
+            bounds = -torch.inf * problem.x0.new_ones(problem.m, 1, 1), torch.inf * problem.x0.new_ones(problem.m, 1, 1)
+        lower, upper, deviation = (row.squeeze(-1).mT for row in (*bounds, self._sigma(problem).sqrt()))
+        return Rounds(
+            self.samples, self.knots, self.decay, self.elite, self.temperature, self.collision_penalty, self.linger,
+            torch.stack([words(key, stream * self.rounds + i) for i in range(self.rounds)], dim=-1),
+            deviation, lower, upper, *self._places(problem),
+        )  # fmt: skip
+
+    def _in_chunks(self, problem: Problem, U: Tensor, key: DrawKey, stream: int, dtype: torch.dtype) -> Tensor:
+        """All rounds by PyTorch, some problems at a time."""
+        sigma, quick, plans = self._sigma(problem), problem.cast(dtype), []
         at_once = max(1, CHUNK // self.samples)
         for rows in torch.arange(problem.B, device=U.device).split(at_once):
             spread = sigma if sigma.shape[1] == 1 else sigma[:, rows]
             part = quick if rows.numel() == problem.B else quick.take(rows)
             plans.append(self._rounds(part, U[rows].to(dtype), spread.to(dtype), key.take(rows), stream))
-        plan = torch.cat(plans).to(U.dtype)
-        return open_loop(problem, plan), plan
+        return torch.cat(plans).to(U.dtype)
 
     def _rounds(self, problem: Problem, U: Tensor, sigma: Tensor, key: DrawKey, stream: int) -> Tensor:
         """All rounds for one chunk of problems; U (B, N, m), sigma (m, B|1, 1)."""
@@ -131,11 +151,16 @@ class MPPI:
     def _noise(self, problem: Problem, key: DrawKey, scale: Tensor, stream: int, samples: range) -> Noise:
         rows = self.knots or problem.N
         z = standard_normal(key, rows * problem.m, samples, scale.dtype, stream).unflatten(0, (rows, problem.m))
+        left, share = self._places(problem)
+        return Noise(z, scale, left, None if share is None else share.view(-1, 1, 1, 1))
+
+    def _places(self, problem: Problem) -> tuple[Tensor | None, Tensor | None]:
+        """The knot of the noise before each stage (N,), and the share of the way to the next; None for white noise."""
         if self.knots == 0:
-            return Noise(z, scale, None, None)
-        place = torch.linspace(0, self.knots - 1, problem.N, dtype=z.dtype, device=z.device)
+            return None, None
+        place = torch.linspace(0, self.knots - 1, problem.N, dtype=problem.x0.dtype, device=problem.x0.device)
         left = place.floor().clamp(max=self.knots - 2)
-        return Noise(z, scale, left.long(), (place - left).view(-1, 1, 1, 1))
+        return left.long(), place - left
 
     def _weights(self, S: Tensor) -> Tensor:
         """w (B, S) from the samples' costs."""

@@ -12,6 +12,7 @@ from torchgco.kernels import native
 from torchgco.lagrangian import Lagrangian
 from torchgco.native.compiler import NativeError
 from torchgco.native.engine import Engine, Terms
+from torchgco.native.sampler import Sampler
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 
@@ -39,6 +40,16 @@ def engine_of(problem: Problem) -> Engine | None:
             reason = str(error).splitlines()[0]
             warnings.warn(f"solved by PyTorch's kernels, some 20 times slower: {reason}", EagerWarning, stacklevel=4)
     return problem.form["engine"]
+
+
+def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:
+    """The library that samples for problems of this form in some precision; None where PyTorch does."""
+    engine = engine_of(problem)
+    if engine is None:
+        return None
+    if dtype not in problem.form:
+        problem.form[dtype] = Sampler(engine, dtype)
+    return problem.form[dtype]
 
 
 def open_loop(problem: Problem, U: Tensor) -> Tensor:

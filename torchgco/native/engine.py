@@ -81,21 +81,21 @@ class Engine:
             elif not isinstance(constraint, ControlBounds | StateBounds | BoundSpheres):
                 raise InputError("constraints", "bounds, spheres or functions for native kernels", type(constraint))
         self.model = trace_dynamics(problem.dynamics)
-        form = Form(self.model, problem.dynamics.position, not problem.cost.diagonal, tuple(functions))
-        self.library = build(form.source())
+        self.form = Form(self.model, problem.dynamics.position, not problem.cost.diagonal, tuple(functions))
+        self.library = build(self.form.source())
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         """X (B, N+1, n) from U (B, N, m)."""
         X = U.new_empty(problem.B, problem.N + 1, problem.n)
         X[:, 0] = problem.x0
-        self._run("tgco_open_loop", problem, self._packed(problem, {"X": X, "U": U.contiguous()}))
+        self._run("tgco_open_loop", problem, self.packed(problem, {"X": X, "U": U.contiguous()}))
         return X
 
     def value(self, problem: Problem, X: Tensor, U: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
         """J_var (B,) and L_M (B,) of trajectories."""
         tensors = {"X": X.contiguous(), "U": U.contiguous(), "cost": X.new_empty(problem.B)}
         tensors["merit"] = torch.empty_like(tensors["cost"])
-        self._run("tgco_value", problem, self._packed(problem, tensors, terms))
+        self._run("tgco_value", problem, self.packed(problem, tensors, terms))
         return tensors["cost"], tensors["merit"]
 
     def gains(
@@ -106,7 +106,7 @@ class Engine:
         tensors = {"X": X.contiguous(), "U": U.contiguous(), "regularisation": mu_r.contiguous()}
         tensors |= {name: torch.zeros_like(mu_r) for name in ("cost", "merit")}
         tensors |= {"gains": X.new_empty(problem.B, N, m, z), "status": _flags(problem.B)}
-        packed = self._packed(problem, tensors, terms)
+        packed = self.packed(problem, tensors, terms)
         packed.optimality = True
         self._run("tgco_gains", problem, packed)
         return tensors["gains"], tensors["cost"], tensors["merit"], tensors["status"] != 0
@@ -124,7 +124,7 @@ class Engine:
         """
         out = {name: _flags(problem.B) for name in FLAGS}
         out |= {name: torch.zeros(problem.B, dtype=torch.float64) for name in ("alpha", "used")}
-        packed = self._packed(problem, {**state, **out}, terms)
+        packed = self.packed(problem, {**state, **out}, terms)
         ladder = torch.tensor(options.ladder, dtype=torch.float64)
         packed.rungs, packed.ladder = len(options.ladder), ladder.data_ptr()
         packed.limit, packed.max_iterations = limit, options.max_iterations
@@ -136,26 +136,9 @@ class Engine:
         return out
 
     def _run(self, name: str, problem: Problem, packed: Packed) -> None:
-        """Call a function of the library on all elements, by as many threads as PyTorch has."""
-        function, count = getattr(self.library, name), problem.B
-        if count == 0:
-            return
-        groups = -(-count // LANES)
-        parts = min(torch.get_num_threads(), groups)
-        if parts <= 1:
-            done = [function(ctypes.byref(packed), ctypes.c_int64(0), ctypes.c_int64(count))]
-        else:
-            edges = [LANES * (groups * i // parts) for i in range(parts)] + [count]
-            with ThreadPoolExecutor(parts) as pool:
-                calls = [
-                    pool.submit(function, ctypes.byref(packed), ctypes.c_int64(a), ctypes.c_int64(b))
-                    for a, b in pairwise(edges)
-                ]
-                done = [call.result() for call in calls]
-        if not all(done):
-            raise MemoryError("native kernels: no memory")
+        run(getattr(self.library, name), problem.B, LANES, packed)
 
-    def _packed(self, problem: Problem, tensors: dict[str, Tensor], terms: Terms | None = None) -> Packed:
+    def packed(self, problem: Problem, tensors: dict[str, Tensor], terms: Terms | None = None) -> Packed:
         """The problem as the library reads it, which holds what its pointers point to."""
         fixed = problem.__dict__.get("packed")
         if fixed is None:
@@ -166,7 +149,7 @@ class Engine:
         for name, tensor in tensors.items():
             setattr(packed, name, tensor.data_ptr())
         if terms is None:
-            packed.constraints = 0
+            packed.constraint = ctypes.cast(fixed[1], ctypes.POINTER(Rows))
             return packed
         rows = (Rows * max(1, len(problem.constraints)))()
         ctypes.memmove(rows, fixed[1], ctypes.sizeof(rows))
@@ -205,6 +188,30 @@ class Engine:
         for row, constraint in zip(rows, problem.constraints, strict=False):
             pack_rows(row, constraint, problem, keep)
         return packed, rows, keep
+
+
+def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> None:
+    """Call a function of a library on all elements, in whole groups, by as many threads as PyTorch has.
+
+    Raises:
+        MemoryError: the library got none.
+    """
+    if count == 0:
+        return
+    groups = -(-count // group)
+    parts = min(torch.get_num_threads(), groups)
+    if parts <= 1:
+        done = [function(ctypes.byref(argument), ctypes.c_int64(0), ctypes.c_int64(count))]
+    else:
+        edges = [group * (groups * i // parts) for i in range(parts)] + [count]
+        with ThreadPoolExecutor(parts) as pool:
+            calls = [
+                pool.submit(function, ctypes.byref(argument), ctypes.c_int64(a), ctypes.c_int64(b))
+                for a, b in pairwise(edges)
+            ]
+            done = [call.result() for call in calls]
+    if not all(done):
+        raise MemoryError("native kernels: no memory")
 
 
 def _flags(B: int) -> Tensor:

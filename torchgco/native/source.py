@@ -35,7 +35,8 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
     for (int e = 0; e < COUNT; e++) g[F_column[e]] += entry(e, f) * p[F_row[e]];
 }
 """
-SOLVER = Path(__file__).with_name("ilqr.c")
+SOLVER = ("problem.c", "knot.c", "ilqr.c")
+SAMPLER = ("problem.c", "knot.c", "normal.c", "mppi.c")
 
 
 @dataclass(frozen=True)
@@ -47,18 +48,18 @@ class Form:
     dense: bool  # weights are matrices
     functions: tuple[tuple[int, RowsSource], ...]  # the constraints given as functions, by their place
 
-    def source(self) -> str:
-        """The C file."""
+    def source(self, parts: tuple[str, ...] = SOLVER, real: str = "double", lanes: int = LANES) -> str:
+        """The C file of the solver or the sampler, for numbers of type `real`."""
         model, at = self.dynamics, self.position
         defines = {
-            "REAL": "double", "LANES": LANES, "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
+            "REAL": real, "LANES": lanes, "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
             "DIM": 0 if at is None else at.stop - at.start, "POSITION": 0 if at is None else at.start,
             "QUADRATIC_FULL": int(self.dense), "MAX_ROWS": max([1, *(rows.p for _, rows in self.functions)]),
         }  # fmt: skip
         head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
         functions = [rows.code for _, rows in self.functions]
-        parts = (head, PRELUDE, model.code, _products(model), *functions, _switches(self.functions), SOLVER.read_text())
-        return "\n".join(parts)
+        files = [Path(__file__).with_name(name).read_text() for name in parts]
+        return "\n".join((head, PRELUDE, model.code, _products(model), *functions, _switches(self.functions), *files))
 
 
 def _products(model: DynamicsSource) -> str:

@@ -1,0 +1,120 @@
+"""Rounds of MPPI in C against those of PyTorch with the same noise, on all that a problem may be made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.native.lanes import drawn
+from tests.native.test_engine import user_problem
+from tests.problems import planar_batch, quadrotor_batch
+from torchgco import MPPI, Problem, Spheres, kernels
+from torchgco.draws import DrawKey, standard_normal
+from torchgco.guidance import mppi
+from torchgco.native.compiler import find_compiler
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+
+
+@pytest.fixture(autouse=True)
+def cache() -> None:
+    """The user's own: libraries are compiled once for all of these tests."""
+
+
+@pytest.fixture(autouse=True)
+def native_again() -> Iterator[None]:
+    yield
+    kernels.use_native(True)
+
+
+def moving() -> tuple[Problem, Tensor]:
+    problem, U = quadrotor_batch(B=3, N=20)
+    centers = problem.constraints[0].centers
+    spheres = Spheres(centers, problem.constraints[0].distances - 0.3, 0.3, velocities=0.3 * torch.ones_like(centers))
+    return Problem(problem.dynamics, problem.cost, [spheres, *problem.constraints[1:]], problem.x0, problem.N), U
+
+
+def given_as_functions() -> tuple[Problem, Tensor]:
+    problem = user_problem(B=3)
+    return problem, torch.zeros(3, problem.N, problem.m, dtype=torch.float64)
+
+
+PROBLEMS = {
+    "planar": partial(planar_batch, B=3, N=20),
+    "quadrotor": partial(quadrotor_batch, B=3, N=20),
+    "moving": moving,
+    "functions": given_as_functions,
+}
+SAMPLERS = {
+    "as printed": MPPI(samples=30, covariance=0.5, temperature=50.0, collision_penalty=50.0),
+    "wider than the bounds": MPPI(samples=9, covariance=4.0, temperature=50.0, saturation="symmetric"),
+    "free": MPPI(samples=8, covariance=0.1, temperature=50.0, saturation=None, linger=0.7),
+    "rounds of smooth noise": MPPI(samples=33, covariance=None, spread=0.1, temperature=20.0, rounds=3, knots=5,
+                                   decay=0.8, elite=4, collision_penalty=10.0),
+    "one sample": MPPI(samples=1, covariance=0.5),
+}  # fmt: skip
+
+
+def key(B: int) -> DrawKey:
+    return DrawKey(7, 3 + 5 * torch.arange(B), torch.arange(B))
+
+
+def test_the_noise_is_that_of_pytorch() -> None:
+    made, want = drawn(key(3), 33, 1000), standard_normal(key(3), 33, range(1000), torch.float64)
+    torch.testing.assert_close(made, want, rtol=2e-6, atol=2e-6)
+    assert abs(float(made.mean())) < 0.02 and abs(float(made.var()) - 1.0) < 0.02
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("made", PROBLEMS)
+def test_rounds_equal_those_of_pytorch(made: str, sampler: str, monkeypatch) -> None:
+    problem, U = PROBLEMS[made]()
+
+    def same_noise(key: DrawKey, rows: int, samples: range, dtype: torch.dtype, stream: int) -> Tensor:
+        return drawn(key, rows, samples.stop, stream)[..., samples.start :].to(dtype)
+
+    monkeypatch.setattr(mppi, "standard_normal", same_noise)
+    X, V = SAMPLERS[sampler].improve(problem, U, key(3))
+    kernels.use_native(False)
+    want_X, want_V = SAMPLERS[sampler].improve(problem, U, key(3))
+    # A round hands rounding on to the next one, magnified by what a sample gains or loses over the temperature.
+    torch.testing.assert_close(V, want_V, rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(X, want_X, rtol=1e-7, atol=1e-7)
+    assert made == "functions" or sampler == "one sample" or not torch.equal(V, U)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("made", ["planar", "quadrotor"])
+def test_elements_know_nothing_of_each_other(made: str, dtype: str) -> None:
+    problem, U = PROBLEMS[made]()
+    sampler = replace(SAMPLERS["rounds of smooth noise"], dtype=dtype)
+    _, V = sampler.improve(problem, U, key(3))
+    for rows in ([1], [2, 0], [0, 0, 2, 1]):
+        index = torch.tensor(rows)
+        assert torch.equal(sampler.improve(problem.take(index), U[index], key(3).take(index))[1], V[index])
+    bad = U.clone()
+    bad[1, 0] = torch.nan
+    _, W = sampler.improve(problem, bad, key(3))
+    assert torch.equal(W[[0, 2]], V[[0, 2]])
+
+
+@pytest.mark.parametrize("made", ["planar", "quadrotor"])
+def test_single_precision_follows_double(made: str) -> None:
+    problem, U = PROBLEMS[made]()
+    single, double = (
+        replace(SAMPLERS["as printed"], temperature=1e3, dtype=dtype).improve(problem, U, key(3))[1]
+        for dtype in ("float32", "float64")
+    )
+    torch.testing.assert_close(single, double, rtol=1e-2, atol=1e-2)
+
+
+def test_a_sample_that_leaves_the_finite_numbers_takes_no_other_along() -> None:
+    problem, U = PROBLEMS["planar"]()
+    wild = MPPI(samples=64, covariance=1e300, saturation=None, temperature=1.0)
+    _, V = wild.improve(problem, U, key(3))
+    assert torch.isfinite(V).all()

@@ -1,0 +1,178 @@
+/* MPPI (Algorithm 3): all rounds of sampled controls, problem by problem, with LANES samples side by side. */
+
+#include <float.h>
+
+typedef struct {
+    const Problem *of;
+    int64_t samples, rounds, knots, elite;  /* knots at which noise is drawn; 0: at every stage, white */
+    double temperature, collision_penalty, linger, decay;
+    const uint64_t *keys;                   /* (E, rounds) */
+    Array deviation, lower, upper;          /* (E, 1, NU) */
+    const int32_t *left;                    /* (N): the knot before each stage; unused where white */
+    const double *share;                    /* (N): how far on to the next one */
+    const int32_t *geometric;               /* of each constraint: whether samples that touch it are counted */
+    double *mean;                           /* (E, N, NU) in and out */
+} Sampling;
+
+/* What one problem needs: the lanes of `s` are all this problem. */
+typedef struct {
+    const Sampling *of;
+    Lanes s;
+    V *mean, *z, *sum, deviation[NU], lower[NU], upper[NU];
+    double *score;
+    V *memory;
+} Samples;
+
+/* Noise and controls of stage k. */
+static inline void draw(const Samples *q, int64_t k, V *eps, V *u) {
+    const Sampling *o = q->of;
+    for (int j = 0; j < NU; j++) {
+        V z = q->z[k * NU + j];
+        if (o->knots > 0) {
+            const V *left = q->z + o->left[k] * NU + j;
+            z = left[0] + SET(o->share[k]) * (left[NU] - left[0]);
+        }
+        eps[j] = z * q->deviation[j];
+        V v = q->mean[k * NU + j] + eps[j];
+        u[j] = tgco_fmin(tgco_fmax(v, q->lower[j]), q->upper[j]);
+    }
+}
+
+/* How many obstacles samples touch at knot k. */
+static V hits(const Samples *q, int64_t k, const V *x) {
+    const Problem *p = q->of->of;
+    V count = SET(0.0);
+    for (int64_t i = 0; i < p->constraints; i++) {
+        const Constraint *con = p->constraint + i;
+        if (!q->of->geometric[i] || con->place[k] < 0) continue;
+#if DIM > 0
+        if (con->kind == SPHERES) {
+            for (int j = 0; j < con->rows; j++) {
+                V away[DIM], c;
+                sphere(&q->s, i, j, x, k, away, &c);
+                count += tgco_truth(c >= SET(0.0));
+            }
+            continue;
+        }
+#endif
+        V c[MAX_ROWS], u[NU];
+        memset(u, 0, sizeof u); /* a geometric constraint reads x alone */
+        tgco_rows((int)i, x, u, c);
+        for (int j = 0; j < con->rows; j++) count += tgco_truth(c[j] >= SET(0.0));
+    }
+    return count;
+}
+
+/* Costs of the samples in the lanes (lines 5-11), into score[first], ... */
+static void fly(Samples *q, int64_t first) {
+    const Sampling *o = q->of;
+    const Problem *p = o->of;
+    V x[2 * NX], u[NU], eps[NU], cost = SET(0.0), touched = SET(0.0), likelihood = SET(0.0);
+    memcpy(x, q->s.X, NX * sizeof(V));
+    for (int64_t k = 0; k < p->N; k++) {
+        draw(q, k, eps, u);
+        cost += cost_value(&q->s, k, x, u);
+        model_step(x, u, q->s.parameters, x + NX);
+        memcpy(x, x + NX, NX * sizeof(V));
+        touched += hits(q, k + 1, x);
+        if (o->knots == 0)
+            for (int j = 0; j < NU; j++)
+                likelihood += q->mean[k * NU + j] / (q->deviation[j] * q->deviation[j]) * eps[j];
+    }
+    cost += cost_value(&q->s, p->N, x, 0);
+    if (o->linger > 0) cost += SET(o->linger * p->N) * cost_value(&q->s, p->N - 1, x, u);
+    cost += SET(o->temperature) * likelihood;
+    for (int l = 0; l < LANES && first + l < o->samples; l++) {
+        double score = (double)cost[l] + o->collision_penalty * (double)touched[l];
+        /* A sample that left the finite numbers must not take the others with it. */
+        q->score[first + l] = score - score == 0 ? score : DBL_MAX;
+    }
+}
+
+/* Scores to weights w = softmax(-(S - min S) / lambda), in place. */
+static void weigh(const Sampling *o, double *score) {
+    int64_t count = o->samples;
+    double least = DBL_MAX, temperature = o->temperature, sum = 0;
+    for (int64_t i = 0; i < count; i++) if (score[i] < least) least = score[i];
+    for (int64_t i = 0; i < count; i++) score[i] -= least;
+    if (o->elite > 0) {
+        double *best = score + count; /* the smallest gaps, in order */
+        int64_t held = 0;
+        for (int64_t i = 0; i < count; i++) {
+            if (held == o->elite && !(score[i] < best[held - 1])) continue;
+            int64_t at = held < o->elite ? held++ : held - 1;
+            for (; at > 0 && best[at - 1] > score[i]; at--) best[at] = best[at - 1];
+            best[at] = score[i];
+        }
+        if (best[o->elite - 1] > temperature) temperature = best[o->elite - 1];
+    }
+    for (int64_t i = 0; i < count; i++) sum += score[i] = exp(-score[i] / temperature);
+    for (int64_t i = 0; i < count; i++) score[i] /= sum;
+}
+
+/* The weighted mean of all samples' controls: drawn once more rather than kept, and only where a weight counts. */
+static void average(Samples *q, uint64_t key, int64_t rows) {
+    const Sampling *o = q->of;
+    int64_t N = o->of->N;
+    memset(q->sum, 0, N * NU * sizeof(V));
+    for (int64_t first = 0; first < o->samples; first += LANES) {
+        V weight = SET(0.0), eps[NU], u[NU];
+        for (int l = 0; l < LANES && first + l < o->samples; l++) weight[l] = (REAL)q->score[first + l];
+        if (!any(weight > SET(0.0))) continue;
+        normal(key, first, rows, q->z);
+        for (int64_t k = 0; k < N; k++) {
+            draw(q, k, eps, u);
+            for (int j = 0; j < NU; j++) q->sum[k * NU + j] += weight * u[j];
+        }
+    }
+    for (int64_t i = 0; i < N * NU; i++) {
+        double total = 0;
+        for (int l = 0; l < LANES; l++) total += (double)q->sum[i][l];
+        q->mean[i] = SET(total);
+    }
+}
+
+static int begin(Samples *q, const Sampling *o) {
+    memset(q, 0, sizeof *q);
+    q->of = o;
+    int64_t N = o->of->N, rows = (o->knots ? o->knots : N) * NU;
+    if (!start(&q->s, o->of)) return 0;
+    q->memory = aligned_alloc(sizeof(V), (2 * N * NU + rows + 1) * sizeof(V));
+    q->score = malloc((o->samples + o->elite) * sizeof(double));
+    if (!q->memory || !q->score) { finish(&q->s); free(q->memory); free(q->score); return 0; }
+    q->mean = q->memory; q->sum = q->mean + N * NU; q->z = q->sum + N * NU;
+    return 1;
+}
+
+/* Elements first, first + 1, ..., last - 1: all rounds. Returns 0 without memory. */
+int tgco_sample(const Sampling *o, int64_t first, int64_t last) {
+    Samples samples, *q = &samples;
+    if (!begin(q, o)) return 0;
+    int64_t size = o->of->N * NU, rows = (o->knots ? o->knots : o->of->N) * NU;
+    for (int64_t e = first; e < last; e++) {
+        V spread[NU];
+        for (int l = 0; l < LANES; l++) {
+            enter_problem(&q->s, l, e);
+            fill(spread, &o->deviation, 1, l, e);
+            fill(q->lower, &o->lower, 1, l, e);
+            fill(q->upper, &o->upper, 1, l, e);
+        }
+        for (int64_t i = 0; i < size; i++) q->mean[i] = SET(o->mean[e * size + i]);
+        double shrunk = 1;
+        for (int64_t round = 0; round < o->rounds; round++, shrunk *= o->decay) {
+            uint64_t key = o->keys[e * o->rounds + round];
+            for (int j = 0; j < NU; j++) q->deviation[j] = SET(shrunk) * spread[j];
+            for (int64_t block = 0; block < o->samples; block += LANES) {
+                normal(key, block, rows, q->z);
+                fly(q, block);
+            }
+            weigh(o, q->score);
+            average(q, key, rows);
+        }
+        for (int64_t i = 0; i < size; i++) o->mean[e * size + i] = (double)q->mean[i][0];
+    }
+    finish(&q->s);
+    free(q->memory);
+    free(q->score);
+    return 1;
+}

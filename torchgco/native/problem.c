@@ -1,0 +1,169 @@
+/* Problems side by side, one to a lane of the vectors V; no operation mixes lanes.
+
+   The generated part before this file defines NX, NU, NP, NJ, DIM, POSITION, QUADRATIC_FULL, and
+
+       tgco_step, tgco_jacobian                       the model
+       tgco_gather(P, f, T), tgco_product(f, T, Q)    T = P F and Q = F' T (upper triangle) for its sparse F = [fx fu]
+       tgco_pull_back(p, f, g)                        g = F' p
+       tgco_rows(i, x, u, c), tgco_add_rows(i, ...)   constraints that are given as functions */
+
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define S (NX + NU)
+#define NZ (NX + 1)
+
+enum { BOX = 0, SPHERES = 1, FUNCTION = 2 };
+enum { NO_GUIDE = 0, REGION = 1, PATH = 2 };
+enum { GOING = 0, ENDED = 1, NOT_POSITIVE_DEFINITE = 4, NON_FINITE = 5 };
+
+/* An array over (elements, knots, numbers); a stride of 0 stands for an axis of length 1. */
+typedef struct { const double *data; int64_t element, knot; int64_t size; } Array;
+
+typedef struct {
+    int32_t kind, equality, rows;  /* rows of a knot */
+    const int32_t *place;          /* (N+1): which of the constraint's knots, -1 where it says nothing */
+    int64_t knots;
+    double *lam;                   /* (E, knots, rows) */
+    const int32_t *variable;       /* BOX: (rows) index into [x, u] */
+    const double *sign;            /* BOX: (rows) +1 for an upper bound, -1 for a lower one */
+    Array bound;                   /* BOX: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM) */
+    Array squares;                 /* SPHERES: squared distances (E, 1, rows) */
+    Array velocities;              /* SPHERES: as centres, or NULL */
+    double dt;
+} Constraint;
+
+typedef struct {
+    int64_t N, elements, constraints, rungs, limit, max_iterations;
+    double *X, *U, *cost, *merit, *regularisation;  /* (E, ...) in and out */
+    double *alpha, *used;                           /* (E): step length and mu_r of the last iteration */
+    double *gains;                                  /* (E, N, NU, NZ): what tgco_gains writes */
+    const double *mu;
+    int64_t *inner, *iterations;
+    int32_t *status, *converged, *refused, *lost;
+    Array parameters, Q, R, Qf, x_ref, xf_ref, u_ref, q, r, qf, cross;
+    const Constraint *constraint;
+    int32_t guide, clip, accept_last, replicas, optimality;
+    Array center, radius, weight;
+    const double *ladder;
+    double tolerance, absolute_tolerance, ratio_min, ratio_max, smallest;
+    double first, growth, most, damping, rounding, lost_beyond;
+} Problem;
+
+/* What a group of lanes works on. */
+typedef struct {
+    const Problem *of;
+    V *X, *U, *Xn, *Un, *G, **lam, **bound, **squares, **velocities;
+    V *parameters, *Q, *R, *Qf, *x_ref, *xf_ref, *u_ref, *q, *r, *qf, *cross, *center, *radius;
+    V weight, mu, mu_r, merit, cost, inner, made, alpha, used;
+    int64_t element[LANES];
+    V *memory;
+} Lanes;
+
+static inline int any(I where) {
+    for (int l = 0; l < LANES; l++) if (where[l]) return 1;
+    return 0;
+}
+static inline I finite(V a) { return (a - a) == SET(0.0); }
+
+/* Lanes ----------------------------------------------------------------------------------------------------------- */
+
+static int64_t length(const Array *a, int64_t knots) { return a->data ? (a->knot ? knots : 1) * a->size : 0; }
+
+static void fill(V *to, const Array *from, int64_t knots, int lane, int64_t element) {
+    if (!from->data) return;
+    const double *source = from->data + element * from->element;
+    int64_t count = from->knot ? knots : 1;
+    for (int64_t k = 0; k < count; k++)
+        for (int64_t i = 0; i < from->size; i++) to[k * from->size + i][lane] = source[k * from->knot + i];
+}
+
+static const V *at(const V *array, const Array *shape, int64_t k) { return array + (shape->knot ? k * shape->size : 0); }
+
+static V *cut(V **memory, int64_t count) { V *part = *memory; *memory += count; return part; }
+
+static int64_t lay_out(Lanes *s, V *memory) {
+    const Problem *p = s->of;
+    int64_t N = p->N;
+    V *m = memory;
+    s->X = cut(&m, (N + 1) * NX); s->U = cut(&m, N * NU); s->Xn = cut(&m, (N + 1) * NX); s->Un = cut(&m, N * NU);
+    s->G = cut(&m, N * NU * NZ);
+    s->parameters = cut(&m, length(&p->parameters, 1));
+    s->Q = cut(&m, length(&p->Q, N)); s->R = cut(&m, length(&p->R, N)); s->Qf = cut(&m, length(&p->Qf, 1));
+    s->x_ref = cut(&m, length(&p->x_ref, N)); s->xf_ref = cut(&m, length(&p->xf_ref, 1));
+    s->u_ref = cut(&m, length(&p->u_ref, N)); s->q = cut(&m, length(&p->q, N)); s->r = cut(&m, length(&p->r, N));
+    s->qf = cut(&m, length(&p->qf, 1)); s->cross = cut(&m, length(&p->cross, N));
+    s->center = cut(&m, length(&p->center, N + 1)); s->radius = cut(&m, length(&p->radius, N + 1));
+    for (int64_t i = 0; i < p->constraints; i++) {
+        const Constraint *c = p->constraint + i;
+        V *lam = cut(&m, c->knots * c->rows), *bound = cut(&m, length(&c->bound, 1));
+        V *squares = cut(&m, length(&c->squares, 1)), *velocities = cut(&m, length(&c->velocities, 1));
+        if (memory) { s->lam[i] = lam; s->bound[i] = bound; s->squares[i] = squares; s->velocities[i] = velocities; }
+    }
+    return m - memory;
+}
+
+static int start(Lanes *s, const Problem *p) {
+    memset(s, 0, sizeof *s);
+    s->of = p;
+    int64_t count = lay_out(s, 0), many = p->constraints + 1;
+    s->memory = aligned_alloc(sizeof(V), (count + 1) * sizeof(V));
+    s->lam = calloc(4 * many, sizeof(V *));
+    if (!s->memory || !s->lam) { free(s->memory); free(s->lam); return 0; }
+    memset(s->memory, 0, (count + 1) * sizeof(V));
+    s->bound = s->lam + many; s->squares = s->lam + 2 * many; s->velocities = s->lam + 3 * many;
+    lay_out(s, s->memory);
+    return 1;
+}
+
+static void finish(Lanes *s) { free(s->memory); free(s->lam); }
+
+/* The problem itself: model, cost, and bounds and obstacles. */
+static void enter_problem(Lanes *s, int lane, int64_t e) {
+    const Problem *p = s->of;
+    int64_t N = p->N;
+    s->element[lane] = e;
+    for (int i = 0; i < NX; i++) s->X[i][lane] = p->X[e * (N + 1) * NX + i];
+    fill(s->parameters, &p->parameters, 1, lane, e);
+    fill(s->Q, &p->Q, N, lane, e); fill(s->R, &p->R, N, lane, e); fill(s->Qf, &p->Qf, 1, lane, e);
+    fill(s->x_ref, &p->x_ref, N, lane, e); fill(s->xf_ref, &p->xf_ref, 1, lane, e);
+    fill(s->u_ref, &p->u_ref, N, lane, e); fill(s->q, &p->q, N, lane, e); fill(s->r, &p->r, N, lane, e);
+    fill(s->qf, &p->qf, 1, lane, e); fill(s->cross, &p->cross, N, lane, e);
+    for (int64_t i = 0; i < p->constraints; i++) {
+        const Constraint *c = p->constraint + i;
+        fill(s->bound[i], &c->bound, 1, lane, e);
+        fill(s->squares[i], &c->squares, 1, lane, e);
+        fill(s->velocities[i], &c->velocities, 1, lane, e);
+    }
+}
+
+/* The iterate with its multipliers and guide. */
+static void enter(Lanes *s, int lane, int64_t e) {
+    const Problem *p = s->of;
+    int64_t N = p->N;
+    enter_problem(s, lane, e);
+    for (int64_t i = 0; i < (N + 1) * NX; i++) s->X[i][lane] = p->X[e * (N + 1) * NX + i];
+    for (int64_t i = 0; i < N * NU; i++) s->U[i][lane] = p->U[e * N * NU + i];
+    fill(s->center, &p->center, N + 1, lane, e); fill(s->radius, &p->radius, N + 1, lane, e);
+    if (p->guide != NO_GUIDE) s->weight[lane] = p->weight.data[e * p->weight.element];
+    for (int64_t i = 0; i < p->constraints; i++) {
+        const Constraint *c = p->constraint + i;
+        int64_t size = c->knots * c->rows;
+        for (int64_t j = 0; j < size; j++) s->lam[i][j][lane] = c->lam[e * size + j];
+    }
+    s->mu[lane] = p->mu[e]; s->mu_r[lane] = p->regularisation ? p->regularisation[e] : 0;
+    s->merit[lane] = p->merit[e]; s->cost[lane] = p->cost[e];
+    s->inner[lane] = p->inner ? p->inner[e] : 0; s->made[lane] = 0;
+}
+
+static void leave(const Lanes *s, int lane, int32_t status, int32_t converged, int32_t refused, int32_t lost) {
+    const Problem *p = s->of;
+    int64_t N = p->N, e = s->element[lane];
+    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = s->X[i][lane];
+    for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = s->U[i][lane];
+    p->cost[e] = s->cost[lane]; p->merit[e] = s->merit[lane]; p->regularisation[e] = s->mu_r[lane];
+    p->iterations[e] += (int64_t)s->made[lane]; p->inner[e] = (int64_t)s->inner[lane];
+    p->alpha[e] = s->alpha[lane]; p->used[e] = s->used[lane];
+    p->status[e] = status; p->converged[e] = converged; p->refused[e] = refused; p->lost[e] = lost;
+}
