@@ -29,9 +29,10 @@ class Multipliers:
     @classmethod
     def zero(cls, problem: Problem, mu: float) -> Multipliers:
         """lam = 0 and the same penalty for all."""
-        X = problem.x0.new_zeros(problem.B, problem.N + 1, problem.n)
-        U = problem.x0.new_zeros(problem.B, problem.N, problem.m)
-        lam = tuple(torch.zeros_like(c.value(X, U)) for c in problem.constraints)
+        # The rows of one problem tell those of all: evaluating a large batch for its shape alone takes long.
+        one = problem.take(slice(0, 1))
+        X, U = one.x0.new_zeros(one.B, problem.N + 1, problem.n), one.x0.new_zeros(one.B, problem.N, problem.m)
+        lam = tuple(X.new_zeros(problem.B, *c.value(X, U).shape[1:]) for c in one.constraints)
         return cls(lam, problem.x0.new_full((problem.B,), mu))
 
     def scaled(self, factor: Tensor) -> Multipliers:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -31,6 +31,8 @@ class Dynamics(PerElement):
     dt: float
     integrator: str = "euler"
     position: slice | None = None
+    # A class that says so itself lets its traced step be kept: nothing but the dataclass's fields decides what it does.
+    reads_fields_alone: ClassVar[bool]
     sparsity: tuple[tuple[int, int], ...] = ()  # (row, column) of [ax, au] (n, n+m) for each of `field_entries`
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:

@@ -118,6 +118,7 @@ class QuadrotorPlanning(Dynamics):
 
     n: ClassVar[int] = 14
     m: ClassVar[int] = 4
+    reads_fields_alone: ClassVar[bool] = True
     position: ClassVar[slice] = slice(0, 3)
     per_element: ClassVar[tuple[str, ...]] = ("rate_time_constant", "thrust_time_constant")
     sparsity: ClassVar[tuple[tuple[int, int], ...]] = (
@@ -170,6 +171,7 @@ class QuadrotorPlant(Dynamics):
 
     n: ClassVar[int] = 17
     m: ClassVar[int] = 4
+    reads_fields_alone: ClassVar[bool] = True
     position: ClassVar[slice] = slice(0, 3)
 
     def __post_init__(self) -> None:
@@ -229,6 +231,7 @@ class RotorTracking(Dynamics):
 
     n: ClassVar[int] = 7
     m: ClassVar[int] = 4
+    reads_fields_alone: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_model(self, "rotors")

@@ -18,7 +18,7 @@ from torchgco.guidance.detour import Detour
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.scene import scene_of
 from torchgco.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import sampler_of
+from torchgco.native.dispatch import engine_of, sampler_of
 from torchgco.problem import Problem
 
 SAMPLES = 2  # flown as a trial
@@ -59,7 +59,7 @@ def suited_detour(detour: Detour | None, problem: Problem) -> tuple[Detour | Non
     one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
     if scene_of(one, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))) is None:
         return detour, None
-    why = _failure(_expand, problem, problem.x0.dtype)
+    why = None if engine_of(problem) is not None else _failure(_expand, problem, problem.x0.dtype)
     return (detour, None) if why is None else (None, f"no way can be followed ({why})")
 
 

@@ -182,7 +182,7 @@ class Engine:
         for name, value in (("Qf", cost.Qf), ("xf_ref", cost.xf_ref), ("qf", cost.qf)):
             setattr(packed, name, array(value, keep, knots=False))
         if self.model.count > 0:
-            own = trace_dynamics(problem.dynamics).parameters(torch.arange(problem.B))
+            own = self.model.parameters(torch.arange(problem.B), problem.dynamics)
             packed.parameters = array(own, keep, knots=False)
         rows = (Rows * max(1, len(problem.constraints)))()
         for row, constraint in zip(rows, problem.constraints, strict=False):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -43,18 +44,21 @@ class DynamicsSource:
     values: tuple[float, ...]  # 0.0 where the entry is computed
     key: str  # says what `code` computes, the same in every process
     traced: Traced = field(repr=False, compare=False)
+    own: dict[str, Tensor] = field(repr=False, compare=False)  # what the model has per problem, by field
 
     @property
     def computed(self) -> int:
         """How many entries of the Jacobian `tgco_jacobian` writes."""
         return sum(place >= 0 for place in self.places)
 
-    def parameters(self, index: Tensor) -> Tensor:
+    def parameters(self, index: Tensor, of: Dynamics | None = None) -> Tensor:
         """The own numbers (B, count) float64 of the problems in `index` (B,) int64, on its device.
 
-        They are those of the model that was traced: for `dynamics.take(rows)`, ask for `rows`.
+        They are those of the model that was traced, or of another with the same step, as `take` makes it.
         """
-        return self.traced.parameters_of(index)
+        if of is None or self.count == 0:
+            return self.traced.parameters_of(index)
+        return self.traced.rebound({id(old): getattr(of, name) for name, old in self.own.items()}).parameters_of(index)
 
 
 def trace_dynamics(
@@ -78,10 +82,36 @@ def trace_dynamics(
         InputError: the step can't be traced, or holds an operation without a counterpart.
     """
     n, m = n or dynamics.n, m or dynamics.m
+    known = _traced.get(id(dynamics))
+    # Between two problems of an application that solves one after the other, tracing would take half of the time.
+    if known is not None and known.dynamics() is dynamics and known.versions == _versions(dynamics, dtype, device):
+        return known.source
+    source = _trace(dynamics, n, m, dtype, device)
+    if "reads_fields_alone" in type(dynamics).__dict__:
+        forget = weakref.ref(dynamics, lambda _, key=id(dynamics): _traced.pop(key, None))
+        _traced[id(dynamics)] = _Known(forget, _versions(dynamics, dtype, device), source)
+    return source
+
+
+class _Known(NamedTuple):
+    dynamics: weakref.ref[Dynamics]
+    versions: tuple[Any, ...]
+    source: DynamicsSource
+
+
+_traced: dict[int, _Known] = {}
+
+
+def _versions(dynamics: Dynamics, dtype: torch.dtype, device: torch.device | str) -> tuple[Any, ...]:
+    """Changes with every write into a tensor of the model."""
+    return dtype, str(device), *(value._version for value in vars(dynamics).values() if isinstance(value, Tensor))
+
+
+def _trace(dynamics: Dynamics, n: int, m: int, dtype: torch.dtype, device: torch.device | str) -> DynamicsSource:
     x, u = (torch.zeros(1, size, dtype=dtype, device=device) for size in (n, m))
-    named = (getattr(dynamics, name) for name in (*dynamics.batched, *dynamics.per_element))
-    own = [value for value in named if isinstance(value, Tensor)]
-    traced = Traced("dynamics.step", lambda i, x, u: dynamics.take(i).step(x, u), x, u, own=own)
+    named = {name: getattr(dynamics, name) for name in (*dynamics.batched, *dynamics.per_element)}
+    own = {name: value for name, value in named.items() if isinstance(value, Tensor)}
+    traced = Traced("dynamics.step", lambda i, x, u: dynamics.take(i).step(x, u), x, u, own=own.values())
     key = store.key_of(("model", traced.fingerprint(), *makers()))
     known = store.read(key, ".json")
     if known is None:
@@ -89,7 +119,7 @@ def trace_dynamics(
         store.save(key, ".json", known)
     parts = json.loads(known)
     lists = {name: tuple(parts[name]) for name in ("rows", "columns", "places", "values")}
-    return DynamicsSource(n, m, traced.count, parts["code"], **lists, key=key, traced=traced)
+    return DynamicsSource(n, m, traced.count, parts["code"], **lists, key=key, traced=traced, own=own)
 
 
 def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:

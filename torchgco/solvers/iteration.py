@@ -17,7 +17,7 @@ from torchgco.native.dispatch import engine_of, terms_of
 from torchgco.problem import Problem
 from torchgco.solvers.lifted import LOST, diverges, lifted_search
 from torchgco.solvers.riccati import BackwardPass, backward
-from torchgco.solvers.state import State
+from torchgco.solvers.state import InnerState
 from torchgco.status import Status
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class NativeIterations:
     def __init__(self, inner: ILQR, problem: Problem, limit: int) -> None:
         self.inner, self.limit = inner, limit
 
-    def run(self, s: State, lagrangian: Lagrangian) -> PassEnd:
+    def run(self, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
         engine = engine_of(lagrangian.problem)
         assert engine is not None
         state = {}
@@ -74,7 +74,7 @@ class EagerIterations:
         s = problem.n + 1 + problem.m
         self.space = (standing(problem, problem.B), problem.x0.new_empty(problem.N + 1, problem.B, s, s))
 
-    def run(self, s: State, lagrangian: Lagrangian) -> PassEnd:
+    def run(self, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
         problem, inner = lagrangian.problem, self.inner
         F, H = (t[:, : problem.B] for t in self.space)
         linearise(problem, s.X, s.U, out=F)
@@ -98,7 +98,7 @@ class EagerIterations:
         ended = ~step.failed & (converged | stuck | (s.inner >= inner.max_iterations))
         return PassEnd(ended, converged, stuck, status, alpha, used, step.failed)
 
-    def _damping(self, s: State, refused: Tensor) -> Tensor:
+    def _damping(self, s: InnerState, refused: Tensor) -> Tensor:
         """mu_r of the next pass (B,): zero as printed; with damping, up where the search failed and down elsewhere."""
         now, first = s.regularisation, self.inner.damping
         if first == 0:
@@ -107,7 +107,7 @@ class EagerIterations:
         up = torch.where(up > self.inner.regularisation_max, 0.0, up)
         return torch.where(refused, up, torch.where(down < first, 0.0, down))
 
-    def _raise_regularisation(self, s: State, step: BackwardPass, F: Tensor, H: Tensor, status: Tensor) -> None:
+    def _raise_regularisation(self, s: InnerState, step: BackwardPass, F: Tensor, H: Tensor, status: Tensor) -> None:
         """mu_r up for elements whose Cholesky failed (Algorithm 2, line 9): they try again in the next pass."""
         inner = self.inner
         higher = (s.regularisation * inner.regularisation_growth).clamp(min=inner.regularisation_first)
@@ -117,7 +117,7 @@ class EagerIterations:
         status[step.failed & ~finite] = Status.NON_FINITE
 
     def _move(
-        self, s: State, lagrangian: Lagrangian, step: BackwardPass, moving: Tensor
+        self, s: InnerState, lagrangian: Lagrangian, step: BackwardPass, moving: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Forward pass of the elements in `moving`; returns the merit before, the step lengths, and who was refused."""
         old_merit = s.merit
@@ -141,7 +141,7 @@ class EagerIterations:
         refused[rows] = ~found.accepted
         return old_merit, alpha, refused
 
-    def _lift(self, s: State, lagrangian: Lagrangian, step: BackwardPass, refused: Tensor) -> Tensor:
+    def _lift(self, s: InnerState, lagrangian: Lagrangian, step: BackwardPass, refused: Tensor) -> Tensor:
         """Another search for elements whose rollouts diverge whatever the step length; returns who is still refused.
 
         In the first iteration of an inner solve alone: later on there are gains that have held the states.
@@ -158,7 +158,7 @@ class EagerIterations:
         return refused
 
 
-def lift(s: State, lagrangian: Lagrangian, rows: Tensor) -> Tensor:
+def lift(s: InnerState, lagrangian: Lagrangian, rows: Tensor) -> Tensor:
     """Put what a lifted search finds in place of the iterates in `rows`; which of them it found something for."""
     found = lifted_search(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows])
     won = rows[found.accepted]

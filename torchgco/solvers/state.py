@@ -29,20 +29,26 @@ class Iterate:
 
 
 @dataclass
-class State:
-    """Everything that an element carries from pass to pass; every tensor starts with the running batch."""
+class InnerState:
+    """What an element carries from iteration to iteration; every tensor starts with the running batch."""
 
     rows: Tensor  # place in the batch as it was given
     X: Tensor
     U: Tensor
     cost: Tensor
     merit: Tensor
-    duals: Multipliers
-    guide: Guide | None
     regularisation: Tensor  # mu_r
     inner: Tensor  # iterations of this inner solve
-    outer: Tensor  # inner solves ended
     iterations: Tensor
+
+
+@dataclass
+class State(InnerState):
+    """What it carries from pass to pass."""
+
+    duals: Multipliers
+    guide: Guide | None
+    outer: Tensor  # inner solves ended
     guided: Tensor
     last_cost: Tensor  # J_var when the inner solve before ended
     best: Iterate

@@ -6,7 +6,7 @@ batch for each problem. Only the rest needs a counterpart in CasADi.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -90,6 +90,13 @@ class Traced:
             return torch.func.vmap(one)(index)
         except RuntimeError:  # an operation that can't be done for many at once
             return torch.stack([one(i) for i in index])
+
+    def rebound(self, tensors: Mapping[int, Tensor]) -> Traced:
+        """The same function of other tensors: those of `own` are replaced by what `tensors` holds for their ids."""
+        copy = object.__new__(type(self))
+        copy.__dict__.update(self.__dict__)
+        copy._captured = {slot: tensors.get(id(tensor), tensor) for slot, tensor in self._captured.items()}
+        return copy
 
     def fingerprint(self) -> str:
         """Digits that stand for what `__call__` computes, the same in every process. CasADi isn't needed for them.
