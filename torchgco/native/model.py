@@ -88,8 +88,9 @@ def trace_dynamics(
         return known.source
     source = _trace(dynamics, n, m, dtype, device)
     if "reads_fields_alone" in type(dynamics).__dict__:
-        forget = weakref.ref(dynamics, lambda _, key=id(dynamics): _traced.pop(key, None))
-        _traced[id(dynamics)] = _Known(forget, _versions(dynamics, dtype, device), source)
+        place = id(dynamics)
+        forget = weakref.ref(dynamics, lambda _: _traced.pop(place, None))
+        _traced[place] = _Known(forget, _versions(dynamics, dtype, device), source)
     return source
 
 

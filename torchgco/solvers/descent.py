@@ -17,8 +17,8 @@ from torchgco.status import Status
 def descend(inner: ILQR, lagrangian: Lagrangian, U: Tensor) -> InnerState:
     """Where the inner solve (Algorithm 2) of each element ends, from controls U (B, N, m).
 
-    An element without a finite L_M stays where it starts. Tolerances and damping are those of `inner`, in units in which
-    the problem's cost is given.
+    An element without a finite L_M stays where it starts. Tolerances and damping of `inner` are in the units of the
+    problem's cost.
     """
     problem = lagrangian.problem
     X = open_loop(problem, U)
