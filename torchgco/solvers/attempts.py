@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchgco.constraints.guides import GuideRegion
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import open_loop, value
 from torchgco.problem import Problem
@@ -14,6 +15,10 @@ from torchgco.shapes import copied, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.state import Advice, Iterate, OuterLoop, State
 from torchgco.status import Status
+
+CLOSE = 2.0  # times the distance that counts as having arrived: paths that end nearer are drawn to the goal at last
+WITHIN = 0.95  # share of that distance to which they are drawn
+STIFF = 1e3  # weight of that, in units of cost per radius^4
 
 
 def has_arrived(problem: Problem, path: Iterate | Solution, share: float, limit: float) -> Tensor:
@@ -26,23 +31,55 @@ def has_arrived(problem: Problem, path: Iterate | Solution, share: float, limit:
 
 
 def try_again(s: State, rows: Tensor, problem: Problem, duals: Multipliers, status: Tensor, solver: OuterLoop) -> None:
-    """Back to the caught path for elements that have ended an attempt and have another left (in place)."""
-    left = (s.attempt[rows] > 0) & (s.attempt[rows] < solver.attempts)
-    if solver.arrival is not None and not solver.thorough:
-        left &= ~has_arrived(problem, take(s.best, rows), solver.arrival, solver.violation_tolerance)
-    again = ((status[rows] != Status.RUNNING) & left).nonzero().flatten()
-    if again.numel() == 0:
+    """Another attempt for elements that have ended one and haven't arrived, or whose attempts are all made (in place).
+
+    Further plans are tried from the caught path. Where none is left, and the best path ends close to the goal, the last
+    attempt goes on from there with the end drawn to the goal.
+    """
+    ended = status[rows] != Status.RUNNING
+    tried, best = s.attempt[rows], take(s.best, rows)
+    missing = torch.ones_like(ended)
+    if solver.arrival is not None:
+        missing = ~has_arrived(problem, best, solver.arrival, solver.violation_tolerance)
+    left = (tried > 0) & (tried < solver.attempts) & (missing | solver.thorough)
+    _start(s, rows, duals, status, ended & left, take(s.origin, rows))
+    if solver.arrival is None or not isinstance(s.guide, GuideRegion):
         return
+    near = has_arrived(problem, best, CLOSE * solver.arrival, solver.violation_tolerance)
+    last = ended & ~left & missing & near & (tried <= solver.attempts)
+    place = _start(s, rows, duals, status, last, best)
+    s.attempt[place] = solver.attempts + 1
+    s.led[place] = True
+    part = problem.take(last.nonzero().flatten())
+    put(s.guide, place, _goal_region(part, take(s.guide, place), solver.arrival))
+
+
+def _start(s: State, rows: Tensor, duals: Multipliers, status: Tensor, chosen: Tensor, path: Iterate) -> Tensor:
+    """Begin an attempt of the elements `chosen` (B',) of `rows` from a path each; returns where they are."""
+    again = chosen.nonzero().flatten()
     place = rows[again]
-    origin = take(s.origin, place)
-    s.X, s.U = s.X.clone(), s.U.clone()
-    s.X[place], s.U[place] = origin.X, origin.U
-    put(duals, again, origin.duals)
-    s.attempt[place] += 1
-    s.since[place] = s.outer[place]
-    s.led[place] = False
-    s.last_cost[place] = torch.inf
-    status[place] = Status.RUNNING
+    if again.numel() > 0:
+        begin = take(path, again)
+        s.X, s.U = s.X.clone(), s.U.clone()
+        s.X[place], s.U[place] = begin.X, begin.U
+        put(duals, again, begin.duals)
+        s.attempt[place] += 1
+        s.since[place] = s.outer[place]
+        s.led[place] = False
+        s.last_cost[place] = torch.inf
+        status[place] = Status.RUNNING
+    return place
+
+
+def _goal_region(problem: Problem, guide: GuideRegion, arrival: float) -> GuideRegion:
+    """A ball around the goal for the last knot, a little smaller than what counts as having arrived."""
+    goal, at = problem.cost.goal(problem.x0), guide.position
+    assert goal is not None
+    size = WITHIN * arrival * (problem.x0 - goal)[:, at].square().sum(-1).sqrt()
+    radius = torch.full_like(guide.radius, torch.inf)
+    radius[:, -1] = size
+    center = goal[:, None, at].expand_as(guide.center)
+    return replace(guide, center=center, radius=radius, weight=STIFF * problem.cost_unit / size.pow(4))
 
 
 def go_on_from(

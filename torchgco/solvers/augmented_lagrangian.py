@@ -37,8 +37,9 @@ class AugmentedLagrangian:
         attempts: where guidance puts another path in place of the iterate, so many are tried from the same caught path,
             each to its end, and the best is kept; max_outer_iterations then counts for each (not in the paper).
         arrival: a feasible iterate has arrived where it ends within this share of the distance from start to goal. One
-            that has is worth more than one that hasn't, whatever they cost, and ends the attempts.
-            None: cost alone decides, as in the paper.
+            that has is worth more than one that hasn't, whatever they cost, and ends the attempts. Where all attempts
+            are made and the best path ends within twice that distance, a last one draws its end to the goal (guided
+            problems alone). None: cost alone decides, as in the paper.
         thorough: all attempts are made, even after one has arrived; the cheapest path is kept.
         clip: inequalities push but never pull (`lagrangian.penalty_weights`); False as printed.
         slots: problems worked on at once; the others wait until a slot falls free. None: all. No result depends on it.
