@@ -19,7 +19,7 @@ from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian import Multipliers
 from torchgco.native.compiler import build
 from torchgco.native.model import trace_dynamics
-from torchgco.native.packing import FLAGS, NUMBERS, PATH, REGION, Packed, Rows, array, pack_rows
+from torchgco.native.packing import FLAGS, NUMBERS, PATH, QUADRATIC, REGION, Packed, Rows, array, pack_rows
 from torchgco.native.rows import trace_rows
 from torchgco.native.source import LANES, Form
 from torchgco.problem import Problem
@@ -175,12 +175,8 @@ class Engine:
             return packed, (Rows * max(1, len(problem.constraints)))(), keep
         assert isinstance(cost, BoundQuadratic)
         packed.N, packed.elements, packed.constraints = problem.N, problem.B, len(problem.constraints)
-        shared = {"Q": cost.Q, "R": cost.R, "x_ref": cost.x_ref, "u_ref": cost.u_ref, "q": cost.q, "r": cost.r}
-        shared["cross"] = cost.H
-        for name, value in shared.items():
-            setattr(packed, name, array(value, keep, knots=True))
-        for name, value in (("Qf", cost.Qf), ("xf_ref", cost.xf_ref), ("qf", cost.qf)):
-            setattr(packed, name, array(value, keep, knots=False))
+        for i, name in enumerate(QUADRATIC):
+            packed.cost_data[i] = array(getattr(cost, name), keep, knots=name not in ("Qf", "xf_ref", "qf"))
         if self.model.count > 0:
             own = self.model.parameters(torch.arange(problem.B), problem.dynamics)
             packed.parameters = array(own, keep, knots=False)

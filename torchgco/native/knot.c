@@ -22,194 +22,144 @@ static inline V pull(const Problem *p, int equality, V c, V lam, V mu, V *rho) {
     return p->clip ? tgco_if(~idle, g) : g;
 }
 
-static inline void sphere(const Lanes *s, int64_t i, int64_t j, const V *x, int64_t k, V *away, V *c) {
-    const Constraint *con = s->of->constraint + i;
-    const V *o = s->bound[i] + j * DIM;
+/* Row j of a box. */
+static inline V box(const Constraint *con, const Rows *rows, int64_t j, const V *x, const V *u) {
+    int v = con->variable[j];
+    return SET(con->sign[j]) * ((v < NX ? x[v] : u[v - NX]) - rows->bound[j]);
+}
+
+#if DIM > 0
+/* Row j of spheres at knot k, and the way there from the centre (DIM); an absent one is c = -1 everywhere. */
+static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V *away) {
+    const V *o = rows->bound + j * DIM;
     V square = SET(0.0);
-    I here = s->squares[i][j] >= SET(0.0); /* an absent one is c = -1 everywhere */
+    I here = rows->squares[j] >= SET(0.0);
     for (int a = 0; a < DIM; a++) {
         away[a] = x[POSITION + a] - o[a];
-        if (con->velocities.data) away[a] -= SET(k * con->dt) * s->velocities[i][j * DIM + a];
+        if (con->velocities.data) away[a] -= SET(k * con->dt) * rows->velocities[j * DIM + a];
         away[a] = tgco_if(here, away[a]);
         square += away[a] * away[a];
     }
-    *c = s->squares[i][j] - square;
+    return rows->squares[j] - square;
 }
 
-/* Cost of stage k, or of the last knot. */
-static inline V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
+/* Whether a row adds anything in any lane; most spheres are far away. */
+static inline int matters(V c, V lam) { return any((c > SET(0.0)) | (lam != SET(0.0)) | (c != c)); }
+#endif
+
+static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V total) {
     const Problem *p = s->of;
-    V total = SET(0.0), half = SET(0.5), ex[NX], eu[NU];
-    int last = k == p->N;
-    const V *ref = last ? s->xf_ref : at(s->x_ref, &p->x_ref, k), *Q = last ? s->Qf : at(s->Q, &p->Q, k);
-    for (int i = 0; i < NX; i++) ex[i] = x[i] - ref[i];
-#if QUADRATIC_FULL
-    for (int i = 0; i < NX; i++) {
-        V row = SET(0.0);
-        for (int j = 0; j < NX; j++) row += Q[i * NX + j] * ex[j];
-        total += half * ex[i] * row;
-    }
-#else
-    for (int i = 0; i < NX; i++) total += half * Q[i] * ex[i] * ex[i];
-#endif
-    const V *q = last ? (p->qf.data ? s->qf : 0) : (p->q.data ? at(s->q, &p->q, k) : 0);
-    if (q) for (int i = 0; i < NX; i++) total += q[i] * ex[i];
-    if (!last) {
-        const V *u_ref = at(s->u_ref, &p->u_ref, k), *R = at(s->R, &p->R, k);
-        for (int i = 0; i < NU; i++) eu[i] = u[i] - u_ref[i];
-#if QUADRATIC_FULL
-        for (int i = 0; i < NU; i++) {
-            V row = SET(0.0);
-            for (int j = 0; j < NU; j++) row += R[i * NU + j] * eu[j];
-            total += half * eu[i] * row;
+    const Constraint *con = p->constraint + i;
+    const Rows *rows = s->rows + i;
+    const V *lam = rows->lam + con->place[k] * con->rows;
+    if (con->kind == BOX) {
+        for (int j = 0; j < con->rows; j++) total += worth(p, 0, box(con, rows, j, x, u), lam[j], s->mu);
+#if DIM > 0
+    } else if (con->kind == SPHERES) {
+        for (int j = 0; j < con->rows; j++) {
+            V away[DIM], c = sphere(con, rows, j, k, x, away);
+            if (matters(c, lam[j])) total += worth(p, 0, c, lam[j], s->mu);
         }
-#else
-        for (int i = 0; i < NU; i++) total += half * R[i] * eu[i] * eu[i];
 #endif
-        if (p->r.data) for (int i = 0; i < NU; i++) total += at(s->r, &p->r, k)[i] * eu[i];
-        if (p->cross.data) {
-            const V *H = at(s->cross, &p->cross, k);
-            for (int i = 0; i < NU; i++) for (int j = 0; j < NX; j++) total += eu[i] * H[i * NX + j] * ex[j];
-        }
+    } else {
+        V c[MAX_ROWS];
+        tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
+        for (int j = 0; j < con->rows; j++) total += worth(p, con->equality, c[j], lam[j], s->mu);
     }
     return total;
 }
 
-/* Cost of knot k; guides and constraints go into `added`. */
+static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V *g, V *H) {
+    const Problem *p = s->of;
+    const Constraint *con = p->constraint + i;
+    const Rows *rows = s->rows + i;
+    const V *lam = rows->lam + con->place[k] * con->rows;
+    if (con->kind == BOX) {
+        for (int j = 0; j < con->rows; j++) {
+            int v = con->variable[j];
+            V rho, slope = pull(p, 0, box(con, rows, j, x, u), lam[j], s->mu, &rho);
+            g[v] += SET(con->sign[j]) * slope;
+            H[v * S + v] += rho;
+        }
+#if DIM > 0
+    } else if (con->kind == SPHERES) {
+        for (int j = 0; j < con->rows; j++) {
+            V away[DIM], rho, c = sphere(con, rows, j, k, x, away);
+            if (!matters(c, lam[j])) continue;
+            V slope = pull(p, 0, c, lam[j], s->mu, &rho);
+            for (int a = 0; a < DIM; a++) {
+                g[POSITION + a] -= SET(2.0) * slope * away[a];
+                for (int b = a; b < DIM; b++)
+                    H[(POSITION + a) * S + POSITION + b] += SET(4.0) * rho * away[a] * away[b];
+            }
+        }
+#endif
+    } else {
+        V c[MAX_ROWS], slope[MAX_ROWS], rho[MAX_ROWS];
+        const V *numbers = at(rows->bound, &con->bound, con->place[k]);
+        tgco_rows((int)i, x, u, numbers, c);
+        for (int j = 0; j < con->rows; j++) slope[j] = pull(p, con->equality, c[j], lam[j], s->mu, rho + j);
+        tgco_add_rows((int)i, x, u, numbers, slope, rho, g, H);
+    }
+}
+
+#if DIM > 0
+/* The way from the guide's centre at knot k, and its squared length. */
+static inline V from_guide(const Lanes *s, int64_t k, const V *x, V *away) {
+    V square = SET(0.0);
+    for (int a = 0; a < DIM; a++) {
+        away[a] = x[POSITION + a] - s->center[k * DIM + a];
+        square += away[a] * away[a];
+    }
+    return square;
+}
+
+static inline V guide_value(const Lanes *s, int64_t k, const V *x) {
+    V away[DIM], half = SET(0.5), square = from_guide(s, k, x, away);
+    if (s->of->guide == PATH) return half * s->weight * square;
+    V f = square - s->radius[k] * s->radius[k];
+    return tgco_if(f > SET(0.0), half * s->weight * f * f);
+}
+
+static inline void guide_expand(const Lanes *s, int64_t k, const V *x, V *g, V *H) {
+    V away[DIM], square = from_guide(s, k, x, away);
+    if (s->of->guide == PATH) {
+        for (int a = 0; a < DIM; a++) {
+            g[POSITION + a] += s->weight * away[a];
+            H[(POSITION + a) * S + POSITION + a] += s->weight;
+        }
+        return;
+    }
+    V f = square - s->radius[k] * s->radius[k];
+    V rho = tgco_if(f > SET(0.0), s->weight), slope = tgco_if(f > SET(0.0), s->weight * f * SET(2.0));
+    for (int a = 0; a < DIM; a++) {
+        g[POSITION + a] += slope * away[a];
+        for (int b = a; b < DIM; b++) H[(POSITION + a) * S + POSITION + b] += SET(4.0) * rho * away[a] * away[b];
+    }
+}
+#endif
+
+/* Cost of knot k; guides and constraints go into `added`. u is NULL at the last knot. */
 static inline V knot_value(const Lanes *s, int64_t k, const V *x, const V *u, V *added) {
     const Problem *p = s->of;
-    V total = cost_value(s, k, x, u), more = SET(0.0), half = SET(0.5);
-    for (int64_t i = 0; i < p->constraints; i++) {
-        const Constraint *con = p->constraint + i;
-        if (con->place[k] < 0) continue;
-        const V *lam = s->lam[i] + con->place[k] * con->rows;
-        if (con->kind == BOX) {
-            for (int j = 0; j < con->rows; j++) {
-                V z = con->variable[j] < NX ? x[con->variable[j]] : u[con->variable[j] - NX];
-                V c = SET(con->sign[j]) * (z - s->bound[i][j]);
-                more += worth(p, 0, c, lam[j], s->mu);
-            }
+    V more = SET(0.0);
+    for (int64_t i = 0; i < p->constraints; i++)
+        if (p->constraint[i].place[k] >= 0) more = rows_value(s, i, k, x, u, more);
 #if DIM > 0
-        } else if (con->kind == SPHERES) {
-            for (int j = 0; j < con->rows; j++) {
-                V away[DIM], c;
-                sphere(s, i, j, x, k, away, &c);
-                if (any((c > SET(0.0)) | (lam[j] != SET(0.0)) | (c != c))) more += worth(p, 0, c, lam[j], s->mu);
-            }
-#endif
-        } else {
-            V c[MAX_ROWS];
-            tgco_rows((int)i, x, u, c);
-            for (int j = 0; j < con->rows; j++) more += worth(p, con->equality, c[j], lam[j], s->mu);
-        }
-    }
-#if DIM > 0
-    if (p->guide != NO_GUIDE) {
-        const V *center = s->center + k * DIM;
-        V square = SET(0.0);
-        for (int a = 0; a < DIM; a++) { V e = x[POSITION + a] - center[a]; square += e * e; }
-        if (p->guide == PATH) more += half * s->weight * square;
-        else {
-            V f = square - s->radius[k] * s->radius[k];
-            more += tgco_if(f > SET(0.0), half * s->weight * f * f);
-        }
-    }
+    if (p->guide != NO_GUIDE) more += guide_value(s, k, x);
 #endif
     *added = more;
-    return total;
+    return cost_value(s, k, x, u);
 }
 
 /* Adds gradient g (S) and upper triangle H (S, S) of all terms of knot k. */
 static inline void knot_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
     const Problem *p = s->of;
-    V ex[NX], eu[NU];
-    int last = k == p->N;
-    const V *ref = last ? s->xf_ref : at(s->x_ref, &p->x_ref, k), *Q = last ? s->Qf : at(s->Q, &p->Q, k);
-    for (int i = 0; i < NX; i++) ex[i] = x[i] - ref[i];
-#if QUADRATIC_FULL
-    for (int i = 0; i < NX; i++) for (int j = 0; j < NX; j++) {
-        g[i] += Q[i * NX + j] * ex[j];
-        if (j >= i) H[i * S + j] += Q[i * NX + j];
-    }
-#else
-    for (int i = 0; i < NX; i++) { g[i] += Q[i] * ex[i]; H[i * S + i] += Q[i]; }
-#endif
-    const V *q = last ? (p->qf.data ? s->qf : 0) : (p->q.data ? at(s->q, &p->q, k) : 0);
-    if (q) for (int i = 0; i < NX; i++) g[i] += q[i];
-    if (!last) {
-        const V *u_ref = at(s->u_ref, &p->u_ref, k), *R = at(s->R, &p->R, k);
-        for (int i = 0; i < NU; i++) eu[i] = u[i] - u_ref[i];
-#if QUADRATIC_FULL
-        for (int i = 0; i < NU; i++) for (int j = 0; j < NU; j++) {
-            g[NX + i] += R[i * NU + j] * eu[j];
-            if (j >= i) H[(NX + i) * S + NX + j] += R[i * NU + j];
-        }
-#else
-        for (int i = 0; i < NU; i++) { g[NX + i] += R[i] * eu[i]; H[(NX + i) * S + NX + i] += R[i]; }
-#endif
-        if (p->r.data) for (int i = 0; i < NU; i++) g[NX + i] += at(s->r, &p->r, k)[i];
-        if (p->cross.data) {
-            const V *C = at(s->cross, &p->cross, k);
-            for (int i = 0; i < NU; i++) for (int j = 0; j < NX; j++) {
-                g[NX + i] += C[i * NX + j] * ex[j];
-                g[j] += C[i * NX + j] * eu[i];
-                H[j * S + NX + i] += C[i * NX + j];
-            }
-        }
-    }
-    for (int64_t i = 0; i < p->constraints; i++) {
-        const Constraint *con = p->constraint + i;
-        if (con->place[k] < 0) continue;
-        const V *lam = s->lam[i] + con->place[k] * con->rows;
-        if (con->kind == BOX) {
-            for (int j = 0; j < con->rows; j++) {
-                int v = con->variable[j];
-                V sign = SET(con->sign[j]), rho;
-                V c = sign * ((v < NX ? x[v] : u[v - NX]) - s->bound[i][j]), gradient = pull(p, 0, c, lam[j], s->mu, &rho);
-                g[v] += sign * gradient;
-                H[v * S + v] += rho;
-            }
+    cost_expand(s, k, x, u, g, H);
+    for (int64_t i = 0; i < p->constraints; i++)
+        if (p->constraint[i].place[k] >= 0) rows_expand(s, i, k, x, u, g, H);
 #if DIM > 0
-        } else if (con->kind == SPHERES) {
-            for (int j = 0; j < con->rows; j++) {
-                V away[DIM], c, rho;
-                sphere(s, i, j, x, k, away, &c);
-                if (!any((c > SET(0.0)) | (lam[j] != SET(0.0)) | (c != c))) continue;
-                V gradient = pull(p, 0, c, lam[j], s->mu, &rho);
-                for (int a = 0; a < DIM; a++) {
-                    g[POSITION + a] -= SET(2.0) * gradient * away[a];
-                    for (int b = a; b < DIM; b++)
-                        H[(POSITION + a) * S + POSITION + b] += SET(4.0) * rho * away[a] * away[b];
-                }
-            }
-#endif
-        } else {
-            V c[MAX_ROWS], gradient[MAX_ROWS], rho[MAX_ROWS];
-            tgco_rows((int)i, x, u, c);
-            for (int j = 0; j < con->rows; j++) gradient[j] = pull(p, con->equality, c[j], lam[j], s->mu, rho + j);
-            tgco_add_rows((int)i, x, u, gradient, rho, g, H);
-        }
-    }
-#if DIM > 0
-    if (p->guide != NO_GUIDE) {
-        const V *center = s->center + k * DIM;
-        V e[DIM], square = SET(0.0);
-        for (int a = 0; a < DIM; a++) { e[a] = x[POSITION + a] - center[a]; square += e[a] * e[a]; }
-        if (p->guide == PATH) {
-            for (int a = 0; a < DIM; a++) {
-                g[POSITION + a] += s->weight * e[a];
-                H[(POSITION + a) * S + POSITION + a] += s->weight;
-            }
-        } else {
-            V f = square - s->radius[k] * s->radius[k];
-            V rho = tgco_if(f > SET(0.0), s->weight), pulls = tgco_if(f > SET(0.0), s->weight * f * SET(2.0));
-            for (int a = 0; a < DIM; a++) {
-                g[POSITION + a] += pulls * e[a];
-                for (int b = a; b < DIM; b++)
-                    H[(POSITION + a) * S + POSITION + b] += SET(4.0) * rho * e[a] * e[b];
-            }
-        }
-    }
+    if (p->guide != NO_GUIDE) guide_expand(s, k, x, g, H);
 #endif
 }
 

@@ -48,8 +48,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
 #if DIM > 0
         if (con->kind == SPHERES) {
             for (int j = 0; j < con->rows; j++) {
-                V away[DIM], c;
-                sphere(&q->s, i, j, x, k, away, &c);
+                V away[DIM], c = sphere(con, q->s.rows + i, j, k, x, away);
                 count += tgco_truth(c >= SET(0.0));
             }
             continue;
@@ -57,7 +56,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
 #endif
         V c[MAX_ROWS], u[NU];
         memset(u, 0, sizeof u); /* a geometric constraint reads x alone */
-        tgco_rows((int)i, x, u, c);
+        tgco_rows((int)i, x, u, at(q->s.rows[i].bound, &con->bound, con->place[k]), c);
         for (int j = 0; j < con->rows; j++) count += tgco_truth(c[j] >= SET(0.0));
     }
     return count;

@@ -1,4 +1,4 @@
-"""The structures of the C library (ilqr.c), filled from the parts of a problem."""
+"""The structures of the C library (problem.c), filled from the parts of a problem."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ class Rows(ctypes.Structure):
 COUNTS = ("N", "elements", "constraints", "rungs", "limit", "max_iterations")
 TENSORS = ("X", "U", "cost", "merit", "regularisation", "alpha", "used", "gains", "mu", "inner", "iterations")
 FLAGS = ("status", "converged", "refused", "lost")
-ARRAYS = ("parameters", "Q", "R", "Qf", "x_ref", "xf_ref", "u_ref", "q", "r", "qf", "cross")
+QUADRATIC = ("Q", "R", "Qf", "x_ref", "xf_ref", "u_ref", "q", "r", "qf", "H")  # in the order of quadratic.c
+COST_ARRAYS = len(QUADRATIC)
 CHOICES = ("guide", "clip", "accept_last", "replicas", "optimality")
 NUMBERS = (
     "tolerance", "absolute_tolerance", "ratio_min", "ratio_max", "smallest", "first", "growth", "most", "damping",
@@ -47,7 +48,8 @@ class Packed(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_int64) for name in COUNTS),
         *((name, ctypes.c_void_p) for name in (*TENSORS, *FLAGS)),
-        *((name, Array) for name in ARRAYS),
+        ("parameters", Array),
+        ("cost_data", Array * COST_ARRAYS),
         ("constraint", ctypes.POINTER(Rows)),
         *((name, ctypes.c_int32) for name in CHOICES),
         *((name, Array) for name in ("center", "radius", "weight")),

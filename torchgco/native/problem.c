@@ -1,11 +1,11 @@
 /* Problems side by side, one to a lane of the vectors V; no operation mixes lanes.
 
-   The generated part before this file defines NX, NU, NP, NJ, DIM, POSITION, QUADRATIC_FULL, and
+   The generated part before this file defines NX, NU, NP, NJ, DIM, POSITION, QUADRATIC_FULL, COST_ARRAYS, MAX_ROWS, and
 
-       tgco_step, tgco_jacobian                       the model
-       tgco_gather(P, f, T), tgco_product(f, T, Q)    T = P F and Q = F' T (upper triangle) for its sparse F = [fx fu]
-       tgco_pull_back(p, f, g)                        g = F' p
-       tgco_rows(i, x, u, c), tgco_add_rows(i, ...)   constraints that are given as functions */
+       tgco_step, tgco_jacobian                         the model
+       tgco_gather(P, f, T), tgco_product(f, T, Q)      T = P F and Q = F' T (upper triangle) for its sparse F = [fx fu]
+       tgco_pull_back(p, f, g)                          g = F' p
+       tgco_rows(i, x, u, p, c), tgco_add_rows(i, ...)  traced constraints, with a knot's own numbers p */
 
 #include <stdint.h>
 #include <stdlib.h>
@@ -28,7 +28,7 @@ typedef struct {
     double *lam;                   /* (E, knots, rows) */
     const int32_t *variable;       /* BOX: (rows) index into [x, u] */
     const double *sign;            /* BOX: (rows) +1 for an upper bound, -1 for a lower one */
-    Array bound;                   /* BOX: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM) */
+    Array bound;                   /* BOX: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ..) */
     Array squares;                 /* SPHERES: squared distances (E, 1, rows) */
     Array velocities;              /* SPHERES: as centres, or NULL */
     double dt;
@@ -42,7 +42,7 @@ typedef struct {
     const double *mu;
     int64_t *inner, *iterations;
     int32_t *status, *converged, *refused, *lost;
-    Array parameters, Q, R, Qf, x_ref, xf_ref, u_ref, q, r, qf, cross;
+    Array parameters, cost_data[COST_ARRAYS];
     const Constraint *constraint;
     int32_t guide, clip, accept_last, replicas, optimality;
     Array center, radius, weight;
@@ -51,11 +51,14 @@ typedef struct {
     double first, growth, most, damping, rounding, lost_beyond;
 } Problem;
 
+/* A constraint's multipliers and numbers. */
+typedef struct { V *lam, *bound, *squares, *velocities; } Rows;
+
 /* What a group of lanes works on. */
 typedef struct {
     const Problem *of;
-    V *X, *U, *Xn, *Un, *G, **lam, **bound, **squares, **velocities;
-    V *parameters, *Q, *R, *Qf, *x_ref, *xf_ref, *u_ref, *q, *r, *qf, *cross, *center, *radius;
+    V *X, *U, *Xn, *Un, *G, *parameters, *cost_data[COST_ARRAYS], *center, *radius;
+    Rows *rows;
     V weight, mu, mu_r, merit, cost, inner, made, alpha, used;
     int64_t element[LANES];
     V *memory;
@@ -79,7 +82,14 @@ static void fill(V *to, const Array *from, int64_t knots, int lane, int64_t elem
         for (int64_t i = 0; i < from->size; i++) to[k * from->size + i][lane] = source[k * from->knot + i];
 }
 
-static const V *at(const V *array, const Array *shape, int64_t k) { return array + (shape->knot ? k * shape->size : 0); }
+static inline const V *at(const V *array, const Array *shape, int64_t k) {
+    return array + (shape->knot ? k * shape->size : 0);
+}
+
+/* Array i of the cost at knot k. */
+static inline const V *cost_at(const Lanes *s, int i, int64_t k) {
+    return at(s->cost_data[i], s->of->cost_data + i, k);
+}
 
 static V *cut(V **memory, int64_t count) { V *part = *memory; *memory += count; return part; }
 
@@ -90,16 +100,14 @@ static int64_t lay_out(Lanes *s, V *memory) {
     s->X = cut(&m, (N + 1) * NX); s->U = cut(&m, N * NU); s->Xn = cut(&m, (N + 1) * NX); s->Un = cut(&m, N * NU);
     s->G = cut(&m, N * NU * NZ);
     s->parameters = cut(&m, length(&p->parameters, 1));
-    s->Q = cut(&m, length(&p->Q, N)); s->R = cut(&m, length(&p->R, N)); s->Qf = cut(&m, length(&p->Qf, 1));
-    s->x_ref = cut(&m, length(&p->x_ref, N)); s->xf_ref = cut(&m, length(&p->xf_ref, 1));
-    s->u_ref = cut(&m, length(&p->u_ref, N)); s->q = cut(&m, length(&p->q, N)); s->r = cut(&m, length(&p->r, N));
-    s->qf = cut(&m, length(&p->qf, 1)); s->cross = cut(&m, length(&p->cross, N));
+    for (int i = 0; i < COST_ARRAYS; i++) s->cost_data[i] = cut(&m, length(p->cost_data + i, N));
     s->center = cut(&m, length(&p->center, N + 1)); s->radius = cut(&m, length(&p->radius, N + 1));
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *c = p->constraint + i;
-        V *lam = cut(&m, c->knots * c->rows), *bound = cut(&m, length(&c->bound, 1));
-        V *squares = cut(&m, length(&c->squares, 1)), *velocities = cut(&m, length(&c->velocities, 1));
-        if (memory) { s->lam[i] = lam; s->bound[i] = bound; s->squares[i] = squares; s->velocities[i] = velocities; }
+        Rows rows = {0};
+        rows.lam = cut(&m, c->knots * c->rows); rows.bound = cut(&m, length(&c->bound, c->knots));
+        rows.squares = cut(&m, length(&c->squares, 1)); rows.velocities = cut(&m, length(&c->velocities, 1));
+        if (memory) s->rows[i] = rows;
     }
     return m - memory;
 }
@@ -107,17 +115,16 @@ static int64_t lay_out(Lanes *s, V *memory) {
 static int start(Lanes *s, const Problem *p) {
     memset(s, 0, sizeof *s);
     s->of = p;
-    int64_t count = lay_out(s, 0), many = p->constraints + 1;
+    int64_t count = lay_out(s, 0);
     s->memory = aligned_alloc(sizeof(V), (count + 1) * sizeof(V));
-    s->lam = calloc(4 * many, sizeof(V *));
-    if (!s->memory || !s->lam) { free(s->memory); free(s->lam); return 0; }
+    s->rows = calloc(p->constraints + 1, sizeof(Rows));
+    if (!s->memory || !s->rows) { free(s->memory); free(s->rows); return 0; }
     memset(s->memory, 0, (count + 1) * sizeof(V));
-    s->bound = s->lam + many; s->squares = s->lam + 2 * many; s->velocities = s->lam + 3 * many;
     lay_out(s, s->memory);
     return 1;
 }
 
-static void finish(Lanes *s) { free(s->memory); free(s->lam); }
+static void finish(Lanes *s) { free(s->memory); free(s->rows); }
 
 /* The problem itself: model, cost, and bounds and obstacles. */
 static void enter_problem(Lanes *s, int lane, int64_t e) {
@@ -126,15 +133,12 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
     s->element[lane] = e;
     for (int i = 0; i < NX; i++) s->X[i][lane] = p->X[e * (N + 1) * NX + i];
     fill(s->parameters, &p->parameters, 1, lane, e);
-    fill(s->Q, &p->Q, N, lane, e); fill(s->R, &p->R, N, lane, e); fill(s->Qf, &p->Qf, 1, lane, e);
-    fill(s->x_ref, &p->x_ref, N, lane, e); fill(s->xf_ref, &p->xf_ref, 1, lane, e);
-    fill(s->u_ref, &p->u_ref, N, lane, e); fill(s->q, &p->q, N, lane, e); fill(s->r, &p->r, N, lane, e);
-    fill(s->qf, &p->qf, 1, lane, e); fill(s->cross, &p->cross, N, lane, e);
+    for (int i = 0; i < COST_ARRAYS; i++) fill(s->cost_data[i], p->cost_data + i, N, lane, e);
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *c = p->constraint + i;
-        fill(s->bound[i], &c->bound, 1, lane, e);
-        fill(s->squares[i], &c->squares, 1, lane, e);
-        fill(s->velocities[i], &c->velocities, 1, lane, e);
+        fill(s->rows[i].bound, &c->bound, c->knots, lane, e);
+        fill(s->rows[i].squares, &c->squares, 1, lane, e);
+        fill(s->rows[i].velocities, &c->velocities, 1, lane, e);
     }
 }
 
@@ -150,7 +154,7 @@ static void enter(Lanes *s, int lane, int64_t e) {
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *c = p->constraint + i;
         int64_t size = c->knots * c->rows;
-        for (int64_t j = 0; j < size; j++) s->lam[i][j][lane] = c->lam[e * size + j];
+        for (int64_t j = 0; j < size; j++) s->rows[i].lam[j][lane] = c->lam[e * size + j];
     }
     s->mu[lane] = p->mu[e]; s->mu_r[lane] = p->regularisation ? p->regularisation[e] : 0;
     s->merit[lane] = p->merit[e]; s->cost[lane] = p->cost[e];

@@ -17,10 +17,10 @@ from torchgco.tracing import Traced
 
 @dataclass(frozen=True)
 class RowsSource:
-    """Rows c (p) of x (n), u (m), for the prelude of `emit`:
+    """Rows c (p) of x (n), u (m) and a knot's own numbers p, for the prelude of `emit`:
 
-        tgco_KEY_rows(x, u, c)
-        tgco_KEY_add(x, u, by_c, by_cc, g, H)     g += c_z' by_c,  H += c_z' diag(by_cc) c_z, its upper triangle
+        tgco_KEY_rows(x, u, p, c)
+        tgco_KEY_add(x, u, p, by_c, by_cc, g, H)     g += c_z' by_c,  H += c_z' diag(by_cc) c_z, its upper triangle
     """
 
     p: int
@@ -48,19 +48,19 @@ def trace_rows(field: str, function: Callable[[Tensor, Tensor], Tensor], n: int,
 def _made(traced: Traced, name: str, n: int, m: int) -> dict[str, Any]:
     import casadi as ca
 
-    x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
+    x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX(0, 1)
     c = ca.densify(ca.vertcat(*traced(elements(ca.SX(0, 1)), elements(x)[None], elements(u)[None]).reshape(-1)))
     slopes = ca.sparsify(ca.jacobian(c, ca.vertcat(x, u), {"allow_reverse": False}))
     rows, columns = slopes.sparsity().get_triplet()
     nonzeros: list[Any] = slopes.nonzeros()
     entries = ca.vertcat(ca.SX(0, 1), *nonzeros)
     code = [
-        emit.emit(f"tgco_{name}_rows", ca.Function("rows", [x, u], [c])),
-        emit.emit(f"tgco_{name}_slopes", ca.Function("slopes", [x, u], [entries])),
+        emit.emit(f"tgco_{name}_rows", ca.Function("rows", [x, u, p], [c])),
+        emit.emit(f"tgco_{name}_slopes", ca.Function("slopes", [x, u, p], [entries])),
         f"static inline void tgco_{name}_add(",
-        "    const V *x, const V *u, const V *by_c, const V *by_cc, V *g, V *H) {",
+        "    const V *x, const V *u, const V *p, const V *by_c, const V *by_cc, V *g, V *H) {",
         f"    V e[{max(1, len(rows))}];",
-        f"    tgco_{name}_slopes(x, u, e);",
+        f"    tgco_{name}_slopes(x, u, p, e);",
     ]
     places = sorted(zip(rows, columns, range(len(rows)), strict=True))
     for row, column, i in places:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from torchgco.native.emit import PRELUDE, literal
 from torchgco.native.model import DynamicsSource
+from torchgco.native.packing import COST_ARRAYS
 from torchgco.native.rows import RowsSource
 
 LANES = 8
@@ -35,8 +36,8 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
     for (int e = 0; e < COUNT; e++) g[F_column[e]] += entry(e, f) * p[F_row[e]];
 }
 """
-SOLVER = ("problem.c", "knot.c", "ilqr.c")
-SAMPLER = ("problem.c", "knot.c", "normal.c", "mppi.c")
+SOLVER = ("problem.c", "quadratic.c", "knot.c", "passes.c", "ilqr.c")
+SAMPLER = ("problem.c", "quadratic.c", "knot.c", "normal.c", "mppi.c")
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class Form:
         defines = {
             "REAL": real, "LANES": lanes, "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
             "DIM": 0 if at is None else at.stop - at.start, "POSITION": 0 if at is None else at.start,
-            "QUADRATIC_FULL": int(self.dense), "MAX_ROWS": max([1, *(rows.p for _, rows in self.functions)]),
+            "QUADRATIC_FULL": int(self.dense), "COST_ARRAYS": COST_ARRAYS,
+            "MAX_ROWS": max([1, *(rows.p for _, rows in self.functions)]),
         }  # fmt: skip
         head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
         functions = [rows.code for _, rows in self.functions]
@@ -106,14 +108,14 @@ def _switches(functions: Iterable[tuple[int, RowsSource]]) -> str:
     """`tgco_rows` and `tgco_add_rows`, which call the functions of a constraint by its place."""
     values, adds = [], []
     for i, rows in functions:
-        values.append(f"    case {i}: tgco_{rows.key}_rows(x, u, c); break;")
-        adds.append(f"    case {i}: tgco_{rows.key}_add(x, u, by_c, by_cc, g, H); break;")
+        values.append(f"    case {i}: tgco_{rows.key}_rows(x, u, p, c); break;")
+        adds.append(f"    case {i}: tgco_{rows.key}_add(x, u, p, by_c, by_cc, g, H); break;")
     return "\n".join(
         [
-            "static inline void tgco_rows(int i, const V *x, const V *u, V *c) {", "    switch (i) {", *values,
-            "    }", "}",
+            "static inline void tgco_rows(int i, const V *x, const V *u, const V *p, V *c) {",
+            "    switch (i) {", *values, "    }", "}",
             "static inline void tgco_add_rows(",
-            "    int i, const V *x, const V *u, const V *by_c, const V *by_cc, V *g, V *H) {",
+            "    int i, const V *x, const V *u, const V *p, const V *by_c, const V *by_cc, V *g, V *H) {",
             "    switch (i) {", *adds, "    }", "}",
         ]
     )  # fmt: skip

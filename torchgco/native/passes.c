@@ -1,0 +1,105 @@
+/* Passes along a trajectory: rollouts with the gains, and the backward pass that makes them. */
+
+/* The forward pass (line 16) from the nominal X, U along G with step lengths alpha; writes Xn, Un, J_var and L_M. */
+static void roll(Lanes *s, V alpha, V *cost, V *merit) {
+    const Problem *p = s->of;
+    V total = SET(0.0), more = SET(0.0), part;
+    memcpy(s->Xn, s->X, NX * sizeof(V));
+    for (int64_t k = 0; k < p->N; k++) {
+        const V *X = s->X + k * NX, *G = s->G + k * NU * NZ;
+        V *x = s->Xn + k * NX, *u = s->Un + k * NU, dx[NX];
+        for (int i = 0; i < NX; i++) dx[i] = x[i] - X[i];
+        for (int j = 0; j < NU; j++) {
+            V step = alpha * G[j * NZ + NX];
+            for (int i = 0; i < NX; i++) step += G[j * NZ + i] * dx[i];
+            u[j] = s->U[k * NU + j] + step;
+        }
+        total += knot_value(s, k, x, u, &part);
+        more += part;
+        model_step(x, u, s->parameters, x + NX);
+    }
+    total += knot_value(s, p->N, s->Xn + p->N * NX, 0, &part);
+    *cost = total;
+    *merit = total + (more + part);
+}
+
+/* The backward pass (lines 4-13): gains into G; the expected change's two sums, and the smallest pivot. */
+static void backward(Lanes *s, V *linear, V *squares, V *lowest) {
+    const Problem *p = s->of;
+    V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[NU * NU], Y[NU * NZ];
+    V sum = SET(0.0), square = SET(0.0), least = SET(__builtin_inf());
+    int regular = any(s->mu_r > SET(0.0));
+    memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+    knot_expand(s, p->N, s->X + p->N * NX, 0, g, H);
+    for (int i = 0; i < NX; i++) {
+        vector[i] = g[i];
+        for (int j = 0; j < NX; j++) P[i * NX + j] = i <= j ? H[i * S + j] : H[j * S + i];
+    }
+    for (int64_t k = p->N - 1; k >= 0; k--) {
+        const V *x = s->X + k * NX, *u = s->U + k * NU;
+        V *G = s->G + k * NU * NZ;
+        tgco_jacobian(x, u, s->parameters, f);
+        tgco_gather(P, f, T);
+        tgco_product(f, T, H);
+        tgco_pull_back(vector, f, g);
+        knot_expand(s, k, x, u, g, H);
+        /* Cholesky factor L of Quu + mu_r I (diagonal inverted), Y = L^-1 [Qux Qu], [K d] = -L^-T Y. */
+        for (int j = 0; j < NU; j++) {
+            V *row = Y + j * NZ, pivot = H[(NX + j) * S + NX + j] + s->mu_r;
+            for (int i = 0; i < j; i++) pivot -= L[j * NU + i] * L[j * NU + i];
+            least = tgco_choose((pivot < least) | (pivot != pivot), pivot, least);
+            V inverse = SET(1.0) / tgco_sqrt(pivot);
+            L[j * NU + j] = inverse;
+            for (int i = j + 1; i < NU; i++) {
+                V entry = H[(NX + j) * S + NX + i];
+                for (int a = 0; a < j; a++) entry -= L[i * NU + a] * L[j * NU + a];
+                L[i * NU + j] = entry * inverse;
+            }
+            for (int i = 0; i < NX; i++) row[i] = H[i * S + NX + j];
+            row[NX] = g[NX + j];
+            for (int a = 0; a < j; a++) for (int i = 0; i < NZ; i++) row[i] -= L[j * NU + a] * Y[a * NZ + i];
+            for (int i = 0; i < NZ; i++) row[i] *= inverse;
+        }
+        for (int j = NU - 1; j >= 0; j--) {
+            V *row = G + j * NZ;
+            for (int i = 0; i < NZ; i++) row[i] = -Y[j * NZ + i];
+            for (int a = j + 1; a < NU; a++) for (int i = 0; i < NZ; i++) row[i] -= L[a * NU + j] * G[a * NZ + i];
+            for (int i = 0; i < NZ; i++) row[i] *= L[j * NU + j];
+        }
+        for (int j = 0; j < NU; j++) {
+            sum += g[NX + j] * G[j * NZ + NX];
+            square += G[j * NZ + NX] * G[j * NZ + NX];
+        }
+        /* V = Qzz - Y'Y - mu_r G'G */
+        for (int i = 0; i < NX; i++) {
+            V value = g[i];
+            for (int j = 0; j < NU; j++) value -= Y[j * NZ + i] * Y[j * NZ + NX];
+            if (regular) for (int j = 0; j < NU; j++) value -= s->mu_r * G[j * NZ + i] * G[j * NZ + NX];
+            vector[i] = value;
+            for (int l = i; l < NX; l++) {
+                V entry = H[i * S + l];
+                for (int j = 0; j < NU; j++) entry -= Y[j * NZ + i] * Y[j * NZ + l];
+                if (regular) for (int j = 0; j < NU; j++) entry -= s->mu_r * G[j * NZ + i] * G[j * NZ + l];
+                P[i * NX + l] = P[l * NX + i] = entry;
+            }
+        }
+    }
+    *linear = sum; *squares = square; *lowest = least;
+}
+
+/* Whether all that the backward pass reads is finite. */
+static I is_finite(const Lanes *s) {
+    const Problem *p = s->of;
+    V g[S], H[S * S], f[NJ ? NJ : 1], sum = SET(0.0);
+    for (int64_t k = 0; k <= p->N; k++) {
+        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
+        memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+        knot_expand(s, k, x, u, g, H);
+        for (int i = 0; i < S; i++) sum += SET(0.0) * g[i];
+        for (int i = 0; i < S * S; i++) sum += SET(0.0) * H[i];
+        if (k == p->N) break;
+        tgco_jacobian(x, u, s->parameters, f);
+        for (int i = 0; i < NJ; i++) sum += SET(0.0) * f[i];
+    }
+    return sum == SET(0.0);
+}

@@ -1,0 +1,79 @@
+/* The quadratic cost: its value, gradient and Hessian at a knot. Weights are diagonals, or matrices (QUADRATIC_FULL). */
+
+enum { Q, R, Q_LAST, X_REF, X_REF_LAST, U_REF, Q_LINEAR, R_LINEAR, Q_LINEAR_LAST, CROSS };
+
+/* w' e + e' W e / 2 in e = z - reference, for z = x or z = u at a knot; w may be NULL. */
+typedef struct { const V *W, *w, *reference; } Quadratic;
+
+static inline Quadratic quadratic_at(const Lanes *s, int W, int w, int reference, int64_t k) {
+    const V *linear = s->of->cost_data[w].data ? cost_at(s, w, k) : 0;
+    return (Quadratic){cost_at(s, W, k), linear, cost_at(s, reference, k)};
+}
+
+static inline Quadratic quadratic_of_x(const Lanes *s, int64_t k, int last) {
+    return last ? quadratic_at(s, Q_LAST, Q_LINEAR_LAST, X_REF_LAST, k)
+                : quadratic_at(s, Q, Q_LINEAR, X_REF, k);
+}
+
+static inline Quadratic quadratic_of_u(const Lanes *s, int64_t k) {
+    return quadratic_at(s, R, R_LINEAR, U_REF, k);
+}
+
+/* Writes e, and adds the value to `total`. */
+static inline void quadratic_value(Quadratic of, int size, const V *z, V *e, V *total) {
+    V half = SET(0.5);
+    for (int i = 0; i < size; i++) e[i] = z[i] - of.reference[i];
+#if QUADRATIC_FULL
+    for (int i = 0; i < size; i++) {
+        V row = SET(0.0);
+        for (int j = 0; j < size; j++) row += of.W[i * size + j] * e[j];
+        *total += half * e[i] * row;
+    }
+#else
+    for (int i = 0; i < size; i++) *total += half * of.W[i] * e[i] * e[i];
+#endif
+    if (of.w) for (int i = 0; i < size; i++) *total += of.w[i] * e[i];
+}
+
+/* Writes e, and adds gradient and upper triangle for z, which is [x, u] from `first` on. */
+static inline void quadratic_expand(Quadratic of, int size, int first, const V *z, V *e, V *g, V *H) {
+    for (int i = 0; i < size; i++) e[i] = z[i] - of.reference[i];
+#if QUADRATIC_FULL
+    for (int i = 0; i < size; i++) for (int j = 0; j < size; j++) {
+        g[first + i] += of.W[i * size + j] * e[j];
+        if (j >= i) H[(first + i) * S + first + j] += of.W[i * size + j];
+    }
+#else
+    for (int i = 0; i < size; i++) { g[first + i] += of.W[i] * e[i]; H[(first + i) * S + first + i] += of.W[i]; }
+#endif
+    if (of.w) for (int i = 0; i < size; i++) g[first + i] += of.w[i];
+}
+
+/* The cost of knot k: of stage x, u, or where u is NULL of the last knot. */
+static inline V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
+    V total = SET(0.0), ex[NX], eu[NU];
+    quadratic_value(quadratic_of_x(s, k, !u), NX, x, ex, &total);
+    if (!u) return total;
+    quadratic_value(quadratic_of_u(s, k), NU, u, eu, &total);
+    if (s->of->cost_data[CROSS].data) {
+        const V *C = cost_at(s, CROSS, k);
+        for (int i = 0; i < NU; i++) for (int j = 0; j < NX; j++) total += eu[i] * C[i * NX + j] * ex[j];
+    }
+    return total;
+}
+
+/* Adds gradient g (S) and upper triangle H (S, S) of that. */
+static inline void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
+    V ex[NX], eu[NU];
+    quadratic_expand(quadratic_of_x(s, k, !u), NX, 0, x, ex, g, H);
+    if (!u) return;
+    quadratic_expand(quadratic_of_u(s, k), NU, NX, u, eu, g, H);
+    if (s->of->cost_data[CROSS].data) {
+        const V *C = cost_at(s, CROSS, k);
+        for (int i = 0; i < NU; i++) for (int j = 0; j < NX; j++) {
+            g[NX + i] += C[i * NX + j] * ex[j];
+            g[j] += C[i * NX + j] * eu[i];
+            H[j * S + NX + i] += C[i * NX + j];
+        }
+    }
+}
