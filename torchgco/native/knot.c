@@ -1,19 +1,23 @@
 /* What one knot says of the iterate: cost, constraints, guide and the model's step. */
 
+#define BLOCK 32 /* spheres looked at together: most blocks are far away */
+
 /* What a row adds to L_M. */
-static inline V worth(const Problem *p, int equality, V c, V lam, V mu) {
-    V half = SET(0.5);
+static inline V worth(const Lanes *s, int equality, V c, V lam) {
+    V half = SET(0.5), mu = s->mu;
     if (equality) return (lam + half * mu * c) * c;
-    if (p->clip) {
+    if (s->of->clip) {
         I idle = lam + mu * c < SET(0.0);
-        return tgco_choose(idle, -half * lam * lam / mu, (lam + half * mu * c) * c);
+        return tgco_choose(idle, -half * lam * lam * s->inverse_mu, (lam + half * mu * c) * c);
     }
     I idle = (c < SET(0.0)) & (lam == SET(0.0));
     return (lam + half * tgco_if(~idle, mu) * c) * c;
 }
 
 /* First and second derivative of that by c; of lam c, with the penalty's curvature, where optimality is asked for. */
-static inline V pull(const Problem *p, int equality, V c, V lam, V mu, V *rho) {
+static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
+    const Problem *p = s->of;
+    V mu = s->mu;
     if (p->optimality) { *rho = tgco_if(lam != SET(0.0), mu); return lam; }
     if (equality) { *rho = mu; return lam + mu * c; }
     I idle = p->clip ? lam + mu * c < SET(0.0) : (c < SET(0.0)) & (lam == SET(0.0));
@@ -43,62 +47,87 @@ static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64
     return rows->squares[j] - square;
 }
 
-/* Whether a row adds anything in any lane; most spheres are far away. */
-static inline int matters(V c, V lam) { return any((c > SET(0.0)) | (lam != SET(0.0)) | (c != c)); }
-#endif
+/* Rows c of the spheres first, ..., last - 1 at knot k, and whether they add anything in any lane. */
+static inline int spheres(
+    const Constraint *con, const Rows *rows, int64_t first, int64_t last, int64_t k, const V *x, V *c) {
+    I matters = rows->pushed[con->place[k]];
+    for (int64_t j = first; j < last; j++) {
+        V away[DIM];
+        c[j - first] = sphere(con, rows, j, k, x, away);
+        matters |= ~(c[j - first] <= SET(0.0)); /* NaN matters */
+    }
+    return any(matters);
+}
 
-static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V total) {
-    const Problem *p = s->of;
-    const Constraint *con = p->constraint + i;
-    const Rows *rows = s->rows + i;
+static inline V spheres_value(const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
     const V *lam = rows->lam + con->place[k] * con->rows;
-    if (con->kind == BOX) {
-        for (int j = 0; j < con->rows; j++) total += worth(p, 0, box(con, rows, j, x, u), lam[j], s->mu);
-#if DIM > 0
-    } else if (con->kind == SPHERES) {
-        for (int j = 0; j < con->rows; j++) {
-            V away[DIM], c = sphere(con, rows, j, k, x, away);
-            if (matters(c, lam[j])) total += worth(p, 0, c, lam[j], s->mu);
-        }
-#endif
-    } else {
-        V c[MAX_ROWS];
-        tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
-        for (int j = 0; j < con->rows; j++) total += worth(p, con->equality, c[j], lam[j], s->mu);
+    V c[BLOCK];
+    for (int64_t first = 0; first < con->rows; first += BLOCK) {
+        int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
+        if (!spheres(con, rows, first, last, k, x, c)) continue;
+        for (int64_t j = first; j < last; j++) total += worth(s, 0, c[j - first], lam[j]);
     }
     return total;
 }
 
-static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V *g, V *H) {
-    const Problem *p = s->of;
-    const Constraint *con = p->constraint + i;
-    const Rows *rows = s->rows + i;
+static inline void spheres_expand(
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
     const V *lam = rows->lam + con->place[k] * con->rows;
-    if (con->kind == BOX) {
-        for (int j = 0; j < con->rows; j++) {
-            int v = con->variable[j];
-            V rho, slope = pull(p, 0, box(con, rows, j, x, u), lam[j], s->mu, &rho);
-            g[v] += SET(con->sign[j]) * slope;
-            H[v * S + v] += rho;
-        }
-#if DIM > 0
-    } else if (con->kind == SPHERES) {
-        for (int j = 0; j < con->rows; j++) {
-            V away[DIM], rho, c = sphere(con, rows, j, k, x, away);
-            if (!matters(c, lam[j])) continue;
-            V slope = pull(p, 0, c, lam[j], s->mu, &rho);
+    V c[BLOCK], away[DIM], rho;
+    for (int64_t first = 0; first < con->rows; first += BLOCK) {
+        int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
+        if (!spheres(con, rows, first, last, k, x, c)) continue;
+        for (int64_t j = first; j < last; j++) {
+            if (!any(~(c[j - first] <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
+            V slope = pull(s, 0, sphere(con, rows, j, k, x, away), lam[j], &rho);
             for (int a = 0; a < DIM; a++) {
                 g[POSITION + a] -= SET(2.0) * slope * away[a];
                 for (int b = a; b < DIM; b++)
                     H[(POSITION + a) * S + POSITION + b] += SET(4.0) * rho * away[a] * away[b];
             }
         }
+    }
+}
+#endif
+
+static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V total) {
+    const Constraint *con = s->of->constraint + i;
+    const Rows *rows = s->rows + i;
+    const V *lam = rows->lam + con->place[k] * con->rows;
+    if (con->kind == BOX) {
+        for (int j = 0; j < con->rows; j++) total += worth(s, 0, box(con, rows, j, x, u), lam[j]);
+#if DIM > 0
+    } else if (con->kind == SPHERES) {
+        total = spheres_value(s, con, rows, k, x, total);
+#endif
+    } else {
+        V c[MAX_ROWS];
+        tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
+        for (int j = 0; j < con->rows; j++) total += worth(s, con->equality, c[j], lam[j]);
+    }
+    return total;
+}
+
+static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V *g, V *H) {
+    const Constraint *con = s->of->constraint + i;
+    const Rows *rows = s->rows + i;
+    const V *lam = rows->lam + con->place[k] * con->rows;
+    if (con->kind == BOX) {
+        for (int j = 0; j < con->rows; j++) {
+            int v = con->variable[j];
+            V rho, slope = pull(s, 0, box(con, rows, j, x, u), lam[j], &rho);
+            g[v] += SET(con->sign[j]) * slope;
+            H[v * S + v] += rho;
+        }
+#if DIM > 0
+    } else if (con->kind == SPHERES) {
+        spheres_expand(s, con, rows, k, x, g, H);
 #endif
     } else {
         V c[MAX_ROWS], slope[MAX_ROWS], rho[MAX_ROWS];
         const V *numbers = at(rows->bound, &con->bound, con->place[k]);
         tgco_rows((int)i, x, u, numbers, c);
-        for (int j = 0; j < con->rows; j++) slope[j] = pull(p, con->equality, c[j], lam[j], s->mu, rho + j);
+        for (int j = 0; j < con->rows; j++) slope[j] = pull(s, con->equality, c[j], lam[j], rho + j);
         tgco_add_rows((int)i, x, u, numbers, slope, rho, g, H);
     }
 }

@@ -23,6 +23,15 @@ static inline V tgco_if(I where, V a) { return (V)(where & (I)a); }
 static inline V tgco_truth(I where) { return tgco_if(where, SET(1.0)); }
 static inline I tgco_is(V a) { return a != SET(0.0); } /* NaN is true, as in C */
 
+/* Whether a lane is true. */
+static inline int tgco_any(I where) {
+    typedef long long Word __attribute__((vector_size(sizeof(I))));
+    Word words = (Word)where;
+    long long all = 0;
+    for (int i = 0; i < (int)(sizeof(I) / sizeof(long long)); i++) all |= words[i];
+    return all != 0;
+}
+
 static inline V tgco_fabs(V a) { return (V)(~(I)SET(-0.0) & (I)a); }
 static inline V tgco_copysign(V a, V b) { return (V)((I)tgco_fabs(a) | ((I)SET(-0.0) & (I)b)); }
 static inline V tgco_sign(V a) { return tgco_choose(tgco_is(a) & (a == a), tgco_copysign(SET(1.0), a), a); }
@@ -92,9 +101,7 @@ static inline V tgco_wave(V x, int shift) {
     } \
     static inline V tgco_##name(V x) { \
         V value = tgco_wave(x, shift); \
-        I far = ~(tgco_fabs(x) <= SET(TGCO_FAR)); \
-        for (int i = 0; i < LANES; i++) if (far[i]) return tgco_far_##name(x, value); \
-        return value; \
+        return tgco_any(~(tgco_fabs(x) <= SET(TGCO_FAR))) ? tgco_far_##name(x, value) : value; \
     }
 TGCO_WAVE(sin, 0)
 TGCO_WAVE(cos, 1)

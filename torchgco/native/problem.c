@@ -52,22 +52,22 @@ typedef struct {
 } Problem;
 
 /* A constraint's multipliers and numbers. */
-typedef struct { V *lam, *bound, *squares, *velocities; } Rows;
+typedef struct {
+    V *lam, *bound, *squares, *velocities;
+    I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
+} Rows;
 
 /* What a group of lanes works on. */
 typedef struct {
     const Problem *of;
     V *X, *U, *Xn, *Un, *G, *parameters, *cost_data[COST_ARRAYS], *center, *radius;
     Rows *rows;
-    V weight, mu, mu_r, merit, cost, inner, made, alpha, used;
+    V weight, mu, inverse_mu, mu_r, merit, cost, inner, made, alpha, used;
     int64_t element[LANES];
     V *memory;
 } Lanes;
 
-static inline int any(I where) {
-    for (int l = 0; l < LANES; l++) if (where[l]) return 1;
-    return 0;
-}
+static inline int any(I where) { return tgco_any(where); }
 static inline I finite(V a) { return (a - a) == SET(0.0); }
 
 /* Lanes ----------------------------------------------------------------------------------------------------------- */
@@ -107,6 +107,7 @@ static int64_t lay_out(Lanes *s, V *memory) {
         Rows rows = {0};
         rows.lam = cut(&m, c->knots * c->rows); rows.bound = cut(&m, length(&c->bound, c->knots));
         rows.squares = cut(&m, length(&c->squares, 1)); rows.velocities = cut(&m, length(&c->velocities, 1));
+        rows.pushed = (I *)cut(&m, c->knots);
         if (memory) s->rows[i] = rows;
     }
     return m - memory;
@@ -153,10 +154,17 @@ static void enter(Lanes *s, int lane, int64_t e) {
     if (p->guide != NO_GUIDE) s->weight[lane] = p->weight.data[e * p->weight.element];
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *c = p->constraint + i;
-        int64_t size = c->knots * c->rows;
-        for (int64_t j = 0; j < size; j++) s->rows[i].lam[j][lane] = c->lam[e * size + j];
+        const double *lam = c->lam + e * c->knots * c->rows;
+        for (int64_t k = 0; k < c->knots; k++) {
+            int pushed = 0;
+            for (int j = 0; j < c->rows; j++, lam++) {
+                s->rows[i].lam[k * c->rows + j][lane] = *lam;
+                pushed |= *lam != 0;
+            }
+            s->rows[i].pushed[k][lane] = -pushed;
+        }
     }
-    s->mu[lane] = p->mu[e]; s->mu_r[lane] = p->regularisation ? p->regularisation[e] : 0;
+    s->mu[lane] = p->mu[e]; s->inverse_mu[lane] = 1 / p->mu[e]; s->mu_r[lane] = p->regularisation ? p->regularisation[e] : 0;
     s->merit[lane] = p->merit[e]; s->cost[lane] = p->cost[e];
     s->inner[lane] = p->inner ? p->inner[e] : 0; s->made[lane] = 0;
 }
