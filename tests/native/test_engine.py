@@ -36,6 +36,7 @@ from torchgco.solvers.state import State
 from torchgco.solvers.verdict import optimality
 
 DAMPED = ILQR(max_iterations=50, damping=0.1, line_search=LineSearch(accept_last=False))
+BRIEF = replace(DAMPED, line_search=LineSearch(accept_last=False, ratio_min=0.9, shrink=0.8, smallest=0.05, back=2))
 
 
 @pytest.fixture(autouse=True)
@@ -139,7 +140,7 @@ def begun(problem: Problem, guided: str | None = None, clip: bool = True, seed: 
     state = State(
         **{
             **blank, "rows": torch.arange(B), "X": X, "U": U, "cost": cost, "merit": merit, "inner": zero,
-            "iterations": zero.clone(), "regularisation": torch.zeros_like(cost), "outer": zero.clone(),
+            "iterations": zero.clone(), "rung": zero.clone(), "regularisation": torch.zeros_like(cost), "outer": zero.clone(),
         }
     )  # fmt: skip
     return state, lagrangian
@@ -153,7 +154,7 @@ def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict
         end = EagerIterations(inner, lagrangian.problem, 1).run(state, lagrangian)
         for b in range(lagrangian.problem.B):
             if b in ends:  # an element that had ended before stays where it was
-                for name in ("X", "U", "cost", "merit", "inner", "iterations", "regularisation"):
+                for name in ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation"):
                     getattr(state, name)[b] = getattr(frozen, name)[b]
             elif bool(end.ended[b]) or int(state.iterations[b]) == count:
                 ends[b] = bool(end.converged[b]), bool(end.stuck[b]), int(state.iterations[b])
@@ -175,13 +176,14 @@ def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None
     ), strict=True):  # fmt: skip
         torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(engine.open_loop(problem, state.U), state.X, rtol=1e-10, atol=1e-12)
-    for count in (1, 4):
+    for inner, count in ((DAMPED, 1), (DAMPED, 4), (BRIEF, 4)):
         (a, first), (b, second) = begun(problem, guided, clip), begun(problem, guided, clip)
-        ends = eager(DAMPED, a, first, count)
-        out = NativeIterations(DAMPED, problem, count).run(b, second)
+        ends = eager(inner, a, first, count)
+        out = NativeIterations(inner, problem, count).run(b, second)
         torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
         torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
         assert torch.equal(b.iterations, a.iterations) and torch.equal(b.inner, a.inner)
+        assert torch.equal(b.rung, a.rung) and (inner is BRIEF or not b.rung.any())
         torch.testing.assert_close(b.regularisation, a.regularisation, rtol=1e-10, atol=0)
         assert [bool(x) for x in out.converged] == [ends[i][0] for i in range(problem.B)]
 

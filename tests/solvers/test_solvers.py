@@ -248,7 +248,7 @@ CHANGES = {
 # What shows only in other tests, here, in test_polish or in tests/guidance.
 ELSEWHERE = {
     (ILQR, "regularisation_first"), (ILQR, "regularisation_growth"), (ILQR, "regularisation_max"), (ILQR, "penalty"),
-    (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"),
+    (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"), (LineSearch, "back"),
     (AugmentedLagrangian, "hold_factor"), (AugmentedLagrangian, "cost_tolerance"),
     (AugmentedLagrangian, "grow_when_feasible"), (GCO, "grow_when_idle"), (GCO, "adopt"),
     (GCO, "detour"), (GCO, "detour_at"), (GCO, "detours"), (AugmentedLagrangian, "arrival"),
@@ -340,6 +340,16 @@ def test_damping_goes_on_where_the_search_fails() -> None:
     assert float(damped.trace.regularisation.max()) >= 1.0 and float(plain.trace.regularisation.max()) == 0.0
     after = [run.trace[run.trace.outer == 0].groupby("element").merit.last() for run in (plain, damped)]
     assert bool((after[1] <= after[0]).all()) and bool((after[1] < after[0]).any())
+
+
+def test_a_search_begins_a_little_above_where_the_last_one_ended() -> None:
+    plain, kept = steep_run(), steep_run(line_search={"back": 1})
+    grown = {}
+    for name, run in (("plain", plain), ("kept", kept)):
+        alpha = run.trace[run.trace.alpha > 0].groupby(["element", "outer"]).alpha
+        grown[name] = (alpha.shift(-1) / run.trace.alpha).max()
+    assert grown["plain"] > 2.0 and grown["kept"] <= 2.0
+    assert bool((kept.violation <= 2.0 * plain.violation + 1e-6).all())
 
 
 def test_rungs_side_by_side_are_the_same_rungs() -> None:
@@ -485,6 +495,7 @@ def test_an_adopted_plan_is_held(hold_factor: float) -> None:
         (lambda: LineSearch(ratio_min=0.0), "line_search.ratio_min"),
         (lambda: LineSearch(smallest=2.0), "line_search.smallest"),
         (lambda: LineSearch(parallel=0), "line_search.parallel"),
+        (lambda: LineSearch(back=-1), "line_search.back"),
         (lambda: AugmentedLagrangian(initial_penalty=0.0), "solver.initial_penalty"),
         (lambda: AugmentedLagrangian(penalty_growth=0.9), "solver.penalty_growth"),
         (lambda: AugmentedLagrangian(penalty_max=1.0), "solver.penalty_max"),

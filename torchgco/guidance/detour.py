@@ -31,7 +31,7 @@ from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
 
-SURE = LineSearch(accept_last=False)
+SURE = LineSearch(accept_last=False, back=2)
 AT_ONCE = 1536  # ways followed at once: memory stays bounded, however large the batch
 BETWEEN = 0.049  # of r_obs + r_veh: how deep a finalist may cut into an obstacle between knots; the judge bears 0.05
 DAMPING = 0.02  # of all solves, in units of `Problem.cost_unit`

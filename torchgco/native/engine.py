@@ -33,6 +33,7 @@ class Options:
     """What the loop of iLQR is told (see ILQR and LineSearch)."""
 
     ladder: tuple[float, ...]
+    back: int
     max_iterations: int
     accept_last: bool
     tolerance: float
@@ -117,7 +118,7 @@ class Engine:
         """Up to `limit` iterations of every element's inner solve, in place in `state`.
 
         Args:
-            state: X, U, cost, merit, regularisation; inner, iterations (int64): all contiguous.
+            state: X, U, cost, merit, regularisation; inner, iterations, rung (int64): all contiguous.
 
         Returns:
             status, converged, refused, lost (int32), and alpha and used: step length and mu_r of the last iteration.
@@ -127,7 +128,7 @@ class Engine:
         packed = self.packed(problem, {**state, **out}, terms)
         ladder = torch.tensor(options.ladder, dtype=torch.float64)
         packed.rungs, packed.ladder = len(options.ladder), ladder.data_ptr()
-        packed.limit, packed.max_iterations = limit, options.max_iterations
+        packed.back, packed.limit, packed.max_iterations = options.back, limit, options.max_iterations
         packed.accept_last = options.accept_last
         for name in NUMBERS:
             setattr(packed, name, getattr(options, name))

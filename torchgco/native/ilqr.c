@@ -17,12 +17,13 @@ static void commit(Lanes *s, I won, const int *from, V alpha, V cost, V merit) {
 static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
     const Problem *p = s->of;
     int replicas = p->replicas;
+    int64_t landed[LANES];
     I open = moving, done = moving & ~moving;
     *shortest = SET(0.0);
-    for (int64_t first = 0; first < p->rungs && any(open); first += replicas) {
+    for (int64_t tried = 0; any(open); tried += replicas) {
         V alpha, cost, merit;
         for (int l = 0; l < LANES; l++) {
-            int64_t rung = first + l % replicas;
+            int64_t rung = s->rung[l] + tried + l % replicas;
             alpha[l] = p->ladder[rung < p->rungs ? rung : p->rungs - 1];
         }
         roll(s, alpha, &cost, &merit);
@@ -46,7 +47,14 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
         if (any(won)) commit(s, won, from, alpha, cost, merit);
         open &= ~won;
         done |= won;
+        for (int l = 0; l < LANES; l++) {
+            if (won[l]) landed[l] = s->rung[l] + tried + from[l] % replicas;
+            else if (s->rung[l] + tried + replicas >= p->rungs) open[l] = 0;
+        }
     }
+    /* The next search begins a little above where this one ended; after one that found nothing, at a full step. */
+    for (int l = 0; l < LANES; l++)
+        if (moving[l]) s->rung[l] = done[l] && p->back >= 0 && landed[l] > p->back ? landed[l] - p->back : 0;
     return done;
 }
 

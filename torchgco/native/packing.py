@@ -32,8 +32,8 @@ class Rows(ctypes.Structure):
     ]  # fmt: skip
 
 
-COUNTS = ("N", "elements", "constraints", "rungs", "limit", "max_iterations")
-TENSORS = ("X", "U", "cost", "merit", "regularisation", "alpha", "used", "gains", "mu", "inner", "iterations")
+COUNTS = ("N", "elements", "constraints", "rungs", "back", "limit", "max_iterations")
+TENSORS = ("X", "U", "cost", "merit", "regularisation", "alpha", "used", "gains", "mu", "inner", "iterations", "rung")
 FLAGS = ("status", "converged", "refused", "lost")
 QUADRATIC = ("Q", "R", "Qf", "x_ref", "xf_ref", "u_ref", "q", "r", "qf", "H")  # in the order of quadratic.c
 COST_ARRAYS = len(QUADRATIC)

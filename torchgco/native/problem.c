@@ -35,12 +35,12 @@ typedef struct {
 } Constraint;
 
 typedef struct {
-    int64_t N, elements, constraints, rungs, limit, max_iterations;
+    int64_t N, elements, constraints, rungs, back, limit, max_iterations;
     double *X, *U, *cost, *merit, *regularisation;  /* (E, ...) in and out */
     double *alpha, *used;                           /* (E): step length and mu_r of the last iteration */
     double *gains;                                  /* (E, N, NU, NZ): what tgco_gains writes */
     const double *mu;
-    int64_t *inner, *iterations;
+    int64_t *inner, *iterations, *rung;
     int32_t *status, *converged, *refused, *lost;
     Array parameters, cost_data[COST_ARRAYS];
     const Constraint *constraint;
@@ -63,7 +63,7 @@ typedef struct {
     V *X, *U, *Xn, *Un, *G, *parameters, *cost_data[COST_ARRAYS], *center, *radius;
     Rows *rows;
     V weight, mu, inverse_mu, mu_r, merit, cost, inner, made, alpha, used;
-    int64_t element[LANES];
+    int64_t element[LANES], rung[LANES]; /* at which the next line search begins */
     V *memory;
 } Lanes;
 
@@ -166,7 +166,7 @@ static void enter(Lanes *s, int lane, int64_t e) {
     }
     s->mu[lane] = p->mu[e]; s->inverse_mu[lane] = 1 / p->mu[e]; s->mu_r[lane] = p->regularisation ? p->regularisation[e] : 0;
     s->merit[lane] = p->merit[e]; s->cost[lane] = p->cost[e];
-    s->inner[lane] = p->inner ? p->inner[e] : 0; s->made[lane] = 0;
+    s->inner[lane] = p->inner ? p->inner[e] : 0; s->made[lane] = 0; s->rung[lane] = p->rung ? p->rung[e] : 0;
 }
 
 static void leave(const Lanes *s, int lane, int32_t status, int32_t converged, int32_t refused, int32_t lost) {
@@ -175,7 +175,7 @@ static void leave(const Lanes *s, int lane, int32_t status, int32_t converged, i
     for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = s->X[i][lane];
     for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = s->U[i][lane];
     p->cost[e] = s->cost[lane]; p->merit[e] = s->merit[lane]; p->regularisation[e] = s->mu_r[lane];
-    p->iterations[e] += (int64_t)s->made[lane]; p->inner[e] = (int64_t)s->inner[lane];
+    p->iterations[e] += (int64_t)s->made[lane]; p->inner[e] = (int64_t)s->inner[lane]; p->rung[e] = s->rung[lane];
     p->alpha[e] = s->alpha[lane]; p->used[e] = s->used[lane];
     p->status[e] = status; p->converged[e] = converged; p->refused[e] = refused; p->lost[e] = lost;
 }

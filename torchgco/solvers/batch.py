@@ -97,7 +97,7 @@ class Loop:
             rows=rows,
             X=X, U=U, cost=cost, merit=merit.clone(), duals=duals, guide=guide,
             regularisation=torch.zeros_like(cost),
-            inner=zero, outer=zero.clone(), iterations=zero.clone(), guided=zero.clone(),
+            inner=zero, outer=zero.clone(), iterations=zero.clone(), rung=zero.clone(), guided=zero.clone(),
             last_cost=worst.clone(),
             best=copied(iterate), origin=copied(iterate),
             attempt=zero.clone(), since=zero.clone(), led=torch.zeros_like(rows, dtype=torch.bool),
@@ -169,7 +169,7 @@ class Loop:
         s.regularisation[rows] = 0.0
         lagrangian = Lagrangian(self.problem.take(rows), take(s.duals, rows), take(s.guide, rows), self.solver.clip)
         s.cost[rows], s.merit[rows] = value(lagrangian, s.X[rows], s.U[rows])
-        s.inner[rows] = 0
+        s.inner[rows] = s.rung[rows] = 0
 
     def _be_guided(self, rows: Tensor) -> None:
         """Ask guidance for the elements in `rows`, and go on from the plans that it hands over."""

@@ -23,9 +23,9 @@ def descend(inner: ILQR, lagrangian: Lagrangian, U: Tensor) -> InnerState:
     problem = lagrangian.problem
     X = open_loop(problem, U)
     cost, merit = value(lagrangian, X, U)
-    none = torch.zeros(problem.B, dtype=torch.int64, device=U.device)
     rows = torch.arange(problem.B, device=U.device)
-    found = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), none, none.clone())
+    none = (torch.zeros_like(rows) for _ in range(3))
+    found = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), *none)
     kernels = NativeIterations if engine_of(problem) is not None else EagerIterations
     iterations = kernels(inner, problem, inner.max_iterations)
     going = torch.isfinite(merit) & torch.isfinite(X).flatten(1).all(-1)

@@ -49,7 +49,7 @@ class NativeIterations:
         engine = engine_of(lagrangian.problem)
         assert engine is not None
         state = {}
-        for name in ("X", "U", "cost", "merit", "regularisation", "inner", "iterations"):
+        for name in ("X", "U", "cost", "merit", "regularisation", "inner", "iterations", "rung"):
             state[name] = getattr(s, name).clone(memory_format=torch.contiguous_format)
             setattr(s, name, state[name])
         options = self.inner.options(ROUNDING, LOST)
@@ -126,17 +126,18 @@ class EagerIterations:
         if rows.numel() == 0:
             return old_merit, alpha, refused
         if rows.numel() == moving.numel():
-            found = self.inner.line_search.search(lagrangian, s.X, s.U, s.merit, step)
+            found = self.inner.line_search.search(lagrangian, s.X, s.U, s.merit, step, s.rung)
         else:
             part = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
             found = self.inner.line_search.search(
-                lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows], part
+                lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows], part, s.rung[rows]
             )
         won = rows[found.accepted]
         for name in ("X", "U", "cost", "merit"):
             values = getattr(s, name).clone()
             values[won] = getattr(found, name)[found.accepted]
             setattr(s, name, values)
+        s.rung = s.rung.index_copy(0, rows, self.inner.line_search.next_rung(found))
         alpha[rows] = found.alpha
         refused[rows] = ~found.accepted
         return old_merit, alpha, refused

@@ -40,6 +40,7 @@ class InnerState:
     regularisation: Tensor  # mu_r
     inner: Tensor  # iterations of this inner solve
     iterations: Tensor
+    rung: Tensor  # int64: at which the next line search begins
 
 
 @dataclass
