@@ -248,7 +248,8 @@ CHANGES = {
 # What shows only in other tests, here, in test_polish or in tests/guidance.
 ELSEWHERE = {
     (ILQR, "regularisation_first"), (ILQR, "regularisation_growth"), (ILQR, "regularisation_max"), (ILQR, "penalty"),
-    (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"), (LineSearch, "back"),
+    (ILQR, "damping"), (LineSearch, "parallel"), (LineSearch, "smallest"), (LineSearch, "accept_last"),
+    (LineSearch, "back"),
     (AugmentedLagrangian, "hold_factor"), (AugmentedLagrangian, "cost_tolerance"),
     (AugmentedLagrangian, "grow_when_feasible"), (GCO, "grow_when_idle"), (GCO, "adopt"),
     (GCO, "detour"), (GCO, "detour_at"), (GCO, "detours"), (AugmentedLagrangian, "arrival"),

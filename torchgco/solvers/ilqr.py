@@ -77,8 +77,8 @@ class ILQR:
         nothing, `lost_beyond` how many times L_M the shortest step makes of it where rollouts diverge."""
         search = self.line_search
         return Options(
-            tuple(search.ladder), -1 if search.back is None else search.back, self.max_iterations, search.accept_last, self.tolerance, self.absolute_tolerance,
-            search.ratio_min, search.ratio_max, search.smallest, self.regularisation_first,
+            tuple(search.ladder), -1 if search.back is None else search.back, self.max_iterations,
+            search.accept_last, self.tolerance, self.absolute_tolerance, search.ratio_min, search.ratio_max, search.smallest, self.regularisation_first,
             self.regularisation_growth, self.regularisation_max, self.damping, rounding, lost_beyond,
         )  # fmt: skip
 

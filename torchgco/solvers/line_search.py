@@ -42,8 +42,8 @@ class LineSearch:
         accept_last: take that last one whatever it does to L_M (as printed), rather than no step at all.
         parallel: rungs that those who refused the first try side by side, at least. More where few refused: rolling
             out some dozens of trajectories costs what one costs.
-        back: rungs above the last accepted one at which the next search begins, which spares rollouts and shortens steps;
-            None: each begins with a full step (as printed).
+        back: rungs above the last accepted one at which the next search begins, which spares rollouts and shortens
+            steps; None: each begins with a full step (as printed).
 
     Raises:
         InputError: a field out of its range.
