@@ -42,7 +42,8 @@ class State:
     regularisation: Tensor  # mu_r
     inner: Tensor  # iterations of this inner solve
     outer: Tensor  # inner solves ended
-    iterations: Tensor
+    iterations: Tensor  # of the loop itself
+    advised: Tensor  # iterations of the solves that guidance made
     guided: Tensor
     last_cost: Tensor  # J_var when the inner solve before ended
     best: Iterate
@@ -86,6 +87,7 @@ class Advice:
     taken: Tensor  # (B',) bool: where U replaces the iterate
     # To go on with where U is taken, and left alone until the attempt ends; NaN in mu, or None: the solver's own.
     duals: Multipliers | None = None
+    iterations: Tensor | None = None  # (B',) int64: of the solves that guidance made for this; None: it made none
 
 
 class Guidance(Protocol):
