@@ -73,12 +73,13 @@ class Loop:
         self._end(self._bad_starts(self.state))
         passes = 0
         while self.state.rows.numel() > 0:
+            rows = self.state.rows.clone()  # slots are filled again in place
             self._end(self._pass())
             passes += 1
             if self.callback is not None:
                 total = self.whole.B
                 left = self.state.rows.numel() + self.waiting.numel()
-                self.callback(Progress(passes, total - left, total, self.state))
+                self.callback(Progress(passes, rows, total - left, total, self.state))
         return self._finished()
 
     # Start -------------------------------------------------------------------------------------------------------

@@ -55,9 +55,10 @@ class State:
 
 @dataclass(frozen=True)
 class Progress:
-    """What a callback is told after every pass, or after every problem by a solver that takes them one by one."""
+    """What a callback receives after every pass, or after every problem from a solver that takes them one by one."""
 
     passes: int
+    rows: Tensor  # (b,) int64: places in the batch of the problems that this pass worked on, side by side
     finished: int
     total: int
     state: State | None  # None from a solver that carries no batch
