@@ -32,8 +32,10 @@ class Solution:
     cost: Tensor  # (B,): J_var
     violation: Tensor  # (B,): largest violation, metres for lengths
     status: Tensor  # (B,) int64, see Status
-    iterations: Tensor  # (B,) int64, inner iterations altogether
-    outer_iterations: Tensor  # (B,) int64
+    # (B,) int64: iterations of all solves made for the problem: inner solves, candidates that guidance solves, every
+    # start of several, and the Newton steps of a polish.
+    iterations: Tensor
+    outer_iterations: Tensor  # (B,) int64: of the outermost solver, over all its starts
     guided: Tensor  # (B,) int64, outer iterations with guidance on
     trace: pd.DataFrame | None = None  # a row per element and iteration, where the solver records
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from tests.problems import planar_batch
-from torchgco import ILQR, AugmentedLagrangian, InputError
+from torchgco import GCO, ILQR, AugmentedLagrangian, InputError
 from torchgco.baselines import MultiStart
+from torchgco.guidance import Detour
 from torchgco.lagrangian import is_better
 
 LOCAL = AugmentedLagrangian(inner=ILQR(max_iterations=4), max_outer_iterations=3, clip=True)
@@ -44,6 +45,40 @@ def test_a_spent_budget_ends_the_starts() -> None:
     assert bool(spent.any()) and torch.equal(bounded.iterations[spent], first.iterations[spent])
     generous = replace(MANY, budget=limit + 1).solve(problem, U0)
     assert bool((generous.iterations >= limit + 1).all())
+
+
+def test_the_budget_counts_the_candidates_of_every_start_too(monkeypatch) -> None:
+    """No start begins with the budget spent, and none is left out while it isn't, told from the solves themselves."""
+    made: dict[int, list[int]] = {b: [] for b in range(4)}
+    solve = AugmentedLagrangian.solve
+
+    def noted(self, problem, U0, seed=0, ids=None, *rest, **options):
+        end = solve(self, problem, U0, seed, ids, *rest, **options)
+        for b, count in zip([] if ids is None else ids.tolist(), end.iterations.tolist(), strict=False):
+            made[b].append(count)
+        return end
+
+    problem, U0 = planar_batch(B=4, N=25, obstacles=9, seed=4)
+    problem.x0[2, :2] = problem.constraints[0].centers[2, 0]  # inside an obstacle: no guess helps
+    monkeypatch.setattr(AugmentedLagrangian, "solve", noted)
+    guided = replace(LOCAL, guidance=GCO(detour=Detour(iterations=4, settle=2, depth=9.0), patience=1))
+    budget = 100
+    solution = MultiStart(guided, starts=50, budget=budget, covariance=9.0, knots=5).solve(problem, U0)
+    assert solution.iterations.tolist() == [sum(made[b]) for b in range(4)] and made[2] == [0]
+    for b in (0, 1, 3):
+        assert sum(made[b][:-1]) < budget <= sum(made[b])
+        assert len(made[b]) > 1
+    assert max(max(starts) for starts in made.values()) > 3 * 4  # more than the loop of one start can make alone
+
+
+def test_progress_names_problems_by_their_place_in_the_whole_batch() -> None:
+    problem, U0 = planar_batch(B=4, N=25, obstacles=8, seed=2)
+    first, seen = LOCAL.solve(problem, U0), []
+    budget = int(first.iterations.max())
+    replace(MANY, budget=budget, starts=2).solve(problem, U0, callback=lambda p: seen.append(set(p.rows.tolist())))
+    left = set((first.iterations < budget).nonzero().flatten().tolist())
+    again = seen[int(first.outer_iterations.max()) :]
+    assert left and set.union(*again) == left != {0, 1, 2, 3}
 
 
 @pytest.mark.parametrize(

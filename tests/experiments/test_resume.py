@@ -15,6 +15,7 @@ from torchgco.baselines import MultiStart
 from torchgco.experiments.records import Records
 from torchgco.scenarios import Layouts
 from torchgco.solvers import AugmentedLagrangian, Polish
+from torchgco.solvers.batch import Loop
 
 HOW = ["seconds", "batch_size", "threads"]  # columns that say how a trial was flown
 
@@ -119,15 +120,33 @@ def test_a_polished_study_keeps_its_pieces(run, run_until, monkeypatch) -> None:
 
 
 @pytest.mark.usefixtures("without_report")
-def test_batch_size_is_what_was_worked_on_at_once(run, tmp_path) -> None:
-    words = [*TINY[:2], "study.shard_size=3", "study.batch_size=2", "study.workers=1", "hydra.run.dir=out"]
-    assert run(*words, "solver.max_outer_iterations=1", "study.baselines=[hold,fatrop]")[0] == 0
+def test_batch_size_is_how_many_ran_together(run, tmp_path) -> None:
+    words = ["solver=al_ilqr", "study.layouts=5", TINY[1], "study.batch_size=4", "study.workers=1"]
+    one = "solver.max_outer_iterations=1"  # the first four end in the same pass
+    assert run(*words, one, "study.baselines=[hold,multistart,fatrop]", "hydra.run.dir=out")[0] == 0
     trials = pd.read_parquet(tmp_path / "out" / "trials.parquet")
-    assert trials.groupby("solver")["batch_size"].unique().map(list).to_dict() == {
-        "gco": [2],  # slots
-        "hold": [3],  # handed over in one call
-        "fatrop": [1],  # one after the other
+    assert trials.groupby("solver")["batch_size"].agg(list).to_dict() == {
+        "al_ilqr": [4, 4, 4, 4, 1],
+        "hold": [5] * 5,  # all in one call
+        "multistart": [5] * 5,
+        "fatrop": [1] * 5,  # one after the other
     }
+
+
+@pytest.mark.usefixtures("without_report")
+def test_batch_size_counts_those_that_take_a_freed_slot(run, tmp_path, monkeypatch) -> None:
+    passes = []
+
+    def step(self, real=Loop._pass):
+        passes.append(self.state.rows.tolist())
+        return real(self)
+
+    monkeypatch.setattr(Loop, "_pass", step)
+    words = ["solver=al_ilqr", "study.layouts=7", "scenario.stages=50", "study.batch_size=3", "study.workers=1"]
+    assert run(*words, "solver.cost_tolerance=0.1", "study.baselines=[]", "hydra.run.dir=out")[0] == 0
+    want = [max(len(rows) for rows in passes if b in rows) for b in range(7)]
+    assert pd.read_parquet(tmp_path / "out" / "trials.parquet")["batch_size"].tolist() == want
+    assert want[:3] == [3] * 3 and [0, 1, 2] in passes and any(0 < len(set(rows) & {0, 1, 2}) < 3 for rows in passes)
 
 
 @pytest.mark.usefixtures("without_report")

@@ -22,7 +22,8 @@ from torchgco import (
 )
 from torchgco.draws import DrawKey
 from torchgco.guidance import Detour, Roadmap
-from torchgco.guidance.detour import Plans, Proposal
+from torchgco.guidance.detour import Proposal
+from torchgco.guidance.plans import Plans
 from torchgco.guidance.scene import depth_between
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.rollout import open_loop
@@ -66,7 +67,7 @@ def test_it_leads_around_a_trap_that_catches_the_solver() -> None:
 
 
 def test_a_plan_ends_near_the_goal_and_has_a_penalty() -> None:
-    U, found, duals = Detour(begin=0.1, end=0.8, depth=0.5).propose(cup())
+    U, found, duals, _ = Detour(begin=0.1, end=0.8, depth=0.5).propose(cup())
     assert bool(found.all()) and bool((duals.mu > 0).all()) and bool(torch.isfinite(U).all())
     assert float(judge(cup(), U, GOAL, 0.3).goal_distance.max()) < 0.3
 
@@ -88,8 +89,8 @@ def test_units_are_the_problems_own() -> None:
     ids=["no way", "moving", "no obstacles"],
 )
 def test_where_there_is_no_way_nothing_is_proposed(problem: Problem) -> None:
-    U, found, _ = QUICK.propose(problem)
-    assert not bool(found.any()) and U.shape == (2, 100, 2)
+    U, found, _, iterations = QUICK.propose(problem)
+    assert not bool(found.any()) and U.shape == (2, 100, 2) and iterations.tolist() == [0, 0]
     advice = GCO(detour=QUICK, sampler=MPPI(samples=4)).update(
         problem, torch.zeros(2, 101, 6, dtype=torch.float64), U,
         GCO().start(problem, torch.zeros(2, 101, 6, dtype=torch.float64)),
@@ -116,7 +117,8 @@ class Turns(Detour):
     def propose(self, problem: Problem, rank: torch.Tensor | None = None) -> Proposal:
         self.asked.append(rank.tolist())
         U = controls(problem)
-        return Proposal(U, torch.zeros(problem.B, dtype=torch.bool), Multipliers.zero(problem, 0.0))
+        none = torch.zeros(problem.B, dtype=torch.int64)
+        return Proposal(U, none.bool(), Multipliers.zero(problem, 0.0), none)
 
 
 @pytest.mark.parametrize(
@@ -152,10 +154,11 @@ def test_many_ways_are_followed_by_chunks_that_nobody_notices(monkeypatch) -> No
     x0 = torch.tensor([[-1.0, y, 0, 0, 0, 0] for y in (-0.2, 0.0, 0.1)], dtype=torch.float64)
     problem, two = replace(cup(B=3, N=40), x0=x0), replace(QUICK, ways=2, iterations=2, settle=1)
     whole = two.propose(problem)
-    monkeypatch.setattr("torchgco.guidance.detour.AT_ONCE", 4)
+    for module in ("detour", "plans"):
+        monkeypatch.setattr(f"torchgco.guidance.{module}.AT_ONCE", 4)
     parts = two.propose(problem)
     assert torch.equal(whole.U, parts.U) and torch.equal(whole.found, parts.found)
-    assert torch.equal(whole.duals.mu, parts.duals.mu)
+    assert torch.equal(whole.duals.mu, parts.duals.mu) and torch.equal(whole.iterations, parts.iterations)
 
 
 class Settles(Detour):
@@ -221,8 +224,8 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
         detour = replace(QUICK, tube=tube, stiffness=(stiffness,), iterations=4, settle=0, depth=9.0)
         way = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
         R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
-        live = torch.ones(1, dtype=torch.bool)
-        U = detour._follow(Plans(problem, controls(problem), R, unit, live, 1), way, 0.8 * torch.ones_like(R)).U
+        live, none = torch.ones(1, dtype=torch.bool), torch.zeros(1, dtype=torch.int64)
+        U = detour._follow(Plans(problem, controls(problem), R, unit, live, 1, none), way, 0.8 * torch.ones_like(R)).U
         X = open_loop(problem.dynamics, problem.x0, U)
         off.append(float((X[..., :2] - detour._travel(way, 0.8 * torch.ones_like(R), 120)).norm(dim=-1).mean()))
     assert off[1] < 0.5 * off[0]
@@ -243,20 +246,44 @@ def test_finalists_are_solved_to_their_end_and_the_cheapest_there_is_handed_over
             inner=ILQR(tolerance=1e-2, max_iterations=20), guidance=guidance, max_outer_iterations=20,
             grow_when_feasible=False, clip=True, cost_tolerance=1e-3,
         )  # fmt: skip
-        counts.append(int(solver.solve(problem, controls(problem)).iterations.sum()))
-    assert counts[1] < counts[0]
+        solution = solver.solve(problem, controls(problem))
+        counts.append((int(solution.outer_iterations.sum()), int(solution.iterations.sum())))
+    assert counts[1][0] < counts[0][0]
+
+
+def test_the_iterations_of_every_plan_are_counted(monkeypatch) -> None:
+    """Those followed, those settled, and the finalists: the same as by asking every solve, whatever is handed over."""
+    made = []
+    for solver in (ILQR, AugmentedLagrangian):
+
+        def solve(self, *args, real=solver.solve, **options):
+            end = real(self, *args, **options)
+            made.append(int(end.iterations.sum()))
+            return end
+
+        monkeypatch.setattr(solver, "solve", solve)
+    x0 = torch.tensor([[-1.0, y, 0, 0, 0, 0] for y in (-0.2, 0.0, 0.1)], dtype=torch.float64)
+    problem = replace(cup(B=3), x0=x0)
+    detour = replace(QUICK, ways=3, pushes=((0.7, -0.7),), keep=3, settle=4, stiffness=(20.0, 200.0), finalists=2)
+    together = detour.propose(problem)
+    assert len(made) == 4 and int(together.iterations.sum()) == sum(made) and bool(together.found.any())
+    for b in range(3):
+        made.clear()
+        alone = detour.propose(problem.take(torch.tensor([b])), torch.tensor([2]))  # no rank changes what is solved
+        assert int(alone.iterations) == int(together.iterations[b]) == sum(made) > 0
 
 
 def test_paths_that_are_alike_count_once() -> None:
     problem = cup(B=1)
     R, unit, live = *torch.ones(2, 3, dtype=torch.float64), torch.ones(3, dtype=torch.bool)
-    plans = Plans(problem.take(torch.zeros(3, dtype=torch.int64)), controls(problem).repeat(3, 1, 1), R, unit, live, 3)
+    same, none = problem.take(torch.zeros(3, dtype=torch.int64)), torch.zeros(1, dtype=torch.int64)
+    plans = Plans(same, controls(problem).repeat(3, 1, 1), R, unit, live, 3, none)
     plans.U[2] = -1.0  # drives away, which costs more
     first = torch.ones(3, dtype=torch.bool)
-    assert QUICK._order(plans, first).tolist() == [[0, 1, 2]]
-    assert QUICK._order(plans, first, alike=1e-3).tolist() == [[0, 2, 1]]
+    assert plans.order(80.0, first).tolist() == [[0, 1, 2]]
+    assert plans.order(80.0, first, alike=1e-3).tolist() == [[0, 2, 1]]
     first[0] = False  # what isn't sound stands for nobody
-    assert QUICK._order(plans, first, alike=1e-3).tolist() == [[1, 2, 0]]
+    assert plans.order(80.0, first, alike=1e-3).tolist() == [[1, 2, 0]]
 
 
 def test_what_is_not_live_is_left_as_it_is_and_comes_last() -> None:
@@ -268,9 +295,11 @@ def test_what_is_not_live_is_left_as_it_is_and_comes_last() -> None:
     )
     U = controls(problem).repeat(2, 1, 1)
     U[1] = -1.0  # drives away, which costs more
-    plans = Plans(problem.take(torch.zeros(2, dtype=torch.int64)), U, R, unit, torch.tensor(live), 2)
-    assert QUICK._order(plans, torch.ones(2, dtype=torch.bool)).tolist() == [[1, 0]]
+    none = torch.zeros(1, dtype=torch.int64)
+    plans = Plans(problem.take(torch.zeros(2, dtype=torch.int64)), U, R, unit, torch.tensor(live), 2, none)
+    assert plans.order(80.0, torch.ones(2, dtype=torch.bool)).tolist() == [[1, 0]]
     settled, sound = replace(QUICK, settle=2)._settle(plans)
+    assert 1 <= int(settled.iterations) <= 2
     assert torch.equal(settled.U[0], U[0]) and not torch.equal(settled.U[1], U[1]) and not bool(sound[0])
 
 

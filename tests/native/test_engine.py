@@ -140,7 +140,8 @@ def begun(problem: Problem, guided: str | None = None, clip: bool = True, seed: 
     state = State(
         **{
             **blank, "rows": torch.arange(B), "X": X, "U": U, "cost": cost, "merit": merit,
-            "inner": zero, "iterations": zero.clone(), "rung": zero.clone(), "regularisation": torch.zeros_like(cost), "outer": zero.clone(),
+            "inner": zero, "iterations": zero.clone(), "rung": zero.clone(),
+            "regularisation": torch.zeros_like(cost), "outer": zero.clone(),
         }
     )  # fmt: skip
     return state, lagrangian

@@ -72,6 +72,8 @@ def test_freed_slots_are_taken_by_those_that_wait(batch: str, solver: str) -> No
     seen = []
     few = replace(SOLVERS[solver], slots=2).solve(problem, U0, seed=3, callback=lambda p: seen.append(p))
     assert max(p.state.rows.numel() for p in seen) == 2 and seen[-1].finished == 7
+    assert max(len(set(p.rows.tolist())) for p in seen) == max(p.rows.numel() for p in seen) == 2
+    assert {b for p in seen for b in p.rows.tolist()} == set(KEPT.tolist())
     assert_same_bits(few.take(KEPT), SOLVERS[solver].solve(problem, U0, seed=3).take(KEPT))
     assert few.statuses[4] == Status.NON_FINITE
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -51,7 +51,6 @@ class CasADiSolver:
     tolerance: float = 1e-8
     violation_tolerance: float = 1e-3
     options: Mapping[str, Any] | None = None
-    at_once: ClassVar[int] = 1  # problems worked on at the same time
 
     def __post_init__(self) -> None:
         if self.plugin not in ("ipopt", "fatrop"):
@@ -128,7 +127,6 @@ class PreparedCasADi:
     problem: Problem
     program: Program
     run: Any  # casadi.Function
-    at_once: ClassVar[int] = 1
 
     def solve(
         self,
@@ -155,7 +153,8 @@ class PreparedCasADi:
             if bool(sound[b]):
                 U[b], ends[b] = self._one(b, X0[b], U0[b])
             if callback is not None:
-                callback(Progress(b + 1, b + 1, problem.B, None))
+                rows = torch.arange(b, b + int(sound[b]), device=U.device)
+                callback(Progress(b + 1, rows, b + 1, problem.B, None))
         solution = rolled_out(problem, U, self.solver.violation_tolerance, iterations=0)
         return _with_ends(solution, ends)
 

@@ -28,7 +28,8 @@ class MultiStart:
     Args:
         solver: solves from each guess; without guidance, unless guided starts are what is wanted.
         starts: guesses, at most, the given one included.
-        budget: iLQR iterations of each problem after which no further guess is tried; None: all are.
+        budget: iterations of each problem, of all its starts together and counted as `Solution.iterations` does, after
+            which no further guess is tried: the last start may exceed it. None: all are tried.
         covariance: of the guesses around the given one, a diagonal (m,) or one number, in the units of the inputs.
         knots: guesses are linear between so many random points in time.
         arrival: share of the distance from start to goal within which a path has arrived.
@@ -72,16 +73,14 @@ class MultiStart:
         ids = check_call(problem, U0, ids)
         sigma = self._sigma(problem)
         best = self.solver.solve(problem, U0, seed, ids, warm, callback)
+        left = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)  # elsewhere no guess helps
         for start in range(1, self.starts):
-            if self.budget is None:
-                rows = torch.arange(problem.B, device=U0.device)
-            else:
-                rows = (best.iterations < self.budget).nonzero().flatten()
+            rows = (left if self.budget is None else left & (best.iterations < self.budget)).nonzero().flatten()
             if rows.numel() == 0:
                 break
             part = problem.take(rows)
             guess = U0[rows] + self._noise(DrawKey(seed, ids[rows], torch.full_like(rows, start)), problem.N, sigma)
-            new = self.solver.solve(part, guess, seed, ids[rows], None, callback)
+            new = self.solver.solve(part, guess, seed, ids[rows], None, _for_part(callback, rows))
             best = self._joined(part, best, rows, new)
         return best
 
@@ -112,3 +111,10 @@ class MultiStart:
         if not bool((sigma > 0).all()):
             raise InputError("multistart.covariance", "variances above 0", sigma.tolist())
         return sigma
+
+
+def _for_part(callback: Callback | None, rows: Tensor) -> Callback | None:
+    """The callback of a batch for a solve of its problems `rows` alone."""
+    if callback is None:
+        return None
+    return lambda progress: callback(replace(progress, rows=rows[progress.rows]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import IO, Any, Protocol
 
 import numpy as np
@@ -106,7 +107,7 @@ class Flight:
         setup, layouts = self.setup, self.layouts
         task = setup.vehicle.task(layouts, setup.device, setup.dtype)
         ids = torch.as_tensor(layouts.ids, device=setup.device)
-        solution, seconds, at_once = self._solve(task.problem, task.U0, ids)
+        solution, seconds, together = self._solve(task.problem, task.U0, ids)
         self.bar.update(layouts.count - self.shown)
         statuses = [status.name for status in solution.statuses]
         U = solution.U.detach().to("cpu", torch.float64)
@@ -121,30 +122,35 @@ class Flight:
                 **certificate_columns(certificate),
                 "iterations": solution.iterations.cpu().numpy(),
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),
-                "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": at_once,
+                "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": together,
                 "threads": torch.get_num_threads(), "device": setup.device.type,
                 "dtype": str(setup.dtype).removeprefix("torch."), "version": torchgco.__version__,
             }
         )  # fmt: skip
         return rows, U.numpy()
 
-    def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, int]:
-        """The solution, seconds per problem, and problems worked on at once: half as many after each lack of memory."""
+    def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, np.ndarray]:
+        """The solution, seconds per problem, and how many problems at most ran at the same time as each of them (L,).
+
+        After each lack of memory half as many run at once. A solver that reports no pass runs all of them together.
+        """
         # What a solver builds or compiles for a batch is set-up: the clock starts after it.
         engine_of(problem)
         solver = self.solver.prepare(problem) if hasattr(self.solver, "prepare") else self.solver
         if compiling():
             few = torch.arange(min(WARM_UP, problem.B), device=U0.device)
             self.solver.solve(problem.take(few), U0[few], seed=self.setup.seed, ids=ids[few])
-        at_once = getattr(solver, "at_once", problem.B)
+        at_once = problem.B
         if hasattr(solver, "slots"):
             plan = plan_of(self.setup)
             at_once = min(problem.B, plan.batch_size or plan_batch(problem, self.setup.device, plan.workers))
             solver = replace(solver, slots=at_once)
         while True:
+            together = torch.zeros_like(ids)
+            callback = partial(self._progress, together)
             began = _now(self.setup.device)
             try:
-                solution = solver.solve(problem, U0, seed=self.setup.seed, ids=ids, callback=self._progress)
+                solution = solver.solve(problem, U0, seed=self.setup.seed, ids=ids, callback=callback)
             except (RuntimeError, MemoryError) as error:
                 smaller = _with_slots(solver, at_once // 2)
                 if at_once == 1 or smaller is None or not is_out_of_memory(error):
@@ -152,9 +158,14 @@ class Flight:
                 solver, at_once = smaller, at_once // 2
                 self.bar.write(f"{self.name}: out of memory, on with {at_once} problems at once", sys.stderr)
                 continue
-            return solution, (_now(self.setup.device) - began) / problem.B, at_once
+            seconds = (_now(self.setup.device) - began) / problem.B
+            if not bool(together.any()):
+                together.fill_(problem.B)
+            return solution, seconds, together.cpu().numpy()
 
-    def _progress(self, progress: Progress) -> None:
+    def _progress(self, together: Tensor, progress: Progress) -> None:
+        """Show a pass, and note in `together` how many problems ran side by side in it."""
+        together[progress.rows] = together[progress.rows].clamp(min=progress.rows.numel())
         self.bar.update(max(0, progress.finished - self.shown))
         self.bar.set_postfix({"pass": progress.passes}, refresh=False)
         self.shown = max(self.shown, progress.finished)

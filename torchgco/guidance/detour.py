@@ -22,9 +22,10 @@ from torch import Tensor
 from torchgco.constraints.guides import Guide, GuidePath, GuideRegion
 from torchgco.guidance import scene as seen
 from torchgco.guidance.classes import distinct
+from torchgco.guidance.plans import AT_ONCE, Plans
 from torchgco.guidance.roadmap import Roadmap, points_along
-from torchgco.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import open_loop, value
+from torchgco.lagrangian import Multipliers
+from torchgco.native.dispatch import open_loop
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, check_shape, put, take, tensor
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -32,7 +33,6 @@ from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
 
 SURE = LineSearch(accept_last=False, back=2)
-AT_ONCE = 1536  # ways followed at once: memory stays bounded, however large the batch
 BETWEEN = 0.049  # of r_obs + r_veh: how deep a finalist may cut into an obstacle between knots; the judge bears 0.05
 DAMPING = 0.02  # of all solves, in units of `Problem.cost_unit`
 PUSHED = 0.1  # share of the horizon that a push lasts
@@ -47,32 +47,7 @@ class Proposal(NamedTuple):
     # To go on with: a penalty that keeps the solver from falling back, also with another plan where this one is
     # refused; NaN where there is no way at all.
     duals: Multipliers
-
-
-@dataclass(frozen=True)
-class Plans:
-    """Some plans for each of B problems, those of one beside each other: every tensor has a row for each plan."""
-
-    problem: Problem
-    U: Tensor
-    R: Tensor  # m
-    unit: Tensor  # q0 / R^4
-    live: Tensor  # bool: the others are left as they are, and come last
-    count: int  # for each problem
-
-    def pick(self, order: Tensor) -> Plans:
-        """The plans at the places `order` (B, c) among those of their problem."""
-        rows = self.rows(order).flatten()
-        U, R, unit, live = (t[rows] for t in (self.U, self.R, self.unit, self.live))
-        return Plans(self.problem.take(rows), U, R, unit, live, order.shape[1])
-
-    def rows(self, order: Tensor) -> Tensor:
-        """Rows (B, c) of the plans at the places `order` (B, c)."""
-        return torch.arange(order.shape[0], device=order.device).unsqueeze(-1) * self.count + order
-
-    def duals(self, penalty: float) -> Multipliers:
-        """No multipliers yet, and a penalty in q0 / R^4."""
-        return replace(Multipliers.zero(self.problem, 0.0), mu=penalty * self.unit)
+    iterations: Tensor  # (B,) int64: of all solves of all plans, also where none is found
 
 
 @dataclass(frozen=True)
@@ -163,12 +138,12 @@ class Detour:
         rank = torch.zeros(problem.B, dtype=torch.int64, device=problem.x0.device) if rank is None else rank
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
         U, found, duals = rest.clone(), torch.zeros_like(rank, dtype=torch.bool), Multipliers.zero(problem, torch.nan)
+        whole = Proposal(U, found, duals, torch.zeros_like(rank))
         for rows in torch.arange(problem.B, device=rank.device).split(max(1, AT_ONCE // self.ways)):
             part = self._propose(problem.take(rows), rest[rows], rank[rows])
             if part is not None:
-                U[rows], found[rows] = part.U, part.found
-                put(duals, rows, part.duals)
-        return Proposal(U, found, duals)
+                put(whole, rows, part)
+        return whole
 
     def _propose(self, problem: Problem, rest: Tensor, rank: Tensor) -> Proposal | None:
         scene = seen.scene_of(problem, rest)
@@ -183,17 +158,18 @@ class Detour:
         unit = torch.where(found, unit, 1.0)
         live = (distinct(ways, scene) & found.unsqueeze(-1)).repeat_interleave(starts, dim=1).flatten()
         U = begun.repeat(1, self.ways, 1, 1).flatten(0, 1)
-        plans = Plans(problem.take(everyone), U, R[everyone], unit[everyone], live, count)
+        none = torch.zeros_like(rank)
+        plans = Plans(problem.take(everyone), U, R[everyone], unit[everyone], live, count, iterations=none)
         end = rest.new_tensor(self.ends).repeat(everyone.numel() // len(self.ends))
         plans = self._follow(plans, ways.repeat_interleave(starts, dim=1).flatten(0, 1), end)
-        best = self._order(plans, seen.arrives(plans.problem, plans.U))
+        best = plans.order(self.hold, seen.arrives(plans.problem, plans.U))
         plans = plans.pick(best[:, : count if self.keep is None else self.keep])
         plans, sound = self._settle(plans)
-        plans, duals, order = self._refine(plans, sound, self._order(plans, sound, alike=ALIKE))
+        plans, duals, order = self._refine(plans, sound, plans.order(self.hold, sound, ALIKE))
         chosen = plans.rows(order.gather(1, rank.clamp(max=plans.count - 1).unsqueeze(-1)))[:, 0]
         duals = take(duals, chosen)
         duals = replace(duals, mu=torch.where(found, duals.mu, torch.nan))
-        return Proposal(plans.U[chosen], found & (rank < plans.count) & sound[chosen], duals)
+        return Proposal(plans.U[chosen], found & (rank < plans.count) & sound[chosen], duals, plans.iterations)
 
     def _begun(self, problem: Problem, rest: Tensor) -> Tensor:
         """What a way is followed from, (B, 1 + pushes, N, m): rest, and rest after each push."""
@@ -212,18 +188,17 @@ class Detour:
             guide = self._guide(
                 plans.problem, self._travel(way, end, plans.problem.N), way, plans.R, stiffness * plans.unit
             )
-            U = self._solved(plans, self.iterations, plans.duals(self.obstacle_penalty), guide)
-            plans = replace(plans, U=U)
+            plans = plans.solved(self._inner(self.iterations), self.obstacle_penalty, guide)
         return plans
 
     def _settle(self, plans: Plans) -> tuple[Plans, Tensor]:
         """Plans that nothing draws any more, and whether their paths arrive and lie not too deep in obstacles."""
         problem = plans.problem
         if self.settle > 0:
-            settled = self._solved(plans, self.settle, plans.duals(self.hold))
+            settled = plans.solved(self._inner(self.settle), self.hold)
             # A path that falls back into the trap, where waiting is cheaper, is none.
-            keeps = seen.arrives(problem, settled) | ~seen.arrives(problem, plans.U)
-            plans = replace(plans, U=torch.where(keeps.view(-1, 1, 1), settled, plans.U))
+            keeps = seen.arrives(problem, settled.U) | ~seen.arrives(problem, plans.U)
+            plans = replace(settled, U=torch.where(keeps.view(-1, 1, 1), settled.U, plans.U))
         X = open_loop(problem, plans.U)
         sound = plans.live & seen.arrives(problem, plans.U)
         return plans, sound & (seen.depth(problem, X, plans.U) <= self.depth * plans.R)
@@ -257,44 +232,14 @@ class Detour:
         U, cost = plans.U.clone(), torch.full_like(plans.unit, torch.inf)
         won = rows[good]
         U[won], cost[won] = end.U[good], end.cost[good]
+        iterations = plans.iterations.index_add(0, rows // plans.count, end.iterations)
         put(duals, won, take(end.multipliers, good.nonzero().flatten()))
         best = cost.view(-1, plans.count).gather(1, order[:, :last]).argsort(dim=-1, stable=True)
         order = torch.cat((order[:, :last].gather(1, best), order[:, last:]), dim=1)
-        return replace(plans, U=U), duals, order
-
-    def _solved(self, plans: Plans, iterations: int, duals: Multipliers, guide: Guide | None = None) -> Tensor:
-        """Controls after one inner solve of every live plan."""
-        U = plans.U.clone()
-        for rows in plans.live.nonzero().flatten().split(AT_ONCE):
-            if rows.numel() > 0:
-                parts = plans.problem.take(rows), U[rows], take(duals, rows), take(guide, rows)
-                problem, start, warm, drawn = parts
-                U[rows] = self._inner(iterations).solve(problem, start, warm=warm, guide=drawn).U
-        return U
+        return replace(plans, U=U, iterations=iterations), duals, order
 
     def _inner(self, iterations: int) -> ILQR:
         return ILQR(tolerance=self.tolerance, max_iterations=iterations, damping=DAMPING, line_search=SURE)
-
-    def _order(self, plans: Plans, first: Tensor, alike: float | None = None) -> Tensor:
-        """Each problem's plans as places in their order, (B, count).
-
-        Those in `first` come before the others; then the penalised cost decides. Of those in `first` that are alike
-        all but the cheapest are put behind.
-        """
-        rows = plans.live.nonzero().flatten()
-        problem, U, duals = plans.problem.take(rows), plans.U[rows], take(plans.duals(self.hold), rows)
-        X = open_loop(problem, U)
-        merit, first = torch.full_like(plans.unit, torch.inf), first & plans.live
-        merit[rows] = value(Lagrangian(problem, duals, None, True), X, U)[1]
-        merit, order = merit.nan_to_num(torch.inf).view(-1, plans.count).sort(dim=-1, stable=True)
-        later = (~first).view(-1, plans.count).gather(1, order).to(torch.int8)
-        later, again = later.sort(dim=-1, stable=True)
-        merit, order = merit.gather(1, again), order.gather(1, again)
-        if alike is not None:
-            same = merit[:, 1:] - merit[:, :-1] <= alike * merit[:, :-1].abs()
-            later[:, 1:] += same & (later[:, 1:] == 0)
-            order = order.gather(1, later.argsort(dim=-1, stable=True))
-        return order
 
     def _guide(self, problem: Problem, center: Tensor, way: Tensor, R: Tensor, stiffness: Tensor) -> Guide:
         """What draws to the points of the way that are to be passed; stiffness (B,) in units of q0 / (R^4 L^2)."""

@@ -103,15 +103,16 @@ class GCO:
         growing = torch.ones_like(caught) if self.grow_when_idle else caught
         weight = torch.where(growing, guide.weight * self.penalty_growth, guide.weight)
         new, plan, taken = GuideRegion.inactive(X, weight, guide.position), U.clone(), torch.zeros_like(caught)
-        duals = None
+        duals = iterations = None
         if self.detour is not None:
             attempt = torch.ones_like(key.ids) if key.attempt is None else key.attempt
             rank = attempt - self.detour_at
             turn = (caught & (rank >= 0) & (rank < self.detours)).nonzero().flatten()
             if turn.numel() > 0:
-                plan[turn], taken[turn], given = self.detour.propose(problem.take(turn), rank[turn])
-                duals = Multipliers.zero(problem, torch.nan)
-                put(duals, turn, given)
+                proposal = self.detour.propose(problem.take(turn), rank[turn])
+                plan[turn], taken[turn] = proposal.U, proposal.found
+                duals, iterations = Multipliers.zero(problem, torch.nan), torch.zeros_like(key.ids)
+                put((duals, iterations), turn, (proposal.duals, proposal.iterations))
         rows = (caught & ~taken).nonzero().flatten()
         if rows.numel() > 0 and self.sampler is not None:
             part = problem.take(rows)
@@ -123,7 +124,7 @@ class GCO:
                 take(new, rows), X_safe, knots[rows] & holds.unsqueeze(-1), self._radius(problem, X)[rows]
             )
             put(new, rows[~taken[rows]], take(drawn, (~taken[rows]).nonzero().flatten()))
-        return Advice(new, plan, taken, duals)
+        return Advice(new, plan, taken, duals, iterations)
 
     def _holds(self, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         """Whether a sampled plan keeps to its task, (B,): unstable dynamics let samples diverge, away from all else."""

@@ -73,12 +73,13 @@ class Loop:
         self._end(self._bad_starts(self.state))
         passes = 0
         while self.state.rows.numel() > 0:
+            rows = self.state.rows.clone()  # slots are filled again in place
             self._end(self._pass())
             passes += 1
             if self.callback is not None:
                 total = self.whole.B
                 left = self.state.rows.numel() + self.waiting.numel()
-                self.callback(Progress(passes, total - left, total, self.state))
+                self.callback(Progress(passes, rows, total - left, total, self.state))
         return self._finished()
 
     # Start -------------------------------------------------------------------------------------------------------
@@ -97,7 +98,8 @@ class Loop:
             rows=rows,
             X=X, U=U, cost=cost, merit=merit.clone(), duals=duals, guide=guide,
             regularisation=torch.zeros_like(cost),
-            inner=zero, outer=zero.clone(), iterations=zero.clone(), rung=zero.clone(), guided=zero.clone(),
+            inner=zero, outer=zero.clone(), iterations=zero.clone(), rung=zero.clone(), advised=zero.clone(),
+            guided=zero.clone(),
             last_cost=worst.clone(),
             best=copied(iterate), origin=copied(iterate),
             attempt=zero.clone(), since=zero.clone(), led=torch.zeros_like(rows, dtype=torch.bool),
@@ -180,6 +182,8 @@ class Loop:
         advice = guidance.update(problem, s.X[rows], s.U[rows], take(s.guide, rows), self._key(rows))
         put(s.guide, rows, advice.guide)
         s.guided[rows] += advice.guide.is_active | advice.taken
+        if advice.iterations is not None:
+            s.advised[rows] += advice.iterations
         put(s.duals, rows, go_on_from(s, rows, problem, advice, take(s.duals, rows), self.solver))
 
     def _key(self, rows: Tensor) -> DrawKey:
@@ -218,7 +222,7 @@ class Loop:
         r.X[place], r.U[place], r.cost[place], r.violation[place] = last.X, last.U, last.cost, last.violation
         put(r.multipliers, place, last.duals)
         r.status[place] = status[rows]
-        r.iterations[place], r.outer_iterations[place] = s.iterations[rows], s.outer[rows]
+        r.iterations[place], r.outer_iterations[place] = (s.iterations + s.advised)[rows], s.outer[rows]
         r.guided[place] = s.guided[rows]
 
     def _finished(self) -> Solution:

@@ -76,7 +76,7 @@ class Polish:
         An element is replaced where its violation falls below the tolerance, or stays within it (or within what it was)
         while the KKT residual falls; never where its cost would rise by more than `cost_rise`, or the straight way
         between two knots would meet an obstacle that it kept clear of. The status of a replaced element is that of its
-        new trajectory; counts of iterations stay those of the solver.
+        new trajectory. `iterations` grows by the Newton steps, also those of an element that is left as it was.
 
         Raises:
             InputError: a problem that isn't float64, or a solution of others.
@@ -89,9 +89,10 @@ class Polish:
         for b in (near & problem.start_is_clear).nonzero().flatten():
             rows = b.view(1)
             part, before = problem.take(rows), solution.take(rows)
-            after = self._polished(part, before)
+            after, steps = self._polished(part, before)
             if after is not before:
                 put(result, rows, after)
+            result.iterations[rows] = before.iterations + steps
         return replace(result, trace=solution.trace)
 
     def check(self, problem: Problem) -> None:
@@ -99,21 +100,22 @@ class Polish:
         if problem.x0.dtype != torch.float64:
             raise InputError("polish", "a problem in torch.float64", problem.x0.dtype)
 
-    def _polished(self, problem: Problem, solution: Solution) -> Solution:
-        """One element; `solution` itself where nothing better was found."""
+    def _polished(self, problem: Problem, solution: Solution) -> tuple[Solution, int]:
+        """One element, `solution` itself where nothing better was found; and the steps that were made."""
         lam = torch.cat([solution.cost.new_zeros(0), *(part.flatten() for part in solution.multipliers.lam)])
         first = best = now = _Point.at(problem, solution.X, solution.U, lam)
-        weight = 0.0
-        for _ in range(self.iterations):
+        weight, steps = 0.0, 0
+        while steps < self.iterations:
             if now.worst <= self.tolerance and now.residual <= self.stationarity:
                 break
             moved = self._step(now, weight)
             if moved is None:
                 break
             now, weight = moved
+            steps += 1
             if self._is_better(now, best, first):
                 best = now
-        return solution if best is first else best.put_into(solution)
+        return solution if best is first else best.put_into(solution), steps
 
     def _is_better(self, new: _Point, old: _Point, first: _Point) -> bool:
         if not new.cost <= first.cost + self.cost_rise * abs(first.cost):

@@ -39,7 +39,7 @@ class InnerState:
     merit: Tensor
     regularisation: Tensor  # mu_r
     inner: Tensor  # iterations of this inner solve
-    iterations: Tensor
+    iterations: Tensor  # of the loop itself
     rung: Tensor  # int64: at which the next line search begins
 
 
@@ -50,6 +50,7 @@ class State(InnerState):
     duals: Multipliers
     guide: Guide | None
     outer: Tensor  # inner solves ended
+    advised: Tensor  # iterations of the solves that guidance made
     guided: Tensor
     last_cost: Tensor  # J_var when the inner solve before ended
     best: Iterate
@@ -61,9 +62,10 @@ class State(InnerState):
 
 @dataclass(frozen=True)
 class Progress:
-    """What a callback is told after every pass, or after every problem by a solver that takes them one by one."""
+    """What a callback receives after every pass, or after every problem from a solver that takes them one by one."""
 
     passes: int
+    rows: Tensor  # (b,) int64: places in the batch of the problems that this pass worked on, side by side
     finished: int
     total: int
     state: State | None  # None from a solver that carries no batch
@@ -93,6 +95,7 @@ class Advice:
     taken: Tensor  # (B',) bool: where U replaces the iterate
     # To go on with where U is taken, and left alone until the attempt ends; NaN in mu, or None: the solver's own.
     duals: Multipliers | None = None
+    iterations: Tensor | None = None  # (B',) int64: of the solves that guidance made for this; None: it made none
 
 
 class Guidance(Protocol):

@@ -1,4 +1,4 @@
-"""Recorder: the history of every element, a row per iteration."""
+"""Recorder: the history of every element, a row per iteration of the loop; the solves of guidance have none."""
 
 from __future__ import annotations
 
