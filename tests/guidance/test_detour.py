@@ -1,6 +1,7 @@
 """The geometric proposal: it leads to the goal, says where it can't, and is followed undisturbed."""
 
 from dataclasses import replace
+from pkgutil import resolve_name
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from torchgco.guidance.plans import Plans
 from torchgco.guidance.scene import depth_between
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.rollout import open_loop
+from torchgco.solvers.descent import descend
 
 QUICK = Detour(begin=0.1, end=0.8, iterations=8, depth=1.0)
 END = torch.tensor([0.7], dtype=torch.float64)
@@ -154,8 +156,8 @@ def test_many_ways_are_followed_by_chunks_that_nobody_notices(monkeypatch) -> No
     x0 = torch.tensor([[-1.0, y, 0, 0, 0, 0] for y in (-0.2, 0.0, 0.1)], dtype=torch.float64)
     problem, two = replace(cup(B=3, N=40), x0=x0), replace(QUICK, ways=2, iterations=2, settle=1)
     whole = two.propose(problem)
-    for module in ("detour", "plans"):
-        monkeypatch.setattr(f"torchgco.guidance.{module}.AT_ONCE", 4)
+    for size in ("detour.MOST", "plans.AT_ONCE"):
+        monkeypatch.setattr(f"torchgco.guidance.{size}", 4)
     parts = two.propose(problem)
     assert torch.equal(whole.U, parts.U) and torch.equal(whole.found, parts.found)
     assert torch.equal(whole.duals.mu, parts.duals.mu) and torch.equal(whole.iterations, parts.iterations)
@@ -167,7 +169,7 @@ class Settles(Detour):
     settled: list = []  # noqa: RUF012
 
     def _settle(self, plans: Plans) -> tuple[Plans, torch.Tensor]:
-        self.settled.append(plans.problem.B)
+        self.settled.append(plans.live.numel())
         return super()._settle(plans)
 
 
@@ -224,9 +226,10 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
         detour = replace(QUICK, tube=tube, stiffness=(stiffness,), iterations=4, settle=0, depth=9.0)
         way = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
         R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
-        live, none = torch.ones(1, dtype=torch.bool), torch.zeros(1, dtype=torch.int64)
-        U = detour._follow(Plans(problem, controls(problem), R, unit, live, 1, none), way, 0.8 * torch.ones_like(R)).U
-        X = open_loop(problem.dynamics, problem.x0, U)
+        plans = Plans.begin(problem, controls(problem)[:, None], R, unit, torch.ones(1, 1, dtype=torch.bool))
+        plans = replace(detour, end=0.8)._follow(plans, way[:, None])
+        X = open_loop(problem.dynamics, problem.x0, plans.U)
+        torch.testing.assert_close(plans.X, X)
         off.append(float((X[..., :2] - detour._travel(way, 0.8 * torch.ones_like(R), 120)).norm(dim=-1).mean()))
     assert off[1] < 0.5 * off[0]
 
@@ -254,14 +257,17 @@ def test_finalists_are_solved_to_their_end_and_the_cheapest_there_is_handed_over
 def test_the_iterations_of_every_plan_are_counted(monkeypatch) -> None:
     """Those followed, those settled, and the finalists: the same as by asking every solve, whatever is handed over."""
     made = []
-    for solver in (ILQR, AugmentedLagrangian):
 
-        def solve(self, *args, real=solver.solve, **options):
-            end = real(self, *args, **options)
+    def noted(solve):
+        def call(*args, **options):
+            end = solve(*args, **options)
             made.append(int(end.iterations.sum()))
             return end
 
-        monkeypatch.setattr(solver, "solve", solve)
+        return call
+
+    for place in ("torchgco.guidance.plans.descend", "torchgco.guidance.detour.AugmentedLagrangian.solve"):
+        monkeypatch.setattr(place, noted(resolve_name(place)))
     x0 = torch.tensor([[-1.0, y, 0, 0, 0, 0] for y in (-0.2, 0.0, 0.1)], dtype=torch.float64)
     problem = replace(cup(B=3), x0=x0)
     detour = replace(QUICK, ways=3, pushes=((0.7, -0.7),), keep=3, settle=4, stiffness=(20.0, 200.0), finalists=2)
@@ -273,12 +279,17 @@ def test_the_iterations_of_every_plan_are_counted(monkeypatch) -> None:
         assert int(alone.iterations) == int(together.iterations[b]) == sum(made) > 0
 
 
+def begun(problem: Problem, U: torch.Tensor, *words: torch.Tensor) -> Plans:
+    """Plans with the paths of their controls (1, count, N, m)."""
+    plans = Plans.begin(problem, U, *words)
+    return replace(plans, X=open_loop(problem.dynamics, problem.x0.repeat(plans.count, 1), plans.U))
+
+
 def test_paths_that_are_alike_count_once() -> None:
     problem = cup(B=1)
-    R, unit, live = *torch.ones(2, 3, dtype=torch.float64), torch.ones(3, dtype=torch.bool)
-    same, none = problem.take(torch.zeros(3, dtype=torch.int64)), torch.zeros(1, dtype=torch.int64)
-    plans = Plans(same, controls(problem).repeat(3, 1, 1), R, unit, live, 3, none)
-    plans.U[2] = -1.0  # drives away, which costs more
+    U, one = controls(problem).repeat(1, 3, 1, 1).view(1, 3, -1, 2), torch.ones(1, dtype=torch.float64)
+    U[:, 2] = -1.0  # drives away, which costs more
+    plans = begun(problem, U, one, one, torch.ones(1, 3, dtype=torch.bool))
     first = torch.ones(3, dtype=torch.bool)
     assert plans.order(80.0, first).tolist() == [[0, 1, 2]]
     assert plans.order(80.0, first, alike=1e-3).tolist() == [[0, 2, 1]]
@@ -288,27 +299,22 @@ def test_paths_that_are_alike_count_once() -> None:
 
 def test_what_is_not_live_is_left_as_it_is_and_comes_last() -> None:
     problem = cup(B=1, N=60)
-    R, unit, live = (
-        torch.full((2,), 0.2, dtype=torch.float64),
-        torch.full((2,), 1e4, dtype=torch.float64),
-        [False, True],
-    )
-    U = controls(problem).repeat(2, 1, 1)
-    U[1] = -1.0  # drives away, which costs more
-    none = torch.zeros(1, dtype=torch.int64)
-    plans = Plans(problem.take(torch.zeros(2, dtype=torch.int64)), U, R, unit, torch.tensor(live), 2, none)
+    R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
+    U = controls(problem).repeat(1, 2, 1, 1).view(1, 2, -1, 2)
+    U[:, 1] = -1.0  # drives away, which costs more
+    plans = begun(problem, U, R, unit, torch.tensor([[False, True]]))
     assert plans.order(80.0, torch.ones(2, dtype=torch.bool)).tolist() == [[1, 0]]
     settled, sound = replace(QUICK, settle=2)._settle(plans)
     assert 1 <= int(settled.iterations) <= 2
-    assert torch.equal(settled.U[0], U[0]) and not torch.equal(settled.U[1], U[1]) and not bool(sound[0])
+    assert torch.equal(settled.U[0], U[0, 0]) and not torch.equal(settled.U[1], U[0, 1]) and not bool(sound[0])
 
 
 def test_ways_of_one_class_are_followed_once(monkeypatch) -> None:
     """The cup has a left and a right side: of five ways two are followed, from every start to each end."""
     counts = []
-    solve = ILQR.solve
     monkeypatch.setattr(
-        ILQR, "solve", lambda self, problem, *a, **k: counts.append(problem.B) or solve(self, problem, *a, **k)
+        "torchgco.guidance.plans.descend",
+        lambda inner, lagrangian, U: counts.append(lagrangian.problem.B) or descend(inner, lagrangian, U),
     )
     five = replace(QUICK, ways=5, stiffness=(20.0,), iterations=1, settle=1)
     for pushes, end, rows in (

@@ -22,10 +22,9 @@ from torch import Tensor
 from torchgco.constraints.guides import Guide, GuidePath, GuideRegion
 from torchgco.guidance import scene as seen
 from torchgco.guidance.classes import distinct
-from torchgco.guidance.plans import AT_ONCE, Plans
+from torchgco.guidance.plans import Plans
 from torchgco.guidance.roadmap import Roadmap, points_along
 from torchgco.lagrangian import Multipliers
-from torchgco.native.dispatch import open_loop
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, check_shape, put, take, tensor
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -33,6 +32,7 @@ from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
 
 SURE = LineSearch(accept_last=False, back=2)
+MOST = 1536  # ways of all problems that are sought and followed together: memory stays bounded
 BETWEEN = 0.049  # of r_obs + r_veh: how deep a finalist may cut into an obstacle between knots; the judge bears 0.05
 DAMPING = 0.02  # of all solves, in units of `Problem.cost_unit`
 PUSHED = 0.1  # share of the horizon that a push lasts
@@ -136,14 +136,14 @@ class Detour:
     def propose(self, problem: Problem, rank: Tensor | None = None) -> Proposal:
         """A plan for every problem, from the vehicle at rest, along the best of the ways or that of a rank (B,)."""
         rank = torch.zeros(problem.B, dtype=torch.int64, device=problem.x0.device) if rank is None else rank
-        rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-        U, found, duals = rest.clone(), torch.zeros_like(rank, dtype=torch.bool), Multipliers.zero(problem, torch.nan)
-        whole = Proposal(U, found, duals, torch.zeros_like(rank))
-        for rows in torch.arange(problem.B, device=rank.device).split(max(1, AT_ONCE // self.ways)):
-            part = self._propose(problem.take(rows), rest[rows], rank[rows])
+        U = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
+        found, duals = torch.zeros_like(rank, dtype=torch.bool), Multipliers.zero(problem, torch.nan)
+        whole, scaled = Proposal(U, found, duals, torch.zeros_like(rank)), problem.in_cost_units()
+        for rows in torch.arange(problem.B, device=rank.device).split(max(1, MOST // self.ways)):
+            part = self._propose(scaled.take(rows), U[rows], rank[rows])
             if part is not None:
                 put(whole, rows, part)
-        return whole
+        return whole._replace(duals=whole.duals.scaled(problem.cost_unit))
 
     def _propose(self, problem: Problem, rest: Tensor, rank: Tensor) -> Proposal | None:
         scene = seen.scene_of(problem, rest)
@@ -153,19 +153,15 @@ class Detour:
         R, unit = seen.scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
         begun = self._begun(problem, rest).repeat_interleave(len(self.ends), dim=1)
-        starts, count = begun.shape[1], self.ways * begun.shape[1]
-        everyone = torch.arange(problem.B, device=rest.device).repeat_interleave(count)
-        unit = torch.where(found, unit, 1.0)
-        live = (distinct(ways, scene) & found.unsqueeze(-1)).repeat_interleave(starts, dim=1).flatten()
-        U = begun.repeat(1, self.ways, 1, 1).flatten(0, 1)
-        none = torch.zeros_like(rank)
-        plans = Plans(problem.take(everyone), U, R[everyone], unit[everyone], live, count, iterations=none)
-        end = rest.new_tensor(self.ends).repeat(everyone.numel() // len(self.ends))
-        plans = self._follow(plans, ways.repeat_interleave(starts, dim=1).flatten(0, 1), end)
-        best = plans.order(self.hold, seen.arrives(plans.problem, plans.U))
-        plans = plans.pick(best[:, : count if self.keep is None else self.keep])
+        live = (distinct(ways, scene) & found.unsqueeze(-1)).repeat_interleave(begun.shape[1], dim=1)
+        plans = Plans.begin(problem, begun.repeat(1, self.ways, 1, 1), R, torch.where(found, unit, 1.0), live)
+        plans = self._follow(plans, ways)
+        plans = plans.pick(plans.order(self.hold, plans.arrive())[:, : self.keep])
         plans, sound = self._settle(plans)
-        plans, duals, order = self._refine(plans, sound, plans.order(self.hold, sound, ALIKE))
+        order, wanted = plans.order(self.hold, sound, ALIKE), max(self.finalists, int(rank.max()) + 1)
+        order = order[:, :wanted]
+        sound = sound[plans.rows(order).flatten()]
+        plans, duals, order = self._refine(plans.pick(order), sound)
         chosen = plans.rows(order.gather(1, rank.clamp(max=plans.count - 1).unsqueeze(-1)))[:, 0]
         duals = take(duals, chosen)
         duals = replace(duals, mu=torch.where(found, duals.mu, torch.nan))
@@ -182,41 +178,41 @@ class Detour:
             starts[:, 1:, : math.ceil(PUSHED * N)] += (reach * pushes).unsqueeze(2)
         return starts
 
-    def _follow(self, plans: Plans, way: Tensor, end: Tensor) -> Plans:
-        """Each plan a way's, followed to arrive at its share of the horizon."""
+    def _follow(self, plans: Plans, ways: Tensor) -> Plans:
+        """Each plan along its way (B, ways, P, d), from its start, to arrive at its share of the horizon."""
+        E, K = len(self.ends), ways.shape[1]
+        path = ways.flatten(0, 1).repeat_interleave(E, dim=0)
+        center = self._travel(path, path.new_tensor(self.ends).repeat(path.shape[0] // E), plans.problem.N)
+        one = torch.arange(plans.problem.B, device=path.device).repeat_interleave(K * E) * plans.count
+        plan = torch.arange(plans.live.numel(), device=path.device)
+        place = plan // (plans.count // K) * E + plan % E  # of each plan's way and end among the paths
         for stiffness in self.stiffness:
-            guide = self._guide(
-                plans.problem, self._travel(way, end, plans.problem.N), way, plans.R, stiffness * plans.unit
-            )
-            plans = plans.solved(self._inner(self.iterations), self.obstacle_penalty, guide)
+            guide = self._guide(plans.problem, center, path, plans.R[one], stiffness * plans.unit[one])
+            plans = plans.solved(self._inner(self.iterations), self.obstacle_penalty, guide, place)
         return plans
 
     def _settle(self, plans: Plans) -> tuple[Plans, Tensor]:
         """Plans that nothing draws any more, and whether their paths arrive and lie not too deep in obstacles."""
-        problem = plans.problem
         if self.settle > 0:
             settled = plans.solved(self._inner(self.settle), self.hold)
             # A path that falls back into the trap, where waiting is cheaper, is none.
-            keeps = seen.arrives(problem, settled.U) | ~seen.arrives(problem, plans.U)
-            plans = replace(settled, U=torch.where(keeps.view(-1, 1, 1), settled.U, plans.U))
-        X = open_loop(problem, plans.U)
-        sound = plans.live & seen.arrives(problem, plans.U)
-        return plans, sound & (seen.depth(problem, X, plans.U) <= self.depth * plans.R)
+            keeps = (settled.arrive() | ~plans.arrive()).view(-1, 1, 1)
+            X, U = torch.where(keeps, settled.X, plans.X), torch.where(keeps, settled.U, plans.U)
+            plans = replace(settled, X=X, U=U)
+        return plans, plans.live & plans.arrive() & (plans.depth() <= self.depth * plans.R)
 
-    def _refine(self, plans: Plans, sound: Tensor, order: Tensor) -> tuple[Plans, Multipliers, Tensor]:
-        """The first sound ones in the order (B, count) are solved to their end, and ordered anew by their costs there.
+    def _refine(self, plans: Plans, sound: Tensor) -> tuple[Plans, Multipliers, Tensor]:
+        """The sound ones of the first few are solved to their end, and ordered by their costs there.
 
-        Returns the plans, what each is to go on with, and their order.
+        Returns the plans, what each is to go on with, and their order (B, count).
         """
-        duals = plans.duals(self.hold)
+        everyone = torch.arange(plans.live.numel(), device=sound.device)
+        duals, order = plans.duals(everyone, self.hold), (everyone % plans.count).view(-1, plans.count)
         last = min(self.finalists, plans.count)
-        if last == 1:
+        rows = (sound & (everyone % plans.count < last)).nonzero().flatten()
+        if last == 1 or rows.numel() == 0:
             return plans, duals, order
-        rows = plans.rows(order[:, :last]).flatten()
-        rows = rows[sound[rows]]
-        if rows.numel() == 0:
-            return plans, duals, order
-        part, warm = plans.problem.take(rows), take(duals, rows)
+        part, warm = plans.of(rows), take(duals, rows)
         inner = replace(self._inner(self.iterations), tolerance=0.1 * self.tolerance)
         solver = AugmentedLagrangian(
             inner,
@@ -227,16 +223,16 @@ class Detour:
             clip=True,
         )
         end = solver.solve(part, plans.U[rows], warm=warm)
-        good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.U)
+        good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.X)
         good &= seen.depth_between(part, end.X) <= BETWEEN * plans.R[rows]
-        U, cost = plans.U.clone(), torch.full_like(plans.unit, torch.inf)
+        X, U, cost = plans.X.clone(), plans.U.clone(), torch.full_like(plans.unit, torch.inf)
         won = rows[good]
-        U[won], cost[won] = end.U[good], end.cost[good]
+        X[won], U[won], cost[won] = end.X[good], end.U[good], end.cost[good]
         iterations = plans.iterations.index_add(0, rows // plans.count, end.iterations)
         put(duals, won, take(end.multipliers, good.nonzero().flatten()))
-        best = cost.view(-1, plans.count).gather(1, order[:, :last]).argsort(dim=-1, stable=True)
-        order = torch.cat((order[:, :last].gather(1, best), order[:, last:]), dim=1)
-        return replace(plans, U=U, iterations=iterations), duals, order
+        best = cost.view(-1, plans.count)[:, :last].argsort(dim=-1, stable=True)
+        order = torch.cat((best, order[:, last:]), dim=1)
+        return replace(plans, X=X, U=U, iterations=iterations), duals, order
 
     def _inner(self, iterations: int) -> ILQR:
         return ILQR(tolerance=self.tolerance, max_iterations=iterations, damping=DAMPING, line_search=SURE)

@@ -8,7 +8,6 @@ from torch import Tensor
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.guidance.roadmap import FAR, Scene, segment_gaps
-from torchgco.native.dispatch import open_loop
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 
@@ -61,13 +60,14 @@ def position(problem: Problem) -> slice:
     return where
 
 
-def arrives(problem: Problem, U: Tensor) -> Tensor:
-    """Whether controls end close to the goal, (B,)."""
-    goal = problem.cost.goal(problem.x0)
+def arrives(problem: Problem, X: Tensor) -> Tensor:
+    """Whether paths X (B, ..., N+1, n) end close to the goal, (B, ...)."""
+    goal, at = problem.cost.goal(problem.x0), position(problem)
     assert goal is not None
-    X = open_loop(problem, U)
-    last, first = ((x - goal)[:, position(problem)].square().sum(-1) for x in (X[:, -1], problem.x0))
-    return last <= THERE**2 * first
+    first = (problem.x0 - goal)[:, at].square().sum(-1)
+    shape = (-1, *([1] * (X.dim() - 3)))
+    last = (X[..., -1, at] - goal[:, at].view(*shape, at.stop - at.start)).square().sum(-1)
+    return last <= THERE**2 * first.view(shape)
 
 
 def depth(problem: Problem, X: Tensor, U: Tensor) -> Tensor:

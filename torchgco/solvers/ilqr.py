@@ -79,8 +79,8 @@ class ILQR:
         return Options(
             tuple(search.ladder), -1 if search.back is None else search.back, self.max_iterations,
             search.accept_last, self.tolerance, self.absolute_tolerance, search.ratio_min, search.ratio_max,
-            search.smallest, self.regularisation_first, self.regularisation_growth, self.regularisation_max, self.damping,
-            rounding, lost_beyond,
+            search.smallest, self.regularisation_first, self.regularisation_growth, self.regularisation_max,
+            self.damping, rounding, lost_beyond,
         )  # fmt: skip
 
     def solve(
