@@ -47,6 +47,8 @@ def try_again(s: State, rows: Tensor, problem: Problem, duals: Multipliers, stat
         return
     near = has_arrived(problem, best, CLOSE * solver.arrival, solver.violation_tolerance)
     last = ended & ~left & missing & near & (tried <= solver.attempts)
+    if not bool(last.any()):
+        return
     place = _start(s, rows, duals, status, last, best)
     s.attempt[place] = solver.attempts + 1
     s.led[place] = True
