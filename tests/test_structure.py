@@ -17,6 +17,7 @@ FLOORS = [
     ["lagrangian", "certificate"],
     ["solution", "guidance.samples"],
     ["native"],
+    ["guidance.search"],
     ["solvers", "guidance.mppi", "guidance.detection", "guidance.region", "guidance.roadmap"],
     ["guidance"],
     ["presets"],

@@ -9,8 +9,10 @@ import torch
 
 from tests.reference.roadmap import cheapest_cost, point_along, segment_gap, way_length
 from torchgco import InputError, compose
-from torchgco.guidance.roadmap import FAR, Roadmap, Scene, _apart_from, _cheapest, halton, points_along, segment_gaps
+from torchgco.guidance.roadmap import FAR, Roadmap, Scene, halton, points_along
 from torchgco.guidance.scene import scene_of
+from torchgco.guidance.search import Search, segment_gaps, squares_from_segments
+from torchgco.native.roadmap import Graph, NativeSearch, library_for
 
 
 def flat(points, rows):
@@ -111,18 +113,21 @@ def test_a_way_goes_where_a_metre_is_cheap() -> None:
         assert float(across.min()) < 0 if side > 0 else float(across.max()) > 0
 
 
-def test_no_way_on_the_graph_is_cheaper() -> None:
+@pytest.mark.parametrize("native", [True, False])
+def test_no_way_on_the_graph_is_cheaper(native: bool) -> None:
     """Relaxing all edges at once finds what Dijkstra finds, on the very same graph."""
-    s = random_scene(2, B=3, seed=4)
-    roadmap = Roadmap(nodes=40, spread=20)
+    s, margin = random_scene(2, B=3, seed=4), 0.15
     rng = np.random.default_rng(1)
     points = torch.cat((s.start[:, None], s.goal[:, None], torch.as_tensor(rng.uniform(-1, 1, (3, 50, 2)))), dim=1)
     near = torch.as_tensor(rng.integers(0, 52, (3, 52, 8)))
     price = torch.as_tensor(rng.uniform(0.5, 2.0, (3, 52)))
-    way, found = _cheapest(points, near, roadmap._lengths(points, near, s.centers, s.distances), price)
+    search = Search(s.centers, s.distances, margin)
+    graph = Graph(points, near, search._lengths(points, near))
+    if native:
+        search = NativeSearch(library_for(points), s.centers, s.distances, margin)
+    way, _, found = search.cheapest(graph, price)
     for b in range(3):
         p, o, R = points[b].numpy(), s.centers[b].numpy(), s.distances[b].numpy()
-        margin = roadmap.margin * R.max()
         edges = {}
         for i in range(52):
             edges[i] = {}
@@ -130,7 +135,7 @@ def test_no_way_on_the_graph_is_cheaper() -> None:
                 gap = segment_gap(p[i], p[j], o, R)
                 if gap > 0:
                     length = np.linalg.norm(p[j] - p[i]) + 1e-6 * np.linalg.norm(p[1] - p[0])
-                    dear = 1 + np.clip((margin - gap) / margin, 0, 1)
+                    dear = 1 + np.clip((margin * R.max() - gap) / (margin * R.max()), 0, 1)
                     edges[i][j] = length * dear * 0.5 * float(price[b, i] + price[b, j])
         best = cheapest_cost(edges, 0, 1)
         assert bool(found[b]) == np.isfinite(best)
@@ -159,7 +164,8 @@ def test_gaps_of_segments_and_points_along_a_way() -> None:
 def test_distances_from_a_way() -> None:
     rng = np.random.default_rng(5)
     way, points = rng.uniform(-1, 1, (2, 5, 2)), rng.uniform(-1, 1, (2, 7, 2))
-    apart = _apart_from(torch.as_tensor(points), torch.as_tensor(way))
+    way_ = torch.as_tensor(way)
+    apart = squares_from_segments(torch.as_tensor(points), way_[:, :-1], way_[:, 1:]).amin(1).sqrt()
     for b in range(2):
         along = np.concatenate([a + np.linspace(0, 1, 2001)[:, None] * (c - a) for a, c in pairwise(way[b])])
         nearest = np.linalg.norm(points[b, :, None] - along, axis=-1).min(-1)

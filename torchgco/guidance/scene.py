@@ -7,7 +7,8 @@ from torch import Tensor
 
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.guidance.roadmap import FAR, Scene, segment_gaps
+from torchgco.guidance.roadmap import FAR, Scene
+from torchgco.guidance.search import segment_gaps
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
 
@@ -28,10 +29,11 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     if at.stop - at.start not in (2, 3):
         return None
 
-    def toll(points: Tensor, rows: Tensor) -> Tensor:
-        part = problem.take(rows)
-        price, first = (_resting_cost(part, rest[rows], p) for p in (points, part.x0[:, None, at]))
-        return price.clamp(min=0.0) / first.clamp(min=1e-12) + 0.1
+    first = _resting_cost(problem, rest, problem.x0[:, None, at]).clamp(min=1e-12)
+
+    def toll(points: Tensor, rows: slice) -> Tensor:
+        price = _resting_cost(problem, rest, points, rows)
+        return price.clamp(min=0.0) / first[rows] + 0.1
 
     return Scene(
         problem.x0[:, at], goal[:, at],
@@ -99,9 +101,9 @@ def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:
     return torch.ones_like(signs).expand(first.shape[0], *signs.shape)
 
 
-def _resting_cost(problem: Problem, rest: Tensor, points: Tensor) -> Tensor:
-    """Stage cost (B, V) of resting at points (B, V, d)."""
-    x = problem.x0.unsqueeze(1).repeat(1, points.shape[1], 1)
+def _resting_cost(problem: Problem, rest: Tensor, points: Tensor, rows: slice = slice(None)) -> Tensor:
+    """Stage cost (B', V) of resting at points (B', V, d) of some problems."""
+    x = problem.x0[rows].unsqueeze(1).repeat(1, points.shape[1], 1)
     x[..., position(problem)] = points
-    u = rest[:, :1].expand(-1, points.shape[1], -1)
-    return problem.cost.stage(x, u, 0)
+    u = rest[rows, :1].expand(-1, points.shape[1], -1)
+    return problem.cost.take(rows).stage(x, u, 0)

@@ -1,0 +1,210 @@
+"""The roadmap's search in C and in PyTorch: the same ways, also where several cost the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchgco import kernels
+from torchgco.guidance.roadmap import FAR, Roadmap, Scene, halton
+from torchgco.guidance.search import Search
+from torchgco.native import roadmap as native
+from torchgco.native.dispatch import EagerWarning
+from torchgco.native.roadmap import HOPS, Graph, NativeSearch, library_for
+
+B = 3
+
+
+@pytest.fixture(autouse=True)
+def native_again() -> Iterator[None]:
+    yield
+    kernels.use_native(True)
+
+
+def uneven(points: Tensor, rows: slice) -> Tensor:
+    """A metre costs more to the right and farther out."""
+    return 0.1 + (points[..., 0] + 1.0).square() + 0.3 * points[..., 1].abs()
+
+
+def flat(points: Tensor, rows: slice) -> Tensor:
+    return torch.ones_like(points[..., 0])
+
+
+def scene(centers, distances, start, goal, toll=uneven) -> Scene:
+    """B times the same start and goal among spheres (M, d), or their own (B, M, d)."""
+    o, R = (torch.as_tensor(np.asarray(v, dtype=float)) for v in (centers, distances))
+    ends = (torch.tensor(end, dtype=torch.float64).expand(B, -1) for end in (start, goal))
+    return Scene(*ends, o.expand(B, *o.shape[-2:]), R.expand(B, R.shape[-1]), toll)
+
+
+def drawn(d: int, M: int, seed: int) -> Scene:
+    """Spheres of several sizes, some of which aren't there."""
+    rng = np.random.default_rng(seed)
+    R = rng.uniform(0.02, 0.7, (B, M)) * M ** (-1 / d)
+    R[rng.uniform(size=R.shape) < 0.2] = FAR
+    start, goal = (-1.0,) + (0.0,) * (d - 1), (1.0, *rng.uniform(-0.3, 0.3, d - 1))
+    return scene(rng.uniform(-0.8, 0.8, (B, M, d)), R, start, goal)
+
+
+def lattice(d: int) -> Scene:
+    """Spheres of one size at the corners of a grid that start and goal lie askew to: everything has a mirror image."""
+    axis = np.linspace(-0.6, 0.6, 4)
+    o = np.stack(np.meshgrid(*[axis] * d), axis=-1).reshape(-1, d)
+    return scene(o, np.full(len(o), 0.15), (-1.0,) * d, (1.0,) * d, flat)
+
+
+def ring() -> Scene:
+    angle = np.arange(10) * 0.2 * np.pi
+    o = np.stack((1.0 + 0.5 * np.cos(angle), 0.5 * np.sin(angle)), axis=-1)
+    return scene(o, np.full(10, 0.17), (-1.0, 0.0), (1.0, 0.0))
+
+
+SCENES = {
+    **{f"drawn {d}-D, {M} spheres": drawn(d, M, M) for d in (2, 3) for M in (1, 2, 3, 5, 12, 100)},
+    "lattice": lattice(2),
+    "lattice in space": lattice(3),
+    "nothing there": scene([[0.0, 0.0]] * 3, [FAR] * 3, (-1.0, 0.0), (1.0, 0.0)),
+    "nothing there in space": scene([[0.0, 0.0, 0.0]], [FAR], (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)),
+    "one before many places": scene([[0.0, 0.0]] + [[9.0, 9.0]] * 40, [0.3] + [FAR] * 40, (-1.0, 0.0), (1.0, 0.0)),
+    "in the middle": scene([[0.0, 0.0]], [0.4], (-1.0, 0.0), (1.0, 0.0), flat),
+    "in the middle of a diagonal": scene([[0.0, 0.0]], [0.4], (-1.0, -1.0), (1.0, 1.0), flat),
+    "in the middle of space": scene([[0.0, 0.0, 0.0]], [0.4], (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), flat),
+    "straight up": scene([[0.0, 0.0, 0.0]], [0.4], (0.0, 0.0, -1.0), (0.0, 0.0, 1.0), flat),
+    "touched": scene([[0.0, 0.4], [0.5, -0.3]], [0.4, 0.3], (-1.0, 0.0), (1.0, 0.0), flat),
+    "touching each other": scene([[0.0, 0.25], [0.0, -0.25]], [0.25, 0.25], (-1.0, 0.0), (1.0, 0.0), flat),
+    "one in another": scene([[0.0, 0.0]] * 3 + [[0.1, 0.0]], [0.3, 0.3, 0.2, 0.1], (-1.0, 0.0), (1.0, 0.0), flat),
+    "goal at start": scene([[0.5, 0.0]], [0.2], (0.0, 0.0), (0.0, 0.0)),
+    "goal at start in space": scene([[0.5, 0.0, 0.0], [0.0, 0.4, 0.0]], [0.2, 0.1], (0.0,) * 3, (0.0,) * 3),
+    "goal at start, nothing there": scene([[0.5, 0.0]], [FAR], (0.0, 0.0), (0.0, 0.0)),
+    "start inside": scene([[-1.0, 0.1], [0.0, 0.0]], [0.3, 0.3], (-1.0, 0.0), (1.0, 0.0)),
+    "no way": ring(),
+}
+
+
+def both(roadmap: Roadmap, s: Scene, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    assert library_for(s.centers) is not None
+    first = roadmap.ways(s, count)
+    kernels.use_native(False)
+    return first, roadmap.ways(s, count)
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("roadmap", [Roadmap(slack=0.02), Roadmap(9, 12, neighbours=3, hubs=5, margin=1.0)])
+def test_both_return_the_same_ways(name: str, roadmap: Roadmap) -> None:
+    (ways, found), (wanted, exist) = both(roadmap, SCENES[name], 4)
+    assert torch.equal(found, exist)
+    torch.testing.assert_close(ways, wanted, rtol=0, atol=1e-9)
+
+
+def test_no_way_is_the_straight_line() -> None:
+    s = SCENES["no way"]
+    for ways, found in both(Roadmap(), s, 2):
+        assert not bool(found.any())
+        assert torch.equal(ways[:, :, 0], s.start.unsqueeze(1).expand(-1, 2, -1))
+        assert torch.equal(ways[:, :, 1:], s.goal[:, None, None].expand(-1, 2, HOPS, -1))
+
+
+@pytest.mark.parametrize("name", [name for name in SCENES if name.startswith("drawn") or "lattice" in name])
+def test_both_make_the_same_graph(name: str) -> None:
+    """As matrices of lengths: the order of a point's edges is their own."""
+    s = SCENES[name]
+    d, made = s.start.shape[1], []
+    for search in searches(s.centers, s.distances, 0.15):
+        graph = search.graph(s.start, s.goal, halton(20, d), 30, 5, 4)
+        lengths = torch.full((B, graph.points.shape[1], graph.points.shape[1]), torch.inf, dtype=torch.float64)
+        ends = graph.ends.long().clamp(min=0)
+        made.append((graph.points, lengths.scatter_reduce(2, ends, graph.lengths, "amin")))
+    torch.testing.assert_close(made[0], made[1], rtol=1e-12, atol=1e-12)
+
+
+def searches(o: Tensor, R: Tensor, margin: float) -> tuple[NativeSearch, Search]:
+    library = library_for(o)
+    assert library is not None
+    return NativeSearch(library, o, R, margin), Search(o, R, margin)
+
+
+def chain(points: int) -> Graph:
+    """Start, goal, and points between them in a row, each joined to the next, the last to the goal."""
+    p = torch.zeros(1, points, 2, dtype=torch.float64)
+    p[0, 1, 0] = points - 1.0
+    p[0, 2:, 0] = torch.arange(1, points - 1)
+    ends = torch.arange(1, points + 1).clamp(max=points - 1).view(1, -1, 1)
+    ends[0, 0], ends[0, 1], ends[0, -1] = min(2, points - 1), 1, 1
+    return Graph(p, ends, torch.ones(1, points, 1, dtype=torch.float64))
+
+
+def nowhere() -> tuple[Tensor, Tensor]:
+    return torch.zeros(1, 1, 2, dtype=torch.float64), torch.full((1, 1), FAR, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("edges", [1, 2, HOPS - 1, HOPS, HOPS + 1, HOPS + 2])
+def test_a_way_has_so_many_edges_at_most(edges: int) -> None:
+    graph = chain(edges + 1)
+    for search in searches(*nowhere(), 0.15):
+        way, string, arrives = search.cheapest(graph, torch.ones(1, edges + 1, dtype=torch.float64))
+        assert bool(arrives) == (edges <= HOPS)
+        corners = min(edges, HOPS) if edges <= HOPS else 1
+        assert way[0, : corners + 1, 0].tolist() == torch.linspace(0, edges, corners + 1).tolist()
+        assert torch.equal(string[0, :2], way[0, [0, -1]]) and torch.equal(string[0, 3::2], way[0, 1:-1])
+        assert torch.equal(string[0, 2::2], 0.5 * (way[0, 1:] + way[0, :-1]))
+
+
+def test_of_equals_the_first_is_taken() -> None:
+    """Three ways around, the first two told apart by rounding alone; the last is cheaper by little, or by less."""
+    points = torch.tensor([[[0.0, 0.0], [2.0, 0.0], [1.0, 1.0], [1.0, -1.0], [1.0, 2.0]]], dtype=torch.float64)
+    ends = torch.tensor([[[2, 3, 4], [1, 1, 1], [1, 1, 1], [1, 1, 1], [1, 1, 1]]])
+    for least, taken in ((1.0 - 1e-14, 2), (1.0 - 1e-10, 4)):
+        lengths = torch.ones(1, 5, 3, dtype=torch.float64)
+        lengths[0, 0] = torch.tensor([1.0, 1.0 - 1e-15, least], dtype=torch.float64)
+        for search in searches(*nowhere(), 0.15):
+            way, _, arrives = search.cheapest(Graph(points, ends, lengths), torch.ones(1, 5, dtype=torch.float64))
+            assert bool(arrives) and torch.equal(way[0, 1], points[0, taken])
+
+
+def test_a_price_that_is_no_number_closes_its_edges() -> None:
+    price = torch.ones(1, 5, dtype=torch.float64)
+    price[0, 3] = torch.nan
+    for search in searches(*nowhere(), 0.15):
+        assert not bool(search.cheapest(chain(5), price)[2])
+
+
+def test_a_problem_has_its_bits_in_every_batch() -> None:
+    s = Scene(*(torch.cat([getattr(drawn(3, 12, seed), name) for seed in range(27)]) for name in (
+        "start", "goal", "centers", "distances",
+    )), uneven)  # fmt: skip
+    whole, found = Roadmap().ways(s, 3)
+    assert len(whole) > native.AT_ONCE
+    for rows in (torch.arange(1), torch.tensor([70]), torch.arange(81).flip(0)):
+        part = Scene(s.start[rows], s.goal[rows], s.centers[rows], s.distances[rows], uneven)
+        ways, arrives = Roadmap().ways(part, 3)
+        assert torch.equal(ways, whole[rows]) and torch.equal(arrives, found[rows])
+
+
+def test_no_problems_have_no_ways() -> None:
+    s = SCENES["in the middle"]
+    for ways, found in both(Roadmap(), Scene(s.start[:0], s.goal[:0], s.centers[:0], s.distances[:0], flat), 2):
+        assert ways.shape == (0, 2, HOPS + 1, 2) and found.shape == (0,)
+
+
+def test_pytorch_searches_in_single_precision_and_without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    s = SCENES["in the middle"]
+    single = Scene(*(t.float() for t in (s.start, s.goal, s.centers, s.distances)), flat)
+    assert library_for(single.centers) is None
+    ways, found = Roadmap().ways(single)
+    assert ways.dtype == torch.float32 and bool(found.all())
+    monkeypatch.setenv("TORCHGCO_CC", "none")
+    assert library_for(s.centers) is None
+    ways, _ = Roadmap().ways(s)
+    monkeypatch.undo()
+    monkeypatch.setattr(native, "SOURCE", Path(__file__))  # no C
+    native._library.cache_clear()
+    with pytest.warns(EagerWarning, match="where ways are sought"):
+        assert library_for(s.centers) is None
+    monkeypatch.undo()
+    native._library.cache_clear()
+    torch.testing.assert_close(ways, Roadmap().ways(s)[0], rtol=0, atol=1e-9)
