@@ -2,7 +2,7 @@
 # make families   every solver on the public layouts (an hour or more)
 # make quality   how often gco reaches the goal on the public layouts, and how well (ARGS="--solvers gco gco_max" for more
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
-# make benchmark   speed, side by side with the peers (a quarter of an hour; ARGS="families --compile" for some or more);
+# make benchmark   speed, side by side with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make test    the quick tests; test-slow: those that compile; lint, types: the static checks; clean: start afresh
 
@@ -16,6 +16,8 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constrain
 RUNTIME := $(VENV)/.runtime
 DEV := $(VENV)/.dev
 PEERS := $(VENV)/.peers
+# The wheel of acados brings a CasADi that would stand before the real one: an environment without torchgco.
+ACADOS := .venv-acados
 
 # The public layouts of benchmarks/data, all solvers; FAMILIES picks some. An hour or more on two cores.
 FAMILIES ?= forest30 forest60 walls planar_trap planar_random
@@ -49,6 +51,7 @@ oracle: $(RUNTIME)
 	$(BIN)/python -m benchmarks.oracle $(ARGS)
 
 benchmark: $(PEERS)
+	$(MAKE) $(ACADOS)/.ready || echo "acados can't be installed here: the tables will say so."
 	$(SPEED) $(ARGS)
 
 benchmark-gpu: $(PEERS)
@@ -61,7 +64,7 @@ types: $(DEV)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(ACADOS) build dist .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
@@ -79,3 +82,8 @@ $(DEV): pyproject.toml constraints.txt | $(BIN)/python
 $(PEERS): pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) -e '.[dev,peers]'
 	touch $@ $(RUNTIME) $(DEV)
+
+$(ACADOS)/.ready: constraints.txt
+	$(PYTHON) -m venv --clear $(ACADOS)
+	$(ACADOS)/bin/python -m pip install --disable-pip-version-check -c constraints.txt comma-deps-acados
+	touch $@

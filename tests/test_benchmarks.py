@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,20 @@ import torch
 
 from benchmarks import oracle, quality
 from benchmarks.families import FAMILIES
-from benchmarks.speed import batch, families, growth, latency, mppi, share
+from benchmarks.speed import (
+    acados_peer,
+    batch,
+    families,
+    first_solve,
+    first_use,
+    growth,
+    latency,
+    mppi,
+    own_model,
+    paper,
+    share,
+    targets,
+)
 from benchmarks.speed.__main__ import main
 from benchmarks.speed.bench import Bench
 from benchmarks.speed.provenance import provenance
@@ -21,16 +35,34 @@ from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
 from benchmarks.speed.tables import BEGIN, END, rewrite, section_table
 from torchgco import compose
+from torchgco.native import engine as native_engine
 from torchgco.scenarios import Layouts
 from torchgco.shapes import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = Sizes(
-    families=("forest30",), family_batches=(2,), fatrop_layouts=1, ipopt_layouts=1,
+    families=("forest30",), family_batch=2, large_batch=None, layouts=1, ipopt_layouts=1, ipopt_families=("forest30",),
+    latency_layouts=1, own_layouts=1, paper_layouts=1, models=1,
     whole_batches=(), limited_batches=(2,), fewest_layouts=2,
     growth_batch=2, stages=(6,), obstacles=(3,), samples=(16,), mppi_repeats=1,
-    latency_layouts=1, share_batch=2, num_stages=8, inner_iterations=2,
+    share_batch=2, num_stages=8, inner_iterations=2,
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def few_processes(monkeypatch) -> None:
+    """What `first_use` would start new Pythons for, in this one: a number for an import, a first solve for a model."""
+
+    def started(words: list[str], environment: dict[str, str]) -> str:
+        return "1.5" if words[0] == "-c" else json.dumps(first_solve.measure(words[-1]))
+
+    monkeypatch.setattr(first_use, "_started", started)
+
+
+@pytest.fixture(autouse=True)
+def without_acados(monkeypatch, tmp_path: Path) -> None:
+    """Whatever is installed here: acados compiles for seconds, and has tests of its own."""
+    monkeypatch.setattr(acados_peer, "ENVIRONMENT", tmp_path)
 
 
 def tiny(folder: Path) -> Bench:
@@ -41,7 +73,9 @@ def numbers(bench: Bench, quantity: str) -> list[float]:
     return [float(row["value"]) for row in bench.results.rows if row["quantity"] == quantity]
 
 
-@pytest.mark.parametrize("section", [batch, families, growth, latency, mppi, share])
+@pytest.mark.parametrize(
+    "section", [batch, families, first_use, growth, latency, mppi, own_model, paper, share, targets]
+)
 def test_a_section_gives_whole_rows(section, tmp_path: Path) -> None:
     bench = tiny(tmp_path)
     section.run(bench)
@@ -59,15 +93,47 @@ def test_ratios_are_those_of_their_rows(tmp_path: Path) -> None:
     bench = tiny(tmp_path)
     families.run(bench)
     seconds = {r["solver"]: float(r["value"]) for r in bench.results.rows if r["quantity"] == "seconds a problem"}
-    assert numbers(bench, "seconds fatrop / gco")[0] == pytest.approx(seconds["fatrop"] / seconds["gco"], rel=1e-4)
-    assert [r["ratio"] for r in bench.results.rows if r["quantity"] == "seconds ipopt / gco"] == ["ipopt / gco"]
+    assert set(seconds) == {"gco", "fatrop", "fatrop_guided", "ipopt"}
+    ratios = {r["ratio"]: float(r["value"]) for r in bench.results.rows if r["quantity"] == "seconds, ratio"}
+    for peer in set(seconds) - {"gco"}:
+        assert ratios[f"{peer} / gco"] == pytest.approx(seconds[peer] / seconds["gco"], rel=1e-4)
+    assert [r["case"] for r in bench.results.rows if r["quantity"] == "not installed"] == ["forest30"]
 
 
 def test_shares_add_up(tmp_path: Path) -> None:
+    """By phase, by native function, and all together; what is patched for the timers is as before."""
+    run = native_engine.run
     bench = tiny(tmp_path)
     share.run(bench)
-    shares = [float(row["value"]) for row in bench.results.rows if row["unit"] == "%"]
-    assert sum(shares) == pytest.approx(100, abs=1) and numbers(bench, "inner solves")[0] > 0
+    assert native_engine.run is run
+    rows = [row for row in bench.results.rows if row["case"] == "forest30, B = 2" and row["unit"] == "%"]
+    sums = {row["solver"]: float(row["value"]) for row in rows if row["quantity"] == "sum"}
+    assert sums.pop("all") == pytest.approx(100, abs=0.1) and sum(sums.values()) == pytest.approx(100, abs=0.1)
+    for phase in sums:
+        parts = [float(row["value"]) for row in rows if row["solver"] == phase and row["quantity"] != "sum"]
+        assert sum(parts) == pytest.approx(sums[phase], abs=0.1)
+    assert {"tgco_ilqr", "tgco_value"} <= {row["quantity"] for row in rows if row["solver"] == "all"}
+
+
+def test_the_targets_are_read_off_the_rows(tmp_path: Path) -> None:
+    """This run's before those that are kept; a row from another commit says so."""
+    path = tmp_path / "results.csv"
+    former = Results(path)
+    for section, value in (("mppi", "3"), ("paper", "7.25")):
+        row = {**row_of(section, value), "commit": "0000000"}
+        names = {
+            "mppi": ("S = 1000", "torchgco", mppi.RATIO),
+            "paper": ("planar_trap_paper, N = 1000, B = 8", "gco_paper", "all"),
+        }
+        former.add({**row, **dict(zip(("case", "solver", "quantity"), names[section], strict=True))})
+        former.finish(section, "cpu")
+    bench = Bench(TINY, Results(path), {**provenance("cpu"), "commit": "1111111"}, say=lambda text: None)
+    bench.row("mppi", "S = 1000", "torchgco", mppi.RATIO, 21.04)
+    targets.run(bench)
+    said = {row["case"]: row["value"] for row in bench.results.rows if row["quantity"] == "measured"}
+    assert said["MPPI, S = 1000"] == "21 x" and said["walls, B = 32"] == "not measured"
+    assert said["planar_trap_paper, N = 1000, 8 problems"] == "7.2 s (at 0000000)"
+    assert list(said) == [case for case, *_ in targets.TARGETS]
 
 
 def test_what_takes_too_long_is_left_out_and_named(tmp_path: Path) -> None:

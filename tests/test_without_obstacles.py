@@ -116,7 +116,7 @@ def test_a_constraint_that_is_no_sphere_decides_feasibility() -> None:
     assert beyond.feasible.tolist() == [False] * 2 and before.feasible.tolist() == [True] * 2
 
 
-PEERS = ["hold", "mppi", "gco_paper", "al_ilqr", "multistart", "ipopt", "fatrop"]
+PEERS = ["hold", "mppi", "gco_paper", "al_ilqr", "multistart", "ipopt", "fatrop", "fatrop_guided"]
 QUICK = ["scenario.stages=12", "study.layouts=2", "study.workers=1", f"study.baselines=[{','.join(PEERS)}]"]
 
 

@@ -10,13 +10,12 @@ from dataclasses import asdict
 from benchmarks.speed.bench import Bench
 from benchmarks.speed.provenance import ROOT
 
-SECTION = "batch"
+SECTION, SOLVER = "batch", "gco"
 START = 10.0  # seconds that a process takes before it solves anything
 SHARE = 0.15  # of the time left, what one batch may take
 
 
 def run(bench: Bench) -> None:
-    solver = "gco, compiled" if bench.compiled else "gco"
     for batches, limited in ((bench.sizes.whole_batches, False), (bench.sizes.limited_batches, True)):
         known = 0.0
         for batch in batches:
@@ -24,25 +23,25 @@ def run(bench: Bench) -> None:
             # The last one's seconds an element: more of them take no longer each.
             seconds = START + known * max(batch, bench.sizes.fewest_layouts)
             if bench.fits(SECTION, case, seconds, SHARE):
-                known = _measure(bench, case, solver, batch, limited)
+                known = _measure(bench, case, batch, limited)
 
 
-def _measure(bench: Bench, case: str, solver: str, batch: int, limited: bool) -> float:
+def _measure(bench: Bench, case: str, batch: int, limited: bool) -> float:
     """Start the process, read its one line; returns its seconds an element."""
-    order = {"batch": batch, "limited": limited, "device": bench.device, "compiled": bench.compiled}
+    order = {"batch": batch, "limited": limited, "device": bench.device}
     words = [sys.executable, "-m", "benchmarks.speed.one_batch", json.dumps({**order, "sizes": asdict(bench.sizes)})]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     if done.returncode != 0:
         # Out of memory, most likely, and killed for it: a finding, no reason to stop.
-        bench.row(SECTION, case, solver, "ended with", str(done.returncode))
+        bench.row(SECTION, case, SOLVER, "ended with", str(done.returncode))
         bench.say(done.stderr[-2000:])
         return 0.0
     told = json.loads(done.stdout.splitlines()[-1])
     seconds = told["seconds"]
-    bench.row(SECTION, case, solver, "an element", 1000 * seconds, "ms")
-    bench.row(SECTION, case, solver, "an element and iteration", 1000 * seconds / told["iterations"], "ms")
-    bench.row(SECTION, case, solver, "problems a second", 1 / seconds, "1/s")
+    bench.row(SECTION, case, SOLVER, "an element", 1000 * seconds, "ms")
+    bench.row(SECTION, case, SOLVER, "an element and iteration", 1000 * seconds / told["iterations"], "ms")
+    bench.row(SECTION, case, SOLVER, "problems a second", 1 / seconds, "1/s")
     if told["bytes"] is not None:
-        bench.row(SECTION, case, solver, "peak memory", told["bytes"] / 2**20, "MiB")
-        bench.row(SECTION, case, solver, "memory an element", told["bytes"] / 2**20 / batch, "MiB")
+        bench.row(SECTION, case, SOLVER, "peak memory", told["bytes"] / 2**20, "MiB")
+        bench.row(SECTION, case, SOLVER, "memory an element", told["bytes"] / 2**20 / batch, "MiB")
     return seconds

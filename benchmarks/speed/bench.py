@@ -1,10 +1,9 @@
-"""What a section is handed: sizes, a clock, a device, and a place for its rows."""
+"""What a section is handed: sizes, clocks, a device, and a place for its rows."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -14,21 +13,37 @@ import torch
 from benchmarks.speed.results import MEASURED, Results
 from benchmarks.speed.sizes import Sizes
 from torchgco.experiments.build import Setup, compose
-from torchgco.kernels import compile_kernels
+from torchgco.native.dispatch import engine_of
+from torchgco.scenarios import Task
 
 T = TypeVar("T")
 SEED = 1000  # of all drawn layouts
+WARM_UP = 2  # problems solved off the clock, for what is traced and compiled
+
+
+@dataclass(frozen=True)
+class Took:
+    """How long something took, s."""
+
+    seconds: float  # of the processor; on a GPU as `wall`. All ratios are of these
+    wall: float  # by the clock on the wall
+
+    def __add__(self, other: Took) -> Took:
+        return Took(self.seconds + other.seconds, self.wall + other.wall)
+
+    def each(self, count: int) -> Took:
+        """The same for one of so many."""
+        return Took(self.seconds / count, self.wall / count)
 
 
 @dataclass
 class Bench:
-    """One run. Times are wall-clock seconds of this process, the device's work awaited."""
+    """One run: what it measures, where, and how long it may take."""
 
     sizes: Sizes
     results: Results | None = None  # None: rows are said, not kept
     source: dict[str, str] = field(default_factory=dict)  # the columns that all rows share
     device: str = "cpu"
-    compiled: bool = False
     deadline: float = float("inf")  # on time.monotonic
     say: Callable[[str], None] = partial(print, flush=True)
 
@@ -41,6 +56,12 @@ class Bench:
             inner = replace(setup.solver.inner, max_iterations=limit)
             setup = replace(setup, solver=replace(setup.solver, inner=inner, max_outer_iterations=2))
         return setup
+
+    def warm(self, setup: Setup, task: Task) -> None:
+        """Have what the solver needs for these problems traced and compiled: solve the first ones, off the clock."""
+        engine_of(task.problem)
+        rows = torch.arange(min(WARM_UP, task.problem.B), device=task.U0.device)
+        setup.solver.solve(task.problem.take(rows), task.U0[rows], seed=setup.seed)
 
     def row(self, section: str, case: str, solver: str, quantity: str, value: Any, unit: str = "", ratio: str = ""):
         """Keep and say one measurement; `ratio` names what was divided by what, where it is one."""
@@ -61,27 +82,16 @@ class Bench:
         self.row(section, case, "all", "left out: would take", seconds, "s")
         return False
 
-    def timed(self, work: Callable[[], T]) -> tuple[T, float]:
-        """What the work returns, and its seconds."""
+    def timed(self, work: Callable[[], T]) -> tuple[T, Took]:
+        """What the work returns, and how long it took, the device's work awaited."""
         self.wait()
-        began = time.perf_counter()
+        processor, wall = time.process_time(), time.perf_counter()
         result = work()
         self.wait()
-        return result, time.perf_counter() - began
+        processor, wall = time.process_time() - processor, time.perf_counter() - wall
+        return result, Took(wall if self.device == "cuda" else processor, wall)
 
     def wait(self) -> None:
         if self.device == "cuda":
             torch.cuda.synchronize()
 
-    def modes(self) -> Sequence[bool]:
-        """Eager, and compiled where that is asked for."""
-        return (False, True) if self.compiled else (False,)
-
-    @contextmanager
-    def mode(self, compiled: bool):
-        """Kernels compiled for a while."""
-        compile_kernels(compiled)
-        try:
-            yield
-        finally:
-            compile_kernels(False)

@@ -1,20 +1,25 @@
-"""Problems a second on drawn layouts, against FATROP and IPOPT on the first of them."""
+"""Seconds a problem on drawn layouts: `gco` in batches, other solvers on the first of the same layouts."""
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
-from benchmarks.speed.bench import Bench
-from benchmarks.speed.peers import HAVE_CASADI, Peer, first
+from benchmarks.speed import acados_peer
+from benchmarks.speed.bench import Bench, Took
+from benchmarks.speed.peers import GUIDED, AcadosPeer, CasADiPeer, Peer, first
 from torchgco.experiments.build import Setup
 from torchgco.judge import Verdict, judge
+from torchgco.shapes import InputError
 
 SECTION = "families"
 FAMILIES = {
     "forest30": ("scenario=forest", "scenario.num_obstacles=30"),
     "forest60": ("scenario=forest", "scenario.num_obstacles=60"),
+    "walls": ("scenario=walls",),
     "planar_trap": ("scenario=planar_trap", "model=planar"),
     "planar_random": ("scenario=planar_random", "model=planar"),
 }
@@ -24,10 +29,14 @@ FAMILIES = {
 class Ours:
     """A flight of `gco` on a whole batch."""
 
-    name: str
     batch: int
-    seconds: float  # a problem
+    took: Took  # for a problem
     verdict: Verdict
+
+    @property
+    def per_reached(self) -> float:
+        reached = int(self.verdict.reached.sum())
+        return self.took.seconds * self.batch / reached if reached else float("inf")
 
 
 def run(bench: Bench) -> None:
@@ -42,90 +51,95 @@ def _family(bench: Bench, name: str, share: float) -> None:
     `share` is of the time left, what this family may take.
     """
     setup = bench.setup(*FAMILIES[name])
-    peers = _peers(bench, name, setup)
-    for peer in peers:
-        peer.fly(bench)
-    flights = _fly(bench, name, setup, share)
-    for peer in reversed(peers):
-        peer.fly(bench)
+    with tempfile.TemporaryDirectory() as folder:
+        peers = [peer for peer in _peers(bench, name, setup, Path(folder)) if _flown(bench, name, peer)]
+        flights = _fly(bench, name, setup, share)
+        for peer in reversed(peers):
+            peer.fly(bench)
     for peer in peers:
         _say_peer(bench, name, peer)
         for ours in flights:
             _compare(bench, name, ours, peer)
 
 
-def _peers(bench: Bench, name: str, setup: Setup) -> list[Peer]:
+def _peers(bench: Bench, name: str, setup: Setup, folder: Path) -> list[Peer]:
     """Those that are installed, made ready; none on a GPU, which they have no use for."""
     if bench.device != "cpu":
         return []
-    if not HAVE_CASADI:
-        bench.row(SECTION, name, "fatrop", "not installed", "")
-        return []
-    counts = {"fatrop": bench.sizes.fatrop_layouts, "ipopt": bench.sizes.ipopt_layouts}
-    task = setup.task(setup.layouts(max(counts.values())))
-    return [Peer.ready(bench, solver, first(task, count)) for solver, count in counts.items()]
+    sizes = bench.sizes
+    task = setup.task(setup.layouts(sizes.slow_layouts if name in sizes.slow_families else sizes.layouts))
+    peers: list[Peer] = [CasADiPeer.ready(bench, solver, task) for solver in ("fatrop", GUIDED)]
+    if acados_peer.installed():
+        peers += [AcadosPeer.ready(bench, solver, task, folder) for solver in ("acados", "acados_guided")]
+    else:
+        bench.row(SECTION, name, "acados", "not installed", "")
+    if name in sizes.ipopt_families:
+        peers.append(CasADiPeer.ready(bench, "ipopt", first(task, sizes.ipopt_layouts)))
+    return peers
+
+
+def _flown(bench: Bench, name: str, peer: Peer) -> bool:
+    """Fly for the first time; a peer that can't is named, and flies no more."""
+    try:
+        peer.fly(bench)
+    except (InputError, RuntimeError) as error:
+        bench.row(SECTION, name, peer.name, "ended with", str(error).splitlines()[0][:80])
+        return False
+    return True
 
 
 def _fly(bench: Bench, name: str, setup: Setup, share: float) -> list[Ours]:
-    """`gco` on every batch that fits into the time, eager and, where asked for, compiled."""
+    """`gco` on every batch that fits into the time."""
     flights: list[Ours] = []
-    for compiled in bench.modes():
-        solver = "gco, compiled" if compiled else "gco"
-        with bench.mode(compiled):
-            if compiled:
-                _say_compilation(bench, name, setup, min(bench.sizes.family_batches))
-            for batch in bench.sizes.family_batches:
-                known = flights[-1].seconds if flights else 0.0  # a problem: in a larger batch they take no longer
-                if bench.fits(SECTION, f"{name}, B = {batch}", known * batch, share):
-                    flights.append(_flight(bench, name, setup, solver, batch))
+    batches = (bench.sizes.family_batch, bench.sizes.large_batch if name.startswith("forest") else None)
+    for batch in batches:
+        known = flights[-1].took.wall if flights else 0.0  # a problem: in a larger batch they take no longer
+        if batch is not None and bench.fits(SECTION, f"{name}, B = {batch}", known * batch, share):
+            flights.append(_flight(bench, name, setup, batch))
     return flights
 
 
-def _flight(bench: Bench, name: str, setup: Setup, solver: str, batch: int) -> Ours:
+def _flight(bench: Bench, name: str, setup: Setup, batch: int) -> Ours:
     layouts = setup.layouts(batch)
     task = setup.task(layouts)
-    solution, seconds = bench.timed(lambda: setup.solver.solve(task.problem, task.U0, seed=setup.seed))
+    bench.warm(setup, task)
+    solution, took = bench.timed(lambda: setup.solver.solve(task.problem, task.U0, seed=setup.seed))
     checked = setup.vehicle.task(layouts)  # on the CPU, where the judge sits
     verdict = judge(checked.problem, solution.U.to("cpu", torch.float64), checked.goal, checked.goal_radius)
-    case = f"{name}, B = {batch}"
-    bench.row(SECTION, case, solver, "seconds a problem", seconds / batch, "s")
-    bench.row(SECTION, case, solver, "problems a second", batch / seconds, "1/s")
-    _say_verdict(bench, case, solver, verdict)
-    bench.row(SECTION, case, solver, "iterations", float(solution.iterations.double().mean()))
-    return Ours(solver, batch, seconds / batch, verdict)
+    case, ours = f"{name}, B = {batch}", Ours(batch, took.each(batch), verdict)
+    _say(bench, case, "gco", ours.took, verdict, ours.per_reached)
+    bench.row(SECTION, case, "gco", "iterations", float(solution.iterations.double().mean()))
+    return ours
 
 
-def _say_compilation(bench: Bench, name: str, setup: Setup, batch: int) -> None:
-    """What the first solve takes more than the second one, which is not kept."""
-    task = setup.task(setup.layouts(batch))
-    first_time, again = (bench.timed(lambda: setup.solver.solve(task.problem, task.U0))[1] for _ in range(2))
-    bench.row(SECTION, f"{name}, B = {batch}", "gco, compiled", "compilation", max(0.0, first_time - again), "s")
-
-
-def _say_verdict(bench: Bench, case: str, solver: str, verdict: Verdict) -> None:
+def _say(bench: Bench, case: str, solver: str, took: Took, verdict: Verdict, per_reached: float) -> None:
+    bench.row(SECTION, case, solver, "seconds a problem", took.seconds, "s")
+    bench.row(SECTION, case, solver, "wall", took.wall, "s")
+    bench.row(SECTION, case, solver, "per layout reached", per_reached, "s")
     count = verdict.feasible.numel()
-    bench.row(SECTION, case, solver, "feasible", f"{int(verdict.feasible.sum())}/{count}")
-    bench.row(SECTION, case, solver, "reached", f"{int(verdict.reached.sum())}/{count}")
+    for quantity, hits in (("feasible", verdict.feasible), ("reached", verdict.reached)):
+        bench.row(SECTION, case, solver, quantity, f"{int(hits.sum())}/{count}")
+    cost = verdict.cost[verdict.reached]
+    bench.row(SECTION, case, solver, "median cost", float(cost.quantile(0.5)) if cost.numel() else "")
 
 
 def _say_peer(bench: Bench, name: str, peer: Peer) -> None:
     assert peer.verdict is not None
     case = f"{name}, first {peer.count}"
-    bench.row(SECTION, case, peer.name, "seconds a problem", peer.seconds, "s")
-    bench.row(SECTION, case, peer.name, "problems a second", 1 / peer.seconds, "1/s")
-    _say_verdict(bench, case, peer.name, peer.verdict)
+    _say(bench, case, peer.name, peer.took, peer.verdict, peer.per_reached)
     bench.row(SECTION, case, peer.name, "iterations", peer.iterations)
     bench.row(SECTION, case, peer.name, "spread", 100 * peer.spread, "%")
-    bench.row(SECTION, case, peer.name, "set-up", peer.setup_seconds, "s")
+    bench.row(SECTION, case, peer.name, "set-up", peer.setup, "s")
 
 
 def _compare(bench: Bench, name: str, ours: Ours, peer: Peer) -> None:
-    """Seconds, and costs on the layouts that both flew."""
+    """A line of ratios: seconds, and costs on the layouts that both reached."""
     assert peer.verdict is not None
-    case, told = f"{name}, B = {ours.batch}", f"{peer.name} / {ours.name}"
-    bench.row(SECTION, case, ours.name, f"seconds {peer.name} / gco", peer.seconds / ours.seconds, "", told)
+    case, told = f"{name}, B = {ours.batch}", f"{peer.name} / gco"
+    bench.row(SECTION, case, told, "seconds, ratio", peer.seconds / ours.took.seconds, "", told)
+    if int(ours.verdict.reached.sum()) > 0:
+        bench.row(SECTION, case, told, "per layout reached, ratio", peer.per_reached / ours.per_reached, "", told)
     shared = min(ours.batch, peer.count)
-    both = ours.verdict.feasible[:shared] & peer.verdict.feasible[:shared]
-    ratio = (ours.verdict.cost[:shared] / peer.verdict.cost[:shared])[both]
-    value = float(ratio.quantile(0.5)) if ratio.numel() else ""
-    bench.row(SECTION, case, ours.name, f"cost gco / {peer.name}", value, "", f"{ours.name} / {peer.name}")
+    both = ours.verdict.reached[:shared] & peer.verdict.reached[:shared]
+    ratio = (peer.verdict.cost[:shared] / ours.verdict.cost[:shared])[both]
+    bench.row(SECTION, case, told, "cost, ratio", float(ratio.quantile(0.5)) if ratio.numel() else "", "", told)

@@ -4,78 +4,92 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from statistics import mean
 
 import torch
 from torch import Tensor
 
-from benchmarks.speed.bench import Bench
-from benchmarks.speed.peers import HAVE_CASADI, Peer
+from benchmarks.speed.bench import Bench, Took
+from benchmarks.speed.peers import CasADiPeer
 from torchgco.experiments.build import Setup
-from torchgco.judge import judge
+from torchgco.judge import Verdict, judge
 from torchgco.lagrangian import Multipliers
+from torchgco.native.dispatch import engine_of
 from torchgco.scenarios import Task
 from torchgco.solution import Solution
 
 SECTION = "latency"
 SHARE = 0.15  # of the time left, what a layout may take
 
-Times = dict[tuple[str, str], list[float]]  # by start and solver
-Counts = dict[tuple[str, str], list[bool]]
+
+@dataclass
+class Flights:
+    """Of one solver, from one kind of start."""
+
+    times: list[Took] = field(default_factory=list)
+    setups: list[float] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)
+
+    def add(self, took: Took, setup: float, verdict: Verdict) -> None:
+        """One more."""
+        self.times.append(took)
+        self.setups.append(setup)
+        self.verdicts.append(verdict)
+
+    def count(self, word: str) -> str:
+        """How many are feasible, or reached."""
+        return f"{sum(int(getattr(verdict, word).sum()) for verdict in self.verdicts)}/{len(self.verdicts)}"
+
+
+AllFlights = defaultdict[tuple[str, str], Flights]  # by start and solver
 
 
 def run(bench: Bench) -> None:
+    """Layout by layout, as many as fit into the time: cold, then from what that gave."""
     setup = bench.setup("scenario=forest")
     tasks = [setup.task(setup.scenario.draw([i], setup.seed)) for i in range(bench.sizes.latency_layouts)]
-    for compiled in bench.modes():
-        with bench.mode(compiled):
-            _measure(bench, setup, tasks, "gco, compiled" if compiled else "gco")
-
-
-def _measure(bench: Bench, setup: Setup, tasks: list[Task], name: str) -> None:
-    """Layout by layout, as many as fit into the time: cold, then from what that gave."""
-    first = 0.0
-    if name != "gco":
-        first = bench.timed(lambda: setup.solver.solve(tasks[0].problem, tasks[0].U0))[1]
-    seconds, feasible, known = defaultdict(list), defaultdict(list), 0.0
+    bench.warm(setup, tasks[0])
+    flights: AllFlights = defaultdict(Flights)
+    known = 0.0
     for task in tasks:
         if not bench.fits(SECTION, "a further layout", known, SHARE):
             break
         began = time.monotonic()
-        solution = None
-        for start in ("cold", "warm"):
-            posed = task if solution is None else _next(task, solution)
-            warm = None if solution is None else _shifted(solution.multipliers)
-            peer = Peer.ready(bench, "fatrop", posed) if HAVE_CASADI else None
-            if peer is not None:
-                peer.fly(bench)
-            solution, took = bench.timed(lambda p=posed, w=warm: setup.solver.solve(p.problem, p.U0, warm=w))
-            seconds[start, name].append(took)
-            feasible[start, name].append(_is_feasible(posed, solution.U))
-            if peer is not None:
-                peer.fly(bench)
-                seconds[start, "fatrop"].append(peer.seconds)
-                feasible[start, "fatrop"].append(bool(peer.verdict.feasible.all()))
+        solution = _fly(bench, setup, task, "cold", None, flights)
+        _fly(bench, setup, _next(task, solution), "warm", _shifted(solution.multipliers), flights)
         known = time.monotonic() - began
-    _say(bench, name, seconds, feasible)
-    if name != "gco":
-        bench.row(SECTION, "cold", name, "compilation", max(0.0, first - seconds["cold", name][0]), "s")
+    _say(bench, flights)
 
 
-def _say(bench: Bench, name: str, seconds: Times, feasible: Counts) -> None:
-    for (start, solver), times in seconds.items():
-        beside = solver if solver == name or name == "gco" else f"{solver}, beside compiled"
-        bench.row(SECTION, start, beside, "mean", 1000 * mean(times), "ms")
-        bench.row(SECTION, start, beside, "longest", 1000 * max(times), "ms")
-        bench.row(SECTION, start, beside, "feasible", f"{sum(feasible[start, solver])}/{len(times)}")
-        if solver == "fatrop":
-            ratio = mean(times) / mean(seconds[start, name])
-            bench.row(SECTION, start, name, "seconds fatrop / gco", ratio, "", f"fatrop / {name}")
+def _fly(
+    bench: Bench, setup: Setup, task: Task, start: str, warm: Multipliers | None, flights: AllFlights
+) -> Solution:
+    """FATROP, `gco`, FATROP: a machine that drifts meanwhile does no harm to the ratio."""
+    peer = CasADiPeer.ready(bench, "fatrop", task)
+    peer.fly(bench)
+    setup_time = bench.timed(lambda: engine_of(task.problem))[1]
+    solution, took = bench.timed(lambda: setup.solver.solve(task.problem, task.U0, seed=setup.seed, warm=warm))
+    peer.fly(bench)
+    assert peer.verdict is not None
+    verdict = judge(task.problem, solution.U, task.goal, task.goal_radius)
+    flights[start, "gco"].add(took, setup_time.seconds, verdict)
+    flights[start, "fatrop"].add(peer.took, peer.setup, peer.verdict)
+    return solution
 
 
-def _is_feasible(task: Task, U: Tensor) -> bool:
-    return bool(judge(task.problem, U, task.goal, task.goal_radius).feasible.all())
+def _say(bench: Bench, flights: AllFlights) -> None:
+    means = {key: mean(took.seconds for took in mine.times) for key, mine in flights.items()}
+    for (start, solver), mine in flights.items():
+        bench.row(SECTION, start, solver, "mean", 1000 * means[start, solver], "ms")
+        bench.row(SECTION, start, solver, "longest", 1000 * max(took.seconds for took in mine.times), "ms")
+        bench.row(SECTION, start, solver, "mean wall", 1000 * mean(took.wall for took in mine.times), "ms")
+        bench.row(SECTION, start, solver, "set-up", 1000 * mean(mine.setups), "ms")
+        for word in ("feasible", "reached"):
+            bench.row(SECTION, start, solver, word, mine.count(word))
+        ratio = means[start, "fatrop"] / means[start, "gco"]
+        if solver == "gco":
+            bench.row(SECTION, start, solver, "seconds fatrop / gco", ratio, "", "fatrop / gco")
 
 
 def _next(task: Task, solution: Solution) -> Task:

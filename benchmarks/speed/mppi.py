@@ -10,29 +10,27 @@ from typing import Any
 import torch
 
 import torchgco
-from benchmarks.speed.bench import SEED, Bench
+from benchmarks.speed.bench import SEED, Bench, Took
 from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.draws import DrawKey
-from torchgco.rollout import open_loop
+from torchgco.native.dispatch import open_loop
 from torchgco.scenarios import Task
 
 SECTION = "mppi"
 TEMPERATURE, SIGMA, PENALTY = 1.0, 1.0, 1e8
+RATIO = "seconds pytorch-mppi / torchgco"
 HAVE_PEER = find_spec("pytorch_mppi") is not None
 
 
 def run(bench: Bench) -> None:
     setup = bench.setup("scenario=forest")
     task = setup.task(setup.layouts(1))
-    for compiled in bench.modes():
-        suffix = ", compiled" if compiled else ""
-        with bench.mode(compiled):
-            for samples in bench.sizes.samples:
-                rounds = {f"torchgco{suffix}": _ours(task, samples)}
-                if HAVE_PEER:
-                    rounds[f"pytorch-mppi{suffix}"] = _theirs(task, samples, compiled)
-                _measure(bench, samples, task.problem.N, rounds)
+    for samples in bench.sizes.samples:
+        rounds = {"torchgco": _ours(task, samples)}
+        if HAVE_PEER:
+            rounds["pytorch-mppi"] = _theirs(task, samples)
+        _measure(bench, samples, task.problem.N, rounds)
     _say_rollout(bench, task)
     if not HAVE_PEER:
         bench.row(SECTION, "any", "pytorch-mppi", "not installed", "")
@@ -41,27 +39,26 @@ def run(bench: Bench) -> None:
 def _measure(bench: Bench, samples: int, stages: int, rounds: dict[str, Callable[[], Any]]) -> None:
     """Both in turns, so that both meet the same machine; medians."""
     case = f"S = {samples}"
-    first = {name: bench.timed(work)[1] for name, work in rounds.items()}
-    times: dict[str, list[float]] = {name: [] for name in rounds}
+    for work in rounds.values():
+        work()  # traced and compiled
+    times: dict[str, list[Took]] = {name: [] for name in rounds}
     for _ in range(bench.sizes.mppi_repeats):
         for name, work in rounds.items():
             times[name].append(bench.timed(work)[1])
-    middle = {name: median(values) for name, values in times.items()}
+    middle = {name: median(took.seconds for took in values) for name, values in times.items()}
     for name, seconds in middle.items():
         bench.row(SECTION, case, name, "a round", 1000 * seconds, "ms")
+        bench.row(SECTION, case, name, "wall", 1000 * median(took.wall for took in times[name]), "ms")
         bench.row(SECTION, case, name, "sample-steps a second", samples * stages / seconds / 1e6, "millions")
-        if name.endswith("compiled"):
-            bench.row(SECTION, case, name, "compilation", max(0.0, first[name] - seconds), "s")
-    if len(middle) == 2:
-        ours, theirs = middle
-        bench.row(SECTION, case, ours, "seconds pytorch-mppi / torchgco", middle[theirs] / middle[ours], "",
-                  f"{theirs} / {ours}")  # fmt: skip
+    if HAVE_PEER:
+        ratio = middle["pytorch-mppi"] / middle["torchgco"]
+        bench.row(SECTION, case, "torchgco", RATIO, ratio, "", "pytorch-mppi / torchgco")
 
 
 def _say_rollout(bench: Bench, task: Task) -> None:
     """What our rounds spend, whatever their samples, on the mean's own rollout, which pytorch-mppi leaves out."""
-    fly = lambda: open_loop(task.problem.dynamics, task.problem.x0, task.U0)
-    times = [bench.timed(fly)[1] for _ in range(1 + bench.sizes.mppi_repeats)]
+    fly = lambda: open_loop(task.problem, task.U0)
+    times = [bench.timed(fly)[1].seconds for _ in range(1 + bench.sizes.mppi_repeats)]
     bench.row(SECTION, "rollout of the mean", "torchgco", "a round", 1000 * median(times[1:]), "ms")
 
 
@@ -75,7 +72,7 @@ def _ours(task: Task, samples: int) -> Callable[[], Any]:
     return lambda: sampler.improve(task.problem, task.U0, DrawKey(SEED, ids, ids))
 
 
-def _theirs(task: Task, samples: int, compiled: bool) -> Callable[[], Any]:
+def _theirs(task: Task, samples: int) -> Callable[[], Any]:
     """`command` of pytorch-mppi, refining the plan where it stands.
 
     Without a terminal cost, one evaluation in N: with one, it would store every state and be slower.
@@ -91,7 +88,5 @@ def _theirs(task: Task, samples: int, compiled: bool) -> Callable[[], Any]:
         u_min=bounds.lower[0].float(), u_max=bounds.upper[0].float(), u_init=model.u_ref, U_init=task.U0[0].float(),
         noise_mu=torch.zeros(m, device=device),
     )  # fmt: skip
-    if compiled:
-        controller.compile()
     x0 = task.problem.x0[0].float()
     return lambda: controller.command(x0, shift_nominal_trajectory=False)

@@ -10,11 +10,11 @@ from typing import Any
 
 import torch
 
-from benchmarks.speed.bench import Bench
+from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.sizes import Sizes
 from torchgco.experiments.build import Setup
+from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
-from torchgco.solution import Solution
 
 
 def measure(order: dict[str, Any]) -> dict[str, Any]:
@@ -25,27 +25,23 @@ def measure(order: dict[str, Any]) -> dict[str, Any]:
     if order["limited"]:
         setup = replace(setup, solver=replace(setup.solver, max_outer_iterations=2, attempts=1))
     batch = order["batch"]
-    with bench.mode(order["compiled"]):
-        _warm_up(setup, min(batch, 2))
-        held = _start_of_memory(bench.device)
-        seconds, iterations, flown = 0.0, 0, 0
-        # Few problems say little: small batches fly until as many layouts are flown as for the others.
-        while flown < max(batch, sizes.fewest_layouts):
-            problem, U0 = _problem(setup, flown, batch)
-            solution, took = bench.timed(lambda p=problem, U=U0: _solve(setup, p, U))
-            seconds, iterations, flown = seconds + took, iterations + int(solution.iterations.sum()), flown + batch
+    _warm_up(setup, min(batch, 2))
+    held = _start_of_memory(bench.device)
+    total, iterations, flown = Took(0.0, 0.0), 0, 0
+    # Few problems say little: small batches fly until as many layouts are flown as for the others.
+    while flown < max(batch, sizes.fewest_layouts):
+        problem, U0 = _problem(setup, flown, batch)
+        engine_of(problem)
+        solution, took = bench.timed(lambda p=problem, U=U0: setup.solver.solve(p, U, seed=setup.seed))
+        total, iterations, flown = total + took, iterations + int(solution.iterations.sum()), flown + batch
     peak = _peak_of_memory(bench.device)
     above = None if held is None or peak is None else max(0, peak - held)
-    return {"seconds": seconds / flown, "iterations": max(1.0, iterations / flown), "bytes": above}
+    return {"seconds": total.each(flown).seconds, "iterations": max(1.0, iterations / flown), "bytes": above}
 
 
 def _problem(setup: Setup, start: int, batch: int) -> tuple[Problem, torch.Tensor]:
     task = setup.task(setup.scenario.draw(range(start, start + batch), setup.seed))
     return task.problem, task.U0
-
-
-def _solve(setup: Setup, problem: Problem, U0: torch.Tensor) -> Solution:
-    return setup.solver.solve(problem, U0, seed=setup.seed)
 
 
 def _warm_up(setup: Setup, batch: int) -> None:

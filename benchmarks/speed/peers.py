@@ -1,22 +1,32 @@
-"""FATROP and IPOPT on the first layouts of a task, one after the other."""
+"""Other solvers on the first layouts of a task, one after the other: FATROP, IPOPT and acados.
+
+All get the problem's own model, cost and constraints, traced; all start from the vehicle at rest, or from a plan along
+the roadmap's best path, whose making is on their clock. Of what they return the controls alone count.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from benchmarks.speed.bench import Bench
+from benchmarks.speed import acados_peer
+from benchmarks.speed.bench import Bench, Took
+from torchgco.baselines import GuidedCasADi
 from torchgco.judge import Verdict, judge
+from torchgco.rollout import open_loop
 from torchgco.scenarios import Task
 
-HAVE_CASADI = find_spec("casadi") is not None
+GUIDED = "fatrop_guided"
 
 
 def first(task: Task, count: int) -> Task:
     """The first problems of a task."""
+    count = min(count, task.problem.B)
     rows = torch.arange(count, device=task.U0.device)
     return replace(
         task, problem=task.problem.take(rows), U0=task.U0[rows], goal=task.goal[rows],
@@ -25,41 +35,99 @@ def first(task: Task, count: int) -> Task:
 
 
 @dataclass
-class Peer:
+class Peer(ABC):
     """A solver made ready for a few problems; its set-up is on no clock but its own."""
 
     name: str
     task: Task
-    prepared: Any
-    setup_seconds: float
-    times: list[float] = field(default_factory=list)  # seconds a problem, of every flight
+    setup: float = 0.0  # s
+    times: list[Took] = field(default_factory=list)  # of a problem, in every flight
     verdict: Verdict | None = None
     iterations: float = 0.0
 
-    @classmethod
-    def ready(cls, bench: Bench, name: str, task: Task) -> Peer:
-        solver = bench.setup(f"solver={name}").solver
-        prepared, seconds = bench.timed(lambda: solver.prepare(task.problem))
-        return cls(name, task, prepared, seconds)
+    @abstractmethod
+    def solve(self, bench: Bench) -> tuple[Tensor, float, Took]:
+        """Controls (B, N, m) from the task's own start, mean iterations, and the time of all problems."""
 
     @property
     def count(self) -> int:
         return self.task.problem.B
 
     @property
+    def took(self) -> Took:
+        """Of a problem, the mean of all flights."""
+        return sum(self.times, Took(0.0, 0.0)).each(len(self.times))
+
+    @property
     def seconds(self) -> float:
-        """Seconds a problem, the mean of all flights."""
-        return sum(self.times) / len(self.times)
+        return self.took.seconds
 
     @property
     def spread(self) -> float:
         """Largest minus smallest of the flights' times, as a share of their mean."""
-        return (max(self.times) - min(self.times)) / self.seconds
+        times = [took.seconds for took in self.times]
+        return (max(times) - min(times)) / self.seconds
+
+    @property
+    def per_reached(self) -> float:
+        """Seconds for each layout that was reached; infinite where none was."""
+        reached = 0 if self.verdict is None else int(self.verdict.reached.sum())
+        return self.seconds * self.count / reached if reached else float("inf")
 
     def fly(self, bench: Bench) -> None:
-        """Solve all problems once more, from the vehicle at rest."""
-        solution, seconds = bench.timed(lambda: self.prepared.solve(self.task.problem, self.task.U0))
-        self.times.append(seconds / self.count)
-        self.verdict = judge(self.task.problem, solution.U, self.task.goal, self.task.goal_radius)
-        bench.say(f"  {self.name} flew {self.count}: {self.times[-1]:.3g} s a problem")
-        self.iterations = float(solution.iterations.double().mean())
+        """Solve all problems once more."""
+        U, self.iterations, took = self.solve(bench)
+        self.times.append(took.each(self.count))
+        self.verdict = judge(self.task.problem, U, self.task.goal, self.task.goal_radius)
+        bench.say(f"  {self.name} flew {self.count}: {self.times[-1].seconds:.3g} s a problem")
+
+
+@dataclass
+class CasADiPeer(Peer):
+    """FATROP or IPOPT through CasADi, as the configuration `name` has it."""
+
+    prepared: Any = None
+
+    @classmethod
+    def ready(cls, bench: Bench, name: str, task: Task) -> CasADiPeer:
+        solver = bench.setup(f"solver={name}", *_model(task)).solver
+        prepared, took = bench.timed(lambda: solver.prepare(task.problem))
+        if isinstance(solver, GuidedCasADi):
+            warm = first(task, 1)
+            solver.guess(warm.problem, warm.U0)  # what it compiles
+        return cls(name, task, took.seconds, prepared=prepared)
+
+    def solve(self, bench: Bench) -> tuple[Tensor, float, Took]:
+        solution, took = bench.timed(lambda: self.prepared.solve(self.task.problem, self.task.U0))
+        return solution.U, float(solution.iterations.double().mean()), took
+
+
+@dataclass
+class AcadosPeer(Peer):
+    """acados in an environment of its own, from the vehicle at rest or from the guess of `fatrop_guided`."""
+
+    folder: Path = Path()  # where it writes and compiles
+    guided: GuidedCasADi | None = None
+
+    @classmethod
+    def ready(cls, bench: Bench, name: str, task: Task, folder: Path) -> AcadosPeer:
+        guided = bench.setup(f"solver={GUIDED}", *_model(task)).solver if name.endswith("guided") else None
+        return cls(name, task, folder=folder / name, guided=guided)
+
+    def solve(self, bench: Bench) -> tuple[Tensor, float, Took]:
+        problem, U, took = self.task.problem, self.task.U0, Took(0.0, 0.0)
+        if self.guided is not None:
+            guided = self.guided
+            guess, took = bench.timed(lambda: guided.guess(problem, self.task.U0))
+            U = guess.U
+        X = open_loop(problem.dynamics, problem.x0, U)
+        X = torch.where(torch.isfinite(X), X, problem.x0.unsqueeze(1))
+        answer = acados_peer.fly(problem, X, U, self.folder)
+        self.setup = self.setup or answer.setup
+        own = Took(float(answer.processor.sum()), float(answer.wall.sum()))
+        return answer.U, float(answer.iterations.mean()), took + own
+
+
+def _model(task: Task) -> tuple[str, ...]:
+    """The override that composes a solver's settings for the task's model."""
+    return ("model=planar", "scenario=planar_trap") if task.layouts.dimension == 2 else ()

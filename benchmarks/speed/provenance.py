@@ -16,6 +16,8 @@ def provenance(device: str) -> dict[str, str]:
     """What every row of a run carries, by column."""
     import torch
 
+    from benchmarks.speed import acados_peer
+
     graphics = torch.cuda.get_device_name() if device == "cuda" else ""
     return {
         "date": date.today().isoformat(),
@@ -24,6 +26,7 @@ def provenance(device: str) -> dict[str, str]:
         "torch": torch.__version__,
         "casadi": _version("casadi"),
         "pytorch_mppi": _version("pytorch-mppi"),
+        "acados": acados_peer.version(),
         "threads": str(torch.get_num_threads()),
         "device": device,
     }

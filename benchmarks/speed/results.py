@@ -9,7 +9,7 @@ from pathlib import Path
 Row = dict[str, str]
 
 MEASURED = ("section", "case", "solver", "quantity", "value", "unit", "ratio")
-COLUMNS = (*MEASURED, "date", "commit", "processor", "torch", "casadi", "pytorch_mppi", "threads", "device")
+COLUMNS = (*MEASURED, "date", "commit", "processor", "torch", "casadi", "pytorch_mppi", "acados", "threads", "device")
 
 
 class Results:
@@ -48,11 +48,11 @@ class Results:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The rows of a kept file, none where there is none."""
+    """The rows of a kept file, none where there is none; a column that it doesn't have is empty."""
     if not path.is_file():
         return []
     with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+        return [{column: row.get(column, "") for column in COLUMNS} for row in csv.DictReader(file)]
 
 
 def _write(path: Path, rows: list[Row]) -> None:

@@ -1,4 +1,4 @@
-"""Where the time of a `gco` solve goes: timers around the kernels, each leaving out what it calls."""
+"""Where the time of a `gco` solve goes: by phase of the method, and in each by function of the native libraries."""
 
 from __future__ import annotations
 
@@ -11,66 +11,80 @@ from functools import wraps
 from typing import Any
 
 from benchmarks.speed.bench import Bench
+from benchmarks.speed.families import FAMILIES
 
 SECTION = "share"
 
-# Share, and the functions (module, then attributes) whose own time it is.
-KERNELS = {
-    "inner solves": ("torchgco.native.engine:Engine.iterate", "torchgco.solvers.iteration:EagerIterations.run"),
-    "rollouts and values": ("torchgco.native.engine:Engine.open_loop", "torchgco.native.engine:Engine.value"),
-    "gains and optimality": ("torchgco.solvers.batch:optimality",),
-    "sampling": ("torchgco.guidance.mppi:MPPI.improve",),
-    "roadmap": ("torchgco.guidance.roadmap:Roadmap.ways",),
-    "rest of the candidates": ("torchgco.guidance.detour:Detour.propose",),
-    "outer updates": ("torchgco.solvers.batch:Loop._end_inner",),
+# A phase lasts while its function (module:attributes) runs, but for the phases inside it; the rest is the outer loop.
+PHASES = {
+    "paths sought": "torchgco.guidance.roadmap:Roadmap.ways",
+    "paths followed": "torchgco.guidance.detour:Detour._follow",
+    "plans settled": "torchgco.guidance.detour:Detour._settle",
+    "finalists solved": "torchgco.guidance.detour:Detour._refine",
+    "rest of the proposal": "torchgco.guidance.detour:Detour.propose",
+    "plans sampled": "torchgco.guidance.mppi:MPPI.improve",
+    "set-up": "torchgco.native.engine:Engine.__init__",
 }
+OUTER = "outer loop"
+# What calls the libraries: the name of the function is its first argument's, or the one after the object.
+CALLS = ("torchgco.native.engine:run", "torchgco.native.sampler:run")
+PYTHON = "Python and PyTorch"
 
 
 class Shares:
-    """Seconds by name, each without those of the timers inside it."""
+    """Seconds by phase and native function, each without those of the timers inside it; and calls of the latter."""
 
     def __init__(self, wait: Callable[[], None]) -> None:
-        self.seconds: Counter[str] = Counter()
+        self.seconds: Counter[tuple[str, str]] = Counter()
+        self.calls: Counter[str] = Counter()
         self.wait = wait
-        self.open: list[str] = []
+        self.open = [(OUTER, PYTHON)]
         self.since = 0.0
 
-    def switch(self) -> None:
-        """Book the time since the last switch on the timer that ran."""
+    def begin(self, phase: str | None, function: str) -> None:
+        """Book the time until now, and what follows on this pair; no phase: that which runs."""
+        self._book()
+        self.open.append((phase or self.open[-1][0], function))
+
+    def end(self) -> None:
+        """Go on with what ran before."""
+        self._book()
+        self.open.pop()
+
+    def _book(self) -> None:
         self.wait()
-        now = time.perf_counter()
-        if self.open:
-            self.seconds[self.open[-1]] += now - self.since
+        now = time.process_time()
+        self.seconds[self.open[-1]] += now - self.since
         self.since = now
 
-    def around(self, name: str, work: Callable[..., Any]) -> Callable[..., Any]:
-        """The same function with a timer."""
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Timers in the place of all functions, for a while."""
+        originals = []
+        places = [(place, phase) for phase, place in PHASES.items()] + [(place, None) for place in CALLS]
+        for place, phase in places:
+            holder, attribute = _find(place)
+            originals.append((holder, attribute, getattr(holder, attribute)))
+            setattr(holder, attribute, self._around(originals[-1][2], phase))
+        self.since = time.process_time()
+        try:
+            yield
+            self._book()
+        finally:
+            for holder, attribute, function in reversed(originals):
+                setattr(holder, attribute, function)
 
+    def _around(self, work: Callable[..., Any], phase: str | None) -> Callable[..., Any]:
         @wraps(work)
         def timed(*args: Any, **kwargs: Any) -> Any:
-            self.switch()
-            self.open.append(name)
+            self.begin(phase, PYTHON if phase else args[0].__name__)
+            self.calls[self.open[-1][0]] += phase is None
             try:
                 return work(*args, **kwargs)
             finally:
-                self.switch()
-                self.open.pop()
+                self.end()
 
         return timed
-
-    @contextmanager
-    def installed(self) -> Iterator[None]:
-        """Timers in the place of all kernels, for a while."""
-        originals = []
-        for name, places in KERNELS.items():
-            for holder, attribute in map(_find, places):
-                originals.append((holder, attribute, getattr(holder, attribute)))
-                setattr(holder, attribute, self.around(name, originals[-1][2]))
-        try:
-            yield
-        finally:
-            for holder, attribute, function in originals:
-                setattr(holder, attribute, function)
 
 
 def _find(place: str) -> tuple[Any, str]:
@@ -84,18 +98,30 @@ def _find(place: str) -> tuple[Any, str]:
 
 
 def run(bench: Bench) -> None:
-    setup = bench.setup("scenario=forest")
-    task = setup.task(setup.layouts(bench.sizes.share_batch))
-    case = f"forest, B = {bench.sizes.share_batch}"
-    for compiled in bench.modes():
-        name = "gco, compiled" if compiled else "gco"
-        solve = lambda: setup.solver.solve(task.problem, task.U0, seed=setup.seed)
-        with bench.mode(compiled):
-            if compiled:
-                solve()
-            shares = Shares(bench.wait)
-            with shares.installed():
-                seconds = bench.timed(shares.around("rest", solve))[1]
-        for kernel in (*KERNELS, "rest"):
-            bench.row(SECTION, case, name, kernel, 100 * shares.seconds[kernel] / seconds, "%")
-        bench.row(SECTION, case, name, "seconds a problem", seconds / bench.sizes.share_batch, "s")
+    large = bench.sizes.share_batch
+    for name, batch in (("forest30", large), ("forest30", 1), ("planar_trap", large)):
+        _measure(bench, name, batch)
+
+
+def _measure(bench: Bench, name: str, batch: int) -> None:
+    """One solve of problems that are new to a process that has solved others."""
+    setup = bench.setup(*FAMILIES[name])
+    bench.warm(setup, setup.task(setup.scenario.draw([batch, batch + 1], setup.seed)))
+    task = setup.task(setup.layouts(batch))
+    shares = Shares(bench.wait)
+    with shares.running():
+        setup.solver.solve(task.problem, task.U0, seed=setup.seed)
+    case, total = f"{name}, B = {batch}", sum(shares.seconds.values())
+    functions = [f for f in dict.fromkeys(f for _, f in shares.seconds) if f != PYTHON]
+    for phase in ("all", *PHASES, OUTER):  # the line of all first: it has all columns
+        own = {f: s for (p, f), s in shares.seconds.items() if p == phase}
+        if phase == "all":
+            own = {f: sum(s for (_, g), s in shares.seconds.items() if g == f) for f in (*functions, PYTHON)}
+        for function in (*functions, PYTHON):
+            if function in own:
+                bench.row(SECTION, case, phase, function, 100 * own[function] / total, "%")
+        if own:
+            bench.row(SECTION, case, phase, "sum", 100 * sum(own.values()) / total, "%")
+            calls = shares.calls[phase] if phase != "all" else shares.calls.total()
+            bench.row(SECTION, case, phase, "native calls", calls)
+            bench.row(SECTION, case, phase, "a problem", 1000 * sum(own.values()) / batch, "ms")

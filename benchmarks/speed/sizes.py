@@ -4,19 +4,33 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+EVERY = ("forest30", "forest60", "walls", "planar_trap", "planar_random")
+
 
 @dataclass(frozen=True)
 class Sizes:
     """Numbers of problems, samples and stages of every section."""
 
     # families
-    families: tuple[str, ...] = ("forest30", "forest60", "planar_trap", "planar_random")
-    family_batches: tuple[int, ...] = (32, 256)
-    fatrop_layouts: int = 16  # the first of the same layouts
+    families: tuple[str, ...] = EVERY
+    family_batch: int = 32
+    large_batch: int | None = 256  # forests alone
+    layouts: int = 32  # the first of the same layouts, flown by each peer but:
+    slow_layouts: int = 12  # where FATROP takes a second or more
+    slow_families: tuple[str, ...] = ("walls", "planar_random")
     ipopt_layouts: int = 4
+    ipopt_families: tuple[str, ...] = ("forest30", "planar_trap")
+    # latency
+    latency_layouts: int = 16
+    # own_model
+    own_layouts: int = 32
+    # paper
+    paper_layouts: int = 8
+    # first_use
+    models: int = 4
     # batch
-    whole_batches: tuple[int, ...] = (1, 4, 16, 64)
-    limited_batches: tuple[int, ...] = (1, 4, 16, 64, 256, 1024, 4096)
+    whole_batches: tuple[int, ...] = (1, 8, 64)
+    limited_batches: tuple[int, ...] = (1, 16, 256, 2048)
     fewest_layouts: int = 8  # batches smaller than this fly several times, until so many layouts are flown
     # growth
     growth_batch: int = 16
@@ -25,18 +39,15 @@ class Sizes:
     # mppi
     samples: tuple[int, ...] = (1000, 4000, 16384)
     mppi_repeats: int = 5
-    # latency
-    latency_layouts: int = 5
     # share
-    share_batch: int = 64
+    share_batch: int = 32
     # all sections
     num_stages: int | None = None  # None: as the scenario says
     inner_iterations: int | None = None  # None: as the solver says
 
 
 QUICK = Sizes(
-    families=("forest30", "planar_trap"), family_batches=(8, 32), fatrop_layouts=8, ipopt_layouts=2,
-    whole_batches=(1, 8), limited_batches=(1, 8, 64, 256), fewest_layouts=2,
-    growth_batch=8, stages=(50, 100, 200), obstacles=(10, 30, 100),
-    samples=(1000, 4000), mppi_repeats=3, latency_layouts=2, share_batch=16,
+    family_batch=4, large_batch=8, layouts=2, slow_layouts=1, ipopt_layouts=1, latency_layouts=2, own_layouts=4,
+    paper_layouts=2, models=1, whole_batches=(1, 8), limited_batches=(1, 64), fewest_layouts=2,
+    growth_batch=8, stages=(50, 100), obstacles=(10, 30), samples=(1000,), mppi_repeats=3, share_batch=8,
 )  # fmt: skip

@@ -12,16 +12,27 @@ NO_GPU = "No GPU was at hand: `make benchmark-gpu` measures `families`, `batch` 
 
 # What stands above each section's table, in the order of the file.
 WORDS = {
+    "targets": "The goals of the native kernels, and what the sections below measured. `n x`: how many times as\n"
+    "fast, in processor seconds with set-up apart.",
     "families": "Drawn layouts (seed 1000). The peers fly the first of the same layouts, before and after `gco`;\n"
-    "spread is the difference of the two times. Costs are compared where both are feasible, by the median.",
+    "spread is the difference of the two times, wall the time by the clock. `fatrop_guided` and `acados_guided` start\n"
+    "from a plan along the roadmap's best path, whose making counts, all others from the vehicle at rest. Ratios are\n"
+    "peer / `gco`: of seconds for a problem and for a layout reached, and of costs, the median where both arrive.",
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
-    "plan that is left, `gco` from its multipliers as well.",
+    "plan that is left, `gco` from its multipliers as well. Set-up is apart: `gco` traces the model and finds its\n"
+    "kernels, FATROP's program is written down.",
+    "own_model": "A user's unicycle (4 states, 2 controls, a Python function, RK4), 100 stages, five discs,\n"
+    "`torchgco.solve` without options.",
+    "paper": "The paper's planar problem by the paper's method: a thousand stages, three circles, own random draws.",
+    "mppi": "One round of white noise around the hover, 30 spheres, float32, B = 1; medians of rounds in turns.",
+    "first_use": "A first solve in a new process: the model traced, differentiated, written out as C and compiled,\n"
+    "and what the first solve takes more than the second, in processor seconds, the compiler's included.",
+    "share": "Processor time of one solve, in percent: a line a phase of the method, a column a function of the\n"
+    "native library that it calls. The problems are new to a process that has solved others.",
     "batch": "Forests of 30 spheres. `2 outer` ends every element after two outer iterations. Memory is the peak of a\n"
     "process of its own above what it held before the problems were made.",
-    "mppi": "One round of white noise around the hover, 30 spheres, float32, B = 1; medians of rounds in turns.",
     "growth": "`al_ilqr`, line search included. Quadrotor (n = 14), 100 stages, 30 spheres but for what is named;\n"
     "more stages cut the same 5 s finer, more spheres fill the same region. The planar vehicle has n = 6.",
-    "share": "Timers around the kernels of one solve; each leaves out the kernels that it calls.",
 }
 
 
@@ -74,7 +85,8 @@ def _source(row: Row) -> str:
     where = "one core, one thread" if row["device"] == "cpu" else "one GPU"
     return (
         f"Measured on {row['date']} at commit {row['commit']}, {row['processor']}, {where}; torch {row['torch']}, "
-        f"CasADi {row['casadi']}, pytorch-mppi {row['pytorch_mppi']}."
+        f"CasADi {row['casadi']}, pytorch-mppi {row['pytorch_mppi']}, acados (comma-deps-acados) "
+        f"{row['acados'] or 'not installed'}."
     )
 
 

@@ -1,0 +1,158 @@
+"""acados as a peer: the problem's own model, cost and constraints, solved in an environment of acados' own.
+
+The expressions are those that FATROP gets (`torchgco.baselines.nlp`), as instructions in a file: two versions of CasADi
+read each other's files no other way.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.baselines.nlp import Program, transcribe
+from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.problem import Problem
+from torchgco.shapes import InputError
+
+ENVIRONMENT = Path(__file__).resolve().parents[2] / ".venv-acados"  # made by `make`
+WORKER = Path(__file__).with_name("acados_worker.py")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What acados found for B problems. Times leave out set-up and the setting of a problem's numbers."""
+
+    U: Tensor  # (B, N, m)
+    status: np.ndarray  # (B,): 0 converged, 2 out of iterations, 4 no solution of a quadratic program
+    iterations: np.ndarray  # (B,), of SQP
+    wall: np.ndarray  # (B,), s
+    processor: np.ndarray  # (B,), s
+    setup: float  # s: code generated and compiled
+
+
+def version() -> str:
+    """Of the wheel that is installed here, or that none is."""
+    found = ENVIRONMENT.glob("lib/python*/site-packages/comma_deps_acados-*.dist-info")
+    return next((path.name.removesuffix(".dist-info").split("-")[1] for path in found), "not installed")
+
+
+def installed() -> bool:
+    """Whether acados has an environment here."""
+    return version() != "not installed"
+
+
+def fly(problem: Problem, X: Tensor, U: Tensor, folder: Path) -> Answer:
+    """Solve all problems, one after the other, from the guesses X (B, N+1, n) and U (B, N, m).
+
+    Raises:
+        InputError: a problem that can't be written down for acados.
+        RuntimeError: acados ended before its time; the message is its own.
+    """
+    write(problem, X, U, folder)
+    python = str(ENVIRONMENT / "bin" / "python")
+    done = subprocess.run([python, str(WORKER), str(folder)], capture_output=True, text=True)
+    if done.returncode != 0 or not (folder / "answer.npz").is_file():
+        raise RuntimeError(f"acados ended with {done.returncode}: {(done.stdout + done.stderr)[-2000:]}")
+    return read(folder)
+
+
+def read(folder: Path) -> Answer:
+    """The worker's answer."""
+    with np.load(folder / "answer.npz") as file:
+        found = dict(file)
+    return Answer(torch.from_numpy(found.pop("U")), setup=float(found.pop("setup")), **found)
+
+
+def write(problem: Problem, X: Tensor, U: Tensor, folder: Path) -> None:
+    """The problems as the worker reads them (its docstring says how).
+
+    Raises:
+        InputError: a cost that isn't a diagonal quadratic one, bounds on states, rows that differ from knot to knot.
+    """
+    program = transcribe(problem)
+    B, N, n, m = problem.B, problem.N, problem.n, problem.m
+    p = np.stack([program.values(problem, b) for b in range(B)])
+    bounds = np.stack([np.stack(program.limits.bounds(p[b], N * (n + m) + n)) for b in range(B)])
+    stages = bounds[:, :, : N * (n + m)].reshape(B, 2, N, n + m)
+    if np.isfinite(stages[..., :n]).any() or np.isfinite(bounds[:, :, -n:]).any():
+        raise InputError("constraints", "no bounds on states, for acados", "some")
+    if not np.isfinite(stages[..., n:]).all():
+        raise InputError("constraints", "bounds on all controls, for acados", "some without")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "answer.npz").unlink(missing_ok=True)
+    (folder / "form.json").write_text(json.dumps(_form(problem, program)))
+    lower, upper = stages[:, 0, :, n:], stages[:, 1, :, n:]
+    np.savez(
+        folder / "problems.npz", p=p, x0=problem.x0.numpy(), lower=lower, upper=upper, X=X.numpy(), U=U.numpy(),
+        **_cost(problem),
+    )  # fmt: skip
+
+
+def _cost(problem: Problem) -> dict[str, np.ndarray]:
+    cost, B = problem.cost, problem.B
+    if not isinstance(cost, BoundQuadratic) or not cost.diagonal or not cost.is_autonomous:
+        raise InputError("cost", "a diagonal quadratic cost, the same at all stages, for acados", type(cost).__name__)
+    if not all(part is None for part in (cost.q, cost.r, cost.qf)):
+        raise InputError("cost", "no linear terms, for acados", "some")
+    of_all = lambda x, u: torch.cat((x[:, 0].expand(B, -1), u[:, 0].expand(B, -1)), dim=-1).numpy()
+    return {
+        "weight": of_all(cost.Q, cost.R),
+        "reference": of_all(cost.x_ref, cost.u_ref),
+        "last_weight": cost.Qf.expand(B, -1).numpy(),
+        "last_reference": cost.xf_ref.expand(B, -1).numpy(),
+    }
+
+
+def _form(problem: Problem, program: Program) -> dict[str, Any]:
+    """Sizes, and the functions of one stage and of the last knot."""
+    N, n, m = problem.N, problem.n, problem.m
+    first = program.path_rows[0] > n
+    knots = [_knot(program, k, n, m, N) for k in range(N + 1)]
+    middle = instructions("rows", knots[N // 2])
+    same = all(instructions("rows", knots[k])["steps"] == middle["steps"] for k in (1, N - 1))
+    if first or not same or len(set(program.path_rows[1:-1])) > 1:
+        raise InputError("constraints", "the same ones at all knots but the first, for acados", "others")
+    at = (n + m) * (N // 2)
+    x, u, after = (program.variables[at + a : at + b] for a, b in ((0, n), (n, n + m), (n + m, n + m + n)))
+    step = ca.substitute(-program.rows[sum(program.path_rows[: N // 2]) + n * (N // 2) :][:n], after, ca.SX.zeros(n))
+    flags = np.asarray(program.equality)
+    ends = np.cumsum(program.path_rows) + n * np.minimum(np.arange(1, N + 2), N)
+    equality = [flags[end - count : end].tolist() for end, count in zip(ends, program.path_rows, strict=True)]
+    return {
+        "N": N, "n": n, "m": m,
+        "step": instructions("step", ([x, u, program.parameters], step)),
+        "rows": middle, "equality": equality[N // 2],
+        "last_rows": instructions("last_rows", knots[N]), "last_equality": equality[N],
+    }  # fmt: skip
+
+
+def _knot(program: Program, k: int, n: int, m: int, N: int) -> tuple[list[ca.SX], ca.SX]:
+    """Variables of knot k, and its rows beside the step."""
+    at, end = k * (n + m), sum(program.path_rows[: k + 1]) + n * min(k + 1, N)
+    u = program.variables[at + n : at + n + m] if k < N else ca.SX.sym("none", m)
+    rows = program.rows[end - program.path_rows[k] : end]
+    return [program.variables[at : at + n], u, program.parameters], rows
+
+
+def instructions(name: str, function: tuple[list[ca.SX], ca.SX]) -> dict[str, Any]:
+    """A function of scalar expressions as the list of what it does: operation, places written and read, constant."""
+    inputs, result = function
+    names = {getattr(ca, word): word for word in dir(ca) if word.startswith("OP_")}
+    f = ca.Function(name, inputs, [ca.densify(result)])
+    steps = [
+        (names[f.instruction_id(k)], f.instruction_output(k), f.instruction_input(k), _constant(f, k))
+        for k in range(f.n_instructions())
+    ]
+    return {"work": f.sz_w(), "rows": result.numel(), "steps": steps}
+
+
+def _constant(function: ca.Function, k: int) -> float | None:
+    return function.instruction_constant(k) if function.instruction_id(k) == ca.OP_CONST else None

@@ -1,0 +1,78 @@
+"""The first solve of a process: `first_use` starts this with a cache folder of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+import torchgco
+from torchgco import presets
+from torchgco.native.dispatch import engine_of
+from torchgco.problem import Problem
+
+MODELS = {
+    "Planar": lambda: torchgco.Planar(dt=0.05),
+    "QuadrotorPlanning": lambda: torchgco.QuadrotorPlanning(dt=0.05),
+    "QuadrotorPlant": lambda: torchgco.QuadrotorPlant(dt=0.05),
+    "RotorTracking": lambda: torchgco.RotorTracking(dt=0.05),
+}
+
+
+def measure(name: str) -> dict[str, float]:
+    """Seconds of the processor, compilers that it starts included, and those by the clock on the wall."""
+    problem = _problem(name)
+    solver = replace(presets.gco(problem), max_outer_iterations=2, attempts=1)
+    engine = _took(lambda: engine_of(problem))
+    first, again = (_took(lambda: solver.solve(problem, _controls(problem))) for _ in range(2))
+    rest = [max(0.0, a - b) for a, b in zip(first, again, strict=True)]
+    return {
+        "kernels": engine[0],
+        "more by the first solve": rest[0],
+        "both": engine[0] + rest[0],
+        "both, wall": engine[1] + rest[1],
+    }
+
+
+def _problem(name: str) -> Problem:
+    """At rest, with an obstacle beside the way where there is space for one."""
+    dynamics = MODELS[name]()
+    n, m, at = dynamics.n, dynamics.m, dynamics.position
+    x0 = torch.zeros(1, n, dtype=torch.float64)
+    if n > 9:
+        x0[:, 6] = 1.0  # upright
+    goal = x0.clone()
+    constraints: list = [torchgco.ControlBounds([-5.0] * m, [15.0] * m)]
+    if at is not None:
+        d = at.stop - at.start
+        goal[:, at.start] = 3.0
+        constraints.insert(0, torchgco.Spheres([[1.5] + [0.1] * (d - 1)], [0.3], 0.1))
+    cost = torchgco.QuadraticCost(Q=[1.0] * n, R=[0.1] * m, Qf=[10.0] * n, x_ref=goal.unsqueeze(1))
+    return Problem(dynamics, cost, constraints, x0, 40)
+
+
+def _controls(problem: Problem) -> torch.Tensor:
+    return problem.x0.new_zeros(1, problem.N, problem.m)
+
+
+def _took(work: Callable) -> tuple[float, float]:
+    """Seconds of the processor, and by the clock on the wall."""
+    before, wall = _processor(), time.perf_counter()
+    work()
+    return _processor() - before, time.perf_counter() - wall
+
+
+def _processor() -> float:
+    """Of this process and of those that it has started and that have ended."""
+    times = os.times()
+    return time.process_time() + times.children_user + times.children_system
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    print(json.dumps(measure(sys.argv[1])))

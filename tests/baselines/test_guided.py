@@ -1,0 +1,92 @@
+"""FATROP from a path's plan: around the trap, its own in any batch, and plain FATROP where there is no path."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.problems import planar_batch
+from torchgco import ControlBounds, InputError, Problem, Status, judge
+from torchgco.baselines import CasADiSolver, GuidedCasADi
+from torchgco.experiments.build import compose
+from torchgco.guidance import Detour, Roadmap
+
+GUIDED = GuidedCasADi(detour=Detour(Roadmap(nodes=32, spread=16), ways=2, settle=0, depth=1.0, iterations=10))
+
+
+def test_the_trap_is_left_along_the_path() -> None:
+    """From rest both end in the trap; the path leads both out of it."""
+    setups = [
+        compose(["scenario=planar_trap", "model=planar", "seed=1000", f"solver={name}"])
+        for name in ("fatrop", "fatrop_guided")
+    ]
+    task = setups[0].task(setups[0].layouts(2))
+    reached = []
+    for setup in setups:
+        solution = setup.solver.solve(task.problem, task.U0)
+        reached.append(judge(task.problem, solution.U, task.goal, task.goal_radius).reached.tolist())
+    assert reached == [[False, False], [True, True]]
+    followed = setup.solver.guess(task.problem, task.U0)
+    alone = setups[0].solver.solve(task.problem, followed.U)
+    assert torch.equal(solution.U, alone.U) and bool((followed.iterations > 0).all())
+    assert torch.equal(solution.iterations, followed.iterations + alone.iterations)
+    assert solution.guided.tolist() == [1, 1] and float(solution.violation.max()) < 1e-3
+
+
+def test_companions_change_nothing() -> None:
+    problem, U0 = planar_batch(B=3, N=30, obstacles=3, seed=2)
+    whole = GUIDED.solve(problem, U0)
+    for rows in ([1], [2, 0]):
+        index = torch.tensor(rows)
+        alone = GUIDED.solve(problem.take(index), U0[index])
+        assert torch.equal(alone.U, whole.U[index]) and torch.equal(alone.status, whole.status[index])
+
+
+def test_without_a_path_it_is_fatrop() -> None:
+    """Nothing to go around: the given guess, to the bit."""
+    plain, U0 = planar_batch(B=2, N=20)
+    problem = Problem(plain.dynamics, plain.cost, [ControlBounds([-9.0] * 2, [9.0] * 2)], plain.x0, 20)
+    guided, alone = GUIDED.solve(problem, U0), CasADiSolver("fatrop").solve(problem, U0)
+    assert torch.equal(guided.U, alone.U) and guided.guided.tolist() == [0, 0]
+
+
+def test_a_bad_start_is_one_problem_s_own() -> None:
+    problem, U0 = planar_batch(B=4, N=12, obstacles=2, seed=1)
+    x0 = problem.x0.clone()
+    x0[1, 0] = torch.nan
+    x0[2, :2] = problem.constraints[0].centers[2, 0]
+    bad = Problem(problem.dynamics, problem.cost, problem.constraints, x0, problem.N)
+    told = []
+    solution = GUIDED.solve(bad, U0, callback=told.append)
+    assert solution.statuses == [Status.CONVERGED, Status.NON_FINITE, Status.INVALID_START, Status.CONVERGED]
+    good = GUIDED.solve(problem, U0)
+    assert torch.equal(solution.U[[0, 3]], good.U[[0, 3]]) and solution.guided.tolist() == [1, 0, 0, 1]
+    assert [p.finished for p in told] == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    "change", [dict(solver=CasADiSolver("ipopt")), dict(detour=replace(GUIDED.detour, end=0.5, iterations=1))]
+)
+def test_every_option_is_read(change: dict) -> None:
+    problem, U0 = planar_batch(B=1, N=15, obstacles=3, seed=1)
+    one, other = (solver.solve(problem, U0) for solver in (GUIDED, replace(GUIDED, **change)))
+    assert not torch.equal(one.U, other.U)
+
+
+@pytest.mark.parametrize("model", ["scenario=planar_trap model=planar", "scenario=forest model=quadrotor"])
+def test_the_configuration_serves_every_model(model: str) -> None:
+    """FATROP is that of the configuration `fatrop`, and what is followed that of `gco`, but for few ways."""
+    solvers = [compose([*model.split(), f"solver={name}"]).solver for name in ("fatrop_guided", "fatrop", "gco")]
+    guided, fatrop, gco = solvers
+    detour = gco.guidance.detour
+    assert guided.solver == fatrop and guided.detour.roadmap == detour.roadmap
+    own = dict(ways=4, keep=None, pushes=(), end=detour.ends[0], settle=guided.detour.settle, depth=1.0, finalists=1)
+    assert guided.detour == replace(detour, **own)
+
+
+def test_bad_calls_are_named() -> None:
+    problem, U0 = planar_batch(B=2, N=5)
+    with pytest.raises(InputError, match="U0"):
+        GUIDED.solve(problem, U0[:, :3])
+    with pytest.raises(InputError, match="pushes"):
+        replace(GUIDED, detour=replace(GUIDED.detour, pushes=((1.0, 0.0, 0.0),))).prepare(problem)

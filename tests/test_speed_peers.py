@@ -1,0 +1,144 @@
+"""acados as a peer: what its worker is told says what the problem says, and what it answers is judged like the rest."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.speed import acados_peer, acados_worker, families
+from benchmarks.speed.bench import Bench
+from benchmarks.speed.peers import AcadosPeer
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.results import Results
+from tests.problems import planar_batch, quadrotor_batch
+from tests.test_benchmarks import TINY
+from torchgco import ControlBounds, InputError, Problem, QuadraticCost, StateBounds
+from torchgco.baselines import CasADiSolver
+from torchgco.rollout import open_loop
+
+needs_acados = pytest.mark.skipif(not acados_peer.installed(), reason="acados isn't installed: `make benchmark` does")
+
+
+def told(folder: Path) -> tuple[dict, dict[str, np.ndarray]]:
+    with np.load(folder / "problems.npz") as file:
+        return json.loads((folder / "form.json").read_text()), dict(file)
+
+
+def guess(problem: Problem, U: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    return open_loop(problem.dynamics, problem.x0, U), U
+
+
+def test_instructions_say_what_the_function_says() -> None:
+    x, p = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
+    result = ca.vertcat(
+        ca.sin(x[0]) * p[1] - 2.5,
+        ca.if_else(x[1] > 0, x[1] ** 2, ca.exp(x[2])),
+        ca.fmin(x[0], ca.atan2(x[1], p[0])),
+        7.0,
+    )
+    plain = json.loads(json.dumps(acados_peer.instructions("f", ([x, p], result))))
+    again = ca.Function("f", [x, p], [acados_worker.replay(plain, x, p)])
+    for point in np.random.default_rng(0).normal(size=(5, 5)):
+        expected = ca.Function("f", [x, p], [result])(point[:3], point[3:])
+        assert np.array_equal(again(point[:3], point[3:]), expected)
+
+
+@pytest.mark.parametrize("batch", [planar_batch, quadrotor_batch])
+def test_the_worker_is_told_the_problem(batch, tmp_path: Path) -> None:
+    """Step, rows, cost and bounds at random points, against those of the problem in PyTorch."""
+    problem, U0 = batch(B=2, N=10)
+    acados_peer.write(problem, *guess(problem, U0), tmp_path)
+    form, numbers = told(tmp_path)
+    n, m = problem.n, problem.m
+    draw = torch.Generator().manual_seed(1)
+    X = problem.x0.unsqueeze(1) + torch.randn(2, problem.N + 1, n, generator=draw, dtype=torch.float64)
+    U = torch.randn(2, problem.N, m, generator=draw, dtype=torch.float64)
+    spheres, bounds = problem.constraints
+    rows = spheres.value(X, U).numpy()
+    symbols = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", numbers["p"].shape[1])
+    step, stage, last = (
+        ca.Function(word, symbols, [acados_worker.replay(form[word], *symbols)])
+        for word in ("step", "rows", "last_rows")
+    )
+    for b in range(2):
+        x, u, p = X[b, 3].numpy(), U[b, 3].numpy(), numbers["p"][b]
+        after = problem.dynamics.step(X[:, 3], U[:, 3])[b]
+        np.testing.assert_allclose(np.ravel(step(x, u, p)), after, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(np.ravel(stage(x, u, p)), rows[b, 3 - spheres.knots.start], rtol=1e-10)
+        np.testing.assert_allclose(np.ravel(last(X[b, -1].numpy(), u, p)), rows[b, -1], rtol=1e-10)
+        z = np.concatenate((x, u))
+        cost = 0.5 * (numbers["weight"][b] * (z - numbers["reference"][b]) ** 2).sum()
+        np.testing.assert_allclose(cost, problem.cost.stage(X[:, 3], U[:, 3], 3)[b], rtol=1e-12)
+        end = 0.5 * (numbers["last_weight"][b] * (X[b, -1].numpy() - numbers["last_reference"][b]) ** 2).sum()
+        np.testing.assert_allclose(end, problem.cost.terminal(X[:, -1])[b], rtol=1e-12)
+    assert form["equality"] == form["last_equality"] == [False] * rows.shape[-1]
+    for side in ("lower", "upper"):
+        np.testing.assert_allclose(numbers[side], getattr(bounds, side).expand(2, problem.N, m))
+
+
+def refused(problem: Problem, U0: torch.Tensor, folder: Path) -> None:
+    acados_peer.write(problem, *guess(problem, U0), folder)
+
+
+def test_what_acados_is_not_told_is_named(tmp_path: Path) -> None:
+    plain, U0 = planar_batch(B=2, N=8)
+    spheres, bounds = plain.constraints
+    some = ControlBounds([-9.0, -9.0], [9.0, 9.0], knots=[1, 2])
+    linear = QuadraticCost(Q=[1.0] * 6, R=[0.1] * 2, Qf=[9.0] * 6, q=[1.0] * 6)
+    for cost, constraints, field in (
+        (plain.cost, [bounds, StateBounds([-9.0] * 6, [9.0] * 6)], "states"),
+        (plain.cost, [spheres], "all controls"),
+        (plain.cost, [some], "all controls"),
+        (linear, [bounds], "linear"),
+    ):
+        with pytest.raises(InputError, match=field):
+            refused(Problem(plain.dynamics, cost, constraints, plain.x0, 8), U0, tmp_path)
+
+
+def test_a_worker_that_fails_is_a_row_and_no_end(tmp_path: Path, monkeypatch) -> None:
+    """The other peers fly on, and nothing of the one that failed stays behind."""
+    monkeypatch.setattr(acados_peer, "installed", lambda: True)
+    monkeypatch.setattr(acados_peer, "ENVIRONMENT", tmp_path)
+    (tmp_path / "bin").mkdir()
+    python = tmp_path / "bin" / "python"
+    python.write_text("#!/bin/sh\necho no such library >&2\nexit 3\n")
+    python.chmod(0o755)
+    bench = Bench(TINY, Results(tmp_path / "results.csv"), provenance("cpu"), say=lambda text: None)
+    families.run(bench)
+    ended = {row["solver"]: row["value"] for row in bench.results.rows if row["quantity"] == "ended with"}
+    assert ended == dict.fromkeys(("acados", "acados_guided"), "acados ended with 3: no such library")
+    assert {"fatrop / gco", "fatrop_guided / gco"} <= {row["solver"] for row in bench.results.rows}
+
+
+@needs_acados
+def test_acados_finds_what_fatrop_finds(tmp_path: Path) -> None:
+    """And again from what was compiled; one problem's numbers don't stay for the next."""
+    problem, U0 = planar_batch(B=3, N=30, obstacles=3, seed=2)
+    rows = torch.tensor([1, 2])  # around the first one's obstacles there are two ways
+    first = acados_peer.fly(problem, *guess(problem, U0), tmp_path)
+    solution = CasADiSolver("fatrop").solve(problem, U0)
+    X = open_loop(problem.dynamics, problem.x0, first.U)
+    cost = problem.cost.total(X, first.U)
+    torch.testing.assert_close(cost[rows], solution.cost[rows], rtol=1e-2, atol=0)
+    assert (first.status == 0).all() and (first.iterations > 1).all() and (first.processor >= 0).all()
+    again = acados_peer.fly(problem, *guess(problem, U0), tmp_path)
+    assert torch.equal(again.U, first.U) and again.setup < first.setup
+    part = problem.take(rows)
+    alone = acados_peer.fly(part, *guess(part, U0[rows]), tmp_path)
+    torch.testing.assert_close(alone.U, first.U[rows], rtol=1e-9, atol=1e-9)
+
+
+@needs_acados
+def test_acados_flies_a_family(tmp_path: Path) -> None:
+    bench = Bench(TINY, None, {}, say=lambda text: None)
+    setup = bench.setup("scenario=forest")
+    task = setup.task(setup.layouts(1))
+    for name in ("acados", "acados_guided"):
+        peer = AcadosPeer.ready(bench, name, task, tmp_path)
+        peer.fly(bench)
+        assert peer.verdict is not None and peer.seconds > 0 and peer.setup > 0 and peer.iterations >= 1
