@@ -34,7 +34,7 @@ SEARCH = {
     "gco": ["solver=gco"],
     "gco_max": ["solver=gco_max"],
     "ways": [*WAYS],
-    "early": [*WAYS, "solver.guidance.detour.end=0.6", "solver.guidance.detour.dtype=float32", "solver.attempts=1"],
+    "early": [*WAYS, "solver.guidance.detour.end=0.6", "solver.attempts=1"],
     "multistart": ["solver=multistart"],
     "gco_paper": ["solver=gco_paper"],
     "fatrop": ["solver=fatrop"],

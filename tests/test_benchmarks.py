@@ -205,6 +205,11 @@ def test_without_a_gpu_nothing_is_measured(monkeypatch, capsys, tmp_path: Path) 
     assert "No CUDA device" in capsys.readouterr().out and not (tmp_path / "results.csv").exists()
 
 
+@pytest.mark.parametrize("search", oracle.SEARCH)
+def test_every_search_of_the_oracle_is_a_solver(search: str) -> None:
+    compose(oracle.SEARCH[search])
+
+
 def test_the_oracle_only_ever_lowers_a_cost(tmp_path: Path) -> None:
     path, nan = tmp_path / "layouts.npz", float("nan")
     replace(Layouts.load(ROOT / "benchmarks/data/planar_random.npz").take([0, 1, 2]), best_cost=None).save(path)
