@@ -83,14 +83,23 @@ class Problem:
 
         A thousandth of the controls' mean curvature is added, which alone is left where the start is the goal.
         """
-        like = self.x0.new_zeros(self.B, self.N, self.m)
-        X, U = self.x0.unsqueeze(1).repeat(1, self.N + 1, 1), self.cost.rest_controls(like)
+        X, U = self.at_rest
         s = self.n + 1 + self.m
         H = self.x0.new_empty(self.B, self.N + 1, s, s)
         self.cost.expand(X, U, H)
-        diagonal = H[:, :-1, self.n + 1 :, self.n + 1 :].diagonal(dim1=-2, dim2=-1)
-        curvature = diagonal.abs().contiguous().sum(-1).sum(-1) / (self.N * self.m)  # sums that keep their order
-        unit = self.cost.total(X, U).abs() / self.N + LEAST_UNIT * curvature
+        return self.unit_of(self.cost.total(X, U), H[:, :-1, self.n + 1 :, self.n + 1 :])
+
+    @property
+    def at_rest(self) -> tuple[Tensor, Tensor]:
+        """States (B, N+1, n) that stay at the start, and controls (B, N, m) at rest."""
+        like = self.x0.new_zeros(self.B, self.N, self.m)
+        return self.x0.unsqueeze(1).repeat(1, self.N + 1, 1), self.cost.rest_controls(like)
+
+    def unit_of(self, total: Tensor, Huu: Tensor) -> Tensor:
+        """`cost_unit` from the cost (B,) of staying at the start and its Hessians by the controls (B, N, m, m)."""
+        # Sums that keep their order.
+        curvature = Huu.diagonal(dim1=-2, dim2=-1).abs().contiguous().sum(-1).sum(-1) / (self.N * self.m)
+        unit = total.abs() / self.N + LEAST_UNIT * curvature
         return torch.where(torch.isfinite(unit) & (unit > 0), unit, 1.0)
 
     def in_cost_units(self) -> Self:
@@ -125,7 +134,7 @@ class Problem:
         """The same problems with the constraints dropped."""
         return self._with({"constraints": ()})
 
-    def _with(self, parts: dict[str, object], form: dict[str, Any] | None = None) -> Self:
+    def _with(self, parts: dict[str, object], form: dict[Any, Any] | None = None) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.
         copy = object.__new__(type(self))
         for f in fields(self):

@@ -249,3 +249,10 @@ def test_own_numbers_of_a_part_of_the_batch() -> None:
     source, rows = trace_dynamics(whole), torch.tensor([2, 0, 2])
     own = source.parameters(torch.arange(3), whole.take(rows))
     assert torch.equal(own, source.parameters(rows)) and own.shape == (3, 1)
+
+
+def test_own_numbers_of_a_batch_of_which_one_problem_was_traced() -> None:
+    whole = Planar(drag=torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    source = trace_dynamics(whole.take(torch.tensor([1])))
+    assert source.parameters(torch.arange(3), whole).flatten().tolist() == [1.0, 2.0, 3.0]
+    assert source.parameters(torch.arange(2), whole.take(torch.tensor([2, 0]))).flatten().tolist() == [3.0, 1.0]

@@ -25,6 +25,7 @@ from torchgco import (
     Spheres,
     StateBounds,
 )
+from torchgco.autodiff import gradient_and_hessian
 from torchgco.tracing import Traced
 
 DOUBLE = dict(dtype=torch.float64)
@@ -151,6 +152,7 @@ FUNCTIONS = {
     "hyperbolic": lambda x: x.sinh() + x.cosh() - x.asinh() + (1.0 + x.abs()).acosh() + (0.2 * x).atanh(),
     "exponential": lambda x: x.exp() + x.expm1() + (x.abs() + 1).log() + x.abs().log1p() + x.abs().log2() + x.erf(),
     "activations": lambda x: x.sigmoid() + x.relu() + F.leaky_relu(x, 0.2) + F.gelu(x) + F.silu(x) + F.hardtanh(x),
+    "softplus": lambda x: F.softplus(x) + F.softplus(x, beta=3.0, threshold=2.0) + torch.hypot(x, x + 1.0),
     "choices": lambda x: torch.where((x > 0) & (x.cos() <= 0.9) | ~(x < 1.5), x, torch.minimum(x * x, x + 1.0)),
     "limits": lambda x: torch.maximum(x, -x).clamp(min=0.2) + x.clamp(max=0.1) + x.clamp_min(0.0),
     "reductions": lambda x: x.mean(-1, keepdim=True) + x.prod(-1) + x.amax((0, 1)) - x.amin() + x.sum() + x.cumsum(-1),
@@ -174,6 +176,46 @@ def test_operations(name: str) -> None:
     torch.testing.assert_close(made, FUNCTIONS[name](x), rtol=1e-12, atol=1e-12)
 
 
+KINKS = {
+    "abs": lambda x: x.abs() * (1.0 + x),
+    "clamp": lambda x: x.clamp(min=0.0).square() + x.clamp(max=0.0) + x.clamp_min(0.0),
+    "relu": lambda x: x.relu().square() + x.relu(),
+    "norm": lambda x: x.norm(dim=-1),
+    "where": lambda x: torch.where(x.abs() < 1.0, x.square(), x.abs()),
+    "softplus": F.softplus,
+}
+
+
+@pytest.mark.parametrize("name", KINKS)
+def test_at_a_kink_derivatives_are_those_of_pytorch(name: str) -> None:
+    def function(x: Tensor) -> Tensor:
+        return KINKS[name](x).sum(-1)
+
+    x = torch.tensor([[0.0, 0.0, 0.0, 0.0]], **DOUBLE)
+    traced, (column, elements) = Traced("field", lambda i, x: function(x), x), symbols("x", (1, 4))
+    value = ca.vertcat(*traced(np.zeros(0), elements).reshape(-1))
+    slope = ca.jacobian(value, column, {"allow_reverse": False})
+    made = ca.Function("made", [column], [slope, ca.jacobian(slope, column, {"allow_reverse": False})])(x[0].numpy())
+    for mine, theirs in zip(made, gradient_and_hessian(lambda x: KINKS[name](x).sum(-1), x), strict=True):
+        torch.testing.assert_close(torch.from_numpy(np.array(mine)), theirs.reshape(mine.shape))
+
+
+def test_a_clamped_nan_stays_one() -> None:
+    x = torch.tensor([[torch.nan, 2.0]], **DOUBLE)
+    made = by_casadi(lambda i, x: x.clamp(0.0, 1.0) + x.relu(), [0], x)
+    torch.testing.assert_close(made, x.clamp(0.0, 1.0) + x.relu(), equal_nan=True)
+
+
+def test_constants_may_be_replaced() -> None:
+    """But for those that pick elements."""
+    weights, picked = torch.tensor([2.0, 3.0], **DOUBLE), torch.tensor([1, 0])
+    traced = Traced("field", lambda i, x: weights * x[:, picked] + (weights > 2.5), torch.zeros(1, 2, **DOUBLE))
+    assert sorted(traced.constants) == [0.0, 1.0, 2.0, 3.0]
+    x = np.array([[5.0, 7.0]], dtype=object)
+    assert traced(np.zeros(0), x).tolist() == traced(np.zeros(0), x, constants=traced.constants).tolist() == [[14, 16]]
+    assert traced(np.zeros(0), x, constants=np.zeros(4)).tolist() == [[0.0, 0.0]]
+
+
 def test_writing_in_place() -> None:
     def function(i: Tensor, x: Tensor) -> Tensor:
         kept = x.clone()
@@ -181,6 +223,8 @@ def test_writing_in_place() -> None:
         kept[:, torch.tensor([0, 3])] = x[:, :2]
         kept.index_put_((torch.tensor([0]), torch.tensor([1])), x[0, 3], accumulate=True)
         kept[..., -1].fill_(7.0)
+        kept.view(1, 2, 2).diagonal(dim1=1, dim2=2).mul_(3.0)
+        kept.view(2, 2).diagonal(1).add_(1.0)
         return kept
 
     x = torch.tensor([[0.3, -1.2, 1.7, 0.9]], **DOUBLE)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgco.problem import Problem
 from torchgco.shapes import PerElement
-from torchgco.tracing import Traced
+from torchgco.tracing import Traced, own_tensors
 
 UNBOUNDED = 1e19  # and above: a bound that is there for other problems of the batch only
 
@@ -103,9 +103,7 @@ def _traces(problem: Problem) -> tuple[Traced, Traced, list[Traced]]:
     X, U = problem.x0.new_zeros(1, problem.N + 1, problem.n), problem.x0.new_zeros(1, problem.N, problem.m)
 
     def trace(field: str, part: PerElement, method: str, *examples: Tensor) -> Traced:
-        named = (getattr(part, name) for name in (*part.batched, *part.per_element))
-        own = [value for value in named if isinstance(value, Tensor)]
-        return Traced(field, lambda i, *z: getattr(part.take(i), method)(*z), *examples, own=own)
+        return Traced(field, lambda i, *z: getattr(part.take(i), method)(*z), *examples, own=own_tensors(part))
 
     return (
         trace("dynamics.step", problem.dynamics, "step", X[:, 0], U[:, 0]),

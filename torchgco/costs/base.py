@@ -15,8 +15,12 @@ from torchgco.shapes import Dimensions, PerElement, lead
 class Cost(PerElement):
     """J_var = terminal(x_N) + sum_k stage(x_k, u_k, k).
 
-    A subclass defines `stage` and `terminal` on any leading axes; derivatives come from `torch.func` unless it
-    overrides `expand` too. A Hessian that isn't positive semidefinite is met by the solver's regularisation.
+    A subclass defines `stage` and `terminal` on any leading axes; derivatives are exact unless it overrides `expand`
+    too. A Hessian that isn't positive semidefinite is met by the solver's regularisation.
+
+    On a CPU the code is traced and compiled (`torchgco.native`), with what differs between problems (`batched`,
+    `per_element`) and between stages (what is indexed with k or computed from it) as numbers. A cost that branches on
+    the values of x, u or k, or that joins several knots, is evaluated by PyTorch, and a warning names it.
     """
 
     is_autonomous: bool = False  # whether `stage` is the same for every k

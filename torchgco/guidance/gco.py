@@ -18,6 +18,7 @@ from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
 from torchgco.guidance.scene import position
 from torchgco.lagrangian import Multipliers
+from torchgco.native.dispatch import cost_unit
 from torchgco.problem import Problem
 from torchgco.shapes import GuidanceWarning, InputError, put, take
 from torchgco.solvers.state import Advice
@@ -128,7 +129,7 @@ class GCO:
 
     def _holds(self, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         """Whether a sampled plan keeps to its task, (B,): unstable dynamics let samples diverge, away from all else."""
-        return problem.cost.total(X, U).abs() <= DIVERGED * problem.N * problem.cost_unit
+        return problem.cost.total(X, U).abs() <= DIVERGED * problem.N * cost_unit(problem)
 
     def _caught(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
         """The knots (B, N+1) that guidance is for: J, and with patience those at a single sphere."""

@@ -4,4 +4,6 @@ find_compiler    the C compiler of this machine, or None
 build            C source -> a loaded library
 emit             a CasADi function -> C over vectors whose lanes are problems
 trace_dynamics   a model -> C of its step and Jacobian, and what differs from problem to problem
+trace_cost       a user's cost -> C of a stage and of the last knot, with their derivatives
+trace_rows       a user's constraint -> the same of its rows at a knot
 """

@@ -52,6 +52,17 @@ def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:
     return problem.form[dtype]
 
 
+def cost_unit(problem: Problem) -> Tensor:
+    """`problem.cost_unit` (B,), which the native library finds where PyTorch would need autodiff for it."""
+    engine = engine_of(problem)
+    if engine is not None and engine.cost is not None and "cost_unit" not in vars(problem):
+        X, U = problem.at_rest
+        _, H = engine.expand(problem, X, U, None)
+        unit = problem.unit_of(problem.cost.total(X, U), H[:, :-1, problem.n :, problem.n :])
+        object.__setattr__(problem, "cost_unit", unit)
+    return problem.cost_unit
+
+
 def open_loop(problem: Problem, U: Tensor) -> Tensor:
     """X (B, N+1, n) from controls U (B, N, m)."""
     engine = engine_of(problem)

@@ -11,16 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import FunctionConstraint
-from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.guides import Guide, GuidePath, GuideRegion
-from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian import Multipliers
 from torchgco.native.compiler import build
+from torchgco.native.costs import cost_numbers, trace_cost
 from torchgco.native.model import trace_dynamics
-from torchgco.native.packing import FLAGS, NUMBERS, PATH, QUADRATIC, REGION, Packed, Rows, array, pack_rows
-from torchgco.native.rows import trace_rows
+from torchgco.native.packing import FLAGS, KINDS, NUMBERS, PATH, QUADRATIC, REGION, Packed, Rows, array, pack_rows
+from torchgco.native.rows import rows_numbers, trace_rows
 from torchgco.native.source import LANES, Form
 from torchgco.problem import Problem
 from torchgco.shapes import InputError
@@ -71,18 +69,14 @@ class Engine:
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
         if problem.n + problem.m > MOST:
             raise InputError("dynamics", f"at most {MOST} states and controls together", problem.n + problem.m)
-        if not isinstance(problem.cost, BoundQuadratic):
-            raise InputError("cost", "a QuadraticCost for native kernels", type(problem.cost).__name__)
-        functions = []
-        for i, constraint in enumerate(problem.constraints):
-            if isinstance(constraint, FunctionConstraint):
-                source = trace_rows(constraint.name, _of_knot(constraint), problem.n, problem.m)
-                if source.p > 0:
-                    functions.append((i, source))
-            elif not isinstance(constraint, ControlBounds | StateBounds | BoundSpheres):
-                raise InputError("constraints", "bounds, spheres or functions for native kernels", type(constraint))
         self.model = trace_dynamics(problem.dynamics)
-        self.form = Form(self.model, problem.dynamics.position, not problem.cost.diagonal, tuple(functions))
+        quadratic = problem.cost if type(problem.cost) is BoundQuadratic else None
+        self.cost = trace_cost(problem) if quadratic is None else None
+        traced = (i for i, constraint in enumerate(problem.constraints) if type(constraint) not in KINDS)
+        sources = ((i, trace_rows(problem, i)) for i in traced)
+        self.functions = {i: source for i, source in sources if source.size > 0}
+        dense = quadratic is not None and not quadratic.diagonal
+        self.form = Form(self.model, problem.dynamics.position, self.cost, dense, tuple(self.functions.items()))
         self.library = build(self.form.source())
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
@@ -111,6 +105,34 @@ class Engine:
         packed.optimality = True
         self._run("tgco_gains", problem, packed)
         return tensors["gains"], tensors["cost"], tensors["merit"], tensors["status"] != 0
+
+    def expand(self, problem: Problem, X: Tensor, U: Tensor, terms: Terms | None) -> tuple[Tensor, Tensor]:
+        """Gradients (B, N+1, n+m) and Hessians (B, N+1, n+m, n+m) of L_M, or without terms of J_var.
+
+        Of the Hessians the upper triangle is filled.
+        """
+        B, N, size = problem.B, problem.N, problem.n + problem.m
+        tensors = {"X": X.contiguous(), "U": U.contiguous(), "slopes": X.new_empty(B, N + 1, size)}
+        tensors |= {"curvatures": X.new_empty(B, N + 1, size, size)}
+        tensors |= {name: X.new_zeros(B) for name in ("cost", "merit", "mu")}
+        packed = self.packed(problem, tensors, terms)
+        if terms is None:
+            packed.constraints = 0
+        self._run("tgco_expand", problem, packed)
+        return tensors["slopes"], tensors["curvatures"]
+
+    def lift(self, problem: Problem, state: dict[str, Tensor], terms: Terms, rounds: int, gain: float) -> Tensor:
+        """Up to `rounds` steps in states and controls together, in place in `state`; who found a better rollout (B,).
+
+        Args:
+            state: X, U, cost, merit, all contiguous.
+            gain: share of L_M by which a rollout must lower it.
+        """
+        out = {"converged": _flags(problem.B), "regularisation": torch.zeros_like(state["merit"])}
+        packed = self.packed(problem, {**state, **out}, terms)
+        packed.limit, packed.gain = rounds, gain
+        self._run("tgco_lift", problem, packed)
+        return out["converged"] != 0
 
     def iterate(
         self, problem: Problem, state: dict[str, Tensor], terms: Terms, options: Options, limit: int
@@ -174,16 +196,21 @@ class Engine:
         packed, keep, cost = Packed(), [], problem.cost
         if problem.B == 0:
             return packed, (Rows * max(1, len(problem.constraints)))(), keep
-        assert isinstance(cost, BoundQuadratic)
         packed.N, packed.elements, packed.constraints = problem.N, problem.B, len(problem.constraints)
-        for i, name in enumerate(QUADRATIC):
-            packed.cost_data[i] = array(getattr(cost, name), keep, knots=name not in ("Qf", "xf_ref", "qf"))
         if self.model.count > 0:
             own = self.model.parameters(torch.arange(problem.B), problem.dynamics)
             packed.parameters = array(own, keep, knots=False)
+        if self.cost is None:
+            for i, name in enumerate(QUADRATIC):
+                packed.cost_data[i] = array(getattr(cost, name), keep, knots=name not in ("Qf", "xf_ref", "qf"))
+        else:
+            for i, numbers in enumerate(cost_numbers(problem, self.cost)):
+                packed.cost_data[i] = array(numbers, keep, knots=True)
         rows = (Rows * max(1, len(problem.constraints)))()
-        for row, constraint in zip(rows, problem.constraints, strict=False):
-            pack_rows(row, constraint, problem, keep)
+        for i, constraint in enumerate(problem.constraints):
+            source = self.functions.get(i)
+            numbers = None if source is None else rows_numbers(problem, i, source)
+            pack_rows(rows[i], constraint, numbers, problem, keep)
         return packed, rows, keep
 
 
@@ -213,8 +240,3 @@ def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> No
 
 def _flags(B: int) -> Tensor:
     return torch.zeros(B, dtype=torch.int32)
-
-
-def _of_knot(constraint: FunctionConstraint) -> Any:
-    """The function of one knot's x and u."""
-    return lambda x, u: constraint.function(*(x if a == "x" else u for a in constraint.of))

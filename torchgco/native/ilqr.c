@@ -64,7 +64,7 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
     V linear, squares, lowest, zero = SET(0.0), old = s->merit, shortest;
     s->alpha = zero;
     s->used = s->mu_r;
-    backward(s, &linear, &squares, &lowest);
+    backward(s, NULL, &linear, &squares, &lowest);
     V quadratic = -linear - s->mu_r * squares, before = s->mu_r;
     I failed = ~(lowest > zero) & running;
     V expected = tgco_fabs(linear + SET(0.5) * quadratic);
@@ -141,69 +141,5 @@ int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
         }
     }
     finish(s);
-    return 1;
-}
-
-/* J_var and L_M of given trajectories. */
-int tgco_value(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    if (!start(s, p)) return 0;
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
-        V total = SET(0.0), more = SET(0.0), part;
-        for (int64_t k = 0; k <= p->N; k++) {
-            total += knot_value(s, k, s->X + k * NX, k < p->N ? s->U + k * NU : 0, &part);
-            more += part;
-        }
-        for (int l = 0; l < LANES && e + l < last; l++) {
-            p->cost[e + l] = total[l];
-            p->merit[e + l] = total[l] + more[l];
-        }
-    }
-    finish(s);
-    return 1;
-}
-
-/* One backward pass along given trajectories: gains (E, N, NU, NZ) and the two sums of the expected change. */
-int tgco_gains(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    if (!start(s, p)) return 0;
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
-        V linear, squares, lowest;
-        backward(s, &linear, &squares, &lowest);
-        V quadratic = -linear - s->mu_r * squares;
-        for (int l = 0; l < LANES && e + l < last; l++) {
-            p->cost[e + l] = linear[l];
-            p->merit[e + l] = quadratic[l];
-            p->status[e + l] = !(lowest[l] > 0);
-            for (int64_t i = 0; i < p->N * NU * NZ; i++) p->gains[(e + l) * p->N * NU * NZ + i] = s->G[i][l];
-        }
-    }
-    finish(s);
-    return 1;
-}
-
-/* Rollout of U from the first knot of X. */
-int tgco_open_loop(const Problem *p, int64_t first, int64_t last) {
-    int64_t N = p->N;
-    V parameters[NP ? NP : 1], x[2 * NX], u[NU];
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) {
-            int64_t element = e + l < last ? e + l : e;
-            fill(parameters, &p->parameters, 1, l, element);
-            for (int i = 0; i < NX; i++) x[i][l] = p->X[element * (N + 1) * NX + i];
-        }
-        for (int64_t k = 0; k < N; k++) {
-            for (int l = 0; l < LANES; l++) {
-                int64_t element = e + l < last ? e + l : e;
-                for (int j = 0; j < NU; j++) u[j][l] = p->U[(element * N + k) * NU + j];
-            }
-            model_step(x, u, parameters, x + NX);
-            memcpy(x, x + NX, NX * sizeof(V));
-            for (int l = 0; l < LANES && e + l < last; l++)
-                for (int i = 0; i < NX; i++) p->X[((e + l) * (N + 1) + k + 1) * NX + i] = x[i][l];
-        }
-    }
     return 1;
 }

@@ -182,7 +182,7 @@ static inline V knot_value(const Lanes *s, int64_t k, const V *x, const V *u, V 
 }
 
 /* Adds gradient g (S) and upper triangle H (S, S) of all terms of knot k. */
-static inline void knot_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
+__attribute__((noinline)) static void knot_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
     const Problem *p = s->of;
     cost_expand(s, k, x, u, g, H);
     for (int64_t i = 0; i < p->constraints; i++)

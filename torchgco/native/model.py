@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgco.dynamics import Dynamics
 from torchgco.native import emit, store
-from torchgco.tracing import Traced, arrays, operations
+from torchgco.tracing import Traced, arrays, operations, own_tensors
 
 STEP, JACOBIAN = "tgco_step", "tgco_jacobian"
 
@@ -44,7 +44,7 @@ class DynamicsSource:
     values: tuple[float, ...]  # 0.0 where the entry is computed
     key: str  # says what `code` computes, the same in every process
     traced: Traced = field(repr=False, compare=False)
-    own: dict[str, Tensor] = field(repr=False, compare=False)  # what the model has per problem, by field
+    own: list[Tensor] = field(repr=False, compare=False)  # what the model has per problem
 
     @property
     def computed(self) -> int:
@@ -58,7 +58,8 @@ class DynamicsSource:
         """
         if of is None or self.count == 0:
             return self.traced.parameters_of(index)
-        return self.traced.rebound({id(old): getattr(of, name) for name, old in self.own.items()}).parameters_of(index)
+        traced = self.traced.rebound(self.own, own_tensors(of))
+        return (traced or trace_dynamics(of, self.n, self.m, device=index.device).traced).parameters_of(index)
 
 
 def trace_dynamics(
@@ -110,9 +111,8 @@ def _versions(dynamics: Dynamics, dtype: torch.dtype, device: torch.device | str
 
 def _trace(dynamics: Dynamics, n: int, m: int, dtype: torch.dtype, device: torch.device | str) -> DynamicsSource:
     x, u = (torch.zeros(1, size, dtype=dtype, device=device) for size in (n, m))
-    named = {name: getattr(dynamics, name) for name in (*dynamics.batched, *dynamics.per_element)}
-    own = {name: value for name, value in named.items() if isinstance(value, Tensor)}
-    traced = Traced("dynamics.step", lambda i, x, u: dynamics.take(i).step(x, u), x, u, own=own.values())
+    own = own_tensors(dynamics)
+    traced = Traced("dynamics.step", lambda i, x, u: dynamics.take(i).step(x, u), x, u, own=own)
     key = store.key_of(("model", traced.fingerprint(), *makers()))
     known = store.read(key, ".json")
     if known is None:

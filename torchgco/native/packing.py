@@ -15,6 +15,7 @@ from torchgco.problem import Problem
 
 ABSENT = -1.0  # squared distance of an obstacle that isn't there
 BOX, SPHERES, FUNCTION = range(3)
+KINDS = {ControlBounds: BOX, StateBounds: BOX, BoundSpheres: SPHERES}  # all others, their subclasses too, are traced
 NO_GUIDE, REGION, PATH = range(3)
 
 
@@ -33,7 +34,10 @@ class Rows(ctypes.Structure):
 
 
 COUNTS = ("N", "elements", "constraints", "rungs", "back", "limit", "max_iterations")
-TENSORS = ("X", "U", "cost", "merit", "regularisation", "alpha", "used", "gains", "mu", "inner", "iterations", "rung")
+TENSORS = (
+    "X", "U", "cost", "merit", "regularisation", "alpha", "used", "gains", "slopes", "curvatures", "mu", "inner",
+    "iterations", "rung",
+)  # fmt: skip
 FLAGS = ("status", "converged", "refused", "lost")
 QUADRATIC = ("Q", "R", "Qf", "x_ref", "xf_ref", "u_ref", "q", "r", "qf", "H")  # in the order of quadratic.c
 COST_ARRAYS = len(QUADRATIC)
@@ -54,11 +58,12 @@ class Packed(ctypes.Structure):
         *((name, ctypes.c_int32) for name in CHOICES),
         *((name, Array) for name in ("center", "radius", "weight")),
         ("ladder", ctypes.c_void_p),
-        *((name, ctypes.c_double) for name in NUMBERS),
+        *((name, ctypes.c_double) for name in (*NUMBERS, "gain")),
     ]
 
 
-def pack_rows(c: Rows, constraint: Constraint, problem: Problem, keep: list[Any]) -> None:
+def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: Problem, keep: list[Any]) -> None:
+    """Fill in the parts of a constraint; `numbers` (B|1, K|1, count) are those of one that is traced."""
     one = problem.take(slice(0, 1))
     shape = constraint.take(slice(0, 1)).value(
         one.x0.unsqueeze(1).expand(-1, problem.N + 1, -1), one.x0.new_zeros(1, problem.N, problem.m)
@@ -68,8 +73,10 @@ def pack_rows(c: Rows, constraint: Constraint, problem: Problem, keep: list[Any]
         place[constraint.knots] = torch.arange(shape[1], dtype=torch.int32)
     keep.append(place)
     c.equality, c.knots, c.rows = constraint.sense == "equality", shape[1], shape[2]
-    c.place = place.data_ptr()
-    if isinstance(constraint, ControlBounds | StateBounds):
+    c.place, c.kind = place.data_ptr(), KINDS.get(type(constraint), FUNCTION)
+    if c.kind == FUNCTION:
+        c.bound = array(numbers, keep, knots=True)
+    elif isinstance(constraint, ControlBounds | StateBounds):
         size = problem.m if constraint.of == "u" else problem.n
         variables = torch.arange(size, dtype=torch.int32) + (problem.n if constraint.of == "u" else 0)
         above, below = variables[constraint.above], variables[constraint.below]
@@ -77,17 +84,15 @@ def pack_rows(c: Rows, constraint: Constraint, problem: Problem, keep: list[Any]
         sign = torch.cat((torch.ones(above.numel()), -torch.ones(below.numel()))).double()
         bound = torch.cat((constraint.upper[:, constraint.above], constraint.lower[:, constraint.below]), dim=1)
         keep += [variable, sign]
-        c.kind, c.variable, c.sign = BOX, variable.data_ptr(), sign.data_ptr()
+        c.variable, c.sign = variable.data_ptr(), sign.data_ptr()
         c.bound = array(bound, keep, knots=False)
     elif isinstance(constraint, BoundSpheres):
-        c.kind, c.dt = SPHERES, constraint.dt
+        c.dt = constraint.dt
         c.bound = array(constraint.centers.flatten(1), keep, knots=False)
         squares = torch.where(constraint.absent, ABSENT, constraint.distances.square())
         c.squares = array(squares, keep, knots=False)
         if constraint.velocities is not None:
             c.velocities = array(constraint.velocities.flatten(1), keep, knots=False)
-    else:
-        c.kind = FUNCTION
 
 
 def array(value: Tensor | None, keep: list[Any], knots: bool) -> Array:

@@ -23,8 +23,9 @@ static void roll(Lanes *s, V alpha, V *cost, V *merit) {
     *merit = total + (more + part);
 }
 
-/* The backward pass (lines 4-13): gains into G; the expected change's two sums, and the smallest pivot. */
-static void backward(Lanes *s, V *linear, V *squares, V *lowest) {
+/* The backward pass (lines 4-13): gains into G; the expected change's two sums, and the smallest pivot. `gap` (N, NX) is
+   how far each step ends from the knot after it, NULL along a rollout. */
+static void backward(Lanes *s, const V *gap, V *linear, V *squares, V *lowest) {
     const Problem *p = s->of;
     V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[NU * NU], Y[NU * NZ];
     V sum = SET(0.0), square = SET(0.0), least = SET(__builtin_inf());
@@ -41,6 +42,7 @@ static void backward(Lanes *s, V *linear, V *squares, V *lowest) {
         tgco_jacobian(x, u, s->parameters, f);
         tgco_gather(P, f, T);
         tgco_product(f, T, H);
+        if (gap) for (int i = 0; i < NX; i++) for (int j = 0; j < NX; j++) vector[i] += P[i * NX + j] * gap[k * NX + j];
         tgco_pull_back(vector, f, g);
         knot_expand(s, k, x, u, g, H);
         /* Cholesky factor L of Quu + mu_r I (diagonal inverted), Y = L^-1 [Qux Qu], [K d] = -L^-T Y. */
@@ -102,4 +104,38 @@ static I is_finite(const Lanes *s) {
         for (int i = 0; i < NJ; i++) sum += SET(0.0) * f[i];
     }
     return sum == SET(0.0);
+}
+
+/* How far each step ends from the knot after it. */
+static void gaps(const Lanes *s, V *gap) {
+    for (int64_t k = 0; k < s->of->N; k++) {
+        V next[NX];
+        model_step(s->X + k * NX, s->U + k * NU, s->parameters, next);
+        for (int i = 0; i < NX; i++) gap[k * NX + i] = next[i] - s->X[(k + 1) * NX + i];
+    }
+}
+
+/* A full step of the linearised dynamics, which close the gaps, under the gains: into X and U. */
+static void linear_step(Lanes *s, const V *gap) {
+    V one[NX * NX], F[NX * S], f[NJ ? NJ : 1], z[S], dx[NX];
+    for (int i = 0; i < NX * NX; i++) one[i] = SET(i % (NX + 1) == 0);
+    for (int i = 0; i < NX; i++) dx[i] = SET(0.0);
+    for (int64_t k = 0; k < s->of->N; k++) {
+        V *x = s->X + k * NX, *u = s->U + k * NU;
+        const V *G = s->G + k * NU * NZ;
+        tgco_jacobian(x, u, s->parameters, f);
+        tgco_gather(one, f, F);
+        memcpy(z, dx, sizeof dx);
+        for (int j = 0; j < NU; j++) {
+            z[NX + j] = G[j * NZ + NX];
+            for (int i = 0; i < NX; i++) z[NX + j] += G[j * NZ + i] * dx[i];
+        }
+        for (int i = 0; i < NX; i++) {
+            x[i] += dx[i];
+            dx[i] = gap[k * NX + i];
+            for (int c = 0; c < S; c++) dx[i] += F[c * NX + i] * z[c];
+        }
+        for (int j = 0; j < NU; j++) u[j] += z[NX + j];
+    }
+    for (int i = 0; i < NX; i++) s->X[s->of->N * NX + i] += dx[i];
 }

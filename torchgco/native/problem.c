@@ -39,6 +39,7 @@ typedef struct {
     double *X, *U, *cost, *merit, *regularisation;  /* (E, ...) in and out */
     double *alpha, *used;                           /* (E): step length and mu_r of the last iteration */
     double *gains;                                  /* (E, N, NU, NZ): what tgco_gains writes */
+    double *slopes, *curvatures;                    /* (E, N+1, S), (E, N+1, S, S): what tgco_expand writes */
     const double *mu;
     int64_t *inner, *iterations, *rung;
     int32_t *status, *converged, *refused, *lost;
@@ -48,7 +49,7 @@ typedef struct {
     Array center, radius, weight;
     const double *ladder;
     double tolerance, absolute_tolerance, ratio_min, ratio_max, smallest;
-    double first, growth, most, damping, rounding, lost_beyond;
+    double first, growth, most, damping, rounding, lost_beyond, gain;
 } Problem;
 
 /* A constraint's multipliers and numbers. */

@@ -6,10 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchgco.native.costs import CostSource
 from torchgco.native.emit import PRELUDE, literal
+from torchgco.native.knots import KnotSource
 from torchgco.native.model import DynamicsSource
 from torchgco.native.packing import COST_ARRAYS
-from torchgco.native.rows import RowsSource
 
 LANES = 8
 WRITTEN_OUT = 400  # nonzeros of a Jacobian that are named one by one
@@ -36,8 +37,9 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
     for (int e = 0; e < COUNT; e++) g[F_column[e]] += entry(e, f) * p[F_row[e]];
 }
 """
-SOLVER = ("problem.c", "quadratic.c", "knot.c", "passes.c", "ilqr.c")
-SAMPLER = ("problem.c", "quadratic.c", "knot.c", "normal.c", "mppi.c")
+COST = "quadratic.c"  # or traced.c
+SOLVER = ("problem.c", COST, "knot.c", "passes.c", "ilqr.c", "trajectories.c")
+SAMPLER = ("problem.c", COST, "knot.c", "normal.c", "mppi.c")
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,9 @@ class Form:
 
     dynamics: DynamicsSource
     position: slice | None
-    dense: bool  # weights are matrices
-    functions: tuple[tuple[int, RowsSource], ...]  # the constraints given as functions, by their place
+    cost: CostSource | None  # None: quadratic
+    dense: bool  # its weights are matrices
+    functions: tuple[tuple[int, KnotSource], ...]  # the constraints that are traced, by their place
 
     def source(self, parts: tuple[str, ...] = SOLVER, real: str = "double", lanes: int = LANES) -> str:
         """The C file of the solver or the sampler, for numbers of type `real`."""
@@ -56,12 +59,13 @@ class Form:
             "REAL": real, "LANES": lanes, "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
             "DIM": 0 if at is None else at.stop - at.start, "POSITION": 0 if at is None else at.start,
             "QUADRATIC_FULL": int(self.dense), "COST_ARRAYS": COST_ARRAYS,
-            "MAX_ROWS": max([1, *(rows.p for _, rows in self.functions)]),
+            "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]),
         }  # fmt: skip
         head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
-        functions = [rows.code for _, rows in self.functions]
-        files = [Path(__file__).with_name(name).read_text() for name in parts]
-        return "\n".join((head, PRELUDE, model.code, _products(model), *functions, _switches(self.functions), *files))
+        generated = [model.code, _products(model), "" if self.cost is None else self.cost.code]
+        generated += [*dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions)]
+        names = parts if self.cost is None else ["traced.c" if name == COST else name for name in parts]
+        return "\n".join((head, PRELUDE, *generated, *(Path(__file__).with_name(name).read_text() for name in names)))
 
 
 def _products(model: DynamicsSource) -> str:
@@ -104,7 +108,7 @@ def _written_out(model: DynamicsSource) -> str:
     )  # fmt: skip
 
 
-def _switches(functions: Iterable[tuple[int, RowsSource]]) -> str:
+def _switches(functions: Iterable[tuple[int, KnotSource]]) -> str:
     """`tgco_rows` and `tgco_add_rows`, which call the functions of a constraint by its place."""
     values, adds = [], []
     for i, rows in functions:

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgco.constraints.guides import Guide
 from torchgco.draws import DrawKey
 from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
-from torchgco.native.dispatch import engine_of, open_loop, reproducible, value
+from torchgco.native.dispatch import cost_unit, engine_of, open_loop, reproducible, value
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, copied, put, take
 from torchgco.solution import Solution
@@ -50,7 +50,7 @@ class Loop:
         if warm is not None:
             warm.check(problem)
         self.solver, self.seed, self.callback, self.given = solver, seed, callback, problem
-        self.unit = problem.cost_unit if solver.inner.normalise else torch.ones_like(problem.x0[:, 0])
+        self.unit = cost_unit(problem) if solver.inner.normalise else torch.ones_like(problem.x0[:, 0])
         if solver.inner.normalise:
             problem = problem.in_cost_units()
             warm = None if warm is None else warm.scaled(1.0 / self.unit)

@@ -5,6 +5,7 @@ Both leave the same state behind, up to rounding, and say the same of it; a test
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,8 @@ from torchgco.expansion import linearise, standing
 from torchgco.lagrangian import Lagrangian
 from torchgco.native.dispatch import engine_of, terms_of
 from torchgco.problem import Problem
-from torchgco.solvers.lifted import LOST, diverges, lifted_search
+from torchgco.solvers.lifted import LOST, diverges, lifted_search, native_lifted_search
+from torchgco.solvers.line_search import Candidates
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import InnerState
 from torchgco.status import Status
@@ -58,7 +60,7 @@ class NativeIterations:
         ended, failed = out["status"] == 1, out["status"] > 1
         rows = lost.nonzero().flatten()
         if rows.numel() > 0:
-            won = rows[lift(s, lagrangian, rows)]
+            won = rows[lift(s, lagrangian, rows, native_lifted_search)]
             ended[won] = s.inner[won] >= self.inner.max_iterations
             s.regularisation[won] = 0.0
         status = torch.where(failed, out["status"].long(), int(Status.RUNNING))
@@ -155,13 +157,13 @@ class EagerIterations:
         lost = diverges(part, X, U, merit, step.gains[:, rows], inner.line_search.smallest).nonzero().flatten()
         refused = refused.clone()
         if lost.numel() > 0:
-            refused[rows[lost][lift(s, lagrangian, rows[lost])]] = False
+            refused[rows[lost][lift(s, lagrangian, rows[lost], lifted_search)]] = False
         return refused
 
 
-def lift(s: InnerState, lagrangian: Lagrangian, rows: Tensor) -> Tensor:
+def lift(s: InnerState, lagrangian: Lagrangian, rows: Tensor, search: Callable[..., Candidates]) -> Tensor:
     """Put what a lifted search finds in place of the iterates in `rows`; which of them it found something for."""
-    found = lifted_search(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows])
+    found = search(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows])
     won = rows[found.accepted]
     for name in ("X", "U", "cost", "merit"):
         getattr(s, name)[won] = getattr(found, name)[found.accepted]

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian
+from torchgco.native.dispatch import engine_of, terms_of
 from torchgco.rollout import closed_loop
 from torchgco.solvers.line_search import Candidates
 from torchgco.solvers.riccati import backward
@@ -45,6 +46,16 @@ def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -
         going = ~found.accepted[rows] & ~step.failed & torch.isfinite(X).flatten(1).all(-1)
         rows, X, U = rows[going], X[going], U[going]
     return found
+
+
+def native_lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Candidates:
+    """The same by the native library."""
+    engine = engine_of(lagrangian.problem)
+    assert engine is not None
+    state = {name: t.clone(memory_format=torch.contiguous_format) for name, t in (("X", X), ("U", U), ("merit", merit))}
+    state["cost"] = state["merit"].clone()
+    accepted = engine.lift(lagrangian.problem, state, terms_of(lagrangian), ROUNDS, GAIN)
+    return Candidates(**state, alpha=torch.ones_like(merit), accepted=accepted)
 
 
 def _keep(found: Candidates, rows: Tensor, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian
-from torchgco.native.dispatch import engine_of, terms_of
+from torchgco.native.dispatch import cost_unit, engine_of, terms_of
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.status import Status
 
@@ -41,10 +41,10 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
         # A control that costs nothing, or values beyond the precision: gains all the same, by regularisation.
         if not bool(step.failed.any()):
             break
-        mu = torch.where(step.failed, FIRST * GROWTH**i * problem.cost_unit, mu)
+        mu = torch.where(step.failed, FIRST * GROWTH**i * cost_unit(problem), mu)
         step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
-    cost = problem.cost.total(X, U).abs() + LEAST_COST * problem.N * problem.cost_unit
+    cost = problem.cost.total(X, U).abs() + LEAST_COST * problem.N * cost_unit(problem)
     G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
     return Optimality(G[..., :-1], G[..., -1], torch.where(step.failed, torch.inf, saved / cost))
 

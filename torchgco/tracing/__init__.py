@@ -1,3 +1,4 @@
 """Functions of PyTorch tensors, recorded once and replayed with CasADi expressions."""
 
 from torchgco.tracing.traced import Traced as Traced
+from torchgco.tracing.traced import own_tensors as own_tensors

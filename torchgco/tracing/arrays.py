@@ -52,6 +52,13 @@ def select_scatter(a: np.ndarray, source: np.ndarray, dim: int, index: int) -> n
     return _written(a, (*[slice(None)] * (dim % a.ndim), index), source)
 
 
+def diagonal_scatter(a: np.ndarray, source: np.ndarray, offset: int = 0, dim1: int = 0, dim2: int = 1) -> np.ndarray:
+    copy = a.astype(object)
+    i = np.arange(source.shape[-1])
+    np.moveaxis(copy, (dim1, dim2), (-2, -1))[..., i + max(-offset, 0), i + max(offset, 0)] = source
+    return copy
+
+
 def _written(a: np.ndarray, place: tuple[Any, ...], source: np.ndarray) -> np.ndarray:
     copy = a.astype(object)
     copy[(*place, ...)] = source  # the dots keep it an assignment of arrays where one element is meant

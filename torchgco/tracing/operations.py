@@ -68,8 +68,14 @@ def _divide(a: Any, b: Any, rounding_mode: str | None = None) -> np.ndarray:
 
 
 def _clamp(a: Any, min: Any = None, max: Any = None) -> np.ndarray:
-    a = a if min is None else _fmax(a, min)
-    return a if max is None else _fmin(a, max)
+    # Choices, not fmin and fmax: at a bound the derivative is 1, as PyTorch's, and a NaN stays one.
+    a = a if min is None else _where(_binary(operator.lt)(a, min), min, a)
+    return a if max is None else _where(_binary(operator.gt)(a, max), max, a)
+
+
+def _softplus(a: np.ndarray, beta: float = 1.0, threshold: float = 20.0) -> np.ndarray:
+    scaled = _mul(a, beta)
+    return _where(_binary(operator.gt)(scaled, threshold), a, _truediv(_unary("log1p")(_unary("exp")(scaled)), beta))
 
 
 def _matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -114,7 +120,8 @@ def _fold(combine: Callable) -> Callable:
 def _norm(a: np.ndarray, ord: float = 2, dim: Any = None, keepdim: bool = False, **_: Any) -> np.ndarray:
     if ord != 2:
         raise NoCounterpart
-    return _sqrt(_sum(_mul(a, a), dim, keepdim))
+    square = _sum(_mul(a, a), dim, keepdim)
+    return _where(_binary(operator.eq)(square, 0.0), 0.0, _sqrt(square))  # at zero the derivative is 0, as PyTorch's
 
 
 def _cross(a: np.ndarray, b: np.ndarray, dim: int = -1) -> np.ndarray:
@@ -176,15 +183,17 @@ OPERATIONS: dict[str, Callable] = {
     **{f"aten.{name}": _unary(name) for name in ("exp", "expm1", "log", "log1p", "log10", "erf")},
     "aten.log2": _unary(lambda x: _casadi().log(x) / math.log(2.0)),
     "aten.atan2": _binary("atan2"),
+    "aten.hypot": _binary("hypot"),
     "aten.sigmoid": _unary(lambda x: 0.5 + 0.5 * _casadi().tanh(0.5 * x)),
-    "aten.relu": _unary(lambda x: _casadi().fmax(x, 0.0)),
+    "aten.relu": lambda a: _where(_binary(operator.le)(a, 0.0), 0.0, a),
     "aten.leaky_relu": lambda a, slope=0.01: _where(_binary(operator.gt)(a, 0.0), a, _mul(a, slope)),
+    "aten.softplus": _softplus,
     "aten.gelu": _unary(lambda x: 0.5 * x * (1.0 + _casadi().erf(x / math.sqrt(2.0)))),
     # choices
     "aten.where": _where,
     "aten.clamp": _clamp,
-    "aten.clamp_min": _fmax,
-    "aten.clamp_max": _fmin,
+    "aten.clamp_min": _clamp,
+    "aten.clamp_max": lambda a, max: _clamp(a, max=max),
     "aten.hardtanh": lambda a, low=-1.0, high=1.0: _clamp(a, low, high),
     "aten.maximum": _fmax,
     "aten.minimum": _fmin,
@@ -235,6 +244,7 @@ OPERATIONS: dict[str, Callable] = {
     "aten.gather": arrays.gather,
     "aten.select_scatter": arrays.select_scatter,
     "aten.slice_scatter": arrays.slice_scatter,
+    "aten.diagonal_scatter": arrays.diagonal_scatter,
     "aten.index_put": arrays.index_put,
     # copies and new ones
     "aten.clone": _same,

@@ -121,6 +121,8 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
     try:
         with torch.no_grad(), recorder:
             result = pure(*examples)
+    except InputError:
+        raise  # the function itself says what is wrong
     except Exception as error:  # whatever a function runs into
         told = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise InputError(field, "a function that can be traced", told) from error

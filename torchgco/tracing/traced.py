@@ -6,18 +6,20 @@ batch for each problem. Only the rest needs a counterpart in CasADi.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.shapes import InputError
-from torchgco.tracing.arrays import NoCounterpart, boxed
+from torchgco.shapes import InputError, PerElement
+from torchgco.tracing.arrays import boxed
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.operations import OPERATIONS
 from torchgco.tracing.recorder import Call, Slot, name_of, record
+
+INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
 
 
 class Traced:
@@ -60,12 +62,19 @@ class Traced:
         computed = self._computed(index)
         self._own_shapes = [tuple(computed[slot].shape) for slot in self._own]
         self._constants = {slot: _array(computed[slot]) for slot in border if slot not in varying}
+        indices = {slot for call in self._symbolic if name_of(call.operation) in INDEXING for slot in call.inputs[1:]}
+        self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
         self._shapes = [tuple(example.shape) for example in examples]
 
     @property
     def count(self) -> int:
         """How many numbers differ from problem to problem."""
         return sum(int(np.prod(shape)) for shape in self._own_shapes)
+
+    @property
+    def constants(self) -> np.ndarray:
+        """The numbers (c,) that all problems share, but for those that pick elements."""
+        return np.concatenate([np.zeros(0), *(self._constants[s].astype(float).reshape(-1) for s in self._replaceable)])
 
     def parameters(self, index: Tensor) -> np.ndarray:
         """Those numbers (count,) for the problem that index (1,) int64 names."""
@@ -91,8 +100,14 @@ class Traced:
         except RuntimeError:  # an operation that can't be done for many at once
             return torch.stack([one(i) for i in index])
 
-    def rebound(self, tensors: Mapping[int, Tensor]) -> Traced:
-        """The same function of other tensors: those of `own` are replaced by what `tensors` holds for their ids."""
+    def rebound(self, own: Sequence[Tensor], others: Sequence[Tensor]) -> Traced | None:
+        """The same function with `others` in the place of its `own` tensors; None where it must be traced again.
+
+        So it must where a row that stood for all problems, which none is picked from, is replaced by one of each.
+        """
+        if len(own) != len(others) or any(a.shape[:1] == (1,) != b.shape[:1] for a, b in zip(own, others, strict=True)):
+            return None
+        tensors = {id(old): new for old, new in zip(own, others, strict=True)}
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
         copy._captured = {slot: tensors.get(id(tensor), tensor) for slot, tensor in self._captured.items()}
@@ -107,21 +122,27 @@ class Traced:
         own = dict(zip(self._own, self._own_shapes, strict=True))
         return fingerprint(variables, own, self._constants, self._symbolic, self._result)
 
-    def __call__(self, parameters: np.ndarray, *variables: np.ndarray) -> np.ndarray:
-        """The function on arrays of numbers or expressions: `parameters` (count,), variables shaped as the examples.
+    def __call__(
+        self, parameters: np.ndarray, *variables: np.ndarray, constants: np.ndarray | None = None
+    ) -> np.ndarray:
+        """The function on arrays of numbers or expressions.
+
+        Args:
+            parameters: (count,).
+            variables: shaped as the examples.
+            constants: (c,), what stands in the place of `self.constants`; those by default.
 
         Raises:
             InputError: an operation that CasADi has no counterpart for with these arguments.
         """
         known: dict[Slot, Any] = dict(zip(self._variables, variables, strict=True)) | self._constants
-        place = 0
-        for slot, shape in zip(self._own, self._own_shapes, strict=True):
-            known[slot] = parameters[place : place + int(np.prod(shape))].reshape(shape)
-            place += int(np.prod(shape))
+        known |= _placed(parameters, dict(zip(self._own, self._own_shapes, strict=True)))
+        if constants is not None:
+            known |= _placed(constants, {slot: self._constants[slot].shape for slot in self._replaceable})
         for call in self._symbolic:
             try:
                 call.replay(OPERATIONS[name_of(call.operation)], known)
-            except (NoCounterpart, TypeError) as error:
+            except Exception as error:  # whatever CasADi or NumPy make of these arguments
                 raise _unknown(self.field, call) from error
         return boxed(known[self._result])
 
@@ -132,6 +153,18 @@ class Traced:
             for call in self._plain:
                 call.replay(call.operation, known)
         return known
+
+
+def own_tensors(part: PerElement) -> list[Tensor]:
+    """The tensors of a part of a problem, and of parts within it, that may differ from problem to problem."""
+    found: list[Tensor] = []
+    for value in (getattr(part, name) for name in (*part.batched, *part.per_element)):
+        for leaf in value if isinstance(value, tuple) else (value,):
+            if isinstance(leaf, PerElement):
+                found += own_tensors(leaf)
+            elif isinstance(leaf, Tensor):
+                found.append(leaf)
+    return found
 
 
 def _needed(calls: list[Call], result: Slot) -> list[Call]:
@@ -151,6 +184,16 @@ def _followers(calls: Iterable[Call], sources: Iterable[Slot]) -> set[Slot]:
         if not reached.isdisjoint(call.inputs):
             reached.update(call.outputs)
     return reached
+
+
+def _placed(numbers: np.ndarray, shapes: Mapping[Slot, tuple[int, ...]]) -> dict[Slot, np.ndarray]:
+    """One array per slot, cut from all numbers in turn."""
+    arrays, place = {}, 0
+    for slot, shape in shapes.items():
+        size = int(np.prod(shape))
+        arrays[slot] = numbers[place : place + size].reshape(shape)
+        place += size
+    return arrays
 
 
 def _array(value: Tensor) -> np.ndarray:

@@ -1,0 +1,259 @@
+"""Users' own costs and constraints in C against PyTorch's of the same."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from tests.native.test_engine import DAMPED, begun, eager, normal
+from tests.native.users import PROBLEMS, Each, Smooth, Tube, each, errands, with_cost
+from tests.problems import planar_batch, quick_gco
+from torchgco import Problem, Status, kernels
+from torchgco.constraints.base import Constraint
+from torchgco.native.compiler import find_compiler
+from torchgco.native.dispatch import EagerWarning, cost_unit, engine_of, terms_of
+from torchgco.solvers.iteration import NativeIterations
+from torchgco.solvers.lifted import lifted_search, native_lifted_search
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+
+
+@pytest.fixture(autouse=True)
+def cache() -> None:
+    """The user's own: libraries are compiled once for all of these tests."""
+
+
+@pytest.fixture(autouse=True)
+def native_again() -> Iterator[None]:
+    yield
+    kernels.use_native(True)
+
+
+def blocks(slopes: Tensor, curvatures: Tensor) -> Tensor:
+    """Gradient and upper triangle as one (..., n+m, n+m+1)."""
+    return torch.cat((slopes.unsqueeze(-1), curvatures.triu()), dim=-1)
+
+
+@pytest.mark.parametrize("unit", [False, True], ids=["as it is", "in cost units"])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> None:
+    problem = PROBLEMS[name]()
+    problem = problem.in_cost_units() if unit else problem
+    state, lagrangian = begun(problem)
+    engine, n = engine_of(problem), problem.n
+    assert engine is not None
+    values = engine.value(problem, state.X, state.U, terms_of(lagrangian))
+    for mine, theirs in zip(values, lagrangian.value(state.X, state.U), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
+    z = [i for i in range(n + 1 + problem.m) if i != n]
+    H = lagrangian.expand(state.X, state.U).transpose(0, 1)
+    want = blocks(H[..., z, n], H[..., z, :][..., z])
+    torch.testing.assert_close(
+        blocks(*engine.expand(problem, state.X, state.U, terms_of(lagrangian))), want, rtol=1e-10, atol=1e-10
+    )
+    for count in (1, 4):
+        (a, first), (b, second) = begun(problem), begun(problem)
+        ends = eager(DAMPED, a, first, count)
+        out = NativeIterations(DAMPED, problem, count).run(b, second)
+        torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
+        assert torch.equal(b.iterations, a.iterations) and torch.equal(b.inner, a.inner)
+        assert [bool(x) for x in out.converged] == [ends[i][0] for i in range(problem.B)]
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_unit_of_cost_is_pytorchs(name: str) -> None:
+    problem, same = PROBLEMS[name](), PROBLEMS[name]()
+    torch.testing.assert_close(cost_unit(problem), same.cost_unit, rtol=1e-12, atol=0)
+
+
+def test_at_rest_kinks_have_pytorchs_derivatives() -> None:
+    problem = with_cost(PROBLEMS["kinks"]().cost)
+    X, U = torch.zeros(5, 13, 4, dtype=torch.float64), torch.zeros(5, 12, 2, dtype=torch.float64)
+    H = X.new_zeros(5, 13, 7, 7)
+    problem.cost.expand(X, U, H)
+    slopes, curvatures = engine_of(problem).expand(problem, X, U, None)
+    z = [0, 1, 2, 3, 5, 6]
+    torch.testing.assert_close(blocks(slopes, curvatures), blocks(H[..., z, 4], H[..., z, :][..., z]))
+
+
+def test_a_subset_has_the_numbers_of_its_problems() -> None:
+    problem = PROBLEMS["constraints"]()
+    state, lagrangian = begun(problem)
+    whole = engine_of(problem).value(problem, state.X, state.U, terms_of(lagrangian))[1]
+    for rows in (torch.tensor([3]), torch.tensor([4, 0, 0, 2])):
+        part = problem.take(rows)  # after the whole has found its numbers, and, below, before
+        alone = PROBLEMS["constraints"]().take(rows)
+        for some in (part, alone, part.take(torch.arange(len(rows)))):
+            terms = terms_of(lagrangian.take(rows))
+            assert torch.equal(engine_of(some).value(some, state.X[rows], state.U[rows], terms)[1], whole[rows])
+
+
+def test_the_library_may_be_made_for_one_problem_first() -> None:
+    """A weight (1, 1) then stands for one problem alone, and the batch must not take it for one that all share."""
+    problem, other = PROBLEMS["constraints"](), PROBLEMS["constraints"]()
+    state, lagrangian = begun(problem)
+    want = engine_of(problem).value(problem, state.X, state.U, terms_of(lagrangian))[1]
+    assert engine_of(other.take(torch.tensor([2]))) is not None
+    terms = terms_of(replace(lagrangian, problem=other))
+    assert torch.equal(engine_of(other).value(other, state.X, state.U, terms)[1], want)
+
+
+@pytest.mark.parametrize("name", ["one of each problem", "by knot", "constraints"])
+def test_an_element_has_its_bits_in_every_batch(name: str) -> None:
+    whole = PROBLEMS[name]()
+    all_of_them, lagrangian = begun(whole)
+    NativeIterations(DAMPED, whole, 5).run(all_of_them, lagrangian)
+    names = ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation", "rows", "outer")
+    for rows in (torch.tensor([2]), torch.arange(5).flip(0), torch.tensor([1, 3] * 6)):
+        state, lagrangian = begun(whole)
+        part = replace(state, **{name: getattr(state, name)[rows] for name in names})
+        NativeIterations(DAMPED, whole.take(rows), 5).run(part, lagrangian.take(rows))
+        for name in ("X", "U", "cost", "merit", "iterations"):
+            assert torch.equal(getattr(part, name), getattr(all_of_them, name)[rows]), name
+
+
+def test_a_problem_of_its_own_has_the_bits_of_the_batch() -> None:
+    """The cost's tensors have one row there, which nothing picks."""
+    cost, whole = each(), with_cost(each())
+    own = Each(cost.target[3:4], cost.weight[3:4], cost.shared)
+    alone = Problem(whole.dynamics, own, whole.constraints, whole.x0[3:4], whole.N)
+    (a, first), (b, second) = begun(whole), begun(alone)
+    b.X, b.U, b.cost, b.merit = a.X[3:4], a.U[3:4], a.cost[3:4], a.merit[3:4]
+    second = replace(second, duals=first.take(torch.tensor([3])).duals)
+    NativeIterations(DAMPED, whole, 5).run(a, first)
+    NativeIterations(DAMPED, alone, 5).run(b, second)
+    assert torch.equal(b.U[0], a.U[3]) and torch.equal(b.merit[0], a.merit[3])
+
+
+def test_a_neighbour_that_is_not_finite_changes_no_bits() -> None:
+    problem = PROBLEMS["by knot"]()
+    want, lagrangian = begun(problem)
+    NativeIterations(DAMPED, problem, 5).run(want, lagrangian)
+    target = problem.cost.own_path.clone()
+    target[1] = torch.nan
+    ill = problem._with({"cost": replace(problem.cost, own_path=target)})
+    state, lagrangian = begun(problem)
+    state.X[3] = torch.nan
+    end = NativeIterations(DAMPED, ill, 5).run(state, replace(lagrangian, problem=ill))
+    assert [int(s) for s in end.status] == [0, 0, 0, int(Status.NON_FINITE), 0]
+    assert torch.equal(state.U[1], begun(problem)[0].U[1]) and not torch.equal(state.U[1], want.U[1])
+    for name in ("X", "U", "merit", "iterations"):
+        assert torch.equal(getattr(state, name)[[0, 2, 4]], getattr(want, name)[[0, 2, 4]]), name
+
+
+def test_steps_in_states_and_controls_together_are_pytorchs() -> None:
+    """From states that no rollout joins, until one is low enough: at the first step, or some steps later."""
+    problem = planar_batch(B=11, N=30, obstacles=3)[0]
+    state, lagrangian = begun(problem)
+    X = state.X + 0.1 * normal(*state.X.shape, seed=40)
+    X[:, 0] = problem.x0
+    merit = torch.full_like(state.merit, 1e9)
+    for _ in range(2):
+        mine, theirs = (search(lagrangian, X, state.U, merit) for search in (native_lifted_search, lifted_search))
+        assert torch.equal(mine.accepted, theirs.accepted) and bool(mine.accepted.any())
+        for name in ("X", "U", "merit"):
+            torch.testing.assert_close(getattr(mine, name), getattr(theirs, name), rtol=1e-8, atol=1e-8)
+        rows = mine.accepted
+        torch.testing.assert_close(mine.cost[rows], theirs.cost[rows], rtol=1e-8, atol=0)
+        assert bool((mine.merit[rows] < 0.99 * merit[rows]).all())
+        merit = theirs.merit
+    none = native_lifted_search(lagrangian, X, state.U, -merit.abs())
+    assert not bool(none.accepted.any()) and torch.equal(none.X, X) and torch.equal(none.U, state.U)
+
+
+def test_solve_is_native_for_a_users_own_car_and_cost() -> None:
+    problem = errands()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", EagerWarning)
+        solution = torchgco.solve(problem, solver=quick_gco(problem))
+    assert engine_of(problem) is not None
+    assert set(solution.statuses) <= {Status.CONVERGED, Status.FEASIBLE}
+    torch.testing.assert_close(solution.cost, problem.cost.total(solution.X, solution.U))
+    assert bool((solution.cost < 0.3 * problem.cost.total(*problem.at_rest)).all())
+
+
+def test_such_a_solve_loads_nothing_that_takes_seconds() -> None:
+    code = (
+        "import sys, torchgco; from tests.native.users import errands; from dataclasses import replace;"
+        "problem = errands(1, 20); solver = replace(torchgco.presets.gco(problem), max_outer_iterations=2);"
+        "torchgco.solve(problem, solver=solver); print('torch._dynamo' in sys.modules)"
+    )
+    root = Path(__file__).parents[2]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
+    assert done.stdout.strip() == "False"
+
+
+class Looks(Smooth):
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return super().stage(x, u, k) if bool((x < 1e9).all()) else x[..., 0]
+
+
+class Jerky(Smooth):
+    def total(self, X: Tensor, U: Tensor) -> Tensor:
+        return super().total(X, U) + U.diff(dim=1).square().sum((-1, -2))
+
+
+class FirstIsFree(Smooth):
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        value = super().stage(x, u, k)
+        if isinstance(k, int):
+            return value if k > 0 else 0.0 * value
+        return torch.cat((torch.zeros_like(value[:, :1]), value[:, 1:]), dim=1)
+
+
+class Sums(Smooth):
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return super().stage(x, u, k).cumsum(-1)
+
+
+class Column(Smooth):
+    def terminal(self, x: Tensor) -> Tensor:
+        return super().terminal(x).unsqueeze(-1)
+
+
+@dataclass(frozen=True)
+class Jerk(Constraint):
+    """Rows that join two knots."""
+
+    knots: ClassVar[slice] = slice(0, 11)
+
+    def bind(self, dims: Any) -> Jerk:
+        return self
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return U[:, 1:] - U[:, :-1] - 0.1
+
+
+def with_rows(row: Constraint) -> Problem:
+    base = with_cost(Smooth())
+    return Problem(base.dynamics, base.cost, [row], base.x0, base.N)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: with_cost(Looks()), r"cost.stage \(Looks\): expected a function that can be traced"),
+        (lambda: with_cost(Jerky()), r"cost.total \(Jerky\)"),
+        (lambda: with_cost(FirstIsFree()), r"cost.stage \(FirstIsFree\): expected the same operations at every knot"),
+        (lambda: with_cost(Sums()), r"cost.stage \(Sums\): expected rows that read their own knot alone"),
+        (lambda: with_cost(Column()), r"cost.terminal \(Column\): expected costs \(1,\) of states"),
+        (lambda: with_rows(Jerk()), r"constraints\[0\] \(Jerk\): expected rows that read their own knot alone"),
+        (lambda: with_rows(Tube(torch.zeros(13, 2), torch.ones(5), slice(1, 1))), "at least one knot"),
+    ],
+)
+def test_what_cannot_be_native_is_named_once(make, said: str) -> None:
+    problem = make()
+    with pytest.warns(EagerWarning, match=said) as caught:
+        assert engine_of(problem) is None and engine_of(problem.in_cost_units()) is None
+    assert len(caught) == 1

@@ -1,0 +1,291 @@
+"""Costs and constraints as users write them, on a car with all kinds of constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from tests.native.test_engine import normal, user_problem
+from tests.problems import quadrotor_batch
+from torchgco import ControlBounds, Cost, FirstStepRates, FunctionConstraint, FunctionDynamics, Problem, QuadraticCost
+from torchgco import Spheres as Discs
+from torchgco.constraints.base import Constraint, Sense
+from torchgco.constraints.bounds import ControlBounds as Bounds
+
+B, N = 5, 12
+
+
+def rows_of(own: Tensor, x: Tensor) -> Tensor:
+    """A vector of each problem (B, d) beside states (B, n), (B, N, n) or samples (B, S, n)."""
+    return own if x.dim() == 2 else own.unsqueeze(1)
+
+
+class Smooth(Cost):
+    """A pseudo-Huber distance, a hill, and a term that joins states and controls."""
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        far = (1.0 + (x[..., :2] - 1.0).square().sum(-1)).sqrt() - 1.0
+        hill = torch.exp(-4.0 * x[..., :2].square().sum(-1))
+        return far + 0.5 * hill + 0.2 * u.square().sum(-1) + 0.1 * (u[..., 0] * x[..., 3]).tanh()
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return 10.0 * torch.log1p((x - 0.5).square().sum(-1))
+
+
+@dataclass(frozen=True)
+class Each(Cost):
+    """A target of each problem, a weight of each, and one for all."""
+
+    target: Tensor  # (B, 4)
+    weight: Tensor  # (B, 1)
+    shared: Tensor  # (1, 4)
+
+    batched: ClassVar[tuple[str, ...]] = ("target",)
+    per_element: ClassVar[tuple[str, ...]] = ("weight", "shared")
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        e = x - rows_of(self.target, x)
+        far = (0.1 + (rows_of(self.shared, x) * e.square()).sum(-1)).sqrt()
+        return rows_of(self.weight, x)[..., 0] * far + 0.1 * (1.0 + x[..., 3].square()) * u.square().sum(-1)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return 5.0 * self.weight[..., 0] * (x - self.target).square().sum(-1) + x[..., 2].cosh()
+
+
+@dataclass(frozen=True)
+class ByKnot(Cost):
+    """References by knot, of all problems and of each, and weights that are computed from k."""
+
+    path: Tensor  # (N, 4)
+    own_path: Tensor  # (B, N, 2)
+
+    batched: ClassVar[tuple[str, ...]] = ("own_path",)
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        own = self.own_path[:, k].unsqueeze(1) if isinstance(k, int) and x.dim() == 3 else self.own_path[:, k]
+        far = (0.1 + (x - self.path[k]).square().sum(-1)).sqrt()
+        late = torch.where(torch.as_tensor(k) > 5, 2.0, 0.5)
+        return 0.9**k * far + late * (u - own).square().sum(-1) + 0.01 * (k + 1) * (x[..., 3] * u[..., 0]).sin()
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return (x - self.path[-1]).square().sum(-1)
+
+
+@dataclass(frozen=True)
+class AllAtOnce(ByKnot):
+    """The same for one who takes arange(N) to mean that all stages stand there."""
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        path, own = (self.path[k], self.own_path[:, k]) if isinstance(k, int) else (self.path, self.own_path)
+        return (0.1 + (x - path).square().sum(-1)).sqrt() + (u - own).square().sum(-1)
+
+
+@dataclass(frozen=True)
+class Dense(Cost):
+    """A function of every pair of states and controls."""
+
+    W: Tensor  # (8, 6)
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return torch.nn.functional.softplus(torch.cat((x, u), dim=-1) @ self.W.mT).square().sum(-1)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return (x @ self.W[:, :4].mT).cos().sum(-1) + 3.0 * x.square().sum(-1)
+
+
+class Kinks(Cost):
+    """Terms with kinks, which a start at rest lies on."""
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        inside = torch.where(u.abs() < 0.5, u.square(), u.abs() - 0.25).sum(-1)
+        return inside + u.norm(dim=-1) + x.clamp(min=0.0).square().sum(-1) + torch.relu(u[..., 0]).square()
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return torch.linalg.vector_norm(x, dim=-1) + x.square().sum(-1)
+
+
+class GaussNewton(Smooth):
+    """Brings an expansion of its own."""
+
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        n = X.shape[-1]
+        H.zero_()
+        H[..., :n, :n].diagonal(dim1=-2, dim2=-1).add_(1.0 + X.square())
+        H[:, :-1, n + 1 :, n + 1 :].diagonal(dim1=-2, dim2=-1).add_(0.4 + 0.1 * U.square())
+        H[:, :-1, n + 1, 3] = H[:, :-1, 3, n + 1] = 0.1 * U[..., 0].cos()
+        H[..., :n, n] = H[..., n, :n] = X.tanh()
+        H[:, :-1, n + 1 :, n] = H[:, :-1, n, n + 1 :] = 0.4 * U
+
+
+@dataclass(frozen=True)
+class ScalesItself(Cost):
+    """A number that becomes a tensor where it is scaled."""
+
+    weight: Any = 2.0
+
+    per_element: ClassVar[tuple[str, ...]] = ("weight",)
+
+    def scaled(self, factor: Tensor) -> ScalesItself:
+        return replace(self, weight=factor * self.weight)
+
+    def _times(self, value: Tensor) -> Tensor:
+        own = self.weight
+        return value * (own.view(-1, *[1] * (value.dim() - 1)) if isinstance(own, Tensor) else own)
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return self._times((1.0 + x.square().sum(-1)).sqrt() + u.square().sum(-1))
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return self._times(x.square().sum(-1))
+
+
+@dataclass(frozen=True)
+class Around(Cost):
+    """A quadratic cost, and something more."""
+
+    inner: Cost
+
+    batched: ClassVar[tuple[str, ...]] = ("inner",)
+
+    def bind(self, dims: Any) -> Around:
+        return Around(self.inner.bind(dims))
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return self.inner.stage(x, u, k) + (x[..., 0] * u[..., 1]).sin()
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return self.inner.terminal(x) + x[..., 2].cos()
+
+
+def with_cost(cost: Cost) -> Problem:
+    base = user_problem(B, N)
+    return Problem(base.dynamics, cost, base.constraints, base.x0, N)
+
+
+def each(B: int = B) -> Each:
+    return Each(normal(B, 4, seed=20), 1.0 + normal(B, 1, seed=21).abs(), torch.tensor([[1.0, 2.0, 0.5, 0.1]]).double())
+
+
+def by_knot(kind: type[ByKnot] = ByKnot) -> ByKnot:
+    return kind(normal(N, 4, seed=22), 0.3 * normal(B, N, 2, seed=23))
+
+
+def around() -> Around:
+    weights = dict(Q=[1.0, 2.0, 0.5, 0.1], R=[0.3, 0.2], Qf=[5.0] * 4)
+    return Around(QuadraticCost(**weights, x_ref=normal(B, N + 1, 4, seed=24), u_ref=normal(N, 2, seed=25)))
+
+
+@dataclass(frozen=True)
+class Tube(Constraint):
+    """|p_k - center_k| within a radius of each problem, at some knots."""
+
+    centers: Tensor  # (N+1, 2)
+    radius: Tensor  # (B,)
+    knots: Any
+    sense: Sense = "inequality"
+
+    batched: ClassVar[tuple[str, ...]] = ("radius",)
+
+    def bind(self, dims: Any) -> Tube:
+        return self
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        away = (X[..., :2] - self.centers)[:, self.knots]
+        return away.square().sum(-1, keepdim=True) - self.radius.view(-1, 1, 1).square()
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        slope = 2.0 * (X[..., :2] - self.centers)[:, self.knots]
+        add = H[:, self.knots]
+        add[..., :2, 4] += g * slope
+        add[..., 4, :2] += g * slope
+        add[..., :2, :2] += h.unsqueeze(-1) * slope.unsqueeze(-1) * slope.unsqueeze(-2)
+        H[:, self.knots] = add
+
+
+class Power(FunctionConstraint):
+    """u_0 v <= 1 / 10, half of it with `value` of its own."""
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return 0.5 * super().value(X, U)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        super().accumulate(X, U, 0.5 * g, 0.25 * h, H)
+
+
+class Tight(Bounds):
+    """Bounds with a margin."""
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return super().value(X, U) + 0.1
+
+
+def with_constraints() -> Problem:
+    base = user_problem(B, N)
+    radius = 0.5 + normal(B, seed=26).abs()
+    rows = [
+        Tube(0.3 * normal(N + 1, 2, seed=27), radius, slice(1, N + 1)),
+        Tube(0.3 * normal(N + 1, 2, seed=28), radius, torch.tensor([2, 5, N]), "equality"),
+        Power(lambda x, u: u[..., :1] * x[..., 3:] - 0.1, of="xu"),
+        Tight([-1.0, -torch.inf], [torch.inf, 2.0]),
+        ControlBounds([-2.0, -2.0], [2.0, 2.0]),
+    ]
+    return Problem(base.dynamics, each(), rows, base.x0, N)
+
+
+def first_step() -> Problem:
+    base = quadrotor_batch(B=3, N=6, obstacles=2)[0]
+    thrusts = torch.tensor([[3.0, 4, 3, 4], [4.0, 3, 4, 4], [3.5, 3.5, 3.5, 3.6]], dtype=torch.float64)
+    return Problem(base.dynamics, base.cost, [FirstStepRates(thrusts), *base.constraints], base.x0, base.N)
+
+
+PROBLEMS: dict[str, Callable[[], Problem]] = {
+    "smooth": lambda: with_cost(Smooth()),
+    "one of each problem": lambda: with_cost(each()),
+    "by knot": lambda: with_cost(by_knot()),
+    "all at once": lambda: with_cost(by_knot(AllAtOnce)),
+    "dense": lambda: with_cost(Dense(0.4 * normal(8, 6, seed=29))),
+    "kinks": lambda: with_cost(Kinks()),
+    "an expansion of its own": lambda: with_cost(GaussNewton()),
+    "scales itself": lambda: with_cost(ScalesItself()),
+    "around a quadratic one": lambda: with_cost(around()),
+    "constraints": with_constraints,
+    "first step": first_step,
+}
+
+
+def unicycle(x: Tensor, u: Tensor) -> Tensor:
+    """Rates of x, y, heading and speed under acceleration and turn rate."""
+    return torch.stack((x[..., 3] * x[..., 2].cos(), x[..., 3] * x[..., 2].sin(), u[..., 1], u[..., 0]), dim=-1)
+
+
+@dataclass(frozen=True)
+class Errand(Cost):
+    """To a target of each problem, the more urgent the later; fast turns are dear."""
+
+    target: Tensor  # (B, 2)
+
+    batched: ClassVar[tuple[str, ...]] = ("target",)
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        far = (1.0 + (x[..., :2] - rows_of(self.target, x)).square().sum(-1)).sqrt() - 1.0
+        return (0.02 + 4e-4 * k) * far + 0.01 * u.square().sum(-1) + 0.02 * (x[..., 3] * u[..., 1]).square()
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return 20.0 * (x[..., :2] - rows_of(self.target, x)).square().sum(-1) + 2.0 * x[..., 3].square()
+
+
+def errands(B: int = 2, N: int = 100) -> Problem:
+    """Unicycles that drive through five discs."""
+    start, target = torch.zeros(2, B, 4, dtype=torch.float64)
+    start[:, 1], target[:, 0], target[:, 1] = 0.3 * normal(B, seed=30), 5.0, 0.3 * normal(B, seed=31)
+    centers = [[1.5, 0.3], [2.2, -0.6], [3.0, 0.5], [3.8, -0.3], [2.7, 1.4]]
+    return Problem(
+        FunctionDynamics(unicycle, 4, 2, dt=0.05, integrator="rk4", position=slice(0, 2)),
+        Errand(target[:, :2].contiguous()),
+        [Discs(centers, [0.35] * 5, 0.1), ControlBounds([-3.0, -3.0], [3.0, 3.0])],
+        start, N,
+    )  # fmt: skip

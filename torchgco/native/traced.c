@@ -1,0 +1,35 @@
+/* A traced cost times one number per problem: its value, gradient and Hessian at a knot.
+
+   The generated part defines, for `stage` and `last` alike, with a knot's own numbers p:
+
+       tgco_stage_value(x, u, p, value)
+       tgco_stage_entries(x, u, p, e)   STAGE_ENTRIES derivatives: first STAGE_SLOPES of the gradient's, then the Hessian's
+       tgco_stage_places                where they belong in g and H */
+
+enum { FACTOR, STAGE, LAST };
+
+/* The cost of knot k: of stage x, u, or where u is NULL of the last knot. */
+static inline V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
+    V value;
+    if (u) tgco_stage_value(x, u, cost_at(s, STAGE, k), &value);
+    else tgco_last_value(x, u, cost_at(s, LAST, k), &value);
+    return cost_at(s, FACTOR, k)[0] * value;
+}
+
+static inline void add_entries(V factor, int slopes, int count, const int *places, const V *e, V *g, V *H) {
+    for (int i = 0; i < slopes; i++) g[places[i]] += factor * e[i];
+    for (int i = slopes; i < count; i++) H[places[i]] += factor * e[i];
+}
+
+/* Adds gradient g (S) and upper triangle H (S, S) of that. */
+static inline void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
+    if (u) {
+        V e[STAGE_ENTRIES + 1];
+        tgco_stage_entries(x, u, cost_at(s, STAGE, k), e);
+        add_entries(cost_at(s, FACTOR, k)[0], STAGE_SLOPES, STAGE_ENTRIES, tgco_stage_places, e, g, H);
+    } else {
+        V e[LAST_ENTRIES + 1];
+        tgco_last_entries(x, u, cost_at(s, LAST, k), e);
+        add_entries(cost_at(s, FACTOR, k)[0], LAST_SLOPES, LAST_ENTRIES, tgco_last_places, e, g, H);
+    }
+}

@@ -1,0 +1,120 @@
+/* What Python calls along given trajectories: values, expansions, gains, rollouts, and steps where rollouts diverge. */
+
+/* J_var and L_M of given trajectories. */
+int tgco_value(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    if (!start(s, p)) return 0;
+    for (int64_t e = first; e < last; e += LANES) {
+        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
+        V total = SET(0.0), more = SET(0.0), part;
+        for (int64_t k = 0; k <= p->N; k++) {
+            total += knot_value(s, k, s->X + k * NX, k < p->N ? s->U + k * NU : 0, &part);
+            more += part;
+        }
+        for (int l = 0; l < LANES && e + l < last; l++) {
+            p->cost[e + l] = total[l];
+            p->merit[e + l] = total[l] + more[l];
+        }
+    }
+    finish(s);
+    return 1;
+}
+
+/* One backward pass along given trajectories: gains (E, N, NU, NZ) and the two sums of the expected change. */
+int tgco_gains(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    if (!start(s, p)) return 0;
+    for (int64_t e = first; e < last; e += LANES) {
+        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
+        V linear, squares, lowest;
+        backward(s, NULL, &linear, &squares, &lowest);
+        V quadratic = -linear - s->mu_r * squares;
+        for (int l = 0; l < LANES && e + l < last; l++) {
+            p->cost[e + l] = linear[l];
+            p->merit[e + l] = quadratic[l];
+            p->status[e + l] = !(lowest[l] > 0);
+            for (int64_t i = 0; i < p->N * NU * NZ; i++) p->gains[(e + l) * p->N * NU * NZ + i] = s->G[i][l];
+        }
+    }
+    finish(s);
+    return 1;
+}
+
+/* Rollout of U from the first knot of X. */
+int tgco_open_loop(const Problem *p, int64_t first, int64_t last) {
+    int64_t N = p->N;
+    V parameters[NP ? NP : 1], x[2 * NX], u[NU];
+    for (int64_t e = first; e < last; e += LANES) {
+        for (int l = 0; l < LANES; l++) {
+            int64_t element = e + l < last ? e + l : e;
+            fill(parameters, &p->parameters, 1, l, element);
+            for (int i = 0; i < NX; i++) x[i][l] = p->X[element * (N + 1) * NX + i];
+        }
+        for (int64_t k = 0; k < N; k++) {
+            for (int l = 0; l < LANES; l++) {
+                int64_t element = e + l < last ? e + l : e;
+                for (int j = 0; j < NU; j++) u[j][l] = p->U[(element * N + k) * NU + j];
+            }
+            model_step(x, u, parameters, x + NX);
+            memcpy(x, x + NX, NX * sizeof(V));
+            for (int l = 0; l < LANES && e + l < last; l++)
+                for (int i = 0; i < NX; i++) p->X[((e + l) * (N + 1) + k + 1) * NX + i] = x[i][l];
+        }
+    }
+    return 1;
+}
+
+/* Gradients (E, N+1, S) and upper triangles of the Hessians (E, N+1, S, S) of all terms. */
+int tgco_expand(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    if (!start(s, p)) return 0;
+    for (int64_t e = first; e < last; e += LANES) {
+        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
+        for (int64_t k = 0; k <= p->N; k++) {
+            V g[S], H[S * S];
+            memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+            knot_expand(s, k, s->X + k * NX, k < p->N ? s->U + k * NU : 0, g, H);
+            for (int l = 0; l < LANES && e + l < last; l++) {
+                int64_t at = (e + l) * (p->N + 1) + k;
+                for (int i = 0; i < S; i++) p->slopes[at * S + i] = g[i][l];
+                for (int i = 0; i < S * S; i++) p->curvatures[at * S * S + i] = H[i][l];
+            }
+        }
+    }
+    finish(s);
+    return 1;
+}
+
+/* Up to `limit` Gauss-Newton steps in states and controls together (solvers/lifted.py). The first rollout that lowers L_M
+   by the share `gain` takes the iterate's place, and `converged` says whether there was one. */
+int tgco_lift(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    int64_t N = p->N;
+    V *gap = aligned_alloc(sizeof(V), N * NX * sizeof(V));
+    if (!gap || !start(s, p)) { free(gap); return 0; }
+    for (int64_t e = first; e < last; e += LANES) {
+        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
+        I open = SET(0.0) == SET(0.0);
+        for (int64_t round = 0; round < p->limit && any(open); round++) {
+            V linear, squares, lowest, cost, merit, sum = SET(0.0);
+            gaps(s, gap);
+            backward(s, gap, &linear, &squares, &lowest);
+            if (round > 0) { /* the first gains are those that failed */
+                roll(s, SET(1.0), &cost, &merit);
+                I low = open & finite(merit) & (merit < s->merit - SET(p->gain) * tgco_fabs(s->merit));
+                for (int l = 0; l < LANES && e + l < last; l++) if (low[l]) {
+                    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[(e + l) * (N + 1) * NX + i] = s->Xn[i][l];
+                    for (int64_t i = 0; i < N * NU; i++) p->U[(e + l) * N * NU + i] = s->Un[i][l];
+                    p->cost[e + l] = cost[l]; p->merit[e + l] = merit[l]; p->converged[e + l] = 1;
+                }
+                open &= ~low;
+            }
+            linear_step(s, gap);
+            for (int64_t i = 0; i < (N + 1) * NX; i++) sum += SET(0.0) * s->X[i];
+            open &= (lowest > SET(0.0)) & (sum == SET(0.0));
+        }
+    }
+    free(gap);
+    finish(s);
+    return 1;
+}
