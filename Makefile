@@ -4,7 +4,7 @@
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
 # make benchmark   speed, side by side with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
-# make test    the quick tests; test-slow: those that compile; lint, types: the static checks; clean: start afresh
+# make test    the tests; lint, types: the static checks; clean: start afresh
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -24,16 +24,13 @@ FAMILIES ?= forest30 forest60 walls planar_trap planar_random
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-slow lint types clean quality oracle benchmark benchmark-gpu families $(FAMILIES:%=family-%)
+.PHONY: study test lint types clean quality oracle benchmark benchmark-gpu families $(FAMILIES:%=family-%)
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
 
 test: $(DEV)
 	$(BIN)/python -m pytest -n auto $(ARGS)
-
-test-slow: $(DEV)
-	$(BIN)/python -m pytest -m slow $(ARGS)
 
 families: $(FAMILIES:%=family-%)
 	$(BIN)/torchgco-report outputs/families --output outputs/families-report

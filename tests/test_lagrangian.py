@@ -5,7 +5,6 @@ import torch
 
 from tests.problems import planar_batch, quadrotor_batch, random_trajectory
 from torchgco.constraints import FunctionConstraint, GuidePath, GuideRegion, StateBounds
-from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian, Multipliers, penalty_weights, update, worst_rows
 from torchgco.problem import Problem
 
@@ -163,10 +162,8 @@ def test_a_large_batch_is_valued_and_expanded_in_pieces(monkeypatch) -> None:
     problem = _with_more(quadrotor_batch(B=5, N=9)[0])
     X, U = random_trajectory(problem)
     lagrangian = Lagrangian(problem, _random_duals(problem, X, U), _guide(X, problem.dynamics.position), True)
-    whole = (*lagrangian.value(X, U), lagrangian.expand(X, U), linearise(problem, X, U))
-    for module in ("lagrangian", "expansion"):
-        monkeypatch.setattr(f"torchgco.{module}.AT_ONCE", 2)
-    F = linearise(problem, 2 * X, 2 * U)  # memory that a pass before has left
-    pieces = (*lagrangian.value(X, U), lagrangian.expand(X, U), linearise(problem, X, U, F))
+    whole = (*lagrangian.value(X, U), lagrangian.expand(X, U))
+    monkeypatch.setattr("torchgco.lagrangian.AT_ONCE", 2)
+    pieces = (*lagrangian.value(X, U), lagrangian.expand(X, U))
     for a, b in zip(whole, pieces, strict=True):
         assert torch.equal(a, b)

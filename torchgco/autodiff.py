@@ -14,15 +14,14 @@ from torch import Tensor
 
 def jacobian(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
     """Derivatives of function(*args) (..., out) by the last axis of each argument: one (..., out, in) each."""
-    columns = []
-    for j, arg in enumerate(args):
+    sizes = [arg.shape[-1] for arg in args]
 
-        def along(direction: Tensor, j: int = j) -> Tensor:
-            tangents = tuple(direction.expand_as(a) if i == j else torch.zeros_like(a) for i, a in enumerate(args))
-            return torch.func.jvp(function, args, tangents)[1]
+    def along(direction: Tensor) -> Tensor:
+        tangents = tuple(part.expand_as(arg) for part, arg in zip(direction.split(sizes), args, strict=True))
+        return torch.func.jvp(function, args, tangents)[1]
 
-        columns.append(torch.func.vmap(along)(_basis(arg)).movedim(0, -1))
-    return tuple(columns)
+    basis = torch.eye(sum(sizes), dtype=args[0].dtype, device=args[0].device)
+    return torch.func.vmap(along)(basis).movedim(0, -1).split(sizes, dim=-1)
 
 
 def gradients(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
@@ -41,8 +40,5 @@ def gradient_and_hessian(function: Callable[[Tensor], Tensor], z: Tensor) -> tup
     def along(direction: Tensor) -> Tensor:
         return torch.func.jvp(gradient, (z,), (direction.expand_as(z),))[1]
 
-    return gradient(z), torch.func.vmap(along)(_basis(z)).movedim(0, -1)
-
-
-def _basis(like: Tensor) -> Tensor:
-    return torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
+    basis = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
+    return gradient(z), torch.func.vmap(along)(basis).movedim(0, -1)

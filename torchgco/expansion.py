@@ -2,41 +2,22 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from torchgco.problem import Problem
-from torchgco.shapes import pieces
-
-AT_ONCE = 64  # problems that are differentiated together on a CPU: what is at work stays in the cache
 
 
-def linearise(problem: Problem, X: Tensor, U: Tensor, out: Tensor | None = None) -> Tensor:
+def linearise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """F (N, B, n+1, s) with [dx_{k+1}, 1] = F_k [dx_k, 1, du_k], around X (B, N+1, n), U (B, N, m).
 
-    Stage first, as the backward pass reads it; written into `out` where that is given, which `standing` has made: a
-    model that knows its zeros writes only what moves.
+    Stage first, as the backward pass reads it.
     """
-    n, B = problem.n, problem.B
-    F = standing(problem, B) if out is None else out
-    places = torch.tensor([_place(problem, *at) for at in problem.dynamics.sparsity], device=X.device)
-    for rows in pieces(B, AT_ONCE if X.device.type == "cpu" else B):
-        part, x, u = problem.dynamics.take(rows), X[rows, :-1], U[rows]
-        entries = part.step_entries(x, u)
-        if entries is not None:
-            F[:, rows].flatten(-2).index_copy_(-1, places, entries.transpose(0, 1))
-            continue
-        fx, fu = part.jacobians(x, u)
-        F[:, rows, :n, :n] = fx.transpose(0, 1)
-        F[:, rows, :n, n + 1 :] = fu.transpose(0, 1)
-    return F
-
-
-def standing(problem: Problem, B: int) -> Tensor:
-    """F (N, B, n+1, s) of vehicles of a problem's form that stay where they are."""
-    n, m = problem.n, problem.m
-    F = problem.x0.new_zeros(problem.N, B, n + 1, n + 1 + m)
-    F.diagonal(dim1=-2, dim2=-1).fill_(1.0)
+    n, m, (B, N) = problem.n, problem.m, U.shape[:2]
+    fx, fu = problem.dynamics.jacobians(X[:, :-1], U)
+    F = X.new_zeros(N, B, n + 1, n + 1 + m)
+    F[..., :n, :n] = fx.transpose(0, 1)
+    F[..., :n, n + 1 :] = fu.transpose(0, 1)
+    F[..., n, n] = 1.0
     return F
 
 
@@ -46,9 +27,3 @@ def quadratise(problem: Problem, X: Tensor, U: Tensor, out: Tensor | None = None
     H = X.new_empty(X.shape[0], X.shape[1], s, s) if out is None else out
     problem.cost.expand(X, U, H)
     return H
-
-
-def _place(problem: Problem, row: int, column: int) -> int:
-    """Where an entry of [fx, fu] stands in a block of F that is read row by row."""
-    n, m = problem.n, problem.m
-    return row * (n + 1 + m) + (column if column < n else column + 1)

@@ -11,7 +11,6 @@ from torch import Tensor
 from torchgco.constraints.base import Sense
 from torchgco.constraints.guides import Guide
 from torchgco.expansion import quadratise
-from torchgco.kernels import kernel
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, Rows, pieces, take
 
@@ -60,7 +59,6 @@ def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool
     return torch.where(idle, 0.0, rho)
 
 
-@kernel
 def _worth(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> Tensor:
     """What the rows of a constraint add to L_M, (B,)."""
     rho = penalty_weights(sense, c, lam, mu, clip)
@@ -72,7 +70,6 @@ def _worth(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> Tens
     return terms.sum(-1).sum(-1)
 
 
-@kernel
 def _pull(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> tuple[Tensor, Tensor]:
     """First and second derivative of that by c, (B, K, p) each."""
     rho = penalty_weights(sense, c, lam, mu, clip)

@@ -38,7 +38,7 @@ class Problem:
     x0: Tensor
     N: int
 
-    # What others keep of the problems' form (compiled kernels, say), shared by all subsets of a batch.
+    # What others keep of the problems' form (native kernels, say), shared by all subsets of a batch.
     form: ClassVar[dict[Any, Any]]
 
     def __post_init__(self) -> None:
@@ -107,7 +107,7 @@ class Problem:
         return self._with({"cost": self.cost.scaled(1.0 / self.cost_unit)}, form=self.form)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The parts alone: compiled kernels stay in their process."""
+        """The parts alone: native kernels stay in their process."""
         return {f.name: getattr(self, f.name) for f in fields(self)} | {"form": {}}
 
     def take(self, index: Rows) -> Self:
@@ -124,11 +124,6 @@ class Problem:
         """The same problems in another precision."""
         parts = {name: cast(getattr(self, name), dtype) for name in ("dynamics", "cost", "constraints", "x0")}
         return self._with(parts)
-
-    @property
-    def is_autonomous(self) -> bool:
-        """Whether all stages are alike to a sampler: no reference, weight, obstacle or constraint changes with k."""
-        return self.cost.is_autonomous and all(c.is_autonomous(self.N) for c in self.geometric)
 
     def without_constraints(self) -> Self:
         """The same problems with the constraints dropped."""

@@ -164,10 +164,18 @@ def lead(parameter: Tensor | float, component: Tensor) -> Tensor | float:
     return parameter
 
 
+def components(z: Tensor) -> tuple[Tensor, ...]:
+    """The components (...) of vectors (..., n), each of them contiguous: arithmetic on strided ones takes longer."""
+    return z.movedim(-1, 0).contiguous().unbind(0)
+
+
+def vectors(*parts: Tensor) -> Tensor:
+    """Vectors (..., n) of n components (...), which stay apart in memory for those who ask for them again."""
+    return torch.stack(parts).movedim(0, -1)
+
+
 def sum_rows(z: Tensor) -> Tensor:
     """Sum over the first axis, by halves: `sum(0)` would add in an order that depends on the length of the others."""
-    if torch.compiler.is_compiling():
-        return sum(z[1:].unbind(0), z[0])  # halves would be written to memory, single terms are fused
     while z.shape[0] > 1:
         half = z.shape[0] // 2
         folded = z[:half] + z[half : 2 * half]

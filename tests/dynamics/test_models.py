@@ -1,4 +1,4 @@
-"""Models against the NumPy reference, derivatives against autodiff, order of the integrators."""
+"""Models and their derivatives against the NumPy reference, order of the integrators."""
 
 import numpy as np
 import pytest
@@ -37,64 +37,76 @@ def states_of(model, lead=(3, 5), seed=0):
     return x, u
 
 
+def differences(step, x, u, h=1e-6):
+    """[fx, fu] (..., n, n+m) by central differences, which no model has a hand in."""
+    z = torch.cat((x, u), dim=-1)
+    columns = []
+    for i in range(z.shape[-1]):
+        shift = torch.zeros_like(z)
+        shift[..., i] = h * z[..., i].abs().clamp(min=1.0)
+        ahead, behind = (step(*(z + sign * shift).split((x.shape[-1], u.shape[-1]), dim=-1)) for sign in (1.0, -1.0))
+        columns.append((ahead - behind) / (2.0 * shift[..., i : i + 1]))
+    return torch.stack(columns, dim=-1)
+
+
+def reference_step(model, integrator):
+    """step(x, u) of one state and one control in NumPy."""
+    if type(model) is QuadrotorPlant:
+        return reference.plant_step(model.dt, integrator=getattr(reference, integrator))
+    return getattr(reference, integrator)(FIELDS[type(model)], model.dt)
+
+
 @pytest.mark.parametrize("integrator", ["euler", "midpoint", "rk4"])
 @pytest.mark.parametrize("cls", MODELS)
-def test_jacobians_equal_autodiff(cls, integrator) -> None:
+def test_jacobians_equal_differences_of_the_reference(cls, integrator) -> None:
     model = cls(integrator=integrator)
-    x, u = states_of(model)
-    for analytic, auto in zip(model.jacobians(x, u), model.autodiff_jacobians(x, u), strict=True):
-        torch.testing.assert_close(analytic, auto, rtol=1e-10, atol=1e-12)
+    x, u = states_of(model, lead=(6,))
+    step = reference_step(model, integrator)
+
+    def steps(x, u):
+        return torch.stack([torch.from_numpy(step(a, b)) for a, b in zip(x.numpy(), u.numpy(), strict=True)])
+
+    expected = differences(steps, x, u)
+    torch.testing.assert_close(torch.cat(model.jacobians(x, u), dim=-1), expected, rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("integrator", ["euler", "rk4"])
 @pytest.mark.parametrize("cls", [Planar, QuadrotorPlanning])
-def test_what_is_known_to_be_zero_is_left_out_of_the_linearisation(cls, integrator) -> None:
-    """F from the entries of a sparse model, in memory that a pass with other states has left, equals autodiff."""
-    model = cls(integrator=integrator, **{cls.per_element[0]: torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)})
+def test_the_linearisation_holds_the_jacobians(cls) -> None:
+    """F, stage first and in homogeneous form, of vehicles that differ."""
+    model = cls(**{cls.per_element[0]: torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)})
     x, u = states_of(model)
-    n, other = model.n, torch.cat((x, x[:, :1]), dim=1)
+    n, knots = model.n, torch.cat((x, x[:, :1]), dim=1)
     cost = QuadraticCost(Q=[1.0] * n, R=[1.0] * model.m, Qf=[1.0] * n)
-    problem = Problem(model, cost, [], x[:, 0], N=5)
-    F = linearise(problem, other, u, out=linearise(problem, -other, 2.0 * u))
-    fx, fu = model.autodiff_jacobians(x, u)
-    torch.testing.assert_close(F[:, :, :n, :n].transpose(0, 1), fx, rtol=1e-10, atol=1e-12)
-    torch.testing.assert_close(F[:, :, :n, n + 1 :].transpose(0, 1), fu, rtol=1e-10, atol=1e-12)
+    F = linearise(Problem(model, cost, [], x[:, 0], N=5), knots, u)
+    fx, fu = model.jacobians(x, u)
+    assert torch.equal(F[:, :, :n, :n].transpose(0, 1), fx) and torch.equal(F[:, :, :n, n + 1 :].transpose(0, 1), fu)
     assert torch.equal(F[:, :, n], torch.eye(n + 1 + model.m).double()[n].expand(5, 3, -1))
     assert not F[:, :, :n, n].any()
 
 
-def test_a_subclass_with_derivatives_of_its_own_is_linearised_by_them() -> None:
+def test_a_subclass_steps_and_is_linearised_by_its_own_step() -> None:
     class Towed(Planar):
         def step(self, x, u):
             return super().step(0.5 * x, u)
 
-        def jacobians(self, x, u):
-            return self.autodiff_jacobians(x, u)
-
-    model = Towed()
+    model, plain = Towed(), Planar()
     x, u = states_of(model)
-    problem = Problem(model, QuadraticCost(Q=[1.0] * 6, R=[1.0] * 2, Qf=[1.0] * 6), [], x[:, 0], N=5)
-    F = linearise(problem, torch.cat((x, x[:, :1]), dim=1), u)
-    torch.testing.assert_close(F[:, :, :6, :6].transpose(0, 1), model.autodiff_jacobians(x, u)[0], rtol=1e-10, atol=0)
+    torch.testing.assert_close(model.jacobians(x, u)[0], 0.5 * plain.jacobians(0.5 * x, u)[0], rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize("lead", [(4,), (4, 5)])
-def test_the_quadrotor_of_few_operations_is_the_one_of_components(lead) -> None:
-    T_w = torch.tensor([0.5, 1.0, 1.5, 2.0], dtype=torch.float64)
-    for model in (QuadrotorPlanning(), QuadrotorPlanning(rate_time_constant=T_w, thrust_time_constant=2 * T_w)):
-        x, u = states_of(model, lead)
-        rates = torch.stack(model.rates(x.unbind(-1), u.unbind(-1)), dim=-1)
-        torch.testing.assert_close(model.field(x, u), rates, rtol=1e-14, atol=1e-14)
-
-
-def test_plant_jacobians_at_a_thrust_limit() -> None:
+def test_plant_at_a_thrust_limit() -> None:
+    """A thrust beyond its limit stays there, whatever the controls; so does one of zero, which has a derivative."""
     model = QuadrotorPlant()
-    x, u = states_of(model, lead=(2,))
+    x, u = states_of(model, lead=(3,))
     x[0, -4], u[0, 0] = 6.0, 9000.0
     x[1, -1], u[1, 3] = 0.1046, 0.0
-    for analytic, auto in zip(model.jacobians(x, u), model.autodiff_jacobians(x, u), strict=True):
-        torch.testing.assert_close(analytic, auto, rtol=1e-10, atol=1e-12)
-    assert float(model.step(x, u)[0, -4]) == 6.0 and float(model.step(x, u)[1, -1]) == 0.1046
+    x[2, -1] = 0.0
+    fx, fu = model.jacobians(x, u)
+    assert bool(fx.isfinite().all()) and bool(fu.isfinite().all())
+    after = model.step(x, u)
+    for b, rotor, limit in ((0, 13, 6.0), (1, 16, 0.1046), (2, 16, 0.1046)):
+        assert float(after[b, rotor]) == limit
+        assert not fx[b, rotor].any() and not fu[b, rotor].any()
 
 
 @pytest.mark.parametrize("integrator", ["euler", "midpoint", "rk4"])
@@ -102,10 +114,7 @@ def test_plant_jacobians_at_a_thrust_limit() -> None:
 def test_step_equals_the_reference(cls, integrator) -> None:
     model = cls(integrator=integrator)
     x, u = states_of(model, lead=(6,))
-    if cls is QuadrotorPlant:
-        step = reference.plant_step(model.dt, integrator=getattr(reference, integrator))
-    else:
-        step = getattr(reference, integrator)(FIELDS[cls], model.dt)
+    step = reference_step(model, integrator)
     expected = np.stack([step(a, b) for a, b in zip(x.numpy(), u.numpy(), strict=True)])
     np.testing.assert_allclose(model.step(x, u).numpy(), expected, rtol=1e-12, atol=1e-13)
 
@@ -160,9 +169,7 @@ def test_parameters_per_element() -> None:
         alone = Planar(drag=float(drag[b]))
         torch.testing.assert_close(together[b], alone.step(x[b], u[b]), rtol=1e-14, atol=1e-14)
         torch.testing.assert_close(fx[b], alone.jacobians(x[b], u[b])[0], rtol=1e-14, atol=1e-14)
-    auto = model.autodiff_jacobians(x, u)
-    torch.testing.assert_close(fx, auto[0])
-    torch.testing.assert_close(fu, auto[1])
+        torch.testing.assert_close(fu[b], alone.jacobians(x[b], u[b])[1], rtol=1e-14, atol=1e-14)
     half = model.take(torch.tensor([2, 0]))
     torch.testing.assert_close(half.step(x[[2, 0]], u[[2, 0]]), together[[2, 0]])
 

@@ -16,7 +16,9 @@ import torch
 
 import torchgco
 from tests.experiments.commands import ROOT, TINY, command, problem_line
+from torchgco import kernels
 from torchgco.experiments.build import compose, config_dir
+from torchgco.experiments.identity import decisive, plain
 from torchgco.experiments.records import COLUMNS
 from torchgco.scenarios import Layouts
 from torchgco.solvers.batch import Loop
@@ -53,6 +55,17 @@ def test_a_study_writes_what_the_design_says(tmp_path) -> None:
     assert again.returncode == 0 and "nothing was flown again" in again.stdout
     other = command(*TINY, "hydra.run.dir=out", "study.baselines=[hold,gco]", "seed=4", cwd=tmp_path)
     assert other.returncode == 2 and "seed is 3 there, 4 here" in problem_line(other.stderr)
+
+
+def test_the_configuration_chooses_the_kernels() -> None:
+    """For the whole process, and as a part of the study's identity: results differ in the last bits."""
+    try:
+        for name in ("eager", "native"):
+            setup = compose([f"device.kernels={name}"])
+            assert kernels.native() == (name == "native")
+            assert decisive(plain(setup.config), {})["device"] == {"name": "cpu", "dtype": "float64", "kernels": name}
+    finally:
+        kernels.use_native(True)
 
 
 def test_a_solver_is_polished_where_the_config_says_so() -> None:
@@ -172,7 +185,7 @@ BAD = {
     "crossed bounds": (["model.vehicle.control_lower=[9,9,9,9]"], "control_bounds.lower"),
     "solver option": (["solver.inner.tolerance=-1"], "ilqr.tolerance"),
     "batch size": (["study.batch_size=0"], "study.batch_size"),
-    "compile": (["device.compile=sometimes"], "device.compile"),
+    "kernels": (["device.kernels=compiled"], "device.kernels: expected native or eager"),
     "shard size": (["study.shard_size=0"], "study.shard_size"),
     "threads": (["device.threads=0"], "device.threads"),
     "workers": (["study.workers=0"], "study.workers"),

@@ -60,7 +60,7 @@ def study(
             "seed": seed,
             "scenario": {"name": "forest", "num_obstacles": obstacles, "goal": [1, 2]},
             "model": {"vehicle": {"name": "quadrotor", "radius": 0.3}, "gco": {"samples": obstacles}},
-            "device": {"name": "cpu", "dtype": more.get("dtype", "float64"), "compile": False, "threads": seed + 1},
+            "device": {"name": "cpu", "dtype": more.get("dtype", "float64"), "kernels": "native", "threads": seed + 1},
             "study": {"layouts": len(layouts), "workers": seed + 1},
         }
         (folder / "study.json").write_bytes(Manifest(configuration, settings, layouts).to_json())

@@ -33,7 +33,7 @@ from torchgco import (
 )
 from torchgco.guidance import Detour
 from torchgco.guidance.gco import REACH
-from torchgco.guidance.misfits import suited_sampler
+from torchgco.guidance.misfits import SAMPLES, suited_sampler
 from torchgco.native.compiler import find_compiler
 
 
@@ -154,10 +154,12 @@ def test_without_obstacles_no_guidance_is_missed() -> None:
 
 
 class Fussy(FunctionDynamics):
-    """Bears trajectories, but no samples."""
+    """Bears trajectories, but no samples side by side."""
 
-    def step_rows(self, x: Tensor, u: Tensor) -> Tensor:
-        raise IndexError("no samples here")
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        if x.shape[1:-1] == (SAMPLES,):
+            raise IndexError("no samples here")
+        return super().step(x, u)
 
 
 def test_dynamics_that_bear_no_samples_are_led_by_detours_alone(in_pytorch: None) -> None:

@@ -64,10 +64,6 @@ class Constraint(PerElement):
             return self.knots.start <= k < self.knots.stop
         return bool((self.knots == k).any())
 
-    def is_autonomous(self, N: int) -> bool:
-        """Whether samples meet the same rows at all knots 1..N; a geometric constraint that says so is compiled."""
-        return False
-
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """Whether a problem that starts at x0 (B, n) makes sense, (B,) bool."""
         return torch.ones(x0.shape[0], dtype=torch.bool, device=x0.device)

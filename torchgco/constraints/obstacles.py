@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
-from torchgco.shapes import Dimensions, InputError, check_shape, sum_rows, tensor
+from torchgco.shapes import Dimensions, InputError, check_shape, tensor
 
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
 
@@ -148,11 +148,6 @@ class BoundSpheres(Constraint):
 
     def hits(self, x: Tensor, k: int) -> Tensor:
         p = x[self.position]
-        if torch.compiler.is_compiling() and self.velocities is None:
-            # A product would break the fusion of a whole stage into one loop.
-            away = (p.unsqueeze(2) - self.centers.movedim(-1, 0).unsqueeze(-1)).square()  # (d, B, M, S)
-            reach = torch.where(self.absent, -1.0, self.distances.square()).unsqueeze(-1)
-            return (sum_rows(away) <= reach).to(p.dtype).sum(1)
         rows = [*p.unbind(0), p.square().sum(0), torch.ones_like(p[0])]
         if self.velocities is not None:
             t = k * self.dt
@@ -205,9 +200,6 @@ class BoundSpheres(Constraint):
         nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along
         gap = nearest.square().sum(-1).sqrt() - CONTACT_FACTOR * self.distances.unsqueeze(1)
         return torch.where(self.absent.unsqueeze(1), torch.inf, gap).flatten(1).amin(-1)
-
-    def is_autonomous(self, N: int) -> bool:
-        return self.velocities is None and self.knots == slice(1, N + 1)
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """False where the vehicle touches an obstacle at the start, (B,)."""

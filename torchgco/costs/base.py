@@ -23,8 +23,6 @@ class Cost(PerElement):
     the values of x, u or k, or that joins several knots, is evaluated by PyTorch, and a warning names it.
     """
 
-    is_autonomous: bool = False  # whether `stage` is the same for every k
-
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         """Cost (...) of stage k for x (..., n), u (..., m).
 
@@ -84,10 +82,6 @@ class ScaledCost(Cost):
     factor: Tensor  # (B,)
 
     batched: ClassVar[tuple[str, ...]] = ("cost", "factor")
-
-    @property
-    def is_autonomous(self) -> bool:  # type: ignore[override]
-        return self.cost.is_autonomous
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         value = self.cost.stage(x, u, k)

@@ -92,11 +92,6 @@ class BoundQuadratic(Cost):
         weights = {name: getattr(self, name) for name in ("Q", "R", "Qf", "q", "r", "qf", "H")}
         return replace(self, **{name: lead(factor, W) * W for name, W in weights.items() if W is not None})
 
-    @property
-    def is_autonomous(self) -> bool:  # type: ignore[override]
-        parts = (self.Q, self.R, self.x_ref, self.u_ref, self.q, self.r, self.H)
-        return all(part is None or part.shape[1] == 1 for part in parts)
-
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         def at_k(part: Tensor) -> Tensor:
             if not isinstance(k, int):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.dynamics.base import Dynamics, check_model
-from torchgco.shapes import lead
+from torchgco.shapes import components, lead, vectors
 
 
 @dataclass(frozen=True)
@@ -38,37 +37,20 @@ class Planar(Dynamics):
     reads_fields_alone: ClassVar[bool] = True
     position: ClassVar[slice] = slice(0, 2)
     per_element: ClassVar[tuple[str, ...]] = ("drag", "thrust_gain", "turn_drag", "turn_gain")
-    sparsity: ClassVar[tuple[tuple[int, int], ...]] = (
-        (0, 3), (1, 4), (2, 5), (3, 2), (4, 2), (3, 3), (4, 4), (5, 5), (3, 6), (3, 7), (4, 6), (4, 7), (5, 6), (5, 7),
-    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_model(self, "planar")
 
-    def rates(self, x: Sequence[Tensor], u: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        theta = x[2].contiguous()  # strided and contiguous cosines may differ in the last bit
-        k1, k2, k3, k4 = self._coefficients(theta)
-        push = k2 * (u[0] + u[1])
-        return (
-            x[3],
-            x[4],
-            x[5],
-            push * torch.cos(theta) - k1 * x[3],
-            push * torch.sin(theta) - k1 * x[4],
-            k4 * (u[1] - u[0]) - k3 * x[5],
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        _, _, theta, vx, vy, turning = components(x)
+        left, right = components(u)
+        k1, k2, k3, k4 = (lead(k, theta) for k in (self.drag, self.thrust_gain, self.turn_drag, self.turn_gain))
+        push = k2 * (left + right)
+        return vectors(
+            vx,
+            vy,
+            turning,
+            push * torch.cos(theta) - k1 * vx,
+            push * torch.sin(theta) - k1 * vy,
+            k4 * (right - left) - k3 * turning,
         )
-
-    def field_entries(self, x: Tensor, u: Tensor) -> Tensor:
-        theta = x[..., 2].contiguous()
-        one = torch.ones_like(theta)
-        k1, k2, k3, k4 = (one * k for k in self._coefficients(theta))
-        along, across = k2 * torch.cos(theta), k2 * torch.sin(theta)
-        thrust = u[..., 0] + u[..., 1]
-        entries = (
-            one, one, one, -thrust * across, thrust * along, -k1, -k1, -k3,
-            along, along, across, across, -k4, k4,
-        )  # fmt: skip
-        return torch.stack(entries, dim=-1)
-
-    def _coefficients(self, component: Tensor) -> tuple[Tensor | float, ...]:
-        return tuple(lead(k, component) for k in (self.drag, self.thrust_gain, self.turn_drag, self.turn_gain))

@@ -6,7 +6,6 @@ Quaternions are scalar first; q' = 1/2 Qx(w) q, and R(q) e3 is the body's thrust
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -14,10 +13,10 @@ import torch
 from torch import Tensor
 
 from torchgco.dynamics.base import Dynamics, check_model
-from torchgco.dynamics.pose import POSE_SPARSITY, attitude_rate, pose_entries, pose_rates, thrust_axis
-from torchgco.shapes import InputError, lead
+from torchgco.shapes import InputError, components, lead, vectors
 
 GRAVITY = 9.81  # m/s^2
+Components = tuple[Tensor, ...]
 
 
 @dataclass(frozen=True)
@@ -65,25 +64,10 @@ class Airframe:
         drag = torch.stack((torch.zeros_like(w[..., 2]), torch.zeros_like(w[..., 2]), w[..., 2]), dim=-1)
         return _apply(torch.linalg.inv(J), torque - self.rotational_drag * drag)
 
-    def angular_jacobians(self, w: Tensor, F: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivatives of `angular_acceleration` by w (..., 3, 3) and by F (..., 3, 4)."""
-        J = w.new_tensor(self.inertia)
-        J_inv = torch.linalg.inv(J)
-        gyro = _skew(_apply(J, w)) - _skew(w) @ J  # d(-w x Jw)/dw
-        gyro[..., 2, 2] -= self.rotational_drag
-        by_F = (J_inv @ self.allocation(w)).expand(*F.shape[:-1], 3, 4)
-        return J_inv @ gyro, by_F
-
     def thrust_rate(self, F: Tensor, speed: Tensor) -> Tensor:
         """F' = 2/T_r sqrt(F) (sqrt(b) u - sqrt(F)) for commanded rotor speeds u in rpm, (..., 4)."""
-        root = F.clamp(min=0.0).sqrt()
+        root = F.clamp(min=torch.finfo(F.dtype).tiny).sqrt()  # which has a derivative, as the root of 0 has not
         return 2.0 / self.rotor_time_constant * root * (math.sqrt(self.thrust_coefficient) * speed - root)
-
-    def thrust_jacobians(self, F: Tensor, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Diagonals (..., 4) of the derivatives of `thrust_rate` by F and by the speeds."""
-        gain, b_root = 2.0 / self.rotor_time_constant, math.sqrt(self.thrust_coefficient)
-        root = F.clamp(min=torch.finfo(F.dtype).tiny).sqrt()
-        return gain * (0.5 * b_root * speed / root - 1.0), gain * b_root * root
 
 
 def _apply(A: Tensor, x: Tensor) -> Tensor:
@@ -91,11 +75,20 @@ def _apply(A: Tensor, x: Tensor) -> Tensor:
     return (A * x.unsqueeze(-2)).sum(-1)
 
 
-def _skew(w: Tensor) -> Tensor:
-    """The matrix of w x (...), (..., 3, 3)."""
-    zero = torch.zeros_like(w[..., 0])
-    rows = (zero, -w[..., 2], w[..., 1], w[..., 2], zero, -w[..., 0], -w[..., 1], w[..., 0], zero)
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+def _pose_rates(v: Components, q: Components, w: Components, a: Tensor, gravity: float) -> Components:
+    """p' = v (3), v' = a R(q) e3 - g e3 (3) and q' = 1/2 Qx(w) q (4) under a thrust acceleration a, m/s^2."""
+    (q0, q1, q2, q3), (w1, w2, w3) = q, w
+    axis = 2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3
+    return (
+        *v,
+        a * axis[0],
+        a * axis[1],
+        a * axis[2] - gravity,
+        -0.5 * (q1 * w1 + q2 * w2 + q3 * w3),
+        0.5 * (q0 * w1 + q2 * w3 - q3 * w2),
+        0.5 * (q0 * w2 - q1 * w3 + q3 * w1),
+        0.5 * (q0 * w3 + q1 * w2 - q2 * w1),
+    )
 
 
 @dataclass(frozen=True)
@@ -121,47 +114,24 @@ class QuadrotorPlanning(Dynamics):
     reads_fields_alone: ClassVar[bool] = True
     position: ClassVar[slice] = slice(0, 3)
     per_element: ClassVar[tuple[str, ...]] = ("rate_time_constant", "thrust_time_constant")
-    sparsity: ClassVar[tuple[tuple[int, int], ...]] = (
-        *POSE_SPARSITY, (3, 13), (4, 13), (5, 13), (10, 10), (11, 11), (12, 12), (13, 13),
-        (10, 14), (11, 15), (12, 16), (13, 17),
-    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_model(self, "quadrotor")
 
-    def rates(self, x: Sequence[Tensor], u: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        vx, vy, vz, q0, q1, q2, q3, w1, w2, w3, a = x[3:]
-        T_w, T_a = lead(self.rate_time_constant, a), lead(self.thrust_time_constant, a)
-        bx, by, bz = thrust_axis(q0, q1, q2, q3)
-        dq = attitude_rate((q0, q1, q2, q3), (w1, w2, w3))
-        dw = ((u[0] - w1) / T_w, (u[1] - w2) / T_w, (u[2] - w3) / T_w)
-        return (vx, vy, vz, a * bx, a * by, a * bz - self.gravity, *dq, *dw, (u[3] - a) / T_a)
-
     def field(self, x: Tensor, u: Tensor) -> Tensor:
-        # `rates` with fewer operations.
-        x, u = (x.mT, u.mT) if x.dim() == 2 else (x.movedim(-1, 0), u.movedim(-1, 0))
-        _, v, _, w, a = x.split_with_sizes((3, 3, 4, 3, 1))
-        w_c, a_c = u.split_with_sizes((3, 1))
-        axis, dq = pose_rates(x)
-        dv = axis * a
-        T_w, T_a = (lead(T, x[0]) for T in (self.rate_time_constant, self.thrust_time_constant))
-        rates = torch.cat((v, dv[:2], dv[2:] - self.gravity, dq, (w_c - w) / T_w, (a_c - a) / T_a))
-        return rates.mT if rates.dim() == 2 else rates.movedim(0, -1)
-
-    def field_entries(self, x: Tensor, u: Tensor) -> Tensor:
-        pose, axis = pose_entries(x, x[..., 13:])
-        one = torch.ones_like(x[..., :1])
-        w, a = (one / lead(T, one) for T in (self.rate_time_constant, self.thrust_time_constant))
-        w = w.expand_as(axis)
-        return torch.cat((pose, axis, -w, -a, w, a), dim=-1)
+        states, controls = components(x), components(u)
+        v, q, w, a = states[3:6], states[6:10], states[10:13], states[13]
+        T_w, T_a = (lead(T, a) for T in (self.rate_time_constant, self.thrust_time_constant))
+        turning = ((w_c - w_i) / T_w for w_c, w_i in zip(controls[:3], w, strict=True))
+        return vectors(*_pose_rates(v, q, w, a, self.gravity), *turning, (controls[3] - a) / T_a)
 
 
 @dataclass(frozen=True)
 class QuadrotorPlant(Dynamics):
     """Full quadrotor: x = [p, v, q, w, F (N)], u = commanded rotor speeds (rpm), n = 17, m = 4 (section 2).
 
-    A step ends with the thrusts limited to [f_min, f_max] and the quaternion renormalised, which the
-    derivatives account for (at a limit, the derivative of that thrust is zero).
+    A step ends with the thrusts limited to [f_min, f_max] and the quaternion renormalised, and so do its derivatives
+    (beyond a limit, the derivative of that thrust is zero).
     """
 
     dt: float = 0.01
@@ -178,12 +148,11 @@ class QuadrotorPlant(Dynamics):
         check_model(self, "plant")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
-        w, F = x[..., 10:13], x[..., 13:]
-        axis, dq = (rows.movedim(0, -1) for rows in pose_rates(x.movedim(-1, 0)))
-        dv = axis * (F.sum(-1, keepdim=True) / self.airframe.mass)
-        dw = self.airframe.angular_acceleration(w, F)
-        parts = (x[..., 3:6], dv[..., :2], dv[..., 2:] - self.gravity, dq, dw, self.airframe.thrust_rate(F, u))
-        return torch.cat(parts, dim=-1)
+        _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
+        lift = F.sum(-1) / self.airframe.mass
+        pose = _pose_rates(components(v), components(q), components(w), lift, self.gravity)
+        rates = self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, u)
+        return torch.cat((vectors(*pose), *rates), dim=-1)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         x = super().step(x, u)
@@ -191,34 +160,6 @@ class QuadrotorPlant(Dynamics):
         q = q / q.square().sum(-1, keepdim=True).sqrt()
         F = x[..., 13:].clamp(self.airframe.thrust_min, self.airframe.thrust_max)
         return torch.cat((x[..., :6], q, x[..., 10:13], F), dim=-1)
-
-    def field_jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        w, F = x[..., 10:13], x[..., 13:]
-        ax = x.new_zeros(*x.shape[:-1], 17, 17)
-        rows, columns = zip(*POSE_SPARSITY, strict=True)
-        ax[..., rows, columns], axis = pose_entries(x, F.sum(-1, keepdim=True) / self.airframe.mass)
-        ax[..., 3:6, 13:] = axis.unsqueeze(-1) / self.airframe.mass
-        ax[..., 10:13, 10:13], ax[..., 10:13, 13:] = self.airframe.angular_jacobians(w, F)
-        by_F, by_speed = self.airframe.thrust_jacobians(F, u)
-        ax[..., 13:, 13:] = torch.diag_embed(by_F)
-        au = x.new_zeros(*x.shape[:-1], 17, 4)
-        au[..., 13:, :] = torch.diag_embed(by_speed)
-        return ax, au
-
-    def jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivatives of `step`, limits and renormalisation included."""
-        fx, fu = super().jacobians(x, u)
-        free = super().step(x, u)
-        q, F = free[..., 6:10], free[..., 13:]
-        length = q.square().sum(-1, keepdim=True).sqrt()
-        unit = q / length
-        eye = torch.eye(4, dtype=x.dtype, device=x.device)
-        project = (eye - unit.unsqueeze(-1) * unit.unsqueeze(-2)) / length.unsqueeze(-1)
-        inside = ((self.airframe.thrust_min <= F) & (self.airframe.thrust_max >= F)).to(x.dtype).unsqueeze(-1)
-        for f in (fx, fu):
-            f[..., 6:10, :] = project @ f[..., 6:10, :]
-            f[..., 13:, :] = inside * f[..., 13:, :]
-        return fx, fu
 
 
 @dataclass(frozen=True)
@@ -239,12 +180,3 @@ class RotorTracking(Dynamics):
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         w, F = x[..., :3], x[..., 3:]
         return torch.cat((self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, u)), dim=-1)
-
-    def field_jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        w, F = x[..., :3], x[..., 3:]
-        ax, au = x.new_zeros(*x.shape[:-1], 7, 7), x.new_zeros(*x.shape[:-1], 7, 4)
-        ax[..., :3, :3], ax[..., :3, 3:] = self.airframe.angular_jacobians(w, F)
-        by_F, by_speed = self.airframe.thrust_jacobians(F, u)
-        ax[..., 3:, 3:] = torch.diag_embed(by_F)
-        au[..., 3:, :] = torch.diag_embed(by_speed)
-        return ax, au

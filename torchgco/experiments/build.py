@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
-from torchgco.kernels import compile_kernels
+from torchgco.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 from torchgco.shapes import InputError
 
@@ -152,10 +152,10 @@ def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
         raise InputError("device", "device=cpu, as no CUDA device is visible", "device=cuda")
     if node.dtype not in ("float64", "float32"):
         raise InputError("device.dtype", "float64 or float32", node.dtype)
-    if not isinstance(node.compile, bool):
-        raise InputError("device.compile", "true or false", repr(node.compile))
+    if node.kernels not in ("native", "eager"):
+        raise InputError("device.kernels", "native or eager", repr(node.kernels))
     torch.set_num_threads(_threads(node.threads))
-    compile_kernels(node.compile)
+    use_native(node.kernels == "native")
     return torch.device(node.name), getattr(torch, node.dtype)
 
 

@@ -18,7 +18,6 @@ from torchgco.certificate import certify
 from torchgco.certificate import frame_columns as certificate_columns
 from torchgco.experiments.build import Setup, allotted_cores
 from torchgco.judge import frame_columns, judge
-from torchgco.kernels import compiling
 from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
 from torchgco.scenarios import Layouts
@@ -28,7 +27,6 @@ from torchgco.solvers.memory import is_out_of_memory, plan_batch
 from torchgco.solvers.state import Progress
 from torchgco.status import Status
 
-WARM_UP = 8  # problems that are solved once for what they compile
 NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
 
 
@@ -137,9 +135,6 @@ class Flight:
         # What a solver builds or compiles for a batch is set-up: the clock starts after it.
         engine_of(problem)
         solver = self.solver.prepare(problem) if hasattr(self.solver, "prepare") else self.solver
-        if compiling():
-            few = torch.arange(min(WARM_UP, problem.B), device=U0.device)
-            self.solver.solve(problem.take(few), U0[few], seed=self.setup.seed, ids=ids[few])
         at_once = problem.B
         if hasattr(solver, "slots"):
             plan = plan_of(self.setup)

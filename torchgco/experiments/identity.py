@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchgco.scenarios import Layouts
 
-ARITHMETIC = ("name", "dtype", "compile")  # keys of `device` that decide results
+ARITHMETIC = ("name", "dtype", "kernels")  # keys of `device` that decide results
 # Keys of `study` and `device` that say how a study is flown.
 FLOWN_BY = (("study", "batch_size"), ("study", "shard_size"), ("study", "workers"), ("device", "threads"))
 # Keys of `model.vehicle` that layouts may overrule, and by which of their fields.

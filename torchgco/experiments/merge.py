@@ -73,12 +73,12 @@ def _tagged(run: Run, swept: pd.DataFrame, settings: Mapping[str, dict[str, Any]
     rows[FOLDER], rows[CONFIGURATION] = run.folder.as_posix(), configuration
     if _is_older(rows):
         return rows.assign(**{VARIANT: UNKNOWN})
-    compiled = bool(run.configuration.get("device", {}).get("compile"))
+    kernels = run.configuration.get("device", {}).get("kernels", "native")
     names = ["settings_digest", "device", "dtype", "version"]
     made = {}
     for key in rows[names].drop_duplicates().itertuples(index=False, name=None):
         code, device, dtype, version = key
-        arithmetic = zip(ARITHMETIC, (device, dtype, compiled), strict=True)
+        arithmetic = zip(ARITHMETIC, (device, dtype, kernels), strict=True)
         held = flat(settings.get(code, {"settings": code}))
         held |= {f"device.{name}": value for name, value in arithmetic} | {"version": version}
         made[key] = json.dumps(held, sort_keys=True, default=str)

@@ -22,7 +22,7 @@ from torchgco.experiments.records import COLUMNS, JUDGED, TRIALS, Records
 from torchgco.experiments.report import write_report
 from torchgco.experiments.success import judged, sound
 from torchgco.experiments.workers import run_all
-from torchgco.kernels import compile_kernels, compiling
+from torchgco.kernels import native, use_native
 from torchgco.rollout import open_loop
 from torchgco.scenarios import Layouts
 from torchgco.shapes import InputError
@@ -153,15 +153,15 @@ def _fly_side_by_side(
         [_flight(study, name, ids, NoBar()) for name, ids in batches],
         workers,
         prepare=_prepare,
-        options=(torch.get_num_threads(), compiling()),
+        options=(torch.get_num_threads(), native()),
         keep=keep,
         say=lambda line: bar.write(line, sys.stderr),
     )
 
 
-def _prepare(threads: int, compiled: bool) -> None:
+def _prepare(threads: int, in_c: bool) -> None:
     torch.set_num_threads(threads)
-    compile_kernels(compiled)
+    use_native(in_c)
 
 
 def _fly(flight: Flight) -> Flown:

@@ -86,7 +86,7 @@ def _sample(problem: Problem) -> None:
     x = problem.x0.mT.unsqueeze(-1).repeat(1, 1, SAMPLES)
     u = x.new_zeros(problem.m, 1, SAMPLES)
     cost = problem.cost.stage_rows(x, u, 0) + problem.cost.terminal_rows(x)
-    after = problem.dynamics.step_rows(x, u)
+    after = problem.dynamics.step(x.movedim(0, -1), u.movedim(0, -1)).movedim(-1, 0)
     _check("dynamics", after, x)
     hits = [constraint.hits(after, 1) for constraint in problem.geometric]
     for name, rows in (("cost", cost), *(("a constraint", rows) for rows in hits)):

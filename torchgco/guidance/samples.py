@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.kernels import kernel
 from torchgco.problem import Problem
 from torchgco.shapes import sum_rows
 
-STAGES = 5  # drawn and flown together; compiled, they are one kernel
+STAGES = 5  # drawn and flown together
 
 
 @dataclass(frozen=True)
@@ -49,10 +48,9 @@ def fly(problem: Problem, mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tens
     """Samples drawn around mean (N, m, B, 1), clamped to bounds (m, B|1, 1), rolled out (Algorithm 3, lines 5-11)."""
     x = problem.x0.mT.unsqueeze(-1).expand(-1, -1, noise.z.shape[-1]).contiguous()
     sums, controls = torch.zeros(3, *x.shape[1:], dtype=x.dtype, device=x.device), []
-    alike = problem.is_autonomous
     for k in range(0, problem.N, STAGES):
         stages = (problem, x, sums, mean[k : k + STAGES], noise.scale, bounds, *noise.between(k, k + STAGES))
-        V, x, sums = _fly_alike(*stages) if alike else _fly_stages(*stages, first=k)
+        V, x, sums = _fly_stages(*stages, first=k)
         controls.append(V)
     return Flight(torch.cat(controls), x, *sums)
 
@@ -67,7 +65,6 @@ def draw(mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tensor] | None) -> Te
     )
 
 
-@kernel
 def average(V: Tensor, weights: Tensor) -> Tensor:
     """sum_s w_s v_s (N, m, B, 1) of controls V (N, m, B, S) with weights (B, S)."""
     return (V * weights).sum(-1, keepdim=True)
@@ -107,7 +104,7 @@ def _fly_stages(
     for j, u in enumerate(V.unbind(0)):
         k = first + j
         cost = cost + problem.cost.stage_rows(x, u, k)
-        x = problem.dynamics.step_rows(x, u)
+        x = problem.dynamics.step(x.movedim(0, -1), u.movedim(0, -1)).movedim(-1, 0)
         for constraint in problem.geometric:
             if constraint.holds_at(k + 1):
                 hits = hits + constraint.hits(x, k + 1)
@@ -115,6 +112,3 @@ def _fly_stages(
             likelihood = likelihood + sum_rows(mean[j] / scale.square() * eps[j])
     return V, x, torch.stack((cost, hits, likelihood))
 
-
-# Where all stages are alike, one compiled kernel serves them all.
-_fly_alike = kernel(_fly_stages)

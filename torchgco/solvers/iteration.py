@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchgco.expansion import linearise, standing
+from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian
 from torchgco.native.dispatch import engine_of, terms_of
 from torchgco.problem import Problem
@@ -72,15 +72,10 @@ class EagerIterations:
 
     def __init__(self, inner: ILQR, problem: Problem, limit: int) -> None:
         self.inner = inner
-        # F and H of every pass: new memory costs more than filling it.
-        s = problem.n + 1 + problem.m
-        self.space = (standing(problem, problem.B), problem.x0.new_empty(problem.N + 1, problem.B, s, s))
 
     def run(self, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
         problem, inner = lagrangian.problem, self.inner
-        F, H = (t[:, : problem.B] for t in self.space)
-        linearise(problem, s.X, s.U, out=F)
-        lagrangian.expand(s.X, s.U, out=H)
+        F, H = linearise(problem, s.X, s.U), lagrangian.expand(s.X, s.U)
         step = backward(F, H, s.regularisation)
         status = torch.full_like(s.rows, Status.RUNNING)
         expected = step.expected_change(torch.ones_like(s.merit)).abs()

@@ -8,13 +8,10 @@ Then V = Qzz + Quz' G - mu_r G'G, which is the general value recursion.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from torchgco.kernels import compiling, kernel
 
 
 class BackwardPass(NamedTuple):
@@ -36,7 +33,7 @@ def backward(F: Tensor, H: Tensor, regularisation: Tensor) -> BackwardPass:
     """
     N, B, z, s = F.shape
     gains, slopes, lowest = F.new_empty(N, B, s - z, z), F.new_empty(N, B, s - z), F.new_full((B,), torch.inf)
-    work, any_mu, fused = _Stage(F), bool((regularisation > 0).any()), compiling()
+    work, any_mu = _Stage(F), bool((regularisation > 0).any())
     # Slices of all stages at once: taken one by one, they would cost as much as the arithmetic of a small batch.
     Fs, transposed, Hs, Gs = F.unbind(0), F.mT.unbind(0), H.unbind(0), gains.unbind(0)
     V = H[N, :, :z, :z]
@@ -45,10 +42,7 @@ def backward(F: Tensor, H: Tensor, regularisation: Tensor) -> BackwardPass:
         torch.bmm(V, Fs[k], out=work.VF)
         torch.baddbmm(Hs[k], transposed[k], work.VF, out=work.Q)
         slopes[k] = work.Qu
-        if fused:
-            gains[k], V, pivot = _fused_stage(work.Q, regularisation, Gs[k])
-        else:
-            V, pivot = work.eliminate(regularisation if any_mu else None, Gs[k])
+        V, pivot = work.eliminate(regularisation if any_mu else None, Gs[k])
         lowest = torch.minimum(lowest, pivot)
     d = gains[..., z - 1]
     linear, squares = _over_stages(slopes * d), _over_stages(d.square())
@@ -101,23 +95,3 @@ class _Stage:
             self.half.sub_(mu.view(-1, 1, 1) * torch.bmm(G.mT, G))
         torch.add(self.half, self.half.mT, out=self.V).mul_(0.5)
         return self.V, self.pivots.amin(-1)
-
-
-@partial(kernel, dynamic=None)
-def _fused_stage(Q: Tensor, mu: Tensor, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`_Stage.eliminate` in the form that compiles into few kernels: gains, V, pivot; `like` (B, m, z) tells sizes."""
-    m, z = like.shape[1:]
-    quu = [[Q[:, z + i, z + j] + (mu if i == j else 0.0) for j in range(m)] for i in range(m)]
-    quz, pivots = [Q[:, z + i, :z] for i in range(m)], []
-    for j in range(m):
-        pivots.append(quu[j][j])
-        quz[j], quu[j] = quz[j] / pivots[j].unsqueeze(-1), [entry / pivots[j] for entry in quu[j]]
-        for i in range(m):
-            if i != j:
-                quz[i] = quz[i] - quu[i][j].unsqueeze(-1) * quz[j]
-                quu[i] = [a - quu[i][j] * b for a, b in zip(quu[i], quu[j], strict=True)]
-    G = -torch.stack(quz, dim=1)
-    Quz, V = Q[:, z:, :z], Q[:, :z, :z]
-    for i in range(m):
-        V = V + (Quz[:, i] - mu.unsqueeze(-1) * G[:, i]).unsqueeze(-1) * G[:, i].unsqueeze(-2)
-    return G, 0.5 * (V + V.mT), torch.stack(pivots).amin(0)
