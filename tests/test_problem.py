@@ -1,13 +1,16 @@
 """Malformed input is one error that names the part at fault; constraints hold where they say."""
 
 import pickle
+from dataclasses import dataclass
 
 import pytest
 import torch
+from torch import Tensor
 
 from tests.problems import HOVER, START, planar_batch
 from torchgco import (
     ControlBounds,
+    Cost,
     FirstStepRates,
     FunctionConstraint,
     FunctionDynamics,
@@ -28,6 +31,11 @@ def planar(constraints=(), x0=None, N=5, dynamics=None, cost=None) -> Problem:
     x0 = torch.zeros(2, 6, dtype=torch.float64) if x0 is None else x0
     cost = cost or QuadraticCost([1] * 6, [1, 1], [1] * 6)
     return Problem(dynamics or Planar(), cost, list(constraints), x0, N)
+
+
+@dataclass(frozen=True)
+class Aimed(Cost):
+    goal: Tensor
 
 
 @pytest.mark.parametrize(
@@ -58,6 +66,7 @@ def planar(constraints=(), x0=None, N=5, dynamics=None, cost=None) -> Problem:
         (lambda: planar(constraints=[FunctionConstraint(lambda u: u, of="u", geometric=True)]), "constraint.geometric"),
         (lambda: planar(constraints=[FirstStepRates([1.0] * 4)]), "first_step.dynamics"),
         (lambda: planar(constraints=["spheres"]), "constraints"),
+        (lambda: planar(cost=Aimed(torch.zeros(6))), "cost.goal: expected a method, which no field may hide, got Tensor"),
     ],
 )  # fmt: skip
 def test_malformed_parts_are_named(make, message: str) -> None:

@@ -155,6 +155,8 @@ class Problem:
         for name, part, kind in (("dynamics", self.dynamics, Dynamics), ("cost", self.cost, Cost)):
             if not isinstance(part, kind):
                 raise InputError(name, f"a {kind.__name__}", type(part).__name__)
+        if not callable(self.cost.goal):
+            raise InputError("cost.goal", "a method, which no field may hide", type(self.cost.goal).__name__)
         for constraint in self.constraints:
             if not isinstance(constraint, Constraint):
                 raise InputError("constraints", "a sequence of Constraint", type(constraint).__name__)

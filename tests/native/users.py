@@ -277,6 +277,9 @@ class Errand(Cost):
     def terminal(self, x: Tensor) -> Tensor:
         return 20.0 * (x[..., :2] - rows_of(self.target, x)).square().sum(-1) + 2.0 * x[..., 3].square()
 
+    def goal(self, x0: Tensor) -> Tensor:
+        return torch.cat((self.target, torch.zeros_like(x0[:, 2:])), dim=-1)
+
 
 def errands(B: int = 2, N: int = 100) -> Problem:
     """Unicycles that drive through five discs."""

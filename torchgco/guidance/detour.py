@@ -25,6 +25,7 @@ from torchgco.guidance.classes import distinct
 from torchgco.guidance.plans import Plans
 from torchgco.guidance.roadmap import Roadmap, points_along
 from torchgco.lagrangian import Multipliers
+from torchgco.native.dispatch import cost_unit
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, check_shape, put, take, tensor
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -138,12 +139,13 @@ class Detour:
         rank = torch.zeros(problem.B, dtype=torch.int64, device=problem.x0.device) if rank is None else rank
         U = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
         found, duals = torch.zeros_like(rank, dtype=torch.bool), Multipliers.zero(problem, torch.nan)
+        unit = cost_unit(problem)
         whole, scaled = Proposal(U, found, duals, torch.zeros_like(rank)), problem.in_cost_units()
         for rows in torch.arange(problem.B, device=rank.device).split(max(1, MOST // self.ways)):
             part = self._propose(scaled.take(rows), U[rows], rank[rows])
             if part is not None:
                 put(whole, rows, part)
-        return whole._replace(duals=whole.duals.scaled(problem.cost_unit))
+        return whole._replace(duals=whole.duals.scaled(unit))
 
     def _propose(self, problem: Problem, rest: Tensor, rank: Tensor) -> Proposal | None:
         scene = seen.scene_of(problem, rest)

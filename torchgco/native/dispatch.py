@@ -53,7 +53,10 @@ def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:
 
 
 def cost_unit(problem: Problem) -> Tensor:
-    """`problem.cost_unit` (B,), which the native library finds where PyTorch would need autodiff for it."""
+    """`problem.cost_unit` (B,), which the native library finds where PyTorch would need autodiff for it.
+
+    The problem keeps it: `problem.in_cost_units()` then needs no autodiff either.
+    """
     engine = engine_of(problem)
     if engine is not None and engine.cost is not None and "cost_unit" not in vars(problem):
         X, U = problem.at_rest

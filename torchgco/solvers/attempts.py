@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgco.constraints.guides import GuideRegion
 from torchgco.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import open_loop, value
+from torchgco.native.dispatch import cost_unit, open_loop, value
 from torchgco.problem import Problem
 from torchgco.shapes import copied, put, take
 from torchgco.solution import Solution
@@ -81,7 +81,7 @@ def _goal_region(problem: Problem, guide: GuideRegion, arrival: float) -> GuideR
     radius = torch.full_like(guide.radius, torch.inf)
     radius[:, -1] = size
     center = goal[:, None, at].expand_as(guide.center)
-    return replace(guide, center=center, radius=radius, weight=STIFF * problem.cost_unit / size.pow(4))
+    return replace(guide, center=center, radius=radius, weight=STIFF * cost_unit(problem) / size.pow(4))
 
 
 def go_on_from(
