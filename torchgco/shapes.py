@@ -172,14 +172,3 @@ def components(z: Tensor) -> tuple[Tensor, ...]:
 def vectors(*parts: Tensor) -> Tensor:
     """Vectors (..., n) of n components (...), which stay apart in memory for those who ask for them again."""
     return torch.stack(parts).movedim(0, -1)
-
-
-def sum_rows(z: Tensor) -> Tensor:
-    """Sum over the first axis, by halves: `sum(0)` would add in an order that depends on the length of the others."""
-    while z.shape[0] > 1:
-        half = z.shape[0] // 2
-        folded = z[:half] + z[half : 2 * half]
-        if z.shape[0] % 2:
-            folded[0] += z[-1]
-        z = folded
-    return z[0]

@@ -94,11 +94,11 @@ def test_a_user_cost_scales_as_a_quadratic_one_does() -> None:
     problem.cost.expand(one.X, one.U, H)
     scaled(problem, 3.0).cost.expand(one.X, one.U, h)
     torch.testing.assert_close(3.0 * H, h)
-    x = torch.randn(2, 2, 5, dtype=torch.float64)
-    u = torch.randn(1, 2, 5, dtype=torch.float64)
+    x = torch.randn(2, 5, 2, dtype=torch.float64)
+    u = torch.randn(2, 5, 1, dtype=torch.float64)
     triple = scaled(problem, 3.0).cost
-    torch.testing.assert_close(triple.stage_rows(x, u, 0), 3.0 * problem.cost.stage_rows(x, u, 0))
-    torch.testing.assert_close(triple.terminal_rows(x), 3.0 * problem.cost.terminal_rows(x))
+    torch.testing.assert_close(triple.stage(x, u, 0), 3.0 * problem.cost.stage(x, u, 0))
+    torch.testing.assert_close(triple.terminal(x), 3.0 * problem.cost.terminal(x))
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0])

@@ -54,10 +54,6 @@ class Constraint(PerElement):
         """Rows (B, S, p) for samples x (B, S, n) of one knot; geometric constraints only."""
         raise NotImplementedError
 
-    def hits(self, x: Tensor, k: int) -> Tensor:
-        """How many rows each sample touches, c >= 0: counts (B, S) for x (n, B, S) of knot k."""
-        return (self.at(x.movedim(0, -1), k) >= 0).sum(-1)
-
     def holds_at(self, k: int) -> bool:
         """Whether the constraint speaks of knot k."""
         if isinstance(self.knots, slice):

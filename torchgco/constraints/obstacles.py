@@ -146,15 +146,6 @@ class BoundSpheres(Constraint):
         p = x[..., self.position]
         return torch.bmm(self._features(p, x.new_tensor(k * self.dt)), self.weights)
 
-    def hits(self, x: Tensor, k: int) -> Tensor:
-        p = x[self.position]
-        rows = [*p.unbind(0), p.square().sum(0), torch.ones_like(p[0])]
-        if self.velocities is not None:
-            t = k * self.dt
-            rows += [*(t * p).unbind(0), rows[-1] * t, rows[-1] * t**2]
-        c = torch.bmm(self.weights.mT, torch.stack(rows, dim=1))
-        return c.ge_(0).sum(1)
-
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         # With c_p = -2 (p - o):  sum g c_p = 2 (sum g o - p sum g),  sum h c_p c_p' = 4 sum h (o - p)(o - p)'.
         p = X[:, self.knots, self.position]

@@ -34,14 +34,6 @@ class Cost(PerElement):
         """Cost (...) of the last knot for x (..., n)."""
         raise NotImplementedError(f"{type(self).__name__} defines no terminal cost")
 
-    def stage_rows(self, x: Tensor, u: Tensor, k: int) -> Tensor:
-        """The same, components first: (B, S) for samples x (n, B, S), u (m, B, S) of stage k."""
-        return self.stage(x.movedim(0, -1), u.movedim(0, -1), k)
-
-    def terminal_rows(self, x: Tensor) -> Tensor:
-        """The terminal cost, components first: (B, S) for samples x (n, B, S)."""
-        return self.terminal(x.movedim(0, -1))
-
     def bind(self, dims: Dimensions) -> Self:
         """The cost checked and shaped for one problem; called once, by Problem."""
         return self
@@ -90,12 +82,6 @@ class ScaledCost(Cost):
     def terminal(self, x: Tensor) -> Tensor:
         value = self.cost.terminal(x)
         return lead(self.factor, value) * value
-
-    def stage_rows(self, x: Tensor, u: Tensor, k: int) -> Tensor:
-        return self.factor.unsqueeze(-1) * self.cost.stage_rows(x, u, k)
-
-    def terminal_rows(self, x: Tensor) -> Tensor:
-        return self.factor.unsqueeze(-1) * self.cost.terminal_rows(x)
 
     def rest_controls(self, like: Tensor) -> Tensor:
         return self.cost.rest_controls(like)

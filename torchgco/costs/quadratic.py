@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.costs.base import Cost, add_blocks
-from torchgco.shapes import Dimensions, InputError, check_shape, lead, sum_rows, tensor
+from torchgco.shapes import Dimensions, InputError, check_shape, lead, tensor
 
 
 @dataclass(frozen=True)
@@ -125,18 +125,6 @@ class BoundQuadratic(Cost):
         value = 0.5 * (e * self._times(Qf, e)).sum(-1)
         return value if qf is None else value + (qf * e).sum(-1)
 
-    def stage_rows(self, x: Tensor, u: Tensor, k: int) -> Tensor:
-        if not self.diagonal or self.q is not None or self.r is not None:
-            return super().stage_rows(x, u, k)
-        parts = (self.x_ref, self.Q, self.u_ref, self.R)
-        x_ref, Q, u_ref, R = (part[:, k if part.shape[1] > 1 else 0] for part in parts)
-        return _half_squares(x, x_ref, Q) + _half_squares(u, u_ref, R)
-
-    def terminal_rows(self, x: Tensor) -> Tensor:
-        if not self.diagonal or self.qf is not None:
-            return super().terminal_rows(x)
-        return _half_squares(x, self.xf_ref, self.Qf)
-
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         n = X.shape[-1]
         ex, eu, ef = X[:, :-1] - self.x_ref, U - self.u_ref, X[:, -1] - self.xf_ref
@@ -170,12 +158,6 @@ class BoundQuadratic(Cost):
     def _times(self, W: Tensor, e: Tensor) -> Tensor:
         # Products and sums keep each problem's bits independent of the batch; a shared matrix in one GEMM would not.
         return W * e if self.diagonal else (W * e.unsqueeze(-2)).sum(-1)
-
-
-def _half_squares(z: Tensor, reference: Tensor, weight: Tensor) -> Tensor:
-    """1/2 sum_i weight_i (z_i - reference_i)^2 (B, S) for z (size, B, S), the others (B|1, size)."""
-    e = z - reference.mT.unsqueeze(-1)
-    return sum_rows(e.square_().mul_((0.5 * weight).mT.unsqueeze(-1)))
 
 
 def _weight(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor:

@@ -83,15 +83,15 @@ def _failure(trial: Callable[[Problem], None], problem: Problem, dtype: torch.dt
 
 def _sample(problem: Problem) -> None:
     """One stage of some samples of one problem."""
-    x = problem.x0.mT.unsqueeze(-1).repeat(1, 1, SAMPLES)
-    u = x.new_zeros(problem.m, 1, SAMPLES)
-    cost = problem.cost.stage_rows(x, u, 0) + problem.cost.terminal_rows(x)
-    after = problem.dynamics.step(x.movedim(0, -1), u.movedim(0, -1)).movedim(-1, 0)
+    x = problem.x0.unsqueeze(1).repeat(1, SAMPLES, 1)
+    u = x.new_zeros(1, SAMPLES, problem.m)
+    cost = problem.cost.stage(x, u, 0) + problem.cost.terminal(x)
+    after = problem.dynamics.step(x, u)
     _check("dynamics", after, x)
-    hits = [constraint.hits(after, 1) for constraint in problem.geometric]
+    hits = [(constraint.at(after, 1) >= 0).sum(-1) for constraint in problem.geometric]
     for name, rows in (("cost", cost), *(("a constraint", rows) for rows in hits)):
-        if rows.shape != x.shape[1:]:
-            raise ValueError(f"{name}: shape {tuple(rows.shape)} for samples {tuple(x.shape[1:])}")
+        if rows.shape != x.shape[:2]:
+            raise ValueError(f"{name}: shape {tuple(rows.shape)} for samples {tuple(x.shape[:2])}")
 
 
 def _expand(problem: Problem) -> None:

@@ -17,9 +17,8 @@ from torchgco.native.sampler import Rounds
 from torchgco.problem import Problem
 from torchgco.shapes import InputError, check_shape, tensor
 
-CHUNK = 8192  # samples flown side by side: what a stage needs of them stays in a core's cache
+CHUNK = 8192  # samples flown side by side: memory stays bounded
 OPEN = 1e10  # a range of controls that is no range
-KEPT = 2**25  # numbers: controls of more samples than this are drawn again rather than kept
 
 
 @dataclass(frozen=True)
@@ -108,8 +107,9 @@ class MPPI:
         """The same for the native library."""
         bounds = self._bounds(problem)
         if bounds is None:
-            bounds = -torch.inf * problem.x0.new_ones(problem.m, 1, 1), torch.inf * problem.x0.new_ones(problem.m, 1, 1)
-        lower, upper, deviation = (row.squeeze(-1).mT for row in (*bounds, self._sigma(problem).sqrt()))
+            wide = problem.x0.new_full((1, 1, problem.m), torch.inf)
+            bounds = -wide, wide
+        lower, upper, deviation = (row.squeeze(1) for row in (*bounds, self._sigma(problem).sqrt()))
         return Rounds(
             self.samples, self.knots, self.decay, self.elite, self.temperature, self.collision_penalty, self.linger,
             torch.stack([words(key, stream * self.rounds + i) for i in range(self.rounds)], dim=-1),
@@ -121,38 +121,30 @@ class MPPI:
         sigma, quick, plans = self._sigma(problem), problem.cast(dtype), []
         at_once = max(1, CHUNK // self.samples)
         for rows in torch.arange(problem.B, device=U.device).split(at_once):
-            spread = sigma if sigma.shape[1] == 1 else sigma[:, rows]
+            spread = sigma if sigma.shape[0] == 1 else sigma[rows]
             part = quick if rows.numel() == problem.B else quick.take(rows)
             plans.append(self._rounds(part, U[rows].to(dtype), spread.to(dtype), key.take(rows), stream))
         return torch.cat(plans).to(U.dtype)
 
     def _rounds(self, problem: Problem, U: Tensor, sigma: Tensor, key: DrawKey, stream: int) -> Tensor:
-        """All rounds for one chunk of problems; U (B, N, m), sigma (m, B|1, 1)."""
-        mean, bounds = U.permute(1, 2, 0).unsqueeze(-1).contiguous(), self._bounds(problem)  # (N, m, B, 1)
+        """All rounds for one chunk of problems; U (B, N, m), sigma (B|1, 1, m)."""
+        mean, bounds = U.transpose(0, 1).unsqueeze(2).contiguous(), self._bounds(problem)  # (N, B, 1, m)
         blocks = [range(s, min(s + CHUNK, self.samples)) for s in range(0, self.samples, CHUNK)]
-        keep = self.samples * problem.N * problem.m <= KEPT
         for i in range(self.rounds):
             scale = self.decay**i * sigma.sqrt()
             draws = partial(self._noise, problem, key, scale, stream * self.rounds + i)
-            scores, drawn = [], []
-            for block in blocks:
-                flight = fly(problem, mean, draws(block), bounds)
-                scores.append(self.scores(problem, flight))
-                drawn.append(flight.V if keep else None)
+            scores = [self.scores(problem, fly(problem, mean, draws(block), bounds)) for block in blocks]
             weights = self._weights(torch.cat(scores, dim=-1)).to(U.dtype)
             new = torch.zeros_like(mean)
-            for block, V in zip(blocks, drawn, strict=True):
-                # Drawn again rather than kept where they are too many: memory stays bounded whatever S.
-                V = draw(mean, draws(block), bounds) if V is None else V
-                new = new + average(V, weights[:, block.start : block.stop])
+            for block in blocks:  # drawn again rather than kept: memory stays bounded whatever S
+                new = new + average(draw(mean, draws(block), bounds), weights[:, block.start : block.stop])
             mean = new
-        return mean.squeeze(-1).permute(2, 0, 1)
+        return mean.squeeze(2).transpose(0, 1)
 
     def _noise(self, problem: Problem, key: DrawKey, scale: Tensor, stream: int, samples: range) -> Noise:
         rows = self.knots or problem.N
         z = standard_normal(key, rows * problem.m, samples, scale.dtype, stream).unflatten(0, (rows, problem.m))
-        left, share = self._places(problem)
-        return Noise(z, scale, left, None if share is None else share.view(-1, 1, 1, 1))
+        return Noise(z.movedim(1, -1).contiguous(), scale, *self._places(problem))
 
     def _places(self, problem: Problem) -> tuple[Tensor | None, Tensor | None]:
         """The knot of the noise before each stage (N,), and the share of the way to the next; None for white noise."""
@@ -172,22 +164,22 @@ class MPPI:
 
     def scores(self, problem: Problem, flight: Flight) -> Tensor:
         """S (B, S) in float64 of a block of samples."""
-        cost = flight.cost + problem.cost.terminal_rows(flight.x)
+        cost = flight.cost + problem.cost.terminal(flight.x)
         if self.linger > 0:
-            cost = cost + self.linger * problem.N * problem.cost.stage_rows(flight.x, flight.V[-1], problem.N - 1)
+            cost = cost + self.linger * problem.N * problem.cost.stage(flight.x, flight.V[-1], problem.N - 1)
         cost = cost + self.temperature * flight.likelihood
         S = cost.double() + self.collision_penalty * flight.hits.double()
         # A sample that left the finite numbers must not take the others with it.
         return torch.where(torch.isfinite(S), S, torch.finfo(S.dtype).max)
 
     def _bounds(self, problem: Problem) -> tuple[Tensor, Tensor] | None:
-        """What samples are clamped to as `saturation` says (line 7): two (m, B|1, 1)."""
+        """What samples are clamped to as `saturation` says (line 7): two (B|1, 1, m)."""
         if self.saturation is None:
             return None
         for constraint in problem.constraints:
             if isinstance(constraint, ControlBounds):
-                upper = constraint.upper.mT.unsqueeze(-1)
-                return (constraint.lower.mT.unsqueeze(-1) if self.saturation == "bounds" else -upper), upper
+                upper = constraint.upper.unsqueeze(1)
+                return (constraint.lower.unsqueeze(1) if self.saturation == "bounds" else -upper), upper
         return None
 
     def _sigma(self, problem: Problem) -> Tensor:
@@ -199,11 +191,11 @@ class MPPI:
         check_shape(sigma, (problem.m,), "mppi.covariance")
         if not bool((sigma > 0).all()):
             raise InputError("mppi.covariance", "variances above 0", sigma.tolist())
-        return sigma.view(-1, 1, 1)
+        return sigma.view(1, 1, -1)
 
     def _from_bounds(self, problem: Problem) -> Tensor:
         for constraint in problem.constraints:
             if isinstance(constraint, ControlBounds):
                 deviation = self.spread * (constraint.upper - constraint.lower)
-                return torch.where(deviation < OPEN, deviation.square(), 1.0).mT.unsqueeze(-1)
-        return problem.x0.new_ones(problem.m, 1, 1)
+                return torch.where(deviation < OPEN, deviation.square(), 1.0).unsqueeze(1)
+        return problem.x0.new_ones(1, 1, problem.m)

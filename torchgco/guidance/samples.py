@@ -1,7 +1,6 @@
-"""Sampled controls and what they cost: thousands of rollouts side by side, components first, stage by stage.
+"""Sampled controls and what they cost: the samples of all problems side by side, stage by stage.
 
-With the components apart, every operation runs over all samples at once on memory that lies together, and what a few
-stages need stays in the cache. Costs and collisions are kept apart, so that single precision loses neither.
+Costs and collisions are kept apart, so that single precision loses neither.
 """
 
 from __future__ import annotations
@@ -12,103 +11,59 @@ import torch
 from torch import Tensor
 
 from torchgco.problem import Problem
-from torchgco.shapes import sum_rows
-
-STAGES = 5  # drawn and flown together
 
 
 @dataclass(frozen=True)
 class Noise:
     """scale times unit noise z: white, or linear between knots."""
 
-    z: Tensor  # (N, m, B, S) white, (knots, m, B, S) else
-    scale: Tensor  # (m, B|1, 1): standard deviations
+    z: Tensor  # (N, B, S, m) white, (knots, B, S, m) else
+    scale: Tensor  # (B|1, 1, m): standard deviations
     left: Tensor | None  # (N,) int64: the knot before each stage; None: white
-    share: Tensor | None  # (N, 1, 1, 1): how far on to the next
+    share: Tensor | None  # (N,): how far on to the next
 
-    def between(self, first: int, last: int) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """z, left and share of the stages first..last-1."""
+    @property
+    def eps(self) -> Tensor:
+        """The noise of all stages, (N, B, S, m)."""
         if self.left is None or self.share is None:
-            return self.z[first:last], None, None
-        return self.z, self.left[first:last], self.share[first:last]
+            return self.scale * self.z
+        return self.scale * torch.lerp(self.z[self.left], self.z[self.left + 1], self.share.view(-1, 1, 1, 1))
 
 
 @dataclass(frozen=True)
 class Flight:
-    """What a block of samples did."""
+    """What samples did."""
 
-    V: Tensor  # (N, m, B, S) controls
-    x: Tensor  # (n, B, S) where they end
+    V: Tensor  # (N, B, S, m) controls
+    x: Tensor  # (B, S, n) where they end
     cost: Tensor  # (B, S) of all stages
     hits: Tensor  # (B, S) obstacles touched, counted at every knot
     likelihood: Tensor  # (B, S): sum_k u' Sigma^-1 eps, zero for smooth noise
 
 
-def fly(problem: Problem, mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tensor] | None) -> Flight:
-    """Samples drawn around mean (N, m, B, 1), clamped to bounds (m, B|1, 1), rolled out (Algorithm 3, lines 5-11)."""
-    x = problem.x0.mT.unsqueeze(-1).expand(-1, -1, noise.z.shape[-1]).contiguous()
-    sums, controls = torch.zeros(3, *x.shape[1:], dtype=x.dtype, device=x.device), []
-    for k in range(0, problem.N, STAGES):
-        stages = (problem, x, sums, mean[k : k + STAGES], noise.scale, bounds, *noise.between(k, k + STAGES))
-        V, x, sums = _fly_stages(*stages, first=k)
-        controls.append(V)
-    return Flight(torch.cat(controls), x, *sums)
-
-
 def draw(mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tensor] | None) -> Tensor:
-    """V (N, m, B, S) alone."""
-    return torch.cat(
-        [
-            _draw_stages(mean[k : k + STAGES], noise.scale, bounds, *noise.between(k, k + STAGES))[0]
-            for k in range(0, mean.shape[0], STAGES)
-        ]
-    )
+    """Controls V (N, B, S, m) around mean (N, B, 1, m), clamped to bounds (B|1, 1, m)."""
+    V = mean + noise.eps
+    return V if bounds is None else torch.clamp(V, *bounds)
+
+
+def fly(problem: Problem, mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tensor] | None) -> Flight:
+    """The same samples rolled out (Algorithm 3, lines 5-11)."""
+    V = draw(mean, noise, bounds)
+    x = problem.x0.unsqueeze(1).expand(-1, V.shape[2], -1)
+    cost, hits = x.new_zeros(2, *x.shape[:2]).unbind(0)
+    for k, u in enumerate(V.unbind(0)):
+        cost = cost + problem.cost.stage(x, u, k)
+        x = problem.dynamics.step(x, u).contiguous()  # sums over components then add in one order, whatever the batch
+        for constraint in problem.geometric:
+            if constraint.holds_at(k + 1):
+                hits = hits + (constraint.at(x, k + 1) >= 0).sum(-1)
+    likelihood = torch.zeros_like(cost)
+    if noise.left is None:
+        likelihood = sum((mean / noise.scale.square() * noise.eps).sum(-1).unbind(0), likelihood)
+    return Flight(V, x, cost, hits, likelihood)
 
 
 def average(V: Tensor, weights: Tensor) -> Tensor:
-    """sum_s w_s v_s (N, m, B, 1) of controls V (N, m, B, S) with weights (B, S)."""
-    return (V * weights).sum(-1, keepdim=True)
-
-
-def _draw_stages(
-    mean: Tensor,
-    scale: Tensor,
-    bounds: tuple[Tensor, Tensor] | None,
-    z: Tensor,
-    left: Tensor | None,
-    share: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """Controls and noise (c, m, B, S) of c stages."""
-    if left is not None and share is not None:
-        z = torch.lerp(z[left], z[left + 1], share)
-    eps = z * scale
-    V = mean + eps
-    return V if bounds is None else torch.clamp(V, *bounds), eps
-
-
-def _fly_stages(
-    problem: Problem,
-    x: Tensor,
-    sums: Tensor,
-    mean: Tensor,
-    scale: Tensor,
-    bounds: tuple[Tensor, Tensor] | None,
-    z: Tensor,
-    left: Tensor | None,
-    share: Tensor | None,
-    first: int = 0,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Some stages of all samples, the first of them being stage `first`: controls, states and the three sums."""
-    V, eps = _draw_stages(mean, scale, bounds, z, left, share)
-    cost, hits, likelihood = sums.unbind(0)
-    for j, u in enumerate(V.unbind(0)):
-        k = first + j
-        cost = cost + problem.cost.stage_rows(x, u, k)
-        x = problem.dynamics.step(x.movedim(0, -1), u.movedim(0, -1)).movedim(-1, 0)
-        for constraint in problem.geometric:
-            if constraint.holds_at(k + 1):
-                hits = hits + constraint.hits(x, k + 1)
-        if left is None:
-            likelihood = likelihood + sum_rows(mean[j] / scale.square() * eps[j])
-    return V, x, torch.stack((cost, hits, likelihood))
-
+    """sum_s w_s v_s (N, B, 1, m) of controls V (N, B, S, m) with weights (B, S)."""
+    return weights.unsqueeze(1) @ V
