@@ -156,14 +156,3 @@ def test_the_worst_row_is_named() -> None:
     assert first == {"violation": pytest.approx(0.5), "constraint": "ControlBounds", "knot": 4, "row": 3}
     assert second["constraint"] == "BoundSpheres" and second["knot"] == 3 and second["row"] == 2
     assert second["violation"] == pytest.approx(float(problem.constraints[0].distances[1, 2]))
-
-
-def test_a_large_batch_is_valued_and_expanded_in_pieces(monkeypatch) -> None:
-    problem = _with_more(quadrotor_batch(B=5, N=9)[0])
-    X, U = random_trajectory(problem)
-    lagrangian = Lagrangian(problem, _random_duals(problem, X, U), _guide(X, problem.dynamics.position), True)
-    whole = (*lagrangian.value(X, U), lagrangian.expand(X, U))
-    monkeypatch.setattr("torchgco.lagrangian.AT_ONCE", 2)
-    pieces = (*lagrangian.value(X, U), lagrangian.expand(X, U))
-    for a, b in zip(whole, pieces, strict=True):
-        assert torch.equal(a, b)

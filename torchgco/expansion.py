@@ -21,9 +21,9 @@ def linearise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     return F
 
 
-def quadratise(problem: Problem, X: Tensor, U: Tensor, out: Tensor | None = None) -> Tensor:
+def quadratise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """H (B, N+1, s, s): gradient and Hessian of J_var at every knot; the last block has no control part."""
     s = problem.n + 1 + problem.m
-    H = X.new_empty(X.shape[0], X.shape[1], s, s) if out is None else out
+    H = X.new_empty(*X.shape[:2], s, s)
     problem.cost.expand(X, U, H)
     return H

@@ -12,10 +12,9 @@ from torchgco.constraints.base import Sense
 from torchgco.constraints.guides import Guide
 from torchgco.expansion import quadratise
 from torchgco.problem import Problem
-from torchgco.shapes import InputError, Rows, pieces, take
+from torchgco.shapes import InputError, Rows, take
 
 VIOLATION_TOLERANCE = 1e-3  # metres for lengths, all else in the units of its constraint
-AT_ONCE = 64  # problems that are valued and expanded together on a CPU
 
 
 @dataclass(frozen=True)
@@ -55,17 +54,17 @@ def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool
     rho = mu.view(-1, 1, 1)
     if sense == "equality":
         return rho.expand_as(c)
-    idle = (torch.addcmul(lam, rho, c) < 0) if clip else ((c < 0) & (lam == 0))
+    idle = (lam + rho * c < 0) if clip else ((c < 0) & (lam == 0))
     return torch.where(idle, 0.0, rho)
 
 
 def _worth(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> Tensor:
     """What the rows of a constraint add to L_M, (B,)."""
     rho = penalty_weights(sense, c, lam, mu, clip)
-    terms = torch.addcmul(lam, rho, c, value=0.5).mul_(c)
+    terms = (lam + 0.5 * rho * c) * c
     if clip and sense == "inequality":
         # Continued by its minimum over c where the row lets go, so that L_M stays continuous.
-        terms = torch.where(rho == 0, lam.square().mul_(-0.5 / mu.view(-1, 1, 1)), terms)
+        terms = torch.where(rho == 0, -0.5 * lam.square() / mu.view(-1, 1, 1), terms)
     # Two sums, knots last: one over both axes would be split among threads by batch size.
     return terms.sum(-1).sum(-1)
 
@@ -73,8 +72,8 @@ def _worth(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> Tens
 def _pull(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> tuple[Tensor, Tensor]:
     """First and second derivative of that by c, (B, K, p) each."""
     rho = penalty_weights(sense, c, lam, mu, clip)
-    g = torch.addcmul(lam, rho, c)
-    return (g.masked_fill_(rho == 0, 0.0) if clip and sense == "inequality" else g), rho
+    g = lam + rho * c
+    return (torch.where(rho == 0, 0.0, g) if clip and sense == "inequality" else g), rho
 
 
 @dataclass(frozen=True)
@@ -95,30 +94,24 @@ class Lagrangian:
 
     def value(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         """J_var (B,) and L_M (B,)."""
-        if X.shape[0] <= AT_ONCE:
-            return self._value(X, U)
-        parts = [self.take(rows)._value(X[rows], U[rows]) for rows in _split(X)]
-        return torch.cat([cost for cost, _ in parts]), torch.cat([merit for _, merit in parts])
-
-    def _value(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         cost = self.problem.cost.total(X, U)
         merit = cost
         for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
             merit = merit + _worth(constraint.sense, constraint.value(X, U), lam, self.duals.mu, self.clip)
         return cost, merit if self.guide is None else merit + self.guide.value(X)
 
-    def expand(self, X: Tensor, U: Tensor, out: Tensor | None = None) -> Tensor:
+    def expand(self, X: Tensor, U: Tensor) -> Tensor:
         """H (N+1, B, s, s) of L_M: first derivatives of the constraints only (Equations 31-37).
 
-        Stage first, as the backward pass reads it; written into `out` where that is given.
+        Stage first, as the backward pass reads it.
         """
-        s = self.problem.n + 1 + self.problem.m
-        H = X.new_empty(X.shape[1], X.shape[0], s, s) if out is None else out
-        everyone = _split(X)
-        for rows in everyone:
-            part = self if len(everyone) == 1 else self.take(rows)
-            part._expand(X[rows], U[rows], H[:, rows].transpose(0, 1))
-        return H
+        H = quadratise(self.problem, X, U)
+        for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
+            g, rho = _pull(constraint.sense, constraint.value(X, U), lam, self.duals.mu, self.clip)
+            constraint.accumulate(X, U, g, rho, H)
+        if self.guide is not None:
+            self.guide.accumulate(X, H)
+        return H.transpose(0, 1)
 
     def expand_optimality(self, X: Tensor, U: Tensor) -> Tensor:
         """H (N+1, B, s, s) of J_var + lam'c, with the penalty's curvature on the rows that push."""
@@ -135,19 +128,6 @@ class Lagrangian:
             if constraint.sense == "inequality":
                 slack = slack - (lam * constraint.value(X, U).clamp(max=0.0)).sum(-1).sum(-1)
         return slack
-
-    def _expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
-        quadratise(self.problem, X, U, out=H)
-        for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
-            g, rho = _pull(constraint.sense, constraint.value(X, U), lam, self.duals.mu, self.clip)
-            constraint.accumulate(X, U, g, rho, H)
-        if self.guide is not None:
-            self.guide.accumulate(X, H)
-
-
-def _split(X: Tensor) -> list[slice]:
-    """Rows of a batch, a few problems at a time: what is at work then stays in the cache."""
-    return pieces(X.shape[0], AT_ONCE if X.device.type == "cpu" else X.shape[0])
 
 
 def update(

@@ -56,11 +56,6 @@ class PerElement:
         return replace(self, **changes) if changes else self  # type: ignore[type-var]
 
 
-def pieces(count: int, size: int) -> list[slice]:
-    """0..count in slices of at most `size`: views, where an index would copy."""
-    return [slice(first, min(first + size, count)) for first in range(0, count, size)]
-
-
 def take(tree: Any, index: Rows) -> Any:
     """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged."""
     if isinstance(tree, Tensor):

@@ -152,7 +152,7 @@ def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict
     ends: dict[int, tuple[bool, bool, int]] = {}
     for _ in range(3 * count):
         frozen = replace(state)
-        end = EagerIterations(inner, lagrangian.problem, 1).run(state, lagrangian)
+        end = EagerIterations(inner).run(state, lagrangian)
         for b in range(lagrangian.problem.B):
             if b in ends:  # an element that had ended before stays where it was
                 for name in ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation"):
@@ -180,7 +180,7 @@ def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None
     for inner, count in ((DAMPED, 1), (DAMPED, 4), (BRIEF, 4)):
         (a, first), (b, second) = begun(problem, guided, clip), begun(problem, guided, clip)
         ends = eager(inner, a, first, count)
-        out = NativeIterations(inner, problem, count).run(b, second)
+        out = NativeIterations(inner, count).run(b, second)
         torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
         torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
         assert torch.equal(b.iterations, a.iterations) and torch.equal(b.inner, a.inner)
@@ -206,7 +206,7 @@ def test_models_of_any_size(n: int, m: int, N: int) -> None:
     problem = linear_problem(n, m, N)
     (a, first), (b, second) = begun(problem), begun(problem)
     eager(DAMPED, a, first, 5)
-    NativeIterations(DAMPED, problem, 5).run(b, second)
+    NativeIterations(DAMPED, 5).run(b, second)
     torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
 
@@ -215,14 +215,14 @@ def test_models_of_any_size(n: int, m: int, N: int) -> None:
 def test_an_element_has_its_bits_in_every_batch(B: int) -> None:
     whole = planar_batch(B=40, N=15, obstacles=5)[0]
     all_of_them, lagrangian = begun(whole)
-    NativeIterations(DAMPED, whole, 6).run(all_of_them, lagrangian)
+    NativeIterations(DAMPED, 6).run(all_of_them, lagrangian)
     state, lagrangian = begun(whole)
     rows = torch.arange(B).flip(0)
     part = replace(state, **{
         name: getattr(state, name)[rows]
         for name in ("X", "U", "cost", "merit", "inner", "iterations", "regularisation", "rows", "outer")
     })  # fmt: skip
-    NativeIterations(DAMPED, whole.take(rows), 6).run(part, lagrangian.take(rows))
+    NativeIterations(DAMPED, 6).run(part, lagrangian.take(rows))
     for name in ("X", "U", "cost", "merit", "regularisation", "iterations"):
         assert torch.equal(getattr(part, name), getattr(all_of_them, name)[rows]), name
 
@@ -231,13 +231,13 @@ def test_an_element_has_its_bits_in_every_batch(B: int) -> None:
 def test_a_neighbour_that_is_not_finite_changes_no_bits(threads: int) -> None:
     problem = quadrotor_batch(B=19, N=10, obstacles=4)[0]
     want, lagrangian = begun(problem)
-    NativeIterations(DAMPED, problem, 5).run(want, lagrangian)
+    NativeIterations(DAMPED, 5).run(want, lagrangian)
     state, lagrangian = begun(problem)
     state.X[3], state.U[11, 4] = torch.nan, torch.inf
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        end = NativeIterations(DAMPED, problem, 5).run(state, lagrangian)
+        end = NativeIterations(DAMPED, 5).run(state, lagrangian)
     finally:
         torch.set_num_threads(before)
     rest = torch.tensor([b for b in range(19) if b not in (3, 11)])
@@ -253,10 +253,10 @@ def test_statuses_are_those_of_pytorch() -> None:
     problem = free._with({"cost": concave, "constraints": ()})
     for inner in (replace(DAMPED, regularisation_max=1e-4), replace(DAMPED, max_iterations=3)):
         (a, first), (b, second) = begun(problem), begun(problem)
-        native = NativeIterations(inner, problem, 3).run(b, second)
+        native = NativeIterations(inner, 3).run(b, second)
         statuses = torch.zeros(2, dtype=torch.int64)
         for _ in range(20):
-            end = EagerIterations(inner, problem, 1).run(a, first)
+            end = EagerIterations(inner).run(a, first)
             statuses = torch.where(statuses == 0, end.status, statuses)
             if bool((end.ended | (statuses > 0)).all()):
                 break

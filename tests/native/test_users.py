@@ -64,7 +64,7 @@ def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> N
     for count in (1, 4):
         (a, first), (b, second) = begun(problem), begun(problem)
         ends = eager(DAMPED, a, first, count)
-        out = NativeIterations(DAMPED, problem, count).run(b, second)
+        out = NativeIterations(DAMPED, count).run(b, second)
         torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
         torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
         assert torch.equal(b.iterations, a.iterations) and torch.equal(b.inner, a.inner)
@@ -113,12 +113,12 @@ def test_the_library_may_be_made_for_one_problem_first() -> None:
 def test_an_element_has_its_bits_in_every_batch(name: str) -> None:
     whole = PROBLEMS[name]()
     all_of_them, lagrangian = begun(whole)
-    NativeIterations(DAMPED, whole, 5).run(all_of_them, lagrangian)
+    NativeIterations(DAMPED, 5).run(all_of_them, lagrangian)
     names = ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation", "rows", "outer")
     for rows in (torch.tensor([2]), torch.arange(5).flip(0), torch.tensor([1, 3] * 6)):
         state, lagrangian = begun(whole)
         part = replace(state, **{name: getattr(state, name)[rows] for name in names})
-        NativeIterations(DAMPED, whole.take(rows), 5).run(part, lagrangian.take(rows))
+        NativeIterations(DAMPED, 5).run(part, lagrangian.take(rows))
         for name in ("X", "U", "cost", "merit", "iterations"):
             assert torch.equal(getattr(part, name), getattr(all_of_them, name)[rows]), name
 
@@ -131,21 +131,21 @@ def test_a_problem_of_its_own_has_the_bits_of_the_batch() -> None:
     (a, first), (b, second) = begun(whole), begun(alone)
     b.X, b.U, b.cost, b.merit = a.X[3:4], a.U[3:4], a.cost[3:4], a.merit[3:4]
     second = replace(second, duals=first.take(torch.tensor([3])).duals)
-    NativeIterations(DAMPED, whole, 5).run(a, first)
-    NativeIterations(DAMPED, alone, 5).run(b, second)
+    NativeIterations(DAMPED, 5).run(a, first)
+    NativeIterations(DAMPED, 5).run(b, second)
     assert torch.equal(b.U[0], a.U[3]) and torch.equal(b.merit[0], a.merit[3])
 
 
 def test_a_neighbour_that_is_not_finite_changes_no_bits() -> None:
     problem = PROBLEMS["by knot"]()
     want, lagrangian = begun(problem)
-    NativeIterations(DAMPED, problem, 5).run(want, lagrangian)
+    NativeIterations(DAMPED, 5).run(want, lagrangian)
     target = problem.cost.own_path.clone()
     target[1] = torch.nan
     ill = problem._with({"cost": replace(problem.cost, own_path=target)})
     state, lagrangian = begun(problem)
     state.X[3] = torch.nan
-    end = NativeIterations(DAMPED, ill, 5).run(state, replace(lagrangian, problem=ill))
+    end = NativeIterations(DAMPED, 5).run(state, replace(lagrangian, problem=ill))
     assert [int(s) for s in end.status] == [0, 0, 0, int(Status.NON_FINITE), 0]
     assert torch.equal(state.U[1], begun(problem)[0].U[1]) and not torch.equal(state.U[1], want.U[1])
     for name in ("X", "U", "merit", "iterations"):

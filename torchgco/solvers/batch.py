@@ -65,8 +65,8 @@ class Loop:
         self.state = self._begin(everyone[:slots])
         self.problem = problem if slots == problem.B else problem.take(everyone[:slots])
         limit = 1 if solver.record else solver.inner.max_iterations
-        kernels = NativeIterations if engine_of(problem) is not None else EagerIterations
-        self.iterations = kernels(solver.inner, self.problem, limit)
+        native = engine_of(problem) is not None
+        self.iterations = NativeIterations(solver.inner, limit) if native else EagerIterations(solver.inner)
 
     def run(self) -> Solution:
         """Pass after pass until every element has ended."""

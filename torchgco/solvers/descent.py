@@ -26,8 +26,8 @@ def descend(inner: ILQR, lagrangian: Lagrangian, U: Tensor) -> InnerState:
     rows = torch.arange(problem.B, device=U.device)
     none = (torch.zeros_like(rows) for _ in range(3))
     found = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), *none)
-    kernels = NativeIterations if engine_of(problem) is not None else EagerIterations
-    iterations = kernels(inner, problem, inner.max_iterations)
+    native = engine_of(problem) is not None
+    iterations = NativeIterations(inner, inner.max_iterations) if native else EagerIterations(inner)
     going = torch.isfinite(merit) & torch.isfinite(X).flatten(1).all(-1)
     running = found
     while bool(going.any()):

@@ -15,7 +15,6 @@ from torch import Tensor
 from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian
 from torchgco.native.dispatch import engine_of, terms_of
-from torchgco.problem import Problem
 from torchgco.solvers.lifted import LOST, diverges, lifted_search, native_lifted_search
 from torchgco.solvers.line_search import Candidates
 from torchgco.solvers.riccati import BackwardPass, backward
@@ -44,7 +43,7 @@ class PassEnd:
 class NativeIterations:
     """Up to `limit` iterations of every element's inner solve in one call of the native library."""
 
-    def __init__(self, inner: ILQR, problem: Problem, limit: int) -> None:
+    def __init__(self, inner: ILQR, limit: int) -> None:
         self.inner, self.limit = inner, limit
 
     def run(self, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
@@ -70,7 +69,7 @@ class NativeIterations:
 class EagerIterations:
     """One iteration of every element by PyTorch's kernels: on a GPU, in single precision, and as the reference."""
 
-    def __init__(self, inner: ILQR, problem: Problem, limit: int) -> None:
+    def __init__(self, inner: ILQR) -> None:
         self.inner = inner
 
     def run(self, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
