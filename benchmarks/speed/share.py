@@ -26,8 +26,8 @@ PHASES = {
     "set-up": "torchgco.native.engine:Engine.__init__",
 }
 OUTER = "outer loop"
-# What calls the libraries: the name of the function is its first argument's, or the one after the object.
-CALLS = ("torchgco.native.engine:run", "torchgco.native.sampler:run")
+# What calls the libraries: with a function of theirs first, or with the name of one.
+CALLS = ("torchgco.native.engine:run", "torchgco.native.sampler:run", "torchgco.native.roadmap:NativeSearch._run")
 PYTHON = "Python and PyTorch"
 
 
@@ -77,7 +77,8 @@ class Shares:
     def _around(self, work: Callable[..., Any], phase: str | None) -> Callable[..., Any]:
         @wraps(work)
         def timed(*args: Any, **kwargs: Any) -> Any:
-            self.begin(phase, PYTHON if phase else args[0].__name__)
+            name = next((arg for arg in args if isinstance(arg, str)), None)
+            self.begin(phase, PYTHON if phase else name or args[0].__name__)
             self.calls[self.open[-1][0]] += phase is None
             try:
                 return work(*args, **kwargs)
