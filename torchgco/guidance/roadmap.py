@@ -18,7 +18,7 @@ from torch import Tensor
 from torchgco.guidance.search import Search
 from torchgco.native import roadmap
 from torchgco.native.roadmap import NativeSearch
-from torchgco.shapes import InputError, pieces
+from torchgco.shapes import InputError
 
 AT_ONCE = 4  # problems that PyTorch searches together: memory holds the distances of all edges from all obstacles
 PRIMES = (2, 3, 5)  # bases of the low-discrepancy sequence
@@ -83,7 +83,8 @@ class Roadmap:
         """
         library = roadmap.library_for(scene.centers)
         most = AT_ONCE if library is None else roadmap.AT_ONCE
-        parts = [self._ways(scene, rows, count, library) for rows in pieces(scene.start.shape[0], most) or [slice(0)]]
+        B = scene.start.shape[0]
+        parts = [self._ways(scene, slice(i, i + most), count, library) for i in range(0, max(B, 1), most)]
         return torch.cat([way for way, _ in parts]), torch.cat([found for _, found in parts])
 
     def _ways(self, scene: Scene, rows: slice, count: int, library: CDLL | None) -> tuple[Tensor, Tensor]:
