@@ -121,7 +121,8 @@ TARGETS: tuple[tuple[str, tuple[Measured, ...], str, str], ...] = (
 def run(bench: Bench) -> None:
     rows, commit = [] if bench.results is None else _known(bench), bench.source.get("commit", "")
     for case, measured, asked, aim in TARGETS:
-        bench.row(SECTION, case, "gco", "measured", "; ".join(one.read(rows, commit) for one in measured))
+        texts = dict.fromkeys(one.read(rows, commit) for one in measured)  # each once
+        bench.row(SECTION, case, "gco", "measured", "; ".join(texts))
         bench.row(SECTION, case, "gco", "asked", asked)
         bench.row(SECTION, case, "gco", "better still", aim)
 
