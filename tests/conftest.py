@@ -1,8 +1,23 @@
 """What holds for every test: one thread, as the workers of a parallel run share the cores."""
 
 import os
+from collections.abc import Iterator
 
+import pytest
 import torch
+
+from torchgco import kernels
+from torchgco.native.compiler import find_compiler
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start
 torch.set_num_threads(1)
+
+
+@pytest.fixture(params=["native", "eager"])
+def native(request: pytest.FixtureRequest) -> Iterator[bool]:
+    """Both kinds of kernels, one after the other."""
+    if request.param == "native" and find_compiler() is None:
+        pytest.skip("no C compiler")
+    kernels.use_native(request.param == "native")
+    yield request.param == "native"
+    kernels.use_native(True)

@@ -1,6 +1,5 @@
 """MPPI, detection and region against the NumPy reference; the draws by their promises."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,12 +11,11 @@ from tests.native.lanes import drawn
 from tests.problems import planar_batch, quadrotor_batch, reference_of
 from tests.reference.guidance import active_spheres, cpuf, stuck_knots
 from tests.reference.mppi import MppiSettings, mppi
-from torchgco import GCO, MPPI, InputError, kernels
+from torchgco import GCO, MPPI, InputError
 from torchgco.constraints import GuideRegion
 from torchgco.draws import DrawKey, standard_normal
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.samples import Flight, Noise, draw, fly
-from torchgco.native.compiler import find_compiler
 from torchgco.rollout import open_loop
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
@@ -25,16 +23,6 @@ BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
 
 def key(B: int, seed: int = 0, outer: int = 1) -> DrawKey:
     return DrawKey(seed, torch.arange(B), torch.full((B,), outer))
-
-
-@pytest.fixture(params=["native", "PyTorch"])
-def native(request) -> Iterator[bool]:
-    """Both kinds of kernels, one after the other."""
-    if request.param == "native" and find_compiler() is None:
-        pytest.skip("no C compiler")
-    kernels.use_native(request.param == "native")
-    yield request.param == "native"
-    kernels.use_native(True)
 
 
 def white_noise(problem, key_: DrawKey, samples: int, native: bool) -> np.ndarray:
@@ -178,7 +166,7 @@ def test_single_precision_keeps_cost_apart_from_collisions(native: bool) -> None
 
 
 @pytest.mark.parametrize("knots", [0, 4])
-@pytest.mark.parametrize("native", ["PyTorch"], indirect=True)
+@pytest.mark.parametrize("native", ["eager"], indirect=True)
 def test_many_samples_are_flown_in_blocks(knots: int, native: bool, monkeypatch) -> None:
     problem, U = planar_batch(B=3, N=12)
     sampler = MPPI(samples=23, knots=knots, rounds=2, covariance=4.0)

@@ -55,7 +55,7 @@ def _reference(problem, U0, b: int, tolerance: float, limit: int, guided: bool):
 
 @pytest.mark.parametrize("guided", [False, True], ids=["al_ilqr", "gco"])
 @pytest.mark.parametrize("case", CASES)
-def test_iterates_follow_the_nested_loops(case: str, guided: bool) -> None:
+def test_iterates_follow_the_nested_loops(case: str, guided: bool, native: bool) -> None:
     make, tolerance, limit = CASES[case]
     problem, U0 = make()
     guidance = GCO(sampler=MPPI(samples=SAMPLES)) if guided else None

@@ -97,6 +97,17 @@ def solve_rows(solver, problem: Problem, U0, rows: list[int]) -> Solution:
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("batch", BATCHES)
 def test_alone_in_any_batch_and_in_any_order(batch: str, solver: str) -> None:
+    check_alone_in_any_batch_and_in_any_order(batch, solver)
+
+
+@pytest.mark.parametrize("native", ["eager"], indirect=True)
+@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "gco with plans"])
+@pytest.mark.parametrize("batch", BATCHES)
+def test_eager_kernels_keep_the_contract(batch: str, solver: str, native: bool) -> None:
+    check_alone_in_any_batch_and_in_any_order(batch, solver)
+
+
+def check_alone_in_any_batch_and_in_any_order(batch: str, solver: str) -> None:
     problem, U0 = BATCHES[batch]()
     together = SOLVERS[solver].solve(problem, U0, seed=3)
     if solver != "mppi":
