@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.guides import GuideRegion
-from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import cost_unit, open_loop, value
 from torchgco.problem import Problem
@@ -32,10 +31,10 @@ def has_arrived(problem: Problem, path: Iterate | Solution, share: float, limit:
 
 
 def try_again(s: State, rows: Tensor, problem: Problem, duals: Multipliers, status: Tensor, solver: OuterLoop) -> None:
-    """Another attempt for elements that have ended one and haven't arrived, or whose attempts are all made (in place).
+    """Another attempt for elements that have ended one and haven't arrived (in place).
 
     Further plans are tried from the caught path. Where none is left, and the best path ends close to the goal, the last
-    attempt goes on from there with the end drawn to the goal, among obstacles alone.
+    attempt goes on from there with the end drawn to the goal. A path that was never caught is left as it is.
     """
     ended = status[rows] != Status.RUNNING
     tried, best = s.attempt[rows], take(s.best, rows)
@@ -46,8 +45,8 @@ def try_again(s: State, rows: Tensor, problem: Problem, duals: Multipliers, stat
     _start(s, rows, duals, status, ended & left, take(s.origin, rows))
     if solver.arrival is None or not isinstance(s.guide, GuideRegion):
         return
-    near = has_arrived(problem, best, CLOSE * solver.arrival, solver.violation_tolerance) & _has_obstacles(problem)
-    last = ended & ~left & missing & near & (tried <= solver.attempts)
+    near = has_arrived(problem, best, CLOSE * solver.arrival, solver.violation_tolerance)
+    last = ended & ~left & missing & near & (tried > 0) & (tried <= solver.attempts)
     if not bool(last.any()):
         return
     place = _start(s, rows, duals, status, last, best)
@@ -55,14 +54,6 @@ def try_again(s: State, rows: Tensor, problem: Problem, duals: Multipliers, stat
     s.led[place] = True
     part = problem.take(last.nonzero().flatten())
     put(s.guide, place, _goal_region(part, take(s.guide, place), solver.arrival))
-
-
-def _has_obstacles(problem: Problem) -> Tensor:
-    """Whether there is anything to fly around, (B,): elsewhere the optimum is left as it is."""
-    there = torch.zeros(problem.B, dtype=torch.bool, device=problem.x0.device)
-    for constraint in problem.geometric:
-        there |= (~constraint.absent).any(-1) if isinstance(constraint, BoundSpheres) else torch.ones_like(there)
-    return there
 
 
 def _start(s: State, rows: Tensor, duals: Multipliers, status: Tensor, chosen: Tensor, path: Iterate) -> Tensor:
