@@ -98,10 +98,12 @@ def write(problem: Problem, X: Tensor, U: Tensor, folder: Path) -> None:
 
 def _cost(problem: Problem) -> dict[str, np.ndarray]:
     cost, B = problem.cost, problem.B
-    if not isinstance(cost, BoundQuadratic) or not cost.diagonal or not cost.is_autonomous:
-        raise InputError("cost", "a diagonal quadratic cost, the same at all stages, for acados", type(cost).__name__)
-    if not all(part is None for part in (cost.q, cost.r, cost.qf)):
-        raise InputError("cost", "no linear terms, for acados", "some")
+    if not isinstance(cost, BoundQuadratic) or not cost.diagonal:
+        raise InputError("cost", "a diagonal quadratic cost for acados", type(cost).__name__)
+    if not all(part.shape[1] == 1 for part in (cost.Q, cost.R, cost.x_ref, cost.u_ref)):
+        raise InputError("cost", "weights and references that are the same at all stages, for acados", "others")
+    if not all(part is None for part in (cost.q, cost.r, cost.qf, cost.H)):
+        raise InputError("cost", "no linear and no cross terms, for acados", "some")
     of_all = lambda x, u: torch.cat((x[:, 0].expand(B, -1), u[:, 0].expand(B, -1)), dim=-1).numpy()
     return {
         "weight": of_all(cost.Q, cost.R),
