@@ -55,6 +55,7 @@ def _acados() -> Any:
     link = install / "interfaces" / "acados_template" / "acados_template"
     link.parent.mkdir(parents=True, exist_ok=True)
     if not link.exists():
+        link.unlink(missing_ok=True)  # one that leads to where the environment was before
         link.symlink_to(templates)
     libraries = str(install / "lib")
     if libraries not in os.environ.get("LD_LIBRARY_PATH", "").split(":"):

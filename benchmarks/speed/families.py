@@ -83,7 +83,7 @@ def _flown(bench: Bench, name: str, peer: Peer) -> bool:
     try:
         peer.fly(bench)
     except (InputError, RuntimeError) as error:
-        bench.row(SECTION, name, peer.name, "ended with", str(error).splitlines()[0][:80])
+        bench.row(SECTION, name, peer.name, "ended with", str(error).strip().splitlines()[-1][:80])
         return False
     return True
 
