@@ -47,7 +47,7 @@ class GuidedCasADi:
             InputError: what `CasADiSolver.prepare` raises; a problem without a position, or pushes that don't fit it.
         """
         self.detour.check(problem)
-        engine_of(problem)
+        engine_of(problem)  # compiled now, so that no solve waits for it
         return PreparedGuided(self, self.solver.prepare(problem))
 
     def solve(

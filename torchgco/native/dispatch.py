@@ -38,7 +38,7 @@ def engine_of(problem: Problem) -> Engine | None:
         except (InputError, NativeError) as error:
             problem.form["engine"] = None
             reason = str(error).splitlines()[0]
-            warnings.warn(f"solved by PyTorch's kernels, some 20 times slower: {reason}", EagerWarning, stacklevel=4)
+            warnings.warn(f"solved by PyTorch's kernels, many times slower: {reason}", EagerWarning, stacklevel=4)
     return problem.form["engine"]
 
 
