@@ -13,7 +13,7 @@ import torch
 
 import torchgco
 from torchgco import presets
-from torchgco.native.dispatch import engine_of
+from torchgco.native.dispatch import engine_of, sampler_of
 from torchgco.problem import Problem
 
 MODELS = {
@@ -31,11 +31,13 @@ def measure(name: str) -> dict[str, float]:
     engine = _took(lambda: engine_of(problem))
     first, again = (_took(lambda: solver.solve(problem, _controls(problem))) for _ in range(2))
     rest = [max(0.0, a - b) for a, b in zip(first, again, strict=True)]
+    sampler = _took(lambda: sampler_of(problem, torch.float32))
     return {
         "kernels": engine[0],
         "more by the first solve": rest[0],
         "both": engine[0] + rest[0],
         "both, wall": engine[1] + rest[1],
+        "where it samples, further": sampler[0],
     }
 
 

@@ -14,7 +14,7 @@ from tests.native import users
 from tests.native.lanes import drawn
 from tests.native.test_engine import user_problem
 from tests.problems import planar_batch, quadrotor_batch
-from torchgco import MPPI, Problem, Spheres, kernels
+from torchgco import MPPI, Problem, Spheres, kernels, presets
 from torchgco.draws import DrawKey, standard_normal
 from torchgco.guidance import mppi
 from torchgco.native.compiler import find_compiler
@@ -125,3 +125,10 @@ def test_a_sample_that_leaves_the_finite_numbers_takes_no_other_along() -> None:
     wild = MPPI(samples=64, covariance=1e300, saturation=None, temperature=1.0)
     _, V = wild.improve(problem, U, key(3))
     assert torch.isfinite(V).all()
+
+
+def test_a_solve_that_never_samples_compiles_no_sampler() -> None:
+    problem, U = planar_batch(B=1, N=20)
+    free = Problem(problem.dynamics, problem.cost, [Spheres([[50.0, 50.0]], [0.1], 0.1)], problem.x0, problem.N)
+    presets.gco(free).solve(free, U)
+    assert "engine" in free.form and torch.float32 not in free.form

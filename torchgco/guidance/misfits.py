@@ -18,7 +18,7 @@ from torchgco.guidance.detour import Detour
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.scene import scene_of
 from torchgco.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import engine_of, sampler_of
+from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
 
 SAMPLES = 2  # flown as a trial
@@ -33,8 +33,8 @@ def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None,
     if sampler is None:
         return None, None
     sampler.check(problem)
-    if sampler_of(problem, problem.x0.dtype if sampler.dtype is None else getattr(torch, sampler.dtype)) is not None:
-        return sampler, None
+    if engine_of(problem) is not None:
+        return sampler, None  # natively it samples the same traced functions that the solver runs
     own, wanted, why = _tried(_sample, problem, sampler.dtype)
     if why is None:
         return sampler, None

@@ -43,7 +43,10 @@ def engine_of(problem: Problem) -> Engine | None:
 
 
 def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:
-    """The library that samples for problems of this form in some precision; None where PyTorch does."""
+    """The library that samples for problems of this form in some precision; None where PyTorch does.
+
+    Compiled at the first call: most solves never sample.
+    """
     engine = engine_of(problem)
     if engine is None:
         return None
