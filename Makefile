@@ -1,5 +1,5 @@
 # make study   the default study, in an environment of its own (ARGS="experiment=planar_trap seed=1" for others)
-# make families   every solver on the public layouts (an hour or more)
+# make families   every solver on the public layouts (an hour or more; ARGS="--families walls" for some)
 # make quality   how often gco reaches the goal on the public layouts, and how well (ARGS="--solvers gco gco_max" for more
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
 # make benchmark   speed, side by side with the peers (twenty minutes; ARGS="families targets" for some sections);
@@ -19,12 +19,9 @@ PEERS := $(VENV)/.peers
 # The wheel of acados brings a CasADi that would stand before the real one: an environment without torchgco.
 ACADOS := .venv-acados
 
-# The public layouts of benchmarks/data, all solvers; FAMILIES picks some. An hour or more on two cores.
-FAMILIES ?= forest30 forest60 walls planar_trap planar_random
-
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test lint types clean quality oracle benchmark benchmark-gpu families $(FAMILIES:%=family-%)
+.PHONY: study test lint types clean quality oracle benchmark benchmark-gpu families
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -32,14 +29,8 @@ study: $(RUNTIME)
 test: $(DEV)
 	$(BIN)/python -m pytest -n auto $(ARGS)
 
-families: $(FAMILIES:%=family-%)
-	$(BIN)/torchgco-report outputs/families --output outputs/families-report
-	cp outputs/families-report/summary.csv benchmarks/families.csv
-
-family-%: $(RUNTIME)
-	$(BIN)/torchgco scenario=layouts scenario.path=benchmarks/data/$*.npz \
-	    model=$(if $(filter planar%,$*),planar,quadrotor) \
-	    study.baselines=[gco_paper,al_ilqr,mppi,hold] hydra.run.dir=outputs/families/$* $(ARGS)
+families: $(RUNTIME)
+	$(BIN)/python -m benchmarks.quality --write --page families --solvers gco gco_paper al_ilqr mppi hold $(ARGS)
 
 quality: $(RUNTIME)
 	$(BIN)/python -m benchmarks.quality --write $(ARGS)

@@ -1,8 +1,8 @@
-"""python -m benchmarks.concar: a car among four hard circles, 100 problems, beside IPOPT.
+"""python -m benchmarks.concar: a car among four hard circles, 100 problems, alongside IPOPT.
 
 torchgco flies all as one batch, IPOPT one after the other, both from zero controls, with one thread; `judge` counts for
-both. Model, problems and solver are those of `notebooks/own_model.ipynb`, whose cells tagged `shared` are run as they
-stand there, so that nothing is written twice.
+both. With --write the table goes into benchmarks/results/concar.md. Model, problems and solver are those of
+`notebooks/own_model.ipynb`, whose cells tagged `shared` are run as they stand there, so that nothing is written twice.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.tables import put_between
 from torchgco import Problem, Solution, Status, judge
 from torchgco.baselines import CasADiSolver
 
@@ -30,7 +32,7 @@ FEASIBLE, EXACT = 1e-3, 1e-6  # violation of the full radii, m
 DEARER = 1.01  # a cost ratio from which on two paths are told apart
 HEAD = (
     "solver", "circles", "n", "feasible", "violation <= 1e-6", "reached", "median objective", "ratio of medians",
-    "median ratio", "seconds a problem",
+    "median ratio", "seconds per problem",
 )  # fmt: skip
 
 
@@ -45,7 +47,7 @@ def own_model() -> SimpleNamespace:
 
 
 def read_layouts() -> pd.DataFrame:
-    """One problem a row."""
+    """One problem per row."""
     return pd.read_csv(DATA / "concar.csv")
 
 
@@ -62,7 +64,7 @@ class Flight:
     violation: Tensor  # (B,), m: circles at knots 1..99 and, in their own units, control limits
     reached: Tensor  # (B,) bool
     converged: int  # by the solver's own word
-    seconds: float  # a problem
+    seconds: float  # per problem
 
     @classmethod
     def judged(cls, name: str, problem: Problem, solution: Solution, seconds: float) -> Flight:
@@ -108,12 +110,12 @@ def published(seeds: pd.Series) -> list[list[str]]:
 
 
 def compared(ours: Flight, peer: Flight) -> str:
-    """What the medians don't tell."""
+    """Both solvers layout by layout, which the medians don't show."""
     ratio = ours.cost / peer.cost
     return (
         f"Layout by layout torchgco is more than 1 % cheaper on {int((ratio < 1 / DEARER).sum())} of {len(ratio)} and "
-        f"more than 1 % dearer on {int((ratio > DEARER).sum())} (ratios of {float(ratio.min()):.2f} to "
-        f"{float(ratio.max()):.2f}). By their own word {ours.converged} and {peer.converged} converged."
+        f"more than 1 % more expensive on {int((ratio > DEARER).sum())} (ratios of {float(ratio.min()):.2f} to "
+        f"{float(ratio.max()):.2f}). By their own statuses {ours.converged} and {peer.converged} converged."
     )
 
 
@@ -125,14 +127,26 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.concar", description="A car among four hard circles.")
     parser.add_argument("--first", type=int, default=100, help="so many problems only")
     parser.add_argument("--seed", type=int, default=0, help="of the random draws of guidance")
+    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/concar.md")
     asked = parser.parse_args(words)
     torch.set_num_threads(1)
     layouts = read_layouts().head(asked.first)
     ours, peer = fly(layouts, asked.seed)
     lines = [list(HEAD), ["---"] * len(HEAD), ours.cells(peer), peer.cells(peer), *published(layouts["seed"])]
-    print("\n".join(f"| {' | '.join(line)} |" for line in lines))
-    print("\n" + compared(ours, peer))
+    text = "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n\n" + compared(ours, peer)
+    print(text)
+    if asked.write:
+        marks = "<!-- concar -->", "<!-- end concar -->"
+        put_between(ROOT / "benchmarks" / "results" / "concar.md", *marks, f"{_source(asked.seed)}\n\n{text}")
     return 0
+
+
+def _source(seed: int) -> str:
+    origin = provenance("cpu")
+    return (
+        f"Measured on {origin['date']} at commit {origin['commit']}, seed {seed}, one thread on one core, "
+        f"{origin['processor']}, shared and busy; set-up excluded."
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The five families: where their layouts are, how they are drawn afresh, and what `gco` is to make of them."""
+"""The five families: where their layouts are, and how new ones are drawn."""
 
 from __future__ import annotations
 
@@ -15,15 +15,13 @@ class Family:
     name: str
     model: str
     drawn: tuple[str, ...]  # overrides of the generator
-    reached: int  # of the file's 32, at least
-    success: int
 
     def file(self, fresh: int = 0, seed: int = 0) -> Path:
         """Where the public layouts are, or the first drawn ones of a seed, with the best costs known."""
         return DATA / (f"drawn/{self.name}-seed{seed}.npz" if fresh else f"{self.name}.npz")
 
     def overrides(self, fresh: int = 0, seed: int = 0) -> list[str]:
-        """What `torchgco` is told: the file's layouts, or `fresh` new ones of a seed."""
+        """Overrides for `torchgco`: the file's layouts, or `fresh` new ones of a seed."""
         if fresh == 0:
             source = ["scenario=layouts", f"scenario.path={self.file()}"]
         else:
@@ -34,10 +32,10 @@ class Family:
 FAMILIES = {
     family.name: family
     for family in (
-        Family("forest30", "quadrotor", ("scenario=forest",), 32, 31),
-        Family("forest60", "quadrotor", ("scenario=forest", "scenario.num_obstacles=60"), 32, 31),
-        Family("walls", "quadrotor", ("scenario=walls",), 31, 29),
-        Family("planar_trap", "planar", ("scenario=planar_trap",), 32, 30),
-        Family("planar_random", "planar", ("scenario=planar_random",), 32, 30),
+        Family("forest30", "quadrotor", ("scenario=forest",)),
+        Family("forest60", "quadrotor", ("scenario=forest", "scenario.num_obstacles=60")),
+        Family("walls", "quadrotor", ("scenario=walls",)),
+        Family("planar_trap", "planar", ("scenario=planar_trap",)),
+        Family("planar_random", "planar", ("scenario=planar_random",)),
     )
-}  # fmt: skip
+}

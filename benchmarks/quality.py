@@ -1,8 +1,9 @@
 """python -m benchmarks.quality: how often the goal is reached, and how well, on the public families.
 
 Every family and solver is a study of its own below outputs/quality, so that a run that was stopped goes on where it
-was. The table is printed and, where all families flew, written into benchmarks/README.md with date and commit: that of
-`gco` alone as the quality, any other as the ladder, that of drawn layouts by itself.
+was. The table is printed and, with --write and where all families flew, put into its page with date and commit: the
+table of `gco` alone goes into benchmarks/README.md, drawn layouts into results/drawn.md, several solvers into
+results/ladder.md, unless --page names another.
 """
 
 from __future__ import annotations
@@ -24,31 +25,47 @@ from torchgco.judge import SUCCESS_VIOLATION
 from torchgco.scenarios import Layouts
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGES = {
+    "quality": "README.md",
+    "ladder": "results/ladder.md",
+    "drawn": "results/drawn.md",
+    "families": "results/families.md",
+}  # below benchmarks/; a table stands between the marks of its name
 HEAD = (
     "family", "solver", "n", "feasible", "reached", "success", "violation <= 1e-3", "median cost", "iterations",
-    "seconds", "asked: reached, success",
+    "seconds",
 )  # fmt: skip
 
 
 def main(words: Sequence[str] | None = None) -> int:
     asked = _parser().parse_args(words)
     trials = pd.concat([fly(FAMILIES[name], asked) for name in asked.families], ignore_index=True)
-    text = table(trials, asked.fresh)
+    text = table(trials)
     print(text)
     if set(asked.families) == set(FAMILIES) and asked.write:
-        name = "fresh" if asked.fresh else "quality" if asked.solvers == ["gco"] else "ladder"
+        name = page(asked)
         marks = f"<!-- {name} -->", f"<!-- end {name} -->"
-        put_between(ROOT / "benchmarks" / "README.md", *marks, f"{_source(asked)}\n\n{text}")
+        put_between(ROOT / "benchmarks" / PAGES[name], *marks, f"{_source(asked)}\n\n{text}")
     return 0
+
+
+def page(asked: argparse.Namespace) -> str:
+    """The name of the page that a run's table belongs to."""
+    if asked.page is not None:
+        return asked.page
+    return "drawn" if asked.fresh else "quality" if asked.solvers == ["gco"] else "ladder"
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.quality", description="Fly the families, and count.")
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(FAMILIES), metavar="NAME")
     parser.add_argument("--solvers", nargs="+", default=["gco"], metavar="NAME", help="configs; default: gco")
-    parser.add_argument("--fresh", type=int, default=0, metavar="N", help="N drawn layouts a family, not the public 32")
+    parser.add_argument(
+        "--fresh", type=int, default=0, metavar="N", help="N drawn layouts per family, not the public 32"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/README.md")
+    parser.add_argument("--write", action="store_true", help="put the table into its page")
+    parser.add_argument("--page", choices=list(PAGES), metavar="NAME", help=", ".join(PAGES) + "; default: by content")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "quality")
     parser.add_argument("overrides", nargs="*", help="of the configuration, for all studies")
     return parser
@@ -80,17 +97,15 @@ def succeeded(trials: pd.DataFrame, layouts: Layouts) -> pd.DataFrame:
     return with_success(trials.assign(sound=sound), layouts, 1)
 
 
-def table(trials: pd.DataFrame, fresh: int) -> str:
+def table(trials: pd.DataFrame) -> str:
     """Markdown: a row per family and solver, rates with 95 % Wilson intervals in percent."""
     lines = ["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|"]
     for row in summarise(trials).to_dict(orient="records"):
-        family = FAMILIES[str(row["scenario"])]
-        asked = "" if fresh or row["solver"] != "gco" else f"{family.reached}, {family.success}"
         rates = (_rate(row, name) for name in ("feasible", "reached", "success"))
         cells = [
-            family.name, f"`{row['solver']}`", row["n"], *rates,
+            row["scenario"], f"`{row['solver']}`", row["n"], *rates,
             round(row["violation_ok"] * row["n"]), _number(row["cost_median_reached"], ",.0f"),
-            _number(row["iterations_mean"], ".0f"), _number(row["seconds_mean"], ".2f"), asked,
+            _number(row["iterations_mean"], ".0f"), _number(row["seconds_mean"], ".2f"),
         ]  # fmt: skip
         lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
     return "\n".join(lines)
@@ -111,11 +126,11 @@ def _number(value: float, form: str) -> str:
 def _source(asked: argparse.Namespace) -> str:
     origin, layouts = (
         provenance("cpu"),
-        f"{asked.fresh} drawn layouts a family" if asked.fresh else "the public layouts",
+        f"{asked.fresh} drawn layouts per family" if asked.fresh else "the public layouts",
     )
     return (
         f"Flown on {origin['date']} at commit {origin['commit']}, {layouts}, seed {asked.seed}, 95 % Wilson intervals "
-        f"in percent; one thread a process, {origin['processor']}, shared and busy."
+        f"in percent; one thread per process, {origin['processor']}, shared and busy."
     )
 
 

@@ -33,7 +33,7 @@ from benchmarks.speed.provenance import provenance
 from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
-from benchmarks.speed.tables import BEGIN, END, rewrite, section_table
+from benchmarks.speed.tables import SPEED, TARGETS, rewrite, section_table
 from torchgco import compose
 from torchgco.native import engine as native_engine
 from torchgco.scenarios import Layouts
@@ -92,7 +92,7 @@ def test_a_section_gives_whole_rows(section, tmp_path: Path) -> None:
 def test_ratios_are_those_of_their_rows(tmp_path: Path) -> None:
     bench = tiny(tmp_path)
     families.run(bench)
-    seconds = {r["solver"]: float(r["value"]) for r in bench.results.rows if r["quantity"] == "seconds a problem"}
+    seconds = {r["solver"]: float(r["value"]) for r in bench.results.rows if r["quantity"] == "seconds per problem"}
     assert set(seconds) == {"gco", "fatrop", "fatrop_guided", "ipopt"}
     ratios = {r["ratio"]: float(r["value"]) for r in bench.results.rows if r["quantity"] == "seconds, ratio"}
     for peer in set(seconds) - {"gco"}:
@@ -130,10 +130,11 @@ def test_the_targets_are_read_off_the_rows(tmp_path: Path) -> None:
     bench = Bench(TINY, Results(path), {**provenance("cpu"), "commit": "1111111"}, say=lambda text: None)
     bench.row("mppi", "S = 1000", "torchgco", mppi.RATIO, 21.04)
     targets.run(bench)
-    said = {row["case"]: row["value"] for row in bench.results.rows if row["quantity"] == "measured"}
-    assert said["MPPI, S = 1000"] == "21 x" and said["walls, B = 32"] == "not measured"
-    assert said["planar_trap_paper, N = 1000, 8 problems"] == "7.2 s (at 0000000)"
-    assert list(said) == [case for case, *_ in targets.TARGETS]
+    said = {(row["case"], row["quantity"]): row["value"] for row in bench.results.rows}
+    assert said["one round of MPPI, S = 1000", "pytorch-mppi"] == "21 x"
+    assert said["walls, B = 32", "time"] == "not measured"
+    assert said["planar_trap_paper, N = 1000, all of 8 problems", "time"] == "7.2 s (at 0000000)"
+    assert [case for case, quantity in said if quantity == "time"] == [target.case for target in targets.TARGETS]
 
 
 def test_what_takes_too_long_is_left_out_and_named(tmp_path: Path) -> None:
@@ -176,26 +177,32 @@ def test_a_finished_section_replaces_its_former_rows_and_no_others(tmp_path: Pat
 
 
 def test_the_tables_are_rewritten_in_place(tmp_path: Path) -> None:
-    readme = tmp_path / "README.md"
-    readme.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
-    rows = [row_of("mppi", "0.12345"), row_of("share", "1234.4"), row_of("mppi", "7", "cuda")]
-    rewrite(readme, rows)
-    once = readme.read_text()
-    rewrite(readme, rows)
-    assert readme.read_text() == once
-    assert once.startswith(f"before\n{BEGIN}\n") and once.endswith(f"{END}\nafter\n") and "old" not in once
-    assert "| 0.123 |" in once and "| 1234 |" in once and "## Speed on a GPU" in once
-    readme.write_text("no marks")
+    readme, page = tmp_path / "README.md", tmp_path / "results" / "speed.md"
+    page.parent.mkdir()
+    for file, (begin, end) in ((readme, TARGETS), (page, SPEED)):
+        file.write_text(f"before\n{begin}\nold\n{end}\nafter\n")
+    rows = [row_of(*words) for words in (("mppi", "0.12345"), ("share", "1234.4"), ("mppi", "7", "cuda"))]
+    rows.append(row_of("targets", "39 x FATROP"))
+    rewrite(tmp_path, rows)
+    first, second = readme.read_text(), page.read_text()
+    rewrite(tmp_path, rows)
+    assert (readme.read_text(), page.read_text()) == (first, second)
+    for text, (begin, end) in ((first, TARGETS), (second, SPEED)):
+        assert text.startswith(f"before\n{begin}\n") and text.endswith(f"{end}\nafter\n") and "old" not in text
+    assert "39 x FATROP" in first and "39 x FATROP" not in second
+    assert "| 0.123 |" in second and "| 1234 |" in second and "## Speed on a GPU" in second
+    page.write_text("no marks")
     with pytest.raises(ValueError):
-        rewrite(readme, rows)
+        rewrite(tmp_path, rows)
 
 
 def test_the_published_page_says_what_the_published_rows_say(tmp_path: Path) -> None:
-    page = (ROOT / "benchmarks" / "README.md").read_text()
-    copy = tmp_path / "README.md"
-    copy.write_text(page)
-    rewrite(copy, read_rows(ROOT / "benchmarks" / "results.csv"))
-    assert copy.read_text() == page
+    folder, pages = ROOT / "benchmarks", ("README.md", "results/speed.md")
+    (tmp_path / "results").mkdir()
+    for page in pages:
+        (tmp_path / page).write_text((folder / page).read_text())
+    rewrite(tmp_path, read_rows(folder / "results" / "speed.csv"))
+    assert [(tmp_path / page).read_text() for page in pages] == [(folder / page).read_text() for page in pages]
 
 
 def test_without_a_gpu_nothing_is_measured(monkeypatch, capsys, tmp_path: Path) -> None:

@@ -40,8 +40,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="small sizes; the published tables are left alone")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cuda: " + ", ".join(ON_GPU))
     parser.add_argument("--minutes", type=float, default=20.0, help="what would take longer is left out (20)")
-    parser.add_argument("--results", type=Path, help="the csv; default benchmarks/results.csv")
-    parser.add_argument("--readme", type=Path, help="the file with the tables; default benchmarks/README.md")
+    parser.add_argument("--results", type=Path, help="the csv; default benchmarks/results/speed.csv")
+    parser.add_argument("--pages", type=Path, help="folder of README.md and results/speed.md; default benchmarks")
     return parser
 
 
@@ -67,7 +67,7 @@ def _measure(asked: argparse.Namespace) -> int:
     if unknown:
         print(f"No section {', '.join(unknown)}: there are {', '.join(possible)} on {asked.device}.", file=sys.stderr)
         return 2
-    asked.results, readme = _files(asked)
+    asked.results, pages = _files(asked)
     deadline = time.monotonic() + 60 * asked.minutes
     results, source = Results(asked.results), provenance(asked.device)
     bench = Bench(QUICK if asked.quick else Sizes(), results, source, asked.device, deadline)
@@ -78,18 +78,18 @@ def _measure(asked: argparse.Namespace) -> int:
         results.finish(section, asked.device)
         own = [row for row in results.rows if row["section"] == section]
         print(f"\n{section_table(own)}\n\n{section} took {time.monotonic() - began:.0f} s\n", flush=True)
-        if readme is not None:
-            rewrite(readme, read_rows(asked.results))
+        if pages is not None:
+            rewrite(pages, read_rows(asked.results))
     results.close()
-    print(f"Written: {asked.results}" + (f", {readme}" if readme else ""))
+    print(f"Written: {asked.results}" + (f", tables in {pages}" if pages else ""))
     return 0
 
 
 def _files(asked: argparse.Namespace) -> tuple[Path, Path | None]:
     """Where rows and tables go: a quick look doesn't overwrite what is published."""
     if asked.quick:
-        return asked.results or HERE.parent / "outputs" / "speed" / "results.csv", asked.readme
-    return asked.results or HERE / "results.csv", asked.readme or HERE / "README.md"
+        return asked.results or HERE.parent / "outputs" / "speed" / "results.csv", asked.pages
+    return asked.results or HERE / "results" / "speed.csv", asked.pages or HERE
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Seconds and memory an element as the batch grows, every batch in a process of its own."""
+"""Seconds and memory per element as the batch grows, every batch in a process of its own."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def run(bench: Bench) -> None:
         known = 0.0
         for batch in batches:
             case = f"B = {batch}{', 2 outer' if limited else ''}"
-            # The last one's seconds an element: more of them take no longer each.
+            # The last one's seconds per element: in a larger batch they take no longer.
             seconds = START + known * max(batch, bench.sizes.fewest_layouts)
             if bench.fits(SECTION, case, seconds, SHARE):
                 known = _measure(bench, case, batch, limited)
 
 
 def _measure(bench: Bench, case: str, batch: int, limited: bool) -> float:
-    """Start the process, read its one line; returns its seconds an element."""
+    """Start the process, read its one line; returns its seconds per element."""
     order = {"batch": batch, "limited": limited, "device": bench.device}
     words = [sys.executable, "-m", "benchmarks.speed.one_batch", json.dumps({**order, "sizes": asdict(bench.sizes)})]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
@@ -38,10 +38,10 @@ def _measure(bench: Bench, case: str, batch: int, limited: bool) -> float:
         return 0.0
     told = json.loads(done.stdout.splitlines()[-1])
     seconds = told["seconds"]
-    bench.row(SECTION, case, SOLVER, "an element", 1000 * seconds, "ms")
-    bench.row(SECTION, case, SOLVER, "an element and iteration", 1000 * seconds / told["iterations"], "ms")
-    bench.row(SECTION, case, SOLVER, "problems a second", 1 / seconds, "1/s")
+    bench.row(SECTION, case, SOLVER, "per element", 1000 * seconds, "ms")
+    bench.row(SECTION, case, SOLVER, "per element and iteration", 1000 * seconds / told["iterations"], "ms")
+    bench.row(SECTION, case, SOLVER, "problems per second", 1 / seconds, "1/s")
     if told["bytes"] is not None:
         bench.row(SECTION, case, SOLVER, "peak memory", told["bytes"] / 2**20, "MiB")
-        bench.row(SECTION, case, SOLVER, "memory an element", told["bytes"] / 2**20 / batch, "MiB")
+        bench.row(SECTION, case, SOLVER, "memory per element", told["bytes"] / 2**20 / batch, "MiB")
     return seconds

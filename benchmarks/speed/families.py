@@ -1,4 +1,4 @@
-"""Seconds a problem on drawn layouts: `gco` in batches, other solvers on the first of the same layouts."""
+"""Seconds per problem on drawn layouts: `gco` in batches, other solvers on the first of the same layouts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Ours:
     """A flight of `gco` on a whole batch."""
 
     batch: int
-    took: Took  # for a problem
+    took: Took  # per problem
     verdict: Verdict
 
     @property
@@ -93,7 +93,7 @@ def _fly(bench: Bench, name: str, setup: Setup, share: float) -> list[Ours]:
     flights: list[Ours] = []
     batches = (bench.sizes.family_batch, bench.sizes.large_batch if name.startswith("forest") else None)
     for batch in batches:
-        known = flights[-1].took.wall if flights else 0.0  # a problem: in a larger batch they take no longer
+        known = flights[-1].took.wall if flights else 0.0  # per problem: in a larger batch they take no longer
         if batch is not None and bench.fits(SECTION, f"{name}, B = {batch}", known * batch, share):
             flights.append(_flight(bench, name, setup, batch))
     return flights
@@ -113,7 +113,7 @@ def _flight(bench: Bench, name: str, setup: Setup, batch: int) -> Ours:
 
 
 def _say(bench: Bench, case: str, solver: str, took: Took, verdict: Verdict, per_reached: float) -> None:
-    bench.row(SECTION, case, solver, "seconds a problem", took.seconds, "s")
+    bench.row(SECTION, case, solver, "seconds per problem", took.seconds, "s")
     bench.row(SECTION, case, solver, "wall", took.wall, "s")
     bench.row(SECTION, case, solver, "per layout reached", per_reached, "s")
     count = verdict.feasible.numel()

@@ -1,4 +1,4 @@
-"""Milliseconds an element and iteration as stages, obstacles and states grow."""
+"""Milliseconds per element and iteration as stages, obstacles and states grow."""
 
 from __future__ import annotations
 
@@ -35,4 +35,4 @@ def _measure(bench: Bench, case: str, *overrides: str) -> None:
     solution, took = min(flights, key=lambda flight: flight[1].seconds)
     # Elements that end before the limit count with what they did.
     count = max(1, int(solution.iterations.sum()))
-    bench.row(SECTION, case, "al_ilqr", "an element and iteration", 1000 * took.seconds / count, "ms")
+    bench.row(SECTION, case, "al_ilqr", "per element and iteration", 1000 * took.seconds / count, "ms")

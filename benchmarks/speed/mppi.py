@@ -1,4 +1,4 @@
-"""Sample-steps a second of one MPPI round, against pytorch-mppi on the same problem."""
+"""Sample-steps per second of one MPPI round, against pytorch-mppi on the same problem."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def _measure(bench: Bench, samples: int, stages: int, rounds: dict[str, Callable
             times[name].append(bench.timed(work)[1])
     middle = {name: median(took.seconds for took in values) for name, values in times.items()}
     for name, seconds in middle.items():
-        bench.row(SECTION, case, name, "a round", 1000 * seconds, "ms")
+        bench.row(SECTION, case, name, "per round", 1000 * seconds, "ms")
         bench.row(SECTION, case, name, "wall", 1000 * median(took.wall for took in times[name]), "ms")
-        bench.row(SECTION, case, name, "sample-steps a second", samples * stages / seconds / 1e6, "millions")
+        bench.row(SECTION, case, name, "sample-steps per second", samples * stages / seconds / 1e6, "millions")
     if HAVE_PEER:
         ratio = middle["pytorch-mppi"] / middle["torchgco"]
         bench.row(SECTION, case, "torchgco", RATIO, ratio, "", "pytorch-mppi / torchgco")
@@ -59,7 +59,7 @@ def _say_rollout(bench: Bench, task: Task) -> None:
     """What our rounds spend, whatever their samples, on the mean's own rollout, which pytorch-mppi leaves out."""
     fly = lambda: open_loop(task.problem, task.U0)
     times = [bench.timed(fly)[1].seconds for _ in range(1 + bench.sizes.mppi_repeats)]
-    bench.row(SECTION, "rollout of the mean", "torchgco", "a round", 1000 * median(times[1:]), "ms")
+    bench.row(SECTION, "rollout of the mean", "torchgco", "per round", 1000 * median(times[1:]), "ms")
 
 
 def _ours(task: Task, samples: int) -> Callable[[], Any]:

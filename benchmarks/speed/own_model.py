@@ -74,7 +74,7 @@ def _judged(problem: Problem, U: Tensor) -> Verdict:
 
 
 def _say(bench: Bench, case: str, solver: str, took: Took, verdict: Verdict) -> None:
-    bench.row(SECTION, case, solver, "seconds a problem", took.seconds, "s")
+    bench.row(SECTION, case, solver, "seconds per problem", took.seconds, "s")
     bench.row(SECTION, case, solver, "wall", took.wall, "s")
     for quantity, hits in (("feasible", verdict.feasible), ("reached", verdict.reached)):
         bench.row(SECTION, case, solver, quantity, f"{int(hits.sum())}/{hits.numel()}")

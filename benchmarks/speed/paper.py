@@ -21,7 +21,7 @@ def run(bench: Bench) -> None:
     case = f"planar_trap_paper, N = {task.problem.N}, B = {count}"
     bench.row(SECTION, case, SOLVER, "all", took.seconds, "s")
     bench.row(SECTION, case, SOLVER, "wall", took.wall, "s")
-    bench.row(SECTION, case, SOLVER, "seconds a problem", took.seconds / count, "s")
+    bench.row(SECTION, case, SOLVER, "seconds per problem", took.seconds / count, "s")
     bench.row(SECTION, case, SOLVER, "iterations", float(solution.iterations.double().mean()))
     for quantity, hits in (("feasible", verdict.feasible), ("reached", verdict.reached)):
         bench.row(SECTION, case, SOLVER, quantity, f"{int(hits.sum())}/{count}")

@@ -41,7 +41,7 @@ class Peer(ABC):
     name: str
     task: Task
     setup: float = 0.0  # s
-    times: list[Took] = field(default_factory=list)  # of a problem, in every flight
+    times: list[Took] = field(default_factory=list)  # per problem, in every flight
     verdict: Verdict | None = None
     iterations: float = 0.0
 
@@ -55,7 +55,7 @@ class Peer(ABC):
 
     @property
     def took(self) -> Took:
-        """Of a problem, the mean of all flights."""
+        """Per problem, the mean of all flights."""
         return sum(self.times, Took(0.0, 0.0)).each(len(self.times))
 
     @property
@@ -79,7 +79,7 @@ class Peer(ABC):
         U, self.iterations, took = self.solve(bench)
         self.times.append(took.each(self.count))
         self.verdict = judge(self.task.problem, U, self.task.goal, self.task.goal_radius)
-        bench.say(f"  {self.name} flew {self.count}: {self.times[-1].seconds:.3g} s a problem")
+        bench.say(f"  {self.name} flew {self.count}: {self.times[-1].seconds:.3g} s per problem")
 
 
 @dataclass

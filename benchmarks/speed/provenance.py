@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-WRITTEN = (":!benchmarks/README.md", ":!benchmarks/results.csv")  # what a benchmark itself changes
+WRITTEN = (":!benchmarks/README.md", ":!benchmarks/results")  # what a benchmark itself changes
 
 
 def provenance(device: str) -> dict[str, str]:

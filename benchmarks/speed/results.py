@@ -1,4 +1,4 @@
-"""The rows of `results.csv`: kept as they are measured, taken over section by section."""
+"""The rows of `speed.csv`: kept as they are measured, taken over section by section."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COLUMNS = (*MEASURED, "date", "commit", "processor", "torch", "casadi", "pytorch
 
 
 class Results:
-    """The file that is kept, and beside it the one that grows.
+    """The file that is kept, and next to it the one that grows.
 
     A row is on disk as soon as it is measured. A section's rows replace those of former runs once it has come to its
     end: stopped half way, the kept file holds whole sections, each from one run.

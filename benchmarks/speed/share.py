@@ -125,4 +125,4 @@ def _measure(bench: Bench, name: str, batch: int) -> None:
             bench.row(SECTION, case, phase, "sum", 100 * sum(own.values()) / total, "%")
             calls = shares.calls[phase] if phase != "all" else shares.calls.total()
             bench.row(SECTION, case, phase, "native calls", calls)
-            bench.row(SECTION, case, phase, "a problem", 1000 * sum(own.values()) / batch, "ms")
+            bench.row(SECTION, case, phase, "per problem", 1000 * sum(own.values()) / batch, "ms")

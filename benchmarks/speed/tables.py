@@ -1,4 +1,4 @@
-"""Rows as tables for people, and the part of benchmarks/README.md that holds them."""
+"""Rows as tables for people, and the parts of benchmarks/README.md and results/speed.md that hold them."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ from pathlib import Path
 
 from benchmarks.speed.results import Row
 
-BEGIN, END = "<!-- speed -->", "<!-- end speed -->"
+TARGETS = "<!-- targets -->", "<!-- end targets -->"  # in README.md
+SPEED = "<!-- speed -->", "<!-- end speed -->"  # in results/speed.md: all other sections
 NOT_MEASURED = "Not measured yet: `make benchmark` does."
 NO_GPU = "No GPU was at hand: `make benchmark-gpu` measures `families`, `batch` and `mppi` where there is one."
 
 # What stands above each section's table, in the order of the file.
 WORDS = {
-    "targets": "The goals of the native kernels, and what the sections below measured. `n x`: how many times as\n"
-    "fast, in processor seconds with set-up apart.",
+    "targets": "Processor time per problem, set-up apart. Under a peer's name: how many times as fast the solver is,\n"
+    "per problem and, after the comma, per layout reached, as a peer that stops short of the goal may be fast.",
     "families": "Drawn layouts (seed 1000). The peers fly the first of the same layouts, before and after `gco`;\n"
-    "spread is the difference of the two times, wall the time by the clock. `fatrop_guided` and `acados_guided` start\n"
+    "spread is the difference of the two times, wall the elapsed time. `fatrop_guided` and `acados_guided` start\n"
     "from a plan along the roadmap's best path, whose making counts, all others from the vehicle at rest. Ratios are\n"
-    "peer / `gco`: of seconds for a problem and for a layout reached, and of costs, the median where both arrive.",
+    "peer / `gco`: of seconds per problem and per layout reached, and of costs, the median where both arrive.",
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
     "plan that is left, `gco` from its multipliers as well. Set-up is apart: `gco` traces the model and finds its\n"
     "kernels, FATROP's program is written down.",
@@ -27,7 +28,7 @@ WORDS = {
     "mppi": "One round of white noise around the hover, 30 spheres, float32, B = 1; medians of rounds in turns.",
     "first_use": "A first solve in a new process: the model traced, differentiated, written out as C and compiled,\n"
     "and what the first solve takes more than the second, in processor seconds, the compiler's included.",
-    "share": "Processor time of one solve, in percent: a line a phase of the method, a column a function of the\n"
+    "share": "Processor time of one solve, in percent: a line per phase of the method, a column per function of the\n"
     "native library that it calls. The problems are new to a process that has solved others.",
     "batch": "Forests of 30 spheres. `2 outer` ends every element after two outer iterations. Memory is the peak of a\n"
     "process of its own above what it held before the problems were made.",
@@ -61,10 +62,17 @@ def _head(row: Row) -> str:
     return row["quantity"] + (f", {row['unit']}" if row["unit"] else "")
 
 
+def targets_text(rows: list[Row]) -> str:
+    """The compact table with its source."""
+    own = [row for row in rows if row["section"] == "targets" and row["device"] == "cpu"]
+    return f"{_source(own[0])}\n{WORDS['targets']}\n\n{section_table(own)}" if own else NOT_MEASURED
+
+
 def speed_text(rows: list[Row]) -> str:
-    """All that stands between the marks."""
-    blocks = [_device_text([row for row in rows if row["device"] == "cpu"]) or NOT_MEASURED]
-    graphics = _device_text([row for row in rows if row["device"] == "cuda"])
+    """All other tables."""
+    rest = [row for row in rows if row["section"] != "targets"]
+    blocks = [_device_text([row for row in rest if row["device"] == "cpu"]) or NOT_MEASURED]
+    graphics = _device_text([row for row in rest if row["device"] == "cuda"])
     return "\n\n".join([*blocks, f"## Speed on a GPU\n\n{graphics}" if graphics else NO_GPU])
 
 
@@ -90,9 +98,10 @@ def _source(row: Row) -> str:
     )
 
 
-def rewrite(readme: Path, rows: list[Row]) -> None:
-    """Put the tables between their marks."""
-    put_between(readme, BEGIN, END, speed_text(rows))
+def rewrite(folder: Path, rows: list[Row]) -> None:
+    """Put the tables between their marks in the folder's README.md and results/speed.md."""
+    put_between(folder / "README.md", *TARGETS, targets_text(rows))
+    put_between(folder / "results" / "speed.md", *SPEED, speed_text(rows))
 
 
 def put_between(file: Path, begin: str, end: str, new: str) -> None:

@@ -1,13 +1,14 @@
-"""The goals of the native kernels beside what the other sections measured, in this run or a former one."""
+"""The compact table: what the other sections measured, in this run or a former one, against the peers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from benchmarks.speed.bench import Bench
 from benchmarks.speed.results import Row, read_rows
 
 SECTION = "targets"
+NOT_MEASURED = "not measured"
 
 
 @dataclass(frozen=True)
@@ -18,14 +19,14 @@ class Measured:
         section, quantity: of the row.
         case: of the row; None: of all cases the largest value.
         solver: of the row.
-        text: a format.
+        text: a format; {} takes two digits, or a whole number.
     """
 
     section: str
     case: str | None
     solver: str
     quantity: str
-    text: str = "{:.2g} x FATROP"
+    text: str
 
     def read(self, rows: list[Row], commit: str) -> str:
         """The text, with the commit where that isn't this one; or that there is no such row."""
@@ -38,93 +39,96 @@ class Measured:
             and row["value"] not in ("", "inf")
         ]
         if not found:
-            return "not measured"
+            return NOT_MEASURED
         row = max(found, key=lambda row: float(row["value"]))
-        return self.text.format(float(row["value"])) + (f" (at {row['commit']})" if row["commit"] != commit else "")
+        value = float(row["value"])
+        number = (f"{value:.2g}" if value < 100 else f"{value:.0f}") if "{}" in self.text else value
+        return self.text.format(number) + (f" (at {row['commit']})" if row["commit"] != commit else "")
 
 
-def _family(case: str) -> Measured:
-    return Measured("families", case, "fatrop / gco", "seconds, ratio")
-
-
-def _acados(case: str, quantity: str, text: str) -> Measured:
-    return Measured("families", case, "acados / gco", quantity, text)
+def _ratios(case: str, peer: str) -> tuple[Measured, Measured]:
+    """Of seconds per problem, and per layout reached: a peer that stops short of the goal is fast."""
+    source = "families", case, f"{peer} / gco"
+    return Measured(*source, "seconds, ratio", "{} x"), Measured(*source, "per layout reached, ratio", "{} x")
 
 
 def _seconds(case: str) -> Measured:
-    return Measured("families", case, "gco", "seconds a problem", "{:.3f} s")
+    return Measured("families", case, "gco", "seconds per problem", "{:.3f} s")
 
 
-# What it is, what was measured, what was asked for, and what is aimed at.
-TARGETS: tuple[tuple[str, tuple[Measured, ...], str, str], ...] = (
-    ("forest30, B = 256", (_family("forest30, B = 256"), _seconds("forest30, B = 256")), "6 x FATROP", "10 x"),
-    ("forest60, B = 256", (_family("forest60, B = 256"), _seconds("forest60, B = 256")), "6 x FATROP", "10 x"),
-    ("forest30, B = 32", (_family("forest30, B = 32"), _seconds("forest30, B = 32")), "6 x FATROP", "10 x"),
-    ("forest60, B = 32", (_family("forest60, B = 32"), _seconds("forest60, B = 32")), "6 x FATROP", "10 x"),
-    (
-        "forest30, B = 1, cold",
-        (
-            Measured("latency", "cold", "gco", "seconds fatrop / gco"),
-            Measured("latency", "cold", "gco", "mean", "{:.0f} ms"),
-        ),
-        "4 x FATROP", "8 x",
+@dataclass(frozen=True)
+class Target:
+    """A line of the table: what is measured, how long it takes, and how that compares.
+
+    Args:
+        case, solver: the line's name.
+        times: rows with what the case takes.
+        ratios: rows that divide a peer's time by it, under the peer's name.
+    """
+
+    case: str
+    solver: str
+    times: tuple[Measured, ...]
+    ratios: dict[str, tuple[Measured, ...]] = field(default_factory=dict)
+
+
+def _batch(case: str) -> Target:
+    ratios = {"FATROP": _ratios(case, "fatrop"), "acados": _ratios(case, "acados")}
+    return Target(case, "gco", (_seconds(case),), ratios)
+
+
+def _latency(case: str, kind: str) -> Target:
+    ratio = Measured("latency", kind, "gco", "seconds fatrop / gco", "{} x")
+    return Target(case, "gco", (Measured("latency", kind, "gco", "mean", "{:.0f} ms"),), {"FATROP": (ratio,)})
+
+
+TARGETS = (
+    _batch("forest30, B = 256"),
+    _batch("forest60, B = 256"),
+    _batch("forest30, B = 32"),
+    _batch("forest60, B = 32"),
+    _batch("walls, B = 32"),
+    _batch("planar_trap, B = 32"),
+    _batch("planar_random, B = 32"),
+    _latency("forest30, B = 1, cold", "cold"),
+    _latency("forest30, B = 1, one stage later, warm", "warm"),
+    Target(
+        "a user's unicycle, B = 1", "torchgco.solve",
+        (Measured("own_model", "B = 1", "torchgco.solve", "seconds per problem", "{:.3f} s"),),
     ),
-    (
-        "forest30, B = 256, acados",
-        (
-            _acados("forest30, B = 256", "seconds, ratio", "{:.2g} x"),
-            _acados("forest30, B = 256", "per layout reached, ratio", "{:.2g} x per layout reached"),
-        ),
-        "2 x, 4 x per layout reached", "4 x, 8 x",
+    Target(
+        "planar_trap_paper, N = 1000, all of 8 problems", "gco_paper",
+        (Measured("paper", "planar_trap_paper, N = 1000, B = 8", "gco_paper", "all", "{:.1f} s"),),
     ),
-    (
-        "one stage later, B = 1, warm",
-        (
-            Measured("latency", "warm", "gco", "seconds fatrop / gco"),
-            Measured("latency", "warm", "gco", "mean", "{:.0f} ms"),
-        ),
-        "5 x FATROP", "10 ms",
+    Target(
+        "one round of MPPI, S = 1000", "torchgco",
+        (Measured("mppi", "S = 1000", "torchgco", "per round", "{:.1f} ms"),),
+        {"pytorch-mppi": (Measured("mppi", "S = 1000", "torchgco", "seconds pytorch-mppi / torchgco", "{} x"),)},
     ),
-    ("walls, B = 32", (_seconds("walls, B = 32"),), "0.25 s", "0.1 s"),
-    ("planar_trap, B = 32", (_family("planar_trap, B = 32"), _seconds("planar_trap, B = 32")), "1 x FATROP", "0.15 s"),
-    (
-        "planar_random, B = 32", (_family("planar_random, B = 32"), _seconds("planar_random, B = 32")),
-        "1 x FATROP", "0.15 s",
+    Target(
+        "first use of a model, the slowest", "torchgco.solve",
+        (Measured("first_use", None, "torchgco.solve", "both", "{:.1f} s"),),
     ),
-    (
-        "a user's unicycle, B = 1",
-        (Measured("own_model", "B = 1", "torchgco.solve", "seconds a problem", "{:.3f} s"),), "0.2 s", "0.05 s",
-    ),
-    (
-        "planar_trap_paper, N = 1000, 8 problems",
-        (Measured("paper", "planar_trap_paper, N = 1000, B = 8", "gco_paper", "all", "{:.1f} s"),), "60 s", "20 s",
-    ),
-    (
-        "MPPI, S = 1000", (Measured("mppi", "S = 1000", "torchgco", "seconds pytorch-mppi / torchgco", "{:.2g} x"),),
-        "8 x pytorch-mppi", "15 x",
-    ),
-    (
-        "first use of a model, the slowest",
-        (Measured("first_use", None, "torchgco.solve", "both", "{:.1f} s"),), "5 s", "2 s",
-    ),
-    (
-        "import torchgco",
+    Target(
+        "import torchgco", "python",
         (
             Measured("first_use", "import torchgco", "python", "seconds", "{:.1f} s"),
             Measured("first_use", "import torch", "python", "seconds", "import torch alone {:.1f} s"),
         ),
-        "no slower", "",
     ),
 )  # fmt: skip
 
 
 def run(bench: Bench) -> None:
     rows, commit = [] if bench.results is None else _known(bench), bench.source.get("commit", "")
-    for case, measured, asked, aim in TARGETS:
-        texts = dict.fromkeys(one.read(rows, commit) for one in measured)  # each once
-        bench.row(SECTION, case, "gco", "measured", "; ".join(texts))
-        bench.row(SECTION, case, "gco", "asked", asked)
-        bench.row(SECTION, case, "gco", "aim", aim)
+    for target in TARGETS:
+        for quantity, measured in {"time": target.times, **target.ratios}.items():
+            bench.row(SECTION, target.case, target.solver, quantity, ", ".join(_texts(measured, rows, commit)))
+
+
+def _texts(measured: tuple[Measured, ...], rows: list[Row], commit: str) -> list[str]:
+    texts = [one.read(rows, commit) for one in measured]
+    return texts[:1] if set(texts) == {NOT_MEASURED} else texts
 
 
 def _known(bench: Bench) -> list[Row]:
