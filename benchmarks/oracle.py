@@ -21,9 +21,9 @@ import torch
 
 from benchmarks.families import DATA, FAMILIES, Family
 from torchgco import compose, judge
+from torchgco.errors import InputError
 from torchgco.judge import SUCCESS_COST
 from torchgco.scenarios import Layouts
-from torchgco.shapes import InputError
 
 # Solver configs with overrides. `ways` solves 32 plans along up to 24 ways to their end, `early` with another timing.
 WAYS = (

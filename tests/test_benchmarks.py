@@ -35,9 +35,9 @@ from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
 from benchmarks.speed.tables import SPEED, TARGETS, rewrite, section_table
 from torchgco import compose
+from torchgco.errors import InputError
 from torchgco.native import engine as native_engine
 from torchgco.scenarios import Layouts
-from torchgco.shapes import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = Sizes(

@@ -32,13 +32,13 @@ from torchgco.dynamics import Planar as Planar
 from torchgco.dynamics import QuadrotorPlanning as QuadrotorPlanning
 from torchgco.dynamics import QuadrotorPlant as QuadrotorPlant
 from torchgco.dynamics import RotorTracking as RotorTracking
+from torchgco.errors import GuidanceWarning as GuidanceWarning
+from torchgco.errors import InputError as InputError
 from torchgco.guidance import GCO as GCO
 from torchgco.guidance import MPPI as MPPI
 from torchgco.judge import judge as judge
 from torchgco.problem import Problem as Problem
 from torchgco.scenarios import Layouts as Layouts
-from torchgco.shapes import GuidanceWarning as GuidanceWarning
-from torchgco.shapes import InputError as InputError
 from torchgco.solution import Solution as Solution
 from torchgco.solvers import ILQR as ILQR
 from torchgco.solvers import AugmentedLagrangian as AugmentedLagrangian

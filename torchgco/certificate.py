@@ -19,9 +19,10 @@ from torchgco.autodiff import gradients
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.errors import InputError
 from torchgco.judge import segment_distance
 from torchgco.problem import Problem
-from torchgco.shapes import InputError, check_shape
+from torchgco.shapes import check_shape
 
 NEGLIGIBLE = 1e-9  # share of the largest scale of all controls that each control's scale has at least
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this to spare (m for lengths) may have a multiplier

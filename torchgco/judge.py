@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.obstacles import CONTACT_FACTOR, BoundSpheres
+from torchgco.errors import InputError
 from torchgco.problem import Problem
-from torchgco.shapes import InputError
 
 OTHERS_WITHIN = 1e-3  # how far all constraints but the obstacles may be violated by a feasible trajectory
 SUCCESS_VIOLATION = 1e-3  # full radii, in metres

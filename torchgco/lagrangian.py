@@ -10,9 +10,10 @@ from torch import Tensor
 
 from torchgco.constraints.base import Sense
 from torchgco.constraints.guides import Guide
+from torchgco.errors import InputError
 from torchgco.expansion import quadratise
 from torchgco.problem import Problem
-from torchgco.shapes import InputError, Rows, take
+from torchgco.tree import Rows, take
 
 VIOLATION_TOLERANCE = 1e-3  # metres for lengths, all else in the units of its constraint
 

@@ -13,7 +13,9 @@ from torch import Tensor
 from torchgco.constraints.base import Constraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
-from torchgco.shapes import Dimensions, InputError, Rows, cast
+from torchgco.errors import InputError
+from torchgco.shapes import Dimensions
+from torchgco.tree import Rows, cast
 
 LEAST_UNIT = 1e-3  # share of the controls' curvature in the unit of cost
 

@@ -12,98 +12,13 @@ Dimensions, always these letters in this order:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, ClassVar, Self, TypeAlias
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-Rows: TypeAlias = Tensor | slice
-
-
-class InputError(ValueError):
-    """Malformed input: the field at fault, what was expected there, and what came."""
-
-    def __init__(self, field: str, expected: str, got: object) -> None:
-        self.field, self.expected, self.got = field, expected, got
-        super().__init__(f"{field}: expected {expected}, got {got}")
-
-    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
-        return type(self), (self.field, self.expected, str(self.got))  # a worker process hands it on whole
-
-
-class GuidanceWarning(UserWarning):
-    """Guidance, or a part of it, can't serve a problem: it is solved without."""
-
-
-class PerElement:
-    """Mixin for problem parts that may hold one value per problem.
-
-    A subclass names its tensor fields with a batch axis: in `batched` those where it always has length B; in
-    `per_element` those where length 1, or a parameter without axes, stands for a value that all problems share.
-    """
-
-    batched: ClassVar[tuple[str, ...]] = ()
-    per_element: ClassVar[tuple[str, ...]] = ()
-
-    def take(self, index: Rows) -> Self:
-        """The same part for the problems in `index` (int64, (B',), or a slice)."""
-        changes = {name: take(getattr(self, name), index) for name in self.batched}
-        for name in self.per_element:
-            value = getattr(self, name)
-            if isinstance(value, Tensor) and value.dim() > 0 and value.shape[0] != 1:
-                changes[name] = value[index]
-        return replace(self, **changes) if changes else self  # type: ignore[type-var]
-
-
-def take(tree: Any, index: Rows) -> Any:
-    """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged."""
-    if isinstance(tree, Tensor):
-        return tree[index]
-    if isinstance(tree, PerElement):
-        return tree.take(index)
-    if isinstance(tree, tuple):
-        return tuple(take(leaf, index) for leaf in tree)
-    if is_dataclass(tree) and not isinstance(tree, type):
-        return replace(tree, **{f.name: take(getattr(tree, f.name), index) for f in fields(tree)})
-    return tree
-
-
-def cast(tree: Any, dtype: torch.dtype) -> Any:
-    """Every floating tensor in nested tuples and dataclasses in another precision; all else passes unchanged."""
-    if isinstance(tree, Tensor):
-        return tree.to(dtype) if tree.is_floating_point() else tree
-    if isinstance(tree, tuple):
-        return tuple(cast(leaf, dtype) for leaf in tree)
-    if is_dataclass(tree) and not isinstance(tree, type):
-        copy = object.__new__(type(tree))  # parts are checked and bound already
-        for name, value in vars(tree).items():
-            object.__setattr__(copy, name, cast(value, dtype))
-        return copy
-    return tree
-
-
-def copied(tree: Any) -> Any:
-    """The same with every tensor cloned."""
-    if isinstance(tree, Tensor):
-        return tree.clone()
-    if isinstance(tree, tuple):
-        return tuple(copied(leaf) for leaf in tree)
-    if is_dataclass(tree) and not isinstance(tree, type):
-        return replace(tree, **{f.name: copied(getattr(tree, f.name)) for f in fields(tree)})
-    return tree
-
-
-def put(tree: Any, index: Tensor, rows: Any) -> None:
-    """Write `rows` into rows `index` of every tensor of `tree`, in place; the two have the same structure."""
-    if isinstance(tree, Tensor):
-        tree[index] = rows
-    elif isinstance(tree, tuple):
-        for leaf, new in zip(tree, rows, strict=True):
-            put(leaf, index, new)
-    elif is_dataclass(tree) and not isinstance(tree, type):
-        for f in fields(tree):
-            put(getattr(tree, f.name), index, getattr(rows, f.name))
+from torchgco.errors import InputError
 
 
 def tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:

@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
-from torchgco.shapes import InputError, take
 from torchgco.status import Status
+from torchgco.tree import take
 
 if TYPE_CHECKING:
     import pandas as pd

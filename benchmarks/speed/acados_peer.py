@@ -19,8 +19,8 @@ from torch import Tensor
 
 from torchgco.baselines.nlp import Program, transcribe
 from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.errors import InputError
 from torchgco.problem import Problem
-from torchgco.shapes import InputError
 
 ENVIRONMENT = Path(__file__).resolve().parents[2] / ".venv-acados"  # made by `make`
 WORKER = Path(__file__).with_name("acados_worker.py")

@@ -62,9 +62,7 @@ def run(bench: Bench) -> None:
     _say(bench, flights)
 
 
-def _fly(
-    bench: Bench, setup: Setup, task: Task, start: str, warm: Multipliers | None, flights: AllFlights
-) -> Solution:
+def _fly(bench: Bench, setup: Setup, task: Task, start: str, warm: Multipliers | None, flights: AllFlights) -> Solution:
     """FATROP, `gco`, FATROP: a machine that drifts meanwhile does no harm to the ratio."""
     peer = CasADiPeer.ready(bench, "fatrop", task)
     peer.fly(bench)

@@ -6,10 +6,10 @@ import pandas as pd
 import pytest
 
 from tests.trials import flights, trials
+from torchgco.errors import InputError
 from torchgco.experiments.report import compare, format_table, main, merge, write_report
 from torchgco.experiments.statistics import summarise
 from torchgco.scenarios.layouts import Layouts
-from torchgco.shapes import InputError
 
 HITS = [i < 30 for i in range(32)]
 

@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 
 from tests.trials import flights, trials
+from torchgco.errors import InputError
 from torchgco.experiments.statistics import paired, paired_table, summarise
-from torchgco.shapes import InputError
 
 
 def wilson(count: int, n: int) -> tuple[float, float]:

@@ -14,9 +14,9 @@ import pytest
 
 from tests.experiments import doomed
 from tests.experiments.commands import begin, command, problem_line
+from torchgco.errors import InputError
 from torchgco.experiments import workers
 from torchgco.experiments.workers import run_all
-from torchgco.shapes import InputError
 
 WAIT = 120  # seconds, for what takes a few
 

@@ -56,7 +56,9 @@ class Emitted:
 
 def drawn(key: DrawKey, rows: int, samples: int, stream: int = 0) -> Tensor:
     """Normal draws (rows, B, samples) float64, as the native sampler makes them."""
-    code = Path(model.__file__).with_name("normal.c").read_text() + """
+    code = (
+        Path(model.__file__).with_name("normal.c").read_text()
+        + """
 void tgco_draw(uint64_t key, int64_t samples, int64_t rows, double *z) {
     V block[rows];
     for (int64_t first = 0; first < samples; first += LANES) {
@@ -66,6 +68,7 @@ void tgco_draw(uint64_t key, int64_t samples, int64_t rows, double *z) {
     }
 }
 """
+    )
     library = build(f"#define REAL double\n#define LANES {LANES}\n#include <stdint.h>\n{PRELUDE}{code}")
     made = torch.empty(key.ids.numel(), rows, samples, dtype=torch.float64)
     for z, word in zip(made, words(key, stream).tolist(), strict=True):

@@ -11,13 +11,13 @@ from matplotlib.colors import to_hex
 from matplotlib.patches import Circle, Rectangle
 
 from tests.trials import flights, trials
+from torchgco.errors import InputError
 from torchgco.experiments.statistics import summarise
 from torchgco.plotting.convergence import convergence_figure
 from torchgco.plotting.distributions import clearance_histogram, violation_histogram
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.rates import rates_figure
 from torchgco.plotting.style import PALETTE, save, solver_colours
-from torchgco.shapes import InputError
 
 
 def bars(ax: Axes) -> list[Rectangle]:

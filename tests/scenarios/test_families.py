@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from torchgco.errors import InputError
 from torchgco.scenarios import Forest, ForestMoving, Layouts, PlanarRandom, PlanarTrap, Scenario, Walls
 from torchgco.scenarios.base import generator
 from torchgco.scenarios.planar import TRAP
-from torchgco.shapes import InputError
 
 DATA = Path(__file__).parents[2] / "benchmarks" / "data"
 FAMILIES = [PlanarTrap(), PlanarRandom(), Forest(), ForestMoving(), Walls()]

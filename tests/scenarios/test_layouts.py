@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from torchgco.errors import InputError
 from torchgco.scenarios import LayoutFile, Layouts, concatenate
-from torchgco.shapes import InputError
 
 DATA = Path(__file__).parents[2] / "benchmarks" / "data"
 NAN = np.nan

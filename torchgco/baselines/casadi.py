@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from torchgco.baselines.hold import rolled_out
+from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
-from torchgco.shapes import InputError
 from torchgco.solution import Solution
 from torchgco.solvers.batch import check_call
 from torchgco.solvers.state import Callback, Progress

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from torchgco.baselines.hold import rolled_out
 from torchgco.draws import DrawKey
+from torchgco.errors import GuidanceWarning, InputError
 from torchgco.guidance.misfits import suited_sampler
 from torchgco.guidance.mppi import MPPI
 from torchgco.lagrangian import Multipliers, is_better, violation
 from torchgco.problem import Problem
-from torchgco.shapes import GuidanceWarning, InputError
 from torchgco.solution import Solution
 from torchgco.solvers.batch import check_call
 from torchgco.solvers.state import Callback

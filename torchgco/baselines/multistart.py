@@ -9,14 +9,16 @@ import torch
 from torch import Tensor
 
 from torchgco.draws import DrawKey, standard_normal
+from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers, is_better
 from torchgco.problem import Problem
-from torchgco.shapes import InputError, check_shape, copied, put, tensor
+from torchgco.shapes import check_shape, tensor
 from torchgco.solution import Solution
 from torchgco.solvers.attempts import has_arrived
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.batch import check_call
 from torchgco.solvers.state import Callback
+from torchgco.tree import copied, put
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from torchgco.problem import Problem
-from torchgco.shapes import PerElement
 from torchgco.tracing import Traced, own_tensors
+from torchgco.tree import PerElement
 
 UNBOUNDED = 1e19  # and above: a bound that is there for other problems of the batch only
 

@@ -11,7 +11,9 @@ from torch import Tensor
 
 from torchgco.autodiff import jacobian
 from torchgco.costs.base import add_blocks
-from torchgco.shapes import Dimensions, InputError, PerElement
+from torchgco.errors import InputError
+from torchgco.shapes import Dimensions
+from torchgco.tree import PerElement
 
 Sense = Literal["inequality", "equality"]
 Knots = slice | Sequence[int] | Tensor

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint, resolve_knots
-from torchgco.shapes import Dimensions, InputError, check_shape, tensor
+from torchgco.errors import InputError
+from torchgco.shapes import Dimensions, check_shape, tensor
 
 
 @dataclass(frozen=True)

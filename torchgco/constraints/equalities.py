@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint, Sense
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.shapes import Dimensions, InputError, check_shape, tensor
+from torchgco.errors import InputError
+from torchgco.shapes import Dimensions, check_shape, tensor
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
-from torchgco.shapes import Dimensions, InputError, check_shape, tensor
+from torchgco.errors import InputError
+from torchgco.shapes import Dimensions, check_shape, tensor
 
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
 

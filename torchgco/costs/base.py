@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchgco.autodiff import gradient_and_hessian
-from torchgco.shapes import Dimensions, PerElement, lead
+from torchgco.shapes import Dimensions, lead
+from torchgco.tree import PerElement
 
 
 class Cost(PerElement):

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchgco.costs.base import Cost, add_blocks
-from torchgco.shapes import Dimensions, InputError, check_shape, lead, tensor
+from torchgco.errors import InputError
+from torchgco.shapes import Dimensions, check_shape, lead, tensor
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchgco.autodiff import jacobian
 from torchgco.dynamics.integrators import INTEGRATORS
-from torchgco.shapes import InputError, PerElement
+from torchgco.errors import InputError
+from torchgco.tree import PerElement
 
 
 class Dynamics(PerElement):

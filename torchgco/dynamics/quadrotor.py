@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from torchgco.dynamics.base import Dynamics, check_model
-from torchgco.shapes import InputError, components, lead, vectors
+from torchgco.errors import InputError
+from torchgco.shapes import components, lead, vectors
 
 GRAVITY = 9.81  # m/s^2
 Components = tuple[Tensor, ...]

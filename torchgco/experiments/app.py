@@ -16,11 +16,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
+from torchgco.errors import InputError
 from torchgco.experiments.build import as_input_error, compose_config, config_dir
 from torchgco.experiments.files import write
 from torchgco.experiments.identity import decisive, digest, plain, settings_of
 from torchgco.experiments.study import run_study
-from torchgco.shapes import InputError
 
 
 def study_folder(_root_: Any) -> str:

@@ -17,9 +17,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
+from torchgco.errors import InputError
 from torchgco.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
-from torchgco.shapes import InputError
 
 DEFAULT_LAYOUTS = 64
 

@@ -9,7 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import IO, Any
 
-from torchgco.shapes import InputError
+from torchgco.errors import InputError
 
 PART = ".part"  # ending of a file that is still being written
 

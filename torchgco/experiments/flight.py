@@ -16,12 +16,12 @@ from torch import Tensor
 import torchgco
 from torchgco.certificate import certify
 from torchgco.certificate import frame_columns as certificate_columns
+from torchgco.errors import InputError
 from torchgco.experiments.build import Setup, allotted_cores
 from torchgco.judge import frame_columns, judge
 from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
 from torchgco.scenarios import Layouts
-from torchgco.shapes import InputError
 from torchgco.solution import Solution
 from torchgco.solvers.memory import is_out_of_memory, plan_batch
 from torchgco.solvers.state import Progress

@@ -14,12 +14,12 @@ from typing import Any
 
 import pandas as pd
 
+from torchgco.errors import InputError
 from torchgco.experiments.identity import ARITHMETIC, digest, flat
 from torchgco.experiments.runs import MERGED, ROW, Run, find_runs
 from torchgco.experiments.statistics import PAIR, TASK, task_columns
 from torchgco.experiments.success import judged, sound
 from torchgco.experiments.variants import UNKNOWN, labels, task_of_runs
-from torchgco.shapes import InputError
 
 REPEATED = "repeated"  # in the attributes of a merged table: rows left out because another run has the same flight
 OLDER = "older"  # and the folders of runs without digests

@@ -21,10 +21,10 @@ from typing import IO, Any
 import numpy as np
 import pandas as pd
 
+from torchgco.errors import InputError
 from torchgco.experiments.files import PART, checksum, damaged, write
 from torchgco.experiments.identity import Manifest, difference
 from torchgco.scenarios import Layouts
-from torchgco.shapes import InputError
 
 COLUMNS = (
     "scenario", "layout", "seed", "model", "solver", "status", "feasible", "reached", "success", "cost", "best_cost",

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from torchgco.errors import InputError
 from torchgco.experiments.files import write
 from torchgco.experiments.merge import OLDER, REPEATED, merge
 from torchgco.experiments.records import TRIALS
@@ -26,7 +27,6 @@ from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.rates import rates_figure
 from torchgco.plotting.style import save
 from torchgco.scenarios.layouts import Layouts
-from torchgco.shapes import InputError
 
 __all__ = ["compare", "format_table", "main", "merge", "write_report"]
 

@@ -14,10 +14,10 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from torchgco.errors import InputError
 from torchgco.experiments.files import checksum, damaged
 from torchgco.experiments.records import DONE, MANIFEST, TRIALS, read_checksums, read_manifest
 from torchgco.experiments.statistics import PAIR
-from torchgco.shapes import InputError
 
 MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
 ROW = [*PAIR, "solver"]

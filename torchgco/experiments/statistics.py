@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from torchgco.shapes import InputError
+from torchgco.errors import InputError
 from torchgco.status import Status
 
 OUTCOMES = ("feasible", "reached", "success")

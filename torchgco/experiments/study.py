@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 import torchgco
+from torchgco.errors import InputError
 from torchgco.experiments.build import Setup, build, solver_of
 from torchgco.experiments.flight import Bar, Flight, NoBar, Plan, plan_of
 from torchgco.experiments.identity import Manifest, layout_digests, plain, settings_of
@@ -25,7 +26,6 @@ from torchgco.experiments.workers import run_all
 from torchgco.kernels import native, use_native
 from torchgco.rollout import open_loop
 from torchgco.scenarios import Layouts
-from torchgco.shapes import InputError
 from torchgco.status import Status
 
 # How the configuration of a baseline is found: its name in, the whole configuration with that solver out.

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, TypeVar
 
-from torchgco.shapes import InputError
+from torchgco.errors import InputError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.guides import Guide, GuidePath, GuideRegion
+from torchgco.errors import InputError
 from torchgco.guidance import scene as seen
 from torchgco.guidance.classes import distinct
 from torchgco.guidance.plans import Plans
@@ -27,10 +28,11 @@ from torchgco.guidance.roadmap import Roadmap, points_along
 from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import cost_unit
 from torchgco.problem import Problem
-from torchgco.shapes import InputError, check_shape, put, take, tensor
+from torchgco.shapes import check_shape, tensor
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
+from torchgco.tree import put, take
 
 SURE = LineSearch(accept_last=False, back=2)
 MOST = 1536  # ways of all problems that are sought and followed together: memory stays bounded

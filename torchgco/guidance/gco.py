@@ -11,6 +11,7 @@ from torch import Tensor
 from torchgco.constraints.guides import GuideRegion
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.draws import DrawKey
+from torchgco.errors import GuidanceWarning, InputError
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.detour import Detour
 from torchgco.guidance.misfits import suited_detour, suited_sampler
@@ -20,8 +21,8 @@ from torchgco.guidance.scene import position
 from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import cost_unit
 from torchgco.problem import Problem
-from torchgco.shapes import GuidanceWarning, InputError, put, take
 from torchgco.solvers.state import Advice
+from torchgco.tree import put, take
 
 REACH = 0.02  # r_guide as a share of the distance to be flown; the paper's vehicles have radii of 0.017 and 0.03 of it
 DIVERGED = 1e3  # times what staying at the start costs: a plan that costs more leads nowhere

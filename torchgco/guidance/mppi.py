@@ -11,11 +11,12 @@ from torch import Tensor
 
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.draws import DrawKey, standard_normal, words
+from torchgco.errors import InputError
 from torchgco.guidance.samples import Flight, Noise, average, draw, fly
 from torchgco.native.dispatch import open_loop, sampler_of
 from torchgco.native.sampler import Rounds
 from torchgco.problem import Problem
-from torchgco.shapes import InputError, check_shape, tensor
+from torchgco.shapes import check_shape, tensor
 
 CHUNK = 8192  # samples flown side by side: memory stays bounded
 OPEN = 1e10  # a range of controls that is no range

@@ -13,9 +13,9 @@ from torchgco.guidance import scene as seen
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import value
 from torchgco.problem import Problem
-from torchgco.shapes import take
 from torchgco.solvers.descent import descend
 from torchgco.solvers.ilqr import ILQR
+from torchgco.tree import take
 
 AT_ONCE = 256  # plans solved at once: memory stays bounded, however large the batch
 

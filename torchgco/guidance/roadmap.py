@@ -15,10 +15,10 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from torchgco.errors import InputError
 from torchgco.guidance.search import Search
 from torchgco.native import roadmap
 from torchgco.native.roadmap import NativeSearch
-from torchgco.shapes import InputError
 
 AT_ONCE = 4  # problems that PyTorch searches together: memory holds the distances of all edges from all obstacles
 PRIMES = (2, 3, 5)  # bases of the low-discrepancy sequence

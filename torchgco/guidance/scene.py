@@ -7,10 +7,10 @@ from torch import Tensor
 
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.errors import InputError
 from torchgco.guidance.roadmap import FAR, Scene
 from torchgco.guidance.search import segment_gaps
 from torchgco.problem import Problem
-from torchgco.shapes import InputError
 
 OPEN = 1e10  # a range of controls that is no range
 THERE = 0.25  # share of the distance from start to goal; a path that ends farther from it has fallen back

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from torchgco.costs.base import Cost, ScaledCost
+from torchgco.errors import InputError
 from torchgco.native import emit
 from torchgco.native.knots import Knot, KnotSource, Span, knot_source
 from torchgco.problem import Problem
-from torchgco.shapes import InputError
 from torchgco.tracing import Traced, own_tensors
 
 

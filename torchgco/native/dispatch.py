@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from torchgco import rollout
+from torchgco.errors import InputError
 from torchgco.kernels import native
 from torchgco.lagrangian import Lagrangian
 from torchgco.native.compiler import NativeError
 from torchgco.native.engine import Engine, Terms
 from torchgco.native.sampler import Sampler
 from torchgco.problem import Problem
-from torchgco.shapes import InputError
 
 NUDGE = 1e-14  # share of the controls by which a rollout's sensitivity is tried out
 AMPLIFIED = 1e6  # times that: other last bits are no matter below it

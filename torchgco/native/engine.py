@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchgco.constraints.guides import Guide, GuidePath, GuideRegion
 from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
 from torchgco.native.compiler import build
 from torchgco.native.costs import cost_numbers, trace_cost
@@ -21,7 +22,6 @@ from torchgco.native.packing import FLAGS, KINDS, NUMBERS, PATH, QUADRATIC, REGI
 from torchgco.native.rows import rows_numbers, trace_rows
 from torchgco.native.source import LANES, Form
 from torchgco.problem import Problem
-from torchgco.shapes import InputError
 
 MOST = 128  # states and controls: matrices of a stage lie on the stack
 

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.errors import InputError
 from torchgco.native import store
 from torchgco.native.model import elements, makers
-from torchgco.shapes import InputError
 from torchgco.tracing import Traced
 
 

@@ -65,9 +65,11 @@ class Packed(ctypes.Structure):
 def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: Problem, keep: list[Any]) -> None:
     """Fill in the parts of a constraint; `numbers` (B|1, K|1, count) are those of one that is traced."""
     one = problem.take(slice(0, 1))
-    shape = constraint.take(slice(0, 1)).value(
-        one.x0.unsqueeze(1).expand(-1, problem.N + 1, -1), one.x0.new_zeros(1, problem.N, problem.m)
-    ).shape
+    shape = (
+        constraint.take(slice(0, 1))
+        .value(one.x0.unsqueeze(1).expand(-1, problem.N + 1, -1), one.x0.new_zeros(1, problem.N, problem.m))
+        .shape
+    )
     place = torch.full((problem.N + 1,), -1, dtype=torch.int32)
     if shape[2] > 0:
         place[constraint.knots] = torch.arange(shape[1], dtype=torch.int32)
@@ -103,6 +105,4 @@ def array(value: Tensor | None, keep: list[Any], knots: bool) -> Array:
     keep.append(value)
     per_knot = value[0, 0].numel() if knots else value[0].numel()
     many = value.shape[1] if knots else 1
-    return Array(
-        value.data_ptr(), 0 if value.shape[0] == 1 else many * per_knot, per_knot if many > 1 else 0, per_knot
-    )
+    return Array(value.data_ptr(), 0 if value.shape[0] == 1 else many * per_knot, per_knot if many > 1 else 0, per_knot)

@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from torchgco.errors import InputError
 from torchgco.plotting.style import INK, legend, panels, tidy
-from torchgco.shapes import InputError
 
 COLUMNS = ("element", "iteration", "outer", "cost", "guided")
 UPDATE, GUIDED = "#C62828", "#C9E0F4"

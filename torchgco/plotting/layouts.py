@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
+from torchgco.errors import InputError
 from torchgco.plotting.scene import Arrays, Scene, map_box, scene_of
 from torchgco.plotting.style import INK, SMALL, TEXT, legend, panels, solver_colours, tidy
-from torchgco.shapes import InputError
 
 STONE, EDGE = "#CFC8BA", "#A39B8B"
 # Greys, away from all solvers' colours.

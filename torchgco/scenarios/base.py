@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from torchgco.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.layouts import Layouts, concatenate
-from torchgco.shapes import InputError
 
 MAX_DRAWS = 5000  # rounds of redrawing what lies too near before a rule is called impossible
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from torchgco.shapes import InputError
+from torchgco.errors import InputError
 
 
 def number(value: Any, field: str, above: float = -math.inf, at_least: float = -math.inf) -> float:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from torchgco.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import Scenario
 from torchgco.scenarios.layouts import Layouts
-from torchgco.shapes import InputError
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from torchgco.errors import InputError
 from torchgco.scenarios import checks
-from torchgco.shapes import InputError
 
 # What a file may hold, in the order of the fields of Layouts. `layout` are the ids, if they are not 0..L-1.
 REQUIRED = ("centers", "radii")

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchgco.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import Family, uniform_clear
 from torchgco.scenarios.layouts import Layouts
-from torchgco.shapes import InputError
 
 # A cup that opens towards the start and stands on the straight way to the goal.
 TRAP = ((0.0, -0.25), (0.1, 0.0), (0.12, 0.25), (0.0, 0.5), (-0.2, 0.6), (-0.2, -0.35))

@@ -12,9 +12,9 @@ from torchgco.constraints.bounds import ControlBounds
 from torchgco.constraints.obstacles import Spheres
 from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.base import Dynamics
+from torchgco.errors import InputError
 from torchgco.problem import Problem
 from torchgco.scenarios.layouts import Layouts
-from torchgco.shapes import InputError
 
 
 @dataclass(frozen=True)

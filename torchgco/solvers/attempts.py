@@ -11,10 +11,10 @@ from torchgco.constraints.guides import GuideRegion
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import cost_unit, open_loop, value
 from torchgco.problem import Problem
-from torchgco.shapes import copied, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.state import Advice, Iterate, OuterLoop, State
 from torchgco.status import Status
+from torchgco.tree import copied, put, take
 
 CLOSE = 2.0  # times the distance that counts as having arrived: paths that end nearer are drawn to the goal at last
 WITHIN = 0.95  # share of that distance to which they are drawn

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
-from torchgco.shapes import InputError
 from torchgco.solution import Solution
 from torchgco.solvers.batch import Loop
 from torchgco.solvers.ilqr import ILQR

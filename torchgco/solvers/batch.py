@@ -15,10 +15,10 @@ from torch import Tensor
 
 from torchgco.constraints.guides import Guide
 from torchgco.draws import DrawKey
+from torchgco.errors import InputError
 from torchgco.lagrangian import Lagrangian, Multipliers, is_better, update, violation
 from torchgco.native.dispatch import cost_unit, engine_of, open_loop, reproducible, value
 from torchgco.problem import Problem
-from torchgco.shapes import InputError, copied, put, take
 from torchgco.solution import Solution
 from torchgco.solvers.attempts import go_on_from, has_arrived, try_again
 from torchgco.solvers.iteration import EagerIterations, NativeIterations, PassEnd
@@ -26,6 +26,7 @@ from torchgco.solvers.state import Callback, InnerEnd, Iterate, OuterLoop, Progr
 from torchgco.solvers.trace import Recorder
 from torchgco.solvers.verdict import final_status, optimality
 from torchgco.status import Status
+from torchgco.tree import copied, put, take
 
 
 class Loop:

@@ -7,11 +7,11 @@ from torch import Tensor
 
 from torchgco.lagrangian import Lagrangian
 from torchgco.native.dispatch import engine_of, open_loop, value
-from torchgco.shapes import put, take
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.iteration import EagerIterations, NativeIterations
 from torchgco.solvers.state import InnerState
 from torchgco.status import Status
+from torchgco.tree import put, take
 
 
 def descend(inner: ILQR, lagrangian: Lagrangian, U: Tensor) -> InnerState:

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.guides import Guide
+from torchgco.errors import InputError
 from torchgco.lagrangian import VIOLATION_TOLERANCE, Multipliers
 from torchgco.native.engine import Options
 from torchgco.problem import Problem
-from torchgco.shapes import InputError
 from torchgco.solution import Solution
 from torchgco.solvers.batch import Loop
 from torchgco.solvers.line_search import LineSearch

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchgco.errors import InputError
 from torchgco.lagrangian import Lagrangian
 from torchgco.rollout import closed_loop
-from torchgco.shapes import InputError
 from torchgco.solvers.riccati import BackwardPass
 
 SIDE_BY_SIDE = 256  # trajectories that cost little more than one

@@ -6,10 +6,10 @@ import os
 
 import torch
 
+from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
-from torchgco.shapes import InputError
 
 CPU_LIMIT = 256  # more problems at once are no faster on a core: what they share is paid for by then
 SHARE = 0.5  # of the free memory; the rest is the system's and other processes'

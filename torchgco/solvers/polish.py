@@ -14,15 +14,16 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.errors import InputError
 from torchgco.lagrangian import VIOLATION_TOLERANCE, Lagrangian, Multipliers, violation
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
-from torchgco.shapes import InputError, copied, put
 from torchgco.solution import Solution
 from torchgco.solvers.active_set import multipliers
 from torchgco.solvers.condensed import Condensed
 from torchgco.solvers.verdict import final_status, optimality
 from torchgco.status import Status
+from torchgco.tree import copied, put
 
 STIFFNESS = 1e4  # curvature put across the rows that push, as a share of the Hessian's mean: it changes no solution
 SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)  # shares of the same mean put on the diagonal until the model is convex
@@ -192,9 +193,7 @@ class _Point:
         # Optimality is that of what is returned; the outer limit no longer is the reason for anything.
         ended = torch.full_like(solution.status, Status.MAX_ITERATIONS)
         status = final_status(ended, left, worst, VIOLATION_TOLERANCE, bool(problem.constraints))
-        return replace(
-            solution, X=X, U=U, K=K, d=d, multipliers=duals, cost=cost, violation=worst, status=status
-        )
+        return replace(solution, X=X, U=U, K=K, d=d, multipliers=duals, cost=cost, violation=worst, status=status)
 
 
 def _slope(model: Condensed, lam: Tensor) -> float:

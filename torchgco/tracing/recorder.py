@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-from torchgco.shapes import InputError
+from torchgco.errors import InputError
 from torchgco.tracing.operations import OPERATIONS
 
 

@@ -1,0 +1,18 @@
+"""The error of malformed input, and the warning of a part that can't serve."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """Malformed input: the field at fault, what was expected there, and what came."""
+
+    def __init__(self, field: str, expected: str, got: object) -> None:
+        self.field, self.expected, self.got = field, expected, got
+        super().__init__(f"{field}: expected {expected}, got {got}")
+
+    def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
+        return type(self), (self.field, self.expected, str(self.got))  # a worker process hands it on whole
+
+
+class GuidanceWarning(UserWarning):
+    """Guidance, or a part of it, can't serve a problem: it is solved without."""

@@ -1,0 +1,81 @@
+"""Nested tuples and dataclasses of tensors with a batch axis: select, cast, copy and write rows of all at once."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, ClassVar, Self, TypeAlias
+
+import torch
+from torch import Tensor
+
+Rows: TypeAlias = Tensor | slice
+
+
+class PerElement:
+    """Mixin for problem parts that may hold one value per problem.
+
+    A subclass names its tensor fields with a batch axis: in `batched` those where it always has length B; in
+    `per_element` those where length 1, or a parameter without axes, stands for a value that all problems share.
+    """
+
+    batched: ClassVar[tuple[str, ...]] = ()
+    per_element: ClassVar[tuple[str, ...]] = ()
+
+    def take(self, index: Rows) -> Self:
+        """The same part for the problems in `index` (int64, (B',), or a slice)."""
+        changes = {name: take(getattr(self, name), index) for name in self.batched}
+        for name in self.per_element:
+            value = getattr(self, name)
+            if isinstance(value, Tensor) and value.dim() > 0 and value.shape[0] != 1:
+                changes[name] = value[index]
+        return replace(self, **changes) if changes else self  # type: ignore[type-var]
+
+
+def take(tree: Any, index: Rows) -> Any:
+    """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged."""
+    if isinstance(tree, Tensor):
+        return tree[index]
+    if isinstance(tree, PerElement):
+        return tree.take(index)
+    if isinstance(tree, tuple):
+        return tuple(take(leaf, index) for leaf in tree)
+    if is_dataclass(tree) and not isinstance(tree, type):
+        return replace(tree, **{f.name: take(getattr(tree, f.name), index) for f in fields(tree)})
+    return tree
+
+
+def cast(tree: Any, dtype: torch.dtype) -> Any:
+    """Every floating tensor in nested tuples and dataclasses in another precision; all else passes unchanged."""
+    if isinstance(tree, Tensor):
+        return tree.to(dtype) if tree.is_floating_point() else tree
+    if isinstance(tree, tuple):
+        return tuple(cast(leaf, dtype) for leaf in tree)
+    if is_dataclass(tree) and not isinstance(tree, type):
+        copy = object.__new__(type(tree))  # parts are checked and bound already
+        for name, value in vars(tree).items():
+            object.__setattr__(copy, name, cast(value, dtype))
+        return copy
+    return tree
+
+
+def copied(tree: Any) -> Any:
+    """The same with every tensor cloned."""
+    if isinstance(tree, Tensor):
+        return tree.clone()
+    if isinstance(tree, tuple):
+        return tuple(copied(leaf) for leaf in tree)
+    if is_dataclass(tree) and not isinstance(tree, type):
+        return replace(tree, **{f.name: copied(getattr(tree, f.name)) for f in fields(tree)})
+    return tree
+
+
+def put(tree: Any, index: Tensor, rows: Any) -> None:
+    """Write `rows` into rows `index` of every tensor of `tree`, in place; the two have the same structure."""
+    if isinstance(tree, Tensor):
+        tree[index] = rows
+    elif isinstance(tree, tuple):
+        for leaf, new in zip(tree, rows, strict=True):
+            put(leaf, index, new)
+    elif is_dataclass(tree) and not isinstance(tree, type):
+        for f in fields(tree):
+            put(getattr(tree, f.name), index, getattr(rows, f.name))
