@@ -39,6 +39,10 @@ from torchgco.guidance import MPPI as MPPI
 from torchgco.judge import judge as judge
 from torchgco.problem import Problem as Problem
 from torchgco.scenarios import Layouts as Layouts
+from torchgco.search import MultiStart as MultiStart
+from torchgco.search import PathProposals as PathProposals
+from torchgco.search import Restarts as Restarts
+from torchgco.search import Roadmap as Roadmap
 from torchgco.solution import Solution as Solution
 from torchgco.solvers import ILQR as ILQR
 from torchgco.solvers import AugmentedLagrangian as AugmentedLagrangian

@@ -29,18 +29,10 @@ class DrawKey:
     seed: int
     ids: Tensor  # (B,) int64
     outer: Tensor  # (B,) int64
-    began: Tensor | None = None  # (B,) int64: where the present attempt began; None: with the solve
-    attempt: Tensor | None = None  # (B,) int64: which attempt it is, from 1; None: the first. No draw depends on it
-
-    @property
-    def age(self) -> Tensor:
-        """Outer iterations of the present attempt, (B,)."""
-        return self.outer if self.began is None else self.outer - self.began
 
     def take(self, index: Tensor) -> DrawKey:
         """The keys of the elements in `index`."""
-        began, attempt = (None if t is None else t[index] for t in (self.began, self.attempt))
-        return DrawKey(self.seed, self.ids[index], self.outer[index], began, attempt)
+        return DrawKey(self.seed, self.ids[index], self.outer[index])
 
 
 def words(key: DrawKey, stream: int = 0) -> Tensor:

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Sense
-from torchgco.constraints.guides import Guide
 from torchgco.errors import InputError
 from torchgco.expansion import quadratise
+from torchgco.penalties import Penalty
 from torchgco.problem import Problem
 from torchgco.tree import Rows, take
-
-VIOLATION_TOLERANCE = 1e-3  # metres for lengths, all else in the units of its constraint
 
 
 @dataclass(frozen=True)
@@ -46,60 +43,60 @@ class Multipliers:
             raise InputError("warm", f"multipliers of shapes {expected}", got)
 
 
-def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> Tensor:
+def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> Tensor:
     """rho: mu where a row pulls, else 0 (Equation 18).
 
-    As printed, an inequality lets go once c < 0 and lam = 0. With `clip` it lets go where lam + mu c < 0, so that a
-    multiplier pushes away from an obstacle but never holds the path to its surface.
+    As printed, an inequality is inactive where c < 0 and lam = 0. With `phr` (Powell, Hestenes, Rockafellar) it is
+    inactive where lam + mu c < 0: a multiplier pushes the trajectory away from an obstacle and never pulls it back.
     """
     rho = mu.view(-1, 1, 1)
     if sense == "equality":
         return rho.expand_as(c)
-    idle = (lam + rho * c < 0) if clip else ((c < 0) & (lam == 0))
+    idle = (lam + rho * c < 0) if phr else ((c < 0) & (lam == 0))
     return torch.where(idle, 0.0, rho)
 
 
-def _worth(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> Tensor:
+def _penalty_value(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> Tensor:
     """What the rows of a constraint add to L_M, (B,)."""
-    rho = penalty_weights(sense, c, lam, mu, clip)
+    rho = penalty_weights(sense, c, lam, mu, phr)
     terms = (lam + 0.5 * rho * c) * c
-    if clip and sense == "inequality":
+    if phr and sense == "inequality":
         # Continued by its minimum over c where the row lets go, so that L_M stays continuous.
         terms = torch.where(rho == 0, -0.5 * lam.square() / mu.view(-1, 1, 1), terms)
     # Two sums, knots last: one over both axes would be split among threads by batch size.
     return terms.sum(-1).sum(-1)
 
 
-def _pull(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, clip: bool) -> tuple[Tensor, Tensor]:
+def _penalty_slopes(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> tuple[Tensor, Tensor]:
     """First and second derivative of that by c, (B, K, p) each."""
-    rho = penalty_weights(sense, c, lam, mu, clip)
+    rho = penalty_weights(sense, c, lam, mu, phr)
     g = lam + rho * c
-    return (torch.where(rho == 0, 0.0, g) if clip and sense == "inequality" else g), rho
+    return (torch.where(rho == 0, 0.0, g) if phr and sense == "inequality" else g), rho
 
 
 @dataclass(frozen=True)
 class Lagrangian:
     """L_M = J_var + sum_k sum_i [lam c + rho/2 c^2] + J_gco for fixed multipliers (Equations 17, 64).
 
-    With `clip` the terms of an inequality are the continuous ones of `penalty_weights`, else as printed.
+    With `phr` the terms of an inequality are the continuous ones of `penalty_weights`, else as printed.
     """
 
     problem: Problem
-    duals: Multipliers
-    guide: Guide | None
-    clip: bool
+    multipliers: Multipliers
+    penalty: Penalty | None
+    phr: bool
 
     def take(self, index: Rows) -> Lagrangian:
         """The same for the problems in `index`."""
-        return Lagrangian(self.problem.take(index), take(self.duals, index), take(self.guide, index), self.clip)
+        return Lagrangian(self.problem.take(index), take(self.multipliers, index), take(self.penalty, index), self.phr)
 
     def value(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         """J_var (B,) and L_M (B,)."""
         cost = self.problem.cost.total(X, U)
         merit = cost
-        for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
-            merit = merit + _worth(constraint.sense, constraint.value(X, U), lam, self.duals.mu, self.clip)
-        return cost, merit if self.guide is None else merit + self.guide.value(X)
+        for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
+            merit = merit + _penalty_value(constraint.sense, constraint.value(X, U), lam, self.multipliers.mu, self.phr)
+        return cost, merit if self.penalty is None else merit + self.penalty.value(X)
 
     def expand(self, X: Tensor, U: Tensor) -> Tensor:
         """H (N+1, B, s, s) of L_M: first derivatives of the constraints only (Equations 31-37).
@@ -107,67 +104,36 @@ class Lagrangian:
         Stage first, as the backward pass reads it.
         """
         H = quadratise(self.problem, X, U)
-        for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
-            g, rho = _pull(constraint.sense, constraint.value(X, U), lam, self.duals.mu, self.clip)
+        for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
+            g, rho = _penalty_slopes(constraint.sense, constraint.value(X, U), lam, self.multipliers.mu, self.phr)
             constraint.accumulate(X, U, g, rho, H)
-        if self.guide is not None:
-            self.guide.accumulate(X, H)
+        if self.penalty is not None:
+            self.penalty.accumulate(X, H)
         return H.transpose(0, 1)
 
     def expand_optimality(self, X: Tensor, U: Tensor) -> Tensor:
         """H (N+1, B, s, s) of J_var + lam'c, with the penalty's curvature on the rows that push."""
         H = quadratise(self.problem, X, U)
-        for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
-            rho = torch.where(lam == 0, 0.0, self.duals.mu.view(-1, 1, 1))
+        for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
+            rho = torch.where(lam == 0, 0.0, self.multipliers.mu.view(-1, 1, 1))
             constraint.accumulate(X, U, lam, rho.expand_as(lam), H)
         return H.transpose(0, 1)
 
     def slack(self, X: Tensor, U: Tensor) -> Tensor:
         """Sum |lam c| (B,) of the inequalities that push without being met, which complementarity leaves open."""
         slack = X.new_zeros(X.shape[0])
-        for constraint, lam in zip(self.problem.constraints, self.duals.lam, strict=True):
+        for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
             if constraint.sense == "inequality":
                 slack = slack - (lam * constraint.value(X, U).clamp(max=0.0)).sum(-1).sum(-1)
         return slack
 
 
 def update(
-    problem: Problem, X: Tensor, U: Tensor, duals: Multipliers, growth: Tensor | float, mu_max: float
+    problem: Problem, X: Tensor, U: Tensor, multipliers: Multipliers, growth: Tensor | float, mu_max: float
 ) -> Multipliers:
     """lam + mu c, at least 0 for inequalities; mu times `growth`, at most mu_max (Equations 21, 22)."""
     lam = []
-    for constraint, old in zip(problem.constraints, duals.lam, strict=True):
-        new = old + duals.mu.view(-1, 1, 1) * constraint.value(X, U)
+    for constraint, old in zip(problem.constraints, multipliers.lam, strict=True):
+        new = old + multipliers.mu.view(-1, 1, 1) * constraint.value(X, U)
         lam.append(new if constraint.sense == "equality" else new.clamp(min=0.0))
-    return Multipliers(tuple(lam), (duals.mu * growth).clamp(max=mu_max))
-
-
-def violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """The largest violation (B,): lengths in metres, all else in the units of its constraint."""
-    worst = X.new_zeros(X.shape[0])
-    for constraint in problem.constraints:
-        worst = torch.maximum(worst, constraint.worst(X, U))
-    return worst
-
-
-def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, limit: float) -> Tensor:
-    """Whether an iterate is worth more than an old one (B,): feasible before infeasible, then cost, then violation."""
-    fits, old_fits = worst <= limit, old_worst <= limit
-    return (fits & (~old_fits | (cost < old_cost))) | (~fits & ~old_fits & (worst < old_worst))
-
-
-def worst_rows(problem: Problem, X: Tensor, U: Tensor) -> list[dict[str, Any]]:
-    """Which constraint, knot and row is violated most, one entry per problem (the first thing to look at)."""
-    report: list[dict[str, Any]] = [{"violation": 0.0, "constraint": None} for _ in range(X.shape[0])]
-    for constraint in problem.constraints:
-        rows = constraint.violation(X, U)
-        if rows.numel() == 0:
-            continue
-        knots = torch.arange(problem.N + 1)[constraint.knots]
-        worst, place = rows.flatten(1).max(-1)
-        for b, (value, flat) in enumerate(zip(worst.tolist(), place.tolist(), strict=True)):
-            if value > report[b]["violation"]:
-                knot, row = divmod(flat, rows.shape[-1])
-                name = getattr(constraint, "name", type(constraint).__name__)
-                report[b] = {"violation": value, "constraint": name, "knot": int(knots[knot]), "row": row}
-    return report
+    return Multipliers(tuple(lam), (multipliers.mu * growth).clamp(max=mu_max))

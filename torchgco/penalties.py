@@ -1,4 +1,4 @@
-"""What guidance adds to the Lagrangian: regions that knots are drawn into, or a path that they are tied to."""
+"""Penalties that guidance adds to the Lagrangian: balls that attract knots, or a path that knots are tied to."""
 
 from __future__ import annotations
 
@@ -78,4 +78,4 @@ class GuidePath:
         H[..., at, at].diagonal(dim1=-2, dim2=-1).add_(self.weight.view(-1, 1, 1))
 
 
-Guide: TypeAlias = GuideRegion | GuidePath
+Penalty: TypeAlias = GuideRegion | GuidePath

@@ -67,6 +67,18 @@ class Problem:
         return self.dynamics.m
 
     @property
+    def position(self) -> slice:
+        """Where the position stands in the state.
+
+        Raises:
+            InputError: dynamics without a position.
+        """
+        where = self.dynamics.position
+        if where is None:
+            raise InputError("dynamics.position", "a model with a position", type(self.dynamics).__name__)
+        return where
+
+    @property
     def geometric(self) -> tuple[Constraint, ...]:
         """The constraints on position that sampling and guidance look at."""
         return tuple(c for c in self.constraints if c.geometric)

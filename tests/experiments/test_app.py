@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from torchgco.solvers.batch import Loop
 
 import torchgco
 from tests.experiments.commands import ROOT, TINY, command, problem_line
@@ -21,7 +22,6 @@ from torchgco.experiments.build import compose, config_dir
 from torchgco.experiments.identity import decisive, plain
 from torchgco.experiments.records import COLUMNS
 from torchgco.scenarios import Layouts
-from torchgco.solvers.batch import Loop
 
 DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from torchgco.solvers.batch import Loop
 
 from tests.experiments.commands import HOLD, TINY, problem_line
 from torchgco.baselines import MultiStart
 from torchgco.experiments.records import Records
 from torchgco.scenarios import Layouts
 from torchgco.solvers import AugmentedLagrangian, Polish
-from torchgco.solvers.batch import Loop
 
 HOW = ["seconds", "batch_size", "threads"]  # columns that say how a trial was flown
 

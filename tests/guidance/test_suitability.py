@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torchgco.guidance.misfits import SAMPLES, suited_sampler
 
 import torchgco
 from torchgco import (
@@ -33,7 +34,6 @@ from torchgco import (
 )
 from torchgco.guidance import Detour
 from torchgco.guidance.gco import REACH
-from torchgco.guidance.misfits import SAMPLES, suited_sampler
 from torchgco.native.compiler import find_compiler
 
 

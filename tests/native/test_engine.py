@@ -11,6 +11,8 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
+from torchgco.constraints.guides import GuidePath, GuideRegion
+from torchgco.solvers.iteration import EagerIterations, NativeIterations
 
 from tests.problems import PRINTED, planar_batch, quadrotor_batch
 from torchgco import (
@@ -27,11 +29,9 @@ from torchgco import (
     StateBounds,
     kernels,
 )
-from torchgco.constraints.guides import GuidePath, GuideRegion
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import EagerWarning, engine_of, terms_of
 from torchgco.rollout import open_loop
-from torchgco.solvers.iteration import EagerIterations, NativeIterations
 from torchgco.solvers.state import State
 from torchgco.solvers.verdict import optimality
 

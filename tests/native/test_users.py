@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 from torch import Tensor
+from torchgco.solvers.iteration import NativeIterations
 
 import torchgco
 from tests.native.test_engine import DAMPED, begun, eager, normal
@@ -22,7 +23,6 @@ from torchgco import Problem, Status, kernels
 from torchgco.constraints.base import Constraint
 from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import EagerWarning, cost_unit, engine_of, terms_of
-from torchgco.solvers.iteration import NativeIterations
 from torchgco.solvers.lifted import lifted_search, native_lifted_search
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

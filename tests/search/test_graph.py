@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-
-from torchgco import kernels
 from torchgco.guidance.roadmap import FAR, Roadmap, Scene, halton
 from torchgco.guidance.search import Search
+
+from torchgco import kernels
 from torchgco.native import roadmap as native
 from torchgco.native.dispatch import EagerWarning
 from torchgco.native.roadmap import HOPS, Graph, NativeSearch, library_for

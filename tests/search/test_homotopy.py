@@ -1,7 +1,6 @@
 """Ways of one class count once: in the plane by how they wind, in space by how far they are apart."""
 
 import torch
-
 from torchgco.guidance.classes import distinct
 from torchgco.guidance.roadmap import FAR, Scene
 

@@ -6,6 +6,10 @@ from pkgutil import resolve_name
 import numpy as np
 import pytest
 import torch
+from torchgco.guidance.detour import Proposal
+from torchgco.guidance.plans import Plans
+from torchgco.guidance.scene import depth_between
+from torchgco.solvers.descent import descend
 
 from tests.problems import planar_batch, quadrotor_batch
 from torchgco import (
@@ -23,12 +27,8 @@ from torchgco import (
 )
 from torchgco.draws import DrawKey
 from torchgco.guidance import Detour, Roadmap
-from torchgco.guidance.detour import Proposal
-from torchgco.guidance.plans import Plans
-from torchgco.guidance.scene import depth_between
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.rollout import open_loop
-from torchgco.solvers.descent import descend
 
 QUICK = Detour(begin=0.1, end=0.8, iterations=8, depth=1.0)
 END = torch.tensor([0.7], dtype=torch.float64)

@@ -6,12 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-
-from tests.reference.roadmap import cheapest_cost, point_along, segment_gap, way_length
-from torchgco import InputError, compose
 from torchgco.guidance.roadmap import FAR, Roadmap, Scene, halton, points_along
 from torchgco.guidance.scene import scene_of
 from torchgco.guidance.search import Search, segment_gaps, squares_from_segments
+
+from tests.reference.roadmap import cheapest_cost, point_along, segment_gap, way_length
+from torchgco import InputError, compose
 from torchgco.native.roadmap import Graph, NativeSearch, library_for
 
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torchgco.solvers.iteration import EagerIterations, NativeIterations
 
 from tests.problems import planar_batch, quadrotor_batch, quick_gco
 from torchgco import ILQR, MPPI, AugmentedLagrangian, Polish, Problem
 from torchgco.baselines import MultiStart
-from torchgco.solvers.iteration import EagerIterations, NativeIterations
 
 BATCHES = {
     "planar": lambda: planar_batch(B=3, N=25, obstacles=9, seed=4),

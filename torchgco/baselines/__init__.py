@@ -4,4 +4,3 @@ from torchgco.baselines.casadi import CasADiSolver as CasADiSolver
 from torchgco.baselines.guided import GuidedCasADi as GuidedCasADi
 from torchgco.baselines.hold import Hold as Hold
 from torchgco.baselines.mppi import IteratedMPPI as IteratedMPPI
-from torchgco.baselines.multistart import MultiStart as MultiStart

@@ -17,12 +17,10 @@ from torch import Tensor
 
 from torchgco.baselines.hold import rolled_out
 from torchgco.errors import InputError
-from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.solution import Solution
-from torchgco.solvers.batch import check_call
-from torchgco.solvers.state import Callback, Progress
+from torchgco.solvers.contracts import Call, Progress, Solver
 from torchgco.status import Status
 
 if TYPE_CHECKING:
@@ -32,7 +30,7 @@ _End = tuple[Status, int]  # how the solver ended, and its iterations
 
 
 @dataclass(frozen=True)
-class CasADiSolver:
+class CasADiSolver(Solver):
     """An interior-point solver on the multiple-shooting program, one problem of the batch after the other.
 
     Args:
@@ -63,7 +61,7 @@ class CasADiSolver:
         if find_spec("casadi") is None:
             raise InputError("solver", "CasADi, which `pip install casadi` brings", "no such module")
 
-    def prepare(self, problem: Problem) -> PreparedCasADi:
+    def prepare(self, problem: Problem) -> Solver:
         """The program and the solver built for one batch; solving it then costs the solver's time alone.
 
         Raises:
@@ -82,22 +80,9 @@ class CasADiSolver:
             raise _refused(self.plugin, error) from error
         return PreparedCasADi(self, problem, program, run)
 
-    def solve(
-        self,
-        problem: Problem,
-        U0: Tensor,
-        seed: int = 0,
-        ids: Tensor | None = None,
-        warm: Multipliers | None = None,
-        callback: Callback | None = None,
-    ) -> Solution:
-        """From U0 (B, N, m) and its rollout; X is the rollout of the controls found. seed and warm change nothing.
-
-        Raises:
-            InputError: U0 or ids don't fit the problem, and what `prepare` raises.
-        """
-        check_call(problem, U0, ids)
-        return self.prepare(problem).solve(problem, U0, seed, ids, warm, callback)
+    def run(self, call: Call) -> Solution:
+        """From U0 and its rollout; X is the rollout of the controls found. Raises the errors of `prepare`, too."""
+        return self.prepare(call.problem).run(call)
 
     def _options(self, problem: Problem, program: Program) -> dict[str, Any]:
         """Options of the plugin and of CasADi around it; both say nothing while they work."""
@@ -120,7 +105,7 @@ class CasADiSolver:
 
 
 @dataclass(frozen=True)
-class PreparedCasADi:
+class PreparedCasADi(Solver):
     """A CasADiSolver with all that one batch needs, built."""
 
     solver: CasADiSolver
@@ -128,23 +113,11 @@ class PreparedCasADi:
     program: Program
     run: Any  # casadi.Function
 
-    def solve(
-        self,
-        problem: Problem,
-        U0: Tensor,
-        seed: int = 0,
-        ids: Tensor | None = None,
-        warm: Multipliers | None = None,
-        callback: Callback | None = None,
-    ) -> Solution:
-        """As `CasADiSolver.solve`.
-
-        Raises:
-            InputError: another problem than the prepared one; U0 or ids don't fit it.
-        """
+    def run(self, call: Call) -> Solution:
+        """As `CasADiSolver.run`; InputError for another problem than the prepared one."""
+        problem, U0 = call.problem, call.U0
         if problem is not self.problem:
             raise InputError("problem", "the one that was prepared", "another")
-        check_call(problem, U0, ids)
         X0 = open_loop(problem.dynamics, problem.x0, U0)
         X0 = torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1))
         sound = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
@@ -152,9 +125,9 @@ class PreparedCasADi:
         for b in range(problem.B):
             if bool(sound[b]):
                 U[b], ends[b] = self._one(b, X0[b], U0[b])
-            if callback is not None:
+            if call.callback is not None:
                 rows = torch.arange(b, b + int(sound[b]), device=U.device)
-                callback(Progress(b + 1, rows, b + 1, problem.B, None))
+                call.callback(Progress(b + 1, rows, b + 1, problem.B))
         solution = rolled_out(problem, U, self.solver.violation_tolerance, iterations=0)
         return _with_ends(solution, ends)
 

@@ -7,37 +7,24 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.lagrangian import Multipliers, violation
+from torchgco.evaluation import violation
+from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.solution import Solution
-from torchgco.solvers.batch import check_call
-from torchgco.solvers.state import Callback
+from torchgco.solvers.contracts import Call, Solver
 from torchgco.status import Status
 
 
 @dataclass(frozen=True)
-class Hold:
+class Hold(Solver):
     """Solves nothing: the trajectory of U0, with the statuses of bad starts."""
 
     violation_tolerance: float = 1e-3
 
-    def solve(
-        self,
-        problem: Problem,
-        U0: Tensor,
-        seed: int = 0,
-        ids: Tensor | None = None,
-        warm: Multipliers | None = None,
-        callback: Callback | None = None,
-    ) -> Solution:
-        """U0 (B, N, m) rolled out; seed, warm and callback change nothing.
-
-        Raises:
-            InputError: U0 or ids don't fit the problem.
-        """
-        check_call(problem, U0, ids)
-        return rolled_out(problem, U0, self.violation_tolerance, iterations=0)
+    def run(self, call: Call) -> Solution:
+        """U0 rolled out."""
+        return rolled_out(call.problem, call.U0, self.violation_tolerance, iterations=0)
 
 
 def rolled_out(problem: Problem, U: Tensor, violation_tolerance: float, iterations: int) -> Solution:

@@ -6,22 +6,19 @@ import warnings
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from torchgco.baselines.hold import rolled_out
 from torchgco.draws import DrawKey
 from torchgco.errors import GuidanceWarning, InputError
-from torchgco.guidance.misfits import suited_sampler
+from torchgco.evaluation import is_better, violation
 from torchgco.guidance.mppi import MPPI
-from torchgco.lagrangian import Multipliers, is_better, violation
-from torchgco.problem import Problem
+from torchgco.guidance.suitability import suited_sampler
 from torchgco.solution import Solution
-from torchgco.solvers.batch import check_call
-from torchgco.solvers.state import Callback
+from torchgco.solvers.contracts import Call, Solver
 
 
 @dataclass(frozen=True)
-class IteratedMPPI:
+class IteratedMPPI(Solver):
     """Algorithm 3 again and again, each time around its own mean; the best iterate is kept.
 
     Best is: feasible before infeasible, then by cost, then by violation. The initial guess doesn't count.
@@ -45,30 +42,22 @@ class IteratedMPPI:
         if not self.violation_tolerance > 0:
             raise InputError("solver.violation_tolerance", "above 0", self.violation_tolerance)
 
-    def solve(
-        self,
-        problem: Problem,
-        U0: Tensor,
-        seed: int = 0,
-        ids: Tensor | None = None,
-        warm: Multipliers | None = None,
-        callback: Callback | None = None,
-    ) -> Solution:
-        """Sample around U0 (B, N, m); draws are keyed by (seed, id, iteration). warm and callback change nothing.
+    def run(self, call: Call) -> Solution:
+        """Sample around U0; draws are keyed by (seed, id, iteration).
 
         Raises:
-            InputError: U0 or ids don't fit the problem, or its parts can't be evaluated for samples.
+            InputError: the parts of the problem can't be evaluated for samples.
         """
-        ids = check_call(problem, U0, ids)
+        problem, ids = call.problem, call.ids
         sampler, lost = suited_sampler(self.sampler, problem)
         if sampler is None:
             raise InputError("problem", "parts that can be evaluated for many samples at once", lost)
         if lost is not None:
             warnings.warn(lost, GuidanceWarning, stacklevel=2)
-        U, best = U0, U0
+        U = best = call.U0
         best_cost = best_violation = torch.full_like(problem.x0[:, 0], torch.inf)
         for i in range(self.iterations):
-            X, U = sampler.improve(problem, U, DrawKey(seed, ids, torch.full_like(ids, i)))
+            X, U = sampler.improve(problem, U, DrawKey(call.seed, ids, torch.full_like(ids, i)))
             cost, worst = problem.cost.total(X, U), violation(problem, X, U)
             better = is_better(cost, worst, best_cost, best_violation, self.violation_tolerance)
             best = torch.where(better.view(-1, 1, 1), U, best)

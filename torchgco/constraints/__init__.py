@@ -5,8 +5,5 @@ from torchgco.constraints.base import FunctionConstraint as FunctionConstraint
 from torchgco.constraints.bounds import ControlBounds as ControlBounds
 from torchgco.constraints.bounds import StateBounds as StateBounds
 from torchgco.constraints.equalities import FirstStepRates as FirstStepRates
-from torchgco.constraints.guides import Guide as Guide
-from torchgco.constraints.guides import GuidePath as GuidePath
-from torchgco.constraints.guides import GuideRegion as GuideRegion
 from torchgco.constraints.obstacles import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.obstacles import Spheres as Spheres

@@ -18,10 +18,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
 from torchgco.errors import InputError
+from torchgco.experiments.presets import register
 from torchgco.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 
 DEFAULT_LAYOUTS = 64
+register()
 
 
 def config_dir() -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import IO, Any, Protocol
 
@@ -23,8 +23,8 @@ from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
 from torchgco.scenarios import Layouts
 from torchgco.solution import Solution
+from torchgco.solvers.contracts import Progress
 from torchgco.solvers.memory import is_out_of_memory, plan_batch
-from torchgco.solvers.state import Progress
 from torchgco.status import Status
 
 NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
@@ -134,12 +134,11 @@ class Flight:
         """
         # What a solver builds or compiles for a batch is set-up: the clock starts after it.
         engine_of(problem)
-        solver = self.solver.prepare(problem) if hasattr(self.solver, "prepare") else self.solver
-        at_once = problem.B
-        if hasattr(solver, "slots"):
+        solver, at_once = self.solver.prepare(problem), problem.B
+        if solver.in_slots(1) is not None:
             plan = plan_of(self.setup)
             at_once = min(problem.B, plan.batch_size or plan_batch(problem, self.setup.device, plan.workers))
-            solver = replace(solver, slots=at_once)
+            solver = solver.in_slots(at_once)
         while True:
             together = torch.zeros_like(ids)
             callback = partial(self._progress, together)
@@ -147,7 +146,7 @@ class Flight:
             try:
                 solution = solver.solve(problem, U0, seed=self.setup.seed, ids=ids, callback=callback)
             except (RuntimeError, MemoryError) as error:
-                smaller = _with_slots(solver, at_once // 2)
+                smaller = solver.in_slots(max(1, at_once // 2))
                 if at_once == 1 or smaller is None or not is_out_of_memory(error):
                     raise
                 solver, at_once = smaller, at_once // 2
@@ -164,14 +163,6 @@ class Flight:
         self.bar.update(max(0, progress.finished - self.shown))
         self.bar.set_postfix({"pass": progress.passes}, refresh=False)
         self.shown = max(self.shown, progress.finished)
-
-
-def _with_slots(solver: Any, slots: int) -> Any:
-    """The solver, or the one it wraps as `solver`, with so many slots; None where there are none to set."""
-    if hasattr(solver, "slots"):
-        return replace(solver, slots=max(1, slots))
-    inner: Any = getattr(solver, "solver", None)
-    return replace(solver, solver=replace(inner, slots=max(1, slots))) if hasattr(inner, "slots") else None
 
 
 def _now(device: torch.device) -> float:

@@ -1,6 +1,4 @@
-"""Guidance: find where a trajectory is caught, and a region to pass through."""
+"""The paper's guidance: find where a trajectory is caught, sample a way past, and attract the trajectory to it."""
 
-from torchgco.guidance.detour import Detour as Detour
 from torchgco.guidance.gco import GCO as GCO
 from torchgco.guidance.mppi import MPPI as MPPI
-from torchgco.guidance.roadmap import Roadmap as Roadmap

@@ -16,11 +16,20 @@ def active_counts(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     return counts
 
 
-def caught_knots(problem: Problem, X: Tensor, U: Tensor, least: int = 2) -> Tensor:
-    """J (B, N+1) bool: knots with |F_k| >= `least`, the given start and the unguided end left out.
+def caught_knots(
+    problem: Problem, X: Tensor, U: Tensor, outer: Tensor | None = None, single_contact_after: int | None = None
+) -> Tensor:
+    """J (B, N+1) bool: knots with |F_k| >= 2, the given start and the unguided end left out.
 
-    One active sphere is left to the gradient; the gradients of two can cancel.
+    One active sphere is left to the gradient, as the gradients of two can cancel. But a sphere met dead-centre has no
+    gradient to the side: from the outer iteration `single_contact_after` on, one is enough.
+
+    Args:
+        outer: outer iterations of each problem so far (B,).
     """
+    least = torch.full_like(X[:, :1, 0], 2)
+    if outer is not None and single_contact_after is not None:
+        least = torch.where(outer >= single_contact_after, 1, 2).unsqueeze(-1)
     caught = active_counts(problem, X, U) >= least
     caught[:, 0] = caught[:, -1] = False
     return caught

@@ -19,6 +19,7 @@ from torchgco.problem import Problem
 from torchgco.shapes import check_shape, tensor
 
 CHUNK = 8192  # samples flown side by side: memory stays bounded
+COLLISION_PENALTY = 1e8  # rho_mp, per knot and obstacle touched
 OPEN = 1e10  # a range of controls that is no range
 
 
@@ -38,15 +39,14 @@ class MPPI:
         spread: standard deviation as a share of the range between the control bounds, and 1 where there are none; where
             `covariance` is None.
         temperature: lambda, in units of cost.
-        collision_penalty: rho_mp, per knot and obstacle touched.
         saturation: "bounds" clamps samples to the problem's control bounds; "symmetric" to [-upper, upper], wider
             than the bounds on purpose (planar study); None leaves them.
-        rounds: how often; each draws around the mean of the one before.
-        knots: noise is drawn at so many knots and linear between them; 0: white, at every stage. Smooth noise moves the
-            vehicle where white noise averages out. Its likelihood term (u' Sigma^-1 eps) is left out.
+        rounds: number of rounds; each draws around the mean of the round before.
+        noise_knots: knots of the noise, which is linear between them; 0: white noise, drawn at every stage. Smooth
+            noise moves the vehicle where white noise averages out. Its likelihood term (u' Sigma^-1 eps) is left out.
         decay: factor of the noise's standard deviation from round to round.
-        linger: horizons that a sample is charged for staying where it ends, at its last stage's cost. A plan that
-            stops before an obstacle is cheap within the horizon; this makes it dear.
+        dwell_cost: number of further horizons for which a sample pays the cost of its last stage. A trajectory that
+            stops in front of an obstacle is cheap within the horizon; this makes it expensive.
         dtype: "float32" to sample in single precision, twice as fast; None: in the problem's own.
         elite: the temperature is raised to the gap between the best sample and the elite-th best; 0 leaves it.
 
@@ -58,33 +58,30 @@ class MPPI:
     covariance: Any = 1.0
     spread: float = 0.25
     temperature: float = 1.0
-    collision_penalty: float = 1e8
     saturation: Literal["bounds", "symmetric"] | None = "bounds"
     rounds: int = 1
-    knots: int = 0
+    noise_knots: int = 0
     decay: float = 1.0
-    linger: float = 0.0
+    dwell_cost: float = 0.0
     elite: int = 0
     dtype: Literal["float32", "float64"] | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("samples", 1), ("rounds", 1), ("knots", 0), ("elite", 0)):
+        for name, least in (("samples", 1), ("rounds", 1), ("noise_knots", 0), ("elite", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"mppi.{name}", f"at least {least}", getattr(self, name))
         if self.elite > self.samples:
             raise InputError("mppi.elite", f"at most the {self.samples} samples", self.elite)
-        if self.knots == 1:
-            raise InputError("mppi.knots", "0, or at least 2", self.knots)
+        if self.noise_knots == 1:
+            raise InputError("mppi.noise_knots", "0, or at least 2", self.noise_knots)
         if not 0 < self.decay <= 1:
             raise InputError("mppi.decay", "above 0, at most 1", self.decay)
         if not self.spread > 0:
             raise InputError("mppi.spread", "above 0", self.spread)
         if not self.temperature > 0:
             raise InputError("mppi.temperature", "above 0", self.temperature)
-        if not self.linger >= 0:
-            raise InputError("mppi.linger", "at least 0 horizons", self.linger)
-        if not self.collision_penalty >= 0:
-            raise InputError("mppi.collision_penalty", "at least 0", self.collision_penalty)
+        if not self.dwell_cost >= 0:
+            raise InputError("mppi.dwell_cost", "at least 0 horizons", self.dwell_cost)
         if self.dtype not in ("float32", "float64", None):
             raise InputError("mppi.dtype", "float32, float64 or null", repr(self.dtype))
         if self.saturation not in ("bounds", "symmetric", None):
@@ -94,17 +91,17 @@ class MPPI:
         """Raise InputError where the covariance doesn't fit the controls."""
         self._sigma(problem)
 
-    def improve(self, problem: Problem, U: Tensor, key: DrawKey, stream: int = 0) -> tuple[Tensor, Tensor]:
+    def improve(self, problem: Problem, U: Tensor, key: DrawKey) -> tuple[Tensor, Tensor]:
         """X (B, N+1, n) and U (B, N, m): the mean of the last round's samples, the first drawn around U."""
         dtype = U.dtype if self.dtype is None else getattr(torch, self.dtype)
         sampler = sampler_of(problem, dtype)
         if sampler is not None:
-            plan = sampler.improve(problem, U, self._native(problem, key, stream))
+            plan = sampler.improve(problem, U, self._native(problem, key))
         else:
-            plan = self._in_chunks(problem, U, key, stream, dtype)
+            plan = self._in_chunks(problem, U, key, dtype)
         return open_loop(problem, plan), plan
 
-    def _native(self, problem: Problem, key: DrawKey, stream: int) -> Rounds:
+    def _native(self, problem: Problem, key: DrawKey) -> Rounds:
         """The same for the native library."""
         bounds = self._bounds(problem)
         if bounds is None:
@@ -112,28 +109,28 @@ class MPPI:
             bounds = -wide, wide
         lower, upper, deviation = (row.squeeze(1) for row in (*bounds, self._sigma(problem).sqrt()))
         return Rounds(
-            self.samples, self.knots, self.decay, self.elite, self.temperature, self.collision_penalty, self.linger,
-            torch.stack([words(key, stream * self.rounds + i) for i in range(self.rounds)], dim=-1),
+            self.samples, self.noise_knots, self.decay, self.elite, self.temperature, COLLISION_PENALTY, self.dwell_cost,
+            torch.stack([words(key, i) for i in range(self.rounds)], dim=-1),
             deviation, lower, upper, *self._places(problem),
         )  # fmt: skip
 
-    def _in_chunks(self, problem: Problem, U: Tensor, key: DrawKey, stream: int, dtype: torch.dtype) -> Tensor:
+    def _in_chunks(self, problem: Problem, U: Tensor, key: DrawKey, dtype: torch.dtype) -> Tensor:
         """All rounds by PyTorch, some problems at a time."""
         sigma, quick, plans = self._sigma(problem), problem.cast(dtype), []
         at_once = max(1, CHUNK // self.samples)
         for rows in torch.arange(problem.B, device=U.device).split(at_once):
             spread = sigma if sigma.shape[0] == 1 else sigma[rows]
             part = quick if rows.numel() == problem.B else quick.take(rows)
-            plans.append(self._rounds(part, U[rows].to(dtype), spread.to(dtype), key.take(rows), stream))
+            plans.append(self._rounds(part, U[rows].to(dtype), spread.to(dtype), key.take(rows)))
         return torch.cat(plans).to(U.dtype)
 
-    def _rounds(self, problem: Problem, U: Tensor, sigma: Tensor, key: DrawKey, stream: int) -> Tensor:
+    def _rounds(self, problem: Problem, U: Tensor, sigma: Tensor, key: DrawKey) -> Tensor:
         """All rounds for one chunk of problems; U (B, N, m), sigma (B|1, 1, m)."""
         mean, bounds = U.transpose(0, 1).unsqueeze(2).contiguous(), self._bounds(problem)  # (N, B, 1, m)
         blocks = [range(s, min(s + CHUNK, self.samples)) for s in range(0, self.samples, CHUNK)]
         for i in range(self.rounds):
             scale = self.decay**i * sigma.sqrt()
-            draws = partial(self._noise, problem, key, scale, stream * self.rounds + i)
+            draws = partial(self._noise, problem, key, scale, i)
             scores = [self.scores(problem, fly(problem, mean, draws(block), bounds)) for block in blocks]
             weights = self._weights(torch.cat(scores, dim=-1)).to(U.dtype)
             new = torch.zeros_like(mean)
@@ -143,16 +140,16 @@ class MPPI:
         return mean.squeeze(2).transpose(0, 1)
 
     def _noise(self, problem: Problem, key: DrawKey, scale: Tensor, stream: int, samples: range) -> Noise:
-        rows = self.knots or problem.N
+        rows = self.noise_knots or problem.N
         z = standard_normal(key, rows * problem.m, samples, scale.dtype, stream).unflatten(0, (rows, problem.m))
         return Noise(z.movedim(1, -1).contiguous(), scale, *self._places(problem))
 
     def _places(self, problem: Problem) -> tuple[Tensor | None, Tensor | None]:
         """The knot of the noise before each stage (N,), and the share of the way to the next; None for white noise."""
-        if self.knots == 0:
+        if self.noise_knots == 0:
             return None, None
-        place = torch.linspace(0, self.knots - 1, problem.N, dtype=problem.x0.dtype, device=problem.x0.device)
-        left = place.floor().clamp(max=self.knots - 2)
+        place = torch.linspace(0, self.noise_knots - 1, problem.N, dtype=problem.x0.dtype, device=problem.x0.device)
+        left = place.floor().clamp(max=self.noise_knots - 2)
         return left.long(), place - left
 
     def _weights(self, S: Tensor) -> Tensor:
@@ -166,10 +163,10 @@ class MPPI:
     def scores(self, problem: Problem, flight: Flight) -> Tensor:
         """S (B, S) in float64 of a block of samples."""
         cost = flight.cost + problem.cost.terminal(flight.x)
-        if self.linger > 0:
-            cost = cost + self.linger * problem.N * problem.cost.stage(flight.x, flight.V[-1], problem.N - 1)
+        if self.dwell_cost > 0:
+            cost = cost + self.dwell_cost * problem.N * problem.cost.stage(flight.x, flight.V[-1], problem.N - 1)
         cost = cost + self.temperature * flight.likelihood
-        S = cost.double() + self.collision_penalty * flight.hits.double()
+        S = cost.double() + COLLISION_PENALTY * flight.hits.double()
         # A sample that left the finite numbers must not take the others with it.
         return torch.where(torch.isfinite(S), S, torch.finfo(S.dtype).max)
 

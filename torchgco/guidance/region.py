@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchgco.constraints.guides import GuideRegion
+from torchgco.penalties import GuideRegion
 
 
 def guide_along(guide: GuideRegion, X_safe: Tensor, caught: Tensor, radius: Tensor) -> GuideRegion:

@@ -103,4 +103,4 @@ def value(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]
 
 def terms_of(lagrangian: Lagrangian) -> Terms:
     """What the Lagrangian adds to the cost, as the library takes it."""
-    return Terms(lagrangian.duals, lagrangian.guide, lagrangian.clip)
+    return Terms(lagrangian.multipliers, lagrangian.penalty, lagrangian.phr)

@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.constraints.guides import Guide, GuidePath, GuideRegion
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
@@ -21,6 +20,7 @@ from torchgco.native.model import trace_dynamics
 from torchgco.native.packing import FLAGS, KINDS, NUMBERS, PATH, QUADRATIC, REGION, Packed, Rows, array, pack_rows
 from torchgco.native.rows import rows_numbers, trace_rows
 from torchgco.native.source import LANES, Form
+from torchgco.penalties import GuidePath, GuideRegion, Penalty
 from torchgco.problem import Problem
 
 MOST = 128  # states and controls: matrices of a stage lie on the stack
@@ -51,9 +51,9 @@ class Options:
 class Terms:
     """What the Lagrangian adds to the cost (see Lagrangian)."""
 
-    duals: Multipliers
-    guide: Guide | None
-    clip: bool
+    multipliers: Multipliers
+    penalty: Penalty | None
+    phr: bool
 
 
 class Engine:
@@ -176,13 +176,13 @@ class Engine:
             return packed
         rows = (Rows * max(1, len(problem.constraints)))()
         ctypes.memmove(rows, fixed[1], ctypes.sizeof(rows))
-        for row, lam in zip(rows, terms.duals.lam, strict=False):
+        for row, lam in zip(rows, terms.multipliers.lam, strict=False):
             keep.append(lam := lam.contiguous())
             row.lam = lam.data_ptr()
-        keep += [rows, mu := terms.duals.mu.contiguous()]
+        keep += [rows, mu := terms.multipliers.mu.contiguous()]
         packed.constraint, packed.mu = ctypes.cast(rows, ctypes.POINTER(Rows)), mu.data_ptr()
-        packed.clip = terms.clip
-        guide = terms.guide
+        packed.phr = terms.phr
+        guide = terms.penalty
         if guide is not None:
             packed.guide = PATH if isinstance(guide, GuidePath) else REGION
             packed.center = array(guide.center, keep, knots=True)

@@ -6,7 +6,7 @@
 static inline V worth(const Lanes *s, int equality, V c, V lam) {
     V half = SET(0.5), mu = s->mu;
     if (equality) return (lam + half * mu * c) * c;
-    if (s->of->clip) {
+    if (s->of->phr) {
         I idle = lam + mu * c < SET(0.0);
         return tgco_choose(idle, -half * lam * lam * s->inverse_mu, (lam + half * mu * c) * c);
     }
@@ -20,10 +20,10 @@ static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
     V mu = s->mu;
     if (p->optimality) { *rho = tgco_if(lam != SET(0.0), mu); return lam; }
     if (equality) { *rho = mu; return lam + mu * c; }
-    I idle = p->clip ? lam + mu * c < SET(0.0) : (c < SET(0.0)) & (lam == SET(0.0));
+    I idle = p->phr ? lam + mu * c < SET(0.0) : (c < SET(0.0)) & (lam == SET(0.0));
     *rho = tgco_if(~idle, mu);
     V g = lam + *rho * c;
-    return p->clip ? tgco_if(~idle, g) : g;
+    return p->phr ? tgco_if(~idle, g) : g;
 }
 
 /* Row j of a box. */

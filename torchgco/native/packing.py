@@ -41,7 +41,7 @@ TENSORS = (
 FLAGS = ("status", "converged", "refused", "lost")
 QUADRATIC = ("Q", "R", "Qf", "x_ref", "xf_ref", "u_ref", "q", "r", "qf", "H")  # in the order of quadratic.c
 COST_ARRAYS = len(QUADRATIC)
-CHOICES = ("guide", "clip", "accept_last", "replicas", "optimality")
+CHOICES = ("guide", "phr", "accept_last", "replicas", "optimality")
 NUMBERS = (
     "tolerance", "absolute_tolerance", "ratio_min", "ratio_max", "smallest", "first", "growth", "most", "damping",
     "rounding", "lost_beyond",

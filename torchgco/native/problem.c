@@ -45,7 +45,7 @@ typedef struct {
     int32_t *status, *converged, *refused, *lost;
     Array parameters, cost_data[COST_ARRAYS];
     const Constraint *constraint;
-    int32_t guide, clip, accept_last, replicas, optimality;
+    int32_t guide, phr, accept_last, replicas, optimality;
     Array center, radius, weight;
     const double *ladder;
     double tolerance, absolute_tolerance, ratio_min, ratio_max, smallest;

@@ -1,4 +1,4 @@
-"""Several plans for every problem of a batch: solved side by side, counted, and put in order."""
+"""Several candidate trajectories for every problem of a batch: solved together, counted, and ordered."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchgco.constraints.guides import Guide
-from torchgco.guidance import scene as seen
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import value
+from torchgco.penalties import Penalty
 from torchgco.problem import Problem
-from torchgco.solvers.descent import descend
-from torchgco.solvers.ilqr import ILQR
+from torchgco.search import scene as seen
+from torchgco.solvers.ilqr import ILQR, descend
 from torchgco.tree import take
 
-AT_ONCE = 256  # plans solved at once: memory stays bounded, however large the batch
+AT_ONCE = 256  # candidates solved at once: memory stays bounded, however large the batch
+PENALTY = 80.0  # of obstacles once nothing attracts a candidate, in q0 / R^4
 
 
 @dataclass(frozen=True)
-class Plans:
-    """Some plans for each of B problems, those of one problem next to each other.
+class Candidates:
+    """Some candidates for each of B problems, those of one problem next to each other.
 
-    Every tensor but `iterations` has a row for each plan.
+    Every tensor but `iterations` has a row for each candidate.
     """
 
     problem: Problem  # of the B problems
@@ -33,74 +33,76 @@ class Plans:
     R: Tensor  # m
     unit: Tensor  # q0 / R^4
     live: Tensor  # bool: the others are left as they are, and come last
-    count: int  # plans of each problem
-    iterations: Tensor  # (B,) int64: of all solves of a problem's plans so far, of plans dropped since, too
+    count: int  # candidates of each problem
+    iterations: Tensor  # (B,) int64: of all solves so far, those of dropped candidates included
 
     @classmethod
-    def begin(cls, problem: Problem, U: Tensor, R: Tensor, unit: Tensor, live: Tensor) -> Plans:
-        """Plans with controls U (B, count, N, m) where `live` (B, count); R and unit (B,)."""
+    def begin(cls, problem: Problem, U: Tensor, R: Tensor, unit: Tensor, live: Tensor) -> Candidates:
+        """Candidates with controls U (B, count, N, m) where `live` (B, count); R and unit (B,)."""
         count = U.shape[1]
         R, unit = (t.repeat_interleave(count) for t in (R, unit))
         X = U.new_zeros(U.shape[0] * count, problem.N + 1, problem.n)
         none = torch.zeros(problem.B, dtype=torch.int64, device=U.device)
         return cls(problem, X, U.flatten(0, 1), R, unit, live.flatten(), count, none)
 
-    def pick(self, order: Tensor) -> Plans:
-        """The plans at the places `order` (B, c) among those of their problem."""
+    def pick(self, order: Tensor) -> Candidates:
+        """The candidates at the places `order` (B, c) among those of their problem."""
         rows = self.rows(order).flatten()
         X, U, R, unit, live = (t[rows] for t in (self.X, self.U, self.R, self.unit, self.live))
-        return Plans(self.problem, X, U, R, unit, live, order.shape[1], self.iterations)
+        return Candidates(self.problem, X, U, R, unit, live, order.shape[1], self.iterations)
 
     def rows(self, order: Tensor) -> Tensor:
-        """Rows (B, c) of the plans at the places `order` (B, c)."""
+        """Rows (B, c) of the candidates at the places `order` (B, c)."""
         return torch.arange(order.shape[0], device=order.device).unsqueeze(-1) * self.count + order
 
     def of(self, rows: Tensor) -> Problem:
-        """The problems of the plans in `rows` (b,)."""
+        """The problems of the candidates in `rows` (b,)."""
         return self.problem.take(rows // self.count)
 
-    def duals(self, rows: Tensor, penalty: float) -> Multipliers:
-        """No multipliers yet, and a penalty in q0 / R^4, of the plans in `rows` (b,)."""
+    def multipliers(self, rows: Tensor, penalty: float) -> Multipliers:
+        """No multipliers yet, and a penalty in q0 / R^4, of the candidates in `rows` (b,)."""
         return replace(Multipliers.zero(self.of(rows), 0.0), mu=penalty * self.unit[rows])
 
     def parts(self) -> Iterator[Tensor]:
-        """Rows of the live plans, some at a time."""
+        """Rows of the live candidates, some at a time."""
         return (rows for rows in self.live.nonzero().flatten().split(AT_ONCE) if rows.numel() > 0)
 
     def arrive(self) -> Tensor:
-        """Whether each plan's path ends close to the goal."""
+        """Whether each candidate ends near the goal."""
         return seen.arrives(self.problem, self.X.view(self.problem.B, self.count, *self.X.shape[1:])).flatten()
 
-    def depth(self) -> Tensor:
-        """How deep each live plan's path reaches into an obstacle, m."""
+    def penetration(self) -> Tensor:
+        """The deepest penetration of each live candidate into an obstacle, m."""
         depth = torch.zeros_like(self.R)
         for rows in self.parts():
-            depth[rows] = seen.depth(self.of(rows), self.X[rows], self.U[rows])
+            depth[rows] = seen.penetration(self.of(rows), self.X[rows], self.U[rows])
         return depth
 
-    def solved(self, inner: ILQR, penalty: float, guide: Guide | None = None, place: Tensor | None = None) -> Plans:
-        """The plans after one inner solve of every live one, with a penalty in q0 / R^4.
+    def solved(
+        self, inner: ILQR, penalty: float, attraction: Penalty | None = None, place: Tensor | None = None
+    ) -> Candidates:
+        """The candidates after one inner solve of every live one, with a penalty of obstacles in q0 / R^4.
 
-        `place` says which of the guide's rows is each plan's.
+        `place` says which row of `attraction` belongs to each candidate.
         """
         X, U, iterations = self.X.clone(), self.U.clone(), self.iterations
         for rows in self.parts():
-            drawn = take(guide, rows if place is None else place[rows])
-            lagrangian = Lagrangian(self.of(rows), self.duals(rows, penalty), drawn, True)
-            end = descend(inner, lagrangian, U[rows])
+            part = take(attraction, rows if place is None else place[rows])
+            lagrangian = Lagrangian(self.of(rows), self.multipliers(rows, penalty), part, True)
+            end, _ = descend(inner, lagrangian, U[rows])
             X[rows], U[rows] = end.X, end.U
             iterations = iterations.index_add(0, rows // self.count, end.iterations)
         return replace(self, X=X, U=U, iterations=iterations)
 
-    def order(self, penalty: float, first: Tensor, alike: float | None = None) -> Tensor:
-        """Each problem's plans as places in their order, (B, count).
+    def order(self, first: Tensor, alike: float | None = None) -> Tensor:
+        """The candidates of each problem as places in their order, (B, count).
 
-        Those in `first` come before the others; then the cost with a penalty in q0 / R^4 decides. Of those in `first`
-        whose costs differ by at most `alike`, as a share, all but the cheapest are put behind.
+        Candidates in `first` come before the others; then the penalised cost decides. Of those in `first` whose costs
+        differ by at most `alike`, as a share, all but the cheapest come after the others.
         """
         merit, first = torch.full_like(self.unit, torch.inf), first & self.live
         for rows in self.parts():
-            lagrangian = Lagrangian(self.of(rows), self.duals(rows, penalty), None, True)
+            lagrangian = Lagrangian(self.of(rows), self.multipliers(rows, PENALTY), None, True)
             merit[rows] = value(lagrangian, self.X[rows], self.U[rows])[1]
         merit, order = merit.nan_to_num(torch.inf).view(-1, self.count).sort(dim=-1, stable=True)
         later = (~first).view(-1, self.count).gather(1, order).to(torch.int8)

@@ -1,6 +1,6 @@
 """The search of the roadmap in PyTorch: the counterpart of native/roadmap.c for every device and precision.
 
-Both return the same ways, also where several cost the same. Ties are broken by the lowest index, and no comparison
+Both return the same paths, also where several cost the same. Ties are broken by the lowest index, and no comparison
 depends on rounding: sums have a fixed order (there is no matrix product), clearance and nearness are compared as
 squares (PyTorch's square roots are not always correctly rounded), and detours and costs that differ by rounding alone
 are equal.
@@ -9,19 +9,19 @@ are equal.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
 
 import torch
 from torch import Tensor
 
 from torchgco.native.roadmap import CLEAR, HOPS, LEAST, MIDWAY, RAYS, SHELLS, TIE, Graph, directions
+from torchgco.search.geometry import squares, squares_from_segments
 
-CLASS = 8  # ways are drawn taut together with those of as many eights of edges
+CLASS = 8  # paths are drawn taut together with those of as many eights of edges
 
 
 @dataclass(frozen=True)
 class Search:
-    """Graphs between spheres and the cheapest ways over them, B problems.
+    """Graphs between spheres and the cheapest paths over them, B problems.
 
     Args:
         o: centres (B, M, d), m.
@@ -56,15 +56,15 @@ class Search:
         return Graph(points, ends, torch.where(joined, self._lengths(points, ends), torch.inf))
 
     def cheapest(self, graph: Graph, price: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The cheapest ways from point 0 to point 1, by relaxing all edges at once.
+        """The cheapest paths from point 0 to point 1, by relaxing all edges at once.
 
         Args:
             price: of a metre at the points, (B, V).
 
         Returns:
-            Corners (B, HOPS+1, d), the goal repeated at their ends: the straight line where there is no way of at most
+            Corners (B, HOPS+1, d), the goal repeated at their ends: the straight line where there is no path of at most
             HOPS edges; start, goal, and then the middles of the edges and the other corners in turn,
-            (B, 2 HOPS + 1, d); whether there is a way (B,).
+            (B, 2 HOPS + 1, d); whether there is a path (B,).
         """
         points, ends, lengths = graph
         edges = lengths * 0.5 * (price.unsqueeze(-1) + _rows(price, ends))
@@ -87,34 +87,34 @@ class Search:
         arrives = torch.isfinite(cost[:, 0]) & (stops[-1][:, 0] == 1)
         straight = torch.ones_like(stops[0]).expand(-1, HOPS + 1).clone()
         straight[:, 0] = 0
-        way = _rows(points, torch.where(arrives.unsqueeze(-1), torch.cat(stops, dim=1), straight))
-        between = torch.stack((0.5 * (way[:, :-1] + way[:, 1:]), way[:, 1:]), dim=2).flatten(1, 2)
-        return way, torch.cat((way[:, :1], way[:, -1:], between[:, :-1]), dim=1), arrives
+        path = _rows(points, torch.where(arrives.unsqueeze(-1), torch.cat(stops, dim=1), straight))
+        between = torch.stack((0.5 * (path[:, :-1] + path[:, 1:]), path[:, 1:]), dim=2).flatten(1, 2)
+        return path, torch.cat((path[:, :1], path[:, -1:], between[:, :-1]), dim=1), arrives
 
-    def taut(self, way: Tensor, string: Tensor, price: Tensor) -> Tensor:
-        """The same once more over a way's own corners and what lies between them, all joined: a taut string.
+    def taut(self, path: Tensor, string: Tensor, price: Tensor) -> Tensor:
+        """The same once more over a path's own corners and what lies between them, all joined: a taut string.
 
         Args:
-            way: corners (B, HOPS+1, d).
+            path: corners (B, HOPS+1, d).
             string: the points that `cheapest` returned with it, (B, 2 HOPS + 1, d).
             price: of a metre there, (B, 2 HOPS + 1).
         """
-        # All corners are joined to all: ways of few corners aren't to pay for the rare ones of many.
-        edges = (way != way[:, -1:]).any(-1).sum(-1)
-        taut = way.clone()
+        # All corners are joined to all: paths of few corners aren't to pay for the rare ones of many.
+        edges = (path != path[:, -1:]).any(-1).sum(-1)
+        taut = path.clone()
         for most in range(CLASS, HOPS + 1, CLASS):
             part = ((edges > most - CLASS) & (edges <= most)).nonzero().flatten()
             if part.numel() > 0:
                 search, points = Search(self.o[part], self.R[part], self.margin), string[part, : 2 * most + 1]
-                everyone = torch.arange(2 * most + 1, device=way.device).expand(*points.shape[:2], -1)
+                everyone = torch.arange(2 * most + 1, device=path.device).expand(*points.shape[:2], -1)
                 graph = Graph(points, everyone, search._lengths(points, everyone))
                 shorter, _, arrives = search.cheapest(graph, price[part, : 2 * most + 1])
-                taut[part] = torch.where(arrives.view(-1, 1, 1), shorter, way[part])
+                taut[part] = torch.where(arrives.view(-1, 1, 1), shorter, path[part])
         return taut
 
-    def raised(self, price: Tensor, points: Tensor, way: Tensor, factor: float) -> Tensor:
-        """Prices (B, V) times a factor at points that are nearer to a way than the largest radius."""
-        apart = squares_from_segments(points, way[:, :-1], way[:, 1:]).amin(1)
+    def raised(self, price: Tensor, points: Tensor, path: Tensor, factor: float) -> Tensor:
+        """Prices (B, V) times a factor at points that are nearer to a path than the largest radius."""
+        apart = squares_from_segments(points, path[:, :-1], path[:, 1:]).amin(1)
         return torch.where(apart < _signed_square(self.R.amax(-1, keepdim=True)), factor * price, price)
 
     def _spread(self, start: Tensor, goal: Tensor, cube: Tensor) -> Tensor:
@@ -167,31 +167,11 @@ class Search:
         free = (away > _signed_square(self.R).unsqueeze(1)).all(-1).view(ends.shape)
         gap = away.sqrt_().sub_(self.R.unsqueeze(1)).amin(-1).view(ends.shape)
         length = (b - a).square().sum(-1).sqrt().view(ends.shape)
-        # No edge is free of charge: ways would turn in circles among points that coincide.
+        # No edge is free of charge: paths would turn in circles among points that coincide.
         length = length + LEAST * (points[:, 1] - points[:, 0]).square().sum(-1).sqrt().view(-1, 1, 1)
         margin = self.margin * self.R.amax(-1).clamp(min=1e-9).view(-1, 1, 1)
         close = 1.0 + ((margin - gap) / margin).clamp(0.0, 1.0)
         return torch.where(free, length * close, torch.inf)
-
-
-def segment_gaps(a: Tensor, b: Tensor, centers: Tensor, distances: Tensor) -> Tensor:
-    """Smallest distance (B, E) of the segments a to b (B, E, d) from spheres of radius `distances` (B, M)."""
-    return squares_from_segments(centers, a, b).sqrt_().sub_(distances.unsqueeze(1)).amin(-1)
-
-
-def squares_from_segments(points: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Squared distances (B, E, V) of points (B, V, d) from segments a to b (B, E, d)."""
-    along = b - a
-    inverse = 1.0 / along.square().sum(-1, keepdim=True).clamp(min=1e-12)
-    # Coordinate by coordinate and in place: these are the largest arrays of the search.
-    axes = [(along[..., i, None], points[:, None, :, i] - a[..., i, None]) for i in range(a.shape[-1])]
-    share = reduce(torch.add, (toward * step for step, toward in axes)).mul_(inverse).clamp_(0.0, 1.0)
-    return reduce(torch.add, (toward.sub_(share * step).square_() for step, toward in axes))
-
-
-def squares(a: Tensor, b: Tensor) -> Tensor:
-    """|a_i - b_j|^2 (B, V, W)."""
-    return (a.unsqueeze(2) - b.unsqueeze(1)).square_().sum(-1)
 
 
 def _lowest(values: Tensor, count: int) -> Tensor:

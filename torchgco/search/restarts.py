@@ -1,120 +1,183 @@
-"""Other paths in place of the iterate: taken from guidance, and tried again from where the first one was caught."""
+"""The default solver: AL-iLQR with restarts, from paths of several homotopy classes and from samples.
+
+1. The solver works on every problem until its trajectory is caught between obstacles, or its solve ends.
+2. Where it is caught, `paths` proposes a trajectory along the best of several paths, and the solver continues from it.
+3. Without a path, or where that attempt doesn't arrive, further attempts start from the caught trajectory, guided by
+   samples.
+4. Where no attempt arrives but the best one ends close to the goal, a last attempt attracts its end to the goal.
+
+The best trajectory of all attempts is returned: one that arrives before one that is feasible, then the cheapest.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchgco.constraints.guides import GuideRegion
-from torchgco.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import cost_unit, open_loop, value
+from torchgco.draws import DrawKey
+from torchgco.errors import GuidanceWarning, InputError
+from torchgco.evaluation import GOAL_TOLERANCE
+from torchgco.guidance.detection import caught_knots
+from torchgco.guidance.gco import GCO
+from torchgco.guidance.suitability import suited_sampler
+from torchgco.native.dispatch import cost_unit
+from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem
+from torchgco.search.best import Best
+from torchgco.search.paths import PathProposals
+from torchgco.search.suitability import suited_paths
 from torchgco.solution import Solution
-from torchgco.solvers.state import Advice, Iterate, OuterLoop, State
-from torchgco.status import Status
-from torchgco.tree import copied, put, take
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
+from torchgco.solvers.contracts import Advice, Call, Solver
+from torchgco.solvers.state import STOPPED, Iterate, SolveEnd
+from torchgco.solvers.trace import Recorder
+from torchgco.solvers.verdict import finished
+from torchgco.tree import take
 
-CLOSE = 2.0  # times the distance that counts as having arrived: paths that end nearer are drawn to the goal at last
-WITHIN = 0.95  # share of that distance to which they are drawn
+CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal in a last attempt
+WITHIN = 0.95  # share of the goal tolerance to which they are attracted
+SEED_STEP = 1_000_003  # between the seeds of two attempts
 STIFF = 1e3  # weight of that, in units of cost per radius^4
 
 
-def has_arrived(problem: Problem, path: Iterate | Solution, share: float, limit: float) -> Tensor:
-    """Whether a feasible path has come to the goal (B,): within `share` of the distance from the start."""
-    goal, at = problem.cost.goal(problem.x0), problem.dynamics.position
-    if goal is None or at is None:
-        return torch.zeros_like(path.violation, dtype=torch.bool)
-    last, first = ((x - goal)[:, at].square().sum(-1).sqrt() for x in (path.X[:, -1], problem.x0))
-    return (path.violation <= limit) & (last <= share * first)
+@dataclass(frozen=True)
+class Restarts(Solver):
+    """AL-iLQR, and where it is caught between obstacles, further attempts; the best trajectory is returned.
 
+    Args:
+        local: solves every attempt; it brings no guidance of its own.
+        paths: proposals along paths between static obstacles, for the first attempt after a trajectory is caught; None:
+            without them.
+        sampling: guidance of the other attempts; its `single_contact_after` also says when a trajectory counts as
+            caught. None: without them.
+        attempts: per problem, after its trajectory is caught.
+        all_attempts: make them all even if one arrives, and return the cheapest.
 
-def try_again(s: State, rows: Tensor, problem: Problem, duals: Multipliers, status: Tensor, solver: OuterLoop) -> None:
-    """Another attempt for elements that have ended one and haven't arrived (in place).
-
-    Further plans are tried from the caught path. Where none is left, and the best path ends close to the goal, the last
-    attempt goes on from there with the end drawn to the goal. A path that was never caught is left as it is.
+    Raises:
+        InputError: a field out of its range.
     """
-    ended = status[rows] != Status.RUNNING
-    tried, best = s.attempt[rows], take(s.best, rows)
-    missing = torch.ones_like(ended)
-    if solver.arrival is not None:
-        missing = ~has_arrived(problem, best, solver.arrival, solver.violation_tolerance)
-    left = (tried > 0) & (tried < solver.attempts) & (missing | solver.thorough)
-    _start(s, rows, duals, status, ended & left, take(s.origin, rows))
-    if solver.arrival is None or not isinstance(s.guide, GuideRegion):
-        return
-    near = has_arrived(problem, best, CLOSE * solver.arrival, solver.violation_tolerance)
-    last = ended & ~left & missing & near & (tried > 0) & (tried <= solver.attempts)
-    if not bool(last.any()):
-        return
-    place = _start(s, rows, duals, status, last, best)
-    s.attempt[place] = solver.attempts + 1
-    s.led[place] = True
-    part = problem.take(last.nonzero().flatten())
-    put(s.guide, place, _goal_region(part, take(s.guide, place), solver.arrival))
+
+    local: AugmentedLagrangian = AugmentedLagrangian()
+    paths: PathProposals | None = PathProposals()
+    sampling: GCO | None = GCO()
+    attempts: int = 4
+    all_attempts: bool = False
+
+    def __post_init__(self) -> None:
+        if self.attempts < 1:
+            raise InputError("solver.attempts", "at least 1", self.attempts)
+        if self.local.guidance is not None:
+            raise InputError("solver.local.guidance", "null: attempts are guided by `sampling`", self.local.guidance)
+
+    def in_slots(self, slots: int) -> Restarts:
+        """The same solver with at most `slots` problems at a time."""
+        return replace(self, local=self.local.in_slots(slots))
+
+    def run(self, call: Call) -> Solution:
+        """Solve a checked call."""
+        solver = self.local
+        scaled, unit = solver.inner.in_units(call)
+        recorder = Recorder() if solver.record else None
+        paths, sampling = self._suited(scaled.problem)
+        if paths is None and sampling is None:
+            end = solver.iterate(scaled, recorder=recorder)
+        else:
+            after = None if self.sampling is None else self.sampling.single_contact_after
+            caught = solver.iterate(scaled, StopWhenCaught(after), recorder=recorder)
+            end = self._restarted(scaled, caught, paths, sampling, recorder)
+        phr = not solver.inner.as_printed
+        return finished(call, scaled, unit, end, phr, solver.violation_tolerance, solver.slots, recorder)
+
+    def _suited(self, problem: Problem) -> tuple[PathProposals | None, GCO | None]:
+        """The parts that can serve these problems; a GuidanceWarning names the others."""
+        if not problem.geometric:
+            return None, None
+        sampler, unsampled = suited_sampler(None if self.sampling is None else self.sampling.sampler, problem)
+        paths, unsought = suited_paths(self.paths, problem)
+        sampling = None if sampler is None or self.sampling is None else replace(self.sampling, sampler=sampler)
+        lost = list(dict.fromkeys(why for why in (unsampled, unsought) if why is not None))
+        if lost:
+            effect = "solved without guidance" if sampling is None and paths is None else "guided in part"
+            warnings.warn(f"{effect}: {'; '.join(lost)}", GuidanceWarning, stacklevel=5)
+        return paths, sampling
+
+    def _restarted(
+        self,
+        call: Call,
+        caught: SolveEnd,
+        paths: PathProposals | None,
+        sampling: GCO | None,
+        recorder: Recorder | None,
+    ) -> SolveEnd:
+        """The best of the solves so far and of all attempts, for the problems that were stopped."""
+        best = Best(call, caught, self.local, recorder)
+        stopped = caught.status == STOPPED
+        for attempt in range(1, self.attempts + 1):
+            wanted = (stopped if self.all_attempts else stopped & ~best.arrived()).nonzero().flatten()
+            if attempt == 1 and paths is not None:
+                wanted = wanted[~self._along_paths(best, wanted, paths)]
+            if sampling is not None:
+                # The draws of an attempt are those of a seed of its own.
+                seed = SEED_STEP * (attempt - 1) + call.seed
+                again = replace(call.take(wanted), **_from(take(caught.last, wanted)), seed=seed)
+                best.improve(wanted, again, guidance=sampling)
+        self._into_the_goal(best, (stopped & ~best.arrived() & best.arrived(CLOSE)).nonzero().flatten())
+        return best.end
+
+    def _along_paths(self, best: Best, rows: Tensor, paths: PathProposals) -> Tensor:
+        """An attempt along the proposed path of each problem in `rows`; where there is one (b,)."""
+        if rows.numel() == 0:
+            return torch.zeros_like(rows, dtype=torch.bool)
+        proposal = paths.propose(best.call.problem.take(rows))
+        best.end.iterations[rows] += proposal.iterations
+        found = proposal.found.nonzero().flatten()
+        chosen = rows[found]
+        given, before = take(proposal.multipliers, found), best.first.last.multipliers.mu[chosen]
+        warm = replace(given, mu=torch.maximum(given.mu, before))
+        best.end.guided[chosen] += 1
+        best.improve(chosen, replace(best.call.take(chosen), U0=proposal.U[found], warm=warm))
+        return proposal.found
+
+    def _into_the_goal(self, best: Best, rows: Tensor) -> None:
+        """A last attempt from the best trajectories of `rows`, their ends attracted to the goal."""
+        if rows.numel() > 0:
+            call = replace(best.call.take(rows), **_from(take(best.end.best, rows)))
+            best.improve(rows, call, penalty=_goal_region(call.problem))
 
 
-def _start(s: State, rows: Tensor, duals: Multipliers, status: Tensor, chosen: Tensor, path: Iterate) -> Tensor:
-    """Begin an attempt of the elements `chosen` (B',) of `rows` from a path each; returns where they are."""
-    again = chosen.nonzero().flatten()
-    place = rows[again]
-    if again.numel() > 0:
-        begin = take(path, again)
-        s.X, s.U = s.X.clone(), s.U.clone()
-        s.X[place], s.U[place] = begin.X, begin.U
-        put(duals, again, begin.duals)
-        s.attempt[place] += 1
-        s.since[place] = s.outer[place]
-        s.led[place] = False
-        s.last_cost[place] = torch.inf
-        status[place] = Status.RUNNING
-    return place
+class StopWhenCaught:
+    """Guidance that ends the solve of a problem whose trajectory is caught between obstacles."""
+
+    def __init__(self, single_contact_after: int | None) -> None:
+        self.single_contact_after = single_contact_after
+
+    def suited(self, problem: Problem) -> StopWhenCaught:
+        """Itself: any problem will do."""
+        return self
+
+    def start(self, problem: Problem, X: Tensor) -> None:
+        """No penalty."""
+
+    def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
+        """Stop where a knot is caught."""
+        return Advice(None, stop=caught_knots(problem, X, U, key.outer, self.single_contact_after).any(-1))
 
 
-def _goal_region(problem: Problem, guide: GuideRegion, arrival: float) -> GuideRegion:
-    """A ball around the goal for the last knot, a little smaller than what counts as having arrived."""
-    goal, at = problem.cost.goal(problem.x0), guide.position
+def _from(start: Iterate) -> dict[str, Any]:
+    """The arguments of a call that continues from trajectories."""
+    return {"U0": start.U, "warm": start.multipliers}
+
+
+def _goal_region(problem: Problem) -> GuideRegion:
+    """A ball around the goal for the last knot, slightly smaller than the goal tolerance."""
+    goal, at = problem.cost.goal(problem.x0), problem.position
     assert goal is not None
-    size = WITHIN * arrival * (problem.x0 - goal)[:, at].square().sum(-1).sqrt()
-    radius = torch.full_like(guide.radius, torch.inf)
+    size = WITHIN * GOAL_TOLERANCE * (problem.x0 - goal)[:, at].square().sum(-1).sqrt()
+    radius = problem.x0.new_full((problem.B, problem.N + 1), torch.inf)
     radius[:, -1] = size
-    center = goal[:, None, at].expand_as(guide.center)
-    return replace(guide, center=center, radius=radius, weight=STIFF * cost_unit(problem) / size.pow(4))
-
-
-def go_on_from(
-    s: State, rows: Tensor, problem: Problem, advice: Advice, duals: Multipliers, solver: OuterLoop
-) -> Multipliers:
-    """Put the advised controls in place of the iterate where they are taken, and return multipliers for it.
-
-    The old ones belong to the path that is left: they start again at zero. The penalty must keep the solver from
-    falling back, so it is raised to what was advised, or until the path that is left costs more than the one taken.
-    """
-    taken = advice.taken.nonzero().flatten()
-    if taken.numel() == 0:
-        return duals
-    part, place = problem.take(taken), rows[taken]
-    old_X, old_U = s.X[place], s.U[place]
-    first = (s.attempt[place] == 0).nonzero().flatten()
-    left = Iterate(old_X, old_U, take(duals, taken), s.cost[place], s.best.violation[place])
-    put(s.origin, place[first], take(left, first))
-    s.attempt[place[first]] = 1
-    U = advice.U[taken]
-    X = open_loop(part, U)
-    fresh = Multipliers(tuple(torch.zeros_like(lam[taken]) for lam in duals.lam), torch.ones_like(duals.mu[taken]))
-    cost, merit = value(Lagrangian(part, fresh, None, True), old_X, old_U)
-    gain = (part.cost.total(X, U) - cost).clamp(min=0.0) / (merit - cost).clamp(min=1e-12)
-    keeping = solver.hold_factor * gain
-    if advice.duals is not None:
-        given = take(advice.duals, taken)
-        s.led[place] = ~torch.isnan(given.mu)
-        keeping = torch.where(s.led[place], given.mu, keeping)
-        fresh = replace(fresh, lam=given.lam)  # zero where the penalty is the solver's own
-    mu = torch.maximum(duals.mu[taken], keeping).clamp(max=solver.penalty_max)
-    held = copied(duals)
-    put(held, taken, replace(fresh, mu=mu))
-    s.X, s.U = s.X.clone(), s.U.clone()
-    s.X[place], s.U[place] = X, U
-    return held
+    center = goal[:, None, at].expand(-1, problem.N + 1, -1).contiguous()
+    return GuideRegion(center, radius, STIFF * cost_unit(problem) / size.pow(4), at)

@@ -1,4 +1,4 @@
-"""What the geometric proposal sees of a problem: where it begins and ends, the spheres between, and their scales."""
+"""A problem as the search sees it: start, goal, the spheres between, and their scales."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from torch import Tensor
 
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.errors import InputError
-from torchgco.guidance.roadmap import FAR, Scene
-from torchgco.guidance.search import segment_gaps
 from torchgco.problem import Problem
+from torchgco.search.geometry import FAR, Scene, segment_gaps
 
 OPEN = 1e10  # a range of controls that is no range
-THERE = 0.25  # share of the distance from start to goal; a path that ends farther from it has fallen back
+FALLEN_BACK = 0.25  # share of the distance from start to goal; a candidate that ends farther away isn't one
 
 
 def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
@@ -25,13 +23,13 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     goal = problem.cost.goal(problem.x0)
     if sum(c.distances.shape[1] for c in spheres) == 0 or len(spheres) < len(problem.geometric) or goal is None:
         return None
-    at = position(problem)
+    at = problem.position
     if at.stop - at.start not in (2, 3):
         return None
 
     first = _resting_cost(problem, rest, problem.x0[:, None, at]).clamp(min=1e-12)
 
-    def toll(points: Tensor, rows: slice) -> Tensor:
+    def traversal_cost(points: Tensor, rows: slice) -> Tensor:
         price = _resting_cost(problem, rest, points, rows)
         return price.clamp(min=0.0) / first[rows] + 0.1
 
@@ -39,48 +37,36 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
         problem.x0[:, at], goal[:, at],
         torch.cat([c.centers for c in spheres], dim=1),
         torch.cat([torch.where(c.absent, FAR, c.distances) for c in spheres], dim=1),
-        toll,
+        traversal_cost,
     )  # fmt: skip
 
 
 def scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor]:
     """R and q0 / R^4 (B,), the units of lengths and penalties."""
-    here = scene.distances > 0
-    R = torch.where(here, scene.distances, 0.0).sum(-1) / here.sum(-1).clamp(min=1)
+    here = scene.inflated_radii > 0
+    R = torch.where(here, scene.inflated_radii, 0.0).sum(-1) / here.sum(-1).clamp(min=1)
     return R, _resting_cost(problem, rest, scene.start.unsqueeze(1))[:, 0] / R.pow(4)
 
 
-def position(problem: Problem) -> slice:
-    """Where the position stands in the state.
-
-    Raises:
-        InputError: dynamics without one.
-    """
-    where = problem.dynamics.position
-    if where is None:
-        raise InputError("guidance", "dynamics with a position", type(problem.dynamics).__name__)
-    return where
-
-
 def arrives(problem: Problem, X: Tensor) -> Tensor:
-    """Whether paths X (B, ..., N+1, n) end close to the goal, (B, ...)."""
-    goal, at = problem.cost.goal(problem.x0), position(problem)
+    """Whether candidates X (B, ..., N+1, n) end near the goal, (B, ...): in a looser sense than that of a solution."""
+    goal, at = problem.cost.goal(problem.x0), problem.position
     assert goal is not None
     first = (problem.x0 - goal)[:, at].square().sum(-1)
     shape = (-1, *([1] * (X.dim() - 3)))
     last = (X[..., -1, at] - goal[:, at].view(*shape, at.stop - at.start)).square().sum(-1)
-    return last <= THERE**2 * first.view(shape)
+    return last <= FALLEN_BACK**2 * first.view(shape)
 
 
-def depth(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """How deep a path reaches into an obstacle, (B,), m."""
+def penetration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The deepest penetration of a trajectory into an obstacle at the knots, (B,), m."""
     rows = [c.worst(X, U) for c in problem.geometric]
     return torch.stack(rows).amax(0)
 
 
-def depth_between(problem: Problem, X: Tensor) -> Tensor:
-    """How deep the straight segments between the knots of paths X (B, N+1, n) reach into a sphere, (B,), m."""
-    p = X[..., position(problem)]
+def chord_penetration(problem: Problem, X: Tensor) -> Tensor:
+    """The deepest penetration of the segments between the knots of X (B, N+1, n) into a sphere, (B,), m."""
+    p = X[..., problem.position]
     spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres) and c.distances.shape[1] > 0]
     gaps = [
         segment_gaps(p[:, :-1], p[:, 1:], c.centers, torch.where(c.absent, FAR, c.distances)).amin(-1) for c in spheres
@@ -104,6 +90,6 @@ def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:
 def _resting_cost(problem: Problem, rest: Tensor, points: Tensor, rows: slice = slice(None)) -> Tensor:
     """Stage cost (B', V) of resting at points (B', V, d) of some problems."""
     x = problem.x0[rows].unsqueeze(1).repeat(1, points.shape[1], 1)
-    x[..., position(problem)] = points
+    x[..., problem.position] = points
     u = rest[rows, :1].expand(-1, points.shape[1], -1)
     return problem.cost.take(rows).stage(x, u, 0)

@@ -1,50 +1,53 @@
-"""Augmented Lagrangian around a local solver, with a place for guidance (Algorithms 1 and 4)."""
+"""Augmented Lagrangian around iLQR, with a place for guidance (Algorithms 1 and 4)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from torchgco.draws import DrawKey
 from torchgco.errors import InputError
-from torchgco.lagrangian import Multipliers
+from torchgco.evaluation import is_better, violation
+from torchgco.lagrangian import Lagrangian, Multipliers, update
+from torchgco.native.dispatch import open_loop, value
+from torchgco.penalties import Penalty
 from torchgco.problem import Problem
 from torchgco.solution import Solution
-from torchgco.solvers.batch import Loop
-from torchgco.solvers.ilqr import ILQR
-from torchgco.solvers.polish import Polish
-from torchgco.solvers.state import Callback, Guidance, InnerEnd
+from torchgco.solvers.contracts import Advice, Call, Guidance, Progress, Solver
+from torchgco.solvers.ilqr import ILQR, advance
+from torchgco.solvers.scheduler import run_all
+from torchgco.solvers.state import STOPPED, Iterate, PassEnd, SolveEnd, State
+from torchgco.solvers.trace import Recorder
+from torchgco.solvers.verdict import finished, start_status
 from torchgco.status import Status
+from torchgco.tree import copied, put, take
+
+PENALTY_MAX = 1e12  # ceiling of mu
+SETTLED = 1e-3  # share of J_var: a solve ends where an inner solve changed it by less, and is feasible
+HOLD = 2.0  # the penalty on an abandoned trajectory, as a multiple of the extra cost of its replacement
 
 
 @dataclass(frozen=True)
-class AugmentedLagrangian:
-    """AL-iLQR; with `guidance`, the paper's GCO or whatever else speaks its protocol.
+class AugmentedLagrangian(Solver):
+    """AL-iLQR, for each problem: inner solve, multiplier update, penalty update, guidance, until it has converged.
+
+    With `inner.as_printed` the loop is that of the paper: mu grows after every inner solve, inequalities have the
+    printed form (see `lagrangian.penalty_weights`), and max_outer_iterations is the only end. Otherwise mu grows while
+    the violation is over its tolerance, inequalities have the Powell-Hestenes-Rockafellar form, and a solve ends where
+    an inner solve has converged to a feasible trajectory that changes the cost by less than 0.1 %.
 
     Args:
         inner: the local solver.
-        guidance: asked after every inner solve where the next one should be drawn to; None for none.
-        initial_penalty, penalty_growth, penalty_max: mu, its factor eta per outer iteration, and its ceiling.
-        grow_when_feasible: mu grows after every inner solve (as printed), or only while the violation is over its
-            tolerance, which spares feasible iterates a stiffer problem.
-        max_outer_iterations: outer limit; the paper's only end.
-        violation_tolerance: what counts as feasible (metres for lengths), for the status and the best iterate.
-        cost_tolerance: end early once an inner solve converged, its violation is under the tolerance and J_var
-            changed by less than this share since the one before. None: never, as in the paper.
-        hold_factor: where guidance puts another path in place of the iterate, the penalty is raised until the path that
-            is left costs at least this times what the new one costs more (not in the paper).
-        attempts: where guidance puts another path in place of the iterate, so many are tried from the same caught path,
-            each to its end, and the best is kept; max_outer_iterations then counts for each (not in the paper).
-        arrival: a feasible iterate has arrived where it ends within this share of the distance from start to goal. One
-            that has is worth more than one that hasn't, whatever they cost, and ends the attempts. Where all attempts
-            are made and the best path ends within twice that distance, a last one draws its end to the goal (guided
-            problems alone). None: cost alone decides, as in the paper.
-        thorough: all attempts are made, even after one has arrived; the cheapest path is kept.
-        clip: inequalities push but never pull (`lagrangian.penalty_weights`); False as printed.
-        slots: problems worked on at once; the others wait until a slot falls free. None: all. No result depends on it.
-        polish: a last stage of Newton steps on what was found, elements one by one; None for none, as in the paper.
-        record: keep the history of every element in `solution.trace`.
+        guidance: called after every inner solve for a penalty on the next one, or for controls that replace the
+            iterate; None for none.
+        initial_penalty, penalty_growth: mu and its factor eta per outer iteration; mu in units of the cost with
+            `inner.as_printed`, else of `Problem.cost_unit`.
+        max_outer_iterations: outer limit; the only end of the paper's loop.
+        violation_tolerance: violation (metres for lengths) up to which a trajectory counts as feasible.
+        slots: problems that run at the same time; the others wait for a free slot. None: all. No result depends on it.
+        record: keep the history of every problem in `solution.trace`.
 
     Raises:
         InputError: a field out of its range.
@@ -54,77 +57,200 @@ class AugmentedLagrangian:
     guidance: Guidance | None = None
     initial_penalty: float = 20.0
     penalty_growth: float = 2.2
-    penalty_max: float = 1e12
-    grow_when_feasible: bool = True
     max_outer_iterations: int = 10
     violation_tolerance: float = 1e-3
-    cost_tolerance: float | None = None
-    hold_factor: float = 10.0
-    attempts: int = 1
-    arrival: float | None = None
-    thorough: bool = False
-    clip: bool = False
     slots: int | None = None
-    polish: Polish | None = None
     record: bool = False
 
     def __post_init__(self) -> None:
-        if not self.initial_penalty > 0:
-            raise InputError("solver.initial_penalty", "above 0", self.initial_penalty)
+        if not 0 < self.initial_penalty <= PENALTY_MAX:
+            raise InputError("solver.initial_penalty", f"above 0, at most {PENALTY_MAX:g}", self.initial_penalty)
         if not self.penalty_growth >= 1:
             raise InputError("solver.penalty_growth", "at least 1", self.penalty_growth)
-        if not self.penalty_max >= self.initial_penalty:
-            raise InputError("solver.penalty_max", "at least initial_penalty", self.penalty_max)
         if self.max_outer_iterations < 1:
             raise InputError("solver.max_outer_iterations", "at least 1", self.max_outer_iterations)
         if not self.violation_tolerance > 0:
             raise InputError("solver.violation_tolerance", "above 0", self.violation_tolerance)
-        if self.attempts < 1:
-            raise InputError("solver.attempts", "at least 1", self.attempts)
-        if self.arrival is not None and not 0 < self.arrival < 1:
-            raise InputError("solver.arrival", "between 0 and 1, or null", self.arrival)
         if self.slots is not None and self.slots < 1:
             raise InputError("solver.slots", "at least 1, or null", self.slots)
-        if not self.hold_factor >= 1:
-            raise InputError("solver.hold_factor", "at least 1", self.hold_factor)
-        if self.cost_tolerance is not None and not self.cost_tolerance > 0:
-            raise InputError("solver.cost_tolerance", "above 0, or null", self.cost_tolerance)
 
-    def solve(
+    def in_slots(self, slots: int) -> AugmentedLagrangian:
+        """The same solver with at most `slots` problems at a time."""
+        return replace(self, slots=slots)
+
+    def run(self, call: Call) -> Solution:
+        """Solve a checked call."""
+        scaled, unit = self.inner.in_units(call)
+        recorder = Recorder() if self.record else None
+        guidance = None if self.guidance is None else self.guidance.suited(scaled.problem)
+        end = self.iterate(scaled, guidance, recorder=recorder)
+        phr = not self.inner.as_printed
+        return finished(call, scaled, unit, end, phr, self.violation_tolerance, self.slots, recorder)
+
+    def iterate(
         self,
-        problem: Problem,
-        U0: Tensor,
-        seed: int = 0,
-        ids: Tensor | None = None,
-        warm: Multipliers | None = None,
-        callback: Callback | None = None,
-    ) -> Solution:
-        """Solve every problem of the batch.
+        call: Call,
+        guidance: Guidance | None = None,
+        penalty: Penalty | None = None,
+        recorder: Recorder | None = None,
+    ) -> SolveEnd:
+        """The solve without its verdict, in the units of the call: with guidance, or with a fixed penalty."""
+        loop = OuterLoop(self, call, guidance, penalty, recorder)
+        B = call.problem.B
+        every = torch.arange(B, device=call.rows.device)
+        run_all(loop, every, max(1, B if self.slots is None else self.slots), loop.report)
+        return loop.result
 
-        Args:
-            problem: B problems.
-            U0: initial controls (B, N, m).
-            seed, ids: key the random draws; an element's result depends on (seed, id), not on its place. ids is
-                int64 (B,), 0..B-1 unless given.
-            warm: multipliers and penalties to start from, as a former solution's `multipliers`.
-            callback: told of the progress after every pass.
 
-        Raises:
-            InputError: U0, ids or warm don't fit the problem, or it isn't float64 and is to be polished.
-        """
-        if self.polish is not None:
-            self.polish.check(problem)
-        solution = Loop(self, problem, U0, seed, ids, warm, callback).run()
-        return solution if self.polish is None else self.polish.refine(problem, solution)
+class OuterLoop:
+    """The outer loops of one call (Algorithm 4), as the scheduler takes them."""
 
-    def verdict(self, inner: InnerEnd) -> Tensor:
-        """Why an element ends: its outer limit, or the early test (CONVERGED); else RUNNING."""
-        status = torch.full_like(inner.outer, Status.RUNNING)
-        over = inner.outer >= self.max_outer_iterations
-        status[over & inner.refused] = Status.LINE_SEARCH_FAILED
-        status[over & ~inner.refused] = Status.MAX_ITERATIONS
-        if self.cost_tolerance is not None:
-            settled = (inner.cost - inner.last_cost).abs() <= self.cost_tolerance * inner.cost.abs()
-            done = inner.converged & settled & (inner.violation <= self.violation_tolerance)
-            status[done] = Status.CONVERGED
+    def __init__(
+        self,
+        solver: AugmentedLagrangian,
+        call: Call,
+        guidance: Guidance | None,
+        penalty: Penalty | None,
+        recorder: Recorder | None,
+    ) -> None:
+        self.solver, self.call, self.guidance, self.penalty, self.recorder = solver, call, guidance, penalty, recorder
+        self.phr = not solver.inner.as_printed
+        self.result = SolveEnd.blank(call.problem, call.U0)
+        self.stopped = 0  # problems that guidance has stopped
+        self.limit = 1 if recorder is not None else solver.inner.max_iterations
+
+    def begin(self, rows: Tensor) -> tuple[State, Tensor]:
+        """Rollouts of the initial controls of the problems `rows`, and the statuses of starts that are no starts."""
+        problem, U = self.call.problem.take(rows), self.call.U0[rows]
+        X = open_loop(problem, U)
+        if self.call.warm is None:
+            multipliers = Multipliers.zero(problem, self.solver.initial_penalty)
+        else:
+            multipliers = take(self.call.warm, rows)
+        penalty = take(self.penalty, rows) if self.guidance is None else self.guidance.start(problem, X)
+        cost, merit = value(Lagrangian(problem, multipliers, penalty, self.phr), X, U)
+        none, worst = torch.zeros_like(rows), torch.full_like(cost, torch.inf)
+        state = State(
+            rows=rows.clone(),
+            X=X, U=U, cost=cost, merit=merit.clone(), multipliers=multipliers, penalty=penalty,
+            regularisation=torch.zeros_like(cost),
+            inner=none, outer=none.clone(), iterations=none.clone(), rung=none.clone(), guided=none.clone(),
+            last_cost=worst.clone(),
+            best=copied(Iterate(X, U, multipliers, cost, worst)),
+        )  # fmt: skip
+        return state, start_status(problem, X, merit, problem.start_is_clear)
+
+    def regroup(self, rows: Tensor) -> None:
+        """From now on the running problems are these."""
+        whole = self.call.problem
+        self.problem = whole if rows.numel() == whole.B else whole.take(rows)
+
+    def advance(self, s: State) -> Tensor:
+        """One inner solve of every running problem (one iteration on a GPU), and the outer update where it ended."""
+        lagrangian = Lagrangian(self.problem, s.multipliers, s.penalty, self.phr)
+        end = advance(self.solver.inner, s, lagrangian, self.limit)
+        if self.recorder is not None:
+            self.recorder.add(self.problem, self.call.rows[s.rows], s, end)
+        rows = end.ended.nonzero().flatten()
+        if rows.numel() > 0:
+            self._outer_iteration(s, rows, end)
+        return end.status
+
+    def _outer_iteration(self, s: State, rows: Tensor, end: PassEnd) -> None:
+        """Algorithm 4, lines 7-12, for the problems in `rows`, whose inner solve has ended."""
+        solver, problem, X, U = self.solver, self.problem.take(rows), s.X[rows], s.U[rows]
+        worst = violation(problem, X, U)
+        growth = torch.full_like(worst, solver.penalty_growth)
+        if self.phr:
+            growth = growth.masked_fill(worst <= solver.violation_tolerance, 1.0)
+        multipliers = update(problem, X, U, take(s.multipliers, rows), growth, PENALTY_MAX)
+        self._keep_best(s, rows, Iterate(X, U, multipliers, s.cost[rows], worst))
+        s.multipliers = copied(s.multipliers)
+        put(s.multipliers, rows, multipliers)
+        s.outer[rows] += 1
+        end.status[rows] = self._status(s, rows, end, worst)
+        s.last_cost[rows] = s.cost[rows]
+        going = rows[end.status[rows] == Status.RUNNING]
+        if going.numel() > 0:
+            self._ask_guidance(s, going, end.status)
+            self._begin_inner(s, going)
+
+    def _status(self, s: State, rows: Tensor, end: PassEnd, worst: Tensor) -> Tensor:
+        """Why problems end: the outer limit, or convergence; else RUNNING."""
+        status = torch.full_like(rows, Status.RUNNING)
+        over = s.outer[rows] >= self.solver.max_outer_iterations
+        status[over & end.stuck[rows]] = Status.LINE_SEARCH_FAILED
+        status[over & ~end.stuck[rows]] = Status.MAX_ITERATIONS
+        if self.phr:
+            settled = (s.cost[rows] - s.last_cost[rows]).abs() <= SETTLED * s.cost[rows].abs()
+            status[end.converged[rows] & settled & (worst <= self.solver.violation_tolerance)] = Status.CONVERGED
         return status
+
+    def _keep_best(self, s: State, rows: Tensor, new: Iterate) -> None:
+        old = take(s.best, rows)
+        better = is_better(new.cost, new.violation, old.cost, old.violation, self.solver.violation_tolerance)
+        chosen = better.nonzero().flatten()
+        put(s.best, rows[chosen], take(new, chosen))
+
+    def _begin_inner(self, s: State, rows: Tensor) -> None:
+        """The next inner solve of the problems in `rows`: L_M with its new multipliers and penalty."""
+        s.regularisation[rows] = 0.0
+        penalty = None if s.penalty is None else take(s.penalty, rows)
+        lagrangian = Lagrangian(self.problem.take(rows), take(s.multipliers, rows), penalty, self.phr)
+        s.cost[rows], s.merit[rows] = value(lagrangian, s.X[rows], s.U[rows])
+        s.inner[rows] = s.rung[rows] = 0
+
+    def _ask_guidance(self, s: State, rows: Tensor, status: Tensor) -> None:
+        if self.guidance is None:
+            return
+        problem = self.problem.take(rows)
+        key = DrawKey(self.call.seed, self.call.ids[s.rows[rows]], s.outer[rows])
+        advice = self.guidance.update(problem, s.X[rows], s.U[rows], take(s.penalty, rows), key)
+        if advice.penalty is not None:
+            put(s.penalty, rows, advice.penalty)
+            s.guided[rows] += advice.penalty.is_active
+        if advice.stop is not None:
+            status[rows[advice.stop]] = STOPPED
+        if advice.U is not None and advice.taken is not None:
+            self._replace_iterate(s, rows, problem, advice)
+
+    def _replace_iterate(self, s: State, rows: Tensor, problem: Problem, advice: Advice) -> None:
+        """Continue from the advised controls where they are taken.
+
+        The multipliers belong to the abandoned trajectory, so they start again at zero. Its penalty has to keep the
+        solver from returning to it: mu is raised until that is `HOLD` times the extra cost of the new trajectory.
+        """
+        assert advice.U is not None and advice.taken is not None
+        taken = advice.taken.nonzero().flatten()
+        if taken.numel() == 0:
+            return
+        part, place, U = problem.take(taken), rows[taken], advice.U[taken]
+        X, old = open_loop(part, U), take(s.multipliers, place)
+        lam = tuple(torch.zeros_like(part) for part in old.lam)
+        unit = Lagrangian(part, Multipliers(lam, torch.ones_like(old.mu)), None, True)
+        cost, merit = value(unit, s.X[place], s.U[place])
+        needed = (part.cost.total(X, U) - cost).clamp(min=0.0) / (merit - cost).clamp(min=1e-12)
+        put(s.multipliers, place, Multipliers(lam, torch.maximum(old.mu, HOLD * needed).clamp(max=PENALTY_MAX)))
+        s.X, s.U = s.X.clone(), s.U.clone()
+        s.X[place], s.U[place] = X, U
+        penalized = s.penalty.is_active[place] if s.penalty is not None else torch.zeros_like(taken, dtype=torch.bool)
+        s.guided[place] += ~penalized
+
+    def end(self, s: State, places: Tensor, status: Tensor) -> None:
+        """Keep the best and the last iterate of the problems at `places` of the state."""
+        problem, r, rows = self.problem.take(places), self.result, s.rows[places]
+        X, U = s.X[places], s.U[places]
+        last = Iterate(X, U, take(s.multipliers, places), s.cost[places], violation(problem, X, U))
+        best, known = copied(last), torch.isfinite(s.best.violation[places]).nonzero().flatten()
+        put(best, known, take(take(s.best, places), known))
+        put(r.last, rows, last)
+        put(r.best, rows, best)
+        r.status[rows], r.iterations[rows] = status, s.iterations[places]
+        r.outer[rows], r.guided[rows] = s.outer[places], s.guided[places]
+        self.stopped += int((status == STOPPED).sum())
+
+    def report(self, passes: int, rows: Tensor, left: int, state: State) -> None:
+        """The progress of a pass, for the callback."""
+        if self.call.callback is not None:
+            total = self.call.problem.B
+            self.call.callback(Progress(passes, self.call.rows[rows], total - left - self.stopped, total, state))

@@ -1,63 +1,22 @@
-"""What the batched loop carries, and what it asks of the solver that starts it and of the guidance that steers it."""
+"""The contracts that solvers, guidance and callers share; the penalties of guidance have theirs in `penalties`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, Self
 
+import torch
 from torch import Tensor
 
-from torchgco.constraints.guides import Guide, GuideRegion
 from torchgco.draws import DrawKey
+from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
+from torchgco.native.dispatch import cost_unit
+from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem
-
-if TYPE_CHECKING:
-    from torchgco.solvers.ilqr import ILQR
-
-
-@dataclass(frozen=True)
-class Iterate:
-    """A trajectory and its worth."""
-
-    X: Tensor
-    U: Tensor
-    duals: Multipliers
-    cost: Tensor
-    violation: Tensor
-
-
-@dataclass
-class InnerState:
-    """What an element carries from iteration to iteration; every tensor starts with the running batch."""
-
-    rows: Tensor  # place in the batch as it was given
-    X: Tensor
-    U: Tensor
-    cost: Tensor
-    merit: Tensor
-    regularisation: Tensor  # mu_r
-    inner: Tensor  # iterations of this inner solve
-    iterations: Tensor  # of the loop itself
-    rung: Tensor  # int64: at which the next line search begins
-
-
-@dataclass
-class State(InnerState):
-    """What it carries from pass to pass."""
-
-    duals: Multipliers
-    guide: Guide | None
-    outer: Tensor  # inner solves ended
-    advised: Tensor  # iterations of the solves that guidance made
-    guided: Tensor
-    last_cost: Tensor  # J_var when the inner solve before ended
-    best: Iterate
-    origin: Iterate  # the caught path that guidance first replaced
-    attempt: Tensor  # plans tried from there, 0 while none was
-    since: Tensor  # `outer` when the attempt began
-    led: Tensor  # bool: the attempt goes on from a plan with its own penalty, and guidance keeps silent
+from torchgco.solution import Solution
+from torchgco.tree import Rows, take
 
 
 @dataclass(frozen=True)
@@ -65,90 +24,125 @@ class Progress:
     """What a callback receives after every pass, or after every problem from a solver that takes them one by one."""
 
     passes: int
-    rows: Tensor  # (b,) int64: places in the batch of the problems that this pass worked on, side by side
+    rows: Tensor  # (b,) int64: places in the batch of the problems that this pass worked on together
     finished: int
     total: int
-    state: State | None  # None from a solver that carries no batch
+    state: Any = None  # the running state of a batched solver, after the pass
 
 
 Callback = Callable[[Progress], None]
 
 
 @dataclass(frozen=True)
-class InnerEnd:
-    """How the inner solve ended, for the elements that have just ended one; every tensor is (B',)."""
+class Call:
+    """The arguments of one `Solver.solve`, checked."""
 
-    converged: Tensor
-    refused: Tensor  # no step length was acceptable
-    outer: Tensor  # inner solves ended in this attempt, this one included
-    cost: Tensor
-    last_cost: Tensor  # when the inner solve before ended; infinite at first
-    violation: Tensor
+    problem: Problem
+    U0: Tensor  # (B, N, m): initial controls
+    seed: int
+    ids: Tensor  # (B,) int64: key the random draws, together with the seed
+    rows: Tensor  # (B,) int64: places in the batch that the user handed in
+    warm: Multipliers | None
+    callback: Callback | None
+
+    @classmethod
+    def checked(
+        cls,
+        problem: Problem,
+        U0: Tensor,
+        seed: int = 0,
+        ids: Tensor | None = None,
+        warm: Multipliers | None = None,
+        callback: Callback | None = None,
+    ) -> Call:
+        """Raises InputError where U0, ids or warm don't fit the problem."""
+        problem.check_controls(U0)
+        rows = torch.arange(problem.B, device=problem.x0.device)
+        if ids is None:
+            ids = rows
+        elif not isinstance(ids, Tensor) or tuple(ids.shape) != (problem.B,) or ids.dtype != torch.int64:
+            raise InputError("ids", f"an int64 tensor ({problem.B},)", getattr(ids, "shape", type(ids).__name__))
+        if warm is not None:
+            warm.check(problem)
+        return cls(problem, U0, seed, ids, rows, warm, callback)
+
+    def take(self, index: Rows) -> Self:
+        """The same call for the problems in `index`."""
+        warm = None if self.warm is None else take(self.warm, index)
+        parts = self.problem.take(index), self.U0[index], self.seed, self.ids[index], self.rows[index]
+        return type(self)(*parts, warm, self.callback)
+
+    def in_cost_units(self) -> tuple[Self, Tensor]:
+        """The same call with costs and multipliers in units of `Problem.cost_unit`, and these units (B,)."""
+        unit = cost_unit(self.problem)
+        warm = None if self.warm is None else self.warm.scaled(1.0 / unit)
+        return replace(self, problem=self.problem.in_cost_units(), warm=warm), unit
+
+
+class Solver:
+    """A solver for batches of problems. Its fields are its options; it keeps no state between calls."""
+
+    def solve(
+        self,
+        problem: Problem,
+        U0: Tensor,
+        seed: int = 0,
+        ids: Tensor | None = None,
+        warm: Multipliers | None = None,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve every problem of the batch.
+
+        Args:
+            problem: B problems.
+            U0: initial controls (B, N, m).
+            seed, ids: key the random draws, where a solver makes any: the result of a problem depends on (seed, id),
+                not on its place in the batch. ids is int64 (B,), by default 0..B-1.
+            warm: multipliers and penalties of a former solution, where a solver has any use for them.
+            callback: called with the progress after every pass.
+
+        Raises:
+            InputError: U0, ids or warm don't fit the problem, or an option of the solver doesn't.
+        """
+        return self.run(Call.checked(problem, U0, seed, ids, warm, callback))
+
+    def run(self, call: Call) -> Solution:
+        """Solve a checked call."""
+        raise NotImplementedError
+
+    def prepare(self, problem: Problem) -> Solver:
+        """The solver with everything built that solving this batch needs, for callers that measure time."""
+        return self
+
+    def in_slots(self, slots: int) -> Solver | None:
+        """The same solver with at most `slots` problems at a time; None where it takes all of them at once."""
+        return None
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What guidance says of a solved batch: where to draw the next inner solve, or from where to start it."""
+    """The answer of guidance for problems whose inner solve has just ended, B' of them."""
 
-    guide: GuideRegion  # penalty of the next inner solve
-    U: Tensor  # (B', N, m): controls to go on from
-    taken: Tensor  # (B',) bool: where U replaces the iterate
-    # To go on with where U is taken, and left alone until the attempt ends; NaN in mu, or None: the solver's own.
-    duals: Multipliers | None = None
-    iterations: Tensor | None = None  # (B',) int64: of the solves that guidance made for this; None: it made none
+    penalty: GuideRegion | None  # of the next inner solve
+    U: Tensor | None = None  # (B', N, m): controls that replace the iterate
+    taken: Tensor | None = None  # (B',) bool: where they do
+    stop: Tensor | None = None  # (B',) bool: where the solve is to end, for another attempt
 
 
 class Guidance(Protocol):
-    """Plug-in of the outer loop, asked after every inner solve."""
+    """Plug-in of the outer loop (Algorithm 4), called after every inner solve."""
 
     def suited(self, problem: Problem) -> Guidance | None:
-        """The guidance that can serve these problems, asked once, when a solve starts; None: they are solved without.
+        """The guidance that can serve these problems, called once per solve; None: they are solved without.
 
-        Guidance that can't be had is no error: a GuidanceWarning says which part is missing and why.
+        A part that can't serve is no error: a GuidanceWarning names it and the reason.
         """
         ...
 
-    def start(self, problem: Problem, X: Tensor) -> GuideRegion:
-        """The penalty that is no penalty yet, for every element."""
+    def start(self, problem: Problem, X: Tensor) -> GuideRegion | None:
+        """The penalty of the first inner solve, inactive for every problem."""
         ...
 
-    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: GuideRegion, key: DrawKey) -> Advice:
-        """Advice for the elements whose inner solve has just ended, with X, U."""
-        ...
-
-
-class OuterLoop(Protocol):
-    """What the loop asks of the solver that started it."""
-
-    @property
-    def inner(self) -> ILQR: ...
-    @property
-    def guidance(self) -> Guidance | None: ...
-    @property
-    def initial_penalty(self) -> float: ...
-    @property
-    def penalty_growth(self) -> float: ...
-    @property
-    def penalty_max(self) -> float: ...
-    @property
-    def grow_when_feasible(self) -> bool: ...
-    @property
-    def violation_tolerance(self) -> float: ...
-    @property
-    def hold_factor(self) -> float: ...
-    @property
-    def attempts(self) -> int: ...
-    @property
-    def arrival(self) -> float | None: ...
-    @property
-    def thorough(self) -> bool: ...
-    @property
-    def clip(self) -> bool: ...
-    @property
-    def slots(self) -> int | None: ...
-    @property
-    def record(self) -> bool: ...
-
-    def verdict(self, inner: InnerEnd) -> Tensor:
-        """A status (B',) for each element whose inner solve has ended; RUNNING starts the next one."""
+    def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
+        """Advice for problems whose inner solve has ended with X, U; `key` numbers the outer iteration."""
         ...

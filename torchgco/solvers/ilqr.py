@@ -1,124 +1,234 @@
-"""iLQR, the local solver (Algorithm 2)."""
+"""iLQR, the local solver (Algorithm 2): its options, one iteration, and an inner solve."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchgco.constraints.guides import Guide
 from torchgco.errors import InputError
-from torchgco.lagrangian import VIOLATION_TOLERANCE, Multipliers
+from torchgco.evaluation import violation
+from torchgco.expansion import linearise
+from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.native.dispatch import engine_of, open_loop, terms_of, value
 from torchgco.native.engine import Options
-from torchgco.problem import Problem
 from torchgco.solution import Solution
-from torchgco.solvers.batch import Loop
+from torchgco.solvers.contracts import Call, Solver
+from torchgco.solvers.lifted import LOST, diverges, lifted_search, native_lifted_search
 from torchgco.solvers.line_search import LineSearch
-from torchgco.solvers.state import Callback, InnerEnd
+from torchgco.solvers.riccati import BackwardPass, backward
+from torchgco.solvers.state import InnerState, Iterate, PassEnd, SolveEnd
+from torchgco.solvers.verdict import finished, start_status
 from torchgco.status import Status
+from torchgco.tree import put, take
+
+ROUNDING = 1e-14  # share of L_M: an expected change below it means nothing
+# mu_r after a failed Cholesky (Algorithm 2, line 9): its first value, its growth, and where a problem ends.
+REGULARISATION_FIRST, REGULARISATION_GROWTH, REGULARISATION_MAX = 1e-6, 10.0, 1e10
+# mu_r after a failed line search, in units of `Problem.cost_unit`, and its factors after further ones and successes.
+DAMPING, DAMPING_GROWTH, DAMPING_DECAY = 0.02, 10.0, 3.0
+VIOLATION_TOLERANCE = 1e-3  # metres for lengths, for the status of iLQR without an outer loop
 
 
 @dataclass(frozen=True)
-class ILQR:
+class ILQR(Solver):
     """Iterative LQR: expansions, backward pass, line search, until L_M no longer falls.
 
-    Alone it leaves constraints out (`penalty` = 0) or holds them by a fixed quadratic penalty; inside
-    `AugmentedLagrangian` it is the inner solver.
+    As a solver of its own it makes one inner solve; constraints count by the multipliers and penalties of a warm start
+    alone, which stay fixed.
 
     Args:
-        tolerance: share of L_M. The solve ends where a full step changed L_M by less and the quadratic model expects
-            no more than that from the step.
-        absolute_tolerance: ends the solve where |L_M - L_M,prev| is below it, in units of cost (as printed), or of
-            `Problem.cost_unit` where `normalise`; 0: never.
-        normalise: work in units of `Problem.cost_unit`, so that scaling all weights changes no iterate: penalties and
-            regularisation are then relative to the cost. False as printed.
+        as_printed: the algorithm as the paper prints it: costs in their own units, the last step of a line search is
+            accepted whatever it does to L_M, and the inner solve ends with the first failed one. Otherwise costs are in
+            units of `Problem.cost_unit`, so that scaling all weights changes no iterate, no step raises L_M, and a
+            failed line search raises mu_r (Levenberg-Marquardt).
+        tolerance: an inner solve has converged where actual and expected change of L_M are at most this share of it;
+            as printed: where the actual change is below it, in units of cost.
         max_iterations: inner limit.
         line_search: how step lengths are chosen.
-        regularisation_first, regularisation_growth, regularisation_max: mu_r after a failed Cholesky: its first
-            value, its growth, and where the element gives up.
-        damping: mu_r after a failed line search, ten times more after the next, a third after a success; the inner
-            solve ends where even regularisation_max didn't help. 0: it ends with the first failure.
-        penalty: weight of constraint violations when used alone.
 
     Raises:
         InputError: a field out of its range.
     """
 
+    as_printed: bool = False
     tolerance: float = 1e-6
-    absolute_tolerance: float = 0.0
-    normalise: bool = True
     max_iterations: int = 50
     line_search: LineSearch = LineSearch()
-    regularisation_first: float = 1e-6
-    regularisation_growth: float = 10.0
-    regularisation_max: float = 1e10
-    damping: float = 0.0
-    penalty: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("tolerance", "absolute_tolerance"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"ilqr.{name}", "at least 0", getattr(self, name))
+        if not self.tolerance >= 0:
+            raise InputError("ilqr.tolerance", "at least 0", self.tolerance)
         if self.max_iterations < 1:
             raise InputError("ilqr.max_iterations", "at least 1", self.max_iterations)
-        if not 0 < self.regularisation_first <= self.regularisation_max:
-            raise InputError("ilqr.regularisation_first", "positive, below its maximum", self.regularisation_first)
-        if not self.regularisation_growth > 1:
-            raise InputError("ilqr.regularisation_growth", "above 1", self.regularisation_growth)
-        if not self.damping >= 0:
-            raise InputError("ilqr.damping", "at least 0", self.damping)
-        if not self.penalty >= 0:
-            raise InputError("ilqr.penalty", "at least 0", self.penalty)
 
-    def options(self, rounding: float, lost_beyond: float) -> Options:
-        """The same for native kernels; `rounding` is the share of L_M below which an expected change means
-        nothing, `lost_beyond` how many times L_M the shortest step makes of it where rollouts diverge."""
-        search = self.line_search
-        return Options(
-            tuple(search.ladder), -1 if search.back is None else search.back, self.max_iterations,
-            search.accept_last, self.tolerance, self.absolute_tolerance, search.ratio_min, search.ratio_max,
-            search.smallest, self.regularisation_first, self.regularisation_growth, self.regularisation_max,
-            self.damping, rounding, lost_beyond,
-        )  # fmt: skip
+    def in_units(self, call: Call) -> tuple[Call, Tensor]:
+        """The call in the units of cost that the solver works in, and these units (B,)."""
+        return (call, torch.ones_like(call.problem.x0[:, 0])) if self.as_printed else call.in_cost_units()
 
-    def solve(
-        self,
-        problem: Problem,
-        U0: Tensor,
-        seed: int = 0,
-        ids: Tensor | None = None,
-        warm: Multipliers | None = None,
-        callback: Callback | None = None,
-        guide: Guide | None = None,
-    ) -> Solution:
-        """One inner solve of every problem, from U0 (B, N, m); `violation` tells what the constraints say of it.
+    def run(self, call: Call) -> Solution:
+        """One inner solve of a checked call."""
+        scaled, unit = self.in_units(call)
+        problem = scaled.problem
+        fixed = Multipliers.zero(problem, 0.0) if scaled.warm is None else scaled.warm
+        lagrangian = Lagrangian(problem, fixed, None, phr=False)
+        s, status = descend(self, lagrangian, scaled.U0, start_is_clear=problem.start_is_clear)
+        end = Iterate(s.X, s.U, fixed, s.cost, violation(problem, s.X, s.U))
+        none = torch.zeros_like(status)
+        ended = SolveEnd(end, end, status, s.iterations, (s.iterations > 0).long(), none)
+        return finished(call, scaled, unit, ended, False, VIOLATION_TOLERANCE)
 
-        `warm` multipliers are held fixed, with their own penalties, and so is the region that `guide` draws to. `seed`
-        is unused: nothing here is random.
+    def iterate(self, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
+        """One iteration of every running problem, in place, by PyTorch's kernels; `advance` prefers native ones."""
+        F, H = linearise(lagrangian.problem, s.X, s.U), lagrangian.expand(s.X, s.U)
+        step = backward(F, H, s.regularisation)
+        status = torch.full_like(s.rows, Status.RUNNING)
+        expected = step.expected_change(torch.ones_like(s.merit)).abs()
+        settled = expected <= ROUNDING * s.merit.abs()
+        moving = ~step.failed & ~settled
+        if bool(step.failed.any()):
+            _raise_regularisation(s, step, F, H, status)
+        old_merit, alpha, refused = self._forward(s, lagrangian, step, moving)
+        refused = self._lift(s, lagrangian, step, refused)
+        change, used = (s.merit - old_merit).abs(), s.regularisation
+        s.inner, s.iterations = s.inner + ~step.failed, s.iterations + ~step.failed
+        s.regularisation = torch.where(step.failed, used, self._damping(used, refused))
+        stuck = refused & (s.regularisation == 0)
+        if self.as_printed:
+            flat = change < self.tolerance
+        else:
+            flat = (torch.maximum(change, expected) <= self.tolerance * s.merit.abs()) & (used <= DAMPING)
+        converged = settled | (moving & ~refused & flat)
+        ended = ~step.failed & (converged | stuck | (s.inner >= self.max_iterations))
+        return PassEnd(ended, converged, stuck, status, alpha, used, step.failed)
+
+    def _forward(
+        self, s: InnerState, lagrangian: Lagrangian, step: BackwardPass, moving: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Line search of the problems in `moving`; the merit before, the step lengths, and the problems refused."""
+        old_merit = s.merit
+        alpha, refused = torch.zeros_like(old_merit), torch.zeros_like(moving)
+        rows = moving.nonzero().flatten()
+        if rows.numel() == 0:
+            return old_merit, alpha, refused
+        if rows.numel() < moving.numel():
+            step = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
+            lagrangian = lagrangian.take(rows)
+        found = self.line_search.search(
+            lagrangian, s.X[rows], s.U[rows], s.merit[rows], step, s.rung[rows], self.as_printed
+        )
+        won = rows[found.accepted]
+        for name in ("X", "U", "cost", "merit"):
+            values = getattr(s, name).clone()
+            values[won] = getattr(found, name)[found.accepted]
+            setattr(s, name, values)
+        s.rung = s.rung.index_copy(0, rows, self.line_search.next_rung(found, self.as_printed))
+        alpha[rows] = found.alpha
+        refused[rows] = ~found.accepted
+        return old_merit, alpha, refused
+
+    def _damping(self, now: Tensor, refused: Tensor) -> Tensor:
+        """mu_r of the next iteration (B,): zero as printed, else up where the search failed and down elsewhere."""
+        if self.as_printed:
+            return torch.zeros_like(now)
+        up, down = (DAMPING_GROWTH * now).clamp(min=DAMPING), now / DAMPING_DECAY
+        up = torch.where(up > REGULARISATION_MAX, 0.0, up)
+        return torch.where(refused, up, torch.where(down < DAMPING, 0.0, down))
+
+    def _lift(self, s: InnerState, lagrangian: Lagrangian, step: BackwardPass, refused: Tensor) -> Tensor:
+        """Another search for problems whose rollouts diverge whatever the step length; which are still refused.
+
+        In the first iteration of an inner solve alone: later on there are gains that have held the states.
         """
-        return Loop(_OneInnerSolve(self, self.penalty), problem, U0, seed, ids, warm, callback, guide).run()
+        rows = (refused & (s.inner == 0)).nonzero().flatten()
+        if self.as_printed or rows.numel() == 0:
+            return refused
+        part, X, U, merit = lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows]
+        lost = diverges(part, X, U, merit, step.gains[:, rows], self.line_search.smallest).nonzero().flatten()
+        refused = refused.clone()
+        if lost.numel() > 0:
+            refused[rows[lost][_lifted(s, lagrangian, rows[lost], native=False)]] = False
+        return refused
 
 
-@dataclass(frozen=True)
-class _OneInnerSolve:
-    """The outer loop that isn't one: it ends with the first inner solve, and says how that ended."""
+def advance(inner: ILQR, s: InnerState, lagrangian: Lagrangian, limit: int) -> PassEnd:
+    """The inner solve of every running problem, in place: up to `limit` native iterations, or one by PyTorch.
 
-    inner: ILQR
-    initial_penalty: float
-    guidance: None = None
-    penalty_growth: float = 1.0
-    penalty_max: float = math.inf
-    grow_when_feasible: bool = True
-    violation_tolerance: float = VIOLATION_TOLERANCE
-    hold_factor: float = 1.0
-    attempts: int = 1
-    arrival: float | None = None
-    thorough: bool = False
-    clip: bool = False
-    slots: None = None
-    record: bool = False
+    Both leave the same state, up to rounding.
+    """
+    engine = engine_of(lagrangian.problem)
+    if engine is None:
+        return inner.iterate(s, lagrangian)
+    state = {}
+    for name in ("X", "U", "cost", "merit", "regularisation", "inner", "iterations", "rung"):
+        state[name] = getattr(s, name).clone(memory_format=torch.contiguous_format)
+        setattr(s, name, state[name])
+    out = engine.iterate(lagrangian.problem, state, terms_of(lagrangian), _native_options(inner), limit)
+    converged, stuck, lost = (out[name] != 0 for name in ("converged", "refused", "lost"))
+    ended, failed = out["status"] == 1, out["status"] > 1
+    rows = lost.nonzero().flatten()
+    if rows.numel() > 0:
+        won = rows[_lifted(s, lagrangian, rows, native=True)]
+        ended[won] = s.inner[won] >= inner.max_iterations
+        s.regularisation[won] = 0.0
+    status = torch.where(failed, out["status"].long(), int(Status.RUNNING))
+    return PassEnd(ended, converged, stuck, status, out["alpha"], out["used"], failed)
 
-    def verdict(self, inner: InnerEnd) -> Tensor:
-        return torch.where(inner.refused, int(Status.LINE_SEARCH_FAILED), int(Status.MAX_ITERATIONS))
+
+def descend(
+    inner: ILQR, lagrangian: Lagrangian, U: Tensor, start_is_clear: Tensor | None = None
+) -> tuple[InnerState, Tensor]:
+    """One inner solve of each problem from controls U (B, N, m), and its status (B,).
+
+    A problem without a finite L_M, or where `start_is_clear` (B,) is False, stays as it starts. Tolerances are in the
+    units of the problem's cost.
+    """
+    problem = lagrangian.problem
+    X = open_loop(problem, U)
+    cost, merit = value(lagrangian, X, U)
+    rows = torch.arange(problem.B, device=U.device)
+    none = (torch.zeros_like(rows) for _ in range(3))
+    found = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), *none)
+    status = start_status(problem, X, merit, start_is_clear)
+    running, going = found, status == Status.RUNNING
+    while bool(going.any()):
+        if not bool(going.all()):
+            stay = going.nonzero().flatten()
+            running, lagrangian = take(running, stay), lagrangian.take(stay)
+        end = advance(inner, running, lagrangian, inner.max_iterations)
+        reason = torch.where(end.stuck, int(Status.LINE_SEARCH_FAILED), int(Status.MAX_ITERATIONS))
+        now = torch.where(end.ended, reason, end.status)
+        status[running.rows], going = now, now == Status.RUNNING
+        if running is not found:
+            put(found, running.rows, running)
+    return found, status
+
+
+def _native_options(inner: ILQR) -> Options:
+    search, printed = inner.line_search, inner.as_printed
+    return Options(
+        tuple(search.ladder(printed)), -1 if search.back is None else search.back, inner.max_iterations, printed,
+        0.0 if printed else inner.tolerance, inner.tolerance if printed else 0.0,
+        search.ratio_min, search.ratio_max, search.smallest,
+        REGULARISATION_FIRST, REGULARISATION_GROWTH, REGULARISATION_MAX, 0.0 if printed else DAMPING, ROUNDING, LOST,
+    )  # fmt: skip
+
+
+def _raise_regularisation(s: InnerState, step: BackwardPass, F: Tensor, H: Tensor, status: Tensor) -> None:
+    """mu_r up for problems whose Cholesky failed (Algorithm 2, line 9): they try again in the next pass."""
+    higher = (s.regularisation * REGULARISATION_GROWTH).clamp(min=REGULARISATION_FIRST)
+    s.regularisation = torch.where(step.failed, higher, s.regularisation)
+    finite = torch.isfinite(F).all(-1).all(-1).all(0) & torch.isfinite(H).all(-1).all(-1).all(0)
+    status[step.failed & (s.regularisation > REGULARISATION_MAX)] = Status.NOT_POSITIVE_DEFINITE
+    status[step.failed & ~finite] = Status.NON_FINITE
+
+
+def _lifted(s: InnerState, lagrangian: Lagrangian, rows: Tensor, native: bool) -> Tensor:
+    """Replace the iterates in `rows` by the result of a lifted search; which of them have one."""
+    search = native_lifted_search if native else lifted_search
+    found = search(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows])
+    won = rows[found.accepted]
+    for name in ("X", "U", "cost", "merit"):
+        getattr(s, name)[won] = getattr(found, name)[found.accepted]
+    return found.accepted

@@ -14,7 +14,7 @@ from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian
 from torchgco.native.dispatch import engine_of, terms_of
 from torchgco.rollout import closed_loop
-from torchgco.solvers.line_search import Candidates
+from torchgco.solvers.line_search import Rollouts
 from torchgco.solvers.riccati import backward
 
 ROUNDS = 20  # steps at most
@@ -28,10 +28,10 @@ def diverges(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor, G: Ten
     return ~(value <= LOST * merit.abs())
 
 
-def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Candidates:
+def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Rollouts:
     """The first rollout that lowers L_M = merit (B,) markedly, from X (B, N+1, n), U (B, N, m); else not accepted."""
     none = torch.zeros_like(merit, dtype=torch.bool)
-    found = Candidates(X.clone(), U.clone(), merit.clone(), merit.clone(), torch.ones_like(merit), none)
+    found = Rollouts(X.clone(), U.clone(), merit.clone(), merit.clone(), torch.ones_like(merit), none)
     rows = torch.arange(X.shape[0], device=X.device)
     for i in range(ROUNDS):
         if rows.numel() == 0:
@@ -48,17 +48,17 @@ def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -
     return found
 
 
-def native_lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Candidates:
+def native_lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Rollouts:
     """The same by the native library."""
     engine = engine_of(lagrangian.problem)
     assert engine is not None
     state = {name: t.clone(memory_format=torch.contiguous_format) for name, t in (("X", X), ("U", U), ("merit", merit))}
     state["cost"] = state["merit"].clone()
     accepted = engine.lift(lagrangian.problem, state, terms_of(lagrangian), ROUNDS, GAIN)
-    return Candidates(**state, alpha=torch.ones_like(merit), accepted=accepted)
+    return Rollouts(**state, alpha=torch.ones_like(merit), accepted=accepted)
 
 
-def _keep(found: Candidates, rows: Tensor, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> None:
+def _keep(found: Rollouts, rows: Tensor, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> None:
     """Write the trajectories that are low enough into `found`."""
     cost, value = lagrangian.value(X, U)
     low = torch.isfinite(value) & (value < found.merit[rows] - GAIN * found.merit[rows].abs())

@@ -16,12 +16,13 @@ from torchgco.lagrangian import Lagrangian
 from torchgco.rollout import closed_loop
 from torchgco.solvers.riccati import BackwardPass
 
-SIDE_BY_SIDE = 256  # trajectories that cost little more than one
+SIDE_BY_SIDE = 256  # rollouts that cost little more than one
+PARALLEL = 4  # rungs that are tried together at least, by problems that refused the first
 
 
 @dataclass(frozen=True)
-class Candidates:
-    """One trajectory per element and what it is worth."""
+class Rollouts:
+    """One rollout per problem with its cost and L_M."""
 
     X: Tensor
     U: Tensor
@@ -39,11 +40,8 @@ class LineSearch:
         shrink: phi, factor from one step length to the next.
         ratio_min, ratio_max: accepted range of the ratio.
         smallest: step lengths end with the first one below this.
-        accept_last: take that last one whatever it does to L_M (as printed), rather than no step at all.
-        parallel: rungs that those who refused the first try side by side, at least. More where few refused: rolling
-            out some dozens of trajectories costs what one costs.
-        back: rungs above the last accepted one at which the next search begins, which spares rollouts and shortens
-            steps; None: each begins with a full step (as printed).
+        back: the next search begins this many rungs above the last accepted one, which spares rollouts and shortens
+            steps; None: each search begins with a full step (as printed).
 
     Raises:
         InputError: a field out of its range.
@@ -53,8 +51,6 @@ class LineSearch:
     ratio_min: float = 1e-4
     ratio_max: float = 10.0
     smallest: float = 1e-4
-    accept_last: bool = True
-    parallel: int = 4
     back: int | None = None
 
     def __post_init__(self) -> None:
@@ -64,62 +60,75 @@ class LineSearch:
             raise InputError("line_search.ratio_min", f"between 0 and ratio_max {self.ratio_max}", self.ratio_min)
         if not 0 < self.smallest < 1:
             raise InputError("line_search.smallest", "between 0 and 1", self.smallest)
-        if self.parallel < 1:
-            raise InputError("line_search.parallel", "at least 1", self.parallel)
         if self.back is not None and self.back < 0:
             raise InputError("line_search.back", "at least 0, or null", self.back)
 
-    @property
-    def ladder(self) -> list[float]:
-        """1, phi, phi^2, ... down to the first below `smallest` (left out where it is never taken)."""
+    def ladder(self, accept_last: bool) -> list[float]:
+        """1, phi, phi^2, ... down to the first below `smallest`, which is there only to be accepted in any case."""
         rungs = [1.0]
         while rungs[-1] >= self.smallest:
             rungs.append(rungs[-1] * self.shrink)
-        return rungs if self.accept_last else rungs[:-1]
+        return rungs if accept_last else rungs[:-1]
 
     def search(
-        self, lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor, step: BackwardPass, rung: Tensor
-    ) -> Candidates:
-        """The first acceptable trajectory of each element, from X, U with L_M = merit (B,), by the ladder from `rung`.
+        self,
+        lagrangian: Lagrangian,
+        X: Tensor,
+        U: Tensor,
+        merit: Tensor,
+        step: BackwardPass,
+        rung: Tensor,
+        accept_last: bool,
+    ) -> Rollouts:
+        """The first acceptable rollout of each problem, from X, U with L_M = merit (B,), by the ladder from `rung`.
 
-        Where there is none, `accepted` is False, alpha is 0, and the trajectory is not to be used.
+        Where there is none, the last rung is accepted whatever it does to L_M (`accept_last`, as printed), or
+        `accepted` is False, alpha is 0, and the rollout is not to be used.
         """
-        ladder = merit.new_tensor(self.ladder)
-        found = self._try(lagrangian, X, U, merit, step, ladder[rung])
+        ladder = merit.new_tensor(self.ladder(accept_last))
+        found = self._try(lagrangian, X, U, merit, step, ladder[rung], accept_last)
         rungs = list(range(1, len(ladder)))
         while rungs:
             refused = (~found.accepted & (rung + rungs[0] < len(ladder))).nonzero().flatten()
             if refused.numel() == 0:
                 break
-            width = max(self.parallel, SIDE_BY_SIDE // refused.numel())
+            width = max(PARALLEL, SIDE_BY_SIDE // refused.numel())
             chunk, rungs = rungs[:width], rungs[width:]
             rows = refused.repeat_interleave(len(chunk))
             places = rung[rows] + torch.tensor(chunk, device=rung.device).repeat(refused.numel())
             alpha = ladder[places.clamp(max=len(ladder) - 1)]  # the last one once more does no harm
             part = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
-            tried = self._try(lagrangian.take(rows), X[rows], U[rows], merit[rows], part, alpha)
+            tried = self._try(lagrangian.take(rows), X[rows], U[rows], merit[rows], part, alpha, accept_last)
             found = self._first_accepted(found, tried, refused, len(chunk))
         return replace(found, alpha=torch.where(found.accepted, found.alpha, 0.0))
 
-    def next_rung(self, found: Candidates) -> Tensor:
-        """At which the next search of each element begins, (B,) int64; the first after one that found nothing."""
-        landed = (found.alpha.unsqueeze(-1) == found.alpha.new_tensor(self.ladder)).to(torch.int8).argmax(-1)
-        back = len(self.ladder) if self.back is None else self.back
+    def next_rung(self, found: Rollouts, accept_last: bool) -> Tensor:
+        """The first rung of the next search of each problem, (B,) int64: 0 after one that found nothing."""
+        ladder = self.ladder(accept_last)
+        landed = (found.alpha.unsqueeze(-1) == found.alpha.new_tensor(ladder)).to(torch.int8).argmax(-1)
+        back = len(ladder) if self.back is None else self.back
         return torch.where(found.accepted, (landed - back).clamp(min=0), 0)
 
     def _try(
-        self, lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor, step: BackwardPass, alpha: Tensor
-    ) -> Candidates:
+        self,
+        lagrangian: Lagrangian,
+        X: Tensor,
+        U: Tensor,
+        merit: Tensor,
+        step: BackwardPass,
+        alpha: Tensor,
+        accept_last: bool,
+    ) -> Rollouts:
         new_X, new_U = closed_loop(lagrangian.problem.dynamics, X, U, step.gains, alpha)
         cost, value = lagrangian.value(new_X, new_U)
         ratio = (value - merit) / step.expected_change(alpha)
         accepted = (ratio >= self.ratio_min) & (ratio <= self.ratio_max)
-        if self.accept_last:
+        if accept_last:
             accepted = accepted | (alpha < self.smallest)
-        return Candidates(new_X, new_U, cost, value, alpha, accepted & torch.isfinite(value))
+        return Rollouts(new_X, new_U, cost, value, alpha, accepted & torch.isfinite(value))
 
     @staticmethod
-    def _first_accepted(found: Candidates, tried: Candidates, refused: Tensor, rungs: int) -> Candidates:
+    def _first_accepted(found: Rollouts, tried: Rollouts, refused: Tensor, rungs: int) -> Rollouts:
         """Write the first accepted rung of each refused element into a copy of `found`."""
         ok = tried.accepted.view(-1, rungs)
         rung = ok.to(torch.int8).argmax(dim=1)  # the first True
@@ -130,4 +139,4 @@ class LineSearch:
         for name in ("X", "U", "cost", "merit", "alpha", "accepted"):
             merged[name] = getattr(found, name).clone()
             merged[name][target] = getattr(tried, name)[source]
-        return Candidates(**merged)
+        return Rollouts(**merged)

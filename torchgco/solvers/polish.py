@@ -15,7 +15,8 @@ from torch import Tensor
 
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.errors import InputError
-from torchgco.lagrangian import VIOLATION_TOLERANCE, Lagrangian, Multipliers, violation
+from torchgco.evaluation import violation
+from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.solution import Solution
@@ -25,6 +26,7 @@ from torchgco.solvers.verdict import final_status, optimality
 from torchgco.status import Status
 from torchgco.tree import copied, put
 
+VIOLATION_TOLERANCE = 1e-3  # metres for lengths, for the status
 STIFFNESS = 1e4  # curvature put across the rows that push, as a share of the Hessian's mean: it changes no solution
 SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)  # shares of the same mean put on the diagonal until the model is convex
 NEAR = 1e-2  # rows this near to their limit, measured as a length of their slope, are in the program from the start
@@ -187,13 +189,13 @@ class _Point:
     def put_into(self, solution: Solution) -> Solution:
         """The solution with this trajectory in place of its own, and gains along it."""
         problem, X, U = self.model.problem, self.model.X, self.model.U
-        duals = Multipliers(self.model.by_constraint(self.lam), solution.multipliers.mu)
-        K, d, left = optimality(Lagrangian(problem, duals, None, True), X, U)
+        fitted = Multipliers(self.model.by_constraint(self.lam), solution.multipliers.mu)
+        K, d, left = optimality(Lagrangian(problem, fitted, None, True), X, U)
         cost, worst = torch.full_like(solution.cost, self.cost), torch.full_like(solution.violation, self.worst)
         # Optimality is that of what is returned; the outer limit no longer is the reason for anything.
         ended = torch.full_like(solution.status, Status.MAX_ITERATIONS)
         status = final_status(ended, left, worst, VIOLATION_TOLERANCE, bool(problem.constraints))
-        return replace(solution, X=X, U=U, K=K, d=d, multipliers=duals, cost=cost, violation=worst, status=status)
+        return replace(solution, X=X, U=U, K=K, d=d, multipliers=fitted, cost=cost, violation=worst, status=status)
 
 
 def _slope(model: Condensed, lam: Tensor) -> float:

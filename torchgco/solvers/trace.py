@@ -1,4 +1,4 @@
-"""Recorder: the history of every element, a row per iteration of the loop; the solves of guidance have none."""
+"""The history of every problem, a row per iteration; the solves that a search makes for its candidates have none."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchgco.lagrangian import violation
+from torchgco.evaluation import violation
 from torchgco.problem import Problem
-from torchgco.solvers.iteration import PassEnd
-from torchgco.solvers.state import State
+from torchgco.solvers.state import PassEnd, State
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,12 +20,14 @@ class Recorder:
 
     def __init__(self) -> None:
         self._passes: list[dict[str, Tensor]] = []
+        self.attempt = 1
 
-    def add(self, problem: Problem, state: State, end: PassEnd) -> None:
-        """Note the iteration just made by every element whose backward pass succeeded."""
-        guided = state.guide.is_active if state.guide is not None else torch.zeros_like(end.failed)
+    def add(self, problem: Problem, rows: Tensor, state: State, end: PassEnd) -> None:
+        """Note the iteration just made by the problems `rows` of the batch whose backward pass succeeded."""
+        guided = state.penalty.is_active if state.penalty is not None else torch.zeros_like(end.failed)
         row = {
-            "element": state.rows,
+            "element": rows,
+            "attempt": torch.full_like(rows, self.attempt),
             "iteration": state.iterations - 1,
             "outer": state.outer,
             "inner": state.inner - 1,
@@ -40,7 +41,7 @@ class Recorder:
         self._passes.append({name: value[~end.failed].clone() for name, value in row.items()})
 
     def frame(self, unit: Tensor) -> pd.DataFrame:
-        """The table, sorted by element and iteration; `unit` (B,) is what costs were divided by."""
+        """The table, sorted by element, attempt and iteration; `unit` (B,) is what costs were divided by."""
         import pandas as pd
 
         columns = (
@@ -53,4 +54,4 @@ class Recorder:
             scale = unit.cpu().numpy()[frame["element"]]
             for name in ("cost", "merit", "regularisation"):
                 frame[name] *= scale
-        return frame.sort_values(["element", "iteration"], ignore_index=True) if self._passes else frame
+        return frame.sort_values(["element", "attempt", "iteration"], ignore_index=True) if self._passes else frame

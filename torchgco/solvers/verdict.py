@@ -1,4 +1,4 @@
-"""What the solver says of a trajectory that it returns: feedback gains, how far from stationary it is, and the status.
+"""What a solver says of the trajectories that it returns: feedback gains, optimality and statuses.
 
 The test asks how much cost the quadratic model could still save: the expected decrease of one full step on
 J_var + lam'c, and what complementarity leaves open, as a share of the cost. It depends on no scale of cost, controls or
@@ -8,20 +8,71 @@ constraints.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian
-from torchgco.native.dispatch import cost_unit, engine_of, terms_of
+from torchgco.native.dispatch import cost_unit, engine_of, reproducible, terms_of
+from torchgco.problem import Problem
+from torchgco.solution import Solution
+from torchgco.solvers.contracts import Call
 from torchgco.solvers.riccati import BackwardPass, backward
+from torchgco.solvers.state import STOPPED, SolveEnd
 from torchgco.status import Status
+from torchgco.tree import take
+
+if TYPE_CHECKING:
+    from torchgco.solvers.trace import Recorder
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 LEAST_COST = 1e-6  # the cost counts at least this share of the cost of staying at the start
 FIRST, GROWTH, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
+
+
+def finished(
+    call: Call,
+    scaled: Call,
+    unit: Tensor,
+    end: SolveEnd,
+    phr: bool,
+    tolerance: float,
+    slots: int | None = None,
+    recorder: Recorder | None = None,
+) -> Solution:
+    """The best trajectories of a solve with gains and statuses, in the units of the call as it was given.
+
+    Args:
+        scaled, unit: the call that was solved, and what its costs were divided by (B,).
+        phr, tolerance: of the solver, see Lagrangian and `final_status`.
+        slots: problems whose gains are computed together; None: all.
+    """
+    problem, best = scaled.problem, end.best
+    X, U = best.X.clone(), best.U.clone()
+    K, d, left = U.new_zeros(*U.shape, problem.n), torch.zeros_like(U), torch.zeros_like(best.cost)
+    for rows in torch.arange(problem.B, device=U.device).split(slots or max(1, problem.B)):
+        lagrangian = Lagrangian(problem.take(rows), take(best.multipliers, rows), None, phr)
+        K[rows], d[rows], left[rows] = optimality(lagrangian, X[rows], U[rows])
+        X[rows], U[rows] = reproducible(lagrangian.problem, X[rows], U[rows], K[rows])
+    ended = torch.where(end.status == STOPPED, int(Status.MAX_ITERATIONS), end.status)
+    status = final_status(ended, left, best.violation, tolerance, bool(problem.constraints))
+    return Solution(
+        X, U, K, d, best.multipliers.scaled(unit), call.problem.cost.total(X, U), best.violation, status,
+        end.iterations, end.outer, end.guided, None if recorder is None else recorder.frame(unit),
+    )  # fmt: skip
+
+
+def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:
+    """The statuses (B,) of problems that can't start, with rollouts X (B, N+1, n); RUNNING for the others."""
+    status = torch.full((problem.B,), int(Status.RUNNING), device=X.device)
+    if start_is_clear is not None:
+        status[~start_is_clear] = Status.INVALID_START
+    # NaN compares as clear of every obstacle, hence this test comes after.
+    finite = torch.isfinite(merit) & torch.isfinite(X).flatten(1).all(-1)
+    status[~finite] = Status.NON_FINITE
+    return status
 
 
 class Optimality(NamedTuple):

@@ -1,0 +1,56 @@
+"""The geometry that the search works on: scenes of spheres, and points along polylines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+
+import torch
+from torch import Tensor
+
+FAR = -1e9  # the radius of an absent obstacle
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Start, goal and obstacles of B problems; m."""
+
+    start: Tensor  # (B, d)
+    goal: Tensor  # (B, d)
+    centers: Tensor  # (B, M, d)
+    inflated_radii: Tensor  # (B, M): r_obs + r_veh, FAR where absent
+    traversal_cost: Callable[[Tensor, slice], Tensor]  # per metre at points (B', V, d) of some problems, (B', V)
+
+
+def points_along(path: Tensor, length: Tensor) -> Tensor:
+    """Points (B, K, d) at arc lengths (B, K), m, on polylines (B, P, d)."""
+    steps = (path[:, 1:] - path[:, :-1]).square().sum(-1).sqrt()
+    reached = torch.cat((torch.zeros_like(steps[:, :1]), steps.cumsum(-1)), dim=1)
+    right = torch.searchsorted(reached, length.contiguous(), right=True).clamp(1, path.shape[1] - 1)
+    share = (length - reached.gather(1, right - 1)) / steps.gather(1, right - 1).clamp(min=1e-12)
+
+    def corner(index: Tensor) -> Tensor:
+        return path.gather(1, index.unsqueeze(-1).expand(-1, -1, path.shape[-1]))
+
+    return torch.lerp(corner(right - 1), corner(right), share.clamp(0.0, 1.0).unsqueeze(-1))
+
+
+def segment_gaps(a: Tensor, b: Tensor, centers: Tensor, distances: Tensor) -> Tensor:
+    """Smallest distance (B, E) of the segments a to b (B, E, d) from spheres of radius `distances` (B, M)."""
+    return squares_from_segments(centers, a, b).sqrt_().sub_(distances.unsqueeze(1)).amin(-1)
+
+
+def squares_from_segments(points: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Squared distances (B, E, V) of points (B, V, d) from segments a to b (B, E, d)."""
+    along = b - a
+    inverse = 1.0 / along.square().sum(-1, keepdim=True).clamp(min=1e-12)
+    # Coordinate by coordinate and in place: these are the largest arrays of the search.
+    axes = [(along[..., i, None], points[:, None, :, i] - a[..., i, None]) for i in range(a.shape[-1])]
+    share = reduce(torch.add, (toward * step for step, toward in axes)).mul_(inverse).clamp_(0.0, 1.0)
+    return reduce(torch.add, (toward.sub_(share * step).square_() for step, toward in axes))
+
+
+def squares(a: Tensor, b: Tensor) -> Tensor:
+    """|a_i - b_j|^2 (B, V, W)."""
+    return (a.unsqueeze(2) - b.unsqueeze(1)).square_().sum(-1)

@@ -1,0 +1,52 @@
+"""Whether paths can be sought for a problem, found out before anything is solved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.expansion import linearise
+from torchgco.guidance.suitability import check_form, failure
+from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.native.dispatch import engine_of
+from torchgco.problem import Problem
+from torchgco.search.paths import PathProposals
+from torchgco.search.scene import scene_of
+
+
+def suited_paths(paths: PathProposals | None, problem: Problem) -> tuple[PathProposals | None, str | None]:
+    """The proposals that a problem can have, or None, and a sentence on the loss; None where there is none.
+
+    Obstacles that the roadmap doesn't know by design, such as moving ones, are no loss. Initial offsets for another
+    number of controls are left out.
+    """
+    if paths is None:
+        return None, None
+    position = problem.dynamics.position
+    if position is None:
+        return None, "the dynamics have no position"
+    d = position.stop - position.start
+    if d not in (2, 3) and any(isinstance(c, BoundSpheres) for c in problem.geometric):
+        return None, f"no path is sought around spheres in {d}-D, as the roadmap knows 2-D and 3-D alone"
+    if any(len(offset) != problem.m for offset in paths.initial_offsets):
+        paths = replace(paths, initial_offsets=())
+    one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
+    rest = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))
+    if scene_of(one, rest) is None:
+        return paths, None
+    paths.starts(one, rest)  # raises where an offset isn't one
+    why = None if engine_of(problem) is not None else failure(_expand, problem, problem.x0.dtype)
+    return (paths, None) if why is None else (None, f"no path can be followed ({why})")
+
+
+def _expand(problem: Problem) -> None:
+    """What an iLQR iteration evaluates, for one problem that stays at its start."""
+    X = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1)
+    U = X.new_zeros(1, problem.N, problem.m)
+    check_form("dynamics", problem.dynamics.step(X[:, :-1], U), X[:, :-1])
+    lagrangian = Lagrangian(problem, Multipliers.zero(problem, 1.0), None, True)
+    check_form("cost", lagrangian.value(X, U)[1], X[:, 0, 0])
+    linearise(problem, X, U)
+    lagrangian.expand(X, U)
