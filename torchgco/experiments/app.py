@@ -20,7 +20,6 @@ from torchgco.errors import InputError
 from torchgco.experiments.build import as_input_error, compose_config, config_dir
 from torchgco.experiments.files import write
 from torchgco.experiments.identity import decisive, digest, plain, settings_of
-from torchgco.experiments.study import run_study
 
 
 def study_folder(_root_: Any) -> str:
@@ -58,6 +57,8 @@ def _composed(overrides: tuple[str, ...], searchpath: tuple[str, ...]) -> DictCo
 
 @hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="config")
 def _run(config: DictConfig) -> None:
+    from torchgco.experiments.study import run_study  # here, as workers import this module and need no figures
+
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
     try:

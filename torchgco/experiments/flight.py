@@ -19,6 +19,7 @@ from torchgco.certificate import frame_columns as certificate_columns
 from torchgco.errors import InputError
 from torchgco.experiments.build import Setup, allotted_cores
 from torchgco.judge import frame_columns, judge
+from torchgco.kernels import use_native
 from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
 from torchgco.scenarios import Layouts
@@ -27,6 +28,7 @@ from torchgco.solvers.contracts import Progress
 from torchgco.solvers.memory import is_out_of_memory, plan_batch
 from torchgco.status import Status
 
+Flown = tuple[str, tuple[pd.DataFrame, np.ndarray]]  # a solver's name, its rows and controls
 NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
 
 
@@ -169,3 +171,17 @@ def _now(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
+
+
+# What a worker process runs. It stands here, and not beside the study, so that no worker loads the report's figures.
+
+
+def prepare(threads: int, in_c: bool) -> None:
+    """Set up a worker process as the study's own is."""
+    torch.set_num_threads(threads)
+    use_native(in_c)
+
+
+def fly(flight: Flight) -> Flown:
+    """The flight's rows and controls, under its solver's name."""
+    return flight.name, flight.fly()

@@ -17,20 +17,19 @@ from tqdm import tqdm
 import torchgco
 from torchgco.errors import InputError
 from torchgco.experiments.build import Setup, build, solver_of
-from torchgco.experiments.flight import Bar, Flight, NoBar, Plan, plan_of
+from torchgco.experiments.flight import Bar, Flight, Flown, NoBar, Plan, fly, plan_of, prepare
 from torchgco.experiments.identity import Manifest, layout_digests, plain, settings_of
 from torchgco.experiments.records import COLUMNS, JUDGED, TRIALS, Records
 from torchgco.experiments.report import write_report
 from torchgco.experiments.success import judged, sound
 from torchgco.experiments.workers import run_all
-from torchgco.kernels import native, use_native
+from torchgco.kernels import native
 from torchgco.rollout import open_loop
 from torchgco.scenarios import Layouts
 from torchgco.status import Status
 
 # How the configuration of a baseline is found: its name in, the whole configuration with that solver out.
 Recompose = Callable[[str], DictConfig]
-Flown = tuple[str, tuple[pd.DataFrame, np.ndarray]]
 
 
 def run_study(
@@ -149,23 +148,14 @@ def _fly_side_by_side(
 
     bar.set_description(f"{workers} processes")
     run_all(
-        _fly,
+        fly,
         [_flight(study, name, ids, NoBar()) for name, ids in batches],
         workers,
-        prepare=_prepare,
+        prepare=prepare,
         options=(torch.get_num_threads(), native()),
         keep=keep,
         say=lambda line: bar.write(line, sys.stderr),
     )
-
-
-def _prepare(threads: int, in_c: bool) -> None:
-    torch.set_num_threads(threads)
-    use_native(in_c)
-
-
-def _fly(flight: Flight) -> Flown:
-    return flight.name, flight.fly()
 
 
 def with_success(rows: pd.DataFrame, layouts: Layouts, solvers: int) -> pd.DataFrame:
