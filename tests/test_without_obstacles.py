@@ -117,7 +117,9 @@ def test_a_constraint_that_is_no_sphere_decides_feasibility() -> None:
 
 
 PEERS = ["hold", "mppi", "gco_paper", "al_ilqr", "multistart", "ipopt", "fatrop", "fatrop_guided"]
-QUICK = ["scenario.stages=12", "study.layouts=2", "study.workers=1", f"study.baselines=[{','.join(PEERS)}]"]
+# A thousand starts and samples prove no more than a few.
+FEW = ["model.gco.multistart_iterations=20", "model.gco.samples=32", "model.paper.samples=32"]
+QUICK = ["scenario.stages=12", "study.layouts=2", "study.workers=1", f"study.baselines=[{','.join(PEERS)}]", *FEW]
 
 
 @pytest.mark.parametrize(
