@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -36,6 +39,7 @@ from benchmarks.speed.sizes import Sizes
 from benchmarks.speed.tables import SPEED, TARGETS, rewrite, section_table
 from torchgco import compose
 from torchgco.errors import InputError
+from torchgco.experiments import app, study
 from torchgco.native import engine as native_engine
 from torchgco.scenarios import Layouts
 
@@ -63,6 +67,20 @@ def few_processes(monkeypatch) -> None:
 def without_acados(monkeypatch, tmp_path: Path) -> None:
     """Whatever is installed here: acados compiles for seconds, and has tests of its own."""
     monkeypatch.setattr(acados_peer, "ENVIRONMENT", tmp_path)
+
+
+@pytest.fixture
+def studies_here(monkeypatch) -> None:
+    """The studies of `quality` in this process, without their figures; one test leaves it as it is."""
+
+    def started(command: list[str], cwd: Path, **_: object) -> None:
+        assert command[:3] == [sys.executable, "-m", "torchgco"]
+        monkeypatch.chdir(cwd)
+        monkeypatch.setattr(sys, "argv", command[2:])
+        assert app.main() == 0
+
+    monkeypatch.setattr(quality, "subprocess", SimpleNamespace(run=started, DEVNULL=subprocess.DEVNULL))
+    monkeypatch.setattr(study, "write_report", lambda folder, trajectories: "")
 
 
 def tiny(folder: Path) -> Bench:
@@ -229,6 +247,7 @@ def test_the_oracle_only_ever_lowers_a_cost(tmp_path: Path) -> None:
         np.testing.assert_array_equal(Layouts.load(path).best_cost, best)
 
 
+@pytest.mark.usefixtures("studies_here")
 def test_the_oracle_keeps_drawn_layouts_and_success_is_told_for_them(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr("benchmarks.families.DATA", tmp_path)
     monkeypatch.setattr(oracle, "SEARCH", {"hold": ["solver=hold"]})
@@ -260,6 +279,7 @@ def test_the_quality_of_one_family(tmp_path: Path, capsys) -> None:
     assert row[0] == "| planar_trap" and row[1:4] == ["`hold`", "3", "3 [44, 100]"] and row[4] == "0 [0, 56]"
 
 
+@pytest.mark.usefixtures("studies_here")
 def test_success_is_told_against_the_best_cost_of_today(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("benchmarks.families.DATA", tmp_path)
     family = FAMILIES["planar_trap"]
