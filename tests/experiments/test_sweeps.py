@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.experiments.commands import TINY, command
+from tests.experiments.commands import TINY
 from tests.trials import PLAIN, trials
 from torchgco.experiments.identity import Manifest, digest, layout_digests
 from torchgco.experiments.merge import merge
@@ -248,10 +248,11 @@ def test_runs_of_an_older_version_are_named_and_never_paired_with_new_ones(tmp_p
     assert [row[2] for row in pairs(table) if "al_ilqr" in row and "gco" in row] == [0]
 
 
-def test_a_sweep_from_the_command_line(tmp_path, capsys) -> None:
+@pytest.mark.usefixtures("without_report")
+def test_a_sweep_from_the_command_line(run, tmp_path, capsys) -> None:
     sweep = ["-m", "solver=hold,al_ilqr", "study.baselines=[hold]", "scenario.num_obstacles=2,3", *TINY[:4], TINY[5]]
-    done = command(*sweep, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    code, _, err = run(*sweep)
+    assert code == 0, err
     assert main([str(tmp_path / "outputs")]) == 0
     table = pd.read_parquet(tmp_path / "outputs" / "report" / "trials.parquet")
     assert {key: n for key, (_, n) in counts(table, OBSTACLES).items()} == {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -9,12 +10,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from tests.experiments import doomed
 from tests.experiments.commands import begin, command, problem_line
 from torchgco.errors import InputError
+from tests.experiments.commands import begin, problem_line
 from torchgco.experiments import workers
 from torchgco.experiments.workers import run_all
 
@@ -56,15 +59,17 @@ def words(folder: Path, solver: str) -> list[str]:
     return ["--config-dir", str(folder / "conf"), *given, "study.workers=2", "hydra.run.dir=out"]
 
 
-def test_a_study_whose_workers_die_ends_and_resumes(tmp_path) -> None:
+@pytest.mark.usefixtures("without_report")
+def test_a_study_whose_workers_die_ends_and_resumes(run, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(workers, "NEW_POOLS", 1)
     study = words(tmp_path, "Doomed")
-    done = command(*study, cwd=tmp_path)
-    lines = [line for line in done.stderr.splitlines() if "worker process died" not in line]
-    assert done.returncode == 2 and "study.workers" in problem_line("\n".join(lines))
+    code, _, err = run(*study)
+    lines = [line for line in err.splitlines() if "worker process died" not in line]
+    assert code == 2 and "study.workers" in problem_line("\n".join(lines))
     shards = [path.name for path in (tmp_path / "out" / "shards").iterdir()]
     assert shards == ["doomed-000000-000001.npz"]
     (tmp_path / "spared").touch()
-    assert command(*study, cwd=tmp_path).returncode == 0
+    assert run(*study)[0] == 0
     assert pd.read_parquet(tmp_path / "out" / "trials.parquet")["layout"].tolist() == [0, 1, 2, 3]
 
 
@@ -121,9 +126,20 @@ def test_ctrl_c_ends_all_processes_with_one_line(slow) -> None:
     wait_for(lambda: not workers_of(process))
 
 
-def test_workers_end_with_a_killed_study(slow) -> None:
-    process, _ = slow
+@pytest.mark.usefixtures("without_report")
+def test_a_killed_study_leaves_no_workers_and_goes_on(slow, run, tmp_path) -> None:
+    process, study = slow
     assert workers_of(process)
     process.kill()
     process.wait()
     wait_for(lambda: not workers_of(process))
+    (shard,) = (tmp_path / "out" / "shards").glob("*.npz")
+    assert not (tmp_path / "out" / "done").exists()
+    with np.load(shard) as held:  # make it recognisable: what is done must not be done again
+        rows, U = json.loads(str(held["rows"])), held["U"]
+    rows["iterations"] = [777] * len(rows["iterations"])
+    np.savez(shard, U=U, rows=np.array(json.dumps(rows)))
+    (tmp_path / "spared").touch()
+    assert run(*study)[0] == 0
+    trials = pd.read_parquet(tmp_path / "out" / "trials.parquet")
+    assert trials["layout"].tolist() == [0, 1, 2, 3] and trials["iterations"].tolist() == [777, 777, 0, 0]
