@@ -25,9 +25,9 @@ from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
 from torchgco import compose, judge
 from torchgco.draws import DrawKey
+from torchgco.evaluation import violation
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.gco import GCO
-from torchgco.lagrangian import violation
 from torchgco.problem import Problem
 
 HERE = Path(__file__).resolve().parent
@@ -60,13 +60,10 @@ class Witness:
     def start(self, problem: Problem, X: Tensor) -> Any:
         return self.guidance.start(problem, X)
 
-    def takes_long(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
-        return self.guidance.takes_long(problem, X, U, key)
-
-    def update(self, problem: Problem, X: Tensor, U: Tensor, guide: Any, key: DrawKey) -> Any:
+    def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: Any, key: DrawKey) -> Any:
         self.plan = None
         advice = replace(self.guidance, sampler=_Listening(self.guidance.sampler, self)).update(
-            problem, X, U, guide, key
+            problem, X, U, penalty, key
         )
         self._note(problem, X, U, key)
         return advice

@@ -1,9 +1,9 @@
-"""python -m benchmarks.oracle: the best cost known on every layout, and whether a way is known at all.
+"""python -m benchmarks.oracle: the best cost known on every layout, and whether a path is known at all.
 
 Minutes a layout, offline. It flies the solvers of SEARCH, and takes the cheapest sound path of any: at the goal, within
 1 mm of every constraint, clear of the obstacles between the knots. The peers' costs on the public layouts come from
 data/reference.csv. The result is written as `best_cost` into the files of benchmarks/data, where the judge of `success`
-reads it and nothing else; a cost that stands there is only ever lowered, and NaN means that no way is known. With
+reads it and nothing else; a cost that stands there is only ever lowered, and NaN means that no path is known. With
 `--fresh N` the layouts are the first N drawn under `--seed`, kept with their costs in benchmarks/data/drawn.
 """
 
@@ -25,16 +25,15 @@ from torchgco.errors import InputError
 from torchgco.judge import SUCCESS_COST
 from torchgco.scenarios import Layouts
 
-# Solver configs with overrides. `ways` solves 32 plans along up to 24 ways to their end, `early` with another timing.
-WAYS = (
-    "solver=gco_max", "solver.guidance.detour.finalists=32", "solver.guidance.detour.ways=24",
-    "solver.guidance.detour.roadmap.spread=256",
+# Solver configs with overrides. `paths` refines 32 candidates along up to 24 paths, `early` at another pace.
+PATHS = (
+    "solver=gco_max", "solver.paths.refine_top=32", "solver.paths.num_paths=24", "solver.paths.roadmap.num_halton=256",
 )  # fmt: skip
 SEARCH = {
     "gco": ["solver=gco"],
     "gco_max": ["solver=gco_max"],
-    "ways": [*WAYS],
-    "early": [*WAYS, "solver.guidance.detour.end=0.6", "solver.attempts=1"],
+    "paths": [*PATHS],
+    "early": [*PATHS, "solver.paths.arrive=0.6", "solver.attempts=1"],
     "multistart": ["solver=multistart"],
     "gco_paper": ["solver=gco_paper"],
     "fatrop": ["solver=fatrop"],
@@ -114,11 +113,11 @@ def keep(path: Path, costs: np.ndarray, source: str) -> None:
     lowered = (costs < old) | (np.isnan(old) & ~np.isnan(costs))
     if lowered.any():
         replace(layouts, best_cost=best).save(path)
-    ways, median = int((~np.isnan(best)).sum()), np.nanmedian(best) if not np.isnan(best).all() else np.nan
+    known, median = int((~np.isnan(best)).sum()), np.nanmedian(best) if not np.isnan(best).all() else np.nan
     missed = int((old > SUCCESS_COST * costs).sum())
     print(
         f"{path.stem}: {source} lowers {lowered.sum()} of {layouts.count}, {missed} by over 5 %; "
-        f"ways on {ways}, median {median:,.1f}",
+        f"paths on {known}, median {median:,.1f}",
         flush=True,
     )
 

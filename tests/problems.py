@@ -11,18 +11,16 @@ from torch import Tensor
 from tests.reference import models
 from tests.reference.problem import ReferenceProblem
 from torchgco import (
-    AugmentedLagrangian,
     ControlBounds,
     Planar,
     Problem,
     QuadraticCost,
     QuadrotorPlanning,
+    Restarts,
     Spheres,
     presets,
 )
 
-# Tolerances and penalties in units of cost, as the paper prints them.
-PRINTED = dict(tolerance=0.0, normalise=False)
 HOVER = [0.0, 0.0, 0.0, 9.81]
 START = [-1.0, 1.0, 0.0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 9.81]
 
@@ -70,14 +68,16 @@ def quadrotor_batch(B: int = 3, N: int = 40, obstacles: int = 6, seed: int = 0) 
     return problem, torch.tensor(HOVER, dtype=torch.float64).repeat(B, N, 1)
 
 
-def quick_gco(problem: Problem) -> AugmentedLagrangian:
-    """The default solver of a problem with all its parts, but few ways, offsets and samples: seconds become tenths."""
+def quick_gco(problem: Problem) -> Restarts:
+    """The default solver of a problem with all its parts, but few paths, offsets and samples: tenths of a second."""
     solver = presets.gco(problem)
-    if solver.guidance is None:
-        return solver
-    detour, sampler = solver.guidance.detour, replace(solver.guidance.sampler, samples=48, rounds=4)
-    detour = replace(detour, ways=2, pushes=detour.pushes[:2], finalists=2, settle=20, keep=None)
-    return replace(solver, guidance=replace(solver.guidance, sampler=sampler, detour=detour))
+    assert solver.paths is not None and solver.sampling is not None
+    paths = replace(
+        solver.paths, num_paths=2, initial_offsets=solver.paths.initial_offsets[:2], refine_top=2,
+        relax_iterations=20, relax_top=None,
+    )  # fmt: skip
+    sampler = replace(solver.sampling.sampler, samples=48, rounds=4)
+    return replace(solver, paths=paths, sampling=replace(solver.sampling, sampler=sampler))
 
 
 def random_trajectory(problem: Problem, seed: int = 0, spread: float = 0.3) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,8 @@ def test_a_device_gives_what_the_processor_gives() -> None:
         [
             Spheres(
                 torch.where(spheres.absent.unsqueeze(-1), torch.nan, spheres.centers).cuda(),
-                torch.where(spheres.absent, torch.nan, spheres.distances).cuda(),
+                torch.where(spheres.absent, torch.nan, spheres.distances - 0.06).cuda(),
+                0.06,
             ),
             ControlBounds(bounds.lower.cuda(), bounds.upper.cuda()),
         ],
@@ -27,7 +28,7 @@ def test_a_device_gives_what_the_processor_gives() -> None:
         problem.N,
     )
     solver = AugmentedLagrangian(
-        inner=ILQR(max_iterations=5), guidance=GCO(sampler=MPPI(samples=10), radius=0.06), max_outer_iterations=3
+        inner=ILQR(max_iterations=5), guidance=GCO(sampler=MPPI(samples=10)), max_outer_iterations=3
     )
     here, there = solver.solve(problem, U0), solver.solve(moved, U0.cuda())
     torch.testing.assert_close(there.U.cpu(), here.U, rtol=1e-6, atol=1e-6)

@@ -51,8 +51,10 @@ MAKERS = {
 
 def everything(problem: Problem, U0: Tensor) -> list[Tensor]:
     """What solve, Polish, judge and certify say."""
-    solver = replace(quick_gco(problem), max_outer_iterations=4, polish=Polish(iterations=2))
-    solution, held = torchgco.solve(problem, U0, solver), Hold().solve(problem, U0)
+    quick = quick_gco(problem)
+    solver = replace(quick, local=replace(quick.local, max_outer_iterations=4))
+    solved, held = torchgco.solve(problem, U0, solver), Hold().solve(problem, U0)
+    solution = Polish(iterations=2).refine(problem, solved)
     goal = problem.x0.new_zeros(problem.dynamics.position.stop)
     reports = [certify(problem, s.X, s.U) for s in (solution, held)] + [judge(problem, solution.U, goal, 0.3)]
     refined = Polish(iterations=1).refine(problem, held)

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from tests.problems import planar_batch, quadrotor_batch, random_trajectory
-from torchgco.constraints import FunctionConstraint, GuidePath, GuideRegion, StateBounds
-from torchgco.lagrangian import Lagrangian, Multipliers, penalty_weights, update, worst_rows
+from torchgco.constraints import FunctionConstraint, StateBounds
+from torchgco.lagrangian import Lagrangian, Multipliers, penalty_weights, update
+from torchgco.penalties import GuidePath, GuideRegion
 from torchgco.problem import Problem
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
@@ -23,7 +24,7 @@ def _with_more(problem: Problem) -> Problem:
     return Problem(problem.dynamics, problem.cost, [*problem.constraints, *more], problem.x0, problem.N)
 
 
-def _random_duals(problem: Problem, X, U, mu: float = 7.0) -> Multipliers:
+def _random_multipliers(problem: Problem, X, U, mu: float = 7.0) -> Multipliers:
     torch.manual_seed(1)
     lam = [torch.rand_like(c.value(X, U)) * (torch.rand_like(c.value(X, U)) > 0.5) for c in problem.constraints]
     return Multipliers(tuple(lam), torch.linspace(mu, 2 * mu, problem.B, dtype=torch.float64))
@@ -42,8 +43,8 @@ def test_a_path_adds_the_derivatives_of_its_springs(batch: str) -> None:
     X, U = random_trajectory(problem)
     at = problem.dynamics.position
     guide = GuidePath(X[..., at] + torch.rand_like(X[..., at]), torch.tensor([1.0, 2.0, 3.0]).double(), at)
-    duals = Multipliers.zero(problem, 7.0)
-    with_guide, without = (Lagrangian(problem, duals, g, True) for g in (guide, None))
+    multipliers = Multipliers.zero(problem, 7.0)
+    with_guide, without = (Lagrangian(problem, multipliers, g, True) for g in (guide, None))
     added = (with_guide.expand(X, U) - without.expand(X, U)).transpose(0, 1)
     gradient = torch.autograd.functional.jacobian(lambda X: guide.value(X).sum(), X)
     n = problem.n
@@ -55,12 +56,12 @@ def test_a_path_adds_the_derivatives_of_its_springs(batch: str) -> None:
         torch.testing.assert_close(added[b, k, :n, :n], exact[b, k, :, b, k], rtol=1e-9, atol=1e-7)
 
 
-@pytest.mark.parametrize("clip", [False, True])
+@pytest.mark.parametrize("phr", [False, True])
 @pytest.mark.parametrize("batch", BATCHES)
-def test_gradient_is_the_derivative_of_the_value(batch: str, clip: bool) -> None:
+def test_gradient_is_the_derivative_of_the_value(batch: str, phr: bool) -> None:
     problem = _with_more(BATCHES[batch](B=3, N=9)[0])
     X, U = random_trajectory(problem)
-    lagrangian = Lagrangian(problem, _random_duals(problem, X, U), _guide(X, problem.dynamics.position), clip)
+    lagrangian = Lagrangian(problem, _random_multipliers(problem, X, U), _guide(X, problem.dynamics.position), phr)
     X_, U_ = X.clone().requires_grad_(), U.clone().requires_grad_()
     gX, gU = torch.autograd.grad(lagrangian.value(X_, U_)[1].sum(), (X_, U_))
     H, n = lagrangian.expand(X, U).transpose(0, 1), problem.n
@@ -74,14 +75,14 @@ def test_hessian_is_gauss_newton(batch: str) -> None:
     """J_var's Hessian plus rho c_z' c_z, rebuilt from autodiff Jacobians of every row."""
     problem = _with_more(BATCHES[batch](B=2, N=9)[0])
     X, U = random_trajectory(problem)
-    duals, n = _random_duals(problem, X, U), problem.n
+    multipliers, n = _random_multipliers(problem, X, U), problem.n
     guide = _guide(X, problem.dynamics.position)
-    H = Lagrangian(problem, duals, guide, False).expand(X, U).transpose(0, 1)
+    H = Lagrangian(problem, multipliers, guide, False).expand(X, U).transpose(0, 1)
     plain = Problem(problem.dynamics, problem.cost, [], problem.x0, problem.N)
-    expected = Lagrangian(plain, Multipliers((), duals.mu), None, False).expand(X, U).transpose(0, 1)
-    for constraint, lam in zip(problem.constraints, duals.lam, strict=True):
+    expected = Lagrangian(plain, Multipliers((), multipliers.mu), None, False).expand(X, U).transpose(0, 1)
+    for constraint, lam in zip(problem.constraints, multipliers.lam, strict=True):
         c = constraint.value(X, U)
-        rho = penalty_weights(constraint.sense, c, lam, duals.mu, False)
+        rho = penalty_weights(constraint.sense, c, lam, multipliers.mu, False)
         knots = torch.arange(problem.N + 1)[constraint.knots]
         for b in range(problem.B):
             for j, k in enumerate(knots.tolist()):
@@ -110,15 +111,15 @@ def test_printed_rule_of_the_penalty() -> None:
     c = torch.tensor([[[-1.0], [-1.0], [0.0], [2.0]]], dtype=torch.float64)
     lam = torch.tensor([[[0.0], [0.5], [0.0], [0.0]]], dtype=torch.float64)
     mu = torch.tensor([4.0], dtype=torch.float64)
-    assert penalty_weights("inequality", c, lam, mu, clip=False).flatten().tolist() == [0, 4, 4, 4]
-    assert penalty_weights("inequality", c, lam, mu, clip=True).flatten().tolist() == [0, 0, 4, 4]
+    assert penalty_weights("inequality", c, lam, mu, phr=False).flatten().tolist() == [0, 4, 4, 4]
+    assert penalty_weights("inequality", c, lam, mu, phr=True).flatten().tolist() == [0, 0, 4, 4]
 
 
-def test_clipped_value_is_continuous_where_a_row_lets_go() -> None:
+def test_phr_value_is_continuous_where_a_row_lets_go() -> None:
     problem, _ = planar_batch(B=1, N=3, obstacles=1)
     spheres, mu, lam = problem.constraints[0], 4.0, 0.6
     X = problem.x0.unsqueeze(1).repeat(1, 4, 1)
-    duals = Multipliers(
+    multipliers = Multipliers(
         (torch.full((1, 3, 1), lam, dtype=torch.float64), torch.zeros(1, 3, 4, dtype=torch.float64)),
         torch.tensor([mu], dtype=torch.float64),
     )
@@ -129,7 +130,7 @@ def test_clipped_value_is_continuous_where_a_row_lets_go() -> None:
     values = []
     for gap in (edge - 1e-7, edge + 1e-7):
         X[:, 1:, :2] = spheres.centers[0, 0] + torch.tensor([gap, 0.0], dtype=torch.float64)
-        cost, merit = Lagrangian(problem, duals, None, True).value(X, U)
+        cost, merit = Lagrangian(problem, multipliers, None, True).value(X, U)
         values.append(float(merit - cost))
     assert values[0] == pytest.approx(values[1], abs=1e-5)
     assert values[1] == pytest.approx(-3 * lam**2 / (2 * mu))
@@ -138,21 +139,9 @@ def test_clipped_value_is_continuous_where_a_row_lets_go() -> None:
 def test_update_of_multipliers_and_penalty() -> None:
     problem, _ = planar_batch(B=2, N=5)
     X, U = random_trajectory(problem)
-    duals = _random_duals(problem, X, U)
-    new = update(problem, X, U, duals, 3.0, mu_max=30.0)
-    for constraint, lam, after in zip(problem.constraints, duals.lam, new.lam, strict=True):
-        expected = lam + duals.mu.view(-1, 1, 1) * constraint.value(X, U)
+    multipliers = _random_multipliers(problem, X, U)
+    new = update(problem, X, U, multipliers, 3.0, mu_max=30.0)
+    for constraint, lam, after in zip(problem.constraints, multipliers.lam, new.lam, strict=True):
+        expected = lam + multipliers.mu.view(-1, 1, 1) * constraint.value(X, U)
         torch.testing.assert_close(after, expected.clamp(min=0.0))
     assert new.mu.tolist() == [21.0, 30.0]
-
-
-def test_the_worst_row_is_named() -> None:
-    problem, U = planar_batch(B=2, N=5)
-    X = problem.x0.unsqueeze(1).repeat(1, 6, 1)
-    X[1, 3, :2] = problem.constraints[0].centers[1, 2]
-    U = U.clone()
-    U[0, 4, 1] = -10.5
-    first, second = worst_rows(problem, X, U)
-    assert first == {"violation": pytest.approx(0.5), "constraint": "ControlBounds", "knot": 4, "row": 3}
-    assert second["constraint"] == "BoundSpheres" and second["knot"] == 3 and second["row"] == 2
-    assert second["violation"] == pytest.approx(float(problem.constraints[0].distances[1, 2]))

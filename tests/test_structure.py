@@ -9,19 +9,21 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "torchgco"
 FLOORS = [
-    ["shapes", "status", "autodiff", "draws", "kernels"],
-    ["dynamics", "costs", "constraints"],
+    ["errors", "tree", "status", "autodiff", "draws", "kernels"],
+    ["shapes"],
+    ["dynamics", "costs", "constraints", "penalties"],
     ["problem"],
     ["tracing"],
-    ["rollout", "expansion", "judge"],
+    ["rollout", "expansion", "evaluation", "judge"],
     ["lagrangian", "certificate"],
     ["solution", "guidance.samples"],
     ["native"],
-    ["guidance.search"],
-    ["solvers", "guidance.mppi", "guidance.detection", "guidance.region", "guidance.roadmap"],
+    ["solvers"],
     ["guidance"],
+    ["search"],
+    ["baselines"],
     ["presets"],
-    ["scenarios", "baselines", "api"],
+    ["scenarios", "api"],
     ["plotting"],
     ["experiments"],
 ]
@@ -61,7 +63,7 @@ def test_imports_go_one_way(path: Path) -> None:
 
 def test_solvers_do_not_know_guidance_and_problems_know_no_solver() -> None:
     for path in (PACKAGE / "solvers").glob("*.py"):
-        assert not any(name.startswith("guidance") for name in imports_of(path)), path
+        assert not any(name.startswith(("guidance", "search")) for name in imports_of(path)), path
     for room in ("dynamics", "costs", "constraints"):
         for path in (PACKAGE / room).glob("*.py"):
             assert not any(name.startswith(("solvers", "lagrangian", "guidance")) for name in imports_of(path)), path
@@ -107,7 +109,7 @@ def test_instantiate_is_called_in_one_place() -> None:
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_files_and_functions_fit_their_reader(path: Path) -> None:
     text = path.read_text()
-    assert len(text.splitlines()) <= 400
+    assert len(text.splitlines()) <= 300
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef):
             assert node.end_lineno - node.lineno <= 65, f"{node.name} in {path.name}"

@@ -26,10 +26,8 @@ from torchgco import (
     certify,
     judge,
 )
-from torchgco.baselines import MultiStart
 from torchgco.experiments import app
-from torchgco.guidance import Detour
-from torchgco.lagrangian import worst_rows
+from torchgco.search import MultiStart, PathProposals
 
 GOAL = torch.tensor([1.0, 0.4], dtype=torch.float64)
 BOUNDS = ControlBounds([-10, -10], [10, 10])
@@ -45,9 +43,10 @@ EMPTY = {
     "equality": FunctionConstraint(lambda x, u: x[..., :0], of="xu", sense="equality"),
 }
 GUIDED = quick_gco(planar_batch()[0])
+POLISH = Polish(iterations=2)
 SOLVERS = {
-    "polished": replace(GUIDED, polish=Polish(iterations=2)),
-    "multistart": MultiStart(replace(GUIDED, guidance=None, max_outer_iterations=2), starts=2),
+    "gco": GUIDED,
+    "multistart": MultiStart(replace(GUIDED.local, max_outer_iterations=2), starts=2),
     "mppi": IteratedMPPI(iterations=2),
     "hold": Hold(),
 }
@@ -73,22 +72,22 @@ def test_nothing_in_the_way_changes_nothing(kind: str, solver: str) -> None:
     certificate = certify(problem, got.X, got.U)
     assert certificate.clearance.tolist() == [torch.inf] * 2
     assert certificate.kkt_residual.tolist() == certify(free, got.X, got.U).kkt_residual.tolist()
-    assert worst_rows(problem, got.X, got.U) == worst_rows(free, got.X, got.U)
+    assert torch.equal(POLISH.refine(problem, got).U, POLISH.refine(free, want).U)
 
 
 def test_polish_needs_no_constraint() -> None:
     """Nor one that depends on anything."""
     free, U0 = planar()
     constant, _ = planar(FunctionConstraint(lambda x: torch.full_like(x[..., :1], -1.0)))
-    want, got = (torchgco.solve(p, U0, SOLVERS["polished"]) for p in (free, constant))
+    want, got = (POLISH.refine(p, torchgco.solve(p, U0, GUIDED)) for p in (free, constant))
     assert float(certify(free, want.X, want.U).kkt_residual.max()) < 1e-8
     torch.testing.assert_close(got.U, want.U)
 
 
 @pytest.mark.parametrize("kind", ["shared", "absent", "geometric"])
-def test_no_detour_is_proposed(kind: str) -> None:
+def test_no_path_is_proposed(kind: str) -> None:
     problem, _ = planar(EMPTY[kind], BOUNDS)
-    assert not bool(Detour().propose(problem).found.any())
+    assert not bool(PathProposals().propose(problem).found.any())
 
 
 def test_empty_spheres_next_to_others_are_as_good_as_none() -> None:
@@ -96,7 +95,7 @@ def test_empty_spheres_next_to_others_are_as_good_as_none() -> None:
     more = Problem(problem.dynamics, problem.cost, [EMPTY["shared"], *problem.constraints], problem.x0, problem.N)
     want, got = (torchgco.solve(p, U0, GUIDED) for p in (problem, more))
     assert int(want.guided.sum()) > 0 and torch.equal(got.U, want.U)
-    alone, company = (Detour(finalists=2).propose(p) for p in (problem, more))
+    alone, company = (PathProposals(refine_top=2).propose(p) for p in (problem, more))
     assert torch.equal(alone.found, company.found) and torch.equal(alone.U, company.U)
 
 
@@ -117,9 +116,7 @@ def test_a_constraint_that_is_no_sphere_decides_feasibility() -> None:
 
 
 PEERS = ["hold", "mppi", "gco_paper", "al_ilqr", "multistart", "ipopt", "fatrop", "fatrop_guided"]
-# A thousand starts and samples prove no more than a few.
-FEW = ["model.gco.multistart_iterations=20", "model.gco.samples=32", "model.paper.samples=32"]
-QUICK = ["scenario.stages=12", "study.layouts=2", "study.workers=1", f"study.baselines=[{','.join(PEERS)}]", *FEW]
+QUICK = ["scenario.stages=12", "study.layouts=2", "study.workers=1", f"study.baselines=[{','.join(PEERS)}]"]
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
 
 from torchgco.problem import Problem
 
 GOAL_TOLERANCE = 0.09  # share of the distance from start to goal within which a trajectory has arrived
+
+
+class Rated(Protocol):
+    """A trajectory with its cost and violation, (B, ...)."""
+
+    @property
+    def X(self) -> Tensor: ...
+    @property
+    def cost(self) -> Tensor: ...
+    @property
+    def violation(self) -> Tensor: ...
 
 
 def violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
@@ -24,13 +37,19 @@ def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, 
     return (fits & (~old_fits | (cost < old_cost))) | (~fits & ~old_fits & (worst < old_worst))
 
 
-def has_arrived(problem: Problem, X: Tensor, share: float = GOAL_TOLERANCE) -> Tensor:
-    """Whether trajectories X (B, N+1, n) end within `share` of the distance from start to goal, (B,).
-
-    False without a goal.
-    """
+def has_arrived(problem: Problem, X: Tensor, tolerances: float = 1.0) -> Tensor:
+    """Whether trajectories X (B, N+1, n) end within so many goal tolerances of the goal, (B,); False without a goal."""
     goal, at = problem.cost.goal(problem.x0), problem.dynamics.position
     if goal is None or at is None:
         return torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
     last, first = ((x - goal)[:, at].square().sum(-1).sqrt() for x in (X[:, -1], problem.x0))
-    return last <= share * first
+    return last <= tolerances * GOAL_TOLERANCE * first
+
+
+def is_preferred(problem: Problem, new: Rated, old: Rated, limit: float, by_arrival: bool = True) -> Tensor:
+    """Whether a trajectory is to be kept in place of an old one (B,): arrival first, then `is_better`."""
+    better = is_better(new.cost, new.violation, old.cost, old.violation, limit)
+    if not by_arrival:
+        return better
+    arrived, before = ((path.violation <= limit) & has_arrived(problem, path.X) for path in (new, old))
+    return torch.where(arrived == before, better, arrived)

@@ -156,7 +156,7 @@ PRESETS: dict[str, Callable[[Space], Solver]] = {
         ipopt,
         fatrop,
         fatrop_guided,
-    )  # fmt: skip
+    )
 }
 
 

@@ -52,10 +52,7 @@ class Bench:
         extra = [] if self.sizes.num_stages is None else [f"scenario.stages={self.sizes.num_stages}"]
         setup = compose([*extra, *overrides, f"seed={SEED}", f"device={self.device}"])
         limit = self.sizes.inner_iterations
-        if limit is not None and hasattr(setup.solver, "inner"):
-            inner = replace(setup.solver.inner, max_iterations=limit)
-            setup = replace(setup, solver=replace(setup.solver, inner=inner, max_outer_iterations=2))
-        return setup
+        return setup if limit is None else replace(setup, solver=limited(setup.solver, limit))
 
     def warm(self, setup: Setup, task: Task) -> None:
         """Have what the solver needs for these problems traced and compiled: solve the first ones, off the clock."""
@@ -94,3 +91,12 @@ class Bench:
     def wait(self) -> None:
         if self.device == "cuda":
             torch.cuda.synchronize()
+
+
+def limited(solver: Any, iterations: int) -> Any:
+    """The solver with two outer iterations of so many inner ones, where it is an augmented Lagrangian or uses one."""
+    if hasattr(solver, "local"):
+        return replace(solver, local=limited(solver.local, iterations))
+    if not hasattr(solver, "inner"):
+        return solver
+    return replace(solver, inner=replace(solver.inner, max_iterations=iterations), max_outer_iterations=2)

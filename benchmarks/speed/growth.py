@@ -26,7 +26,7 @@ def run(bench: Bench) -> None:
 def _measure(bench: Bench, case: str, *overrides: str) -> None:
     """A fixed number of iterations of `al_ilqr`, of which the fastest of some repeats counts."""
     setup = bench.setup(*overrides, "solver=al_ilqr")
-    inner = replace(setup.solver.inner, max_iterations=ITERATIONS, tolerance=0.0, absolute_tolerance=0.0)
+    inner = replace(setup.solver.inner, max_iterations=ITERATIONS, tolerance=0.0)
     solver = replace(setup.solver, inner=inner, max_outer_iterations=1)
     task = setup.task(setup.layouts(bench.sizes.growth_batch))
     solve = lambda: solver.solve(task.problem, task.U0)

@@ -14,11 +14,12 @@ from benchmarks.speed.bench import SEED, Bench, Took
 from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.draws import DrawKey
+from torchgco.guidance.mppi import COLLISION_PENALTY
 from torchgco.native.dispatch import open_loop
 from torchgco.scenarios import Task
 
 SECTION = "mppi"
-TEMPERATURE, SIGMA, PENALTY = 1.0, 1.0, 1e8
+TEMPERATURE, SIGMA = 1.0, 1.0
 RATIO = "seconds pytorch-mppi / torchgco"
 HAVE_PEER = find_spec("pytorch_mppi") is not None
 
@@ -65,9 +66,8 @@ def _say_rollout(bench: Bench, task: Task) -> None:
 def _ours(task: Task, samples: int) -> Callable[[], Any]:
     """Draw, fly, weigh; the mean is rolled out as well, in double precision, as every caller has it."""
     sampler = torchgco.MPPI(
-        samples=samples, covariance=SIGMA, temperature=TEMPERATURE, collision_penalty=PENALTY, rounds=1, knots=0,
-        dtype="float32",
-    )  # fmt: skip
+        samples=samples, covariance=SIGMA, temperature=TEMPERATURE, rounds=1, noise_knots=0, dtype="float32"
+    )
     ids = torch.zeros(1, dtype=torch.int64, device=task.U0.device)
     return lambda: sampler.improve(task.problem, task.U0, DrawKey(SEED, ids, ids))
 
@@ -79,7 +79,7 @@ def _theirs(task: Task, samples: int) -> Callable[[], Any]:
     """
     from pytorch_mppi import MPPI
 
-    model = QuadrotorAmongSpheres(task.problem, PENALTY)
+    model = QuadrotorAmongSpheres(task.problem, COLLISION_PENALTY)
     bounds = next(c for c in task.problem.constraints if isinstance(c, ControlBounds))
     device, m = task.U0.device, task.problem.m
     controller = MPPI(

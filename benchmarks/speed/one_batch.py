@@ -15,6 +15,7 @@ from benchmarks.speed.sizes import Sizes
 from torchgco.experiments.build import Setup
 from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
+from torchgco.search import Restarts
 
 
 def measure(order: dict[str, Any]) -> dict[str, Any]:
@@ -23,7 +24,7 @@ def measure(order: dict[str, Any]) -> dict[str, Any]:
     bench = Bench(sizes, device=order["device"])
     setup = bench.setup("scenario=forest")
     if order["limited"]:
-        setup = replace(setup, solver=replace(setup.solver, max_outer_iterations=2, attempts=1))
+        setup = replace(setup, solver=_limited(setup.solver))
     batch = order["batch"]
     _warm_up(setup, min(batch, 2))
     held = _start_of_memory(bench.device)
@@ -47,7 +48,12 @@ def _problem(setup: Setup, start: int, batch: int) -> tuple[Problem, torch.Tenso
 def _warm_up(setup: Setup, batch: int) -> None:
     """Compilation, and what libraries allocate once."""
     problem, U0 = _problem(setup, 0, batch)
-    replace(setup.solver, max_outer_iterations=2, attempts=1).solve(problem, U0)
+    _limited(setup.solver).solve(problem, U0)
+
+
+def _limited(solver: Restarts) -> Restarts:
+    """Two outer iterations, and one attempt."""
+    return replace(solver, local=replace(solver.local, max_outer_iterations=2), attempts=1)
 
 
 def _start_of_memory(device: str) -> int | None:

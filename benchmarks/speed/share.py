@@ -17,11 +17,11 @@ SECTION = "share"
 
 # A phase lasts while its function (module:attributes) runs, but for the phases inside it; the rest is the outer loop.
 PHASES = {
-    "paths sought": "torchgco.guidance.roadmap:Roadmap.ways",
-    "paths followed": "torchgco.guidance.detour:Detour._follow",
-    "plans settled": "torchgco.guidance.detour:Detour._settle",
-    "finalists solved": "torchgco.guidance.detour:Detour._refine",
-    "rest of the proposal": "torchgco.guidance.detour:Detour.propose",
+    "paths sought": "torchgco.search.roadmap:Roadmap.paths",
+    "paths tracked": "torchgco.search.follow:track",
+    "candidates relaxed": "torchgco.search.follow:relax",
+    "candidates refined": "torchgco.search.follow:refine",
+    "rest of the proposal": "torchgco.search.paths:PathProposals.propose",
     "plans sampled": "torchgco.guidance.mppi:MPPI.improve",
     "set-up": "torchgco.native.engine:Engine.__init__",
 }

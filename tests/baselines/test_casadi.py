@@ -19,6 +19,7 @@ from torchgco import (
     Planar,
     Problem,
     QuadraticCost,
+    Solution,
     StateBounds,
     Status,
 )
@@ -27,6 +28,7 @@ from torchgco.constraints import Constraint
 from torchgco.experiments.build import compose
 from torchgco.experiments.flight import Flight
 from torchgco.rollout import open_loop
+from torchgco.solvers.contracts import Call, Solver
 
 PLUGINS = ["ipopt", "fatrop"]
 DATA = Path(__file__).resolve().parents[2] / "benchmarks" / "data"
@@ -48,9 +50,9 @@ def solved() -> dict:
 
 
 def test_both_find_what_al_ilqr_finds(solved) -> None:
-    """In the last two: in the first one, obstacles part the ways that solvers take."""
+    """In the last two: in the first one, obstacles part the paths that solvers take."""
     problem, U0 = three_problems()
-    al_ilqr = AugmentedLagrangian(max_outer_iterations=15, clip=True).solve(problem, U0)
+    al_ilqr = AugmentedLagrangian(max_outer_iterations=15).solve(problem, U0)
     for solution in solved.values():
         assert solution.statuses == [Status.CONVERGED] * 3 and float(solution.violation.max()) < 1e-6
         torch.testing.assert_close(solution.cost[1:], al_ilqr.cost[1:], rtol=1e-2, atol=0)
@@ -224,16 +226,16 @@ def test_a_study_prepares_before_the_clock_starts(monkeypatch) -> None:
     setup = compose(["scenario=layouts", f"scenario.path={DATA / 'planar_trap.npz'}", "model=planar"])
     layouts, events = replace(setup.layouts(2), stages=5), []
 
-    class Builder:
-        def prepare(self, problem: Problem):
+    class Builder(Solver):
+        def prepare(self, problem: Problem) -> Solver:
             events.append("prepare")
             self.problem = problem
             return self
 
-        def solve(self, problem: Problem, U0: Tensor, **call):
+        def run(self, call: Call) -> Solution:
             events.append("solve")
-            assert problem is self.problem
-            return Hold().solve(problem, U0, **call)
+            assert call.problem is self.problem
+            return Hold().run(call)
 
     monkeypatch.setattr("torchgco.experiments.flight._now", lambda device: float(events.append("clock") or 0.0))
     Flight(setup, layouts, "builder", Builder(), tqdm(disable=True)).fly()

@@ -1,4 +1,4 @@
-"""FATROP from a path's plan: around the trap, its own in any batch, and plain FATROP where there is no path."""
+"""FATROP from a path proposal: around the trap, its own in any batch, and plain FATROP where there is no path."""
 
 from dataclasses import replace
 
@@ -9,9 +9,13 @@ from tests.problems import planar_batch
 from torchgco import ControlBounds, InputError, Problem, Status, judge
 from torchgco.baselines import CasADiSolver, GuidedCasADi
 from torchgco.experiments.build import compose
-from torchgco.guidance import Detour, Roadmap
+from torchgco.search import PathProposals, Roadmap
 
-GUIDED = GuidedCasADi(detour=Detour(Roadmap(nodes=32, spread=16), ways=2, settle=0, depth=1.0, iterations=10))
+GUIDED = GuidedCasADi(
+    paths=PathProposals(
+        Roadmap(num_halton=16), num_paths=2, relax_iterations=0, max_penetration=1.0, track_iterations=10
+    )
+)
 
 
 def test_the_trap_is_left_along_the_path() -> None:
@@ -26,10 +30,10 @@ def test_the_trap_is_left_along_the_path() -> None:
         solution = setup.solver.solve(task.problem, task.U0)
         reached.append(judge(task.problem, solution.U, task.goal, task.goal_radius).reached.tolist())
     assert reached == [[False, False], [True, True]]
-    followed = setup.solver.guess(task.problem, task.U0)
-    alone = setups[0].solver.solve(task.problem, followed.U)
-    assert torch.equal(solution.U, alone.U) and bool((followed.iterations > 0).all())
-    assert torch.equal(solution.iterations, followed.iterations + alone.iterations)
+    guess = setup.solver.guess(task.problem, task.U0)
+    alone = setups[0].solver.solve(task.problem, guess.U)
+    assert torch.equal(solution.U, alone.U) and bool((guess.iterations > 0).all())
+    assert torch.equal(solution.iterations, guess.iterations + alone.iterations)
     assert solution.guided.tolist() == [1, 1] and float(solution.violation.max()) < 1e-3
 
 
@@ -56,16 +60,17 @@ def test_a_bad_start_is_one_problem_s_own() -> None:
     x0[1, 0] = torch.nan
     x0[2, :2] = problem.constraints[0].centers[2, 0]
     bad = Problem(problem.dynamics, problem.cost, problem.constraints, x0, problem.N)
-    told = []
-    solution = GUIDED.solve(bad, U0, callback=told.append)
+    reports = []
+    solution = GUIDED.solve(bad, U0, callback=reports.append)
     assert solution.statuses == [Status.CONVERGED, Status.NON_FINITE, Status.INVALID_START, Status.CONVERGED]
     good = GUIDED.solve(problem, U0)
     assert torch.equal(solution.U[[0, 3]], good.U[[0, 3]]) and solution.guided.tolist() == [1, 0, 0, 1]
-    assert [p.finished for p in told] == [1, 2, 3, 4]
+    assert [p.finished for p in reports] == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize(
-    "change", [dict(solver=CasADiSolver("ipopt")), dict(detour=replace(GUIDED.detour, end=0.5, iterations=1))]
+    "change",
+    [dict(solver=CasADiSolver("ipopt")), dict(paths=replace(GUIDED.paths, arrive=0.5, track_iterations=1))],
 )
 def test_every_option_is_read(change: dict) -> None:
     problem, U0 = planar_batch(B=1, N=15, obstacles=3, seed=1)
@@ -75,18 +80,19 @@ def test_every_option_is_read(change: dict) -> None:
 
 @pytest.mark.parametrize("model", ["scenario=planar_trap model=planar", "scenario=forest model=quadrotor"])
 def test_the_configuration_serves_every_model(model: str) -> None:
-    """FATROP is that of the configuration `fatrop`, and what is followed that of `gco`, but for few ways."""
+    """FATROP is that of the configuration `fatrop`, and what is tracked that of `gco`, but for few paths."""
     solvers = [compose([*model.split(), f"solver={name}"]).solver for name in ("fatrop_guided", "fatrop", "gco")]
     guided, fatrop, gco = solvers
-    detour = gco.guidance.detour
-    assert guided.solver == fatrop and guided.detour.roadmap == detour.roadmap
-    own = dict(ways=4, keep=None, pushes=(), end=detour.ends[0], settle=guided.detour.settle, depth=1.0, finalists=1)
-    assert guided.detour == replace(detour, **own)
+    own = dict(
+        num_paths=4, initial_offsets=(), arrive=gco.paths.paces[:1], relax_iterations=guided.paths.relax_iterations,
+        relax_top=None, refine_top=1, max_penetration=1.0,
+    )  # fmt: skip
+    assert guided.solver == fatrop and guided.paths == replace(gco.paths, **own)
 
 
 def test_bad_calls_are_named() -> None:
     problem, U0 = planar_batch(B=2, N=5)
     with pytest.raises(InputError, match="U0"):
         GUIDED.solve(problem, U0[:, :3])
-    with pytest.raises(InputError, match="pushes"):
-        replace(GUIDED, detour=replace(GUIDED.detour, pushes=((1.0, 0.0, 0.0),))).prepare(problem)
+    with pytest.raises(InputError, match="initial_offsets"):
+        replace(GUIDED, paths=replace(GUIDED.paths, initial_offsets=((1.0, 0.0, 0.0),))).prepare(problem)

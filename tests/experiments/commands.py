@@ -12,7 +12,7 @@ TINY = [
     "scenario.stages=12",
     "study.batch_size=2",
     "study.shard_size=2",
-    "solver.max_outer_iterations=2",
+    "solver.local.max_outer_iterations=2",
     "study.workers=1",
 ]
 # Nothing is solved: a study of it takes as long as its files.

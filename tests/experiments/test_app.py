@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from torchgco.solvers.batch import Loop
 
 import torchgco
 from tests.experiments.commands import ROOT, TINY, command, problem_line
@@ -15,6 +14,7 @@ from torchgco.experiments.build import compose, config_dir
 from torchgco.experiments.identity import decisive, plain
 from torchgco.experiments.records import COLUMNS
 from torchgco.scenarios import Layouts
+from torchgco.solvers.augmented_lagrangian import OuterLoop
 
 DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
@@ -62,12 +62,6 @@ def test_the_configuration_chooses_the_kernels() -> None:
         kernels.use_native(True)
 
 
-def test_a_solver_is_polished_where_the_config_says_so() -> None:
-    assert torchgco.compose([]).solver.polish is None
-    solver = torchgco.compose(["solver.polish={_target_:torchgco.solvers.Polish,iterations:4}"]).solver
-    assert solver.polish == torchgco.Polish(iterations=4)
-
-
 @pytest.mark.usefixtures("without_report")
 def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:
     """Nor on the number of processes, as a test of resumed studies shows."""
@@ -81,12 +75,12 @@ def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:
 
 
 def test_out_of_memory_halves_the_batch(run, tmp_path, monkeypatch) -> None:
-    def begin(self, rows, real=Loop._begin):
+    def begin(self, rows, real=OuterLoop.begin):
         if rows.numel() > 1:
             raise torch.OutOfMemoryError("no more")
         return real(self, rows)
 
-    monkeypatch.setattr(Loop, "_begin", begin)
+    monkeypatch.setattr(OuterLoop, "begin", begin)
     code, _, err = run(*TINY, "hydra.run.dir=out", "study.baselines=[]")
     assert code == 0 and "on with 1 problems at once" in err
     assert (pd.read_parquet(tmp_path / "out" / "trials.parquet").batch_size == 1).all()
@@ -125,7 +119,7 @@ BAD = {
     "unknown group": (["planner=rrt"], "planner"),
     "unknown option": (["solver=rrt"], "rrt"),
     "unknown baseline": (["study.baselines=[rrt]"], "rrt"),
-    "added key": (["+solver.inner.speed=3"], "speed"),
+    "added key": (["+solver.local.inner.speed=3"], "speed"),
     "missing path": (["scenario=layouts"], "scenario.path"),
     "no such file": (["scenario=layouts", "scenario.path=nowhere.npz"], "scenario.path: expected a layout file"),
     "model misfit": (["model=planar"], "model: expected model=quadrotor"),
@@ -136,7 +130,7 @@ BAD = {
     "negative radius": (["scenario.obstacle_radius=-1"], "obstacle_radius"),
     "weights": (["model.vehicle.control_weight=[1,1,1,-1]"], "cost.R"),
     "crossed bounds": (["model.vehicle.control_lower=[9,9,9,9]"], "control_bounds.lower"),
-    "solver option": (["solver.inner.tolerance=-1"], "ilqr.tolerance"),
+    "solver option": (["solver.local.inner.tolerance=-1"], "ilqr.tolerance"),
     "batch size": (["study.batch_size=0"], "study.batch_size"),
     "kernels": (["device.kernels=compiled"], "device.kernels: expected native or eager"),
     "shard size": (["study.shard_size=0"], "study.shard_size"),

@@ -121,7 +121,7 @@ def test_the_report_names_a_damaged_table_and_manifest(out, capsys) -> None:
 
 FOREIGN = {
     "layouts": (["hold-000002-000003.npz"], []),
-    "settings": (["hold-000000-000001.npz"], ["+solver.violation_tolerance=1e-4"]),
+    "settings": (["hold-000000-000001.npz"], ["solver.violation_tolerance=1e-4"]),
     "scene": (["hold-000000-000001.npz"], ["scenario.num_obstacles=4"]),
     "seed": (["hold-000000-000001.npz"], ["seed=1"]),
 }

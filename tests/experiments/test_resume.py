@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from torchgco.solvers.batch import Loop
 
 from tests.experiments.commands import HOLD, TINY, problem_line
-from torchgco.baselines import MultiStart
+from torchgco import MultiStart
 from torchgco.experiments.records import Records
 from torchgco.scenarios import Layouts
-from torchgco.solvers import AugmentedLagrangian, Polish
+from torchgco.solvers import AugmentedLagrangian
+from torchgco.solvers.augmented_lagrangian import OuterLoop
 
 HOW = ["seconds", "batch_size", "threads"]  # columns that say how a trial was flown
 
@@ -111,15 +111,6 @@ def test_the_default_folder_does_not_depend_on_the_pieces(run, tmp_path) -> None
 
 
 @pytest.mark.usefixtures("without_report")
-def test_a_polished_study_keeps_its_pieces(run, run_until, monkeypatch) -> None:
-    monkeypatch.setattr(Polish, "refine", lambda self, problem, solution: solution)
-    words = [*TINY, "solver.polish={_target_:torchgco.solvers.Polish,iterations:1}", "study.baselines=[]"]
-    run_until(1, *words, "hydra.run.dir=out")
-    code, _, err = run(*words, "study.shard_size=1", "hydra.run.dir=out")
-    assert code == 2 and "study.shard_size is 2 there, 1 here" in problem_line(err)
-
-
-@pytest.mark.usefixtures("without_report")
 def test_batch_size_is_how_many_ran_together(run, tmp_path) -> None:
     words = ["solver=al_ilqr", "study.layouts=5", TINY[1], "study.batch_size=4", "study.workers=1"]
     one = "solver.max_outer_iterations=1"  # the first four end in the same pass
@@ -128,7 +119,7 @@ def test_batch_size_is_how_many_ran_together(run, tmp_path) -> None:
     assert trials.groupby("solver")["batch_size"].agg(list).to_dict() == {
         "al_ilqr": [4, 4, 4, 4, 1],
         "hold": [5] * 5,  # all in one call
-        "multistart": [5] * 5,
+        "multistart": [4, 4, 4, 4, 1],
         "fatrop": [1] * 5,  # one after the other
     }
 
@@ -137,13 +128,14 @@ def test_batch_size_is_how_many_ran_together(run, tmp_path) -> None:
 def test_batch_size_counts_those_that_take_a_freed_slot(run, tmp_path, monkeypatch) -> None:
     passes = []
 
-    def step(self, real=Loop._pass):
-        passes.append(self.state.rows.tolist())
-        return real(self)
+    def step(self, state, real=OuterLoop.advance):
+        passes.append(state.rows.tolist())
+        return real(self, state)
 
-    monkeypatch.setattr(Loop, "_pass", step)
+    monkeypatch.setattr(OuterLoop, "advance", step)
     words = ["solver=al_ilqr", "study.layouts=7", "scenario.stages=50", "study.batch_size=3", "study.workers=1"]
-    assert run(*words, "solver.cost_tolerance=0.1", "study.baselines=[]", "hydra.run.dir=out")[0] == 0
+    words += ["solver.inner.as_printed=false"]  # which ends problems early
+    assert run(*words, "solver.inner.tolerance=1e-3", "study.baselines=[]", "hydra.run.dir=out")[0] == 0
     want = [max(len(rows) for rows in passes if b in rows) for b in range(7)]
     assert pd.read_parquet(tmp_path / "out" / "trials.parquet")["batch_size"].tolist() == want
     assert want[:3] == [3] * 3 and [0, 1, 2] in passes and any(0 < len(set(rows) & {0, 1, 2}) < 3 for rows in passes)
@@ -153,18 +145,18 @@ def test_batch_size_counts_those_that_take_a_freed_slot(run, tmp_path, monkeypat
 def test_out_of_memory_reaches_a_wrapped_solver(run, tmp_path, monkeypatch) -> None:
     seen = []
 
-    def solve(self, problem, *rest, real=AugmentedLagrangian.solve):
+    def iterate(self, call, *rest, real=AugmentedLagrangian.iterate):
         seen.append(self.slots)
-        if self.slots is None or self.slots > 1:
+        if self.slots > 1:
             raise torch.OutOfMemoryError("no more")
-        return real(self, problem, *rest)
+        return real(self, call, *rest)
 
-    monkeypatch.setattr(AugmentedLagrangian, "solve", solve)
-    words = ["solver=multistart", "solver.starts=1", "solver.solver.max_outer_iterations=1", "scenario.stages=5"]
+    monkeypatch.setattr(AugmentedLagrangian, "iterate", iterate)
+    words = ["solver=multistart", "solver.starts=1", "solver.local.max_outer_iterations=1", "scenario.stages=5"]
     code, _, err = run(*words, "study.layouts=4", "study.baselines=[]", "study.workers=1", "hydra.run.dir=out")
-    assert code == 0 and seen == [None, 2, 1] and "on with 1 problems at once" in err
+    assert code == 0 and seen == [4, 2, 1] and "on with 1 problems at once" in err
     assert (pd.read_parquet(tmp_path / "out" / "trials.parquet")["batch_size"] == 1).all()
-    assert MultiStart().solver.slots is None
+    assert MultiStart().local.slots is None
 
 
 @pytest.fixture

@@ -15,9 +15,8 @@ import pandas as pd
 import pytest
 
 from tests.experiments import doomed
-from tests.experiments.commands import begin, command, problem_line
-from torchgco.errors import InputError
 from tests.experiments.commands import begin, problem_line
+from torchgco.errors import InputError
 from torchgco.experiments import workers
 from torchgco.experiments.workers import run_all
 

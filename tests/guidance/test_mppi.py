@@ -12,10 +12,10 @@ from tests.problems import planar_batch, quadrotor_batch, reference_of
 from tests.reference.guidance import active_spheres, cpuf, stuck_knots
 from tests.reference.mppi import MppiSettings, mppi
 from torchgco import GCO, MPPI, InputError
-from torchgco.constraints import GuideRegion
 from torchgco.draws import DrawKey, standard_normal
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.samples import Flight, Noise, draw, fly
+from torchgco.penalties import GuideRegion
 from torchgco.rollout import open_loop
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
@@ -34,11 +34,13 @@ def white_noise(problem, key_: DrawKey, samples: int, native: bool) -> np.ndarra
 
 @pytest.mark.parametrize("saturation", ["bounds", "symmetric"])
 @pytest.mark.parametrize("batch", BATCHES)
-def test_improve_equals_algorithm_3(batch: str, saturation: str, native: bool) -> None:
+def test_improve_equals_algorithm_3(batch: str, saturation: str, native: bool, monkeypatch) -> None:
     problem, U = BATCHES[batch](B=3, N=20)
     U = U + 0.2 * torch.randn(U.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    sampler = MPPI(samples=30, covariance=torch.linspace(0.5, 9.0, problem.m).tolist(), temperature=5.0,
-                   collision_penalty=50.0, saturation=saturation)  # fmt: skip
+    monkeypatch.setattr("torchgco.guidance.mppi.COLLISION_PENALTY", 50.0)
+    sampler = MPPI(
+        samples=30, covariance=torch.linspace(0.5, 9.0, problem.m).tolist(), temperature=5.0, saturation=saturation
+    )
     X, mean = sampler.improve(problem, U, key(3))
     z = white_noise(problem, key(3), 30, native)
     for b in range(3):
@@ -72,7 +74,7 @@ def test_detection_and_region_equal_algorithm_5(batch: str, native: bool) -> Non
     counts, caught = active_counts(problem, X, U), caught_knots(problem, X, U)
     gco = GCO(sampler=MPPI(samples=20))
     start = GuideRegion.inactive(X, torch.full((4,), 20.0, dtype=torch.float64), problem.dynamics.position)
-    guide = gco.update(problem, X, U, start, key(4)).guide
+    guide = gco.update(problem, X, U, start, key(4)).penalty
     z = white_noise(problem, key(4), 20, native)
     for b in range(4):
         twin = reference_of(problem, b)
@@ -92,47 +94,40 @@ def test_detection_and_region_equal_algorithm_5(batch: str, native: bool) -> Non
     assert guide.weight.tolist() == [pytest.approx(20.0 * 4.84)] * 4
 
 
-def test_growth_only_where_caught() -> None:
-    problem, U = planar_batch(B=4, N=30, obstacles=14)
-    X = through_the_obstacles(problem)
-    start = GuideRegion.inactive(X, torch.full((4,), 20.0, dtype=torch.float64), problem.dynamics.position)
-    guide = GCO(sampler=MPPI(samples=5), grow_when_idle=False).update(problem, X, U, start, key(4)).guide
-    caught = caught_knots(problem, X, U).any(-1)
-    assert guide.weight.tolist() == [pytest.approx(96.8 if c else 20.0) for c in caught.tolist()]
-
-
-def test_a_plan_that_touches_nothing_is_handed_over() -> None:
-    """The path is caught, the plan stays where the vehicle stands: with `adopt` it is taken, and no region is left."""
+def test_a_sample_that_touches_nothing_replaces_the_iterate() -> None:
+    """The path is caught, the sample stays where the vehicle stands: with `start_from_sample` no region is left."""
     problem, U = planar_batch(B=4, N=30, obstacles=14)
     X = through_the_obstacles(problem)
     caught = caught_knots(problem, X, U).any(-1)
     start = GuideRegion.inactive(X, torch.full((4,), 20.0, dtype=torch.float64), problem.dynamics.position)
     still = MPPI(samples=3, covariance=1e-12)
-    advice = GCO(sampler=still, adopt=True).update(problem, X, U, start, key(4))
-    assert torch.equal(advice.taken, caught) and not advice.guide.is_active.any()
+    advice = GCO(sampler=still, start_from_sample=True).update(problem, X, U, start, key(4))
+    assert torch.equal(advice.taken, caught) and not advice.penalty.is_active.any()
     torch.testing.assert_close(advice.U, U, rtol=0, atol=1e-4)
     drawn = GCO(sampler=still).update(problem, X, U, start, key(4))
-    assert not drawn.taken.any() and torch.equal(drawn.guide.is_active, caught)
+    assert not drawn.taken.any() and torch.equal(drawn.penalty.is_active, caught)
 
 
-def test_patience_counts_a_single_sphere() -> None:
+def test_a_single_sphere_counts_after_some_iterations() -> None:
     problem, U = planar_batch(B=3, N=30, obstacles=1)
     X = through_the_obstacles(problem)
     X[..., 1] = problem.constraints[0].centers[:, :1, 1]
     start = GuideRegion.inactive(X, torch.full((3,), 20.0, dtype=torch.float64), problem.dynamics.position)
-    gco = GCO(sampler=MPPI(samples=3), patience=2)
-    assert not gco.update(problem, X, U, start, key(3, outer=1)).guide.is_active.any()
+    gco = GCO(sampler=MPPI(samples=3), single_contact_after=2)
+    assert not gco.update(problem, X, U, start, key(3, outer=1)).penalty.is_active.any()
     present = ~problem.constraints[0].absent[:, 0]
-    assert torch.equal(gco.update(problem, X, U, start, key(3, outer=2)).guide.is_active, present)
+    assert torch.equal(gco.update(problem, X, U, start, key(3, outer=2)).penalty.is_active, present)
 
 
 def test_smooth_noise_is_linear_between_its_knots_and_shrinks() -> None:
     problem, U = planar_batch(B=2, N=21)
-    noise = MPPI(samples=4, knots=5)._noise(problem, key(2), torch.ones(1, 1, 2, dtype=torch.float64), 0, range(4))
+    noise = MPPI(samples=4, noise_knots=5)._noise(
+        problem, key(2), torch.ones(1, 1, 2, dtype=torch.float64), 0, range(4)
+    )
     V = draw(torch.zeros(21, 2, 1, 2, dtype=torch.float64), noise, None)
     torch.testing.assert_close(V[::5], noise.z)
     torch.testing.assert_close(V[2], 0.6 * noise.z[0] + 0.4 * noise.z[1])
-    wide, narrow = (MPPI(samples=64, rounds=6, decay=d, covariance=4.0, knots=5) for d in (1.0, 0.5))
+    wide, narrow = (MPPI(samples=64, rounds=6, decay=d, covariance=4.0, noise_knots=5) for d in (1.0, 0.5))
     spread = [float((s.improve(problem, U, key(2))[1] - U).abs().mean()) for s in (wide, narrow)]
     assert spread[1] < spread[0]
 
@@ -144,11 +139,11 @@ def test_elite_temperature_is_the_gap_to_the_better_samples() -> None:
     torch.testing.assert_close(MPPI(samples=4)._weights(S), torch.softmax(-S, dim=1))
 
 
-def test_lingering_charges_where_a_sample_ends() -> None:
+def test_dwelling_charges_where_a_sample_ends() -> None:
     problem, U = planar_batch(B=1, N=6)
     flight = flown(problem, U.unsqueeze(1) + torch.tensor([0.0, 4.0]).view(1, 2, 1, 1))
     V = flight.V
-    plain, longer = MPPI(samples=2).scores(problem, flight), MPPI(samples=2, linger=2.0).scores(problem, flight)
+    plain, longer = MPPI(samples=2).scores(problem, flight), MPPI(samples=2, dwell_cost=2.0).scores(problem, flight)
     for s in range(2):
         controls = V[:, :, s].transpose(0, 1)
         X = open_loop(problem.dynamics, problem.x0, controls)
@@ -159,7 +154,7 @@ def test_lingering_charges_where_a_sample_ends() -> None:
 def test_single_precision_keeps_cost_apart_from_collisions(native: bool) -> None:
     """rho_mp = 1e8 beside costs of some thousands: added in float32, the costs would be lost."""
     problem, U = quadrotor_batch(B=3, N=30)
-    sampler = MPPI(samples=64, knots=4, elite=5, rounds=3)
+    sampler = MPPI(samples=64, noise_knots=4, elite=5, rounds=3)
     one, two = (replace(sampler, dtype=dtype).improve(problem, U, key(3)) for dtype in (None, "float32"))
     torch.testing.assert_close(one[1], two[1], rtol=0, atol=2e-2)
     assert two[1].dtype == torch.float64
@@ -169,7 +164,7 @@ def test_single_precision_keeps_cost_apart_from_collisions(native: bool) -> None
 @pytest.mark.parametrize("native", ["eager"], indirect=True)
 def test_many_samples_are_flown_in_blocks(knots: int, native: bool, monkeypatch) -> None:
     problem, U = planar_batch(B=3, N=12)
-    sampler = MPPI(samples=23, knots=knots, rounds=2, covariance=4.0)
+    sampler = MPPI(samples=23, noise_knots=knots, rounds=2, covariance=4.0)
     whole = sampler.improve(problem, U, key(3))[1]
     monkeypatch.setattr("torchgco.guidance.mppi.CHUNK", 10)
     torch.testing.assert_close(sampler.improve(problem, U, key(3))[1], whole, rtol=1e-12, atol=1e-12)
@@ -208,7 +203,7 @@ def test_draws_are_keyed_by_element_and_sample_not_by_place() -> None:
 def test_samples_do_not_know_their_companions(batch: str, dtype: str, samples: int, native: bool) -> None:
     """Bit by bit: sums and products over the samples of all problems must not mix their order."""
     problem, U = BATCHES[batch](B=7, N=12)
-    sampler = MPPI(samples=samples, knots=4, elite=3, rounds=2, dtype=dtype)
+    sampler = MPPI(samples=samples, noise_knots=4, elite=3, rounds=2, dtype=dtype)
     whole = sampler.improve(problem, U, key(7))[1]
     for rows in ([2], [4, 1], [6, 5, 3]):
         index = torch.tensor(rows)
@@ -229,18 +224,16 @@ def test_a_diverging_sample_is_not_chosen() -> None:
         (lambda: MPPI(samples=0), "mppi.samples"),
         (lambda: MPPI(temperature=0.0), "mppi.temperature"),
         (lambda: MPPI(rounds=0), "mppi.rounds"),
-        (lambda: MPPI(knots=1), "mppi.knots"),
+        (lambda: MPPI(noise_knots=1), "mppi.noise_knots"),
         (lambda: MPPI(decay=0.0), "mppi.decay"),
         (lambda: MPPI(elite=101), "mppi.elite"),
-        (lambda: MPPI(linger=-1.0), "mppi.linger"),
-        (lambda: MPPI(collision_penalty=-1.0), "mppi.collision_penalty"),
+        (lambda: MPPI(dwell_cost=-1.0), "mppi.dwell_cost"),
         (lambda: MPPI(saturation="clip"), "mppi.saturation"),
         (lambda: MPPI(dtype="float16"), "mppi.dtype"),
         (lambda: MPPI(covariance=[1.0, 1.0, 1.0]).improve(*planar_batch(B=1, N=3), key(1)), "mppi.covariance"),
         (lambda: MPPI(covariance=0.0).improve(*planar_batch(B=1, N=3), key(1)), "mppi.covariance"),
         (lambda: GCO(initial_penalty=0.0), "gco.initial_penalty"),
         (lambda: GCO(penalty_growth=0.5), "gco.penalty_growth"),
-        (lambda: GCO(radius=-1.0), "gco.radius"),
     ],
 )
 def test_bad_options_are_named(make, field: str) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torchgco.guidance.misfits import SAMPLES, suited_sampler
 
 import torchgco
 from torchgco import (
@@ -32,9 +31,10 @@ from torchgco import (
     kernels,
     presets,
 )
-from torchgco.guidance import Detour
-from torchgco.guidance.gco import REACH
+from torchgco.guidance.gco import REACH, _radius
+from torchgco.guidance.suitability import SAMPLES, suited_sampler
 from torchgco.native.compiler import find_compiler
+from torchgco.search import PathProposals
 
 
 @pytest.fixture
@@ -70,13 +70,14 @@ def spheres(d: int) -> Spheres:
 
 
 BASE = presets.gco(posed(2, spheres(2)))
-assert BASE.guidance is not None
-SAMPLER = replace(BASE.guidance.sampler, samples=64, rounds=4)
+assert BASE.sampling is not None
+SAMPLER = replace(BASE.sampling.sampler, samples=64, rounds=4)
 SINGLE = replace(
     BASE,
+    local=replace(BASE.local, max_outer_iterations=6),
+    paths=PathProposals(),
+    sampling=replace(BASE.sampling, sampler=SAMPLER),
     attempts=2,
-    max_outer_iterations=6,
-    guidance=replace(BASE.guidance, sampler=SAMPLER, detour=Detour()),
 )
 
 
@@ -106,8 +107,8 @@ CASES = {
     "a function for obstacles": (lambda: posed(2, FunctionConstraint(pillars, geometric=True)), None),
     "a product with float64": (lambda: posed(2, spheres(2), "product"), "samples are drawn in float64"),
     "promoted to float64": (lambda: posed(2, spheres(2), "promoted"), "samples are drawn in float64"),
-    "a line": (lambda: posed(1, spheres(1)), "no way is sought around spheres in 1-D"),
-    "four dimensions": (lambda: posed(4, spheres(4)), "no way is sought around spheres in 4-D"),
+    "a line": (lambda: posed(1, spheres(1)), "no path is sought around spheres in 1-D"),
+    "four dimensions": (lambda: posed(4, spheres(4)), "no path is sought around spheres in 4-D"),
 }
 
 
@@ -116,41 +117,49 @@ def test_what_can_be_had_is_had(case: str, in_pytorch: None) -> None:
     """The caught element is guided, the other left alone, each as if it were by itself, and one warning is given."""
     make, why = CASES[case]
     problem = make()
-    solution, told = solved(problem)
+    solution, warned = solved(problem)
     # The free element is stationary; from a sampled plan, held by a stiff penalty, that may take more iterations.
     assert int(solution.guided[0]) > 0 and solution.statuses[1] == Status.CONVERGED
     assert solution.statuses[0] in (Status.CONVERGED, Status.FEASIBLE) and bool((solution.violation <= 1e-3).all())
     assert all(torch.equal(solution.U[b], alone(problem, b)) for b in (0, 1))
     if why is None:
-        assert told == []
+        assert warned == []
     else:
-        assert len(told) == 1 and told[0].startswith("guided in part: ")
-        assert re.search(why, told[0])
+        assert len(warned) == 1 and warned[0].startswith("guided in part: ")
+        assert re.search(why, warned[0])
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("kind", ["product", "promoted"])
 def test_native_samples_ask_nothing_of_the_users_functions(kind: str) -> None:
     problem = posed(2, spheres(2), kind)
-    solution, told = solved(problem)
-    assert told == [] and int(solution.guided[0]) > 0
+    solution, warned = solved(problem)
+    assert warned == [] and int(solution.guided[0]) > 0
     assert all(torch.equal(solution.U[b], alone(problem, b)) for b in (0, 1))
 
 
 def test_without_a_position_nothing_is_guided() -> None:
     problem = posed(2, FunctionConstraint(pillars, geometric=True))
     nowhere = replace(problem, dynamics=replace(problem.dynamics, position=None))
-    solution, told = solved(nowhere)
-    assert told == ["solved without guidance: the dynamics have no position"]
+    solution, warned = solved(nowhere)
+    assert warned == ["solved without guidance: the dynamics have no position"]
     assert solution.guided.tolist() == [0, 0]
-    want = torchgco.solve(nowhere, solver=replace(SINGLE, guidance=None))
+    want = torchgco.solve(nowhere, solver=SINGLE.local)
     assert torch.equal(solution.U, want.U)
+
+
+@pytest.mark.parametrize("native", ["native", "eager"], indirect=True)
+def test_the_sampler_alone_needs_no_position(native: bool) -> None:
+    problem = posed(2, FunctionConstraint(pillars, geometric=True))
+    nowhere = replace(problem, dynamics=replace(problem.dynamics, position=None))
+    (want, _), (got, warned) = (solved(p, IteratedMPPI(SAMPLER, iterations=2)) for p in (problem, nowhere))
+    assert warned == [] and torch.equal(got.U, want.U)
 
 
 def test_without_obstacles_no_guidance_is_missed() -> None:
     problem = posed(2, FunctionConstraint(pillars), dynamics=replace(vehicle(2), position=None))
-    solution, told = solved(problem)
-    assert told == [] and solution.guided.tolist() == [0, 0]
+    solution, warned = solved(problem)
+    assert warned == [] and solution.guided.tolist() == [0, 0]
 
 
 class Fussy(FunctionDynamics):
@@ -162,18 +171,16 @@ class Fussy(FunctionDynamics):
         return super().step(x, u)
 
 
-def test_dynamics_that_bear_no_samples_are_led_by_detours_alone(in_pytorch: None) -> None:
+def test_dynamics_that_bear_no_samples_are_led_by_paths_alone(in_pytorch: None) -> None:
     plain = vehicle(2)
     fussy = Fussy(plain.function, 4, 2, 0.1, "euler", plain.position)
     problem, lost = posed(2, spheres(2), dynamics=fussy), "no plan can be sampled (no samples here)"
-    solution, told = solved(problem, replace(SINGLE, attempts=3))
-    assert told == [f"guided in part: {lost}"]
+    solution, warned = solved(problem, replace(SINGLE, attempts=3))
+    assert warned == [f"guided in part: {lost}"]
     assert int(solution.guided[0]) == 1 and solution.status.tolist() == [1, 1]
-    assert SINGLE.guidance is not None
-    bare = replace(SINGLE, guidance=replace(SINGLE.guidance, detour=None))
-    solution, told = solved(problem, bare)
-    assert told == [f"solved without guidance: {lost}"]
-    want = torchgco.solve(posed(2, spheres(2)), solver=replace(SINGLE, guidance=None))
+    solution, warned = solved(problem, replace(SINGLE, paths=None))
+    assert warned == [f"solved without guidance: {lost}"]
+    want = torchgco.solve(posed(2, spheres(2)), solver=SINGLE.local)
     assert torch.equal(solution.U, want.U) and solution.guided.tolist() == [0, 0]
     with pytest.raises(InputError, match="got no plan can be sampled"):
         torchgco.solve(problem, solver=IteratedMPPI(iterations=1))
@@ -182,8 +189,8 @@ def test_dynamics_that_bear_no_samples_are_led_by_detours_alone(in_pytorch: None
 @pytest.mark.parametrize("kind", ["product", "promoted"])
 def test_the_sampler_alone_falls_back_to_the_problems_precision(kind: str, in_pytorch: None) -> None:
     problem, sampler = posed(2, spheres(2), kind), replace(SAMPLER, dtype="float32")
-    solution, told = solved(problem, IteratedMPPI(sampler, iterations=2))
-    assert len(told) == 1 and "samples are drawn in float64" in told[0]
+    solution, warned = solved(problem, IteratedMPPI(sampler, iterations=2))
+    assert len(warned) == 1 and "samples are drawn in float64" in warned[0]
     want = torchgco.solve(problem, solver=IteratedMPPI(replace(sampler, dtype="float64"), iterations=2))
     assert torch.equal(solution.U, want.U)
     suited, why = suited_sampler(sampler, posed(2, spheres(2)))
@@ -195,23 +202,29 @@ def test_the_radius_without_spheres_is_a_share_of_the_way() -> None:
     X = problem.x0.unsqueeze(1).repeat(1, 41, 1)
     X[0, 7, :2] = torch.tensor([3.0, 4.0], dtype=torch.float64)
     far = torch.tensor([2.0, 13.0**0.5], dtype=torch.float64)
-    torch.testing.assert_close(GCO()._radius(problem, X), REACH * far)
-    assert GCO(radius=0.3)._radius(problem, X).tolist() == [0.3, 0.3]
-    assert GCO()._radius(posed(2, spheres(2)), X).tolist() == [0.1, 0.1]
+    torch.testing.assert_close(_radius(problem, X), REACH * far)
+    assert _radius(posed(2, spheres(2)), X).tolist() == [0.1, 0.1]
 
     aimless = Problem(problem.dynamics, Cost(), problem.constraints, problem.x0, problem.N)
-    torch.testing.assert_close(GCO()._radius(aimless, X), X.new_tensor([REACH * 5.0, 0.0]))
+    torch.testing.assert_close(_radius(aimless, X), X.new_tensor([REACH * 5.0, 0.0]))
 
 
 @pytest.mark.parametrize(
-    ("guidance", "field"),
+    ("options", "field"),
     [
-        (GCO(sampler=MPPI(covariance=[1.0, 1.0, 1.0])), "mppi.covariance"),
-        (GCO(detour=Detour(pushes=((1.0,),))), "detour.pushes"),
+        (dict(sampling=GCO(sampler=MPPI(covariance=[1.0, 1.0, 1.0]))), "mppi.covariance"),
+        (dict(paths=PathProposals(initial_offsets=(("left", "right"),))), "paths.initial_offsets"),  # type: ignore
     ],
 )
-def test_options_that_do_not_fit_are_named_before_any_element_is_caught(guidance: GCO, field: str) -> None:
+def test_options_that_do_not_fit_are_named_before_any_element_is_caught(options: dict[str, Any], field: str) -> None:
     far = Spheres([[50.0, 50.0]], [0.1])
     with pytest.raises(InputError) as error:
-        torchgco.solve(posed(2, far), solver=replace(SINGLE, guidance=guidance))
+        torchgco.solve(posed(2, far), solver=replace(SINGLE, **options))
     assert error.value.field == field
+
+
+def test_offsets_for_another_number_of_controls_are_left_out() -> None:
+    """Presets hold offsets for two controls, and serve every vehicle."""
+    problem = posed(2, spheres(2))
+    plain, more = (solved(problem, replace(SINGLE, paths=PathProposals(initial_offsets=o))) for o in ((), ((1.0,),)))
+    assert plain[1] == more[1] == [] and torch.equal(plain[0].U, more[0].U)

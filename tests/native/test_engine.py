@@ -11,10 +11,8 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
-from torchgco.constraints.guides import GuidePath, GuideRegion
-from torchgco.solvers.iteration import EagerIterations, NativeIterations
 
-from tests.problems import PRINTED, planar_batch, quadrotor_batch
+from tests.problems import planar_batch, quadrotor_batch
 from torchgco import (
     ILQR,
     AugmentedLagrangian,
@@ -31,12 +29,16 @@ from torchgco import (
 )
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import EagerWarning, engine_of, terms_of
+from torchgco.penalties import GuidePath, GuideRegion
 from torchgco.rollout import open_loop
-from torchgco.solvers.state import State
+from torchgco.solvers import ilqr
+from torchgco.solvers.ilqr import advance
+from torchgco.solvers.state import PassEnd, State
 from torchgco.solvers.verdict import optimality
 
-DAMPED = ILQR(max_iterations=50, damping=0.1, line_search=LineSearch(accept_last=False))
-BRIEF = replace(DAMPED, line_search=LineSearch(accept_last=False, ratio_min=0.9, shrink=0.8, smallest=0.05, back=2))
+DAMPED = ILQR()
+BRIEF = replace(DAMPED, line_search=LineSearch(ratio_min=0.9, shrink=0.8, smallest=0.05, back=2))
+PRINTED = ILQR(as_printed=True, tolerance=0.1, max_iterations=15)
 
 
 @pytest.fixture(autouse=True)
@@ -115,25 +117,25 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
 }
 
 
-def begun(problem: Problem, guided: str | None = None, clip: bool = True, seed: int = 0) -> tuple[State, Lagrangian]:
+def begun(problem: Problem, guided: str | None = None, phr: bool = True, seed: int = 0) -> tuple[State, Lagrangian]:
     """A state as a loop holds it, along random controls, with multipliers and penalties at work."""
     B = problem.B
     U = problem.cost.rest_controls(problem.x0.new_zeros(B, problem.N, problem.m)) + 0.5 * normal(
         B, problem.N, problem.m, seed=seed
     )
     X = open_loop(problem.dynamics, problem.x0, U)
-    duals = Multipliers.zero(problem, 3.0)
+    multipliers = Multipliers.zero(problem, 3.0)
     lam = []
-    for constraint, zero in zip(problem.constraints, duals.lam, strict=True):
+    for constraint, zero in zip(problem.constraints, multipliers.lam, strict=True):
         drawn = normal(*zero.shape, seed=11)
         lam.append(drawn if constraint.sense == "equality" else drawn.clamp(min=0.0))
     at = problem.dynamics.position
-    guide = None
+    penalty = None
     if guided is not None:
         center, weight = X[..., at] + 0.1 * normal(*X[..., at].shape, seed=12), torch.full((B,), 4.0, dtype=X.dtype)
         radius = torch.where(normal(B, problem.N + 1, seed=13) > 0, 0.05, torch.inf)
-        guide = GuidePath(center, weight, at) if guided == "path" else GuideRegion(center, radius, weight, at)
-    lagrangian = Lagrangian(problem, Multipliers(tuple(lam), duals.mu), guide, clip)
+        penalty = GuidePath(center, weight, at) if guided == "path" else GuideRegion(center, radius, weight, at)
+    lagrangian = Lagrangian(problem, Multipliers(tuple(lam), multipliers.mu), penalty, phr)
     cost, merit = lagrangian.value(X, U)
     zero = torch.zeros(B, dtype=torch.int64)
     blank = dict.fromkeys(State.__dataclass_fields__)
@@ -152,7 +154,7 @@ def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict
     ends: dict[int, tuple[bool, bool, int]] = {}
     for _ in range(3 * count):
         frozen = replace(state)
-        end = EagerIterations(inner).run(state, lagrangian)
+        end = inner.iterate(state, lagrangian)
         for b in range(lagrangian.problem.B):
             if b in ends:  # an element that had ended before stays where it was
                 for name in ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation"):
@@ -164,12 +166,18 @@ def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict
     return ends
 
 
-@pytest.mark.parametrize("clip", [True, False], ids=["clipped", "printed"])
+def natively(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> PassEnd:
+    """Up to `count` iterations of every element by native kernels."""
+    assert engine_of(lagrangian.problem) is not None
+    return advance(inner, state, lagrangian, count)
+
+
+@pytest.mark.parametrize("phr", [True, False], ids=["phr", "printed"])
 @pytest.mark.parametrize("guided", [None, "region", "path"])
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None, clip: bool) -> None:
+def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None, phr: bool) -> None:
     problem = PROBLEMS[name]()
-    state, lagrangian = begun(problem, guided, clip)
+    state, lagrangian = begun(problem, guided, phr)
     engine = engine_of(problem)
     assert engine is not None
     for mine, theirs in zip(engine.value(problem, state.X, state.U, terms_of(lagrangian)), lagrangian.value(
@@ -177,10 +185,10 @@ def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None
     ), strict=True):  # fmt: skip
         torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(engine.open_loop(problem, state.U), state.X, rtol=1e-10, atol=1e-12)
-    for inner, count in ((DAMPED, 1), (DAMPED, 4), (BRIEF, 4)):
-        (a, first), (b, second) = begun(problem, guided, clip), begun(problem, guided, clip)
+    for inner, count in ((DAMPED, 1), (DAMPED, 4), (BRIEF, 4), (PRINTED, 4)):
+        (a, first), (b, second) = begun(problem, guided, phr), begun(problem, guided, phr)
         ends = eager(inner, a, first, count)
-        out = NativeIterations(inner, count).run(b, second)
+        out = natively(inner, b, second, count)
         torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
         torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
         assert torch.equal(b.iterations, a.iterations) and torch.equal(b.inner, a.inner)
@@ -206,7 +214,7 @@ def test_models_of_any_size(n: int, m: int, N: int) -> None:
     problem = linear_problem(n, m, N)
     (a, first), (b, second) = begun(problem), begun(problem)
     eager(DAMPED, a, first, 5)
-    NativeIterations(DAMPED, 5).run(b, second)
+    natively(DAMPED, b, second, 5)
     torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
 
@@ -215,14 +223,14 @@ def test_models_of_any_size(n: int, m: int, N: int) -> None:
 def test_an_element_has_its_bits_in_every_batch(B: int) -> None:
     whole = planar_batch(B=40, N=15, obstacles=5)[0]
     all_of_them, lagrangian = begun(whole)
-    NativeIterations(DAMPED, 6).run(all_of_them, lagrangian)
+    natively(DAMPED, all_of_them, lagrangian, 6)
     state, lagrangian = begun(whole)
     rows = torch.arange(B).flip(0)
     part = replace(state, **{
         name: getattr(state, name)[rows]
         for name in ("X", "U", "cost", "merit", "inner", "iterations", "regularisation", "rows", "outer")
     })  # fmt: skip
-    NativeIterations(DAMPED, 6).run(part, lagrangian.take(rows))
+    natively(DAMPED, part, lagrangian.take(rows), 6)
     for name in ("X", "U", "cost", "merit", "regularisation", "iterations"):
         assert torch.equal(getattr(part, name), getattr(all_of_them, name)[rows]), name
 
@@ -231,13 +239,13 @@ def test_an_element_has_its_bits_in_every_batch(B: int) -> None:
 def test_a_neighbour_that_is_not_finite_changes_no_bits(threads: int) -> None:
     problem = quadrotor_batch(B=19, N=10, obstacles=4)[0]
     want, lagrangian = begun(problem)
-    NativeIterations(DAMPED, 5).run(want, lagrangian)
+    natively(DAMPED, want, lagrangian, 5)
     state, lagrangian = begun(problem)
     state.X[3], state.U[11, 4] = torch.nan, torch.inf
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        end = NativeIterations(DAMPED, 5).run(state, lagrangian)
+        end = natively(DAMPED, state, lagrangian, 5)
     finally:
         torch.set_num_threads(before)
     rest = torch.tensor([b for b in range(19) if b not in (3, 11)])
@@ -246,17 +254,18 @@ def test_a_neighbour_that_is_not_finite_changes_no_bits(threads: int) -> None:
         assert torch.equal(getattr(state, name)[rest], getattr(want, name)[rest]), name
 
 
-def test_statuses_are_those_of_pytorch() -> None:
+def test_statuses_are_those_of_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
     """A concave cost without bounds has no minimum to find; one that nothing regularises enough ends with a status."""
     free = planar_batch(B=2, N=6)[0]
     concave = replace(free.cost, R=-free.cost.R)
     problem = free._with({"cost": concave, "constraints": ()})
-    for inner in (replace(DAMPED, regularisation_max=1e-4), replace(DAMPED, max_iterations=3)):
+    for inner, limit in ((DAMPED, 1e-4), (replace(DAMPED, max_iterations=3), ilqr.REGULARISATION_MAX)):
+        monkeypatch.setattr(ilqr, "REGULARISATION_MAX", limit)
         (a, first), (b, second) = begun(problem), begun(problem)
-        native = NativeIterations(inner, 3).run(b, second)
+        native = natively(inner, b, second, 3)
         statuses = torch.zeros(2, dtype=torch.int64)
         for _ in range(20):
-            end = EagerIterations(inner).run(a, first)
+            end = inner.iterate(a, first)
             statuses = torch.where(statuses == 0, end.status, statuses)
             if bool((end.ended | (statuses > 0)).all()):
                 break
@@ -265,8 +274,8 @@ def test_statuses_are_those_of_pytorch() -> None:
 
 def test_whole_solves_agree() -> None:
     problem, U0 = quadrotor_batch(B=3, N=20, obstacles=5, seed=2)
-    for inner in (DAMPED, ILQR(absolute_tolerance=0.1, max_iterations=15, **PRINTED)):
-        solver = AugmentedLagrangian(inner=inner, max_outer_iterations=5, clip=inner is DAMPED)
+    for inner in (DAMPED, PRINTED):
+        solver = AugmentedLagrangian(inner=inner, max_outer_iterations=5)
         native = solver.solve(problem, U0)
         kernels.use_native(False)
         plain = solver.solve(problem, U0)

@@ -13,10 +13,9 @@ from typing import Any, ClassVar
 import pytest
 import torch
 from torch import Tensor
-from torchgco.solvers.iteration import NativeIterations
 
 import torchgco
-from tests.native.test_engine import DAMPED, begun, eager, normal
+from tests.native.test_engine import DAMPED, begun, eager, natively, normal
 from tests.native.users import PROBLEMS, Each, Smooth, Tube, each, errands, with_cost
 from tests.problems import planar_batch, quick_gco
 from torchgco import Problem, Status, kernels
@@ -64,7 +63,7 @@ def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> N
     for count in (1, 4):
         (a, first), (b, second) = begun(problem), begun(problem)
         ends = eager(DAMPED, a, first, count)
-        out = NativeIterations(DAMPED, count).run(b, second)
+        out = natively(DAMPED, b, second, count)
         torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
         torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
         assert torch.equal(b.iterations, a.iterations) and torch.equal(b.inner, a.inner)
@@ -113,12 +112,12 @@ def test_the_library_may_be_made_for_one_problem_first() -> None:
 def test_an_element_has_its_bits_in_every_batch(name: str) -> None:
     whole = PROBLEMS[name]()
     all_of_them, lagrangian = begun(whole)
-    NativeIterations(DAMPED, 5).run(all_of_them, lagrangian)
+    natively(DAMPED, all_of_them, lagrangian, 5)
     names = ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation", "rows", "outer")
     for rows in (torch.tensor([2]), torch.arange(5).flip(0), torch.tensor([1, 3] * 6)):
         state, lagrangian = begun(whole)
         part = replace(state, **{name: getattr(state, name)[rows] for name in names})
-        NativeIterations(DAMPED, 5).run(part, lagrangian.take(rows))
+        natively(DAMPED, part, lagrangian.take(rows), 5)
         for name in ("X", "U", "cost", "merit", "iterations"):
             assert torch.equal(getattr(part, name), getattr(all_of_them, name)[rows]), name
 
@@ -130,22 +129,22 @@ def test_a_problem_of_its_own_has_the_bits_of_the_batch() -> None:
     alone = Problem(whole.dynamics, own, whole.constraints, whole.x0[3:4], whole.N)
     (a, first), (b, second) = begun(whole), begun(alone)
     b.X, b.U, b.cost, b.merit = a.X[3:4], a.U[3:4], a.cost[3:4], a.merit[3:4]
-    second = replace(second, duals=first.take(torch.tensor([3])).duals)
-    NativeIterations(DAMPED, 5).run(a, first)
-    NativeIterations(DAMPED, 5).run(b, second)
+    second = replace(second, multipliers=first.take(torch.tensor([3])).multipliers)
+    natively(DAMPED, a, first, 5)
+    natively(DAMPED, b, second, 5)
     assert torch.equal(b.U[0], a.U[3]) and torch.equal(b.merit[0], a.merit[3])
 
 
 def test_a_neighbour_that_is_not_finite_changes_no_bits() -> None:
     problem = PROBLEMS["by knot"]()
     want, lagrangian = begun(problem)
-    NativeIterations(DAMPED, 5).run(want, lagrangian)
+    natively(DAMPED, want, lagrangian, 5)
     target = problem.cost.own_path.clone()
     target[1] = torch.nan
     ill = problem._with({"cost": replace(problem.cost, own_path=target)})
     state, lagrangian = begun(problem)
     state.X[3] = torch.nan
-    end = NativeIterations(DAMPED, 5).run(state, replace(lagrangian, problem=ill))
+    end = natively(DAMPED, state, replace(lagrangian, problem=ill), 5)
     assert [int(s) for s in end.status] == [0, 0, 0, int(Status.NON_FINITE), 0]
     assert torch.equal(state.U[1], begun(problem)[0].U[1]) and not torch.equal(state.U[1], want.U[1])
     for name in ("X", "U", "merit", "iterations"):
@@ -186,7 +185,8 @@ def test_solve_is_native_for_a_users_own_car_and_cost() -> None:
 def test_such_a_solve_loads_nothing_that_takes_seconds() -> None:
     code = (
         "import sys, torchgco; from tests.native.users import errands; from dataclasses import replace;"
-        "problem = errands(1, 20); solver = replace(torchgco.presets.gco(problem), max_outer_iterations=2);"
+        "problem = errands(1, 20); solver = torchgco.presets.gco(problem);"
+        "solver = replace(solver, local=replace(solver.local, max_outer_iterations=2));"
         "torchgco.solve(problem, solver=solver); print('torch._dynamo' in sys.modules)"
     )
     root = Path(__file__).parents[2]

@@ -1,4 +1,4 @@
-"""The roadmap's search in C and in PyTorch: the same ways, also where several cost the same."""
+"""The roadmap's search in C and in PyTorch: the same paths, also where several cost the same."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from torchgco.guidance.roadmap import FAR, Roadmap, Scene, halton
-from torchgco.guidance.search import Search
 
 from torchgco import kernels
 from torchgco.native import roadmap as native
 from torchgco.native.dispatch import EagerWarning
 from torchgco.native.roadmap import HOPS, Graph, NativeSearch, library_for
+from torchgco.search.geometry import FAR, Scene
+from torchgco.search.graph import Search
+from torchgco.search.roadmap import Roadmap, halton
 
 B = 3
 
@@ -35,11 +36,11 @@ def flat(points: Tensor, rows: slice) -> Tensor:
     return torch.ones_like(points[..., 0])
 
 
-def scene(centers, distances, start, goal, toll=uneven) -> Scene:
+def scene(centers, distances, start, goal, price=uneven) -> Scene:
     """B times the same start and goal among spheres (M, d), or their own (B, M, d)."""
     o, R = (torch.as_tensor(np.asarray(v, dtype=float)) for v in (centers, distances))
     ends = (torch.tensor(end, dtype=torch.float64).expand(B, -1) for end in (start, goal))
-    return Scene(*ends, o.expand(B, *o.shape[-2:]), R.expand(B, R.shape[-1]), toll)
+    return Scene(*ends, o.expand(B, *o.shape[-2:]), R.expand(B, R.shape[-1]), price)
 
 
 def drawn(d: int, M: int, seed: int) -> Scene:
@@ -82,31 +83,36 @@ SCENES = {
     "goal at start in space": scene([[0.5, 0.0, 0.0], [0.0, 0.4, 0.0]], [0.2, 0.1], (0.0,) * 3, (0.0,) * 3),
     "goal at start, nothing there": scene([[0.5, 0.0]], [FAR], (0.0, 0.0), (0.0, 0.0)),
     "start inside": scene([[-1.0, 0.1], [0.0, 0.0]], [0.3, 0.3], (-1.0, 0.0), (1.0, 0.0)),
-    "no way": ring(),
+    "no path": ring(),
 }
 
 
 def both(roadmap: Roadmap, s: Scene, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
     assert library_for(s.centers) is not None
-    first = roadmap.ways(s, count)
+    first = roadmap.paths(s, count)
     kernels.use_native(False)
-    return first, roadmap.ways(s, count)
+    return first, roadmap.paths(s, count)
 
 
 @pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("roadmap", [Roadmap(slack=0.02), Roadmap(9, 12, neighbours=3, hubs=5, margin=1.0)])
-def test_both_return_the_same_ways(name: str, roadmap: Roadmap) -> None:
-    (ways, found), (wanted, exist) = both(roadmap, SCENES[name], 4)
+@pytest.mark.parametrize("size", ["usual", "small"])
+def test_both_return_the_same_paths(name: str, size: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    roadmap = Roadmap(max_overlap=0.02)
+    if size == "small":
+        roadmap = Roadmap(num_halton=12)
+        for constant, value in {"NODES": 9, "NEIGHBOURS": 3, "HALTON_NEIGHBOURS": 5, "MARGIN": 1.0}.items():
+            monkeypatch.setattr(f"torchgco.search.roadmap.{constant}", value)
+    (paths, found), (wanted, exist) = both(roadmap, SCENES[name], 4)
     assert torch.equal(found, exist)
-    torch.testing.assert_close(ways, wanted, rtol=0, atol=1e-9)
+    torch.testing.assert_close(paths, wanted, rtol=0, atol=1e-9)
 
 
-def test_no_way_is_the_straight_line() -> None:
-    s = SCENES["no way"]
-    for ways, found in both(Roadmap(), s, 2):
+def test_no_path_is_the_straight_line() -> None:
+    s = SCENES["no path"]
+    for paths, found in both(Roadmap(), s, 2):
         assert not bool(found.any())
-        assert torch.equal(ways[:, :, 0], s.start.unsqueeze(1).expand(-1, 2, -1))
-        assert torch.equal(ways[:, :, 1:], s.goal[:, None, None].expand(-1, 2, HOPS, -1))
+        assert torch.equal(paths[:, :, 0], s.start.unsqueeze(1).expand(-1, 2, -1))
+        assert torch.equal(paths[:, :, 1:], s.goal[:, None, None].expand(-1, 2, HOPS, -1))
 
 
 @pytest.mark.parametrize("name", [name for name in SCENES if name.startswith("drawn") or "lattice" in name])
@@ -114,7 +120,7 @@ def test_both_make_the_same_graph(name: str) -> None:
     """As matrices of lengths: the order of a point's edges is their own."""
     s = SCENES[name]
     d, made = s.start.shape[1], []
-    for search in searches(s.centers, s.distances, 0.15):
+    for search in searches(s.centers, s.inflated_radii, 0.15):
         graph = search.graph(s.start, s.goal, halton(20, d), 30, 5, 4)
         lengths = torch.full((B, graph.points.shape[1], graph.points.shape[1]), torch.inf, dtype=torch.float64)
         ends = graph.ends.long().clamp(min=0)
@@ -143,27 +149,27 @@ def nowhere() -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("edges", [1, 2, HOPS - 1, HOPS, HOPS + 1, HOPS + 2])
-def test_a_way_has_so_many_edges_at_most(edges: int) -> None:
+def test_a_path_has_so_many_edges_at_most(edges: int) -> None:
     graph = chain(edges + 1)
     for search in searches(*nowhere(), 0.15):
-        way, string, arrives = search.cheapest(graph, torch.ones(1, edges + 1, dtype=torch.float64))
+        path, string, arrives = search.cheapest(graph, torch.ones(1, edges + 1, dtype=torch.float64))
         assert bool(arrives) == (edges <= HOPS)
         corners = min(edges, HOPS) if edges <= HOPS else 1
-        assert way[0, : corners + 1, 0].tolist() == torch.linspace(0, edges, corners + 1).tolist()
-        assert torch.equal(string[0, :2], way[0, [0, -1]]) and torch.equal(string[0, 3::2], way[0, 1:-1])
-        assert torch.equal(string[0, 2::2], 0.5 * (way[0, 1:] + way[0, :-1]))
+        assert path[0, : corners + 1, 0].tolist() == torch.linspace(0, edges, corners + 1).tolist()
+        assert torch.equal(string[0, :2], path[0, [0, -1]]) and torch.equal(string[0, 3::2], path[0, 1:-1])
+        assert torch.equal(string[0, 2::2], 0.5 * (path[0, 1:] + path[0, :-1]))
 
 
 def test_of_equals_the_first_is_taken() -> None:
-    """Three ways around, the first two told apart by rounding alone; the last is cheaper by little, or by less."""
+    """Three paths around, the first two different by rounding alone; the last is cheaper by little, or by less."""
     points = torch.tensor([[[0.0, 0.0], [2.0, 0.0], [1.0, 1.0], [1.0, -1.0], [1.0, 2.0]]], dtype=torch.float64)
     ends = torch.tensor([[[2, 3, 4], [1, 1, 1], [1, 1, 1], [1, 1, 1], [1, 1, 1]]])
     for least, taken in ((1.0 - 1e-14, 2), (1.0 - 1e-10, 4)):
         lengths = torch.ones(1, 5, 3, dtype=torch.float64)
         lengths[0, 0] = torch.tensor([1.0, 1.0 - 1e-15, least], dtype=torch.float64)
         for search in searches(*nowhere(), 0.15):
-            way, _, arrives = search.cheapest(Graph(points, ends, lengths), torch.ones(1, 5, dtype=torch.float64))
-            assert bool(arrives) and torch.equal(way[0, 1], points[0, taken])
+            path, _, arrives = search.cheapest(Graph(points, ends, lengths), torch.ones(1, 5, dtype=torch.float64))
+            assert bool(arrives) and torch.equal(path[0, 1], points[0, taken])
 
 
 def test_a_price_that_is_no_number_closes_its_edges() -> None:
@@ -175,36 +181,36 @@ def test_a_price_that_is_no_number_closes_its_edges() -> None:
 
 def test_a_problem_has_its_bits_in_every_batch() -> None:
     s = Scene(*(torch.cat([getattr(drawn(3, 12, seed), name) for seed in range(27)]) for name in (
-        "start", "goal", "centers", "distances",
+        "start", "goal", "centers", "inflated_radii",
     )), uneven)  # fmt: skip
-    whole, found = Roadmap().ways(s, 3)
+    whole, found = Roadmap().paths(s, 3)
     assert len(whole) > native.AT_ONCE
     for rows in (torch.arange(1), torch.tensor([70]), torch.arange(81).flip(0)):
-        part = Scene(s.start[rows], s.goal[rows], s.centers[rows], s.distances[rows], uneven)
-        ways, arrives = Roadmap().ways(part, 3)
-        assert torch.equal(ways, whole[rows]) and torch.equal(arrives, found[rows])
+        part = Scene(s.start[rows], s.goal[rows], s.centers[rows], s.inflated_radii[rows], uneven)
+        paths, arrives = Roadmap().paths(part, 3)
+        assert torch.equal(paths, whole[rows]) and torch.equal(arrives, found[rows])
 
 
-def test_no_problems_have_no_ways() -> None:
+def test_no_problems_have_no_paths() -> None:
     s = SCENES["in the middle"]
-    for ways, found in both(Roadmap(), Scene(s.start[:0], s.goal[:0], s.centers[:0], s.distances[:0], flat), 2):
-        assert ways.shape == (0, 2, HOPS + 1, 2) and found.shape == (0,)
+    for paths, found in both(Roadmap(), Scene(s.start[:0], s.goal[:0], s.centers[:0], s.inflated_radii[:0], flat), 2):
+        assert paths.shape == (0, 2, HOPS + 1, 2) and found.shape == (0,)
 
 
 def test_pytorch_searches_in_single_precision_and_without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     s = SCENES["in the middle"]
-    single = Scene(*(t.float() for t in (s.start, s.goal, s.centers, s.distances)), flat)
+    single = Scene(*(t.float() for t in (s.start, s.goal, s.centers, s.inflated_radii)), flat)
     assert library_for(single.centers) is None
-    ways, found = Roadmap().ways(single)
-    assert ways.dtype == torch.float32 and bool(found.all())
+    paths, found = Roadmap().paths(single)
+    assert paths.dtype == torch.float32 and bool(found.all())
     monkeypatch.setenv("TORCHGCO_CC", "none")
     assert library_for(s.centers) is None
-    ways, _ = Roadmap().ways(s)
+    paths, _ = Roadmap().paths(s)
     monkeypatch.undo()
     monkeypatch.setattr(native, "SOURCE", Path(__file__))  # no C
     native._library.cache_clear()
-    with pytest.warns(EagerWarning, match="where ways are sought"):
+    with pytest.warns(EagerWarning, match=r"PyTorch's kernels where \w+ are sought"):
         assert library_for(s.centers) is None
     monkeypatch.undo()
     native._library.cache_clear()
-    torch.testing.assert_close(ways, Roadmap().ways(s)[0], rtol=0, atol=1e-9)
+    torch.testing.assert_close(paths, Roadmap().paths(s)[0], rtol=0, atol=1e-9)

@@ -1,8 +1,9 @@
-"""Ways of one class count once: in the plane by how they wind, in space by how far they are apart."""
+"""Paths of one class count once: in the plane by how they wind, in space by how far they are apart."""
 
 import torch
-from torchgco.guidance.classes import distinct
-from torchgco.guidance.roadmap import FAR, Scene
+
+from torchgco.search.geometry import FAR, Scene
+from torchgco.search.homotopy import one_per_class
 
 
 def scene(centers: list[list[float]], distances: list[float], B: int = 1) -> Scene:
@@ -14,32 +15,32 @@ def scene(centers: list[list[float]], distances: list[float], B: int = 1) -> Sce
 
 
 def through(*corners: list[float]) -> torch.Tensor:
-    """A way by some corners, its goal repeated."""
+    """A path by some corners, its goal repeated."""
     d = len(corners[0])
     ends = [[-1.0] + [0.0] * (d - 1)], [[1.0] + [0.0] * (d - 1)] * (4 - len(corners))
     return torch.tensor([*ends[0], *corners, *ends[1]], dtype=torch.float64)
 
 
-def test_in_the_plane_sides_tell_ways_apart() -> None:
-    ways = torch.stack([
+def test_in_the_plane_sides_tell_paths_apart() -> None:
+    paths = torch.stack([
         through([0.0, 0.5]), through([-0.2, 0.9], [0.4, 0.8]),  # over both discs
         through([0.0, -0.5]),  # under both
         through([-0.5, 0.5], [0.0, 0.0], [0.5, -0.5]),  # over the first, under the second
         through([0.0, -2.0], [0.5, -1.0]),  # under both, from farther below
     ])  # fmt: skip
     two = scene([[-0.5, 0.0], [0.5, 0.0]], [0.2, 0.2], B=2)
-    assert distinct(ways.expand(2, -1, -1, -1), two).tolist() == [[True, False, True, True, False]] * 2
+    assert one_per_class(paths.expand(2, -1, -1, -1), two).tolist() == [[True, False, True, True, False]] * 2
     one = scene([[-0.5, 0.0], [0.5, 0.0]], [0.2, FAR])  # the second isn't there
-    assert distinct(ways[None], one).tolist() == [[True, False, True, False, False]]
+    assert one_per_class(paths[None], one).tolist() == [[True, False, True, False, False]]
 
 
-def test_a_loop_around_a_disc_is_a_way_of_its_own() -> None:
+def test_a_loop_around_a_disc_is_a_path_of_its_own() -> None:
     straight = through([0.0, 0.5])
     loop = through([0.5, 0.5], [0.0, -0.5], [-0.5, 0.5])
-    assert distinct(torch.stack([straight, loop])[None], scene([[0.0, 0.0]], [0.2])).tolist() == [[True, True]]
+    assert one_per_class(torch.stack([straight, loop])[None], scene([[0.0, 0.0]], [0.2])).tolist() == [[True, True]]
 
 
-def test_in_space_ways_far_from_each_other_are_different() -> None:
+def test_in_space_paths_far_from_each_other_are_different() -> None:
     ball = scene([[0.0, 0.0, 0.0]], [0.3])
-    over, beside, near = through([0.0, 0.0, 0.5]), through([0.0, 0.5, 0.0]), through([0.0, 0.1, 0.5])
-    assert distinct(torch.stack([over, near, beside, over])[None], ball).tolist() == [[True, False, True, False]]
+    over, left, near = through([0.0, 0.0, 0.5]), through([0.0, 0.5, 0.0]), through([0.0, 0.1, 0.5])
+    assert one_per_class(torch.stack([over, near, left, over])[None], ball).tolist() == [[True, False, True, False]]

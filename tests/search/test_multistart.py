@@ -1,19 +1,17 @@
 """Many guesses: the best is kept, the budget is kept to, and an element's guesses are its own."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import pytest
 import torch
 
 from tests.problems import planar_batch
-from torchgco import GCO, ILQR, AugmentedLagrangian, InputError
-from torchgco.baselines import MultiStart
-from torchgco.guidance import Detour
-from torchgco.lagrangian import is_better
+from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian, InputError, LineSearch, MultiStart, QuadraticCost
+from torchgco.evaluation import has_arrived, is_better
 
-LOCAL = AugmentedLagrangian(inner=ILQR(max_iterations=4), max_outer_iterations=3, clip=True)
-MANY = MultiStart(solver=LOCAL, starts=4, covariance=9.0, knots=5, arrival=0.2)
+LOCAL = AugmentedLagrangian(ILQR(max_iterations=4), max_outer_iterations=3)
+MANY = MultiStart(LOCAL, starts=4, covariance=9.0, noise_knots=5)
 
 
 def test_the_best_of_all_starts_is_kept() -> None:
@@ -47,28 +45,28 @@ def test_a_spent_budget_ends_the_starts() -> None:
     assert bool((generous.iterations >= limit + 1).all())
 
 
-def test_the_budget_counts_the_candidates_of_every_start_too(monkeypatch) -> None:
-    """No start begins with the budget spent, and none is left out while it isn't, told from the solves themselves."""
+def test_the_budget_counts_the_iterations_of_every_start(monkeypatch) -> None:
+    """No start begins with the budget spent, and none is left out while it isn't, as the solves themselves say."""
     made: dict[int, list[int]] = {b: [] for b in range(4)}
-    solve = AugmentedLagrangian.solve
+    iterate = AugmentedLagrangian.iterate
 
-    def noted(self, problem, U0, seed=0, ids=None, *rest, **options):
-        end = solve(self, problem, U0, seed, ids, *rest, **options)
-        for b, count in zip([] if ids is None else ids.tolist(), end.iterations.tolist(), strict=False):
+    def noted(self, call, *rest, **options):
+        end = iterate(self, call, *rest, **options)
+        for b, count in zip(call.rows.tolist(), end.iterations.tolist(), strict=True):
             made[b].append(count)
         return end
 
     problem, U0 = planar_batch(B=4, N=25, obstacles=9, seed=4)
     problem.x0[2, :2] = problem.constraints[0].centers[2, 0]  # inside an obstacle: no guess helps
-    monkeypatch.setattr(AugmentedLagrangian, "solve", noted)
-    guided = replace(LOCAL, guidance=GCO(detour=Detour(iterations=4, settle=2, depth=9.0), patience=1))
-    budget = 100
-    solution = MultiStart(guided, starts=50, budget=budget, covariance=9.0, knots=5).solve(problem, U0)
+    monkeypatch.setattr(AugmentedLagrangian, "iterate", noted)
+    guided = replace(LOCAL, guidance=GCO(MPPI(samples=8), single_contact_after=1))
+    budget = 40
+    solution = MultiStart(guided, starts=50, budget=budget, covariance=9.0, noise_knots=5).solve(problem, U0)
     assert solution.iterations.tolist() == [sum(made[b]) for b in range(4)] and made[2] == [0]
+    assert bool((solution.guided > 0).any())
     for b in (0, 1, 3):
         assert sum(made[b][:-1]) < budget <= sum(made[b])
         assert len(made[b]) > 1
-    assert max(max(starts) for starts in made.values()) > 3 * 4  # more than the loop of one start can make alone
 
 
 def test_progress_names_problems_by_their_place_in_the_whole_batch() -> None:
@@ -81,30 +79,44 @@ def test_progress_names_problems_by_their_place_in_the_whole_batch() -> None:
     assert left and set.union(*again) == left != {0, 1, 2, 3}
 
 
-@pytest.mark.parametrize(
-    "change", [dict(covariance=1.0), dict(covariance=[9.0, 1.0]), dict(knots=3), dict(solver=ILQR)]
-)
-def test_every_option_is_read(change: dict) -> None:
+CHANGES = dict(
+    local=replace(LOCAL, inner=ILQR(max_iterations=2)), starts=2, budget=13, covariance=[9.0, 1.0], noise_knots=3
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_every_option_is_read(name: str) -> None:
     problem, U0 = planar_batch(B=4, N=25, obstacles=8, seed=2)
-    if "solver" in change:
-        change = dict(solver=replace(LOCAL, inner=ILQR(max_iterations=2)))
-    one, other = (m.solve(problem, U0) for m in (MANY, replace(MANY, **change)))
+    one, other = (m.solve(problem, U0) for m in (MANY, replace(MANY, **{name: CHANGES[name]})))
     assert not torch.equal(one.U, other.U)
 
 
-def test_one_that_arrives_is_worth_more_than_a_cheaper_one() -> None:
-    """With a goal a hand's breadth wide, nothing counts as arrived, and the cheaper path is kept."""
-    problem, U0 = planar_batch(B=8, N=25, obstacles=10, seed=7)
-    near, far = (replace(MANY, arrival=share).solve(problem, U0) for share in (1e-9, 0.999))
-    fits = (near.violation <= LOCAL.violation_tolerance) & (far.violation <= LOCAL.violation_tolerance)
-    assert bool((near.cost <= far.cost)[fits].all())
+def test_no_option_is_forgotten_above() -> None:
+    assert {f.name for f in fields(MultiStart)} == set(CHANGES)
+
+
+def test_one_that_arrives_is_worth_more_than_a_cheaper_one(monkeypatch) -> None:
+    """Where no step is accepted, every guess stays as it is, and that of the vehicle at rest is the cheapest."""
+    problem, U0 = planar_batch(B=4, N=25, obstacles=3, seed=7)
+    cost = QuadraticCost(Q=[1e-3] * 6, R=[5.0, 5.0], Qf=[1, 1, 0, 0, 0, 0], x_ref=[1, 0.4, 0, 0, 0, 0])
+    problem = replace(problem, cost=cost)
+    stays = replace(LOCAL, inner=ILQR(max_iterations=1, line_search=LineSearch(ratio_min=1e9, ratio_max=2e9)))
+    many = replace(MANY, local=replace(stays, violation_tolerance=10.0), starts=20)
+    solutions = []
+    for share in (1e-9, 0.9):
+        monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", share)
+        solutions.append(many.solve(problem, U0))
+    rests, arrives = solutions
+    nearer = has_arrived(problem, arrives.X)
+    assert not bool(rests.U.any()) and bool(nearer.any()) and bool((arrives.cost > rests.cost)[nearer].all())
+    assert not bool(arrives.U[~nearer].any())
 
 
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        (dict(starts=0), "multistart.starts"), (dict(knots=1), "multistart.knots"),
-        (dict(budget=0), "multistart.budget"), (dict(arrival=1.0), "multistart.arrival"),
+        (dict(starts=0), "multistart.starts"), (dict(noise_knots=1), "multistart.noise_knots"),
+        (dict(budget=0), "multistart.budget"),
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_named(change: dict, field: str) -> None:

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from tests.problems import PRINTED, planar_batch, quadrotor_batch, reference_of
+from tests.problems import planar_batch, quadrotor_batch, reference_of
 from tests.reference.augmented_lagrangian import Schedule
 from tests.reference.augmented_lagrangian import solve as reference_solve
 from tests.reference.guidance import cpuf_hook
 from tests.reference.mppi import MppiSettings
 from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian
 from torchgco.draws import DrawKey, standard_normal
-from torchgco.solvers.state import Progress
+from torchgco.solvers.contracts import Progress
 
 CASES = {
     "planar": (lambda: planar_batch(B=4, N=40, obstacles=8, seed=4), 1e-3, 30),
@@ -32,8 +32,8 @@ class Snapshots:
     def __call__(self, progress: Progress) -> None:
         state = progress.state
         for i, (row, outer) in enumerate(zip(state.rows.tolist(), state.outer.tolist(), strict=True)):
-            self.lam[row, outer] = [lam[i].numpy().copy() for lam in state.duals.lam]
-            self.mu[row, outer] = float(state.duals.mu[i])
+            self.lam[row, outer] = [lam[i].numpy().copy() for lam in state.multipliers.lam]
+            self.mu[row, outer] = float(state.multipliers.mu[i])
 
 
 def _reference(problem, U0, b: int, tolerance: float, limit: int, guided: bool):
@@ -59,7 +59,7 @@ def test_iterates_follow_the_nested_loops(case: str, guided: bool, native: bool)
     make, tolerance, limit = CASES[case]
     problem, U0 = make()
     guidance = GCO(sampler=MPPI(samples=SAMPLES)) if guided else None
-    inner = ILQR(absolute_tolerance=tolerance, max_iterations=limit, **PRINTED)
+    inner = ILQR(as_printed=True, tolerance=tolerance, max_iterations=limit)
     solver = AugmentedLagrangian(inner=inner, guidance=guidance, max_outer_iterations=OUTER, record=True)
     snapshots = Snapshots()
     solution = solver.solve(problem, U0, callback=snapshots)

@@ -1,59 +1,51 @@
 """An element's result is the same bits alone, in any batch, in any order; a broken element disturbs nobody."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
-from tests.problems import PRINTED, planar_batch, quadrotor_batch
+from tests.problems import planar_batch, quadrotor_batch
 from torchgco import (
     GCO,
     ILQR,
     MPPI,
     AugmentedLagrangian,
-    LineSearch,
+    PathProposals,
     Planar,
     Problem,
     QuadraticCost,
     QuadrotorPlanning,
+    Restarts,
     Spheres,
 )
 from torchgco.baselines import IteratedMPPI
 from torchgco.constraints import ControlBounds, FirstStepRates
-from torchgco.guidance import Detour
 from torchgco.solution import Solution
 from torchgco.status import Status
 
 SAMPLER = MPPI(samples=20)
 SOLVERS = {
     "gco": AugmentedLagrangian(
-        inner=ILQR(absolute_tolerance=0.1, max_iterations=8, **PRINTED),
+        inner=ILQR(tolerance=1e-4, max_iterations=8),
         guidance=GCO(sampler=SAMPLER),
+        initial_penalty=0.1,
         max_outer_iterations=6,
-        clip=True,
     ),
     "gco as printed": AugmentedLagrangian(
-        inner=ILQR(absolute_tolerance=0.1, max_iterations=15, **PRINTED),
+        inner=ILQR(as_printed=True, tolerance=0.1, max_iterations=15),
         guidance=GCO(sampler=SAMPLER),
         max_outer_iterations=4,
     ),
-    "gco with plans": AugmentedLagrangian(
-        inner=ILQR(max_iterations=6, damping=1.0, line_search=LineSearch(accept_last=False)),
-        guidance=GCO(
-            sampler=MPPI(samples=40, covariance=4.0, rounds=3, knots=5, decay=0.8, elite=3, linger=1.0),
-            adopt=True,
-            patience=2,
-            detour=Detour(iterations=4, ways=3, keep=2, settle=3, depth=9.0),
-            detour_at=1,
-            detours=2,
+    "restarts": Restarts(
+        local=AugmentedLagrangian(ILQR(max_iterations=6), initial_penalty=0.1, max_outer_iterations=5),
+        paths=PathProposals(
+            num_paths=3, relax_top=2, refine_top=2, track_iterations=4, relax_iterations=3, max_penetration=9.0
         ),
-        max_outer_iterations=5,
-        grow_when_feasible=False,
-        cost_tolerance=1e-2,
-        hold_factor=2.0,
+        sampling=GCO(
+            sampler=MPPI(samples=40, covariance=4.0, rounds=3, noise_knots=5, decay=0.8, elite=3, dwell_cost=1.0),
+            start_from_sample=True,
+            single_contact_after=2,
+        ),
         attempts=3,
-        arrival=0.1,
-        clip=True,
     ),
     "mppi": IteratedMPPI(sampler=SAMPLER, iterations=4),
 }
@@ -64,13 +56,13 @@ BATCHES = {
 FIELDS = ("X", "U", "K", "d", "cost", "violation", "status", "iterations", "outer_iterations", "guided")
 
 
-@pytest.mark.parametrize("solver", ["gco", "gco with plans"])
+@pytest.mark.parametrize("solver", ["gco", "restarts"])
 @pytest.mark.parametrize("batch", BATCHES)
 def test_freed_slots_are_taken_by_those_that_wait(batch: str, solver: str) -> None:
     problem, U0 = BATCHES[batch]()
     problem.x0[4, 0] = torch.nan  # one that waits and can't begin
     seen = []
-    few = replace(SOLVERS[solver], slots=2).solve(problem, U0, seed=3, callback=lambda p: seen.append(p))
+    few = SOLVERS[solver].in_slots(2).solve(problem, U0, seed=3, callback=lambda p: seen.append(p))
     assert max(p.state.rows.numel() for p in seen) == 2 and seen[-1].finished == 7
     assert max(len(set(p.rows.tolist())) for p in seen) == max(p.rows.numel() for p in seen) == 2
     assert {b for p in seen for b in p.rows.tolist()} == set(KEPT.tolist())
@@ -101,7 +93,7 @@ def test_alone_in_any_batch_and_in_any_order(batch: str, solver: str) -> None:
 
 
 @pytest.mark.parametrize("native", ["eager"], indirect=True)
-@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "gco with plans"])
+@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "restarts"])
 @pytest.mark.parametrize("batch", BATCHES)
 def test_eager_kernels_keep_the_contract(batch: str, solver: str, native: bool) -> None:
     check_alone_in_any_batch_and_in_any_order(batch, solver)
@@ -190,9 +182,7 @@ def test_first_step_consistency_holds_per_element() -> None:
     thrusts = torch.tensor([[3.9, 3.9, 3.9, 3.9], [3.8, 4.0, 4.0, 3.8], [3.9, 3.9, 4.1, 4.1]], dtype=torch.float64)
     first = FirstStepRates(thrusts, period=0.1)
     problem = Problem(QuadrotorPlanning(dt=0.1), problem.cost, [*problem.constraints, first], problem.x0, problem.N)
-    solver = AugmentedLagrangian(
-        inner=ILQR(tolerance=1e-6), max_outer_iterations=12, violation_tolerance=1e-5, clip=True
-    )
+    solver = AugmentedLagrangian(inner=ILQR(tolerance=1e-6), max_outer_iterations=12, violation_tolerance=1e-5)
     solution = solver.solve(problem, U0)
     torch.testing.assert_close(solution.X[:, 1, 10:13], problem.constraints[2].target, rtol=0, atol=1e-4)
     alone = solver.solve(problem.take(torch.tensor([1])), U0[[1]])

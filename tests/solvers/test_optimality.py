@@ -14,11 +14,11 @@ from torchgco import (
     ControlBounds,
     FunctionConstraint,
     FunctionDynamics,
-    LineSearch,
     Planar,
     Polish,
     Problem,
     QuadraticCost,
+    Restarts,
     Spheres,
     Status,
     certify,
@@ -30,9 +30,10 @@ from torchgco import (
 from torchgco.baselines import Hold, IteratedMPPI
 from torchgco.costs.base import Cost
 from torchgco.lagrangian import Lagrangian
+from torchgco.search.suitability import suited_paths
 from torchgco.solvers.verdict import STATIONARY, optimality
 
-CAREFUL = ILQR(max_iterations=300, damping=0.02, line_search=LineSearch(accept_last=False))
+CAREFUL = ILQR(max_iterations=300)
 
 
 def pendulum(scale: float = 1.0, constraints: tuple = ()) -> Problem:
@@ -122,7 +123,7 @@ def test_the_status_is_one_of_four_by_stationarity_and_violation() -> None:
     assert IteratedMPPI(iterations=2).solve(problem, rest(problem)).statuses == [Status.FEASIBLE] * 2
     free = CAREFUL.solve(problem, rest(problem))
     assert free.statuses == [Status.INFEASIBLE] * 2 and float(free.violation.min()) > 1.0
-    hasty = AugmentedLagrangian(inner=replace(CAREFUL, max_iterations=1), max_outer_iterations=2, clip=True)
+    hasty = AugmentedLagrangian(inner=replace(CAREFUL, max_iterations=1), max_outer_iterations=2)
     assert hasty.solve(problem, rest(problem)).statuses != [Status.CONVERGED] * 2
     soft = replace(hasty, initial_penalty=1e-9, penalty_growth=1.0).solve(problem, rest(problem))
     assert soft.statuses == [Status.MAX_ITERATIONS] * 2 and float(soft.violation.min()) > 1e-3
@@ -155,15 +156,12 @@ def test_unstable_dynamics_are_solved_from_rest() -> None:
     verdict = judge(problem, solution.U, torch.tensor([1.0, 0.4], dtype=torch.float64), 0.3)
     assert bool(verdict.reached.all())
     torch.testing.assert_close(solution.cost, verdict.cost)
-    undamped = ILQR(line_search=LineSearch(accept_last=False))
-    stuck = AugmentedLagrangian(inner=undamped, clip=True).solve(problem, rest(problem))
-    assert stuck.statuses == [Status.FEASIBLE] * 2  # without damping nothing moves, and nobody says that it converged
 
 
 def test_gains_are_finite_where_the_plain_backward_pass_fails() -> None:
     base = pendulum()
     free = Problem(base.dynamics, QuadraticCost(Q=[1.0, 1.0], R=[0.0], Qf=[0.0, 0.0]), [], base.x0, base.N)
-    solution = ILQR(max_iterations=30, damping=0.02, line_search=LineSearch(accept_last=False)).solve(free, rest(free))
+    solution = ILQR(max_iterations=30).solve(free, rest(free))
     assert bool(torch.isfinite(solution.K).all()) and bool(torch.isfinite(solution.d).all())
 
 
@@ -186,7 +184,7 @@ def test_solve_is_the_configuration_gco(scenario: str, model: str) -> None:
 def test_solve_hands_the_problem_to_that_solver(monkeypatch) -> None:
     asked = []
     notice = lambda self, problem, U0, **words: asked.append((self, U0, words))
-    monkeypatch.setattr(AugmentedLagrangian, "solve", notice)
+    monkeypatch.setattr(Restarts, "solve", notice)
     problem, U0 = planar_batch(B=2, N=25)
     solve(problem, seed=3)
     ((solver, begun, words),) = asked
@@ -195,14 +193,15 @@ def test_solve_hands_the_problem_to_that_solver(monkeypatch) -> None:
 
 
 def test_offsets_are_for_two_controls() -> None:
-    one = pendulum()
-    assert presets.gco(one).guidance is None
     three = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u[..., :2]), -1), 4, 3, dt=0.1, position=slice(0, 2))
     problem = Problem(
         three, QuadraticCost(Q=[1.0] * 4, R=[1.0] * 3, Qf=[1.0] * 4), [Spheres([[1.0, 1.0]], [0.1])],
         torch.zeros(1, 4, dtype=torch.float64), 10,
     )  # fmt: skip
-    assert presets.gco(problem).guidance.detour.pushes == ()
+    solver = presets.gco(problem)
+    suited, lost = suited_paths(solver.paths, problem)
+    assert suited.initial_offsets == () and lost is None
+    assert solve(problem).statuses == [Status.CONVERGED]
 
 
 def test_bounded_swing_ups_and_parkings_to_an_equality_are_solved_without_options() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.problems import PRINTED, planar_batch, quadrotor_batch
+from tests.problems import planar_batch, quadrotor_batch
 from tests.reference.active_set import quadratic_program
 from torchgco import (
     GCO,
@@ -20,7 +20,6 @@ from torchgco import (
     FunctionConstraint,
     FunctionDynamics,
     InputError,
-    LineSearch,
     Polish,
     Problem,
     QuadraticCost,
@@ -34,14 +33,10 @@ from torchgco.solvers.active_set import multipliers
 from torchgco.solvers.condensed import Condensed
 
 SOLVER = AugmentedLagrangian(
-    inner=ILQR(
-        absolute_tolerance=1e-2, max_iterations=10, damping=1.0, line_search=LineSearch(accept_last=False), **PRINTED
-    ),
-    guidance=GCO(sampler=MPPI(samples=40, rounds=3, knots=5), adopt=True),
+    inner=ILQR(tolerance=3e-5, max_iterations=10),
+    guidance=GCO(sampler=MPPI(samples=40, rounds=3, noise_knots=5), start_from_sample=True),
+    initial_penalty=1.0,
     max_outer_iterations=12,
-    grow_when_feasible=False,
-    cost_tolerance=1e-3,
-    clip=True,
 )
 BATCHES = {
     "planar": lambda: planar_batch(B=4, N=30, obstacles=5, seed=4),
@@ -129,19 +124,14 @@ def test_what_is_out_of_reach_is_left_alone() -> None:
     assert torch.equal(broken.U[0], before.U[0])  # what was handed in is not written into
 
 
-def test_a_shorter_way_through_an_obstacle_is_refused() -> None:
-    """Between knots that are clear: the optimum of the problem as posed leaps over the edge of a disc."""
-    problem, U0 = planar_batch(B=4, N=30, obstacles=5, seed=0)
+def test_a_shortcut_through_an_obstacle_between_two_knots_is_refused(monkeypatch) -> None:
+    """The optimum of the problem as posed leaps over the edge of a disc, between knots that are clear."""
+    problem, U0 = planar_batch(B=4, N=30, obstacles=5, seed=10)
     before = SOLVER.solve(problem, U0, seed=1)
     after, spheres = Polish().refine(problem, before), problem.constraints[0]
-    X = replace(before, X=before.X).X
-    assert float(spheres.chord_clearance(X)[3]) > 0
-    assert torch.equal(after.X[3], X[3]) and bool((after.violation[:2] < 1e-8).all())
-
-
-def test_the_solver_polishes_what_it_found() -> None:
-    problem, U0 = BATCHES["planar"]()
-    assert_same_bits(replace(SOLVER, polish=Polish()).solve(problem, U0, seed=1), polished("planar"))
+    assert torch.equal(after.X[3], before.X[3]) and bool((after.violation[:3] < 1e-8).all())
+    monkeypatch.setattr(type(spheres), "chord_clearance", lambda self, X: torch.full_like(X[:, 0, 0], torch.inf))
+    assert float(Polish().refine(problem, before).violation[3]) < 1e-8
 
 
 def test_every_option_is_read() -> None:
@@ -174,8 +164,6 @@ def test_bad_options_and_calls_are_named() -> None:
         Polish().refine(problem.cast(torch.float32), before)
     with pytest.raises(InputError, match=r"solution\.U"):
         Polish().refine(problem.take(torch.tensor([0])), before)
-    with pytest.raises(InputError, match="float64"):
-        replace(SOLVER, polish=Polish()).solve(problem.cast(torch.float32), before.U.float())
 
 
 def test_equalities_and_functions_are_polished() -> None:
@@ -184,7 +172,7 @@ def test_equalities_and_functions_are_polished() -> None:
     ring = FunctionConstraint(lambda x: (x[..., :2] ** 2).sum(-1, keepdim=True) - 0.7, sense="equality", knots=[-1])
     wall = FunctionConstraint(lambda x: x[..., 1:2] - 0.25 - 0.1 * x[..., :1].square(), knots=slice(1, None))
     problem = Problem(problem.dynamics, problem.cost, [*problem.constraints, ring, wall], problem.x0, problem.N)
-    solver = AugmentedLagrangian(inner=ILQR(absolute_tolerance=1e-3, **PRINTED), max_outer_iterations=12, clip=True)
+    solver = AugmentedLagrangian(inner=ILQR(), max_outer_iterations=12)
     before = solver.solve(problem, U0)
     after = Polish().refine(problem, before)
     assert float(before.violation.max()) > 1e-7 and float(after.violation.max()) < 1e-8

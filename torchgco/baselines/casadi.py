@@ -75,10 +75,10 @@ class CasADiSolver(Solver):
         program = transcribe(problem)
         nlp = {"x": program.variables, "p": program.parameters, "f": program.objective, "g": program.rows}
         try:
-            run = casadi.nlpsol("solver", self.plugin, nlp, self._options(problem, program))
+            function = casadi.nlpsol("solver", self.plugin, nlp, self._options(problem, program))
         except RuntimeError as error:
             raise _refused(self.plugin, error) from error
-        return PreparedCasADi(self, problem, program, run)
+        return PreparedCasADi(self, problem, program, function)
 
     def run(self, call: Call) -> Solution:
         """From U0 and its rollout; X is the rollout of the controls found. Raises the errors of `prepare`, too."""
@@ -111,7 +111,7 @@ class PreparedCasADi(Solver):
     solver: CasADiSolver
     problem: Problem
     program: Program
-    run: Any  # casadi.Function
+    function: Any  # casadi.Function
 
     def run(self, call: Call) -> Solution:
         """As `CasADiSolver.run`; InputError for another problem than the prepared one."""
@@ -141,8 +141,8 @@ class PreparedCasADi(Solver):
         highest = np.zeros(len(self.program.equality))
         lowest = np.where(self.program.equality, 0.0, -np.inf)
         try:
-            found = self.run(x0=guess, p=p, lbx=lower, ubx=upper, lbg=lowest, ubg=highest)
-            stats = self.run.stats()
+            found = self.function(x0=guess, p=p, lbx=lower, ubx=upper, lbg=lowest, ubg=highest)
+            stats = self.function.stats()
         except RuntimeError as error:  # with bounds that cross, say: no loss to the others
             if "option" in str(error).lower():  # FATROP reads them only now
                 raise _refused(self.solver.plugin, error) from error

@@ -42,7 +42,7 @@ class GuidedCasADi(Solver):
         """As `CasADiSolver.prepare`; the guess belongs to the solve.
 
         Raises:
-            InputError: what `CasADiSolver.prepare` raises; a problem without a position, or initial offsets that don't fit.
+            InputError: what `CasADiSolver.prepare` raises; no position, or initial offsets that don't fit.
         """
         self.paths.starts(problem, problem.at_rest[1])
         engine_of(problem)  # compiled now, so that no solve waits for it

@@ -14,7 +14,7 @@ from torchgco.errors import GuidanceWarning, InputError
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
-from torchgco.guidance.suitability import suited_sampler
+from torchgco.guidance.suitability import suited_guide
 from torchgco.native.dispatch import cost_unit
 from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem
@@ -67,7 +67,7 @@ class GCO:
         """
         if not problem.geometric:
             return None
-        sampler, lost = suited_sampler(self.sampler, problem)
+        sampler, lost = suited_guide(self.sampler, problem)
         if lost is not None:
             effect = "solved without guidance" if sampler is None else "guided in part"
             warnings.warn(f"{effect}: {lost}", GuidanceWarning, stacklevel=5)

@@ -109,8 +109,8 @@ class MPPI:
             bounds = -wide, wide
         lower, upper, deviation = (row.squeeze(1) for row in (*bounds, self._sigma(problem).sqrt()))
         return Rounds(
-            self.samples, self.noise_knots, self.decay, self.elite, self.temperature, COLLISION_PENALTY, self.dwell_cost,
-            torch.stack([words(key, i) for i in range(self.rounds)], dim=-1),
+            self.samples, self.noise_knots, self.decay, self.elite, self.temperature, COLLISION_PENALTY,
+            self.dwell_cost, torch.stack([words(key, i) for i in range(self.rounds)], dim=-1),
             deviation, lower, upper, *self._places(problem),
         )  # fmt: skip
 

@@ -26,8 +26,6 @@ def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None,
     """
     if sampler is None:
         return None, None
-    if problem.dynamics.position is None:
-        return None, "the dynamics have no position"
     sampler.check(problem)
     if engine_of(problem) is not None:
         return sampler, None  # natively it samples the same traced functions that the solver runs
@@ -37,6 +35,13 @@ def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None,
     if wanted != own and failure(_sample, problem, own) is None:
         return replace(sampler, dtype=None), f"samples are drawn in {_name(own)}, as {_name(wanted)} fails ({why})"
     return None, f"no plan can be sampled ({why})"
+
+
+def suited_guide(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None, str | None]:
+    """The same for a sampler that guides a solver, which needs positions to compare."""
+    if sampler is not None and problem.dynamics.position is None:
+        return None, "the dynamics have no position"
+    return suited_sampler(sampler, problem)
 
 
 def _tried(

@@ -100,7 +100,9 @@ class PathProposals:
             raise InputError("paths.roadmap", "a Roadmap", self.roadmap)
         if not self.paces or not all(0 <= self.depart < arrive <= 1 for arrive in self.paces):
             raise InputError("paths.depart", f"at least 0 and below arrive, {self.arrive}", self.depart)
-        if not isinstance(self.initial_offsets, Sequence):
+        if not isinstance(self.initial_offsets, Sequence) or not all(
+            hasattr(o, "__len__") for o in self.initial_offsets
+        ):
             raise InputError("paths.initial_offsets", "a list of offsets of the controls", self.initial_offsets)
         if not 0 <= self.smoothing < 1:
             raise InputError("paths.smoothing", "at least 0 and below 1", self.smoothing)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +22,7 @@ from torchgco.errors import GuidanceWarning, InputError
 from torchgco.evaluation import GOAL_TOLERANCE
 from torchgco.guidance.detection import caught_knots
 from torchgco.guidance.gco import GCO
-from torchgco.guidance.suitability import suited_sampler
+from torchgco.guidance.suitability import suited_guide
 from torchgco.native.dispatch import cost_unit
 from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem
@@ -33,7 +32,7 @@ from torchgco.search.suitability import suited_paths
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Advice, Call, Solver
-from torchgco.solvers.state import STOPPED, Iterate, SolveEnd
+from torchgco.solvers.state import STOPPED, SolveEnd
 from torchgco.solvers.trace import Recorder
 from torchgco.solvers.verdict import finished
 from torchgco.tree import take
@@ -84,10 +83,10 @@ class Restarts(Solver):
         recorder = Recorder() if solver.record else None
         paths, sampling = self._suited(scaled.problem)
         if paths is None and sampling is None:
-            end = solver.iterate(scaled, recorder=recorder)
+            end = solver.iterate(scaled, recorder=recorder, by_arrival=True)
         else:
             after = None if self.sampling is None else self.sampling.single_contact_after
-            caught = solver.iterate(scaled, StopWhenCaught(after), recorder=recorder)
+            caught = solver.iterate(scaled, StopWhenCaught(after), recorder=recorder, by_arrival=True)
             end = self._restarted(scaled, caught, paths, sampling, recorder)
         phr = not solver.inner.as_printed
         return finished(call, scaled, unit, end, phr, solver.violation_tolerance, solver.slots, recorder)
@@ -96,7 +95,7 @@ class Restarts(Solver):
         """The parts that can serve these problems; a GuidanceWarning names the others."""
         if not problem.geometric:
             return None, None
-        sampler, unsampled = suited_sampler(None if self.sampling is None else self.sampling.sampler, problem)
+        sampler, unsampled = suited_guide(None if self.sampling is None else self.sampling.sampler, problem)
         paths, unsought = suited_paths(self.paths, problem)
         sampling = None if sampler is None or self.sampling is None else replace(self.sampling, sampler=sampler)
         lost = list(dict.fromkeys(why for why in (unsampled, unsought) if why is not None))
@@ -117,14 +116,15 @@ class Restarts(Solver):
         best = Best(call, caught, self.local, recorder)
         stopped = caught.status == STOPPED
         for attempt in range(1, self.attempts + 1):
+            if recorder is not None:
+                recorder.attempt = attempt + 1  # the same for a problem in every batch
             wanted = (stopped if self.all_attempts else stopped & ~best.arrived()).nonzero().flatten()
             if attempt == 1 and paths is not None:
                 wanted = wanted[~self._along_paths(best, wanted, paths)]
-            if sampling is not None:
-                # The draws of an attempt are those of a seed of its own.
-                seed = SEED_STEP * (attempt - 1) + call.seed
-                again = replace(call.take(wanted), **_from(take(caught.last, wanted)), seed=seed)
-                best.improve(wanted, again, guidance=sampling)
+            if sampling is not None and wanted.numel() > 0:
+                self._from_samples(best, wanted, attempt, sampling)
+        if recorder is not None:
+            recorder.attempt = self.attempts + 2
         self._into_the_goal(best, (stopped & ~best.arrived() & best.arrived(CLOSE)).nonzero().flatten())
         return best.end
 
@@ -136,16 +136,28 @@ class Restarts(Solver):
         best.end.iterations[rows] += proposal.iterations
         found = proposal.found.nonzero().flatten()
         chosen = rows[found]
-        given, before = take(proposal.multipliers, found), best.first.last.multipliers.mu[chosen]
-        warm = replace(given, mu=torch.maximum(given.mu, before))
+        # Also where the proposal is rejected: a sampled trajectory is kept from returning by the same penalty.
+        best.first.last.multipliers.mu[rows] = torch.fmax(best.first.last.multipliers.mu[rows], proposal.multipliers.mu)
+        warm = replace(take(proposal.multipliers, found), mu=best.first.last.multipliers.mu[chosen])
         best.end.guided[chosen] += 1
         best.improve(chosen, replace(best.call.take(chosen), U0=proposal.U[found], warm=warm))
         return proposal.found
 
+    def _from_samples(self, best: Best, rows: Tensor, attempt: int, sampling: GCO) -> None:
+        """An attempt at the problems in `rows` from their caught trajectories, guided by samples from the start."""
+        start = take(best.first.last, rows)
+        call = replace(best.call.take(rows), U0=start.U, warm=start.multipliers)
+        if attempt == 1:
+            call = replace(call, outer=best.first.outer[rows])
+        else:  # draws of its own
+            call = replace(call, seed=call.seed + SEED_STEP * (attempt - 1))
+        best.improve(rows, call, guidance=sampling, guide_first=True)
+
     def _into_the_goal(self, best: Best, rows: Tensor) -> None:
         """A last attempt from the best trajectories of `rows`, their ends attracted to the goal."""
         if rows.numel() > 0:
-            call = replace(best.call.take(rows), **_from(take(best.end.best, rows)))
+            start = take(best.end.best, rows)
+            call = replace(best.call.take(rows), U0=start.U, warm=start.multipliers)
             best.improve(rows, call, penalty=_goal_region(call.problem))
 
 
@@ -165,11 +177,6 @@ class StopWhenCaught:
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
         """Stop where a knot is caught."""
         return Advice(None, stop=caught_knots(problem, X, U, key.outer, self.single_contact_after).any(-1))
-
-
-def _from(start: Iterate) -> dict[str, Any]:
-    """The arguments of a call that continues from trajectories."""
-    return {"U0": start.U, "warm": start.multipliers}
 
 
 def _goal_region(problem: Problem) -> GuideRegion:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgco.draws import DrawKey
 from torchgco.errors import InputError
-from torchgco.evaluation import is_better, violation
+from torchgco.evaluation import is_preferred, violation
 from torchgco.lagrangian import Lagrangian, Multipliers, update
 from torchgco.native.dispatch import open_loop, value
 from torchgco.penalties import Penalty
@@ -93,9 +93,16 @@ class AugmentedLagrangian(Solver):
         guidance: Guidance | None = None,
         penalty: Penalty | None = None,
         recorder: Recorder | None = None,
+        guide_first: bool = False,
+        by_arrival: bool = False,
     ) -> SolveEnd:
-        """The solve without its verdict, in the units of the call: with guidance, or with a fixed penalty."""
-        loop = OuterLoop(self, call, guidance, penalty, recorder)
+        """The solve without its verdict, in the units of the call: with guidance, or with a fixed penalty.
+
+        Args:
+            guide_first: guidance is called before the first inner solve, too.
+            by_arrival: an iterate that has arrived at the goal is kept in place of any that hasn't.
+        """
+        loop = OuterLoop(self, call, guidance, penalty, recorder, guide_first, by_arrival)
         B = call.problem.B
         every = torch.arange(B, device=call.rows.device)
         run_all(loop, every, max(1, B if self.slots is None else self.slots), loop.report)
@@ -112,8 +119,11 @@ class OuterLoop:
         guidance: Guidance | None,
         penalty: Penalty | None,
         recorder: Recorder | None,
+        guide_first: bool,
+        by_arrival: bool,
     ) -> None:
         self.solver, self.call, self.guidance, self.penalty, self.recorder = solver, call, guidance, penalty, recorder
+        self.guide_first, self.by_arrival = guide_first, by_arrival
         self.phr = not solver.inner.as_printed
         self.result = SolveEnd.blank(call.problem, call.U0)
         self.stopped = 0  # problems that guidance has stopped
@@ -135,10 +145,15 @@ class OuterLoop:
             X=X, U=U, cost=cost, merit=merit.clone(), multipliers=multipliers, penalty=penalty,
             regularisation=torch.zeros_like(cost),
             inner=none, outer=none.clone(), iterations=none.clone(), rung=none.clone(), guided=none.clone(),
-            last_cost=worst.clone(),
+            replaced=torch.zeros_like(none, dtype=torch.bool), last_cost=worst.clone(),
             best=copied(Iterate(X, U, multipliers, cost, worst)),
         )  # fmt: skip
-        return state, start_status(problem, X, merit, problem.start_is_clear)
+        status = start_status(problem, X, merit, problem.start_is_clear)
+        if self.guide_first:
+            well = (status == Status.RUNNING).nonzero().flatten()
+            self._ask_guidance(problem, state, well, status)
+            self._begin_inner(problem, state, well)
+        return state, status
 
     def regroup(self, rows: Tensor) -> None:
         """From now on the running problems are these."""
@@ -172,8 +187,8 @@ class OuterLoop:
         s.last_cost[rows] = s.cost[rows]
         going = rows[end.status[rows] == Status.RUNNING]
         if going.numel() > 0:
-            self._ask_guidance(s, going, end.status)
-            self._begin_inner(s, going)
+            self._ask_guidance(self.problem, s, going, end.status)
+            self._begin_inner(self.problem, s, going)
 
     def _status(self, s: State, rows: Tensor, end: PassEnd, worst: Tensor) -> Tensor:
         """Why problems end: the outer limit, or convergence; else RUNNING."""
@@ -187,24 +202,25 @@ class OuterLoop:
         return status
 
     def _keep_best(self, s: State, rows: Tensor, new: Iterate) -> None:
-        old = take(s.best, rows)
-        better = is_better(new.cost, new.violation, old.cost, old.violation, self.solver.violation_tolerance)
-        chosen = better.nonzero().flatten()
+        old, problem = take(s.best, rows), self.problem.take(rows)
+        chosen = is_preferred(problem, new, old, self.solver.violation_tolerance, self.by_arrival).nonzero().flatten()
         put(s.best, rows[chosen], take(new, chosen))
 
-    def _begin_inner(self, s: State, rows: Tensor) -> None:
-        """The next inner solve of the problems in `rows`: L_M with its new multipliers and penalty."""
+    def _begin_inner(self, running: Problem, s: State, rows: Tensor) -> None:
+        """The next inner solve of `rows` of the running problems: L_M with its new multipliers and penalty."""
         s.regularisation[rows] = 0.0
         penalty = None if s.penalty is None else take(s.penalty, rows)
-        lagrangian = Lagrangian(self.problem.take(rows), take(s.multipliers, rows), penalty, self.phr)
+        lagrangian = Lagrangian(running.take(rows), take(s.multipliers, rows), penalty, self.phr)
         s.cost[rows], s.merit[rows] = value(lagrangian, s.X[rows], s.U[rows])
         s.inner[rows] = s.rung[rows] = 0
 
-    def _ask_guidance(self, s: State, rows: Tensor, status: Tensor) -> None:
-        if self.guidance is None:
+    def _ask_guidance(self, running: Problem, s: State, rows: Tensor, status: Tensor) -> None:
+        rows = rows[~s.replaced[rows]]
+        if self.guidance is None or rows.numel() == 0:
             return
-        problem = self.problem.take(rows)
-        key = DrawKey(self.call.seed, self.call.ids[s.rows[rows]], s.outer[rows])
+        problem = running.take(rows)
+        place = s.rows[rows]
+        key = DrawKey(self.call.seed, self.call.ids[place], self.call.outer[place] + s.outer[rows])
         advice = self.guidance.update(problem, s.X[rows], s.U[rows], take(s.penalty, rows), key)
         if advice.penalty is not None:
             put(s.penalty, rows, advice.penalty)
@@ -233,6 +249,7 @@ class OuterLoop:
         put(s.multipliers, place, Multipliers(lam, torch.maximum(old.mu, HOLD * needed).clamp(max=PENALTY_MAX)))
         s.X, s.U = s.X.clone(), s.U.clone()
         s.X[place], s.U[place] = X, U
+        s.replaced[place] = True
         penalized = s.penalty.is_active[place] if s.penalty is not None else torch.zeros_like(taken, dtype=torch.bool)
         s.guided[place] += ~penalized
 

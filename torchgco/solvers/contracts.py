@@ -42,6 +42,7 @@ class Call:
     seed: int
     ids: Tensor  # (B,) int64: key the random draws, together with the seed
     rows: Tensor  # (B,) int64: places in the batch that the user handed in
+    outer: Tensor  # (B,) int64: outer iterations that this call continues; draws are keyed by their number
     warm: Multipliers | None
     callback: Callback | None
 
@@ -64,13 +65,13 @@ class Call:
             raise InputError("ids", f"an int64 tensor ({problem.B},)", getattr(ids, "shape", type(ids).__name__))
         if warm is not None:
             warm.check(problem)
-        return cls(problem, U0, seed, ids, rows, warm, callback)
+        return cls(problem, U0, seed, ids, rows, torch.zeros_like(rows), warm, callback)
 
     def take(self, index: Rows) -> Self:
         """The same call for the problems in `index`."""
         warm = None if self.warm is None else take(self.warm, index)
-        parts = self.problem.take(index), self.U0[index], self.seed, self.ids[index], self.rows[index]
-        return type(self)(*parts, warm, self.callback)
+        U0, ids, rows, outer = take((self.U0, self.ids, self.rows, self.outer), index)
+        return type(self)(self.problem.take(index), U0, self.seed, ids, rows, outer, warm, self.callback)
 
     def in_cost_units(self) -> tuple[Self, Tensor]:
         """The same call with costs and multipliers in units of `Problem.cost_unit`, and these units (B,)."""

@@ -28,11 +28,11 @@ class Work(Protocol):
         """From now on the running problems are these."""
         ...
 
-    def advance(self, state: State) -> Tensor:
+    def advance(self, s: State) -> Tensor:
         """One pass over all running problems, in place; their statuses."""
         ...
 
-    def end(self, state: State, places: Tensor, status: Tensor) -> None:
+    def end(self, s: State, places: Tensor, status: Tensor) -> None:
         """Keep the results of the problems at `places` of the state."""
         ...
 

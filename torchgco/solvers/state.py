@@ -61,6 +61,7 @@ class State(InnerState):
     penalty: Penalty | None  # of guidance
     outer: Tensor  # inner solves ended
     guided: Tensor  # outer iterations with guidance on
+    replaced: Tensor  # bool: the iterate was replaced by guidance, which is silent from then on
     last_cost: Tensor  # J_var at the end of the inner solve before
     best: Iterate  # of those that ended an inner solve; infinite violation while there is none
 

@@ -1,0 +1,82 @@
+"""Four vehicles that need different attempts, and a small solver that makes them all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tests.search.cup import controls
+from torchgco import (
+    GCO,
+    ILQR,
+    MPPI,
+    AugmentedLagrangian,
+    ControlBounds,
+    FunctionDynamics,
+    PathProposals,
+    Problem,
+    QuadraticCost,
+    Restarts,
+    Solution,
+    Spheres,
+)
+from torchgco.solvers.contracts import Call
+from torchgco.solvers.state import SolveEnd
+
+LOCAL = AugmentedLagrangian(ILQR(tolerance=5e-6, max_iterations=20), initial_penalty=2.0, max_outer_iterations=12)
+SAMPLER = MPPI(
+    samples=32, covariance=None, spread=0.35, temperature=0.01, rounds=3, noise_knots=8, decay=0.93, dwell_cost=1.0,
+    elite=5,
+)  # fmt: skip
+SAMPLING = GCO(SAMPLER, 2.0, start_from_sample=True, sample_from_rest=True, single_contact_after=3)
+PATHS = PathProposals(track_iterations=8, max_penetration=0.5)
+SOLVER = Restarts(LOCAL, PATHS, SAMPLING, attempts=2)
+FREE, PASSES, SHORT, CLOSED = range(4)
+FIELDS = ("X", "U", "K", "d", "cost", "violation", "status", "iterations", "outer_iterations", "guided")
+
+
+def gates(weight: float = 6.0) -> tuple[Problem, Tensor]:
+    """Four vehicles on the line to a goal: FREE; PASSES a gate on a path; SHORT does so, but its optimum ends short of
+    the goal for this terminal weight; CLOSED in by a ring, where there is no path.
+    """
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    centers, radii = np.full((4, 12, 2), np.nan), np.full((4, 12), np.nan)
+    centers[FREE, :2] = [[5, 9], [5, 9.6]]
+    centers[[PASSES, SHORT], :2] = [[5, 0.3], [5, -0.3]]
+    centers[CLOSED] = 2 * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+    radii[:CLOSED, :2], radii[CLOSED] = 0.5, 0.5
+    weights = torch.tensor([[w, w, 0, 0] for w in (100.0, 100.0, weight, 100.0)], dtype=torch.float64)
+    problem = Problem(
+        FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, "euler", slice(0, 2)),
+        QuadraticCost(Q=[0.01, 0.01, 0.1, 0.1], R=[1.0, 1.0], Qf=torch.diag_embed(weights), x_ref=[10.0, 0, 0, 0]),
+        [Spheres(centers, radii, 0.1), ControlBounds([-5.0] * 2, [5.0] * 2)],
+        torch.zeros(4, 4, dtype=torch.float64),
+        40,
+    )
+    return problem, controls(problem)
+
+
+@dataclass
+class Solve:
+    """One solve that was made on the way."""
+
+    call: Call
+    guidance: Any
+    penalty: Any
+    end: SolveEnd
+
+    @property
+    def rows(self) -> list[int]:
+        return self.call.rows.tolist()
+
+
+def assert_same_bits(a: Solution, b: Solution) -> None:
+    for name in FIELDS:
+        assert torch.equal(getattr(a, name), getattr(b, name)), name
+    for lam_a, lam_b in zip(a.multipliers.lam, b.multipliers.lam, strict=True):
+        assert torch.equal(lam_a, lam_b)
+    assert torch.equal(a.multipliers.mu, b.multipliers.mu)

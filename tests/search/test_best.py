@@ -1,0 +1,108 @@
+"""The choice among attempts: one that arrives, then one that is feasible, then the cheapest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+
+from tests.problems import planar_batch
+from tests.search.gates import LOCAL, Solve
+from torchgco import (
+    GCO,
+    ILQR,
+    AugmentedLagrangian,
+    LineSearch,
+    Problem,
+    QuadraticCost,
+    Restarts,
+    Solution,
+)
+from torchgco.search.best import Best
+from torchgco.search.restarts import SEED_STEP
+from torchgco.solvers.contracts import Advice, Call
+from torchgco.solvers.state import SolveEnd
+
+
+@dataclass(frozen=True)
+class Given(GCO):
+    """In place of samples the constant controls `levels`, one for each attempt."""
+
+    levels: tuple[float, ...] = ()
+
+    def update(self, problem, X, U, penalty, key) -> Advice:
+        level = self.levels[key.seed // SEED_STEP]
+        return Advice(penalty, torch.full_like(U, level), torch.ones_like(X[:, 0, 0], dtype=torch.bool))
+
+
+STAYS, ARRIVES = 1e-3, 4.0  # controls: the first are cheap
+
+
+def given() -> tuple[Problem, torch.Tensor, AugmentedLagrangian]:
+    """A problem in which moving is expensive, controls like its own, and a solver that improves nothing."""
+    problem, U0 = planar_batch(B=1, N=25, obstacles=3, seed=3)
+    cost = QuadraticCost(Q=[1e-3] * 6, R=[5.0, 5.0], Qf=[1, 1, 0, 0, 0, 0], x_ref=[1, 0.4, 0, 0, 0, 0])
+    inner = ILQR(tolerance=1e-9, max_iterations=1, line_search=LineSearch(ratio_min=1e9, ratio_max=2e9))
+    local = AugmentedLagrangian(inner, max_outer_iterations=3, violation_tolerance=10.0, penalty_growth=1.0)
+    return replace(problem, cost=cost), U0, local
+
+
+def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> Solution:
+    """The choice among trajectories that are given, all caught and none improved; `share` counts as having arrived."""
+    problem, U0, local = given()
+    monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", share)
+    monkeypatch.setattr("torchgco.search.restarts.caught_knots", lambda problem, X, *_: torch.ones_like(X[..., 0]) > 0)
+    return Restarts(local, None, Given(levels=levels), attempts=len(levels), **options).solve(problem, U0)
+
+
+@pytest.mark.parametrize(
+    ("levels", "share", "options", "attempts", "kept"),
+    [
+        ((ARRIVES, STAYS), 1e-9, {}, 2, STAYS),
+        ((ARRIVES, STAYS), 0.5, {}, 1, ARRIVES),
+        ((STAYS, ARRIVES), 0.5, {}, 2, ARRIVES),
+        ((STAYS, ARRIVES), 0.5, dict(all_attempts=True), 2, ARRIVES),
+        ((ARRIVES, STAYS), 0.5, dict(all_attempts=True), 2, ARRIVES),
+        ((ARRIVES, ARRIVES), 0.5, dict(all_attempts=True), 2, ARRIVES),
+    ],
+)
+def test_one_that_arrives_is_worth_more_than_a_cheaper_one(
+    levels, share, options, attempts, kept, solves: list[Solve], monkeypatch
+) -> None:
+    solution = choose(levels, monkeypatch, share, **options)
+    assert len(solves) == 1 + attempts
+    assert bool(solution.U.mean() > 3.0) == (kept == ARRIVES)
+
+
+@pytest.mark.parametrize("by_arrival", [True, False])
+def test_one_that_arrives_is_kept_within_an_attempt_too(by_arrival: bool, monkeypatch) -> None:
+    """The first inner solve arrives; then guidance replaces it by a trajectory that stays, which is cheaper."""
+    monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", 0.5)
+    problem, U0, local = given()
+    call = Call.checked(problem, torch.full_like(U0, ARRIVES))
+    end = local.iterate(call, Given(levels=(STAYS,)), by_arrival=by_arrival)
+    assert bool(end.best.U.mean() > 3.0) == by_arrival
+
+
+def test_arrived_comes_before_feasible_and_feasible_before_cheap() -> None:
+    """Of two ends, as (arrived, violation, cost): the first is the better one, whichever comes first."""
+    problem, U0 = planar_batch(B=1, N=5, obstacles=1)
+    call = Call.checked(problem, U0)
+
+    def end(there: bool, violation: float, cost: float) -> SolveEnd:
+        made = SolveEnd.blank(problem, U0)
+        made.best.X[:, -1, :2] = torch.tensor([1.0, 0.4]) if there else -1.0
+        made.best.violation[:], made.best.cost[:], made.status[:] = violation, cost, int(cost)
+        made.iterations[:], made.outer[:], made.guided[:] = 1, 2, 3
+        return made
+
+    ordered = [(True, 0.0, 2), (True, 0.0, 3), (False, 0.0, 1), (True, 0.1, 1), (False, 0.2, 1)]
+    for i, better in enumerate(ordered):
+        for worse in ordered[i + 1 :]:
+            for one, other in ((better, worse), (worse, better)):
+                best = Best(call, end(*one), LOCAL)
+                best.keep(torch.tensor([0]), end(*other))
+                assert (float(best.end.best.violation), float(best.end.best.cost)) == better[1:]
+                assert int(best.end.status) == better[2]
+                assert (int(best.end.iterations), int(best.end.outer), int(best.end.guided)) == (2, 4, 6)

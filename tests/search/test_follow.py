@@ -1,0 +1,128 @@
+"""From paths to trajectories: candidates track them, are relaxed where that serves, and refined to convergence."""
+
+from dataclasses import replace
+
+import torch
+
+from tests.search.cup import GOAL, QUICK, controls, cost, cup
+from tests.search.test_paths import alone
+from torchgco import AugmentedLagrangian, PathProposals, Problem, Restarts, judge
+from torchgco.rollout import open_loop
+from torchgco.search import follow
+from torchgco.search.candidates import Candidates
+from torchgco.solvers.ilqr import ILQR
+
+END = torch.tensor([0.7], dtype=torch.float64)
+
+
+def test_the_vehicle_rests_first_and_last() -> None:
+    path = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [1.0, 1.0]]], dtype=torch.float64)
+    center = follow.travel(replace(QUICK, depart=0.2, smoothing=0.0), path, END, 100)[0]
+    assert torch.equal(center[:21], path[0, :1].expand(21, -1)) and torch.equal(
+        center[70:], path[0, -1:].expand(31, -1)
+    )
+    assert float((center[1:] - center[:-1]).square().sum(-1).sqrt().max()) < 1.6 * 2.0 / 50
+    rounded = follow.travel(replace(QUICK, depart=0.2, smoothing=0.1), path, END, 100)[0]
+    corner = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    assert float((center - corner).norm(dim=-1).min()) < 0.03 < float((rounded - corner).norm(dim=-1).min())
+
+
+def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
+    problem, off = cup(B=1, N=120), []
+    for tube, stiffness in ((0.05, 20.0), (None, 500.0)):
+        options = replace(QUICK, tube=tube, stiffness=(stiffness,), track_iterations=4)
+        path = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
+        candidates = follow.track(options, begun(problem, controls(problem)[:, None]), path[:, None])
+        X = open_loop(problem.dynamics, problem.x0, candidates.U)
+        torch.testing.assert_close(candidates.X, X)
+        off.append(float((X[..., :2] - follow.travel(options, path, END + 0.1, 120)).norm(dim=-1).mean()))
+    assert off[1] < 0.5 * off[0]
+
+
+def begun(problem: Problem, U: torch.Tensor) -> Candidates:
+    """Live candidates with controls U (1, count, N, m), with radii and units as in the cup."""
+    R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
+    return Candidates.begin(problem, U, R, unit, torch.ones(1, U.shape[1], dtype=torch.bool))
+
+
+def test_every_candidate_tracks_its_own_path_at_its_own_pace() -> None:
+    """Two paths, each from two starts at two paces: eight candidates, the paces of a start next to each other."""
+    problem = cup(B=1, N=120)
+    options = replace(QUICK, arrive=(0.9, 0.5), tube=None, stiffness=(1e4,), track_iterations=20)
+    ends = (-1.0, 0.0), (1.0, 0.4)
+    paths = torch.tensor([[[ends[0], (0.0, y), ends[1]] for y in (-0.9, 1.2)]], dtype=torch.float64)
+    found = follow.track(options, begun(problem, controls(problem)[:, None].repeat(1, 8, 1, 1)), paths)
+    for i, X in enumerate(found.X):
+        apart = []
+        for path in paths[0]:
+            for pace in options.paces:
+                center = follow.travel(options, path[None], torch.full_like(END, pace), 120)[0]
+                apart.append(float((X[:, :2] - center).norm(dim=-1).mean()))
+        assert apart.index(min(apart)) == i // 4 * 2 + i % 2
+
+
+def test_candidates_that_are_not_among_the_first_are_not_relaxed(monkeypatch) -> None:
+    relaxed, relax = [], follow.relax
+
+    def noted(options: PathProposals, candidates: Candidates):
+        relaxed.append(candidates.live.numel())
+        return relax(options, candidates)
+
+    monkeypatch.setattr("torchgco.search.follow.relax", noted)
+    problem = cup(B=2, N=60)
+    three = replace(QUICK, num_paths=3, track_iterations=2, relax_iterations=1, max_penetration=9.0)
+    proposals = [replace(three, relax_top=top).propose(problem) for top in (None, 9, 2)]
+    assert relaxed == [6, 6, 4] and torch.equal(proposals[0].U, proposals[1].U)
+    tracked = [replace(three, relax_top=top, relax_iterations=0).propose(problem).U for top in (None, 1)]
+    assert torch.equal(*tracked)
+
+
+def test_a_candidate_that_falls_back_into_the_trap_is_not_relaxed() -> None:
+    """Flying is so expensive that waiting is cheaper: the candidate stays as it was tracked."""
+    problem = replace(cup(B=1), cost=cost(controls=20.0))
+    tracked, relaxed = (PathProposals(depart=0.1, arrive=0.8, relax_iterations=n).propose(problem).U for n in (0, 20))
+    assert torch.equal(tracked, relaxed)
+    assert float(judge(problem, relaxed, GOAL, 0.3).goal_distance) < 0.3
+
+
+def test_a_relaxed_candidate_is_cheaper() -> None:
+    problem = cup(N=120)
+    costs = [judge(problem, replace(QUICK, relax_iterations=n).propose(problem).U, GOAL, 0.3).cost for n in (0, 3)]
+    assert bool((costs[0] > costs[1]).all())
+
+
+def test_a_candidate_deep_within_an_obstacle_is_rejected() -> None:
+    problem = cup(B=1)
+    proposals = [replace(QUICK, max_penetration=depth).propose(problem) for depth in (1e-4, 1.0)]
+    assert [bool(p.found) for p in proposals] == [False, True]
+    assert not bool(proposals[0].multipliers.mu.isnan().any()) and int(proposals[0].iterations) > 0
+    X = open_loop(problem.dynamics, problem.x0, proposals[1].U)
+    assert float(problem.constraints[0].violation(X, proposals[1].U).max()) > 1e-4 * 0.2
+
+
+def test_the_cheapest_refined_candidate_is_proposed_and_saves_the_solver_work() -> None:
+    problem, four = cup(B=2, N=120), replace(QUICK, num_paths=4, track_iterations=20)
+    relaxed, refined = (replace(four, refine_top=n).propose(problem) for n in (1, 3))
+    verdicts = [judge(problem, proposal.U, GOAL, 0.3) for proposal in (relaxed, refined)]
+    assert not bool(verdicts[0].sound.any()) and bool(verdicts[1].sound.all())
+    for k in range(2):  # on either side alone
+        other = judge(problem, alone(replace(four, refine_top=3), problem, k).U, GOAL, 0.3)
+        assert bool(other.sound.all()) and bool((verdicts[1].cost <= other.cost).all())
+    assert not any(bool(lam.any()) for lam in relaxed.multipliers.lam) and bool(refined.multipliers.lam[0].any())
+    local = AugmentedLagrangian(ILQR(tolerance=1e-2, max_iterations=20), max_outer_iterations=20)
+    counts = []
+    for top in (1, 3):
+        solver = Restarts(local, replace(four, refine_top=top), sampling=None, attempts=1)
+        counts.append(int(solver.solve(problem, controls(problem)).outer_iterations.sum()))
+    assert counts[1] < counts[0]
+
+
+def test_a_refined_candidate_that_cuts_through_an_obstacle_between_two_knots_is_rejected(monkeypatch) -> None:
+    """Where nobody keeps such a distance, the best relaxed candidate is proposed as it is."""
+    problem, one = cup(B=1, N=120), replace(QUICK, num_paths=2, track_iterations=20, refine_top=2)
+    refined = one.propose(problem)
+    assert bool(refined.found) and bool(refined.multipliers.lam[0].any())
+    monkeypatch.setattr("torchgco.search.follow.CHORD_PENETRATION", -9.0)
+    rejected = one.propose(problem)
+    assert torch.equal(rejected.U, replace(one, refine_top=1).propose(problem).U)
+    assert not torch.equal(refined.U, rejected.U) and not any(bool(lam.any()) for lam in rejected.multipliers.lam)

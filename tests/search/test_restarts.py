@@ -1,0 +1,200 @@
+"""Restarts: where a trajectory is caught, further attempts start, the best is kept, and all of them are counted."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.problems import planar_batch
+from tests.search.cup import GOAL, controls, cup
+from tests.search.gates import (
+    CLOSED,
+    FREE,
+    LOCAL,
+    PASSES,
+    PATHS,
+    SAMPLING,
+    SHORT,
+    SOLVER,
+    Solve,
+    assert_same_bits,
+    gates,
+)
+from torchgco import (
+    GCO,
+    ILQR,
+    AugmentedLagrangian,
+    InputError,
+    PathProposals,
+    Restarts,
+    Solution,
+    Spheres,
+    Status,
+    judge,
+)
+from torchgco.evaluation import has_arrived
+from torchgco.guidance.region import GuideRegion
+from torchgco.search.restarts import SEED_STEP, StopWhenCaught
+from torchgco.solvers.contracts import Call
+from torchgco.solvers.state import STOPPED
+
+
+def arrived(solve: Solve) -> Tensor:
+    best = solve.end.best
+    return (best.violation <= LOCAL.violation_tolerance) & has_arrived(solve.call.problem, best.X)
+
+
+def rank(solve: Solve, place: int) -> tuple:
+    """Arrived, then feasible, then cheap; of infeasible ones the less violated."""
+    best, fits = solve.end.best, bool(solve.end.best.violation[place] <= LOCAL.violation_tolerance)
+    return not bool(arrived(solve)[place]), not fits, float((best.cost if fits else best.violation)[place])
+
+
+def test_sampled_attempts_start_from_the_caught_trajectory_and_the_best_is_kept(solves: list[Solve]) -> None:
+    problem, U0 = gates()
+    solution = Restarts(LOCAL, None, SAMPLING, attempts=3, all_attempts=True).solve(problem, U0, seed=5)
+    first, attempts = solves[0], solves[1:4]
+    assert isinstance(first.guidance, StopWhenCaught) and torch.equal(first.call.U0, U0)
+    assert (first.end.status == STOPPED).tolist() == [False, True, True, True]
+    for k, attempt in enumerate(attempts):
+        assert attempt.rows == [PASSES, SHORT, CLOSED] and isinstance(attempt.guidance, GCO)
+        assert attempt.call.seed == 5 + k * SEED_STEP and attempt.call.ids.tolist() == attempt.rows
+        assert torch.equal(attempt.call.U0, first.end.last.U[1:])
+        assert torch.equal(attempt.call.warm.mu, first.end.last.multipliers.mu[1:])
+    for b in (PASSES, SHORT, CLOSED):
+        found = [(rank(s, s.rows.index(b)), s.end.best.U[s.rows.index(b)]) for s in solves if b in s.rows]
+        best = min(found, key=lambda pair: pair[0])
+        assert torch.equal(solution.U[b], best[1]) and len({key for key, _ in found}) > 2
+
+
+@pytest.mark.parametrize("all_attempts", [False, True])
+def test_one_that_arrives_ends_the_attempts_unless_all_are_wanted(all_attempts: bool, solves: list[Solve]) -> None:
+    problem, U0 = gates()
+    Restarts(LOCAL, None, SAMPLING, attempts=3, all_attempts=all_attempts).solve(problem, U0)
+    wanted = [PASSES, SHORT, CLOSED]
+    for attempt in solves[1:4]:
+        assert attempt.rows == wanted
+        wanted = [b for b, there in zip(wanted, arrived(attempt).tolist(), strict=True) if all_attempts or not there]
+    assert (PASSES in wanted) == all_attempts
+
+
+def test_the_first_attempt_is_along_a_path_and_no_guidance_disturbs_it(solves: list[Solve]) -> None:
+    problem, U0 = gates()
+    SOLVER.solve(problem, U0, seed=3)
+    caught, along, sampled, again, last = solves
+    proposal = PATHS.propose(problem.in_cost_units())
+    assert proposal.found.tolist() == [True, True, True, False]
+    assert along.rows == [PASSES, SHORT] and along.guidance is along.penalty is None
+    assert torch.equal(along.call.U0, proposal.U[1:3])
+    before = caught.end.last.multipliers.mu[1:3]
+    assert torch.equal(along.call.warm.mu, torch.maximum(proposal.multipliers.mu[1:3], before))
+    assert not any(bool(lam.any()) for lam in along.call.warm.lam)
+    # Where there is no path, the first attempt is sampled; the second is, where the first doesn't arrive.
+    assert sampled.rows == [CLOSED] and again.rows == [SHORT, CLOSED] and last.rows == [SHORT]
+    assert [s.call.seed for s in (sampled, again)] == [3, 3 + SEED_STEP]
+
+
+def test_without_a_path_and_without_samples_the_caught_trajectory_remains() -> None:
+    """Any proposal penetrates deeper than is accepted here; its candidates are counted all the same."""
+    problem, U0 = gates()
+    problem, U0 = problem.take(torch.tensor([PASSES])), U0[:1]
+    caught = LOCAL.iterate(Call.checked(problem, U0).in_cost_units()[0], StopWhenCaught(None))
+    shallow = replace(PATHS, max_penetration=1e-9)
+    solution, proposal = Restarts(LOCAL, shallow, sampling=None).solve(problem, U0), shallow.propose(problem)
+    assert caught.status.tolist() == [STOPPED] and solution.statuses == [Status.MAX_ITERATIONS]
+    assert torch.equal(solution.U, caught.best.U) and not bool(proposal.found)
+    assert torch.equal(solution.iterations, caught.iterations + proposal.iterations) and int(solution.guided) == 0
+
+
+@pytest.mark.parametrize(("weight", "attracted"), [(1.0, False), (6.0, True), (100.0, False)])
+def test_a_trajectory_that_ends_close_to_the_goal_is_attracted_to_it_at_last(
+    weight: float, attracted: bool, solves: list[Solve], monkeypatch
+) -> None:
+    """Where the optimum stays short of the goal: far (left as it is), slightly (attracted), hardly."""
+    problem, U0 = gates(weight)
+    solution = SOLVER.solve(problem, U0)
+    last = solves[-1]
+    assert (last.penalty is not None) == attracted
+    assert all(s.penalty is None for s in solves[:-1])
+    monkeypatch.setattr("torchgco.search.restarts.CLOSE", 0.0)
+    plain = SOLVER.solve(problem, U0)
+    away, optimal = ((s.X[:, -1, :2] - torch.tensor([10.0, 0.0])).norm(dim=-1) for s in (solution, plain))
+    assert bool(away[SHORT] < 0.9 < optimal[SHORT]) == attracted
+    others = torch.tensor([FREE, PASSES, CLOSED])
+    assert torch.equal(solution.U[others], plain.U[others])
+    if attracted:
+        assert last.rows == [SHORT] and last.guidance is None and isinstance(last.penalty, GuideRegion)
+        assert torch.isfinite(last.penalty.radius).nonzero().tolist() == [[0, 40]]  # of the last knot alone
+        assert away[SHORT] > 0.8 and solution.cost[SHORT] < 1.05 * plain.cost[SHORT]
+        assert solution.statuses[SHORT] == Status.FEASIBLE  # the optimum lies elsewhere
+
+
+def test_one_that_is_never_caught_has_the_bits_of_its_own_solve() -> None:
+    problem, U0 = gates()
+    solution, plain = SOLVER.solve(problem, U0), LOCAL.solve(problem, U0)
+    index = torch.tensor([FREE])
+    assert_same_bits(solution.take(index), plain.take(index))
+    free = replace(problem, constraints=problem.constraints[1:])
+    assert_same_bits(SOLVER.solve(free, U0), LOCAL.solve(free, U0))
+
+
+def test_counts_are_those_of_all_attempts_and_candidates(solves: list[Solve], monkeypatch) -> None:
+    made, propose = [], PathProposals.propose
+    monkeypatch.setattr(PathProposals, "propose", lambda self, part: made.append(propose(self, part)) or made[-1])
+    problem, U0 = gates()
+    solution = SOLVER.solve(problem, U0)
+    wanted = torch.zeros(3, 4, dtype=torch.int64)
+    for s in solves:
+        wanted[:, s.call.rows] += torch.stack((s.end.iterations, s.end.outer, s.end.guided))
+        if s.guidance is None and s.penalty is None:
+            wanted[2, s.call.rows] += 1  # along a path
+    assert len(made) == 1 and int(made[0].iterations.min()) == 0 < int(made[0].iterations[:2].min())
+    wanted[0, PASSES:] += made[0].iterations
+    assert torch.equal(torch.stack((solution.iterations, solution.outer_iterations, solution.guided)), wanted)
+    assert solution.guided[FREE] == 0 and solution.guided[PASSES] == 1 < int(solution.guided[SHORT])
+
+
+def test_it_leads_around_a_trap_that_catches_the_solver() -> None:
+    problem = cup(B=1, N=120)
+    local = AugmentedLagrangian(ILQR(tolerance=1e-2, max_iterations=20), max_outer_iterations=12)
+    solver = Restarts(local, PathProposals(depart=0.1, arrive=0.8), SAMPLING, attempts=1)
+    stays, passes = (judge(problem, s.solve(problem, controls(problem)).U, GOAL, 0.3) for s in (local, solver))
+    assert not bool(stays.reached) and bool(passes.sound)
+
+
+CHANGES = dict(
+    local=replace(LOCAL, initial_penalty=1.0), paths=None, sampling=replace(SAMPLING, initial_penalty=9.0), attempts=1,
+    all_attempts=True,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_every_option_is_read(name: str, whole: Solution) -> None:
+    other = replace(SOLVER, **{name: CHANGES[name]}).solve(*gates(), seed=3)
+    assert not (torch.equal(other.U, whole.U) and torch.equal(other.iterations, whole.iterations))
+
+
+def test_no_option_is_forgotten_above() -> None:
+    assert {f.name for f in fields(Restarts)} == set(CHANGES)
+
+
+def test_a_single_contact_counts_as_caught_from_the_iteration_that_sampling_says(solves: list[Solve]) -> None:
+    problem, U0 = planar_batch(B=1, N=60, obstacles=1, seed=1)
+    problem = replace(problem, constraints=[Spheres([[[0.0, 0.2]]], [[0.2]], 0.1), problem.constraints[1]])
+    counts = []
+    for after in (1, 2, None):
+        solves.clear()
+        Restarts(LOCAL, None, replace(SAMPLING, single_contact_after=after), attempts=1).solve(problem, U0)
+        counts.append((int(solves[0].end.status) == STOPPED, int(solves[0].end.outer), len(solves)))
+    assert counts[:2] == [(True, 1, 2), (True, 2, 2)] and counts[2][0] is False and counts[2][2] == 1
+
+
+def test_options_out_of_range_are_named() -> None:
+    with pytest.raises(InputError, match=r"^solver\.attempts"):
+        Restarts(attempts=0)
+    with pytest.raises(InputError, match=r"^solver\.local\.guidance: .*`sampling`") as caught:
+        Restarts(replace(LOCAL, guidance=SAMPLING), None, None)
+    assert len(str(caught.value).splitlines()) == 1

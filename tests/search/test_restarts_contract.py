@@ -1,0 +1,92 @@
+"""Restarts in a batch: the same bits in any company, progress that never goes back, and a trace that names attempts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.search.gates import (
+    CLOSED,
+    FREE,
+    LOCAL,
+    PASSES,
+    SHORT,
+    SOLVER,
+    Solve,
+    assert_same_bits,
+    gates,
+)
+from torchgco import (
+    Problem,
+    Restarts,
+    Solution,
+    Status,
+)
+from torchgco.solvers.contracts import Progress
+
+
+def reports(solver: Restarts, problem: Problem, U0: Tensor, **options) -> list[Progress]:
+    seen: list[Progress] = []
+    solver.solve(problem, U0, callback=seen.append, **options)
+    return seen
+
+
+@pytest.mark.parametrize("change", [{}, dict(paths=None), dict(all_attempts=True), dict(sampling=None)])
+def test_progress_never_goes_back_and_ends_at_the_total(change: dict, solves: list[Solve]) -> None:
+    seen = reports(replace(SOLVER, **change), *gates())
+    finished = [now.finished for now in seen]
+    assert finished == sorted(finished) and finished[-1] == 4 and {now.total for now in seen} == {4}
+    first = next(now for now in seen if now.passes == 1)
+    assert first.rows.tolist() == [0, 1, 2, 3] and first.finished <= 1
+    again = {b for s in solves[1:] for b in s.rows}
+    assert {b for now in seen[12:] for b in now.rows.tolist()} <= again  # places in the whole batch, not in a part
+
+
+@pytest.mark.parametrize("rows", [[FREE], [PASSES], [SHORT], [CLOSED], [CLOSED, SHORT, PASSES, FREE], [SHORT, FREE]])
+def test_alone_and_in_any_order_a_problem_has_its_bits(rows: list[int], whole: Solution) -> None:
+    problem, U0 = gates()
+    index = torch.tensor(rows)
+    part = SOLVER.solve(problem.take(index), U0[index], seed=3, ids=index)
+    assert_same_bits(part, whole.take(index))
+
+
+@pytest.mark.parametrize("slots", [1, 2])
+def test_slots_change_no_bits(slots: int, whole: Solution) -> None:
+    few = SOLVER.in_slots(slots)
+    seen = []
+    solution = few.solve(*gates(), seed=3, callback=seen.append)
+    assert max(now.rows.numel() for now in seen) == slots
+    assert_same_bits(solution, whole)
+
+
+def test_a_problem_that_cannot_start_is_not_attempted_and_disturbs_nobody(whole: Solution, solves: list[Solve]) -> None:
+    problem, U0 = gates()
+    x0 = problem.x0.clone()
+    x0[FREE, :2], x0[CLOSED, 0] = problem.constraints[0].centers[FREE, 0], torch.nan
+    solution = SOLVER.solve(replace(problem, x0=x0), U0, seed=3)
+    assert solution.statuses[FREE] == Status.INVALID_START and solution.statuses[CLOSED] == Status.NON_FINITE
+    assert {b for s in solves[1:] for b in s.rows} == {PASSES, SHORT}
+    middle = torch.tensor([PASSES, SHORT])
+    assert_same_bits(solution.take(middle), whole.take(middle))
+
+
+def test_the_trace_names_the_attempt() -> None:
+    """Counted from 1 for each problem, whatever its company: the first solve, the attempts, the one into the goal."""
+    problem, U0 = gates()
+    solver = replace(SOLVER, local=replace(LOCAL, record=True))
+    solution = solver.solve(problem, U0, seed=3)
+    attempts = solution.trace.groupby("element")["attempt"].unique()
+    assert {b: list(attempts[b]) for b in range(4)} == {
+        FREE: [1],
+        PASSES: [1, 2],
+        SHORT: [1, 2, 3, 4],
+        CLOSED: [1, 2, 3],
+    }
+    for b in (SHORT, CLOSED):
+        index = torch.tensor([b])
+        alone = solver.solve(problem.take(index), U0[index], seed=3, ids=index).trace.drop(columns="element")
+        mine = solution.trace[solution.trace["element"] == b].drop(columns="element").reset_index(drop=True)
+        assert alone.equals(mine)
