@@ -4,7 +4,8 @@
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
 # make benchmark   speed, side by side with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
-# make test    the tests; lint, types: the static checks; clean: start afresh
+# make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md
+# make test    the tests; lint, types: the static checks; clean: remove environments, caches and builds
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -21,7 +22,7 @@ ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test lint types clean quality oracle benchmark benchmark-gpu families
+.PHONY: study test lint types clean quality oracle benchmark benchmark-gpu families docs figures
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -45,6 +46,12 @@ benchmark: $(PEERS)
 benchmark-gpu: $(PEERS)
 	$(SPEED) --device cuda $(ARGS)
 
+docs: $(DEV)
+	$(BIN)/python -m pdoc torchgco --docformat google --output-directory docs/api
+
+figures: $(RUNTIME)
+	$(BIN)/python docs/figures.py
+
 lint: $(DEV)
 	$(BIN)/ruff check .
 
@@ -52,7 +59,7 @@ types: $(DEV)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 clean:
-	rm -rf $(VENV) $(ACADOS) build dist .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(ACADOS) build dist docs/api .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
