@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "benchmarks" / "data"
 GOAL, GOAL_RADIUS = torch.ones(2, dtype=torch.float64), 0.1  # m
 FEASIBLE, EXACT = 1e-3, 1e-6  # violation of the full radii, m
-DEARER = 1.01  # a cost ratio from which on two paths are told apart
+NOTABLE = 1.01  # the cost ratio beyond which one path counts as cheaper than another
 HEAD = (
     "solver", "circles", "n", "feasible", "violation <= 1e-6", "reached", "median objective", "ratio of medians",
     "median ratio", "seconds per problem",
@@ -113,8 +113,8 @@ def compared(ours: Flight, peer: Flight) -> str:
     """Both solvers layout by layout, which the medians don't show."""
     ratio = ours.cost / peer.cost
     return (
-        f"Layout by layout torchgco is more than 1 % cheaper on {int((ratio < 1 / DEARER).sum())} of {len(ratio)} and "
-        f"more than 1 % more expensive on {int((ratio > DEARER).sum())} (ratios of {float(ratio.min()):.2f} to "
+        f"Layout by layout torchgco is more than 1 % cheaper on {int((ratio < 1 / NOTABLE).sum())} of {len(ratio)} and "
+        f"more than 1 % more expensive on {int((ratio > NOTABLE).sum())} (ratios of {float(ratio.min()):.2f} to "
         f"{float(ratio.max()):.2f}). By their own statuses {ours.converged} and {peer.converged} converged."
     )
 

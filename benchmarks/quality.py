@@ -1,6 +1,6 @@
 """python -m benchmarks.quality: how often the goal is reached, and how well, on the public families.
 
-Every family and solver is a study of its own below outputs/quality, so that a run that was stopped goes on where it
+Every family and solver is a study of its own below outputs/quality, so that a run that was stopped resumes where it
 was. The table is printed and, with --write and where all families flew, put into its page with date and commit: the
 table of `gco` alone goes into benchmarks/README.md, drawn layouts into results/drawn.md, several solvers into
 results/ladder.md, unless --page names another.

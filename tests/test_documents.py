@@ -1,0 +1,148 @@
+"""Links lead to files and headings that exist, Python runs, and commands are accepted by the programs they call."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import itertools
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks import oracle, quality
+from benchmarks.speed import __main__ as speed
+from torchgco.experiments.build import compose_config
+
+ROOT = Path(__file__).resolve().parents[1]
+GENERATED = ROOT / "docs" / "api"
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+PAGES += [
+    page
+    for folder in ("docs", "benchmarks")
+    for page in sorted((ROOT / folder).rglob("*.md"))
+    if GENERATED not in page.parents
+]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"(?<=\n\n)(?:    .*\n)+")
+PYTHON, SHELL = "python", "sh"
+TARGETS = {"quality": quality, "families": quality, "oracle": oracle, "benchmark": speed, "benchmark-gpu": speed}
+
+
+def blocks(page: Path) -> Iterator[tuple[str, str]]:
+    """Language and text of the code blocks of a page; an indented block is Python where it begins with an import."""
+    text = page.read_text()
+    yield from FENCE.findall(text)
+    for block in INDENTED.findall(FENCE.sub("", text)):
+        lines = [line[4:] for line in block.splitlines()]
+        yield PYTHON if lines[0].startswith(("import ", "from ")) else SHELL, "\n".join(lines)
+
+
+def commands(page: Path) -> list[str]:
+    text = "\n".join(text for language, text in blocks(page) if language == SHELL).replace("\\\n", " ")
+    return [line for line in text.splitlines() if re.match(r"(make|python|torchgco\S*|pip)( |$)", line)]
+
+
+def links(page: Path) -> list[str]:
+    """Targets of the links and images of a page, code left out."""
+    text = re.sub(r"`[^`\n]*`", "", FENCE.sub("", page.read_text()))
+    return re.findall(r"\]\(([^)\s]+)\)", text)
+
+
+def anchors(page: Path) -> set[str]:
+    """The names that a page's headings have in links."""
+    names = (
+        re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
+        for heading in re.findall(r"^#+ (.*)$", FENCE.sub("", page.read_text()), re.MULTILINE)
+    )
+    found: dict[str, int] = {}
+    for name in names:
+        found[name] = found.get(name, 0) + 1
+    return {name if i == 0 else f"{name}-{i}" for name, count in found.items() for i in range(count)}
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def accept(command: str) -> None:
+    """Raise, or exit, unless the program accepts the command's arguments; nothing is flown."""
+    program, *words = shlex.split(command, comments=True)
+    if program == "torchgco":
+        accept_overrides(words)
+    elif program == "torchgco-report":
+        assert words and not words[0].startswith("-")
+    elif program == "make":
+        accept_make(words)
+    elif program == "python":
+        accept_python(words)
+    else:
+        assert command == "pip install -e ."
+
+
+def accept_make(words: list[str]) -> None:
+    rules = (ROOT / "Makefile").read_text()
+    arguments = shlex.split(" ".join(word.removeprefix("ARGS=") for word in words if word.startswith("ARGS=")))
+    for target in (word for word in words if "=" not in word):
+        assert re.search(rf"^{target}:", rules, re.MULTILINE), target
+        if target in TARGETS:
+            TARGETS[target]._parser().parse_args(arguments)
+        elif target == "study":
+            accept_overrides(arguments)
+
+
+def accept_overrides(words: list[str]) -> None:
+    """Every combination of a sweep composes."""
+    sweep = "-m" in words
+    parts = [word.split("=", 1) for word in words if word != "-m"]
+    choices = [[f"{key}={choice}" for choice in (value.split(",") if sweep else [value])] for key, value in parts]
+    for overrides in itertools.product(*choices):
+        compose_config([word for word in overrides if not word.startswith("hydra.")])
+
+
+def accept_python(words: list[str]) -> None:
+    if words[0] != "-m":
+        assert (ROOT / words[0]).is_file()
+        return
+    module = importlib.util.find_spec(words[1])
+    assert module is not None and module.origin is not None
+    if hasattr(importlib.import_module(words[1]), "_parser"):
+        importlib.import_module(words[1])._parser().parse_args(words[2:])
+    else:
+        text = Path(module.origin).read_text()
+        assert all(f'"{word}"' in text for word in words[2:] if word.startswith("--"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    for link in links(page):
+        if re.match(r"\w+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=name_of)
+def test_every_command_is_accepted(page: Path) -> None:
+    for command in commands(page):
+        accept(command)
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if any(language == PYTHON for language, _ in blocks(page))], ids=name_of
+)
+def test_every_python_block_runs(page: Path) -> None:
+    names: dict[str, object] = {}  # a later block may use what an earlier one defines
+    for language, text in blocks(page):
+        if language == PYTHON:
+            exec(text, names)
+
+
+def test_a_wrong_command_is_not_accepted() -> None:
+    for command in ("make quantity", "torchgco solver=none", "pip install torchgco", 'make quality ARGS="--solver"'):
+        with pytest.raises((AssertionError, SystemExit, ValueError)):
+            accept(command)
