@@ -15,6 +15,7 @@ import pytest
 from benchmarks import oracle, quality
 from benchmarks.speed import __main__ as speed
 from torchgco.experiments.build import compose_config
+from torchgco.native.compiler import find_compiler
 
 ROOT = Path(__file__).resolve().parents[1]
 GENERATED = ROOT / "docs" / "api"
@@ -140,6 +141,18 @@ def test_every_python_block_runs(page: Path) -> None:
     for language, text in blocks(page):
         if language == PYTHON:
             exec(text, names)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="the figures watch native kernels")
+def test_the_figures_of_the_algorithm_are_drawn(tmp_path: Path) -> None:
+    page = ROOT / "docs" / "algorithm.md"
+    spec = importlib.util.spec_from_file_location("figures", page.parent / "figures.py")
+    assert spec is not None and spec.loader is not None
+    figures = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(figures)
+    assert figures.main(["--output", str(tmp_path)]) == 0
+    shown = [link for link in links(page) if link.startswith("figures/")]
+    assert shown == [f"figures/{path.name}" for path in sorted(tmp_path.iterdir())]
 
 
 def test_a_wrong_command_is_not_accepted() -> None:
