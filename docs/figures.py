@@ -33,12 +33,12 @@ SIZE, DPI = (4.6, 3.7), 110
 
 # All that these figures know of the package's inside: module:attributes of the function that does a step.
 WATCHED = {
-    "proposal": "torchgco.guidance.gco:GCO.update",  # (guidance, problem, X, U, guide, key) -> Advice
+    "caught": "torchgco.search.restarts:StopWhenCaught.update",  # (guidance, problem, X, ...) -> Advice
     "graph": "torchgco.native.roadmap:NativeSearch.graph",  # -> Graph
-    "classes": "torchgco.guidance.classes:_wind_alike",  # (paths, scene) -> which paths are of one class
-    "tracked": "torchgco.guidance.detour:Detour._follow",  # -> Plans
-    "relaxed": "torchgco.guidance.detour:Detour._settle",  # -> Plans, which of them are sound
-    "refined": "torchgco.guidance.detour:Detour._refine",  # (detour, plans, sound) -> Plans, multipliers, order
+    "classes": "torchgco.search.homotopy:_wind_alike",  # (paths, scene) -> which paths are of one class
+    "tracked": "torchgco.search.follow:track",  # -> Candidates
+    "relaxed": "torchgco.search.follow:relax",  # -> Candidates, which of them are sound
+    "refined": "torchgco.search.follow:refine",  # (options, candidates, sound) -> Candidates, multipliers, best
 }
 Calls = dict[str, list[tuple[tuple[Any, ...], Any]]]
 
@@ -88,7 +88,7 @@ def solve(layout: int) -> tuple[Calls, Layouts, np.ndarray]:
 def draw(calls: Calls, layouts: Layouts, final: np.ndarray) -> dict[str, Figure]:
     """A figure per step."""
     figures = {}
-    caught = next(words[2] for words, advice in calls["proposal"] if bool(advice.taken.any()))
+    caught = next(words[2] for words, advice in calls["caught"] if bool(advice.stop.any()))
     (paths, _), alike = calls["classes"][0]
     label = alike[0].to(torch.int8).argmax(-1).numpy()  # of every path: the first one of its class
     classes = list(dict.fromkeys(label.tolist()))
@@ -115,13 +115,13 @@ def draw(calls: Calls, layouts: Layouts, final: np.ndarray) -> dict[str, Figure]
         ax.plot(*_xy(relaxed.X[row]), color=PALE, linewidth=0.6)
     _shaded(ax, relaxed, sound.nonzero().flatten().tolist(), 0.8)
 
-    (_, before, kept), (refined, _, order) = calls["refined"][0]
+    (_, before, kept), (refined, _, best) = calls["refined"][0]
     rows = [row for row in kept.nonzero().flatten().tolist() if not torch.equal(before.U[row], refined.U[row])]
     figures["5-refined"], ax = _scene(layouts, f"5  Refined: {len(rows)} end feasible, darker is cheaper")
     _shaded(ax, refined, rows, 1.2)
 
     figures["6-final"], ax = _scene(layouts, "6  Result, over the proposal")
-    ax.plot(*_xy(refined.X[int(order[0, 0])]), color=PALE, linewidth=3)
+    ax.plot(*_xy(refined.X[int(best[0])]), color=PALE, linewidth=3)
     ax.plot(*final.T, color=PALETTE[0])
     return figures
 
@@ -146,9 +146,10 @@ def _scene(layouts: Layouts, title: str) -> tuple[Figure, Axes]:
     return figure, ax
 
 
-def _shaded(ax: Axes, plans: Any, rows: Sequence[int], width: float) -> None:
+def _shaded(ax: Axes, candidates: Any, rows: Sequence[int], width: float) -> None:
     """Trajectories in shades of their costs' ranks, the cheapest drawn last."""
-    problem, X, U = plans.of(torch.tensor(rows)), plans.X[list(rows)], plans.U[list(rows)]
+    problem = candidates.of(torch.tensor(rows))
+    X, U = candidates.X[list(rows)], candidates.U[list(rows)]
     for rank, i in enumerate(problem.cost.total(X, U).argsort(descending=True).tolist()):
         shade = colormaps["viridis_r"]((rank + 1) / len(rows))
         ax.plot(*_xy(X[i]), color=shade, linewidth=width)
