@@ -85,7 +85,7 @@ class Witness:
                 frame["near"][row] = (plan[:, at] - path)[caught[row]].norm(dim=-1).mean()
                 hits = active_counts(part, plan[None], U[row : row + 1])[0] > 0
                 frame["deep"][row] = float((hits & caught[row]).any())
-                goal = part.cost.goal(part.x0)[0, at]
+                goal = part.goal.position[0]
                 frame["ends"][row] = (plan[-1, at] - goal).norm() / (part.x0[0, at] - goal).norm()
                 if i in self.last:
                     frame["moved"][row] = (plan[:, at] - self.last[i]).norm(dim=-1).mean()
@@ -152,7 +152,7 @@ def fly(family: Family, count: int, seed: int) -> tuple[pd.DataFrame, dict[str, 
             name = cause(notes[notes.id == i], bool(verdict.feasible[i]), R)
             path = solution.X[i, :, task.problem.dynamics.position]
             plan = witness.last.get(i)
-            goal = task.problem.cost.goal(task.problem.x0)[i, task.problem.dynamics.position]
+            goal = task.problem.goal.position[i]
             examples.setdefault(name, Example(family.name, i, spheres.centers[i], distances, path, plan, goal))
         rows.append({"family": family.name, "layout": i, "cause": name, "reached": bool(verdict.reached[i])})
     return pd.DataFrame(rows), examples

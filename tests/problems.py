@@ -11,6 +11,7 @@ from torch import Tensor
 from tests.reference import models
 from tests.reference.problem import ReferenceProblem
 from torchgco import (
+    Boxes,
     ControlBounds,
     Planar,
     Problem,
@@ -66,6 +67,22 @@ def quadrotor_batch(B: int = 3, N: int = 40, obstacles: int = 6, seed: int = 0) 
         N=N,
     )
     return problem, torch.tensor(HOVER, dtype=torch.float64).repeat(B, N, 1)
+
+
+def boxed_batch(d: int = 2, B: int = 4, N: int = 30, boxes: int = 4, seed: int = 0) -> tuple[Problem, Tensor]:
+    """The same with turned boxes among the discs or spheres, one of the boxes absent in every other problem."""
+    plain, U = planar_batch(B, N, 3, seed) if d == 2 else quadrotor_batch(B, N, 3, seed)
+    rng = np.random.default_rng(seed + 1)
+    scale, start = (1.0, plain.x0[0, :2].numpy()) if d == 2 else (4.0, plain.x0[0, :3].numpy())
+    middle = start + scale * np.array([1.0, 0.2, 0.0])[:d]
+    centers = middle + scale * rng.uniform(-0.5, 0.5, (B, boxes, d))
+    half = scale * rng.uniform(0.03, 0.15, (B, boxes, d))
+    turns = rng.normal(size=(B, boxes, 4))
+    rotations = turns[..., 0] if d == 2 else turns / np.linalg.norm(turns, axis=-1, keepdims=True)
+    centers[1::2, -1], half[1::2, -1], rotations[1::2, -1] = np.nan, np.nan, np.nan
+    radius = float(plain.constraints[0].vehicle_radius[0])
+    parts = [*plain.constraints, Boxes(centers, half, radius, rotations)]
+    return Problem(plain.dynamics, plain.cost, parts, plain.x0, N), U
 
 
 def quick_gco(problem: Problem) -> Restarts:

@@ -11,8 +11,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / "torchgco"
 FLOORS = [
     ["errors", "tree", "status", "autodiff", "draws", "kernels"],
     ["shapes"],
-    ["dynamics", "costs", "constraints", "penalties"],
-    ["problem"],
+    ["dynamics", "costs", "constraints", "penalties", "goal"],
+    ["problem", "measure"],
     ["tracing"],
     ["rollout", "expansion", "evaluation", "judge"],
     ["lagrangian", "certificate"],

@@ -17,6 +17,7 @@ from torchgco.baselines import Hold as Hold
 from torchgco.baselines import IteratedMPPI as IteratedMPPI
 from torchgco.certificate import Certificate as Certificate
 from torchgco.certificate import certify as certify
+from torchgco.constraints import Boxes as Boxes
 from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
 from torchgco.constraints import FirstStepRates as FirstStepRates
@@ -34,6 +35,7 @@ from torchgco.dynamics import QuadrotorPlant as QuadrotorPlant
 from torchgco.dynamics import RotorTracking as RotorTracking
 from torchgco.errors import GuidanceWarning as GuidanceWarning
 from torchgco.errors import InputError as InputError
+from torchgco.goal import Goal as Goal
 from torchgco.guidance import GCO as GCO
 from torchgco.guidance import MPPI as MPPI
 from torchgco.judge import judge as judge

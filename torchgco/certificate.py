@@ -7,6 +7,7 @@ least-squares fit of their own. The words have one meaning everywhere (README, "
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +18,13 @@ from torch import Tensor
 
 from torchgco.autodiff import gradients
 from torchgco.constraints.base import Constraint
+from torchgco.constraints.bodies import Obstacles
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.boxes import BoundBoxes
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.errors import InputError
-from torchgco.judge import segment_distance
+from torchgco.judge import by_kind, segment_distance
+from torchgco.measure import box_segment_distance
 from torchgco.problem import Problem
 from torchgco.shapes import check_shape
 
@@ -35,8 +39,9 @@ class Certificate:
     # Largest |x_{k+1} - step(x_k, u_k)| and |X_0 - x_0| over all states, in their units. Rounding alone (some 1e-12 in
     # float64) proves that X is what U does in the planning model; it says nothing of how good that model is.
     dynamics_residual: Tensor
-    # m to the surface of the full r_obs + r_veh, anywhere from the first knot to the last, at most; infinite without
-    # spheres. At 0 or more, no sphere is touched between the knots either, on the conditions that `certify` tells.
+    # m to the surface of the full r_obs + r_veh (of a box: grown by r_veh), anywhere from the first knot to the last,
+    # at most; infinite without obstacles. At 0 or more, none is touched between the knots either, on the conditions
+    # that `certify` states.
     clearance: Tensor
     # Largest excess over control and state bounds, in their units; 0 proves that they hold at every knot.
     bound_violation: Tensor
@@ -50,15 +55,15 @@ class Certificate:
 def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None) -> Certificate:
     """Certify trajectories X (B, N+1, n), U (B, N, m).
 
-    The clearance can't miss a collision between knots that lie outside a sphere. Positions of an Euler plan move
-    straight from knot to knot, and so do obstacles, hence its distances are exact. For midpoint and rk4 the path leaves
-    the chord by at most dt^2 / 8 times the largest acceleration, which is subtracted. That acceleration is the field's,
-    at both ends of the interval and at half a step, plus the largest change between these: a bound as long as it
-    changes no more from one of the three to its neighbour's side than they differ. Steps without a known field
-    (`integrator="none"`, a class that overrides `step` alone) have no path between knots; the chord is meant. Geometric
-    constraints other than spheres count at their knots only, as violations.
+    The clearance can't miss a collision between knots that lie outside an obstacle. Positions of an Euler plan move
+    straight from knot to knot, and so do obstacles, hence its distances are exact (from boxes, bounds within 1e-9). For
+    midpoint and rk4 the path leaves the chord by at most dt^2 / 8 times the largest acceleration, which is subtracted.
+    That acceleration is the field's, at both ends of the interval and at half a step, plus the largest change between
+    these: a bound as long as it changes no more from one of the three to its neighbour's side than they differ. Steps
+    without a known field (`integrator="none"`, a class that overrides `step` alone) have no path between knots; the
+    chord is meant. Geometric constraints other than obstacles count at their knots only, as violations.
 
-    A row may have a multiplier where it is an equality, or an inequality with at most 1e-3 to spare (m for spheres).
+    A row may have a multiplier where it is an equality, or an inequality with at most 1e-3 to spare (m for obstacles).
 
     Args:
         problem: the planning problems, float64.
@@ -113,16 +118,30 @@ def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     nearest = X.new_full((), torch.inf)
-    for spheres in problem.constraints:
-        if isinstance(spheres, BoundSpheres) and not bool(spheres.absent.all()):
-            k = torch.arange(problem.N + 1, dtype=X.dtype, device=X.device).view(-1, 1, 1)
-            relative = X[0, :, None, spheres.position] - spheres.centers[0]  # (N+1, M, d)
-            if spheres.velocities is not None:
-                relative = relative - k * spheres.dt * spheres.velocities[0]
-            chord = segment_distance(relative[:-1], relative[1:]) - spheres.distances[0]
-            path = chord - _bulge(problem, X, U).unsqueeze(-1)
-            nearest = torch.minimum(nearest, path[:, ~spheres.absent[0]].amin())
+    for obstacles in problem.constraints:
+        if isinstance(obstacles, Obstacles) and not bool(obstacles.absent.all()):
+            path = by_kind(CHORDS, obstacles)(obstacles, X[0]) - _bulge(problem, X, U).unsqueeze(-1)
+            nearest = torch.minimum(nearest, path[:, ~obstacles.absent[0]].amin())
     return nearest
+
+
+def _sphere_chords(spheres: BoundSpheres, X: Tensor) -> Tensor:
+    k = torch.arange(X.shape[0], dtype=X.dtype, device=X.device).view(-1, 1, 1)
+    relative = X[:, None, spheres.position] - spheres.centers[0]  # (N+1, M, d)
+    if spheres.velocities is not None:
+        relative = relative - k * spheres.dt * spheres.velocities[0]
+    return segment_distance(relative[:-1], relative[1:]) - spheres.distances[0]
+
+
+def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
+    return box_segment_distance(boxes, X[None, :, boxes.position])[0] - boxes.vehicle_radius[0]
+
+
+# By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, at most.
+CHORDS: dict[type[Obstacles], Callable[[Any, Tensor], Tensor]] = {
+    BoundSpheres: _sphere_chords,
+    BoundBoxes: _box_chords,
+}
 
 
 def _bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
@@ -193,9 +212,9 @@ def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tup
 
 
 def _spare(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
-    """What each row (1, K, p) has to spare: m for spheres, else the units of c."""
-    if isinstance(constraint, BoundSpheres):
-        return constraint.gaps(X) - constraint.distances.unsqueeze(1)
+    """What each row (1, K, p) has to spare: m for obstacles, else the units of c."""
+    if isinstance(constraint, Obstacles):
+        return constraint.signed_distance(X[:, constraint.knots, constraint.position], constraint.times(X))
     return -constraint.value(X, U)
 
 

@@ -7,9 +7,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchgco.goal import SHARE
 from torchgco.problem import Problem
 
-GOAL_TOLERANCE = 0.09  # share of the distance from start to goal within which a trajectory has arrived
+GOAL_TOLERANCE = SHARE  # of the distance from start to goal
 
 
 class Rated(Protocol):
@@ -37,13 +38,25 @@ def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, 
     return (fits & (~old_fits | (cost < old_cost))) | (~fits & ~old_fits & (worst < old_worst))
 
 
+def goal_tolerance(problem: Problem) -> Tensor | None:
+    """The distance from the goal within which a solver takes a trajectory as arrived, (B,), m; None without a goal.
+
+    The smaller of the goal's radius and `GOAL_TOLERANCE` times the distance from the start: a solver that stopped at
+    the edge of a generous goal would return trajectories that a little more work makes cheaper.
+    """
+    goal = problem.goal
+    if goal is None:
+        return None
+    near = GOAL_TOLERANCE * goal.distance(problem.x0[:, problem.position])
+    return near if goal.assumed else torch.minimum(goal.radius, near)
+
+
 def has_arrived(problem: Problem, X: Tensor, tolerances: float = 1.0) -> Tensor:
     """Whether trajectories X (B, N+1, n) end within so many goal tolerances of the goal, (B,); False without a goal."""
-    goal, at = problem.cost.goal(problem.x0), problem.dynamics.position
-    if goal is None or at is None:
+    near = goal_tolerance(problem)
+    if near is None or problem.goal is None:
         return torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
-    last, first = ((x - goal)[:, at].square().sum(-1).sqrt() for x in (X[:, -1], problem.x0))
-    return last <= tolerances * GOAL_TOLERANCE * first
+    return problem.goal.distance(X[:, -1, problem.position]) <= tolerances * near
 
 
 def is_preferred(problem: Problem, new: Rated, old: Rated, limit: float, by_arrival: bool = True) -> Tensor:

@@ -6,14 +6,18 @@ words it returns have one meaning everywhere (README, "What the words mean").
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bodies import Obstacles
+from torchgco.constraints.boxes import BoundBoxes
 from torchgco.constraints.obstacles import CONTACT_FACTOR, BoundSpheres
 from torchgco.errors import InputError
+from torchgco.measure import box_distance, box_segment_distance
 from torchgco.problem import Problem
 
 OTHERS_WITHIN = 1e-3  # how far all constraints but the obstacles may be violated by a feasible trajectory
@@ -27,7 +31,9 @@ class Verdict:
 
     cost: Tensor  # J_var
     violation: Tensor  # largest violation of the planning problem, full radii; lengths in metres
-    clearance_knots: Tensor  # m to a surface of 0.95 (r_obs + r_veh), at the knots; infinite without obstacles
+    # m to a surface of 0.95 (r_obs + r_veh), of a box grown by 0.95 r_veh, at the knots; infinite without obstacles. A
+    # constraint given as a function has no distance: its rows count as a violation alone.
+    clearance_knots: Tensor
     clearance: Tensor  # the same along the straight segments between the knots
     goal_distance: Tensor  # m, last knot to goal, positions only
     feasible: Tensor  # bool: clearance_knots >= 0, every other constraint within 1e-3
@@ -39,40 +45,56 @@ class Verdict:
         return self.sound & (self.cost <= SUCCESS_COST * best_cost)
 
 
-def judge(problem: Problem, U: Tensor, goal: Tensor, goal_radius: float) -> Verdict:
+def judge(
+    problem: Problem, U: Tensor, goal: Tensor | None = None, goal_radius: Tensor | float | None = None
+) -> Verdict:
     """Judge controls U (B, N, m) by what they do from x0.
 
     Args:
         problem: the planning problems, float64.
         U: controls; NaN where a solver returned none, which is then neither feasible nor reached.
-        goal: positions (B, d) or (d,), m.
-        goal_radius: m.
+        goal: positions (B, d) or (d,), m. None: the problem's goal.
+        goal_radius: number or (B,), m. None: that of the problem's goal.
 
     Raises:
-        InputError: U doesn't fit the problem, or the problem isn't float64.
+        InputError: U doesn't fit the problem, the problem isn't float64, no goal is given and the problem has none, or
+            obstacles are of a kind that can't be judged.
     """
     problem.check_controls(U, "U")
     if problem.x0.dtype != torch.float64:
         raise InputError("x0", "torch.float64 for the judge", problem.x0.dtype)
     if problem.dynamics.position is None:
         raise InputError("dynamics.position", "a model with a position", type(problem.dynamics).__name__)
+    center, radius = _goal(problem, goal, goal_radius)
     X = [problem.x0]
     cost = torch.zeros_like(problem.x0[:, 0])
     for k in range(problem.N):
         cost = cost + problem.cost.stage(X[-1], U[:, k], k)
         X.append(problem.dynamics.step(X[-1], U[:, k]))
     cost = cost + problem.cost.terminal(X[-1])
-    return _verdict(problem, torch.stack(X, dim=1), U, cost, goal, goal_radius)
+    return _verdict(problem, torch.stack(X, dim=1), U, cost, center, radius)
 
 
-def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor, goal_radius: float) -> Verdict:
+def _goal(problem: Problem, center: Tensor | None, radius: Tensor | float | None) -> tuple[Tensor, Tensor | float]:
+    """Position and radius of the goal: those given, else the problem's."""
+    if center is not None and radius is not None:
+        return center, radius
+    if problem.goal is None:
+        raise InputError("goal", "a Goal in the problem, or position and radius here", "neither")
+    return (
+        problem.goal.position if center is None else center,
+        problem.goal.radius if radius is None else radius,
+    )
+
+
+def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor, radius: Tensor | float) -> Verdict:
     far = torch.full_like(cost, torch.inf)
     clearance_knots, clearance, violation, others = far, far, torch.zeros_like(cost), torch.zeros_like(cost)
     for constraint in problem.constraints:
         worst = constraint.worst(X, U)
         violation = torch.maximum(violation, worst)
-        if isinstance(constraint, BoundSpheres):
-            at_knots, between = sphere_clearance(constraint, X)
+        if isinstance(constraint, Obstacles):
+            at_knots, between = by_kind(CLEARANCES, constraint)(constraint, X)
             clearance_knots = torch.minimum(clearance_knots, at_knots)
             clearance = torch.minimum(clearance, between)
         else:
@@ -81,7 +103,7 @@ def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor,
     goal_distance = (position - goal).square().sum(-1).sqrt()
     finite = torch.isfinite(X).flatten(1).all(-1)
     feasible = finite & (clearance_knots >= 0) & (others <= OTHERS_WITHIN)
-    reached = feasible & (goal_distance < goal_radius)
+    reached = feasible & (goal_distance < radius)
     sound = reached & (violation <= SUCCESS_VIOLATION) & (clearance >= 0)
     return Verdict(cost, violation, clearance_knots, clearance, goal_distance, feasible, reached, sound)
 
@@ -107,6 +129,41 @@ def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
             between = torch.minimum(between, (segment_distance(before, relative) - contact).amin(-1))
         before = relative
     return at_knots, torch.minimum(between, at_knots)
+
+
+def box_clearance(boxes: BoundBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest distance (B,) to a surface grown by 0.95 r_veh, at the knots and along the segments between, m.
+
+    As for spheres: all knots count, and it is infinite where there is no obstacle.
+    """
+    p = X[..., boxes.position]
+    if boxes.centers.shape[1] == 0:
+        far = torch.full_like(p[:, 0, 0], torch.inf)
+        return far, far
+    contact = torch.where(boxes.absent, -torch.inf, CONTACT_FACTOR * boxes.vehicle_radius.unsqueeze(-1)).unsqueeze(1)
+    at_knots = (box_distance(boxes, p) - contact).flatten(1).amin(-1)
+    between = (box_segment_distance(boxes, p) - contact).flatten(1).amin(-1)
+    return at_knots, torch.minimum(between, at_knots)
+
+
+# By kind of obstacles: smallest distances (B,) from X (B, N+1, n) to where bodies touch, at the knots and between them.
+CLEARANCES: dict[type[Obstacles], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
+    BoundSpheres: sphere_clearance,
+    BoundBoxes: box_clearance,
+}
+
+
+def by_kind(measures: dict[type[Obstacles], Any], obstacles: Obstacles) -> Any:
+    """What measures obstacles of this kind.
+
+    Raises:
+        InputError: nothing does. Silence would look like endless room.
+    """
+    for kind, measure in measures.items():
+        if isinstance(obstacles, kind):
+            return measure
+    known = ", ".join(kind.__name__ for kind in measures)
+    raise InputError("constraints", f"obstacles that can be judged ({known})", type(obstacles).__name__)
 
 
 def segment_distance(a: Tensor, b: Tensor) -> Tensor:

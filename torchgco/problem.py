@@ -14,6 +14,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
 from torchgco.errors import InputError
+from torchgco.goal import Goal
 from torchgco.shapes import Dimensions
 from torchgco.tree import Rows, cast
 
@@ -28,6 +29,8 @@ class Problem:
         dynamics, cost, constraints: the parts; whatever is given per problem has the batch of x0.
         x0: (B, n), fixes batch, device and dtype.
         N: number of stages.
+        goal: where the last knot is to end. None: the position in the state that the cost names (`Cost.goal`; the
+            reference of a quadratic one), within 0.09 of the distance from the start; or none, where it names none.
 
     Raises:
         InputError: names the part at fault, what was expected and what came. A start that is bad in one problem (not
@@ -39,6 +42,7 @@ class Problem:
     constraints: Sequence[Constraint]
     x0: Tensor
     N: int
+    goal: Goal | None = None
 
     # What others keep of the problems' form (native kernels, say), shared by all subsets of a batch.
     form: ClassVar[dict[Any, Any]]
@@ -52,6 +56,9 @@ class Problem:
         self._check_dynamics()
         object.__setattr__(self, "cost", self.cost.bind(dims))
         object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
+        given = self.goal if self.goal is not None and not self.goal.assumed else None
+        goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
+        object.__setattr__(self, "goal", goal)
         object.__setattr__(self, "form", {})
 
     @property
@@ -131,12 +138,13 @@ class Problem:
             "cost": self.cost.take(index),
             "constraints": tuple(c.take(index) for c in self.constraints),
             "x0": self.x0[index],
+            "goal": None if self.goal is None else self.goal.take(index),
         }
         return self._with(parts, form=self.form)
 
     def cast(self, dtype: torch.dtype) -> Self:
         """The same problems in another precision."""
-        parts = {name: cast(getattr(self, name), dtype) for name in ("dynamics", "cost", "constraints", "x0")}
+        parts = {name: cast(getattr(self, name), dtype) for name in ("dynamics", "cost", "constraints", "x0", "goal")}
         return self._with(parts)
 
     def without_constraints(self) -> Self:
@@ -171,6 +179,8 @@ class Problem:
                 raise InputError(name, f"a {kind.__name__}", type(part).__name__)
         if not callable(self.cost.goal):
             raise InputError("cost.goal", "a method, which no field may hide", type(self.cost.goal).__name__)
+        if self.goal is not None and not isinstance(self.goal, Goal):
+            raise InputError("goal", "a Goal, or None", type(self.goal).__name__)
         for constraint in self.constraints:
             if not isinstance(constraint, Constraint):
                 raise InputError("constraints", "a sequence of Constraint", type(constraint).__name__)

@@ -288,6 +288,14 @@ OTHERS = {
 }  # fmt: skip
 
 
+def test_boxes_make_another_layout_where_they_are_there() -> None:
+    boxes = {"box_centers": np.zeros((2, 1, 2)), "box_half_sizes": np.ones((2, 1, 2))}
+    absent = {name: np.full((2, 1, 2), np.nan) for name in boxes}
+    turned = boxes | {"box_rotations": np.ones((2, 1))}
+    plain, none, some, other = (layout_digests(scene(**more), PLANE) for more in ({}, absent, boxes, turned))
+    assert plain == none and len({plain[0], some[0], other[0]}) == 3
+
+
 @pytest.mark.parametrize("field", OTHERS)
 def test_all_that_a_flight_depends_on_makes_another_layout(field: str) -> None:
     one, other = layout_digests(scene(), PLANE), layout_digests(scene(**{field: OTHERS[field]}), PLANE)

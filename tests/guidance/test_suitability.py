@@ -107,8 +107,8 @@ CASES = {
     "a function for obstacles": (lambda: posed(2, FunctionConstraint(pillars, geometric=True)), None),
     "a product with float64": (lambda: posed(2, spheres(2), "product"), "samples are drawn in float64"),
     "promoted to float64": (lambda: posed(2, spheres(2), "promoted"), "samples are drawn in float64"),
-    "a line": (lambda: posed(1, spheres(1)), "no path is sought around spheres in 1-D"),
-    "four dimensions": (lambda: posed(4, spheres(4)), "no path is sought around spheres in 4-D"),
+    "a line": (lambda: posed(1, spheres(1)), "no path is sought around obstacles in 1-D"),
+    "four dimensions": (lambda: posed(4, spheres(4)), "no path is sought around obstacles in 4-D"),
 }
 
 

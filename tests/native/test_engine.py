@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.problems import planar_batch, quadrotor_batch
+from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from torchgco import (
     ILQR,
     AugmentedLagrangian,
@@ -113,6 +113,8 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "quadrotor": lambda: quadrotor_batch(B=5, N=15, obstacles=5)[0],
     "a user's own": user_problem,
     "moving": moving_problem,
+    "boxes": lambda: boxed_batch(2, B=5, N=20)[0],
+    "boxes in space": lambda: boxed_batch(3, B=5, N=15)[0],
     "one stage": lambda: planar_batch(B=3, N=1, obstacles=2)[0],
 }
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from tests.native import users
 from tests.native.lanes import drawn
 from tests.native.test_engine import user_problem
-from tests.problems import planar_batch, quadrotor_batch
+from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from torchgco import MPPI, Problem, Spheres, kernels, presets
 from torchgco.draws import DrawKey, standard_normal
 from torchgco.guidance import mppi
@@ -54,6 +54,8 @@ PROBLEMS = {
     "planar": partial(planar_batch, B=3, N=20),
     "quadrotor": partial(quadrotor_batch, B=3, N=20),
     "moving": moving,
+    "boxes": partial(boxed_batch, 2, B=3, N=20),
+    "boxes in space": partial(boxed_batch, 3, B=3, N=20),
     "functions": given_as_functions,
     "a user's cost": partial(users_own, "by knot"),
 }

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.problems import planar_batch, quadrotor_batch
+from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from torchgco import (
     GCO,
     ILQR,
@@ -52,6 +52,7 @@ SOLVERS = {
 BATCHES = {
     "planar": lambda: planar_batch(B=7, N=25, obstacles=9, seed=4),
     "quadrotor": lambda: quadrotor_batch(B=7, N=25, obstacles=7, seed=2),
+    "boxes": lambda: boxed_batch(2, B=7, N=25, boxes=6, seed=4),
 }
 FIELDS = ("X", "U", "K", "d", "cost", "violation", "status", "iterations", "outer_iterations", "guided")
 

@@ -14,10 +14,12 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.constraints.bodies import CONTACT_FACTOR as CONTACT_FACTOR
+from torchgco.constraints.bodies import Inflated, Obstacles, least
 from torchgco.errors import InputError
 from torchgco.shapes import Dimensions, check_shape, tensor
 
-CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
+FAR = -1e9  # the radius of an obstacle that isn't there
 
 
 @dataclass(frozen=True)
@@ -50,12 +52,12 @@ class Spheres(Constraint):
         centers = tensor(self.centers, "obstacles.centers", dims.like)
         if tuple(centers.shape) == (0,) and dims.position is not None:
             centers = centers.reshape(0, dims.position.stop - dims.position.start)
-        centers = _batched(centers, "obstacles.centers", 3, dims)
+        centers = per_problem(centers, "obstacles.centers", 3, dims)
         d = centers.shape[-1]
         if dims.position is None or dims.position.stop - dims.position.start != d:
             raise InputError("obstacles.centers", "the dimension of the vehicle's position", f"{d}-D centres")
         M = centers.shape[1]
-        radii = _batched(self.radii, "obstacles.radii", 2, dims)
+        radii = per_problem(self.radii, "obstacles.radii", 2, dims)
         check_shape(radii, (dims.B, M), "obstacles.radii")
         vehicle = tensor(self.vehicle_radius, "obstacles.vehicle_radius", dims.like).reshape(-1, 1)
         absent = torch.isnan(centers).all(-1)
@@ -66,7 +68,7 @@ class Spheres(Constraint):
             raise InputError("obstacles.radii", "radii of at least 0 m", lowest)
         velocities = None
         if self.velocities is not None:
-            velocities = _batched(self.velocities, "obstacles.velocities", 3, dims)
+            velocities = per_problem(self.velocities, "obstacles.velocities", 3, dims)
             check_shape(velocities, (dims.B, M, d), "obstacles.velocities")
             velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
         if velocities is not None and dims.dt is None:
@@ -85,7 +87,7 @@ class Spheres(Constraint):
 
 
 @dataclass(frozen=True)
-class BoundSpheres(Constraint):
+class BoundSpheres(Obstacles):
     """Spheres shaped for their problem, with the matrices of the one-product evaluation prepared."""
 
     centers: Tensor  # (B, M, d), at t = 0
@@ -100,8 +102,6 @@ class BoundSpheres(Constraint):
     first: Tensor  # (B, M, 1 + d [+ d]): 1, o, and v where they move
     second: Tensor  # (B, M, d d [* 3]): o o', and o v' + v o', v v' where they move
 
-    sense: ClassVar[Sense] = "inequality"
-    geometric: ClassVar[bool] = True
     batched: ClassVar[tuple[str, ...]] = (
         "centers", "distances", "velocities", "absent", "vehicle_radius", "weights", "first", "second",
     )  # fmt: skip
@@ -168,40 +168,58 @@ class BoundSpheres(Constraint):
 
     def gaps(self, X: Tensor) -> Tensor:
         """Distance |p_obs,i(k) - p_k| (B, K, M), m; infinite where absent."""
-        p, t = X[:, self.knots, self.position], self._times(X)
+        return self._gaps(X[:, self.knots, self.position], self._times(X))
+
+    @property
+    def moving(self) -> bool:
+        return self.velocities is not None
+
+    @property
+    def sizes(self) -> Tensor:
+        return self.distances
+
+    @property
+    def margins(self) -> Tensor:
+        return self.distances
+
+    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
+        return self._gaps(p, t.unsqueeze(-1)) - self.distances.unsqueeze(1)
+
+    def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
         o = self.centers.unsqueeze(1)
-        if self.velocities is not None:
-            o = o + t.view(1, -1, 1, 1) * self.velocities.unsqueeze(1)
-        gap = (p.unsqueeze(2) - o).square().sum(-1).sqrt()
+        gap = _from_origin(a.unsqueeze(2) - o, (b - a).unsqueeze(2)) - self.distances.unsqueeze(1)
         return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
 
-    def chord_clearance(self, X: Tensor) -> Tensor:
-        """Smallest distance (B,) from the straight ways between knots to where bodies touch, m; negative in contact.
+    def inflated(self) -> Inflated | None:
+        if self.moving:
+            return None
+        return Inflated(self.centers, torch.where(self.absent, FAR, self.distances))
 
-        Infinite where there is no obstacle.
-        """
-        if self.centers.shape[1] == 0:
-            return torch.full_like(X[:, 0, 0], torch.inf)
+    def chord_clearance(self, X: Tensor) -> Tensor:
         o = self.centers.unsqueeze(1)
         if self.velocities is not None:
             t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device) * self.dt
             o = o + t.view(1, -1, 1, 1) * self.velocities.unsqueeze(1)
         away = X[:, :, None, self.position] - o
-        a, along = away[:, :-1], away.diff(dim=1)
-        length = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(X.dtype).tiny)
-        nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along
-        gap = nearest.square().sum(-1).sqrt() - CONTACT_FACTOR * self.distances.unsqueeze(1)
-        return torch.where(self.absent.unsqueeze(1), torch.inf, gap).flatten(1).amin(-1)
+        gap = _from_origin(away[:, :-1], away.diff(dim=1)) - CONTACT_FACTOR * self.distances.unsqueeze(1)
+        return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """False where the vehicle touches an obstacle at the start, (B,)."""
         gap = (x0[:, None, self.position] - self.centers).square().sum(-1).sqrt()
         return ((gap >= CONTACT_FACTOR * self.distances) | self.absent).all(-1)
 
+    def _gaps(self, p: Tensor, t: Tensor) -> Tensor:
+        """Distances (B, K, M) of points p (B, K, d) from the centres at times t (K, 1); infinite where absent."""
+        o = self.centers.unsqueeze(1)
+        if self.velocities is not None:
+            o = o + t.view(1, -1, 1, 1) * self.velocities.unsqueeze(1)
+        gap = (p.unsqueeze(2) - o).square().sum(-1).sqrt()
+        return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
+
     def _times(self, X: Tensor) -> Tensor:
         """t = k dt at the constraint's knots, (K, 1)."""
-        k = torch.arange(X.shape[1], dtype=X.dtype, device=X.device)[self.knots]
-        return (k * self.dt).unsqueeze(-1)
+        return self.times(X).unsqueeze(-1)
 
     def _features(self, p: Tensor, t: Tensor) -> Tensor:
         q = [p, p.square().sum(-1, keepdim=True), torch.ones_like(p[..., :1])]
@@ -225,12 +243,19 @@ class BoundSpheres(Constraint):
         return s.unflatten(-1, (d, d))
 
 
+def _from_origin(a: Tensor, along: Tensor) -> Tensor:
+    """Distances (...) of the origin from segments that begin at a and go along, (..., d)."""
+    length = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny)
+    nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along
+    return nearest.square().sum(-1).sqrt()
+
+
 def _outer(a: Tensor, b: Tensor) -> Tensor:
     """a b' of the last axis, flattened: (..., d * d)."""
     return (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2)
 
 
-def _batched(value: Any, name: str, dim: int, dims: Dimensions) -> Tensor:
+def per_problem(value: Any, name: str, dim: int, dims: Dimensions) -> Tensor:
     """`value` with its batch axis, repeated for every problem where it came without one."""
     given = tensor(value, name, dims.like)
     if given.dim() == dim - 1:

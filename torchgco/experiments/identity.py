@@ -17,10 +17,9 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from torchgco.scenarios import Layouts
+from torchgco.scenarios.layouts import BOXES
 
 ARITHMETIC = ("name", "dtype", "kernels")  # keys of `device` that decide results
-# Keys of `study` and `device` that say how a study is flown.
-FLOWN_BY = (("study", "batch_size"), ("study", "shard_size"), ("study", "workers"), ("device", "threads"))
 # Keys of `model.vehicle` that layouts may overrule, and by which of their fields.
 OVERRULED = {
     "start": "start", "goal": "goal", "radius": "vehicle_radius", "goal_radius": "goal_radius", "stages": "stages",
@@ -45,14 +44,11 @@ def settings_of(config: DictConfig) -> dict[str, Any]:
 
 def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> dict[str, Any]:
     """The part of a resolved configuration that decides results, with the settings of all solvers that fly."""
-    flown_by = {}
-    if any(key.split(".")[-1] == "polish" and value for s in solvers.values() for key, value in _branches(s)):
-        flown_by = {name: configuration[group].get(name) for group, name in FLOWN_BY}
     return {
         "scenario": configuration["scenario"],
         "model": {"vehicle": configuration["model"]["vehicle"]},
         "device": {name: configuration["device"].get(name) for name in ARITHMETIC},
-        "study": {"solvers": list(solvers), **flown_by},
+        "study": {"solvers": list(solvers)},
         "solvers": dict(solvers),
     }
 
@@ -138,6 +134,11 @@ def layout_digests(layouts: Layouts, vehicle: Mapping[str, Any]) -> dict[int, st
         own = {"centers": layouts.centers[i][there], "radii": layouts.radii[i][there]}
         if moves and layouts.velocities is not None:
             own["velocities"] = layouts.velocities[i][there]
+        if layouts.box_centers is not None:
+            here = ~np.isnan(layouts.box_centers[i]).all(axis=-1)
+            held = {name: getattr(layouts, name) for name in BOXES}
+            if here.any():
+                own |= {name: value[i][here] for name, value in held.items() if value is not None}
         for name in ("start", "goal"):
             if getattr(layouts, name) is not None:
                 own[name] = getattr(layouts, name)[i]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.constraints.bodies import Obstacles
 from torchgco.draws import DrawKey
 from torchgco.errors import GuidanceWarning, InputError
 from torchgco.guidance.detection import active_counts, caught_knots
@@ -102,8 +102,8 @@ class GCO:
 def _radius(problem: Problem, X: Tensor) -> Tensor:
     """r_guide (B,), m."""
     for constraint in problem.geometric:
-        if isinstance(constraint, BoundSpheres):
+        if isinstance(constraint, Obstacles):
             return constraint.vehicle_radius
-    goal = problem.cost.goal(problem.x0)
-    ends = X[:, 1:] if goal is None else goal.unsqueeze(1)
-    return REACH * (ends - problem.x0.unsqueeze(1))[..., problem.position].square().sum(-1).sqrt().amax(-1)
+    at = problem.position
+    ends = X[:, 1:, at] if problem.goal is None else problem.goal.position.unsqueeze(1)
+    return REACH * (ends - problem.x0[:, None, at]).square().sum(-1).sqrt().amax(-1)

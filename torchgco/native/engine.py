@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchgco.constraints.boxes import BoundBoxes
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
@@ -76,7 +77,8 @@ class Engine:
         sources = ((i, trace_rows(problem, i)) for i in traced)
         self.functions = {i: source for i, source in sources if source.size > 0}
         dense = quadratic is not None and not quadratic.diagonal
-        self.form = Form(self.model, problem.dynamics.position, self.cost, dense, tuple(self.functions.items()))
+        boxes = any(type(constraint) is BoundBoxes for constraint in problem.constraints)
+        self.form = Form(self.model, problem.dynamics.position, self.cost, dense, tuple(self.functions.items()), boxes)
         self.library = build(self.form.source())
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:

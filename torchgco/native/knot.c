@@ -26,8 +26,8 @@ static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
     return p->phr ? tgco_if(~idle, g) : g;
 }
 
-/* Row j of a box. */
-static inline V box(const Constraint *con, const Rows *rows, int64_t j, const V *x, const V *u) {
+/* Row j of bounds. */
+static inline V bound(const Constraint *con, const Rows *rows, int64_t j, const V *x, const V *u) {
     int v = con->variable[j];
     return SET(con->sign[j]) * ((v < NX ? x[v] : u[v - NX]) - rows->bound[j]);
 }
@@ -90,15 +90,23 @@ static inline void spheres_expand(
 }
 #endif
 
+#if WITH_BOXES
+/* boxes.c stands here. */
+#endif
+
 static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V total) {
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
     const V *lam = rows->lam + con->place[k] * con->rows;
-    if (con->kind == BOX) {
-        for (int j = 0; j < con->rows; j++) total += worth(s, 0, box(con, rows, j, x, u), lam[j]);
+    if (con->kind == BOUNDS) {
+        for (int j = 0; j < con->rows; j++) total += worth(s, 0, bound(con, rows, j, x, u), lam[j]);
 #if DIM > 0
     } else if (con->kind == SPHERES) {
         total = spheres_value(s, con, rows, k, x, total);
+#endif
+#if WITH_BOXES
+    } else if (con->kind == BOXES) {
+        total = boxes_value(s, con, rows, k, x, total);
 #endif
     } else {
         V c[MAX_ROWS];
@@ -112,16 +120,20 @@ static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x,
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
     const V *lam = rows->lam + con->place[k] * con->rows;
-    if (con->kind == BOX) {
+    if (con->kind == BOUNDS) {
         for (int j = 0; j < con->rows; j++) {
             int v = con->variable[j];
-            V rho, slope = pull(s, 0, box(con, rows, j, x, u), lam[j], &rho);
+            V rho, slope = pull(s, 0, bound(con, rows, j, x, u), lam[j], &rho);
             g[v] += SET(con->sign[j]) * slope;
             H[v * S + v] += rho;
         }
 #if DIM > 0
     } else if (con->kind == SPHERES) {
         spheres_expand(s, con, rows, k, x, g, H);
+#endif
+#if WITH_BOXES
+    } else if (con->kind == BOXES) {
+        boxes_expand(s, con, rows, k, x, g, H);
 #endif
     } else {
         V c[MAX_ROWS], slope[MAX_ROWS], rho[MAX_ROWS];

@@ -54,6 +54,12 @@ static V hits(const Samples *q, int64_t k, const V *x) {
             continue;
         }
 #endif
+#if WITH_BOXES
+        if (con->kind == BOXES) {
+            for (int j = 0; j < con->rows; j++) count += tgco_truth(solid(q->s.rows + i, j, x, 0) >= SET(0.0));
+            continue;
+        }
+#endif
         V c[MAX_ROWS], u[NU];
         memset(u, 0, sizeof u); /* a geometric constraint reads x alone */
         tgco_rows((int)i, x, u, at(q->s.rows[i].bound, &con->bound, con->place[k]), c);

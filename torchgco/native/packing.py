@@ -10,12 +10,14 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.boxes import BoundBoxes
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.problem import Problem
 
 ABSENT = -1.0  # squared distance of an obstacle that isn't there
-BOX, SPHERES, FUNCTION = range(3)
-KINDS = {ControlBounds: BOX, StateBounds: BOX, BoundSpheres: SPHERES}  # all others, their subclasses too, are traced
+BOUNDS, SPHERES, FUNCTION, BOXES = range(4)
+# All others, their subclasses too, are traced.
+KINDS = {ControlBounds: BOUNDS, StateBounds: BOUNDS, BoundSpheres: SPHERES, BoundBoxes: BOXES}
 NO_GUIDE, REGION, PATH = range(3)
 
 
@@ -95,6 +97,15 @@ def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: 
         c.squares = array(squares, keep, knots=False)
         if constraint.velocities is not None:
             c.velocities = array(constraint.velocities.flatten(1), keep, knots=False)
+    elif isinstance(constraint, BoundBoxes):
+        c.bound = array(_box_numbers(constraint).flatten(1), keep, knots=False)
+
+
+def _box_numbers(boxes: BoundBoxes) -> Tensor:
+    """What boxes.c reads of each box, (B, M, ...)."""
+    radius = boxes.vehicle_radius.view(-1, 1, 1).expand(-1, boxes.centers.shape[1], 1)
+    factor = 2.0 * boxes.depths.unsqueeze(-1)
+    return torch.cat((boxes.centers, boxes.axes.flatten(2), boxes.half_sizes, radius, factor), dim=-1)
 
 
 def array(value: Tensor | None, keep: list[Any], knots: bool) -> Array:

@@ -14,7 +14,7 @@
 #define S (NX + NU)
 #define NZ (NX + 1)
 
-enum { BOX = 0, SPHERES = 1, FUNCTION = 2 };
+enum { BOUNDS = 0, SPHERES = 1, FUNCTION = 2, BOXES = 3 };
 enum { NO_GUIDE = 0, REGION = 1, PATH = 2 };
 enum { GOING = 0, ENDED = 1, NOT_POSITIVE_DEFINITE = 4, NON_FINITE = 5 };
 
@@ -26,9 +26,10 @@ typedef struct {
     const int32_t *place;          /* (N+1): which of the constraint's knots, -1 where it says nothing */
     int64_t knots;
     double *lam;                   /* (E, knots, rows) */
-    const int32_t *variable;       /* BOX: (rows) index into [x, u] */
-    const double *sign;            /* BOX: (rows) +1 for an upper bound, -1 for a lower one */
-    Array bound;                   /* BOX: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ..) */
+    const int32_t *variable;       /* BOUNDS: (rows) index into [x, u] */
+    const double *sign;            /* BOUNDS: (rows) +1 for an upper bound, -1 for a lower one */
+    Array bound;                   /* BOUNDS: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ..);
+                                      BOXES: (E, 1, rows * BOX_NUMBERS) */
     Array squares;                 /* SPHERES: squared distances (E, 1, rows) */
     Array velocities;              /* SPHERES: as centres, or NULL */
     double dt;

@@ -29,10 +29,24 @@ typedef struct {
     double *string;                     /* (B, 2 P - 1, DIM) */
     const double *cost;                 /* (B, 2 P - 1) */
     uint8_t *arrives;                   /* (B) */
+    /* Read where there are boxes alone: their numbers (B, boxes, BOX_NUMBERS), points beside them (B, extras, DIM) and
+       whether each exists, corners of the box that start, goal and they fill (B, 2, DIM), the largest size (B). */
+    const double *box, *beside;
+    const uint8_t *exists;
+    const double *reach, *largest;
+    int64_t boxes, extras;
 } Search;
 
 /* The spheres of a problem: radii, their squares with their signs, the largest; centres coordinate by coordinate. */
-typedef struct { int64_t count; const double *radius, *square, *at[DIM]; double largest; } Spheres;
+typedef struct {
+    int64_t count;
+    const double *radius, *square, *at[DIM];
+    double largest;
+#if BOXES
+    int64_t boxes;
+    const double *box;
+#endif
+} Spheres;
 
 /* Memory for a search over n points with k edges each. */
 typedef struct {
@@ -52,6 +66,10 @@ static Spheres spheres_of(const Search *s, int64_t b, double *room) {
         room[DIM * s->spheres + m] = SIGNED_SQUARE(o.radius[m]);
         if (o.radius[m] > o.largest) o.largest = o.radius[m];
     }
+#if BOXES
+    if (s->largest[b] > o.largest) o.largest = s->largest[b];
+    o.boxes = s->boxes, o.box = s->box + b * s->boxes * BOX_NUMBERS;
+#endif
     return o;
 }
 
@@ -62,6 +80,13 @@ static int is_free(const double *p, const Spheres *o, double gap) {
         for (int i = 0; i < DIM; i++) square += (p[i] - o->at[i][m]) * (p[i] - o->at[i][m]);
         all &= square > SIGNED_SQUARE(least);
     }
+#if BOXES
+    for (int64_t m = 0; m < o->boxes; m++) {
+        const double *box = o->box + m * BOX_NUMBERS;
+        double least = BOX_RADIUS(box) + gap;
+        all &= square_from_box(box, p) > SIGNED_SQUARE(least);
+    }
+#endif
     return all;
 }
 
@@ -126,6 +151,10 @@ static int64_t propose(const Search *s, int64_t b, double *values, int32_t *near
                 p[i] = o[m * DIM + i] + share * (o[near[h] * DIM + i] - o[m * DIM + i]);
         }
     }
+#if BOXES
+    for (int64_t e = b * s->extras; e < (b + 1) * s->extras; e++)
+        if (s->exists[e]) memcpy(p, s->beside + e * DIM, DIM * sizeof(double)), p += DIM;
+#endif
     return (p - to) / DIM;
 }
 
@@ -139,6 +168,11 @@ static void scatter(const Search *s, int64_t b, double *to) {
             if (R[m] > 0 && o - reach < low) low = o - reach;
             if (R[m] > 0 && o + reach > high) high = o + reach;
         }
+#if BOXES
+        const double *reach = s->reach + b * 2 * DIM;
+        if (reach[i] < low) low = reach[i];
+        if (reach[DIM + i] > high) high = reach[DIM + i];
+#endif
         to[i] = start[i], to[DIM + i] = goal[i];
         for (int64_t v = 0; v < s->spread; v++) to[(2 + v) * DIM + i] = low + s->cube[v * DIM + i] * (high - low);
     }
@@ -226,6 +260,18 @@ static void measure(
                 gap[e] = left < gap[e] ? left : gap[e];
                 open[e] = more < open[e] ? more : open[e];
             }
+#if BOXES
+        for (int64_t m = 0; m < o->boxes; m++)
+            for (int e = 0; e < BLOCK; e++) {
+                double begin[DIM], step[DIM];
+                const double *box = o->box + m * BOX_NUMBERS;
+                for (int i = 0; i < DIM; i++) begin[i] = a[i][e], step[i] = along[i][e];
+                double away = square_of_segment(box, begin, step);
+                double left = sqrt(away) - BOX_RADIUS(box), more = away - SIGNED_SQUARE(BOX_RADIUS(box));
+                gap[e] = left < gap[e] ? left : gap[e];
+                open[e] = more < open[e] ? more : open[e];
+            }
+#endif
         for (int e = 0; e < BLOCK && first + e < n * k; e++) {
             double close = 1.0 + CLAMP((margin - gap[e]) / margin, 0.0, 1.0);
             lengths[first + e] = ends[first + e] >= 0 && open[e] > 0 ? (sqrt(square[e]) + least) * close : INFINITY;
@@ -428,6 +474,9 @@ int32_t tgco_raise(const Search *s) {
         const double *way = s->way + b * s->corners * DIM, *R = s->distances + b * M;
         double reach = -INFINITY;
         for (int64_t m = 0; m < M; m++) reach = R[m] > reach ? R[m] : reach;
+#if BOXES
+        if (s->largest[b] > reach) reach = s->largest[b];
+#endif
         for (int64_t v = 0; v < n; v++) {
             nearest[v] = INFINITY;
             for (int i = 0; i < DIM; i++) at[i * n + v] = s->nodes[(b * n + v) * DIM + i];

@@ -1,4 +1,4 @@
-"""The roadmap's search in C, the counterpart of guidance.search: every step is one call for all problems of a batch."""
+"""The roadmap's search in C, the counterpart of search.graph: every step is one call for all problems of a batch."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchgco.constraints.cuboids import Cuboids, beside, between
 from torchgco.kernels import native
 from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
 from torchgco.native.dispatch import EagerWarning
@@ -26,7 +27,7 @@ RAYS = 8  # points of a circle
 TIE = 1e-12  # share of the cost by which equal ways may differ
 LEAST = 1e-6  # share of the distance from start to goal that is added to every edge, as none may be free of charge
 
-SOURCE = Path(__file__).with_name("roadmap.c")
+SOURCE, BOXES = (Path(__file__).with_name(name) for name in ("roadmap.c", "roadmap_boxes.h"))
 # Fused products and sums would be rounded once where PyTorch rounds twice.
 FLAGS = ("-ffp-contract=off",)
 SIZES = (
@@ -36,7 +37,7 @@ SIZES = (
 NUMBERS = ("margin", "least", "clear", "factor", "tie")
 TENSORS = (
     "centers", "distances", "start", "goal", "cube", "rays", "shell", "nodes", "ends", "lengths", "price", "way",
-    "string", "cost", "arrives",
+    "string", "cost", "arrives", "box", "beside", "exists", "reach", "largest",
 )  # fmt: skip
 
 
@@ -55,29 +56,36 @@ class Packed(ctypes.Structure):
         *((name, ctypes.c_int64) for name in SIZES),
         *((name, ctypes.c_double) for name in NUMBERS),
         *((name, ctypes.c_void_p) for name in TENSORS),
+        *((name, ctypes.c_int64) for name in ("boxes", "extras")),
     ]
 
 
 @dataclass(frozen=True)
 class NativeSearch:
-    """The methods of guidance.search.Search, documented there, by a library."""
+    """The methods of search.graph.Search, documented there, by a library."""
 
     library: ctypes.CDLL
     o: Tensor
     R: Tensor
     margin: float
+    boxes: Cuboids | None = None
 
     def graph(self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int) -> Graph:
         (B, d), M = start.shape, self.R.shape[1]
         rays, shell = directions(start, goal), start.new_tensor(SHELLS[d])
-        count = M * (RAYS * len(shell) + min(MIDWAY, M))
+        count, more = M * (RAYS * len(shell) + min(MIDWAY, M)), {}
+        if self.boxes is not None:
+            more["beside"], more["exists"] = around_boxes(self.boxes, self.o, self.R, start, goal)
+            low, high = self.boxes.reach(torch.stack((start, goal), dim=1))
+            more["reach"] = torch.stack((low, high), dim=1)
+            count += more["beside"].shape[1]
         V, K = 2 + len(cube) + min(nodes, count), neighbours + hubs + 1
         made = Graph(start.new_empty(B, V, d), torch.empty(B, V, K, dtype=torch.int32), start.new_empty(B, V, K))
         self._run(
-            "tgco_graph", {"start": start, "goal": goal, "cube": cube, "rays": rays, "shell": shell},
+            "tgco_graph", {"start": start, "goal": goal, "cube": cube, "rays": rays, "shell": shell, **more},
             {"nodes": made.points, "ends": made.ends, "lengths": made.lengths},
             spread=len(cube), candidates=count, points=V, edges=K, neighbours=neighbours, hubs=hubs, directions=RAYS,
-            shells=len(shell), midway=MIDWAY,
+            shells=len(shell), midway=MIDWAY, extras=more["beside"].shape[1] if more else 0,
         )  # fmt: skip
         return made
 
@@ -109,6 +117,9 @@ class NativeSearch:
     def _run(self, name: str, read: dict[str, Tensor], written: dict[str, Tensor], **numbers: float) -> None:
         """Call a function of the library on all problems."""
         read = {**read, "centers": self.o, "distances": self.R}
+        if self.boxes is not None:
+            numbers["boxes"] = self.boxes.radius.shape[1]
+            read |= {"box": _numbers(self.boxes), "largest": self.boxes.sizes.amax(-1)}
         read = {field: tensor.contiguous() for field, tensor in read.items()}  # held until the call returns
         places: dict[str, Any] = {field: tensor.data_ptr() for field, tensor in (read | written).items()}
         B, M = self.R.shape
@@ -116,6 +127,22 @@ class NativeSearch:
         packed = Packed(problems=B, spheres=M, corners=HOPS + 1, **places, **numbers)
         if not getattr(self.library, name)(ctypes.byref(packed)):
             raise MemoryError("native kernels: no memory")
+
+
+def around_boxes(boxes: Cuboids, o: Tensor, R: Tensor, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (B, C, d) beside boxes and between them, spheres and each other, and whether each belongs to one (B, C).
+
+    Args:
+        o, R: centres (B, M, d) and radii (B, M) of the spheres.
+    """
+    (first, here), (second, there) = beside(boxes, start, goal, SHELLS[start.shape[1]]), between(boxes, o, R, MIDWAY)
+    return torch.cat((first, second), dim=1), torch.cat((here, there), dim=1)
+
+
+def _numbers(boxes: Cuboids) -> Tensor:
+    """What C reads of each box, (B, K, ...): centre, directions of its sides, half of them, radius."""
+    parts = boxes.centers, boxes.axes.flatten(-2), boxes.half_sizes, boxes.radius.unsqueeze(-1)
+    return torch.cat(parts, dim=-1)
 
 
 def directions(start: Tensor, goal: Tensor) -> Tensor:
@@ -135,21 +162,23 @@ def _unit(v: Tensor) -> Tensor:
     return v / v.square().sum(-1, keepdim=True).sqrt().clamp(min=1e-12)
 
 
-def library_for(like: Tensor) -> ctypes.CDLL | None:
-    """The library for spheres with centres such as these (..., d); None where PyTorch has to search.
+def library_for(like: Tensor, boxes: bool = False) -> ctypes.CDLL | None:
+    """The library for spheres with centres such as these (..., d), and boxes; None where PyTorch has to search.
 
     It has to on a GPU, in single precision, where the process has chosen it (`kernels.use_native`), where there is no
     compiler, which the solver says itself, and where the source doesn't compile, which an EagerWarning explains.
     """
     if not native() or find_compiler() is None or like.dtype != torch.float64 or like.device.type != "cpu":
         return None
-    return _library(like.shape[-1], find_compiler())
+    return _library(like.shape[-1], boxes, find_compiler())
 
 
 @functools.cache
-def _library(dimension: int, compiler: Compiler | None) -> ctypes.CDLL | None:
+def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.CDLL | None:
+    # Code for boxes is left out where there are none: the spheres' code is then what it would be without it.
+    head = f"#define DIM {dimension}\n#define BOXES {int(boxes)}\n{BOXES.read_text() if boxes else ''}"
     try:
-        return build(f"#define DIM {dimension}\n{SOURCE.read_text()}", FLAGS)
+        return build(f"{head}\n{SOURCE.read_text()}", FLAGS)
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where ways are sought: {reason}", EagerWarning, stacklevel=3)

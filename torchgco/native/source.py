@@ -37,6 +37,7 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
     for (int e = 0; e < COUNT; e++) g[F_column[e]] += entry(e, f) * p[F_row[e]];
 }
 """
+BOXES_STAND_HERE = "/* boxes.c stands here. */\n"
 COST = "quadratic.c"  # or traced.c
 SOLVER = ("problem.c", COST, "knot.c", "passes.c", "ilqr.c", "trajectories.c")
 SAMPLER = ("problem.c", COST, "knot.c", "normal.c", "mppi.c")
@@ -51,6 +52,7 @@ class Form:
     cost: CostSource | None  # None: quadratic
     dense: bool  # its weights are matrices
     functions: tuple[tuple[int, KnotSource], ...]  # the constraints that are traced, by their place
+    boxes: bool = False  # whether there are boxes among the obstacles
 
     def source(self, parts: tuple[str, ...] = SOLVER, real: str = "double", lanes: int = LANES) -> str:
         """The C file of the solver or the sampler, for numbers of type `real`."""
@@ -65,7 +67,13 @@ class Form:
         generated = [model.code, _products(model), "" if self.cost is None else self.cost.code]
         generated += [*dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions)]
         names = parts if self.cost is None else ["traced.c" if name == COST else name for name in parts]
-        return "\n".join((head, PRELUDE, *generated, *(Path(__file__).with_name(name).read_text() for name in names)))
+        texts = [Path(__file__).with_name(name).read_text() for name in names]
+        if self.boxes:
+            # Left out elsewhere: what others run is compiled from the same code as if there were no boxes.
+            head += "#define WITH_BOXES 1\n"
+            solid = Path(__file__).with_name("boxes.c").read_text()
+            texts = [text.replace(BOXES_STAND_HERE, solid) for text in texts]
+        return "\n".join((head, PRELUDE, *generated, *texts))
 
 
 def _products(model: DynamicsSource) -> str:

@@ -12,7 +12,7 @@ from matplotlib.collections import PatchCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Polygon
 
 from torchgco.errors import InputError
 from torchgco.plotting.scene import Arrays, Scene, map_box, scene_of
@@ -31,14 +31,14 @@ def layout_grid(layouts: Arrays, trajectories: Arrays, trials: pd.DataFrame, col
     """Maps of the first columns x rows layouts with what each solver flew there; in 3-D seen from above.
 
     layouts       arrays of a layout file: centers (L, M, d) and radii (L, M) in metres, and what there is of
-                  velocities (L, M, d), start and goal ((n,) or (L, n)), vehicle_radius, goal_radius, dt,
+                  velocities (L, M, d), boxes, start and goal ((n,) or (L, n)), vehicle_radius, goal_radius, dt,
                   layout (L,) ids
     trajectories  states X (L, N+1, n) by solver, positions first, nan where there is none
     trials        with columns layout, solver, feasible, reached
 
     Spheres are filled at their own radius and outlined at that plus the vehicle's, as the vehicle is a line
-    here. In 3-D their shade tells their height. Moving ones fade along their way. A path that didn't reach
-    the goal is dashed and ends in a cross if it isn't feasible, in a ring if it only stopped short.
+    here; boxes likewise. In 3-D their shade tells their height. Moving ones fade along their way. A path that
+    didn't reach the goal is dashed and ends in a cross if it isn't feasible, in a ring if it only stopped short.
 
     Raises InputError where the trajectories don't fit the layouts, or a trial of theirs isn't in `trials`.
     """
@@ -56,6 +56,7 @@ def layout_grid(layouts: Arrays, trajectories: Arrays, trials: pd.DataFrame, col
     colours = solver_colours(paths)
     heights = _scale(scene, count)
     for i, ax in enumerate(axes):
+        _boxes(ax, scene, i, heights)
         _obstacles(ax, scene, i, heights)
         _targets(ax, scene, i)
         for solver, states in paths.items():
@@ -89,9 +90,8 @@ def _ends(ids: np.ndarray, solvers: list[str], trials: pd.DataFrame) -> dict[tup
 
 def _scale(scene: Scene, count: int) -> Normalize | None:
     """From heights to shades; None in the plane, and where there is nothing to shade."""
-    if scene.heights is None or not np.isfinite(scene.heights[:count]).any():
-        return None
-    return Normalize(np.nanmin(scene.heights[:count]), np.nanmax(scene.heights[:count]))
+    heights = scene.shown_heights(count)
+    return Normalize(heights.min(), heights.max()) if len(heights) else None
 
 
 def _obstacles(ax: Axes, scene: Scene, i: int, scale: Normalize | None) -> None:
@@ -114,6 +114,15 @@ def _obstacles(ax: Axes, scene: Scene, i: int, scale: Normalize | None) -> None:
     opaque = 1.0 if scale is None else SHEER
     _discs(ax, centers, radii, facecolor=shades, alpha=opaque)
     _discs(ax, centers, radii + scene.margin, facecolor="none", edgecolor=EDGE, linewidth=0.5, alpha=opaque)
+
+
+def _boxes(ax: Axes, scene: Scene, i: int, scale: Normalize | None) -> None:
+    """Seen from above: filled as they are, outlined at the vehicle's radius from their sides."""
+    opaque = 1.0 if scale is None else SHEER
+    for box in sorted(scene.boxes[i], key=lambda box: np.nan_to_num(box.height)):
+        shade = STONE if scale is None else HEIGHTS(scale(box.height))
+        ax.add_patch(Polygon(box.corners, facecolor=shade, alpha=opaque))
+        ax.add_patch(Polygon(box.grown(scene.margin), fill=False, edgecolor=EDGE, linewidth=0.5, alpha=opaque))
 
 
 def _discs(ax: Axes, centers: np.ndarray, radii: np.ndarray, **look: Any) -> None:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchgco.plotting.boxes import Outline, outlines
+
 Arrays = Mapping[str, np.ndarray]
 SLACK = 0.5  # share of the scene's size by which paths may widen the map
 
@@ -21,6 +23,7 @@ class Scene:
               (L, 2), nan where unknown
     margin    the vehicle's radius; goal_radius: nan where unknown
     ids       (L,) index of each layout in its file or generator
+    boxes     of each layout, the boxes that are there
     """
 
     centers: np.ndarray
@@ -32,6 +35,14 @@ class Scene:
     margin: float
     goal_radius: float
     ids: np.ndarray
+    boxes: tuple[tuple[Outline, ...], ...]
+
+    def shown_heights(self, count: int) -> np.ndarray:
+        """Heights of all obstacles of the first `count` layouts, m; none in the plane."""
+        if self.heights is None:
+            return np.empty(0)
+        boxes = [box.height for layout in self.boxes[:count] for box in layout]
+        return np.concatenate([self.heights[:count][np.isfinite(self.heights[:count])], boxes])
 
 
 def scene_of(layouts: Arrays, stages: int) -> Scene:
@@ -58,6 +69,7 @@ def scene_of(layouts: Arrays, stages: int) -> Scene:
         margin=float(layouts.get("vehicle_radius", 0.0)),
         goal_radius=float(layouts.get("goal_radius", np.nan)),
         ids=np.asarray(layouts.get("layout", np.arange(count))),
+        boxes=tuple(outlines(layouts, i) for i in range(count)),
     )
 
 
@@ -71,7 +83,8 @@ def map_box(scene: Scene, paths: list[np.ndarray], count: int) -> np.ndarray:
     centers = scene.centers[:count]
     ring = np.nan_to_num(scene.goal_radius)
     ends = [scene.start[:count], scene.goal[:count] - ring, scene.goal[:count] + ring]
-    corners = _corners([(centers - outer).reshape(-1, 2), (centers + outer).reshape(-1, 2), *ends])
+    boxes = [box.grown(scene.margin) for layout in scene.boxes[:count] for box in layout]
+    corners = _corners([(centers - outer).reshape(-1, 2), (centers + outer).reshape(-1, 2), *ends, *boxes])
     if corners is None:
         corners = _corners(paths)
     if corners is None:

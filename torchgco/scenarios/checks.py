@@ -1,7 +1,7 @@
 """Checks of what scenarios and layouts are given.
 
 Each returns the value in one plain form or raises InputError. Letters as in `layouts`: L layouts,
-M obstacles, d the dimension of space, n states, m controls.
+M spheres, K boxes, d the dimension of space, n states, m controls.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from torchgco.constraints.boxes import UNIT_WITHIN
 from torchgco.errors import InputError
 
 
@@ -118,6 +119,51 @@ def velocities(value: Any, centers: np.ndarray) -> np.ndarray | None:
     _none_of(bad, "layouts.velocities", "finite velocities where the centre is finite", moving)
     moving[absent] = np.nan
     return moving
+
+
+def boxes(centers: Any, halves: Any, turns: Any, like: np.ndarray) -> tuple[np.ndarray | None, ...]:
+    """Centres and half sides (L, K, d), and turns (L, K) or (L, K, 4), that are present or absent together; or None.
+
+    `like` are the spheres' centres (L, M, d).
+    """
+    if centers is None:
+        for name, value in (("half_sizes", halves), ("rotations", turns)):
+            if value is not None:
+                raise InputError(f"layouts.box_{name}", "none without box_centers", "some")
+        return None, None, None
+    middle = array(centers, "layouts.box_centers")
+    count, _, d = like.shape
+    if middle.ndim != 3 or middle.shape[0] != count or middle.shape[2] != d:
+        raise InputError("layouts.box_centers", f"shape ({count}, K, {d})", f"shape {middle.shape}")
+    absent = np.asarray(np.isnan(middle).all(axis=2))
+    _none_of(~absent & ~np.isfinite(middle).all(axis=2), "layouts.box_centers", "finite rows or rows of NaN", middle)
+    if halves is None:
+        raise InputError("layouts.box_half_sizes", "this array beside box_centers", "none")
+    half = array(halves, "layouts.box_half_sizes")
+    if half.shape != middle.shape:
+        raise InputError("layouts.box_half_sizes", f"the shape {middle.shape} of box_centers", half.shape)
+    good = np.isfinite(half).all(axis=2) & (half > 0).all(axis=2)
+    _none_of(~absent & ~good, "layouts.box_half_sizes", "finite half sides above 0 where the centre is finite", half)
+    _none_of(absent & ~np.isnan(half).all(axis=2), "layouts.box_half_sizes", "NaN where the centre is NaN", half)
+    return middle, half, _turns(turns, absent, d)
+
+
+def _turns(value: Any, absent: np.ndarray, dimension: int) -> np.ndarray | None:
+    """Angles (L, K) in the plane, unit quaternions (L, K, 4) in space, NaN where there is no box."""
+    if value is None:
+        return None
+    field, turns = "layouts.box_rotations", array(value, "layouts.box_rotations")
+    shape = absent.shape if dimension == 2 else (*absent.shape, 4)
+    if turns.shape != shape:
+        raise InputError(field, f"shape {shape}: " + ("angles" if dimension == 2 else "quaternions"), turns.shape)
+    if dimension == 2:
+        _none_of(~absent & ~np.isfinite(turns), field, "finite angles where the centre is finite", turns)
+    else:
+        length = np.asarray(np.linalg.norm(turns, axis=2))
+        wrong = ~(np.abs(length - 1.0) <= UNIT_WITHIN)
+        _none_of(~absent & wrong, field, "unit quaternions [w, x, y, z] where the centre is finite", turns)
+    turns[absent] = np.nan
+    return turns
 
 
 def states(value: Any, field: str, centers: np.ndarray) -> np.ndarray | None:

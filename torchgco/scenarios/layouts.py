@@ -1,7 +1,7 @@
 """Obstacle layouts: what a scenario draws, and what a layout file holds.
 
-L layouts, M obstacles each, d the dimension of space (2 or 3). A layout with fewer than M obstacles is padded
-with rows of NaN. Lengths in metres, times in seconds.
+L layouts, M spheres and K boxes each, d the dimension of space (2 or 3). A layout with fewer of them is padded with
+rows of NaN. Lengths in metres, times in seconds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from torchgco.scenarios import checks
 REQUIRED = ("centers", "radii")
 SCALARS = ("vehicle_radius", "goal_radius", "dt", "stages")
 CONTROLS = ("control_lower", "control_upper")
-NAMED = (*REQUIRED, "velocities", "start", "goal", *SCALARS, *CONTROLS, "best_cost")
+BOXES = ("box_centers", "box_half_sizes", "box_rotations")
+NAMED = (*REQUIRED, "velocities", *BOXES, "start", "goal", *SCALARS, *CONTROLS, "best_cost")
 IDS = "layout"
 
 # What np.load raises on a file that is no npz, holds pickles or is damaged; a lone .npy fails as a context.
@@ -43,6 +44,10 @@ class Layouts:
     control_lower, control_upper
                     (m,) in the units of the inputs, infinite where unbounded, or None
     best_cost       (L,) J_var of the best solution known, NaN where none is, or None
+    box_centers, box_half_sizes
+                    (L, K, d) m, rows of NaN where a box is absent, or None if there are none; half the sides' lengths
+    box_rotations   (L, K) rad in the plane, (L, K, 4) unit quaternions [w, x, y, z] in space: from the sides to the
+                    axes of space, NaN where absent; None: sides along the axes
     name            of the family, or the stem of the file
     ids             (L,) int64, index of each layout in its file or generator; 0..L-1 unless given
 
@@ -61,6 +66,9 @@ class Layouts:
     control_lower: np.ndarray | None = None
     control_upper: np.ndarray | None = None
     best_cost: np.ndarray | None = None
+    box_centers: np.ndarray | None = None
+    box_half_sizes: np.ndarray | None = None
+    box_rotations: np.ndarray | None = None
     name: str = "layouts"
     ids: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  # empty stands for 0..L-1
 
@@ -72,6 +80,9 @@ class Layouts:
         put("centers", centers)
         put("radii", radii)
         put("velocities", checks.velocities(self.velocities, centers))
+        boxes = checks.boxes(self.box_centers, self.box_half_sizes, self.box_rotations, centers)
+        for name, value in zip(BOXES, boxes, strict=True):
+            put(name, value)
         for name in ("start", "goal"):
             put(name, checks.states(getattr(self, name), f"layouts.{name}", centers))
         if self.start is not None and self.goal is not None and self.start.shape != self.goal.shape:
@@ -118,12 +129,12 @@ class Layouts:
         index = checks.indices(indices, "layouts.take")
         if index.max() >= self.count:
             raise InputError("layouts.take", f"positions in 0..{self.count - 1}", int(index.max()))
-        rows = ("centers", "radii", "velocities", "start", "goal", "best_cost", "ids")
+        rows = ("centers", "radii", "velocities", *BOXES, "start", "goal", "best_cost", "ids")
         held = {name: getattr(self, name) for name in rows if getattr(self, name) is not None}
         return replace(self, **{name: value[index] for name, value in held.items()})
 
     def pad(self, obstacles: int) -> Layouts:
-        """The same layouts with M = `obstacles`, absent ones added last; InputError if there are more."""
+        """The same layouts with M = `obstacles` spheres, absent ones added last; InputError if there are more."""
         present = self.radii.shape[1]
         missing = checks.integer(obstacles, "layouts.pad", 0) - present
         if missing < 0:
@@ -132,7 +143,7 @@ class Layouts:
             return self
 
         def padded(value: np.ndarray) -> np.ndarray:
-            return np.pad(value, [(0, 0), (0, missing), (0, 0)][: value.ndim], constant_values=np.nan)
+            return np.pad(value, _behind(value, missing), constant_values=np.nan)
 
         velocities = None if self.velocities is None else padded(self.velocities)
         return replace(self, centers=padded(self.centers), radii=padded(self.radii), velocities=velocities)
@@ -173,7 +184,7 @@ class Layouts:
 def concatenate(parts: Sequence[Layouts]) -> Layouts:
     """One batch of all layouts in `parts`, in order, padded to the largest number of obstacles.
 
-    Obstacles rest in parts without velocities, and best_cost is NaN in parts without one. Raises InputError
+    Spheres rest in parts without velocities, and best_cost is NaN in parts without one. Raises InputError
     where the parts differ in what a batch shares: dimension, lengths of states, scalars, control bounds.
     """
     if not parts:
@@ -194,6 +205,7 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
         columns["best_cost"] = [
             np.full(part.count, np.nan) if part.best_cost is None else part.best_cost for part in parts
         ]
+    columns |= _joined_boxes(parts)
     return Layouts(
         centers=np.concatenate([part.centers for part in parts]),
         radii=np.concatenate([part.radii for part in parts]),
@@ -202,6 +214,30 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
         name="+".join(dict.fromkeys(part.name for part in parts)),
         ids=np.concatenate([part.ids for part in parts]),
     )
+
+
+def _joined_boxes(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
+    """The boxes of all parts, as many in each; None where no part has any."""
+    width = max(0 if part.box_centers is None else part.box_centers.shape[1] for part in parts)
+    turned = any(part.box_rotations is not None for part in parts)
+    columns: dict[str, list[Any]] = {name: [] for name in BOXES}
+    for part in parts:
+        none = np.empty((part.count, 0, part.dimension))
+        centers = none if part.box_centers is None else part.box_centers
+        halves = none if part.box_half_sizes is None else part.box_half_sizes
+        count, turns = centers.shape[1], part.box_rotations
+        if turns is None:  # no turn: an angle of 0, or its quaternion
+            turns = np.zeros((part.count, count))
+            turns = turns if part.dimension == 2 else np.tile((1.0, 0.0, 0.0, 0.0), (part.count, count, 1))
+        for name, value in zip(BOXES, (centers, halves, turns), strict=True):
+            columns[name].append(np.pad(value, _behind(value, width - count), constant_values=np.nan))
+    kept = BOXES[: 0 if width == 0 else 3 if turned else 2]
+    return {name: column if name in kept else [None] for name, column in columns.items()}
+
+
+def _behind(value: np.ndarray, missing: int) -> list[tuple[int, int]]:
+    """How np.pad adds so many rows along the second axis."""
+    return [(0, 0), (0, missing), (0, 0)][: value.ndim]
 
 
 def _same(name: str, values: list[Any]) -> Any:

@@ -8,11 +8,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds
+from torchgco.constraints.boxes import Boxes
 from torchgco.constraints.obstacles import Spheres
 from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.base import Dynamics
 from torchgco.errors import InputError
+from torchgco.goal import Goal
 from torchgco.problem import Problem
 from torchgco.scenarios.layouts import Layouts
 
@@ -65,7 +68,7 @@ class Vehicle:
         return 0 if position is None else position.stop - position.start
 
     def task(self, layouts: Layouts, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float64) -> Task:
-        """The planning problems of these layouts: quadratic cost to the goal, spheres, control bounds (section 5)."""
+        """The planning problems of these layouts: quadratic cost to the goal, obstacles, control bounds (section 5)."""
         if layouts.dimension != self.dimension:
             other = "quadrotor" if layouts.dimension == 3 else "planar"
             raise InputError("model", f"model={other} for the {layouts.dimension}-D {layouts.name}", self.name)
@@ -76,7 +79,7 @@ class Vehicle:
 
         dynamics = self.dynamics if layouts.dt is None else replace(self.dynamics, dt=layouts.dt)  # type: ignore
         stages = _given(layouts.stages, self.stages)
-        constraints = [
+        constraints: list[Constraint] = [
             Spheres(
                 tensor(layouts.centers),
                 tensor(layouts.radii),
@@ -88,15 +91,20 @@ class Vehicle:
                 tensor(_given(layouts.control_upper, self.control_upper)),
             ),
         ]
+        if layouts.box_centers is not None:
+            turns = None if layouts.box_rotations is None else tensor(layouts.box_rotations)
+            radius = _given(layouts.vehicle_radius, self.radius)
+            constraints.append(Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns))
         cost = QuadraticCost(
             Q=tensor(list(self.state_weight)), R=tensor(list(self.control_weight)),
             Qf=tensor(list(self.terminal_weight)), x_ref=tensor(goal).unsqueeze(1),
             u_ref=tensor(list(self.control_reference)),
         )  # fmt: skip
-        problem = Problem(dynamics, cost, constraints, tensor(start), stages)
-        U0 = tensor(list(self.control_reference)).expand(layouts.count, stages, -1).contiguous()
         goal_radius = _given(layouts.goal_radius, self.goal_radius)
-        return Task(problem, U0, tensor(goal)[:, dynamics.position], goal_radius, layouts)
+        center = tensor(goal)[:, dynamics.position]
+        problem = Problem(dynamics, cost, constraints, tensor(start), stages, Goal(center, goal_radius))
+        U0 = tensor(list(self.control_reference)).expand(layouts.count, stages, -1).contiguous()
+        return Task(problem, U0, center, goal_radius, layouts)
 
     def _states(self, layouts: Layouts, name: str):
         """start or goal (L, n): the layouts' own, or the vehicle's for all."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 TOLERANCE = 5e-5  # of tracking and relaxing, as a share of L_M; refining takes a tenth of it
 SEARCH = LineSearch(back=2)
 TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
-CHORD_PENETRATION = 0.049  # of R, of a refined candidate between two knots; the judge accepts 0.05
+CHORD_PENETRATION = 0.049  # share of an obstacle's margin, between two knots; the judge accepts 0.05
 
 
 def track(options: PathProposals, candidates: Candidates, paths: Tensor) -> Candidates:
@@ -71,7 +71,7 @@ def refine(options: PathProposals, candidates: Candidates, sound: Tensor) -> tup
     solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=20)
     end = solver.solve(part, candidates.U[rows], warm=take(multipliers, rows))
     good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.X)
-    good &= seen.chord_penetration(part, end.X) <= CHORD_PENETRATION * candidates.R[rows]
+    good &= seen.chord_penetration(part, end.X, CHORD_PENETRATION) <= 0
     won = rows[good]
     X, U, cost = candidates.X.clone(), candidates.U.clone(), torch.full_like(candidates.unit, torch.inf)
     X[won], U[won], cost[won] = end.X[good], end.U[good], end.cost[good]

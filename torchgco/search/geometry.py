@@ -9,7 +9,8 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-FAR = -1e9  # the radius of an absent obstacle
+from torchgco.constraints.cuboids import Cuboids
+from torchgco.constraints.obstacles import FAR as FAR
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,17 @@ class Scene:
     centers: Tensor  # (B, M, d)
     inflated_radii: Tensor  # (B, M): r_obs + r_veh, FAR where absent
     traversal_cost: Callable[[Tensor, slice], Tensor]  # per metre at points (B', V, d) of some problems, (B', V)
+    boxes: Cuboids | None = None
+
+    @property
+    def sizes(self) -> Tensor:
+        """The depth of each obstacle's deepest point beneath its surface, boxes last, (B, M'); negative: absent."""
+        return self.inflated_radii if self.boxes is None else torch.cat((self.inflated_radii, self.boxes.sizes), dim=1)
+
+    @property
+    def middles(self) -> Tensor:
+        """The centres of all obstacles, boxes last, (B, M', d)."""
+        return self.centers if self.boxes is None else torch.cat((self.centers, self.boxes.centers), dim=1)
 
 
 def points_along(path: Tensor, length: Tensor) -> Tensor:

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.native.roadmap import CLEAR, HOPS, LEAST, MIDWAY, RAYS, SHELLS, TIE, Graph, directions
+from torchgco.constraints.cuboids import Cuboids
+from torchgco.native.roadmap import CLEAR, HOPS, LEAST, MIDWAY, RAYS, SHELLS, TIE, Graph, around_boxes, directions
 from torchgco.search.geometry import squares, squares_from_segments
 
 CLASS = 8  # paths are drawn taut together with those of as many eights of edges
@@ -27,11 +28,18 @@ class Search:
         o: centres (B, M, d), m.
         R: radii (B, M), m; negative where there is no sphere.
         margin: distance from a sphere, as a share of the largest radius, below which an edge costs more.
+        boxes: further obstacles.
     """
 
     o: Tensor
     R: Tensor
     margin: float
+    boxes: Cuboids | None = None
+
+    @property
+    def largest(self) -> Tensor:
+        """The largest radius, or size of a box, (B, 1)."""
+        return (self.R if self.boxes is None else torch.cat((self.R, self.boxes.sizes), dim=1)).amax(-1, keepdim=True)
 
     def graph(self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int) -> Graph:
         """Points and what each is joined to: the nearest of all, the nearest of those spread, the goal.
@@ -105,7 +113,8 @@ class Search:
         for most in range(CLASS, HOPS + 1, CLASS):
             part = ((edges > most - CLASS) & (edges <= most)).nonzero().flatten()
             if part.numel() > 0:
-                search, points = Search(self.o[part], self.R[part], self.margin), string[part, : 2 * most + 1]
+                boxes = None if self.boxes is None else self.boxes.rows(part)
+                search, points = Search(self.o[part], self.R[part], self.margin, boxes), string[part, : 2 * most + 1]
                 everyone = torch.arange(2 * most + 1, device=path.device).expand(*points.shape[:2], -1)
                 graph = Graph(points, everyone, search._lengths(points, everyone))
                 shorter, _, arrives = search.cheapest(graph, price[part, : 2 * most + 1])
@@ -115,7 +124,7 @@ class Search:
     def raised(self, price: Tensor, points: Tensor, path: Tensor, factor: float) -> Tensor:
         """Prices (B, V) times a factor at points that are nearer to a path than the largest radius."""
         apart = squares_from_segments(points, path[:, :-1], path[:, 1:]).amin(1)
-        return torch.where(apart < _signed_square(self.R.amax(-1, keepdim=True)), factor * price, price)
+        return torch.where(apart < _signed_square(self.largest), factor * price, price)
 
     def _spread(self, start: Tensor, goal: Tensor, cube: Tensor) -> Tensor:
         """Points (B, spread, d) all over the box that start, goal and spheres fill."""
@@ -123,12 +132,17 @@ class Search:
         low, high = torch.minimum(start, goal), torch.maximum(start, goal)
         low = torch.minimum(low, torch.where(here, self.o - reach, low.unsqueeze(1)).amin(1)).unsqueeze(1)
         high = torch.maximum(high, torch.where(here, self.o + reach, high.unsqueeze(1)).amax(1)).unsqueeze(1)
+        if self.boxes is not None:
+            low, high = (end.unsqueeze(1) for end in self.boxes.reach(torch.cat((low, high), dim=1)))
         return low + cube * (high - low)
 
     def _beside(self, start: Tensor, goal: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
         """Free points around the spheres and between them (B, nodes, d), and which places are taken (B, nodes)."""
         (around, first), (midway, second) = self._around(start, goal), self._midway()
         points, exists = torch.cat((around, midway), dim=1), torch.cat((first, second), dim=1)
+        if self.boxes is not None:
+            more, third = around_boxes(self.boxes, self.o, self.R, start, goal)
+            points, exists = torch.cat((points, more), dim=1), torch.cat((exists, third), dim=1)
         detour = squares(points, torch.stack((start, goal), dim=1)).sqrt_().sum(-1)
         detour = torch.where(exists & self._is_free(points), detour, torch.inf).to(torch.float32)
         best = _lowest(detour, nodes)
@@ -156,8 +170,12 @@ class Search:
 
     def _is_free(self, points: Tensor) -> Tensor:
         """Whether points (B, V, d) are clear of all spheres by CLEAR times the largest radius."""
-        least = self.R + CLEAR * self.R.amax(-1, keepdim=True)
-        return (squares(points, self.o) > _signed_square(least).unsqueeze(1)).all(-1)
+        least = self.R + CLEAR * self.largest
+        free = (squares(points, self.o) > _signed_square(least).unsqueeze(1)).all(-1)
+        if self.boxes is None:
+            return free
+        least = self.boxes.radius + CLEAR * self.largest
+        return free & (self.boxes.squares(points) > _signed_square(least).unsqueeze(1)).all(-1)
 
     def _lengths(self, points: Tensor, ends: Tensor) -> Tensor:
         """Lengths (B, V, K) of the edges to the points `ends`, more close to a sphere, infinite through one."""
@@ -166,10 +184,14 @@ class Search:
         away = squares_from_segments(self.o, a, b)
         free = (away > _signed_square(self.R).unsqueeze(1)).all(-1).view(ends.shape)
         gap = away.sqrt_().sub_(self.R.unsqueeze(1)).amin(-1).view(ends.shape)
+        if self.boxes is not None:
+            away = self.boxes.squares_from_segments(a, b)
+            free = free & (away > _signed_square(self.boxes.radius).unsqueeze(1)).all(-1).view(ends.shape)
+            gap = torch.minimum(gap, away.sqrt_().sub_(self.boxes.radius.unsqueeze(1)).amin(-1).view(ends.shape))
         length = (b - a).square().sum(-1).sqrt().view(ends.shape)
         # No edge is free of charge: paths would turn in circles among points that coincide.
         length = length + LEAST * (points[:, 1] - points[:, 0]).square().sum(-1).sqrt().view(-1, 1, 1)
-        margin = self.margin * self.R.amax(-1).clamp(min=1e-9).view(-1, 1, 1)
+        margin = self.margin * self.largest.clamp(min=1e-9).view(-1, 1, 1)
         close = 1.0 + ((margin - gap) / margin).clamp(0.0, 1.0)
         return torch.where(free, length * close, torch.inf)
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchgco.draws import DrawKey
 from torchgco.errors import GuidanceWarning, InputError
-from torchgco.evaluation import GOAL_TOLERANCE
+from torchgco.evaluation import goal_tolerance
 from torchgco.guidance.detection import caught_knots
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide
@@ -181,10 +181,10 @@ class StopWhenCaught:
 
 def _goal_region(problem: Problem) -> GuideRegion:
     """A ball around the goal for the last knot, slightly smaller than the goal tolerance."""
-    goal, at = problem.cost.goal(problem.x0), problem.position
-    assert goal is not None
-    size = WITHIN * GOAL_TOLERANCE * (problem.x0 - goal)[:, at].square().sum(-1).sqrt()
+    near = goal_tolerance(problem)
+    assert near is not None and problem.goal is not None
+    size = WITHIN * near
     radius = problem.x0.new_full((problem.B, problem.N + 1), torch.inf)
     radius[:, -1] = size
-    center = goal[:, None, at].expand(-1, problem.N + 1, -1).contiguous()
-    return GuideRegion(center, radius, STIFF * cost_unit(problem) / size.pow(4), at)
+    center = problem.goal.position.unsqueeze(1).expand(-1, problem.N + 1, -1).contiguous()
+    return GuideRegion(center, radius, STIFF * cost_unit(problem) / size.pow(4), problem.position)

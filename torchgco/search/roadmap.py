@@ -57,7 +57,7 @@ class Roadmap:
             Corners (B, count, HOPS+1, d), the goal repeated at their ends; and whether there is a path (B,), the
             straight line where not.
         """
-        library = roadmap.library_for(scene.centers)
+        library = roadmap.library_for(scene.centers, scene.boxes is not None)
         most = AT_ONCE if library is None else roadmap.AT_ONCE
         B = scene.start.shape[0]
         parts = [self._paths(scene, slice(i, i + most), count, library) for i in range(0, max(B, 1), most)]
@@ -66,7 +66,8 @@ class Roadmap:
     def _paths(self, scene: Scene, rows: slice, count: int, library: CDLL | None) -> tuple[Tensor, Tensor]:
         start, goal, o, R = (t[rows] for t in (scene.start, scene.goal, scene.centers, scene.inflated_radii))
         R = torch.where(R > 0, (1.0 - self.max_overlap) * R, R)
-        search = Search(o, R, MARGIN) if library is None else NativeSearch(library, o, R, MARGIN)
+        boxes = None if scene.boxes is None else scene.boxes.rows(rows).cut(self.max_overlap)
+        search = Search(o, R, MARGIN, boxes) if library is None else NativeSearch(library, o, R, MARGIN, boxes)
         cube = halton(self.num_halton, o.shape[-1]).to(o)
         graph = search.graph(start, goal, cube, NODES, NEIGHBOURS, HALTON_NEIGHBOURS)
         price = scene.traversal_cost(graph.points, rows)

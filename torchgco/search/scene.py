@@ -1,27 +1,31 @@
-"""A problem as the search sees it: start, goal, the spheres between, and their scales."""
+"""A problem as the search sees it: start, goal, the obstacles between, and their scales."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bodies import Obstacles, least
 from torchgco.constraints.bounds import ControlBounds
-from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.constraints.cuboids import join
 from torchgco.problem import Problem
-from torchgco.search.geometry import FAR, Scene, segment_gaps
+from torchgco.search.geometry import FAR, Scene
 
 OPEN = 1e10  # a range of controls that is no range
+LITTLE = 1e-6  # of the unit of cost: a smaller stage cost says nothing of the goal
 FALLEN_BACK = 0.25  # share of the distance from start to goal; a candidate that ends farther away isn't one
 
 
 def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
-    """Start, goal and spheres, with what it costs to be at a point under the controls `rest` (B, N, m).
+    """Start, goal and obstacles, with what it costs to be at a point under the controls `rest` (B, N, m).
 
-    None where there are no spheres, or other obstacles too, or they move, or space is neither 2-D nor 3-D.
+    None where there are no obstacles, or some that the roadmap can't take, or space is neither 2-D nor 3-D.
     """
-    spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres) and c.velocities is None]
-    goal = problem.cost.goal(problem.x0)
-    if sum(c.distances.shape[1] for c in spheres) == 0 or len(spheres) < len(problem.geometric) or goal is None:
+    forms = [c.inflated() if isinstance(c, Obstacles) else None for c in problem.geometric]
+    spheres = [form for form in forms if form is not None]
+    boxes = join([form.boxes for form in spheres if form.boxes is not None and form.boxes.radius.shape[1] > 0])
+    count = sum(c.distances.shape[1] for c in spheres)
+    if (count == 0 and boxes is None) or len(spheres) < len(forms) or problem.goal is None:
         return None
     at = problem.position
     if at.stop - at.start not in (2, 3):
@@ -33,29 +37,33 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
         price = _resting_cost(problem, rest, points, rows)
         return price.clamp(min=0.0) / first[rows] + 0.1
 
-    return Scene(
-        problem.x0[:, at], goal[:, at],
-        torch.cat([c.centers for c in spheres], dim=1),
-        torch.cat([torch.where(c.absent, FAR, c.distances) for c in spheres], dim=1),
-        traversal_cost,
-    )  # fmt: skip
+    centers = torch.cat([c.centers for c in spheres], dim=1)
+    inflated_radii = torch.cat([c.distances for c in spheres], dim=1)
+    if count == 0:  # an absent sphere stands for none: no maximum over spheres is one over nothing
+        centers = problem.x0[:, None, at]
+        inflated_radii = torch.full_like(centers[..., 0], FAR)
+    return Scene(problem.x0[:, at], problem.goal.position, centers, inflated_radii, traversal_cost, boxes)
 
 
 def scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """R and q0 / R^4 (B,), the units of lengths and penalties."""
-    here = scene.inflated_radii > 0
-    R = torch.where(here, scene.inflated_radii, 0.0).sum(-1) / here.sum(-1).clamp(min=1)
-    return R, _resting_cost(problem, rest, scene.start.unsqueeze(1))[:, 0] / R.pow(4)
+    """R and q0 / R^4 (B,), the units of lengths and penalties, of problems in units of cost.
+
+    q0 is the stage cost of resting at the start, or, where a cost asks for the goal at its end alone, what staying
+    there costs per stage.
+    """
+    here = scene.sizes > 0
+    R = torch.where(here, scene.sizes, 0.0).sum(-1) / here.sum(-1).clamp(min=1)
+    resting = _resting_cost(problem, rest, scene.start.unsqueeze(1))[:, 0]
+    ends_matter = (resting.abs() < LITTLE) & (scene.start != scene.goal).any(-1)
+    return R, torch.where(ends_matter, 1.0, resting) / R.pow(4)
 
 
 def arrives(problem: Problem, X: Tensor) -> Tensor:
     """Whether candidates X (B, ..., N+1, n) end near the goal, (B, ...): in a looser sense than that of a solution."""
-    goal, at = problem.cost.goal(problem.x0), problem.position
-    assert goal is not None
-    first = (problem.x0 - goal)[:, at].square().sum(-1)
-    shape = (-1, *([1] * (X.dim() - 3)))
-    last = (X[..., -1, at] - goal[:, at].view(*shape, at.stop - at.start)).square().sum(-1)
-    return last <= FALLEN_BACK**2 * first.view(shape)
+    at = problem.position
+    assert problem.goal is not None
+    first = problem.goal.distance(problem.x0[:, at]).view(-1, *([1] * (X.dim() - 3)))
+    return problem.goal.distance(X[..., -1, at]) <= FALLEN_BACK * first
 
 
 def penetration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
@@ -64,14 +72,15 @@ def penetration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     return torch.stack(rows).amax(0)
 
 
-def chord_penetration(problem: Problem, X: Tensor) -> Tensor:
-    """The deepest penetration of the segments between the knots of X (B, N+1, n) into a sphere, (B,), m."""
+def chord_penetration(problem: Problem, X: Tensor, share: float = 0.0) -> Tensor:
+    """The deepest penetration of the segments between the knots of X (B, N+1, n) into obstacles, (B,), m.
+
+    Counted from a `share` of an obstacle's margin beneath its surface; at most 0 where no segment lies deeper.
+    """
     p = X[..., problem.position]
-    spheres = [c for c in problem.geometric if isinstance(c, BoundSpheres) and c.distances.shape[1] > 0]
-    gaps = [
-        segment_gaps(p[:, :-1], p[:, 1:], c.centers, torch.where(c.absent, FAR, c.distances)).amin(-1) for c in spheres
-    ]
-    return -torch.stack(gaps).amin(0)
+    obstacles = [c for c in problem.geometric if isinstance(c, Obstacles)]
+    gaps = [c.segment_clearance(p[:, :-1], p[:, 1:]) + share * c.margins.unsqueeze(1) for c in obstacles]
+    return -torch.stack([least(gap) for gap in gaps]).amin(0)
 
 
 def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:

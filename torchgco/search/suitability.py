@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.constraints.bodies import Obstacles
 from torchgco.expansion import linearise
 from torchgco.guidance.suitability import check_form, failure
 from torchgco.lagrangian import Lagrangian, Multipliers
@@ -28,8 +28,8 @@ def suited_paths(paths: PathProposals | None, problem: Problem) -> tuple[PathPro
     if position is None:
         return None, "the dynamics have no position"
     d = position.stop - position.start
-    if d not in (2, 3) and any(isinstance(c, BoundSpheres) for c in problem.geometric):
-        return None, f"no path is sought around spheres in {d}-D, as the roadmap knows 2-D and 3-D alone"
+    if d not in (2, 3) and any(isinstance(c, Obstacles) for c in problem.geometric):
+        return None, f"no path is sought around obstacles in {d}-D, as the roadmap knows 2-D and 3-D alone"
     if any(len(offset) != problem.m for offset in paths.initial_offsets):
         paths = replace(paths, initial_offsets=())
     one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))

@@ -13,7 +13,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.constraints.bodies import Obstacles
 from torchgco.errors import InputError
 from torchgco.evaluation import violation
 from torchgco.lagrangian import Lagrangian, Multipliers
@@ -159,7 +159,7 @@ class _Point:
         model = Condensed.around(problem, X, U)
         cost = float(problem.cost.total(X, U))
         slack = float((lam * model.c).abs().max()) / (1.0 + abs(cost)) if lam.numel() else 0.0
-        clearance = min([float(part.chord_clearance(X)) for part in _spheres(problem)], default=torch.inf)
+        clearance = min([float(part.chord_clearance(X)) for part in _obstacles(problem)], default=torch.inf)
         worst = float(violation(problem, X, U))
         return cls(model, lam, cost, worst, max(_slope(model, lam), slack), clearance)
 
@@ -203,8 +203,8 @@ def _slope(model: Condensed, lam: Tensor) -> float:
     return float(model.lagrangian_gradient(lam).abs().max()) / (1.0 + float(model.gradient.abs().max()))
 
 
-def _spheres(problem: Problem) -> list[BoundSpheres]:
-    return [part for part in problem.constraints if isinstance(part, BoundSpheres)]
+def _obstacles(problem: Problem) -> list[Obstacles]:
+    return [part for part in problem.constraints if isinstance(part, Obstacles)]
 
 
 def _convex(point: _Point, exact: bool) -> tuple[Tensor, Tensor] | None:

@@ -1,0 +1,198 @@
+"""Boxes against a slow, obvious NumPy version, against autodiff, and their border checks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.problems import boxed_batch, planar_batch, random_trajectory
+from tests.reference import boxes as slow
+from torchgco import Boxes, InputError, Problem, Spheres
+from torchgco.constraints.boxes import BoundBoxes
+from torchgco.constraints.cuboids import Cuboids
+
+
+def boxes_of(problem: Problem) -> BoundBoxes:
+    (found,) = (c for c in problem.constraints if isinstance(c, BoundBoxes))
+    return found
+
+
+def turned(d: int, M: int = 6, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres, half sides and rotations of M boxes."""
+    rng = np.random.default_rng(seed)
+    turns = rng.normal(size=(M, 4))
+    rotations = turns[:, 0] if d == 2 else turns / np.linalg.norm(turns, axis=-1, keepdims=True)
+    return rng.uniform(-1, 1, (M, d)), rng.uniform(0.1, 0.6, (M, d)), rotations
+
+
+def bound(d: int, radius: float = 0.1, seed: int = 0) -> tuple[BoundBoxes, tuple[np.ndarray, ...]]:
+    """The boxes of one problem, and what they were made from."""
+    parts = turned(d, seed=seed)
+    plain, _ = boxed_batch(d, B=1, N=3)
+    centers, half, rotations = parts
+    problem = Problem(plain.dynamics, plain.cost, [Boxes(centers, half, radius, rotations)], plain.x0, 3)
+    return boxes_of(problem), parts
+
+
+def points(d: int, count: int, seed: int = 1) -> Tensor:
+    return torch.as_tensor(np.random.default_rng(seed).uniform(-2, 2, (1, count, d)))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_distances_by_hand(d: int) -> None:
+    boxes, (centers, half, rotations) = bound(d)
+    p = torch.cat((points(d, 60), torch.as_tensor(centers)[None] + 0.01), dim=1)  # the last lie inside
+    found = boxes.signed_distance(p, torch.zeros(p.shape[1], dtype=p.dtype))
+    for k in range(p.shape[1]):
+        for i in range(len(centers)):
+            expected = slow.distance(p[0, k].numpy(), centers[i], half[i], rotations[i]) - 0.1
+            assert float(found[0, k, i]) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_segments_by_hand(d: int) -> None:
+    boxes, (centers, half, rotations) = bound(d)
+    a, b = points(d, 25, seed=2), points(d, 25, seed=3)
+    b[:, :5] = a[:, :5]  # no length
+    b[:, 5:10, 1:] = a[:, 5:10, 1:]  # along the first axis
+    found = boxes.segment_clearance(a, b)
+    cuboids = boxes.inflated().boxes
+    assert cuboids is not None
+    squares = cuboids.squares_from_segments(a, b)
+    for e in range(25):
+        for i in range(len(centers)):
+            ends = a[0, e].numpy(), b[0, e].numpy()
+            sampled = slow.segment_distance(*ends, centers[i], half[i], rotations[i], samples=801)
+            assert sampled - 3e-3 <= float(found[0, e, i]) + 0.1 <= sampled + 1e-12
+            assert float(squares[0, e, i]) ** 0.5 == pytest.approx(max(float(found[0, e, i]) + 0.1, 0.0), abs=1e-7)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_rows_and_their_expansion(d: int) -> None:
+    problem, U = boxed_batch(d, B=3, N=12)
+    X, _ = random_trajectory(problem, spread=0.3 * (4.0 if d == 3 else 1.0))
+    boxes = boxes_of(problem)
+    for i in range(int((~boxes.absent[0]).sum())):  # a knot within every box of the first problem
+        X[0, 1 + i, problem.dynamics.position] = boxes.centers[0, i] + 0.3 * boxes.half_sizes[0, i]
+    value = boxes.value(X, U)
+    assert bool((value[0] > 0).any()) and bool((value[1][:, -1] == -1.0).all())
+    size = torch.where(boxes.absent, 0.5, boxes.sizes)
+    depth = (value / (2 * size.unsqueeze(1))).clamp(min=0.0)
+    torch.testing.assert_close(boxes.violation(X, U), depth)
+    for k in (1, 5):
+        torch.testing.assert_close(boxes.at(X[:, k : k + 1], k), value[:, k - 1 : k])
+    generator = torch.Generator().manual_seed(4)
+    g, h = (torch.rand(value.shape, generator=generator, dtype=torch.float64) for _ in range(2))
+    s = problem.n + 1 + problem.m
+    H = torch.zeros(3, 13, s, s, dtype=torch.float64)
+    boxes.accumulate(X, U, g, h, H)
+    for b in range(3):
+        one = boxes.take(torch.tensor([b]))
+        slopes = torch.autograd.functional.jacobian(lambda x, one=one: one.value(x, U[:1])[0], X[b : b + 1])
+        for k in range(1, 13):
+            J = slopes[k - 1, :, 0, k]  # (M, n)
+            torch.testing.assert_close(H[b, k, : problem.n, problem.n], J.T @ g[b, k - 1])
+            torch.testing.assert_close(H[b, k, : problem.n, : problem.n], J.T @ torch.diag(h[b, k - 1]) @ J)
+
+
+def test_a_slope_leads_out_of_every_place_inside() -> None:
+    """At the centre, on the medial axis, and right on the surface, where others have no slope."""
+    plain, U = planar_batch(B=1, N=4)
+    problem = Problem(plain.dynamics, plain.cost, [Boxes([[0.0, 0.0]], [[0.3, 0.1]], 0.05)], plain.x0, 4)
+    X = plain.x0.unsqueeze(1).repeat(1, 5, 1)
+    X[0, 1:, :2] = torch.tensor([[0.0, 0.0], [0.15, 0.0], [0.3, 0.05], [-0.29, 0.0]], dtype=torch.float64)
+    H = torch.zeros(1, 5, 9, 9, dtype=torch.float64)
+    boxes_of(problem).accumulate(X, U, torch.ones(1, 4, 1, dtype=X.dtype), torch.zeros(1, 4, 1, dtype=X.dtype), H)
+    slope = -H[0, 1:, :2, 6] / (2 * 0.15)
+    torch.testing.assert_close(slope, slope.new_tensor([[0.0, 1.0], [0.0, 1.0], [1.0, 0.0], [-1.0, 0.0]]))
+
+
+def test_a_box_without_turn_is_one_with_none() -> None:
+    centers, half, _ = turned(2)
+    plain, U = planar_batch(B=2, N=4)
+    X, _ = random_trajectory(plain)
+    rows = []
+    for rotations in (None, np.zeros(6), np.full(6, np.pi)):
+        problem = Problem(plain.dynamics, plain.cost, [Boxes(centers, half, 0.1, rotations)], plain.x0, 4)
+        rows.append(problem.constraints[0].value(X, U))
+    assert torch.equal(rows[0], rows[1])
+    torch.testing.assert_close(rows[0], rows[2])
+
+
+def test_a_start_within_touching_distance_is_refused() -> None:
+    plain, _ = planar_batch(B=3, N=4)
+    x0 = plain.x0.clone()
+    x0[:, 0] = torch.tensor([-1.0, -0.156, -0.158], dtype=torch.float64)  # contact at 0.1 + 0.95 * 0.06 = 0.157
+    problem = Problem(plain.dynamics, plain.cost, [Boxes([[0.0, 0.0]], [[0.1, 0.1]], 0.06)], x0, 4)
+    assert problem.start_is_clear.tolist() == [True, False, True]
+
+
+def test_none_at_all() -> None:
+    plain, U = planar_batch(B=2, N=4)
+    problem = Problem(plain.dynamics, plain.cost, [Boxes([], [], 0.1)], plain.x0, 4)
+    X, _ = random_trajectory(problem)
+    boxes = boxes_of(problem)
+    assert boxes.value(X, U).shape == (2, 4, 0) and bool(problem.start_is_clear.all())
+    assert boxes.chord_clearance(X).tolist() == [torch.inf] * 2
+
+
+def test_the_box_that_they_fill() -> None:
+    boxes = Cuboids(
+        torch.zeros(1, 2, 2, dtype=torch.float64), torch.eye(2, dtype=torch.float64).expand(1, 2, 2, 2),
+        torch.tensor([[[1.0, 2.0], [9.0, 9.0]]], dtype=torch.float64), torch.tensor([[0.0, -1e9]], dtype=torch.float64),
+    )  # fmt: skip
+    low, high = boxes.reach(torch.tensor([[[-4.0, 0.0]]], dtype=torch.float64))
+    assert low.tolist() == [[-4.0, -3.0]] and high.tolist() == [[1.5, 3.0]]
+
+
+BAD = {
+    "shape": (dict(centers=[[0.0, 0.0, 0.0]]), r"boxes.centers: expected shape \(2, M, 2\), got \(2, 1, 3\)"),
+    "sides": (dict(half_sizes=[[0.1, 0.1]] * 2), r"boxes.half_sizes: expected shape \(2, 1, 2\), got \(2, 2, 2\)"),
+    "a side of none": (
+        dict(half_sizes=[[0.1, 0.0]]),
+        "boxes.half_sizes: expected finite half sides above 0 m",
+    ),
+    "mixed": (dict(half_sizes=[[0.1, np.nan]]), "boxes.half_sizes: expected NaN exactly where the centre is NaN"),
+    "infinite": (dict(centers=[[np.inf, 0.0]]), "boxes.half_sizes: expected NaN exactly where the centre is NaN"),
+    "vehicle": (dict(vehicle_radius=-1.0), "boxes.vehicle_radius: expected a number of at least 0 m"),
+    "turn": (
+        dict(rotations=[[1.0, 0, 0, 0]]),
+        "boxes.rotations: expected one set for all",
+    ),
+    "turn of none": (dict(rotations=[np.nan]), "boxes.rotations: expected finite numbers for every box that is there"),
+    "words": (dict(centers="here"), "boxes.centers: expected numbers"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_malformed_boxes_are_named(case: str) -> None:
+    changes, told = BAD[case]
+    plain, _ = planar_batch(B=2, N=4)
+    given = dict(centers=[[0.5, 0.5]], half_sizes=[[0.1, 0.1]], vehicle_radius=0.05) | changes
+    with pytest.raises(InputError, match=told):
+        Problem(plain.dynamics, plain.cost, [Boxes(**given)], plain.x0, 4)
+
+
+def test_a_quaternion_that_turns_nothing_into_nothing_is_named() -> None:
+    plain, _ = boxed_batch(3, B=1, N=3)
+    for turn in ([0.0, 0, 0, 0], [1.0, 1.0, 0, 0]):
+        box = Boxes([[3.0, 1, 0]], [[0.1] * 3], 0.1, [turn])
+        with pytest.raises(InputError, match=r"boxes.rotations: expected unit quaternions \[w, x, y, z\]"):
+            Problem(plain.dynamics, plain.cost, [box], plain.x0, 3)
+
+
+def test_scales_of_both_kinds_agree() -> None:
+    """A box as thick as a disc is of the same size, and its rows have the same slope at its surface."""
+    plain, U = planar_batch(B=1, N=1)
+    X = plain.x0.unsqueeze(1).repeat(1, 2, 1)
+    X[0, 1, :2] = torch.tensor([0.15, 0.0], dtype=torch.float64)
+    slopes = []
+    for part in (Spheres([[0.0, 0.0]], [0.1], 0.05), Boxes([[0.0, 0.0]], [[0.1, 0.1]], 0.05)):
+        (obstacles,) = Problem(plain.dynamics, plain.cost, [part], plain.x0, 1).constraints
+        H = torch.zeros(1, 2, 9, 9, dtype=torch.float64)
+        obstacles.accumulate(X, U, torch.ones(1, 1, 1, dtype=X.dtype), torch.zeros(1, 1, 1, dtype=X.dtype), H)
+        slopes.append(float(H[0, 1, 0, 6]))
+        assert float(obstacles.sizes) == pytest.approx(0.15)
+    assert slopes == pytest.approx([-0.3, -0.3])

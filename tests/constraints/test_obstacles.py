@@ -1,0 +1,77 @@
+"""What all kinds of obstacles promise: distances, chords, starts, and that no kind goes unjudged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.problems import planar_batch
+from torchgco import InputError, Problem, certify, judge
+from torchgco.constraints import CONTACT_FACTOR, Obstacles
+from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.rollout import open_loop
+from torchgco.search.scene import scene_of
+from torchgco.shapes import Dimensions
+
+
+@dataclass(frozen=True)
+class HalfPlane(Obstacles):
+    """All points with x > `edge`: a kind that nobody knows."""
+
+    edge: float
+
+    def bind(self, dims: Dimensions) -> Self:
+        for name, value in {
+            "knots": slice(1, dims.N + 1), "position": dims.position, "dt": dims.dt,
+            "absent": torch.zeros(dims.B, 1, dtype=torch.bool), "vehicle_radius": dims.like.new_zeros(dims.B),
+        }.items():  # fmt: skip
+            object.__setattr__(self, name, value)
+        return self
+
+    @property
+    def margins(self) -> Tensor:
+        return torch.zeros_like(self.vehicle_radius).unsqueeze(-1)
+
+    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
+        return self.edge - p[..., :1]
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return X[:, self.knots, :1] - self.edge
+
+
+def test_a_kind_that_nobody_can_judge_is_named() -> None:
+    problem, U = planar_batch(B=1, N=5)
+    problem = Problem(problem.dynamics, problem.cost, [HalfPlane(0.5)], problem.x0, problem.N)
+    with pytest.raises(InputError, match=r"constraints: expected obstacles that can be judged .*, got HalfPlane"):
+        judge(problem, U, torch.zeros(2, dtype=torch.float64), 0.1)
+    with pytest.raises(InputError, match="got HalfPlane"):
+        certify(problem, open_loop(problem.dynamics, problem.x0, U), U)
+    assert scene_of(problem, U) is None and bool(problem.start_is_clear.all())
+
+
+def test_distances_of_spheres_by_hand() -> None:
+    problem, _ = planar_batch(B=2, N=4)
+    spheres = problem.constraints[0]
+    assert isinstance(spheres, BoundSpheres)
+    generator = torch.Generator().manual_seed(3)
+    p = torch.randn(2, 5, 2, generator=generator, dtype=torch.float64)
+    distance = spheres.signed_distance(p, torch.zeros(5, dtype=torch.float64))
+    along = spheres.segment_clearance(p[:, :-1], p[:, 1:])
+    shares = np.linspace(0, 1, 4001)[:, None]
+    for b in range(2):
+        for m in range(5):
+            o, R = spheres.centers[b, m].numpy(), float(spheres.distances[b, m])
+            if spheres.absent[b, m]:
+                assert bool(torch.isinf(distance[b, :, m]).all() & torch.isinf(along[b, :, m]).all())
+                continue
+            for k in range(5):
+                assert float(distance[b, k, m]) == pytest.approx(np.linalg.norm(p[b, k].numpy() - o) - R)
+            for k in range(4):
+                way = (1 - shares) * p[b, k].numpy() + shares * p[b, k + 1].numpy()
+                assert float(along[b, k, m]) == pytest.approx(np.linalg.norm(way - o, axis=1).min() - R, abs=1e-4)
+    assert torch.equal(spheres.sizes, spheres.margins) and CONTACT_FACTOR == 0.95

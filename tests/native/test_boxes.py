@@ -1,0 +1,61 @@
+"""Native rows of boxes against PyTorch's: outside, at the surface, inside, absent; and traced, for CasADi's solvers."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.problems import boxed_batch, planar_batch, random_trajectory
+from torchgco import Boxes, ControlBounds, Goal, Problem, judge
+from torchgco.baselines.casadi import CasADiSolver
+from torchgco.constraints.boxes import BoundBoxes
+from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.native.dispatch import engine_of, terms_of
+
+
+@pytest.mark.parametrize("phr", [True, False])
+@pytest.mark.parametrize("d", [2, 3])
+def test_values_and_expansions_are_pytorchs(d: int, phr: bool) -> None:
+    problem, _ = boxed_batch(d, B=5, N=40, boxes=6)
+    X, U = random_trajectory(problem, spread=0.5)
+    (boxes,) = (c for c in problem.constraints if isinstance(c, BoundBoxes))
+    generator = torch.Generator().manual_seed(6)
+    for i in range(6):  # knots within boxes, at their centres and on their surfaces
+        for j, share in enumerate((0.0, 0.5, 0.9, 1.0, 1.2)):
+            turn = torch.randint(0, d, (1,), generator=generator)
+            local = share * boxes.half_sizes[:, i] * torch.nn.functional.one_hot(turn, d)
+            at = boxes.centers[:, i] + (boxes.axes[:, i] * local.unsqueeze(-1)).sum(-2)
+            X[:, 1 + 5 * i + j, problem.dynamics.position] = at
+    assert float(boxes.violation(X, U).amax()) > 0.05
+    multipliers = Multipliers.zero(problem, 3.0)
+    lam = [torch.rand(t.shape, generator=generator, dtype=t.dtype).clamp(min=0.5) - 0.5 for t in multipliers.lam]
+    lagrangian = Lagrangian(problem, Multipliers(tuple(lam), multipliers.mu), None, phr)
+    engine = engine_of(problem)
+    assert engine is not None and not engine.functions  # nothing is traced
+    cost, merit = engine.value(problem, X, U, terms_of(lagrangian))
+    torch.testing.assert_close((cost, merit), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
+    slopes, H = engine.expand(problem, X, U, terms_of(lagrangian))
+    want, n, s = lagrangian.expand(X, U).transpose(0, 1), problem.n, problem.n + problem.m
+    kept = [i for i in range(s + 1) if i != n]
+    torch.testing.assert_close(slopes[:, :-1], want[:, :-1, kept, n], rtol=1e-10, atol=1e-9)
+    torch.testing.assert_close(slopes[:, -1, :n], want[:, -1, :n, n], rtol=1e-10, atol=1e-9)
+    upper = torch.triu(torch.ones(s, s, dtype=torch.bool))
+    torch.testing.assert_close(H[..., upper], want[:, :, kept][..., kept][..., upper], rtol=1e-10, atol=1e-9)
+
+
+def test_problems_without_boxes_have_no_code_for_them() -> None:
+    plain, boxed = planar_batch(B=1, N=3)[0], boxed_batch(2, B=1, N=3)[0]
+    sources = [engine.form.source() for problem in (plain, boxed) if (engine := engine_of(problem)) is not None]
+    assert len(sources) == 2
+    assert "WITH_BOXES 1" not in sources[0] and "static inline V solid(" not in sources[0]
+    assert "WITH_BOXES 1" in sources[1] and sources[1].count("static inline V solid(") == 1
+
+
+def test_casadi_solves_among_boxes() -> None:
+    plain, U0 = planar_batch(B=1, N=40)
+    wall = Boxes([[0.1, 0.0]], [[0.1, 0.3]], 0.06, [0.2])
+    parts = [wall, ControlBounds([-10, -10], [10, 10])]
+    problem = Problem(plain.dynamics, plain.cost, parts, plain.x0, 40, Goal([1.0, 0.4], 0.5))
+    solution = CasADiSolver("ipopt").prepare(problem).solve(problem, U0)
+    verdict = judge(problem, solution.U)
+    assert bool(verdict.feasible.all()) and float(verdict.violation) <= 1e-6

@@ -1,0 +1,139 @@
+"""Boxes in layout files: read, checked, joined, made into problems, drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from matplotlib.patches import Polygon
+
+from tests.reference import boxes as slow
+from torchgco import InputError, Planar
+from torchgco.constraints.boxes import BoundBoxes
+from torchgco.plotting.boxes import outlines
+from torchgco.plotting.layouts import layout_grid
+from torchgco.scenarios.layouts import Layouts, concatenate
+from torchgco.scenarios.vehicle import Vehicle
+
+NAN = np.nan
+CAR = Vehicle(
+    "planar", Planar(dt=0.1), [5, 5, 0, 1, 1, 0], [0.1, 0.1], [50, 50, 0, 1, 1, 0], [0, 0], [-10, -10], [10, 10],
+    [-1, 0, 0, 0, 0, 0], [1, 0.4, 0, 0, 0, 0], radius=0.06, goal_radius=0.3, stages=20,
+)  # fmt: skip
+
+
+def example(**changes) -> Layouts:
+    """Two layouts in the plane without discs, the second with a single box."""
+    given = {
+        "centers": np.zeros((2, 0, 2)),
+        "radii": np.zeros((2, 0)),
+        "box_centers": np.array([[[0.0, 0.0], [0.5, 0.5]], [[0.1, 0.0], [NAN, NAN]]]),
+        "box_half_sizes": np.array([[[0.1, 0.2], [0.3, 0.1]], [[0.1, 0.1], [NAN, NAN]]]),
+        "box_rotations": np.array([[0.3, -0.2], [0.0, 7.0]]),
+    }
+    return Layouts(**(given | changes))
+
+
+def in_space(**changes) -> Layouts:
+    half = np.sqrt(0.5)
+    given = {
+        "centers": np.zeros((1, 0, 3)),
+        "radii": np.zeros((1, 0)),
+        "box_centers": np.array([[[0.0, 0.0, 1.0]]]),
+        "box_half_sizes": np.array([[[0.1, 0.2, 0.3]]]),
+        "box_rotations": np.array([[[half, half, 0.0, 0.0]]]),
+    }
+    return Layouts(**(given | changes))
+
+
+def test_a_round_trip_keeps_the_boxes(tmp_path: Path) -> None:
+    for layouts in (example(name="boxes"), in_space(name="boxes"), example(name="boxes", box_rotations=None)):
+        layouts.save(tmp_path / "boxes.npz")
+        assert Layouts.load(tmp_path / "boxes.npz") == layouts
+    assert np.isnan(example().box_rotations[1, 1])
+    assert example().take([1]).box_centers.shape == (1, 2, 2)
+
+
+def test_parts_with_and_without_boxes_are_joined() -> None:
+    discs = Layouts(np.ones((1, 2, 2)), np.ones((1, 2)))
+    plain = example(box_centers=np.zeros((2, 1, 2)), box_half_sizes=np.ones((2, 1, 2)), box_rotations=None)
+    joined = concatenate([discs, example(), plain])
+    assert joined.box_centers.shape == (5, 2, 2) and np.isnan(joined.box_centers[0]).all()
+    assert joined.box_rotations[1].tolist() == [0.3, -0.2] and joined.box_rotations[3, 0] == 0.0
+    assert concatenate([discs, discs]).box_centers is None
+    assert concatenate([plain, plain]).box_rotations is None
+    assert concatenate([in_space(), in_space(box_rotations=None)]).box_rotations[1, 0].tolist() == [1, 0, 0, 0]
+
+
+def test_a_task_has_them_as_obstacles() -> None:
+    task = CAR.task(example())
+    (boxes,) = (c for c in task.problem.constraints if isinstance(c, BoundBoxes))
+    assert boxes.absent.tolist() == [[False, False], [False, True]] and boxes.vehicle_radius.tolist() == [0.06] * 2
+    assert task.problem.start_is_clear.tolist() == [True, True]
+    p = torch.tensor([[[0.2, 0.1]]] * 2, dtype=torch.float64)
+    found = boxes.signed_distance(p, torch.zeros(1, dtype=torch.float64))
+    expected = slow.distance(np.array([0.2, 0.1]), np.array([0.5, 0.5]), np.array([0.3, 0.1]), -0.2) - 0.06
+    assert float(found[0, 0, 1]) == pytest.approx(expected)
+    assert task.problem.goal is not None and task.problem.goal.radius.tolist() == [0.3, 0.3]
+
+
+ERRORS = {
+    "no sides": (dict(box_half_sizes=None), "layouts.box_half_sizes: expected this array beside box_centers, got none"),
+    "no centres": (dict(box_centers=None), "layouts.box_half_sizes: expected none without box_centers, got some"),
+    "layouts": (
+        dict(box_centers=np.zeros((3, 2, 2))),
+        "layouts.box_centers: expected shape (2, K, 2), got",
+    ),
+    "space": (dict(box_centers=np.zeros((2, 2, 3))), "layouts.box_centers: expected shape (2, K, 2)"),
+    "half there": (dict(box_centers=np.array([[[0.0, NAN]] * 2] * 2)), "layouts.box_centers: expected finite rows or"),
+    "sides": (dict(box_half_sizes=np.ones((2, 1, 2))), "layouts.box_half_sizes: expected the shape (2, 2, 2)"),
+    "flat": (dict(box_half_sizes=np.zeros((2, 2, 2))), "layouts.box_half_sizes: expected finite half sides above 0"),
+    "too many": (
+        dict(box_half_sizes=np.ones((2, 2, 2))),
+        "layouts.box_half_sizes: expected NaN where",
+    ),
+    "turns": (dict(box_rotations=np.zeros((2, 2, 4))), "layouts.box_rotations: expected shape (2, 2): angles"),
+    "no angle": (dict(box_rotations=np.full((2, 2), NAN)), "layouts.box_rotations: expected finite angles"),
+    "words": (dict(box_centers="here"), "layouts.box_centers: expected an array of real numbers"),
+}
+
+
+@pytest.mark.parametrize(("changes", "told"), ERRORS.values(), ids=ERRORS.keys())
+def test_malformed_boxes_are_named(changes: dict, told: str) -> None:
+    with pytest.raises(InputError) as caught:
+        example(**changes)
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_quaternion_of_another_length_is_named() -> None:
+    with pytest.raises(InputError, match=r"layouts.box_rotations: expected unit quaternions \[w, x, y, z\]"):
+        in_space(box_rotations=np.ones((1, 1, 4)))
+
+
+def test_an_outline_from_above() -> None:
+    (box,) = outlines(in_space().arrays(), 0)  # turned by 90 degrees about x: 0.6 m wide along y now
+    assert box.height == 1.0
+    assert sorted(map(tuple, box.corners.round(12))) == [(-0.1, -0.3), (-0.1, 0.3), (0.1, -0.3), (0.1, 0.3)]
+    ring = box.grown(0.5)
+    assert ring[0].tolist() == pytest.approx([0.6, ring[0, 1]]) and np.abs(ring).max(axis=0).tolist() == [0.6, 0.8]
+    first, second = outlines(example().arrays(), 0)
+    inner = [slow.distance(c, np.zeros(2), np.array([0.1, 0.2]), 0.3) for c in 0.999 * first.corners]
+    assert max(inner) < 0 and len(second.corners) == 4 and len(outlines(example().arrays(), 1)) == 1
+    assert outlines({"radii": np.zeros((1, 0))}, 0) == ()
+
+
+@pytest.mark.parametrize("layouts", [example(), in_space()], ids=["plane", "space"])
+def test_maps_show_boxes(layouts: Layouts) -> None:
+    d, count = layouts.dimension, layouts.count
+    ends = pd.DataFrame({"layout": range(count), "solver": "gco", "feasible": True, "reached": True})
+    figure = layout_grid(layouts.arrays(), {"gco": np.zeros((count, 3, 2 * d))}, ends)
+    shown = [patch for patch in figure.axes[0].patches if isinstance(patch, Polygon)]
+    assert len(shown) == 2 * (2 if d == 2 else 1)
+    low, high = figure.axes[0].get_xlim()
+    assert all(low <= patch.get_xy()[:, 0].min() and patch.get_xy()[:, 0].max() <= high for patch in shown)
+    plt.close(figure)

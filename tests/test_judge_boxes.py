@@ -1,0 +1,89 @@
+"""The judge and the certificate among boxes, against brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.problems import boxed_batch, random_trajectory
+from tests.reference import boxes as slow
+from torchgco import Boxes, Problem, certify, judge
+from torchgco.certificate import CHORDS
+from torchgco.constraints.boxes import BoundBoxes
+from torchgco.judge import box_clearance
+from torchgco.rollout import open_loop
+
+SAMPLES = 601
+
+
+def made(d: int, N: int = 8) -> tuple[Problem, BoundBoxes, tuple[np.ndarray, ...]]:
+    """Two problems with turned boxes of their own, and what these were made from."""
+    rng = np.random.default_rng(5)
+    plain, _ = boxed_batch(d, B=2, N=N)
+    start = plain.x0[0, :d].numpy()
+    centers, half = start + rng.uniform(-1, 1, (2, 3, d)), rng.uniform(0.05, 0.3, (2, 3, d))
+    turns = rng.normal(size=(2, 3, 4))
+    rotations = turns[..., 0] if d == 2 else turns / np.linalg.norm(turns, axis=-1, keepdims=True)
+    problem = Problem(plain.dynamics, plain.cost, [Boxes(centers, half, 0.1, rotations)], plain.x0, N)
+    boxes = problem.constraints[0]
+    assert isinstance(boxes, BoundBoxes)
+    return problem, boxes, (centers, half, rotations)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_clearances_by_walking_along(d: int) -> None:
+    problem, boxes, parts = made(d)
+    X, _ = random_trajectory(problem, spread=0.5)
+    X[:, 3] = X[:, 2]  # a segment of no length
+    X[:, 5, :d] = 2 * boxes.centers[:, 0] - X[:, 4, :d]  # and one right through a box
+    at_knots, between = box_clearance(boxes, X)
+    for b in range(2):
+        chords = CHORDS[BoundBoxes](boxes.take(torch.tensor([b])), X[b])
+        p, knots, ways = X[b, :, :d].numpy(), np.inf, np.inf
+        for i in range(3):
+            box = tuple(part[b, i] for part in parts)
+            knots = min([knots, *(slow.distance(q, *box) for q in p)])
+            for k in range(problem.N):
+                way = slow.segment_distance(p[k], p[k + 1], *box, samples=SAMPLES)
+                step = np.linalg.norm(p[k + 1] - p[k]) / (SAMPLES - 1)
+                assert way - step - 1e-12 <= float(chords[k, i]) + 0.1 <= way + 1e-12
+                ways = min(ways, way)
+        assert float(at_knots[b]) == pytest.approx(knots - 0.095, abs=1e-12)
+        assert ways - 0.095 - 0.01 <= float(between[b]) <= ways - 0.095 + 1e-12
+        assert float(between[b]) < 0
+
+
+def test_a_way_through_a_wall_is_seen_between_knots_alone() -> None:
+    plain, _ = boxed_batch(2, B=1, N=1)
+    wall = Boxes([[0.0, 0.0]], [[0.01, 5.0]], 0.06)
+    problem = Problem(plain.dynamics, plain.cost, [wall], plain.x0, 1)
+    (boxes,) = problem.constraints
+    X = plain.x0.unsqueeze(1).repeat(1, 2, 1)
+    X[0, 1, 0] = 1.0
+    at_knots, between = box_clearance(boxes, X)
+    assert float(at_knots) == pytest.approx(0.99 - 0.057) and float(between) == pytest.approx(-0.01 - 0.057)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_verdict_and_a_certificate_among_boxes_and_spheres(d: int) -> None:
+    problem, U = boxed_batch(d, B=3, N=10)
+    X = open_loop(problem.dynamics, problem.x0, U)
+    verdict, certificate = judge(problem, U), certify(problem, X, U)
+    assert bool(torch.isfinite(verdict.clearance).all()) and bool((verdict.clearance <= verdict.clearance_knots).all())
+    touch = 0.05 * problem.constraints[0].vehicle_radius
+    assert bool((certificate.clearance <= verdict.clearance - touch + 1e-9).all())
+    gone = U.clone()
+    gone[1] = torch.nan
+    assert judge(problem, gone).feasible.tolist()[1] is False
+    alone = judge(problem.take(torch.tensor([2])), U[2:])
+    assert float(alone.clearance) == float(verdict.clearance[2])
+
+
+def test_boxes_that_are_all_absent_leave_room_without_end() -> None:
+    plain, U = boxed_batch(2, B=1, N=4)
+    nowhere = Boxes([[np.nan, np.nan]], [[np.nan, np.nan]], 0.06)
+    problem = Problem(plain.dynamics, plain.cost, [nowhere], plain.x0, 4)
+    assert float(judge(problem, U).clearance) == float("inf")
+    X = open_loop(problem.dynamics, problem.x0, U)
+    assert float(certify(problem, X, U).clearance) == float("inf")

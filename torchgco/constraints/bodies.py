@@ -1,0 +1,92 @@
+"""What all kinds of obstacles have in common: distances of the vehicle from them, as solver, search and polish ask."""
+
+from __future__ import annotations
+
+from typing import ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint, Sense
+from torchgco.constraints.cuboids import Cuboids
+
+CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
+
+
+class Inflated(NamedTuple):
+    """Static obstacles grown by the vehicle's radius, in the forms that the roadmap knows."""
+
+    centers: Tensor  # (B, M, d) of spheres, m
+    distances: Tensor  # (B, M): r_obs + r_veh, m; negative where absent
+    boxes: Cuboids | None = None
+
+
+class Obstacles(Constraint):
+    """Obstacles that the vehicle's position keeps clear of, M per problem, once bound.
+
+    A kind of obstacles is a subclass. Beside the methods of a constraint it defines what is abstract here. Distances
+    count from the full surface, the obstacle's own grown by the vehicle's radius: positive outside, negative inside,
+    infinite where an obstacle is absent. The judge and the certificate measure distances by code of their own, which a
+    new kind joins through `judge.CLEARANCES` and `certificate.CHORDS`.
+    """
+
+    sense: ClassVar[Sense] = "inequality"
+    geometric: ClassVar[bool] = True
+
+    centers: Tensor  # (B, M, d) at t = 0, m
+    absent: Tensor  # (B, M) bool
+    vehicle_radius: Tensor  # (B,), m
+    position: slice
+    dt: float
+
+    @property
+    def moving(self) -> bool:
+        """Whether any of them may move."""
+        return False
+
+    @property
+    def sizes(self) -> Tensor:
+        """How deep the deepest point lies beneath the full surface, (B, M), m; 0 where absent. Guidance's scale."""
+        raise NotImplementedError
+
+    @property
+    def margins(self) -> Tensor:
+        """The length (B, M), m, of which bodies touch at 1 - CONTACT_FACTOR beneath the full surface."""
+        raise NotImplementedError
+
+    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
+        """Distances (B, K, M) of points p (B, K, d) at times t (K,), s, m."""
+        raise NotImplementedError
+
+    def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
+        """Smallest distances (B, E, M) of the straight segments from a to b (B, E, d), obstacles as at t = 0, m."""
+        raise NotImplementedError
+
+    def inflated(self) -> Inflated | None:
+        """The obstacles as the roadmap takes them; None: it can't, and no path is sought."""
+        return None
+
+    def chord_clearance(self, X: Tensor) -> Tensor:
+        """Smallest distance (B,) from the straight ways between knots to where bodies touch, m; negative in contact.
+
+        Infinite where there is no obstacle. Obstacles that move override this.
+        """
+        p = X[..., self.position]
+        touch = (1.0 - CONTACT_FACTOR) * self.margins
+        return least(self.segment_clearance(p[:, :-1], p[:, 1:]) + touch.unsqueeze(1))
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        """False where the vehicle touches an obstacle at the start, (B,)."""
+        distance = self.signed_distance(x0[:, None, self.position], x0.new_zeros(1))[:, 0]
+        return (distance >= (CONTACT_FACTOR - 1.0) * self.margins).all(-1)
+
+    def times(self, X: Tensor) -> Tensor:
+        """t = k dt (K,) at the constraint's knots, s."""
+        return torch.arange(X.shape[1], dtype=X.dtype, device=X.device)[self.knots] * self.dt
+
+
+def least(distances: Tensor) -> Tensor:
+    """The smallest of distances (B, K, M) of each problem, (B,); infinite where there is none."""
+    if distances.shape[1] == 0 or distances.shape[2] == 0:
+        return distances.new_full(distances.shape[:1], torch.inf)
+    return distances.flatten(1).amin(-1)

@@ -1,0 +1,209 @@
+"""Boxes as obstacles: aligned with the axes or turned, in the plane and in space, at rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.constraints.bodies import Inflated, Obstacles
+from torchgco.constraints.cuboids import Cuboids, excess, segment_distance, signed_distance
+from torchgco.constraints.obstacles import FAR, per_problem
+from torchgco.errors import InputError
+from torchgco.shapes import Dimensions, check_shape, tensor
+
+UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
+
+
+@dataclass(frozen=True)
+class Boxes(Constraint):
+    """2 s (r_veh - distance of p_k from box i) <= 0 for every box i.
+
+    The distance is that from the surface, negative inside. The factor with the size s = r_veh + the smallest half side
+    makes c a square of lengths with the slope of a sphere of that size: penalties mean the same for both kinds. Rows
+    hold at the knots; between two of them a path may cut a corner, which is as round as the vehicle is wide, by up to
+    the square of its step over 8 r_veh.
+
+    Args:
+        centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent boxes (padding); M may be 0, and an
+            empty list stands for (0, d).
+        half_sizes: as centers: half the lengths of the sides, m, above 0; NaN where the centre is.
+        vehicle_radius: number or (B,), m. Bodies touch at CONTACT_FACTOR of it from the surface.
+        rotations: from the box's sides to the axes of space. In the plane angles (M,) or (B, M), rad; in space unit
+            quaternions [w, x, y, z], (M, 4) or (B, M, 4). None: sides along the axes.
+        knots: default 1..N.
+
+    Raises:
+        InputError: on `Problem(...)`: wrong shapes, NaN centre with finite sides, sides that aren't above 0,
+            quaternions of another length than 1, dynamics without a position in the boxes' plane or space.
+    """
+
+    centers: Any
+    half_sizes: Any
+    vehicle_radius: Any = 0.0
+    rotations: Any = None
+    knots: Any = None
+
+    sense: ClassVar[Sense] = "inequality"
+    geometric: ClassVar[bool] = True
+
+    def bind(self, dims: Dimensions) -> Constraint:
+        at = dims.position
+        if at is None or at.stop - at.start not in (2, 3):
+            got = "dynamics without one" if at is None else f"{at.stop - at.start}-D"
+            raise InputError("boxes.centers", "dynamics with a position in 2-D or 3-D", got)
+        centers = tensor(self.centers, "boxes.centers", dims.like)
+        half = tensor(self.half_sizes, "boxes.half_sizes", dims.like)
+        d = at.stop - at.start
+        centers, half = (z.reshape(0, d) if tuple(z.shape) == (0,) else z for z in (centers, half))
+        centers = per_problem(centers, "boxes.centers", 3, dims)
+        check_shape(centers, (dims.B, "M", d), "boxes.centers")
+        M = centers.shape[1]
+        half = per_problem(half, "boxes.half_sizes", 3, dims)
+        check_shape(half, (dims.B, M, d), "boxes.half_sizes")
+        absent = torch.isnan(centers).all(-1)
+        if bool((absent.unsqueeze(-1) != torch.isnan(half)).any()) or not _finite(centers[~absent]):
+            raise InputError("boxes.half_sizes", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
+        if not bool((half[~absent] > 0).all()) or not _finite(half[~absent]):
+            raise InputError("boxes.half_sizes", "finite half sides above 0 m", float(half[~absent].min()))
+        vehicle = tensor(self.vehicle_radius, "boxes.vehicle_radius", dims.like).reshape(-1, 1)
+        if vehicle.shape[0] not in (1, dims.B) or not bool((vehicle >= 0).all()):
+            raise InputError(
+                "boxes.vehicle_radius", f"a number of at least 0 m, or {dims.B}", vehicle.flatten().tolist()
+            )
+        axes = _axes(self.rotations, absent, d, dims)
+        half = torch.where(absent.unsqueeze(-1), 1.0, half)
+        radius = vehicle.expand(dims.B, 1)
+        knots = slice(1, dims.N + 1) if self.knots is None else self.knots
+        return BoundBoxes(
+            torch.where(absent.unsqueeze(-1), 0.0, centers), half, axes, absent, radius[:, 0].contiguous(),
+            torch.where(absent, 0.0, radius + half.amin(-1)), resolve_knots(knots, dims.N, "boxes.knots", half.device),
+            at, dims.dt or 0.0,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class BoundBoxes(Obstacles):
+    """Boxes shaped for their problem."""
+
+    centers: Tensor  # (B, M, d)
+    half_sizes: Tensor  # (B, M, d)
+    axes: Tensor  # (B, M, d, d): row i is the direction of side i
+    absent: Tensor  # (B, M) bool
+    vehicle_radius: Tensor  # (B,)
+    depths: Tensor  # (B, M): r_veh + the smallest half side; 0 where absent
+    knots: Any
+    position: slice
+    dt: float
+
+    batched: ClassVar[tuple[str, ...]] = ("centers", "half_sizes", "axes", "absent", "vehicle_radius", "depths")
+
+    def bind(self, dims: Dimensions) -> Self:
+        return self
+
+    @property
+    def sizes(self) -> Tensor:
+        return self.depths
+
+    @property
+    def margins(self) -> Tensor:
+        return torch.where(self.absent, 0.0, self.vehicle_radius.unsqueeze(-1))
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self._rows(X[:, self.knots, self.position])
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        return self._rows(x[..., self.position])
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        n, at = X.shape[-1], self.position
+        cp = -2.0 * self.depths[:, None, :, None] * self._normals(X[:, self.knots, at])
+        gradient = (g.unsqueeze(-2) @ cp).squeeze(-2)
+        H[:, self.knots, at, n] += gradient
+        H[:, self.knots, n, at] += gradient
+        H[:, self.knots, at, at] += (h.unsqueeze(-1) * cp).mT @ cp
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """Depth beneath the full surface, (B, K, M), m."""
+        p = X[:, self.knots, self.position]
+        return (-self.signed_distance(p, self.times(X))).clamp(min=0.0)
+
+    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
+        return torch.where(self.absent.unsqueeze(1), torch.inf, self._outside(p))
+
+    def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
+        boxes = self._cuboids()
+        along = boxes.local([(b - a)[..., None, j] for j in range(a.shape[-1])])
+        distance = segment_distance(boxes.seen_from(a), along, boxes.halves()) - self.vehicle_radius.view(-1, 1, 1)
+        return torch.where(self.absent.unsqueeze(1), torch.inf, distance)
+
+    def inflated(self) -> Inflated:
+        return Inflated(self.centers[:, :0], self.depths[:, :0], self._cuboids())
+
+    def _cuboids(self) -> Cuboids:
+        radius = torch.where(self.absent, FAR, self.vehicle_radius.unsqueeze(-1))
+        return Cuboids(self.centers, self.axes, self.half_sizes, radius)
+
+    def _outside(self, p: Tensor) -> Tensor:
+        """Distances (B, K, M) of points p (B, K, d) from the full surfaces, as if none were absent."""
+        boxes = self._cuboids()
+        return signed_distance(boxes.seen_from(p), boxes.halves()) - self.vehicle_radius.view(-1, 1, 1)
+
+    def _rows(self, p: Tensor) -> Tensor:
+        """c (B, K, M) at points (B, K, d); an absent box is c = -1 everywhere."""
+        return torch.where(self.absent.unsqueeze(1), -1.0, -2.0 * self.depths.unsqueeze(1) * self._outside(p))
+
+    def _normals(self, p: Tensor) -> Tensor:
+        """Unit vectors (B, K, M, d) in which the distance grows: from the nearest point, inside to the nearest side."""
+        boxes = self._cuboids()
+        local, half = boxes.seen_from(p), boxes.halves()
+        away = torch.stack(excess(local, half), dim=-1)
+        square = away.square().sum(-1, keepdim=True)
+        outside = away / torch.where(square > 0, square, 1.0).sqrt()
+        place = torch.stack(local, dim=-1)
+        inner = place.abs() - torch.stack(half, dim=-1)
+        # The first of the nearest sides; at the centre, where no side is nearer, the positive one.
+        side = torch.nn.functional.one_hot(inner.argmax(-1), place.shape[-1]).to(p.dtype)
+        inside = torch.where(place < 0, -side, side)
+        normal = torch.where(square > 0, outside, inside)
+        return (self.axes.unsqueeze(1) * normal.unsqueeze(-1)).sum(-2)
+
+
+def _finite(values: Tensor) -> bool:
+    return bool(torch.isfinite(values).all())
+
+
+def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
+    """The directions (B, M, d, d) of the sides; those of absent boxes are the axes of space."""
+    straight = torch.eye(d, dtype=dims.like.dtype, device=dims.like.device).expand(*absent.shape, d, d)
+    if rotations is None:
+        return straight.contiguous()
+    if d == 2:
+        angle = per_problem(rotations, "boxes.rotations", 2, dims)
+        check_shape(angle, tuple(absent.shape), "boxes.rotations")
+        cos, sin = angle.cos(), angle.sin()
+        axes = torch.stack((torch.stack((cos, sin), dim=-1), torch.stack((-sin, cos), dim=-1)), dim=-2)
+    else:
+        turns = per_problem(rotations, "boxes.rotations", 3, dims)
+        check_shape(turns, (*absent.shape, 4), "boxes.rotations")
+        length = turns.square().sum(-1, keepdim=True).sqrt()
+        wrong = ((length - 1.0).abs() > UNIT_WITHIN).squeeze(-1) & ~absent
+        if bool(wrong.any()):
+            raise InputError("boxes.rotations", "unit quaternions [w, x, y, z]", turns[wrong][0].tolist())
+        axes = _from_quaternions(turns / length)
+    axes = torch.where(absent[..., None, None], straight, axes)
+    if not _finite(axes):
+        raise InputError("boxes.rotations", "finite numbers for every box that is there", "NaN or infinity")
+    return axes.contiguous()
+
+
+def _from_quaternions(turns: Tensor) -> Tensor:
+    """The images (..., 3, 3), as rows, of the three axes under turns [w, x, y, z] (..., 4)."""
+    w, x, y, z = turns.unbind(-1)
+    first = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+    second = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
+    third = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    return torch.stack([torch.stack(row, dim=-1) for row in (first, second, third)], dim=-2)

@@ -1,0 +1,67 @@
+/* Distances from boxes grown by a radius: constraints/cuboids.py in C, with the same operations in the same order.
+
+   The numbers of a box: its centre (DIM), the directions of its sides (DIM, DIM), half of them (DIM), the radius, which is
+   negative where there is no box. */
+
+#include <float.h>
+#include <math.h>
+
+#define BOX_NUMBERS (DIM * DIM + 2 * DIM + 1)
+#define BOX_HALF(box) ((box) + DIM + DIM * DIM)
+#define BOX_RADIUS(box) ((box)[BOX_NUMBERS - 1])
+
+/* Coordinates of a vector along the sides. */
+static inline void along_sides(const double *box, const double *v, double *local) {
+    const double *axes = box + DIM;
+    for (int i = 0; i < DIM; i++) {
+        local[i] = axes[i * DIM] * v[0];
+        for (int j = 1; j < DIM; j++) local[i] += axes[i * DIM + j] * v[j];
+    }
+}
+
+static inline double beyond(double x, double half) {
+    double held = x > -half ? x : -half;
+    return x - (held < half ? held : half);
+}
+
+/* Squared distance of a point, and half its slope where the point moves on along a segment. */
+static inline double square_at(const double *half, const double *begin, const double *along, double share, double *slope) {
+    double square = 0.0, sum = 0.0;
+    for (int i = 0; i < DIM; i++) {
+        double away = beyond(begin[i] + share * along[i], half[i]);
+        square += away * away;
+        sum += away * along[i];
+    }
+    *slope = sum;
+    return square;
+}
+
+static double square_from_box(const double *box, const double *p) {
+    double seen[DIM], local[DIM], none[DIM] = {0.0}, slope;
+    for (int i = 0; i < DIM; i++) seen[i] = p[i] - box[i];
+    along_sides(box, seen, local);
+    return square_at(BOX_HALF(box), local, none, 0.0, &slope);
+}
+
+/* Smallest squared distance of the segment that begins at a point and goes a step. */
+static inline double square_of_segment(const double *box, const double *start, const double *step) {
+    double seen[DIM], begin[DIM], along[DIM], low = 0.0, high = 1.0, falls, rises, found;
+    const double *half = BOX_HALF(box);
+    for (int i = 0; i < DIM; i++) seen[i] = start[i] - box[i];
+    along_sides(box, seen, begin);
+    along_sides(box, step, along);
+    square_at(half, begin, along, low, &falls);
+    square_at(half, begin, along, high, &rises);
+    for (int i = 0; i < DIM; i++)
+        for (int side = -1; side <= 1; side += 2) {
+            double share = (side * half[i] - begin[i]) / (along[i] == 0.0 ? 1.0 : along[i]);
+            share = share < 0.0 ? 0.0 : share > 1.0 ? 1.0 : share;
+            square_at(half, begin, along, share, &found);
+            int left = found < 0.0 && share > low, right = found >= 0.0 && share < high;
+            low = left ? share : low, falls = left ? found : falls;
+            high = right ? share : high, rises = right ? found : rises;
+        }
+    double change = rises - falls, part = -falls / (change > DBL_MIN ? change : DBL_MIN);
+    part = part < 0.0 ? 0.0 : part > 1.0 ? 1.0 : part;
+    return square_at(half, begin, along, falls < 0.0 ? low + (high - low) * part : low, &found);
+}
