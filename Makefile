@@ -17,7 +17,7 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constrain
 RUNTIME := $(VENV)/.runtime
 DEV := $(VENV)/.dev
 PEERS := $(VENV)/.peers
-# The wheel of acados brings a CasADi that would stand before the real one: an environment without torchgco.
+# The wheel of acados brings a CasADi that would shadow the real one: an environment without torchgco.
 ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
@@ -65,7 +65,7 @@ clean:
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-# The environment is a need of the order only: pip touches its folders with every install.
+# An order-only prerequisite: pip touches its folders with every install.
 $(RUNTIME): pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) -e .
 	touch $@

@@ -1,8 +1,8 @@
-"""python -m benchmarks.failures: why the paper's guidance fails where it does, counted, with one picture a cause.
+"""python -m benchmarks.failures: why the paper's guidance fails where it does, counted, with one picture per cause.
 
 `gco_paper` flies the public layouts while a witness notes, after every inner solve, what guidance saw and what it
-answered. Every layout whose goal isn't reached gets one cause, told from its last outer iterations; the table and the
-pictures go to benchmarks/failures.md and failures.png.
+answered. Every layout whose goal isn't reached gets one cause, derived from its last outer iterations; the table and
+the pictures go to benchmarks/failures.md and failures.png.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from torchgco.guidance.gco import GCO
 from torchgco.problem import Problem
 
 HERE = Path(__file__).resolve().parent
-LAST = 3  # outer iterations that tell the cause
+LAST = 3  # outer iterations that decide the cause
 CAUSES = {
     "thrown away": "the penalty has outgrown the model: the last iterate costs over five times the first",
     "silent": "spheres are touched, but no two at a knot: J is empty, guidance silent (dead-centre, or spoilt before)",
@@ -114,7 +114,7 @@ def _crosses(problem: Problem, path: Tensor, plan: Tensor) -> bool:
     toward = spheres.centers[0].unsqueeze(1) - path
     share = (toward * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
     off = (toward - share.unsqueeze(-1) * along).norm(dim=-1)
-    return bool(((share > 0) & (share < 1) & (off < 0.25 * spheres.distances[0].unsqueeze(1))).any())
+    return bool(((share > 0) & (share < 1) & (off < 0.25 * spheres.inflated_radii[0].unsqueeze(1))).any())
 
 
 def cause(history: pd.DataFrame, feasible: bool, R: float) -> str:
@@ -146,7 +146,7 @@ def fly(family: Family, count: int, seed: int) -> tuple[pd.DataFrame, dict[str, 
     notes, spheres = pd.concat(witness.rows).sort_values("outer"), task.problem.geometric[0]
     rows, examples = [], {}
     for i in range(task.problem.B):
-        name, distances = None, spheres.distances[i]
+        name, distances = None, spheres.inflated_radii[i]
         if not verdict.reached[i]:
             R = float(distances[distances > 0].mean())
             name = cause(notes[notes.id == i], bool(verdict.feasible[i]), R)

@@ -23,7 +23,7 @@ class Example:
     family: str
     layout: int
     centers: Tensor  # (M, d)
-    distances: Tensor  # (M,) r_obs + r_veh
+    inflated_radii: Tensor  # (M,) r_obs + r_veh
     path: Tensor  # (N+1, d): what was returned
     plan: Tensor | None  # (N+1, d): the last sampled plan, where there was one
     goal: Tensor  # (d,)
@@ -31,8 +31,8 @@ class Example:
 
 def _frame(ax: Axes, example: Example) -> None:
     """Start, goal and obstacles with some room: a plan that flies off is cut."""
-    here = example.distances > 0
-    reach = example.distances[here].unsqueeze(-1)
+    here = example.inflated_radii > 0
+    reach = example.inflated_radii[here].unsqueeze(-1)
     centers = example.centers[here, :2]
     points = torch.cat((centers - reach, centers + reach, example.path[:1, :2], example.goal[None, :2]))
     low, high = points.amin(0), points.amax(0)
@@ -45,7 +45,7 @@ def picture(examples: dict[str, Example], file: Path) -> Path:
     """A panel for every cause."""
     figure, axes = panels(len(examples), 2, (4.2, 2.2))
     for ax, (cause, example) in zip(axes, examples.items(), strict=True):
-        for center, distance in zip(example.centers, example.distances, strict=True):
+        for center, distance in zip(example.centers, example.inflated_radii, strict=True):
             if distance > 0:
                 ax.add_patch(Circle(center[:2].tolist(), float(distance), facecolor="#E4DFD4", edgecolor=FAINT, lw=0.5))
         if example.plan is not None:

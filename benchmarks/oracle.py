@@ -1,10 +1,10 @@
 """python -m benchmarks.oracle: the best cost known on every layout, and whether a path is known at all.
 
-Minutes a layout, offline. It flies the solvers of SEARCH, and takes the cheapest sound path of any: at the goal, within
-1 mm of every constraint, clear of the obstacles between the knots. The peers' costs on the public layouts come from
-data/reference.csv. The result is written as `best_cost` into the files of benchmarks/data, where the judge of `success`
-reads it and nothing else; a cost that stands there is only ever lowered, and NaN means that no path is known. With
-`--fresh N` the layouts are the first N drawn under `--seed`, kept with their costs in benchmarks/data/drawn.
+Minutes per layout, offline. It flies the solvers of SEARCH, and takes the cheapest sound trajectory of any: at the
+goal, within 1 mm of every constraint, clear of the obstacles between the knots. The peers' costs on the public layouts
+come from data/reference.csv. The result is written as `best_cost` into the files of benchmarks/data, where the judge of
+`success` reads it and nothing else; a cost that stands there is only ever lowered, and NaN means that no path is known.
+With `--fresh N` the layouts are the first N drawn under `--seed`, kept with their costs in benchmarks/data/drawn.
 """
 
 from __future__ import annotations

@@ -36,9 +36,9 @@ WATCHED = {
     "caught": "torchgco.search.restarts:StopWhenCaught.update",  # (guidance, problem, X, ...) -> Advice
     "graph": "torchgco.native.roadmap:NativeSearch.graph",  # -> Graph
     "classes": "torchgco.search.homotopy:_wind_alike",  # (paths, scene) -> which paths are of one class
-    "tracked": "torchgco.search.follow:track",  # -> Candidates
-    "relaxed": "torchgco.search.follow:relax",  # -> Candidates, which of them are sound
-    "refined": "torchgco.search.follow:refine",  # (options, candidates, sound) -> Candidates, multipliers, best
+    "tracked": "torchgco.search.paths:PathProposals.track",  # -> Candidates
+    "relaxed": "torchgco.search.paths:PathProposals.relax",  # -> Candidates, which of them are sound
+    "refined": "torchgco.search.paths:PathProposals.refine",  # (self, candidates, sound) -> Candidates, ..., best
 }
 Calls = dict[str, list[tuple[tuple[Any, ...], Any]]]
 

@@ -125,7 +125,7 @@ def reference_of(problem: Problem, b: int) -> ReferenceProblem:
         u_ref=cost.u_ref[0, 0].numpy(),
         position=(0, 1) if planar else (0, 1, 2),
         centers=spheres.centers[b].numpy()[present],
-        contact=spheres.distances[b].numpy()[present],
+        contact=spheres.inflated_radii[b].numpy()[present],
         u_lower=bounds.lower[0].numpy(),
         u_upper=bounds.upper[0].numpy(),
     )

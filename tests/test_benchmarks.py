@@ -171,7 +171,7 @@ def test_the_model_for_pytorch_mppi_is_the_planner_s_own(tmp_path: Path) -> None
     after = model.dynamics(x.float(), u.float())
     torch.testing.assert_close(after.double(), problem.dynamics.step(x, u), rtol=1e-4, atol=1e-4)
     spheres = problem.constraints[0]
-    inside = (x[:, None, :3] - spheres.centers[0]).norm(dim=-1) < spheres.distances[0]
+    inside = (x[:, None, :3] - spheres.centers[0]).norm(dim=-1) < spheres.inflated_radii[0]
     assert bool(inside.any()) and torch.equal(model.hits(x.float()).long(), inside.sum(1))
     cost = model.running_cost(x.float(), u.float()).double() - 1e8 * inside.sum(1)
     clear = ~inside.any(1)  # where no collision takes the digits

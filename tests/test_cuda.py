@@ -19,7 +19,7 @@ def test_a_device_gives_what_the_processor_gives() -> None:
         [
             Spheres(
                 torch.where(spheres.absent.unsqueeze(-1), torch.nan, spheres.centers).cuda(),
-                torch.where(spheres.absent, torch.nan, spheres.distances - 0.06).cuda(),
+                torch.where(spheres.absent, torch.nan, spheres.inflated_radii - 0.06).cuda(),
                 0.06,
             ),
             ControlBounds(bounds.lower.cuda(), bounds.upper.cuda()),

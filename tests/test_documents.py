@@ -1,4 +1,7 @@
-"""Links lead to files and headings that exist, Python runs, and commands are accepted by the programs they call."""
+"""Links lead to files and headings that exist, Python runs, and commands are accepted by the programs they call.
+
+All Python blocks of a page share one namespace and run in order; no two pages share one.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,23 @@ import importlib.util
 import itertools
 import re
 import shlex
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
+from torch import Tensor
 
 from benchmarks import oracle, quality
 from benchmarks.speed import __main__ as speed
+from torchgco import Problem
+from torchgco.certificate import CHORDS
+from torchgco.constraints import Constraint
 from torchgco.experiments.build import compose_config
+from torchgco.judge import CLEARANCES
 from torchgco.native.compiler import find_compiler
+from torchgco.native.dispatch import EagerWarning
 
 ROOT = Path(__file__).resolve().parents[1]
 GENERATED = ROOT / "docs" / "api"
@@ -133,14 +144,68 @@ def test_every_command_is_accepted(page: Path) -> None:
         accept(command)
 
 
+def run(page: Path) -> dict[str, object]:
+    """Run the Python blocks of a page in order; the names that they define, which a later block may use."""
+    names: dict[str, object] = {"__name__": page.name}
+    for language, text in blocks(page):
+        if language == PYTHON:
+            # Without the future statement of this file, as a reader's own file runs it.
+            exec(compile(text, page.name, "exec", dont_inherit=True), names)
+    return names
+
+
+@pytest.fixture
+def registries() -> Iterator[None]:
+    """What a page adds to the registries of obstacles is taken out again."""
+    before = [(registry, dict(registry)) for registry in (CLEARANCES, CHORDS)]
+    yield
+    for registry, entries in before:
+        registry.clear()
+        registry.update(entries)
+
+
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if any(language == PYTHON for language, _ in blocks(page))], ids=name_of
 )
-def test_every_python_block_runs(page: Path) -> None:
-    names: dict[str, object] = {}  # a later block may use what an earlier one defines
-    for language, text in blocks(page):
-        if language == PYTHON:
-            exec(text, names)
+def test_every_python_block_runs(page: Path, registries: None) -> None:
+    with warnings.catch_warnings():
+        if find_compiler() is not None:
+            warnings.simplefilter("error", EagerWarning)
+        names = run(page)
+    for problem in names.values():
+        for part in problem.constraints if isinstance(problem, Problem) else ():
+            if type(part).__module__ == page.name:  # natively, nothing calls `accumulate`
+                check_expansion(problem, part)
+
+
+def check_expansion(problem: Problem, part: Constraint) -> None:
+    """`accumulate` against autodiff of `value`."""
+    B, N, n = problem.B, problem.N, problem.n
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=problem.x0.dtype)
+
+    X, U = normal(B, N + 1, n), normal(B, N, problem.m)
+    c = part.value(X, U)
+    g, h = normal(*c.shape), normal(*c.shape)
+    H = X.new_zeros(B, N + 1, n + 1 + problem.m, n + 1 + problem.m)
+    part.accumulate(X, U, g, h, H)
+    slopes = torch.autograd.functional.jacobian(lambda X, U: part.value(X, U).sum(0), (X, U))  # (K, p, B, N+1, n), ...
+    z = torch.zeros(*c.shape[1:], B, N + 1, n + 1 + problem.m, dtype=X.dtype)
+    z[..., :n], z[..., :-1, n + 1 :] = slopes
+    gradient, product = torch.einsum("bkp,kpbts->bts", g, z), torch.einsum("bkp,kpbts,kpbtr->btsr", h, z, z)
+    product[..., n] += gradient
+    product[..., n, :] += gradient
+    torch.testing.assert_close(H, product)
+
+
+def test_contributing_shows_every_addition() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    adding = text[text.index("\n## Adding\n") : text.index("\n## Habits\n")]
+    shown = {part.splitlines()[0]: part.count("```python\n") for part in adding.split("\n### ")[1:]}
+    kinds = ("A model", "A cost", "A constraint", "A kind of obstacle", "A guidance", "A solver", "A scenario")
+    assert shown == dict.fromkeys(kinds, 1)
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="the figures watch native kernels")

@@ -1,4 +1,4 @@
-"""Why gco_paper fails: the causes told from synthetic histories, and the whole run at its smallest."""
+"""Why gco_paper fails: the causes derived from synthetic histories, and the whole run at its smallest."""
 
 from __future__ import annotations
 

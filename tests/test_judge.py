@@ -23,7 +23,7 @@ def sampled_clearance(problem: Problem, X: np.ndarray, b: int, per_segment: int 
             continue
         o = spheres.centers[b, i].numpy()
         v = np.zeros_like(o) if spheres.velocities is None else spheres.velocities[b, i].numpy()
-        R = 0.95 * float(spheres.distances[b, i])
+        R = 0.95 * float(spheres.inflated_radii[b, i])
         for k in range(problem.N + 1):
             p = X[k, : len(o)]
             at = min(at, np.linalg.norm(p - o - v * k * dt) - R)

@@ -125,7 +125,7 @@ def test_phr_value_is_continuous_where_a_row_lets_go() -> None:
     )
     U = torch.zeros(1, 3, 2, dtype=torch.float64)
     # Along a ray away from the disc, c passes -lam / mu.
-    R = float(spheres.distances[0, 0])
+    R = float(spheres.inflated_radii[0, 0])
     edge = (R**2 + lam / mu) ** 0.5
     values = []
     for gap in (edge - 1e-7, edge + 1e-7):

@@ -1,4 +1,4 @@
-"""acados as a peer: what its worker is told says what the problem says, and what it answers is judged like the rest."""
+"""acados as a peer: its worker reads what the problem says, and its answers are judged like all others."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_a_worker_that_fails_is_a_row_and_no_end(tmp_path: Path, monkeypatch) ->
 def test_acados_finds_what_fatrop_finds(tmp_path: Path) -> None:
     """And again from what was compiled; one problem's numbers don't stay for the next."""
     problem, U0 = planar_batch(B=3, N=30, obstacles=3, seed=2)
-    rows = torch.tensor([1, 2])  # around the first one's obstacles there are two ways
+    rows = torch.tensor([1, 2])  # around the first one's obstacles there are two paths
     first = acados_peer.fly(problem, *guess(problem, U0), tmp_path)
     solution = CasADiSolver("fatrop").solve(problem, U0)
     X = open_loop(problem.dynamics, problem.x0, first.U)

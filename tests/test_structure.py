@@ -49,6 +49,13 @@ def imports_of(path: Path) -> set[str]:
     return names - {""}
 
 
+def modules_of(path: Path) -> set[str]:
+    """The same with every imported name, which may be a module itself."""
+    froms = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom) and node.module]
+    named = {f"{node.module}.{alias.name}" for node in froms for alias in node.names} | {node.module for node in froms}
+    return {name.removeprefix("torchgco.") for name in named if name.startswith("torchgco.")}
+
+
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_imports_go_one_way(path: Path) -> None:
     name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
@@ -59,6 +66,15 @@ def test_imports_go_one_way(path: Path) -> None:
         other, other_room = floor_of(imported)
         same_house = {room.split(".")[0], other_room.split(".")[0]} <= {"dynamics", "costs", "constraints"}
         assert other < level or other_room == room or same_house, f"{name} imports {imported}"
+
+
+def test_no_files_import_each_other_in_a_circle() -> None:
+    """Imports for type checkers count, too."""
+    names = {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in MODULES}
+    known = {name: modules_of(path) & set(names) - {name} for name, path in names.items()}
+    while leaves := [name for name, others in known.items() if not others]:
+        known = {name: others - set(leaves) for name, others in known.items() if name not in leaves}
+    assert not known
 
 
 def test_solvers_do_not_know_guidance_and_problems_know_no_solver() -> None:
@@ -104,6 +120,11 @@ def test_a_model_is_recorded_without_what_takes_seconds_to_load() -> None:
 def test_instantiate_is_called_in_one_place() -> None:
     places = [path.name for path in PACKAGE.rglob("*.py") if "utils.instantiate(" in path.read_text()]
     assert places == ["build.py"]
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.[ch]")), ids=lambda p: p.name)
+def test_files_in_c_fit_their_reader(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= 300
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))

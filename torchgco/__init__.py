@@ -58,8 +58,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# On some processors the library behind PyTorch's products picks a kernel by where in memory a matrix lies, and so by
-# its place in the batch; an element's bits would depend on its companions. Read at the library's first use.
+# On some processors the library behind PyTorch's matrix products picks a kernel by a matrix's address in memory, and
+# so by its place in the batch: a problem's bits would depend on its companions. Read at the library's first use.
 os.environ.setdefault("MKL_CBWR", "AUTO")
 
 

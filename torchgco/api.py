@@ -27,7 +27,7 @@ def solve(
         U0: initial controls (B, N, m). Default: those of `warm`, else the cost's reference, else zero.
         solver: default: `presets.gco`, the settings of the configuration `gco`.
         seed, ids: key the random draws (int64 (B,), default 0..B-1).
-        warm: a former solution of problems of this form; its controls and multipliers are where the solve starts.
+        warm: an earlier solution of problems of this form; the solve starts from its controls and multipliers.
 
     Raises:
         InputError: U0, ids or warm don't fit the problem.

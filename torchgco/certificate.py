@@ -1,8 +1,8 @@
-"""What a returned plan proves of itself: it obeys its dynamics, it clears the obstacles between the knots too, it keeps
-its bounds, and it is a stationary point, or by how much each of these fails.
+"""What can be proved of a returned trajectory: that it obeys its dynamics, clears the obstacles between the knots too,
+keeps its bounds, and is a stationary point; or by how much it fails to.
 
-Nothing here is the solvers': derivatives come from autograd through the model's own `step`, multipliers from a
-least-squares fit of their own. The words have one meaning everywhere (README, "What the words mean").
+No code is shared with the solvers: derivatives come from autograd through the model's own `step`, multipliers from a
+least-squares fit of their own. The words have one meaning everywhere (docs/words.md).
 """
 
 from __future__ import annotations
@@ -37,37 +37,37 @@ class Certificate:
     """One value per problem, (B,); NaN where nothing was asked or nothing can be said."""
 
     # Largest |x_{k+1} - step(x_k, u_k)| and |X_0 - x_0| over all states, in their units. Rounding alone (some 1e-12 in
-    # float64) proves that X is what U does in the planning model; it says nothing of how good that model is.
+    # float64) proves that X is what U does in the planning model; it says nothing about how good that model is.
     dynamics_residual: Tensor
-    # m to the surface of the full r_obs + r_veh (of a box: grown by r_veh), anywhere from the first knot to the last,
-    # at most; infinite without obstacles. At 0 or more, none is touched between the knots either, on the conditions
-    # that `certify` states.
+    # Smallest distance to the surface of the full r_obs + r_veh (of a box: grown by r_veh) from the first knot to the
+    # last, or a lower bound of it, m; infinite without obstacles. At 0 or more, no obstacle is touched between the
+    # knots either, on the conditions that `certify` states.
     clearance: Tensor
     # Largest excess over control and state bounds, in their units; 0 proves that they hold at every knot.
     bound_violation: Tensor
     # Largest component of the gradient of the Lagrangian by U, with the multipliers (inequalities: at least 0) that
     # make it smallest in the least-squares sense, as a share of the largest terms that cancel in the gradient of J_var
     # by the same control: no unit of cost or control changes it. Near 0 it proves a stationary point to first order,
-    # not a minimum, and says nothing of rows that are violated.
+    # not a minimum, and says nothing about rows that are violated.
     kkt_residual: Tensor
 
 
 def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None) -> Certificate:
     """Certify trajectories X (B, N+1, n), U (B, N, m).
 
-    The clearance can't miss a collision between knots that lie outside an obstacle. Positions of an Euler plan move
-    straight from knot to knot, and so do obstacles, hence its distances are exact (from boxes, bounds within 1e-9). For
-    midpoint and rk4 the path leaves the chord by at most dt^2 / 8 times the largest acceleration, which is subtracted.
-    That acceleration is the field's, at both ends of the interval and at half a step, plus the largest change between
-    these: a bound as long as it changes no more from one of the three to its neighbour's side than they differ. Steps
-    without a known field (`integrator="none"`, a class that overrides `step` alone) have no path between knots; the
-    chord is meant. Geometric constraints other than obstacles count at their knots only, as violations.
+    The clearance can't miss a collision between knots that lie outside an obstacle. With Euler steps positions move
+    straight from knot to knot, and so do obstacles, hence distances are exact (from boxes, bounds within 1e-9). For
+    midpoint and rk4 the path leaves the chord by at most dt^2 / 8 times the largest acceleration; this is subtracted.
+    The acceleration is sampled at both ends of the interval and at the half step, and the largest difference between
+    samples is added: this is a bound only if the acceleration varies by no more than that between them. Steps without a
+    known field (`integrator="none"`, a class that overrides `step` alone) have no path between knots; distances are
+    then those of the chord. Geometric constraints other than obstacles count at their knots only, as violations.
 
     A row may have a multiplier where it is an equality, or an inequality with at most 1e-3 to spare (m for obstacles).
 
     Args:
         problem: the planning problems, float64.
-        X, U: what a solver returned.
+        X, U: the trajectories that a solver returned.
         asked: (B,) bool, the problems to certify; NaN for the others. None: all.
 
     Raises:
@@ -130,14 +130,15 @@ def _sphere_chords(spheres: BoundSpheres, X: Tensor) -> Tensor:
     relative = X[:, None, spheres.position] - spheres.centers[0]  # (N+1, M, d)
     if spheres.velocities is not None:
         relative = relative - k * spheres.dt * spheres.velocities[0]
-    return segment_distance(relative[:-1], relative[1:]) - spheres.distances[0]
+    return segment_distance(relative[:-1], relative[1:]) - spheres.inflated_radii[0]
 
 
 def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
     return box_segment_distance(boxes, X[None, :, boxes.position])[0] - boxes.vehicle_radius[0]
 
 
-# By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, at most.
+# By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, or lower
+# bounds of them.
 CHORDS: dict[type[Obstacles], Callable[[Any, Tensor], Tensor]] = {
     BoundSpheres: _sphere_chords,
     BoundBoxes: _box_chords,
@@ -189,14 +190,14 @@ def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> np.ndarray:
     if len(cone):
         try:
             lam = nnls(cone.T, -g, maxiter=10 * len(cone))[0]
-        except RuntimeError:  # no end among nearly dependent rows: the unbounded fit, cut off, is an upper bound too
+        except RuntimeError:  # nearly dependent rows, no convergence: the clipped free fit is an upper bound too
             lam = np.linalg.lstsq(cone.T, -g, rcond=None)[0].clip(min=0.0)
         rest = g + lam @ cone
     return rest
 
 
 def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tuple[Tensor, Tensor]]]:
-    """For each constraint with rows that may push: whether it is an equality, and their gradients by X and U."""
+    """For each constraint with rows that may be active: whether it is an equality, and their gradients by X and U."""
     found = []
     for constraint in problem.constraints:
         equality = constraint.sense == "equality"
@@ -219,7 +220,7 @@ def _spare(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
 
 
 def _local(rows: Any, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of rows(X, U) (q,), row j of repetition j, by X (q, N+1, n) and by U (q, N, m), dynamics left aside."""
+    """Gradients of rows(X, U) (q,), row j of repetition j, by X (q, N+1, n) and by U (q, N, m), without dynamics."""
     gX, gU = gradients(rows, X, U)
     return gX, gU
 

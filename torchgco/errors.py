@@ -4,15 +4,15 @@ from __future__ import annotations
 
 
 class InputError(ValueError):
-    """Malformed input: the field at fault, what was expected there, and what came."""
+    """Malformed input: the field at fault, what was expected there, and what was given."""
 
     def __init__(self, field: str, expected: str, got: object) -> None:
         self.field, self.expected, self.got = field, expected, got
         super().__init__(f"{field}: expected {expected}, got {got}")
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
-        return type(self), (self.field, self.expected, str(self.got))  # a worker process hands it on whole
+        return type(self), (self.field, self.expected, str(self.got))  # so that a worker process can return it
 
 
 class GuidanceWarning(UserWarning):
-    """Guidance, or a part of it, can't serve a problem: it is solved without."""
+    """Guidance, or a part of it, can't serve a problem, which is solved without it."""

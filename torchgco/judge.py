@@ -1,7 +1,7 @@
-"""What controls are worth: a re-simulation from U alone, in float64, that no solver has a hand in.
+"""The quality of controls: a re-simulation from U alone, in float64, that shares no code with a solver.
 
 It rolls the planning model out again, adds the cost up stage by stage, and measures distances by plain differences. The
-words it returns have one meaning everywhere (README, "What the words mean").
+words it returns have one meaning everywhere (docs/words.md).
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
     All knots count, the given start too. Both vehicle and obstacle move straight from knot to knot, so the nearest
     point of a segment to the obstacle's centre is exact; for an integrator other than Euler, the chord is meant.
     """
-    contact = torch.where(spheres.absent, -torch.inf, CONTACT_FACTOR * spheres.distances)
+    contact = torch.where(spheres.absent, -torch.inf, CONTACT_FACTOR * spheres.inflated_radii)
     at_knots = between = torch.full_like(X[:, 0, 0], torch.inf)
     if contact.shape[1] == 0:
         return at_knots, between
@@ -154,10 +154,10 @@ CLEARANCES: dict[type[Obstacles], Callable[[Any, Tensor], tuple[Tensor, Tensor]]
 
 
 def by_kind(measures: dict[type[Obstacles], Any], obstacles: Obstacles) -> Any:
-    """What measures obstacles of this kind.
+    """The function that measures obstacles of this kind.
 
     Raises:
-        InputError: nothing does. Silence would look like endless room.
+        InputError: there is none. Without the error these obstacles would count as absent.
     """
     for kind, measure in measures.items():
         if isinstance(obstacles, kind):

@@ -17,7 +17,7 @@ from torchgco.tree import Rows, take
 
 @dataclass(frozen=True)
 class Multipliers:
-    """What the outer loop carries: one lam (B, K, p) per constraint, and one penalty per problem."""
+    """The state of the outer loop: one lam (B, K, p) per constraint, and one penalty per problem."""
 
     lam: tuple[Tensor, ...]
     mu: Tensor  # (B,)
@@ -25,7 +25,7 @@ class Multipliers:
     @classmethod
     def zero(cls, problem: Problem, mu: float) -> Multipliers:
         """lam = 0 and the same penalty for all."""
-        # The rows of one problem tell those of all: evaluating a large batch for its shape alone takes long.
+        # One problem shows the shapes of all: evaluating a large batch for its shape alone takes long.
         one = problem.take(slice(0, 1))
         X, U = one.x0.new_zeros(one.B, problem.N + 1, problem.n), one.x0.new_zeros(one.B, problem.N, problem.m)
         lam = tuple(X.new_zeros(problem.B, *c.value(X, U).shape[1:]) for c in one.constraints)
@@ -44,7 +44,7 @@ class Multipliers:
 
 
 def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> Tensor:
-    """rho: mu where a row pulls, else 0 (Equation 18).
+    """rho: mu where a row is active, else 0 (Equation 18).
 
     As printed, an inequality is inactive where c < 0 and lam = 0. With `phr` (Powell, Hestenes, Rockafellar) it is
     inactive where lam + mu c < 0: a multiplier pushes the trajectory away from an obstacle and never pulls it back.
@@ -61,7 +61,7 @@ def _penalty_value(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) 
     rho = penalty_weights(sense, c, lam, mu, phr)
     terms = (lam + 0.5 * rho * c) * c
     if phr and sense == "inequality":
-        # Continued by its minimum over c where the row lets go, so that L_M stays continuous.
+        # Continued by its minimum over c where the row is inactive, so that L_M stays continuous.
         terms = torch.where(rho == 0, -0.5 * lam.square() / mu.view(-1, 1, 1), terms)
     # Two sums, knots last: one over both axes would be split among threads by batch size.
     return terms.sum(-1).sum(-1)
@@ -112,7 +112,7 @@ class Lagrangian:
         return H.transpose(0, 1)
 
     def expand_optimality(self, X: Tensor, U: Tensor) -> Tensor:
-        """H (N+1, B, s, s) of J_var + lam'c, with the penalty's curvature on the rows that push."""
+        """H (N+1, B, s, s) of J_var + lam'c, with the penalty's curvature on rows whose lam isn't 0."""
         H = quadratise(self.problem, X, U)
         for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
             rho = torch.where(lam == 0, 0.0, self.multipliers.mu.view(-1, 1, 1))
@@ -120,7 +120,7 @@ class Lagrangian:
         return H.transpose(0, 1)
 
     def slack(self, X: Tensor, U: Tensor) -> Tensor:
-        """Sum |lam c| (B,) of the inequalities that push without being met, which complementarity leaves open."""
+        """Sum |lam c| (B,) over inequalities with c < 0, where complementarity asks for lam = 0."""
         slack = X.new_zeros(X.shape[0])
         for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
             if constraint.sense == "inequality":

@@ -16,10 +16,10 @@ def box_distance(boxes: BoundBoxes, p: Tensor) -> Tensor:
 
 
 def box_segment_distance(boxes: BoundBoxes, p: Tensor) -> Tensor:
-    """Smallest signed distances (B, K-1, M) along the straight segments between points p (B, K, d), at most, m.
+    """Lower bounds (B, K-1, M) of the signed distances along the straight segments between points p (B, K, d), m.
 
-    The signed distance from a convex body is a convex function along a segment: comparing it at two points always says
-    which third can be dropped. What is returned lies below the smallest distance, by no more than the length of what is
+    The signed distance from a convex body is a convex function along a segment: comparing it at two points shows which
+    third can be dropped. The returned value lies below the smallest distance by at most the length of the piece that is
     left, as the distance changes no faster than the point moves.
     """
     a, along = p[:, :-1].unsqueeze(2), p.diff(dim=1).unsqueeze(2)  # (B, K-1, 1, d)

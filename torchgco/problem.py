@@ -33,8 +33,8 @@ class Problem:
             reference of a quadratic one), within 0.09 of the distance from the start; or none, where it names none.
 
     Raises:
-        InputError: names the part at fault, what was expected and what came. A start that is bad in one problem (not
-            finite, inside an obstacle) is no error: that problem ends with its own status.
+        InputError: names the part at fault, what was expected and what was given. A start that is bad in one problem
+            (not finite, inside an obstacle) is no error: that problem ends with its own status.
     """
 
     dynamics: Dynamics
@@ -44,7 +44,7 @@ class Problem:
     N: int
     goal: Goal | None = None
 
-    # What others keep of the problems' form (native kernels, say), shared by all subsets of a batch.
+    # A cache for all that depends on the problems' form alone (native kernels, say), shared by all subsets of a batch.
     form: ClassVar[dict[Any, Any]]
 
     def __post_init__(self) -> None:
@@ -146,10 +146,6 @@ class Problem:
         """The same problems in another precision."""
         parts = {name: cast(getattr(self, name), dtype) for name in ("dynamics", "cost", "constraints", "x0", "goal")}
         return self._with(parts)
-
-    def without_constraints(self) -> Self:
-        """The same problems with the constraints dropped."""
-        return self._with({"constraints": ()})
 
     def _with(self, parts: dict[str, object], form: dict[Any, Any] | None = None) -> Self:
         # The parts are bound already: checking them again for every subset would cost more than a pass.

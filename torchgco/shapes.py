@@ -80,5 +80,5 @@ def components(z: Tensor) -> tuple[Tensor, ...]:
 
 
 def vectors(*parts: Tensor) -> Tensor:
-    """Vectors (..., n) of n components (...), which stay apart in memory for those who ask for them again."""
+    """Vectors (..., n) of n components (...), each of which stays contiguous in memory."""
     return torch.stack(parts).movedim(0, -1)

@@ -38,7 +38,7 @@ class Solution:
     iterations: Tensor
     outer_iterations: Tensor  # (B,) int64: of the outermost solver, over all its starts
     guided: Tensor  # (B,) int64, outer iterations with guidance on
-    trace: pd.DataFrame | None = None  # a row per element and iteration, where the solver records
+    trace: pd.DataFrame | None = None  # a row per problem and iteration, where the solver records
 
     @property
     def statuses(self) -> list[Status]:
@@ -59,7 +59,7 @@ class Solution:
         return pd.DataFrame(columns).rename_axis("element")
 
     def save(self, path: str | Path) -> None:
-        """Write an npz beside its final place, then move it there: a reader never sees half a file."""
+        """Write an npz next to its final place, then move it there: a reader never sees half a file."""
         path = Path(path)
         arrays = {f.name: getattr(self, f.name).cpu().numpy() for f in fields(self) if f.name in _TENSORS}
         arrays["mu"] = self.multipliers.mu.cpu().numpy()

@@ -1,4 +1,4 @@
-"""How a problem ended: one status per element, each with a sentence."""
+"""How a problem ended: one status per problem, each with a sentence."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """acados as a peer: the problem's own model, cost and constraints, solved in an environment of acados' own.
 
 The expressions are those that FATROP gets (`torchgco.baselines.nlp`), as instructions in a file: two versions of CasADi
-read each other's files no other way.
+can't read each other's files otherwise.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def _form(problem: Problem, program: Program) -> dict[str, Any]:
 
 
 def _knot(program: Program, k: int, n: int, m: int, N: int) -> tuple[list[ca.SX], ca.SX]:
-    """Variables of knot k, and its rows beside the step."""
+    """Variables of knot k, and its rows other than the step."""
     at, end = k * (n + m), sum(program.path_rows[: k + 1]) + n * min(k + 1, N)
     u = program.variables[at + n : at + n + m] if k < N else ca.SX.sym("none", m)
     rows = program.rows[end - program.path_rows[k] : end]

@@ -1,6 +1,6 @@
 """acados on problems that lie in a folder: `python acados_worker.py FOLDER`, in an environment of its own.
 
-That environment holds acados' wheel and NumPy alone, as the wheel brings a CasADi that would stand before torchgco's.
+That environment holds acados' wheel and NumPy alone, as the wheel brings a CasADi that would shadow torchgco's.
 So nothing of torchgco is imported here; `acados_peer.py` writes the folder, and reads what comes back.
 
     form.json      N, n, m; step, rows, last_rows: functions of (x, u, p) by instructions; equality, last_equality

@@ -1,4 +1,4 @@
-"""Seconds and memory per element as the batch grows, every batch in a process of its own."""
+"""Seconds and memory per problem as the batch grows, every batch in a process of its own."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def run(bench: Bench) -> None:
         known = 0.0
         for batch in batches:
             case = f"B = {batch}{', 2 outer' if limited else ''}"
-            # The last one's seconds per element: in a larger batch they take no longer.
+            # The last one's seconds per problem: in a larger batch they take no longer.
             seconds = START + known * max(batch, bench.sizes.fewest_layouts)
             if bench.fits(SECTION, case, seconds, SHARE):
                 known = _measure(bench, case, batch, limited)
 
 
 def _measure(bench: Bench, case: str, batch: int, limited: bool) -> float:
-    """Start the process, read its one line; returns its seconds per element."""
+    """Start the process, read its one line; returns its seconds per problem."""
     order = {"batch": batch, "limited": limited, "device": bench.device}
     words = [sys.executable, "-m", "benchmarks.speed.one_batch", json.dumps({**order, "sizes": asdict(bench.sizes)})]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)

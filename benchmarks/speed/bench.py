@@ -1,4 +1,4 @@
-"""What a section is handed: sizes, clocks, a device, and a place for its rows."""
+"""What a section receives: sizes, clocks, a device, and a place for its rows."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Bench:
         return setup if limit is None else replace(setup, solver=limited(setup.solver, limit))
 
     def warm(self, setup: Setup, task: Task) -> None:
-        """Have what the solver needs for these problems traced and compiled: solve the first ones, off the clock."""
+        """Trace and compile what the solver needs for these problems: solve the first ones, off the clock."""
         engine_of(task.problem)
         rows = torch.arange(min(WARM_UP, task.problem.B), device=task.U0.device)
         setup.solver.solve(task.problem.take(rows), task.U0[rows], seed=setup.seed)

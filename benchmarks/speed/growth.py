@@ -1,4 +1,4 @@
-"""Milliseconds per element and iteration as stages, obstacles and states grow."""
+"""Milliseconds per problem and iteration as stages, obstacles and states grow."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def run(bench: Bench) -> None:
     for stages in bench.sizes.stages:
         times = f"scenario.stages={stages}", f"scenario.dt={FLIGHT / stages}"
         _measure(bench, f"{stages} stages", "scenario=forest", *times)
-    # Beside the forest of as many obstacles, which comes next.
+    # To compare with the forest of as many obstacles, which comes next.
     planar = "scenario=planar_random", "model=planar", f"scenario.stages={bench.sizes.num_stages or 100}"
     _measure(bench, "10 discs, planar vehicle", *planar, "scenario.num_obstacles=10")
     for obstacles in bench.sizes.obstacles:
@@ -33,6 +33,6 @@ def _measure(bench: Bench, case: str, *overrides: str) -> None:
     solve()  # traced and compiled, first touch of memory
     flights = [bench.timed(solve) for _ in range(REPEATS)]
     solution, took = min(flights, key=lambda flight: flight[1].seconds)
-    # Elements that end before the limit count with what they did.
+    # Problems that end before the limit count with what they did.
     count = max(1, int(solution.iterations.sum()))
     bench.row(SECTION, case, "al_ilqr", "per element and iteration", 1000 * took.seconds / count, "ms")

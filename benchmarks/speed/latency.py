@@ -1,4 +1,4 @@
-"""One problem alone: how long until there is a plan, from nothing and from the plan before."""
+"""One problem alone: how long until there is a solution, cold and from the solution before."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _say(bench: Bench, flights: AllFlights) -> None:
 
 
 def _next(task: Task, solution: Solution) -> Task:
-    """The problem one stage later, with the plan that is left and its last control again."""
+    """The problem one stage later, with the rest of the controls and the last one repeated."""
     return replace(task, problem=replace(task.problem, x0=solution.X[:, 1]), U0=_shift(solution.U))
 
 

@@ -1,4 +1,4 @@
-"""One batch size in a process of its own, as only so its peak of memory can be told: `batch` starts this."""
+"""One batch size in a process of its own, as its peak of memory can't be measured otherwise: `batch` starts this."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchgco.search import Restarts
 
 
 def measure(order: dict[str, Any]) -> dict[str, Any]:
-    """Seconds and iterations an element, and the peak of memory above what was held before (None: can't be told)."""
+    """Seconds and iterations per problem, and the peak of memory above what was held before (None: unknown)."""
     sizes = Sizes(**order["sizes"])
     bench = Bench(sizes, device=order["device"])
     setup = bench.setup("scenario=forest")

@@ -1,4 +1,4 @@
-"""A user's own model, a Python function, solved by `torchgco.solve` without options; FATROP beside it."""
+"""A user's own model, a Python function, solved by `torchgco.solve` without options; and by FATROP, to compare."""
 
 from __future__ import annotations
 

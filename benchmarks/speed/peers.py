@@ -1,7 +1,7 @@
 """Other solvers on the first layouts of a task, one after the other: FATROP, IPOPT and acados.
 
-All get the problem's own model, cost and constraints, traced; all start from the vehicle at rest, or from a plan along
-the roadmap's best path, whose making is on their clock. Of what they return the controls alone count.
+All get the problem's own model, cost and constraints, traced; all start from the vehicle at rest, or from a trajectory
+along the roadmap's best path, the time for which counts. Of a peer's result the controls alone count.
 """
 
 from __future__ import annotations

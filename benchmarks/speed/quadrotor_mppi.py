@@ -31,7 +31,7 @@ class QuadrotorAmongSpheres:
         self.fall = cast(problem.x0.new_tensor([0.0, 0.0, model.gravity]) * self.dt)
         self.x_ref, self.u_ref = cast(cost.x_ref[0, 0]), cast(cost.u_ref[0, 0])
         self.half_Q, self.half_R = cast(0.5 * cost.Q[0, 0]), cast(0.5 * cost.R[0, 0])
-        centers, contact = spheres.centers[0], spheres.distances[0]
+        centers, contact = spheres.centers[0], spheres.inflated_radii[0]
         self.twice_centers = cast(2 * centers.mT)  # (3, M)
         self.offset = cast(contact.square() - centers.square().sum(-1))  # (M,)
         self.one3, self.ones = torch.ones_like(self.fall), torch.ones_like(self.offset)

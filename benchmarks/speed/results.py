@@ -15,8 +15,8 @@ COLUMNS = (*MEASURED, "date", "commit", "processor", "torch", "casadi", "pytorch
 class Results:
     """The file that is kept, and next to it the one that grows.
 
-    A row is on disk as soon as it is measured. A section's rows replace those of former runs once it has come to its
-    end: stopped half way, the kept file holds whole sections, each from one run.
+    A row is on disk as soon as it is measured. A section's rows replace those of former runs once it has ended:
+    after a stop half way, the kept file holds whole sections, each from one run.
     """
 
     def __init__(self, path: Path) -> None:

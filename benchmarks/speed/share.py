@@ -18,9 +18,9 @@ SECTION = "share"
 # A phase lasts while its function (module:attributes) runs, but for the phases inside it; the rest is the outer loop.
 PHASES = {
     "paths sought": "torchgco.search.roadmap:Roadmap.paths",
-    "paths tracked": "torchgco.search.follow:track",
-    "candidates relaxed": "torchgco.search.follow:relax",
-    "candidates refined": "torchgco.search.follow:refine",
+    "paths tracked": "torchgco.search.paths:PathProposals.track",
+    "candidates relaxed": "torchgco.search.paths:PathProposals.relax",
+    "candidates refined": "torchgco.search.paths:PathProposals.refine",
     "rest of the proposal": "torchgco.search.paths:PathProposals.propose",
     "plans sampled": "torchgco.guidance.mppi:MPPI.improve",
     "set-up": "torchgco.native.engine:Engine.__init__",
@@ -47,7 +47,7 @@ class Shares:
         self.open.append((phase or self.open[-1][0], function))
 
     def end(self) -> None:
-        """Go on with what ran before."""
+        """Continue with what ran before."""
         self._book()
         self.open.pop()
 

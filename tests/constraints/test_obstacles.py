@@ -65,13 +65,13 @@ def test_distances_of_spheres_by_hand() -> None:
     shares = np.linspace(0, 1, 4001)[:, None]
     for b in range(2):
         for m in range(5):
-            o, R = spheres.centers[b, m].numpy(), float(spheres.distances[b, m])
+            o, R = spheres.centers[b, m].numpy(), float(spheres.inflated_radii[b, m])
             if spheres.absent[b, m]:
                 assert bool(torch.isinf(distance[b, :, m]).all() & torch.isinf(along[b, :, m]).all())
                 continue
             for k in range(5):
                 assert float(distance[b, k, m]) == pytest.approx(np.linalg.norm(p[b, k].numpy() - o) - R)
             for k in range(4):
-                way = (1 - shares) * p[b, k].numpy() + shares * p[b, k + 1].numpy()
-                assert float(along[b, k, m]) == pytest.approx(np.linalg.norm(way - o, axis=1).min() - R, abs=1e-4)
+                path = (1 - shares) * p[b, k].numpy() + shares * p[b, k + 1].numpy()
+                assert float(along[b, k, m]) == pytest.approx(np.linalg.norm(path - o, axis=1).min() - R, abs=1e-4)
     assert torch.equal(spheres.sizes, spheres.margins) and CONTACT_FACTOR == 0.95

@@ -152,7 +152,7 @@ def test_dwelling_charges_where_a_sample_ends() -> None:
 
 
 def test_single_precision_keeps_cost_apart_from_collisions(native: bool) -> None:
-    """rho_mp = 1e8 beside costs of some thousands: added in float32, the costs would be lost."""
+    """rho_mp = 1e8 next to costs of some thousands: added in float32, the costs would be lost."""
     problem, U = quadrotor_batch(B=3, N=30)
     sampler = MPPI(samples=64, noise_knots=4, elite=5, rounds=3)
     one, two = (replace(sampler, dtype=dtype).improve(problem, U, key(3)) for dtype in (None, "float32"))

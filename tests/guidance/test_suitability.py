@@ -53,7 +53,7 @@ def vehicle(d: int, kind: str = "plain") -> FunctionDynamics:
 
 
 def posed(d: int, obstacles: Any, kind: str = "plain", dynamics: FunctionDynamics | None = None) -> Problem:
-    """Two starts: obstacles stand before the first, and the second has a free way in more than one dimension."""
+    """Two starts: obstacles stand before the first, and the second has a free path in more than one dimension."""
     x0 = torch.zeros(2, 2 * d, dtype=torch.float64)
     x0[1, 1 if d > 1 else 0] = 3.0
     cost = QuadraticCost(Q=[1.0] * 2 * d, R=[0.1] * d, Qf=[50.0] * 2 * d, x_ref=[2.0] + [0.0] * (2 * d - 1))
@@ -62,7 +62,7 @@ def posed(d: int, obstacles: Any, kind: str = "plain", dynamics: FunctionDynamic
 
 
 def spheres(d: int) -> Spheres:
-    """Two that overlap across the way; on a line, two that overlap along it."""
+    """Two that overlap across the path; on a line, two that overlap along it."""
     centers = torch.zeros(2, d, dtype=torch.float64)
     centers[:, 0] = 1.0
     centers[:, min(1, d - 1)] += torch.tensor([0.2, -0.2], dtype=torch.float64)
@@ -114,11 +114,11 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_what_can_be_had_is_had(case: str, in_pytorch: None) -> None:
-    """The caught element is guided, the other left alone, each as if it were by itself, and one warning is given."""
+    """The caught problem is guided, the other left alone, each as if it were by itself, and one warning is given."""
     make, why = CASES[case]
     problem = make()
     solution, warned = solved(problem)
-    # The free element is stationary; from a sampled plan, held by a stiff penalty, that may take more iterations.
+    # The free problem is stationary; from a sampled trajectory, held by a stiff penalty, it may take more iterations.
     assert int(solution.guided[0]) > 0 and solution.statuses[1] == Status.CONVERGED
     assert solution.statuses[0] in (Status.CONVERGED, Status.FEASIBLE) and bool((solution.violation <= 1e-3).all())
     assert all(torch.equal(solution.U[b], alone(problem, b)) for b in (0, 1))
@@ -163,7 +163,7 @@ def test_without_obstacles_no_guidance_is_missed() -> None:
 
 
 class Fussy(FunctionDynamics):
-    """Bears trajectories, but no samples side by side."""
+    """Accepts trajectories, but not several samples at once."""
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         if x.shape[1:-1] == (SAMPLES,):
@@ -174,7 +174,7 @@ class Fussy(FunctionDynamics):
 def test_dynamics_that_bear_no_samples_are_led_by_paths_alone(in_pytorch: None) -> None:
     plain = vehicle(2)
     fussy = Fussy(plain.function, 4, 2, 0.1, "euler", plain.position)
-    problem, lost = posed(2, spheres(2), dynamics=fussy), "no plan can be sampled (no samples here)"
+    problem, lost = posed(2, spheres(2), dynamics=fussy), "no trajectory can be sampled (no samples here)"
     solution, warned = solved(problem, replace(SINGLE, attempts=3))
     assert warned == [f"guided in part: {lost}"]
     assert int(solution.guided[0]) == 1 and solution.status.tolist() == [1, 1]
@@ -182,7 +182,7 @@ def test_dynamics_that_bear_no_samples_are_led_by_paths_alone(in_pytorch: None) 
     assert warned == [f"solved without guidance: {lost}"]
     want = torchgco.solve(posed(2, spheres(2)), solver=SINGLE.local)
     assert torch.equal(solution.U, want.U) and solution.guided.tolist() == [0, 0]
-    with pytest.raises(InputError, match="got no plan can be sampled"):
+    with pytest.raises(InputError, match="got no trajectory can be sampled"):
         torchgco.solve(problem, solver=IteratedMPPI(iterations=1))
 
 

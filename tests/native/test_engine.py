@@ -152,13 +152,13 @@ def begun(problem: Problem, guided: str | None = None, phr: bool = True, seed: i
 
 
 def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict[int, tuple[bool, bool, int]]:
-    """Iterations by PyTorch until every element has ended or made `count`; how each ended."""
+    """Iterations by PyTorch until every problem has ended or made `count`; how each ended."""
     ends: dict[int, tuple[bool, bool, int]] = {}
     for _ in range(3 * count):
         frozen = replace(state)
         end = inner.iterate(state, lagrangian)
         for b in range(lagrangian.problem.B):
-            if b in ends:  # an element that had ended before stays where it was
+            if b in ends:  # a problem that had ended before stays where it was
                 for name in ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation"):
                     getattr(state, name)[b] = getattr(frozen, name)[b]
             elif bool(end.ended[b]) or int(state.iterations[b]) == count:
@@ -169,7 +169,7 @@ def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict
 
 
 def natively(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> PassEnd:
-    """Up to `count` iterations of every element by native kernels."""
+    """Up to `count` iterations of every problem by native kernels."""
     assert engine_of(lagrangian.problem) is not None
     return advance(inner, state, lagrangian, count)
 

@@ -36,7 +36,9 @@ def native_again() -> Iterator[None]:
 def moving() -> tuple[Problem, Tensor]:
     problem, U = quadrotor_batch(B=3, N=20)
     centers = problem.constraints[0].centers
-    spheres = Spheres(centers, problem.constraints[0].distances - 0.3, 0.3, velocities=0.3 * torch.ones_like(centers))
+    spheres = Spheres(
+        centers, problem.constraints[0].inflated_radii - 0.3, 0.3, velocities=0.3 * torch.ones_like(centers)
+    )
     return Problem(problem.dynamics, problem.cost, [spheres, *problem.constraints[1:]], problem.x0, problem.N), U
 
 
@@ -102,7 +104,7 @@ def test_rounds_equal_those_of_pytorch(made: str, sampler: str, monkeypatch) -> 
     X, V = drawing.improve(problem, U, key(3))
     kernels.use_native(False)
     want_X, want_V = drawing.improve(problem, U, key(3))
-    # A round hands rounding on to the next one, magnified by what a sample gains or loses over the temperature.
+    # A round passes rounding on to the next one, magnified by what a sample gains or loses over the temperature.
     torch.testing.assert_close(V, want_V, rtol=1e-7, atol=1e-7)
     torch.testing.assert_close(X, want_X, rtol=1e-7, atol=1e-7)
     assert made in ("functions", "a user's cost") or sampler == "one sample" or not torch.equal(V, U)

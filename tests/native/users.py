@@ -20,7 +20,7 @@ B, N = 5, 12
 
 
 def rows_of(own: Tensor, x: Tensor) -> Tensor:
-    """A vector of each problem (B, d) beside states (B, n), (B, N, n) or samples (B, S, n)."""
+    """A vector of each problem (B, d) shaped to fit states (B, n), (B, N, n) or samples (B, S, n)."""
     return own if x.dim() == 2 else own.unsqueeze(1)
 
 
@@ -264,7 +264,7 @@ def unicycle(x: Tensor, u: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Errand(Cost):
-    """To a target of each problem, the more urgent the later; fast turns are dear."""
+    """To a target of each problem, the more urgent the later; fast turns are expensive."""
 
     target: Tensor  # (B, 2)
 

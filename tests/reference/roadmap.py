@@ -1,4 +1,4 @@
-"""Shortest ways over a graph, one problem at a time: Dijkstra with a heap, distances by dense sampling."""
+"""Shortest paths over a graph, one problem at a time: Dijkstra with a heap, distances by dense sampling."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def segment_gap(a: Array, b: Array, centers: Array, distances: Array, samples: i
 
 
 def cheapest_cost(edges: dict[int, dict[int, float]], start: int, goal: int) -> float:
-    """Cost of the cheapest way from start to goal; infinite where there is none."""
+    """Cost of the cheapest path from start to goal; infinite where there is none."""
     best, heap = {start: 0.0}, [(0.0, start)]
     while heap:
         cost, node = heapq.heappop(heap)
@@ -31,16 +31,16 @@ def cheapest_cost(edges: dict[int, dict[int, float]], start: int, goal: int) -> 
     return np.inf
 
 
-def way_length(way: Array) -> float:
+def path_length(path: Array) -> float:
     """Length of a polyline (P, d)."""
-    return float(np.linalg.norm(np.diff(way, axis=0), axis=-1).sum())
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=-1).sum())
 
 
-def point_along(way: Array, length: float) -> Array:
+def point_along(path: Array, length: float) -> Array:
     """The point at one arc length, walking from corner to corner."""
-    for a, b in pairwise(way):
+    for a, b in pairwise(path):
         step = float(np.linalg.norm(b - a))
         if length <= step and step > 0:
             return a + length / step * (b - a)
         length -= step
-    return way[-1]
+    return path[-1]

@@ -711,7 +711,7 @@ def test_detection_by_hand():
 
 
 def trap():
-    """Two discs that overlap across the way: their gradients cancel between them. Too slow to jump across."""
+    """Two discs that overlap across the path: their gradients cancel between them. Too slow to jump across."""
     discs = dict(centers=[[0.0, 0.25], [0.0, -0.25]], contact=[0.4, 0.4])
     return point_mass(20, 0.1, (-1.0, 0.0), R=0.001, u_lower=[-6.0, -6], u_upper=[6.0, 6], **discs)
 

@@ -82,7 +82,7 @@ def test_a_task_has_them_as_obstacles() -> None:
 
 
 ERRORS = {
-    "no sides": (dict(box_half_sizes=None), "layouts.box_half_sizes: expected this array beside box_centers, got none"),
+    "no sides": (dict(box_half_sizes=None), "layouts.box_half_sizes: expected this array with box_centers, got none"),
     "no centres": (dict(box_centers=None), "layouts.box_half_sizes: expected none without box_centers, got some"),
     "layouts": (
         dict(box_centers=np.zeros((3, 2, 2))),

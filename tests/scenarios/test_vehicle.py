@@ -26,7 +26,7 @@ def test_public_layouts_make_the_published_problem() -> None:
     assert (problem.B, problem.N, problem.dynamics.dt, task.goal_radius) == (32, 100, 0.05, 2.0)
     spheres, bounds = problem.constraints
     np.testing.assert_array_equal(spheres.centers, layouts.centers)
-    np.testing.assert_allclose(spheres.distances, 0.96)
+    np.testing.assert_allclose(spheres.inflated_radii, 0.96)
     np.testing.assert_array_equal(bounds.upper[0], layouts.control_upper)
     np.testing.assert_array_equal(problem.x0[0], layouts.start[0])
     assert task.goal[0].tolist() == [20, 1, 0.2] and task.U0[3, 7].tolist() == [0, 0, 0, 9.81]
@@ -37,7 +37,7 @@ def test_what_the_file_leaves_open_comes_from_the_vehicle() -> None:
     task = vehicle("planar").task(bare)
     assert (task.problem.N, task.goal_radius) == (200, 0.3)
     assert task.problem.x0[0, :2].tolist() == [-1, 0] and task.goal[0].tolist() == [1, 0.4]
-    assert float(task.problem.constraints[0].distances) == pytest.approx(0.16)
+    assert float(task.problem.constraints[0].inflated_radii) == pytest.approx(0.16)
     assert task.problem.constraints[1].lower[0].tolist() == [-10, -10]
 
 

@@ -62,7 +62,7 @@ def gates(weight: float = 6.0) -> tuple[Problem, Tensor]:
 
 @dataclass
 class Solve:
-    """One solve that was made on the way."""
+    """One of the inner solves of a call."""
 
     call: Call
     guidance: Any

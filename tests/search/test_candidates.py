@@ -7,7 +7,6 @@ import torch
 from tests.search.cup import QUICK, controls, cup
 from torchgco import Problem
 from torchgco.rollout import open_loop
-from torchgco.search import follow
 from torchgco.search.candidates import Candidates
 from torchgco.search.scene import chord_penetration
 
@@ -52,7 +51,7 @@ def test_what_is_not_live_is_left_as_it_is_and_comes_last() -> None:
     U[:, 1] = -1.0  # drives away, which costs more
     candidates = begun(problem, U, R, unit, torch.tensor([[False, True]]))
     assert candidates.order(torch.ones(2, dtype=torch.bool)).tolist() == [[1, 0]]
-    relaxed, sound = follow.relax(replace(QUICK, relax_iterations=2), candidates)
+    relaxed, sound = replace(QUICK, relax_iterations=2).relax(candidates)
     assert 1 <= int(relaxed.iterations) <= 2
     assert torch.equal(relaxed.U[0], U[0, 0]) and not torch.equal(relaxed.U[1], U[0, 1]) and not bool(sound[0])
     assert float(candidates.penetration()[0]) == 0.0

@@ -8,8 +8,8 @@ from tests.search.cup import GOAL, QUICK, controls, cost, cup
 from tests.search.test_paths import alone
 from torchgco import AugmentedLagrangian, PathProposals, Problem, Restarts, judge
 from torchgco.rollout import open_loop
-from torchgco.search import follow
 from torchgco.search.candidates import Candidates
+from torchgco.search.tracking import travel
 from torchgco.solvers.ilqr import ILQR
 
 END = torch.tensor([0.7], dtype=torch.float64)
@@ -17,12 +17,12 @@ END = torch.tensor([0.7], dtype=torch.float64)
 
 def test_the_vehicle_rests_first_and_last() -> None:
     path = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [1.0, 1.0]]], dtype=torch.float64)
-    center = follow.travel(replace(QUICK, depart=0.2, smoothing=0.0), path, END, 100)[0]
+    center = travel(path, 0.2, END, 0.0, 100)[0]
     assert torch.equal(center[:21], path[0, :1].expand(21, -1)) and torch.equal(
         center[70:], path[0, -1:].expand(31, -1)
     )
     assert float((center[1:] - center[:-1]).square().sum(-1).sqrt().max()) < 1.6 * 2.0 / 50
-    rounded = follow.travel(replace(QUICK, depart=0.2, smoothing=0.1), path, END, 100)[0]
+    rounded = travel(path, 0.2, END, 0.1, 100)[0]
     corner = torch.tensor([1.0, 0.0], dtype=torch.float64)
     assert float((center - corner).norm(dim=-1).min()) < 0.03 < float((rounded - corner).norm(dim=-1).min())
 
@@ -32,10 +32,12 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
     for tube, stiffness in ((0.05, 20.0), (None, 500.0)):
         options = replace(QUICK, tube=tube, stiffness=(stiffness,), track_iterations=4)
         path = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
-        candidates = follow.track(options, begun(problem, controls(problem)[:, None]), path[:, None])
+        candidates = options.track(begun(problem, controls(problem)[:, None]), path[:, None])
         X = open_loop(problem.dynamics, problem.x0, candidates.U)
         torch.testing.assert_close(candidates.X, X)
-        off.append(float((X[..., :2] - follow.travel(options, path, END + 0.1, 120)).norm(dim=-1).mean()))
+        off.append(
+            float((X[..., :2] - travel(path, options.depart, END + 0.1, options.smoothing, 120)).norm(dim=-1).mean())
+        )
     assert off[1] < 0.5 * off[0]
 
 
@@ -51,24 +53,25 @@ def test_every_candidate_tracks_its_own_path_at_its_own_pace() -> None:
     options = replace(QUICK, arrive=(0.9, 0.5), tube=None, stiffness=(1e4,), track_iterations=20)
     ends = (-1.0, 0.0), (1.0, 0.4)
     paths = torch.tensor([[[ends[0], (0.0, y), ends[1]] for y in (-0.9, 1.2)]], dtype=torch.float64)
-    found = follow.track(options, begun(problem, controls(problem)[:, None].repeat(1, 8, 1, 1)), paths)
+    found = options.track(begun(problem, controls(problem)[:, None].repeat(1, 8, 1, 1)), paths)
     for i, X in enumerate(found.X):
         apart = []
         for path in paths[0]:
             for pace in options.paces:
-                center = follow.travel(options, path[None], torch.full_like(END, pace), 120)[0]
+                arrive = torch.full_like(END, pace)
+                center = travel(path[None], options.depart, arrive, options.smoothing, 120)[0]
                 apart.append(float((X[:, :2] - center).norm(dim=-1).mean()))
         assert apart.index(min(apart)) == i // 4 * 2 + i % 2
 
 
 def test_candidates_that_are_not_among_the_first_are_not_relaxed(monkeypatch) -> None:
-    relaxed, relax = [], follow.relax
+    relaxed, relax = [], PathProposals.relax
 
-    def noted(options: PathProposals, candidates: Candidates):
+    def noted(self: PathProposals, candidates: Candidates):
         relaxed.append(candidates.live.numel())
-        return relax(options, candidates)
+        return relax(self, candidates)
 
-    monkeypatch.setattr("torchgco.search.follow.relax", noted)
+    monkeypatch.setattr(PathProposals, "relax", noted)
     problem = cup(B=2, N=60)
     three = replace(QUICK, num_paths=3, track_iterations=2, relax_iterations=1, max_penetration=9.0)
     proposals = [replace(three, relax_top=top).propose(problem) for top in (None, 9, 2)]
@@ -122,7 +125,7 @@ def test_a_refined_candidate_that_cuts_through_an_obstacle_between_two_knots_is_
     problem, one = cup(B=1, N=120), replace(QUICK, num_paths=2, track_iterations=20, refine_top=2)
     refined = one.propose(problem)
     assert bool(refined.found) and bool(refined.multipliers.lam[0].any())
-    monkeypatch.setattr("torchgco.search.follow.CHORD_PENETRATION", -9.0)
+    monkeypatch.setattr("torchgco.search.paths.CHORD_PENETRATION", -9.0)
     rejected = one.propose(problem)
     assert torch.equal(rejected.U, replace(one, refine_top=1).propose(problem).U)
     assert not torch.equal(refined.U, rejected.U) and not any(bool(lam.any()) for lam in rejected.multipliers.lam)

@@ -207,7 +207,7 @@ def test_pytorch_searches_in_single_precision_and_without_a_compiler(monkeypatch
     assert library_for(s.centers) is None
     paths, _ = Roadmap().paths(s)
     monkeypatch.undo()
-    monkeypatch.setattr(native, "SOURCE", Path(__file__))  # no C
+    monkeypatch.setattr(native, "POINTS", Path(__file__))  # no C
     native._library.cache_clear()
     with pytest.warns(EagerWarning, match=r"PyTorch's kernels where \w+ are sought"):
         assert library_for(s.centers) is None

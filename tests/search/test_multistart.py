@@ -1,4 +1,4 @@
-"""Many guesses: the best is kept, the budget is kept to, and an element's guesses are its own."""
+"""Many guesses: the best is kept, the budget is kept to, and a problem's guesses are its own."""
 
 from dataclasses import fields, replace
 from itertools import pairwise

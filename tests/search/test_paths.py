@@ -113,7 +113,7 @@ def test_the_iterations_of_every_candidate_are_counted(monkeypatch) -> None:
 
         return call
 
-    for place in ("torchgco.search.candidates.descend", "torchgco.search.follow.AugmentedLagrangian.solve"):
+    for place in ("torchgco.search.candidates.descend", "torchgco.search.paths.AugmentedLagrangian.solve"):
         monkeypatch.setattr(place, noted(resolve_name(place)))
     options = replace(QUICK, num_paths=3, initial_offsets=((0.7, -0.7),), relax_top=3, relax_iterations=4, refine_top=2)
     problem = cups()
@@ -167,7 +167,7 @@ CHANGES = dict(
     max_penetration=1e-3,
 )  # fmt: skip
 CONSTANTS = {
-    "follow.TOLERANCE": 0.5, "follow.TRACK_PENALTY": 50.0, "follow.PENALTY": 5.0,
+    "paths.TOLERANCE": 0.5, "paths.TRACK_PENALTY": 50.0, "paths.PENALTY": 5.0,
     "paths.OFFSET_LASTS": 0.3,
 }  # fmt: skip
 BASE = PathProposals(

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.reference.roadmap import cheapest_cost, point_along, segment_gap
-from tests.reference.roadmap import way_length as path_length
+from tests.reference.roadmap import cheapest_cost, path_length, point_along, segment_gap
 from torchgco import InputError, compose
 from torchgco.native.roadmap import Graph, NativeSearch, library_for
 from torchgco.search.geometry import FAR, Scene, points_along, segment_gaps, squares_from_segments

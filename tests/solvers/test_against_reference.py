@@ -23,7 +23,7 @@ OUTER, SAMPLES = 5, 20
 
 
 class Snapshots:
-    """Multipliers in force at each outer iteration of each element, taken from the running state."""
+    """Multipliers in force at each outer iteration of each problem, taken from the running state."""
 
     def __init__(self) -> None:
         self.lam: dict[tuple[int, int], list[np.ndarray]] = {}
@@ -85,6 +85,6 @@ def test_iterates_follow_the_nested_loops(case: str, guided: bool, native: bool)
                 assert snapshots.mu[b, o] == pytest.approx(outer.mu)
         guided_outer = set(mine.outer[mine.guided])
         assert guided_outer == {o for o, outer in enumerate(reference.records) if outer.guide is not None}
-    assert len(lengths) > 1, "every element took as long as the others: the batch isn't mixed"
+    assert len(lengths) > 1, "every problem took as long as the others: the batch isn't mixed"
     if guided:
         assert trace.guided.any()

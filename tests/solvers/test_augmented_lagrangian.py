@@ -137,6 +137,19 @@ def test_the_penalty_keeps_the_solver_from_an_abandoned_trajectory(hold: float, 
     torch.testing.assert_close(mu, (hold * gain).clamp(min=44.0), rtol=1e-6, atol=0)
 
 
+def test_a_penalty_without_a_first_one_is_named() -> None:
+    class Late(OnePlan):
+        def start(self, problem, X):
+            return None
+
+        def update(self, problem, X, U, penalty, key):
+            return Advice(OnePlan.start(self, problem, X))
+
+    problem, U0 = planar_batch(B=1, N=10)
+    with pytest.raises(InputError, match=r"guidance\.start: expected a penalty"):
+        AugmentedLagrangian(guidance=Late(U0), max_outer_iterations=2).solve(problem, U0 + 1.0)
+
+
 def test_guidance_can_stop_a_solve() -> None:
     class Stop(OnePlan):
         def update(self, problem, X, U, penalty, key):

@@ -1,4 +1,4 @@
-"""An element's result is the same bits alone, in any batch, in any order; a broken element disturbs nobody."""
+"""A problem's result is the same bits alone, in any batch, in any order; a broken problem disturbs no other."""
 
 import pytest
 import torch
@@ -133,7 +133,7 @@ def test_large_batch_equals_small_ones() -> None:
 
 
 def test_parts_per_element_follow_their_element() -> None:
-    """Goals per element and knot, weights, drag, bounds, moving obstacles: taken apart they solve to the same bits."""
+    """Goals per problem and knot, weights, drag, bounds, moving obstacles: taken apart they solve to the same bits."""
     B, N = 4, 20
     random = torch.Generator().manual_seed(0)
 

@@ -1,4 +1,4 @@
-"""What a batch is said to need, against what it takes."""
+"""The estimated memory of a batch, against the memory that it takes."""
 
 import subprocess
 import sys

@@ -35,7 +35,7 @@ CHANGES = {
         noise_knots=3, decay=0.3, elite=4, dwell_cost=10.0, dtype="float32",
     ),
 }  # fmt: skip
-# `slots` decides no result (test_batch_contract), the ladder shows in test_ilqr, plans that replace in test_restarts.
+# `slots` decides no result (test_batch_contract), the ladder shows in test_ilqr, replaced iterates in test_restarts.
 ELSEWHERE = {
     (AugmentedLagrangian, "slots"), (LineSearch, "smallest"), (LineSearch, "back"), (GCO, "start_from_sample"),
 }  # fmt: skip

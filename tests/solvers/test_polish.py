@@ -121,7 +121,7 @@ def test_what_is_out_of_reach_is_left_alone() -> None:
     assert bool(torch.isnan(after.U[1]).all())
     rest = torch.tensor([0, 3])
     assert_same_bits(after.take(rest), polished("planar").take(rest))
-    assert torch.equal(broken.U[0], before.U[0])  # what was handed in is not written into
+    assert torch.equal(broken.U[0], before.U[0])  # the given solution is not written into
 
 
 def test_a_shortcut_through_an_obstacle_between_two_knots_is_refused(monkeypatch) -> None:
@@ -146,8 +146,8 @@ def test_every_option_is_read() -> None:
     assert not torch.equal(Polish(tolerance=1e-3).refine(one, start).U, start.U)
     flat = Polish(iterations=2, curvature=False).refine(problem, before)
     assert not torch.equal(flat.U, Polish(iterations=2).refine(problem, before).U)
-    dear = before.cost < polished("planar").cost  # giving back its violation made some path dearer
-    assert bool(dear.any())
+    risen = before.cost < polished("planar").cost  # removing the violation made some trajectory more expensive
+    assert bool(risen.any())
     strict = Polish(cost_rise=0.0).refine(problem, before)
     assert bool((strict.cost <= before.cost).all())
     assert {f.name for f in fields(Polish)} == {

@@ -1,4 +1,4 @@
-"""What the guided solver is compared with."""
+"""The solvers that `gco` is compared with."""
 
 from torchgco.baselines.casadi import CasADiSolver as CasADiSolver
 from torchgco.baselines.guided import GuidedCasADi as GuidedCasADi

@@ -143,7 +143,7 @@ class PreparedCasADi(Solver):
         try:
             found = self.function(x0=guess, p=p, lbx=lower, ubx=upper, lbg=lowest, ubg=highest)
             stats = self.function.stats()
-        except RuntimeError as error:  # with bounds that cross, say: no loss to the others
+        except RuntimeError as error:  # with bounds that cross, say: the others are solved all the same
             if "option" in str(error).lower():  # FATROP reads them only now
                 raise _refused(self.solver.plugin, error) from error
             return U0, (Status.LINE_SEARCH_FAILED, 0)

@@ -25,7 +25,7 @@ class IteratedMPPI(Solver):
 
     Args:
         sampler: draws and weighs.
-        iterations: how often.
+        iterations: number of repetitions.
         violation_tolerance: what counts as feasible (metres for lengths).
 
     Raises:

@@ -31,7 +31,7 @@ class Program:
     objective: ca.SX
     rows: ca.SX
     equality: list[bool]
-    path_rows: list[int]  # rows of each knot 0..N beside the step to the next
+    path_rows: list[int]  # rows of each knot 0..N, without the step to the next
     limits: _Limits
     sources: tuple[Traced, ...]
 
@@ -115,7 +115,7 @@ def _traces(problem: Problem) -> tuple[Traced, Traced, list[Traced]]:
 def _limits(
     at_knot: list[list[tuple[ca.SX, bool]]], variables: ca.SX, parameters: ca.SX
 ) -> tuple[_Limits, list[list[tuple[ca.SX, bool]]]]:
-    """Inequalities that bound a single variable, and what is left. Rows without any variable decide nothing: they go.
+    """Inequalities that bound a single variable, and what is left. Rows without any variable are dropped.
 
     A solver keeps strictly inside bounds that it knows as such, and saves a slack for each.
     """

@@ -57,7 +57,7 @@ class Constraint(PerElement):
         raise NotImplementedError
 
     def holds_at(self, k: int) -> bool:
-        """Whether the constraint speaks of knot k."""
+        """Whether the constraint applies to knot k."""
         if isinstance(self.knots, slice):
             return self.knots.start <= k < self.knots.stop
         return bool((self.knots == k).any())

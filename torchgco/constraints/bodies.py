@@ -1,4 +1,4 @@
-"""What all kinds of obstacles have in common: distances of the vehicle from them, as solver, search and polish ask."""
+"""What all kinds of obstacles have in common: distances of the vehicle from them, for solver, search and polish."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class Inflated(NamedTuple):
     """Static obstacles grown by the vehicle's radius, in the forms that the roadmap knows."""
 
     centers: Tensor  # (B, M, d) of spheres, m
-    distances: Tensor  # (B, M): r_obs + r_veh, m; negative where absent
+    inflated_radii: Tensor  # (B, M): r_obs + r_veh, m; negative where absent
     boxes: Cuboids | None = None
 
 
 class Obstacles(Constraint):
     """Obstacles that the vehicle's position keeps clear of, M per problem, once bound.
 
-    A kind of obstacles is a subclass. Beside the methods of a constraint it defines what is abstract here. Distances
+    A kind of obstacles is a subclass. In addition to a constraint's methods it defines the abstract ones. Distances
     count from the full surface, the obstacle's own grown by the vehicle's radius: positive outside, negative inside,
     infinite where an obstacle is absent. The judge and the certificate measure distances by code of their own, which a
     new kind joins through `judge.CLEARANCES` and `certificate.CHORDS`.
@@ -51,7 +51,7 @@ class Obstacles(Constraint):
 
     @property
     def margins(self) -> Tensor:
-        """The length (B, M), m, of which bodies touch at 1 - CONTACT_FACTOR beneath the full surface."""
+        """The length (B, M), m: bodies touch at (1 - CONTACT_FACTOR) times this beneath the full surface."""
         raise NotImplementedError
 
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ class Obstacles(Constraint):
         return None
 
     def chord_clearance(self, X: Tensor) -> Tensor:
-        """Smallest distance (B,) from the straight ways between knots to where bodies touch, m; negative in contact.
+        """Smallest distance (B,) from the straight lines between knots to where bodies touch, m; negative in contact.
 
         Infinite where there is no obstacle. Obstacles that move override this.
         """

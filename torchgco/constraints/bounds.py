@@ -79,7 +79,7 @@ class _Bounds(Constraint):
 
 
 def _range(components: Tensor) -> slice | Tensor:
-    """Components as a slice where they follow each other: views are had for nothing."""
+    """Components as a slice where they follow each other: views cost nothing."""
     first, count = int(components[0]) if components.numel() else 0, components.numel()
     adjacent = components.tolist() == list(range(first, first + count))
     return slice(first, first + count) if adjacent else components

@@ -24,8 +24,8 @@ class Boxes(Constraint):
 
     The distance is that from the surface, negative inside. The factor with the size s = r_veh + the smallest half side
     makes c a square of lengths with the slope of a sphere of that size: penalties mean the same for both kinds. Rows
-    hold at the knots; between two of them a path may cut a corner, which is as round as the vehicle is wide, by up to
-    the square of its step over 8 r_veh.
+    hold at the knots; between two knots a path may cut a corner, which is rounded by r_veh, by up to the square of its
+    step over 8 r_veh.
 
     Args:
         centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent boxes (padding); M may be 0, and an

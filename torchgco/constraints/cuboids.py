@@ -1,7 +1,7 @@
 """Geometry of boxes that may be turned, grown by a radius: distances of points and of straight segments from them.
 
 Everything is computed coordinate by coordinate, in one order and with no operation but sums, products, quotients and
-comparisons, apart from the last square root: native/roadmap_boxes.c does the same operations, and gets the same bits.
+comparisons, apart from the last square root: native/roadmap_boxes.h does the same operations, and gets the same bits.
 A point is given as its coordinates, a sequence of d tensors of one shape.
 """
 
@@ -78,12 +78,12 @@ class Cuboids(NamedTuple):
 
 
 def join(parts: Sequence[Cuboids]) -> Cuboids | None:
-    """All boxes of the same problems; None of none."""
+    """All boxes of the same problems; None where there are none."""
     return Cuboids(*(torch.cat(columns, dim=1) for columns in zip(*parts, strict=True))) if parts else None
 
 
 def excess(p: Coordinates, half: Coordinates) -> list[Tensor]:
-    """The way from the nearest point of a box to p, both in the box's frame."""
+    """The vector from the nearest point of a box to p, in the box's frame."""
     return [x - torch.minimum(torch.maximum(x, -h), h) for x, h in zip(p, half, strict=True)]
 
 
@@ -91,7 +91,7 @@ def signed_distance(p: Coordinates, half: Coordinates) -> Tensor:
     """Distance of p from a box's surface in the box's frame, m; inside minus the distance from the nearest side."""
     deepest = reduce(torch.maximum, (x.abs() - h for x, h in zip(p, half, strict=True)))
     outside = deepest > 0
-    # The root of 0 has no slope: inside, where it isn't wanted, 1 stands in for it.
+    # The root of 0 has no slope: inside, where it isn't used, 1 stands in for it.
     return torch.where(outside, torch.where(outside, _square(excess(p, half)), 1.0).sqrt(), deepest)
 
 
@@ -137,7 +137,7 @@ def segment_distance(begin: Coordinates, along: Coordinates, half: Coordinates) 
 def beside(boxes: Cuboids, start: Tensor, goal: Tensor, shells: Sequence[float]) -> tuple[Tensor, Tensor]:
     """Points (B, C, d) around the corners, edges and sides of the boxes, and whether each belongs to one (B, C).
 
-    Along edges and sides a point lies where the straight way from start to goal (B, d) comes nearest.
+    Along edges and sides a point lies where the straight line from start to goal (B, d) comes nearest.
     """
     ends = start.unsqueeze(1), goal.unsqueeze(1)
     begin, half = boxes.seen_from(ends[0]), boxes.halves()

@@ -91,7 +91,7 @@ class BoundSpheres(Obstacles):
     """Spheres shaped for their problem, with the matrices of the one-product evaluation prepared."""
 
     centers: Tensor  # (B, M, d), at t = 0
-    distances: Tensor  # (B, M): r_obs + r_veh
+    inflated_radii: Tensor  # (B, M): r_obs + r_veh
     velocities: Tensor | None  # (B, M, d)
     absent: Tensor  # (B, M) bool
     vehicle_radius: Tensor  # (B,)
@@ -103,14 +103,14 @@ class BoundSpheres(Obstacles):
     second: Tensor  # (B, M, d d [* 3]): o o', and o v' + v o', v v' where they move
 
     batched: ClassVar[tuple[str, ...]] = (
-        "centers", "distances", "velocities", "absent", "vehicle_radius", "weights", "first", "second",
+        "centers", "inflated_radii", "velocities", "absent", "vehicle_radius", "weights", "first", "second",
     )  # fmt: skip
 
     @classmethod
     def prepare(
         cls,
         centers: Tensor,
-        distances: Tensor,
+        inflated_radii: Tensor,
         velocities: Tensor | None,
         absent: Tensor,
         vehicle_radius: Tensor,
@@ -119,7 +119,7 @@ class BoundSpheres(Obstacles):
     ) -> BoundSpheres:
         assert dims.position is not None
         o, one = centers, (~absent).to(centers.dtype).unsqueeze(-1)  # no sum counts an absent one
-        rows = [2 * o, -one, (distances.square() - o.square().sum(-1)).unsqueeze(-1)]
+        rows = [2 * o, -one, (inflated_radii.square() - o.square().sum(-1)).unsqueeze(-1)]
         first, second = [one, o], [_outer(o, o)]
         if velocities is not None:
             v = velocities
@@ -132,7 +132,7 @@ class BoundSpheres(Obstacles):
         constant[..., o.shape[-1] + 1] = -1.0
         weights = torch.where(absent.unsqueeze(-1), constant, weights).mT.contiguous()
         return cls(
-            centers, distances, velocities, absent, vehicle_radius, knots, dims.position, dims.dt or 0.0,
+            centers, inflated_radii, velocities, absent, vehicle_radius, knots, dims.position, dims.dt or 0.0,
             weights, torch.cat(first, dim=-1), torch.cat(second, dim=-1),
         )  # fmt: skip
 
@@ -164,7 +164,7 @@ class BoundSpheres(Obstacles):
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """Penetration depth r_obs + r_veh - |p_obs - p|, m, by plain differences."""
-        return (self.distances.unsqueeze(1) - self.gaps(X)).clamp(min=0.0)
+        return (self.inflated_radii.unsqueeze(1) - self.gaps(X)).clamp(min=0.0)
 
     def gaps(self, X: Tensor) -> Tensor:
         """Distance |p_obs,i(k) - p_k| (B, K, M), m; infinite where absent."""
@@ -176,24 +176,24 @@ class BoundSpheres(Obstacles):
 
     @property
     def sizes(self) -> Tensor:
-        return self.distances
+        return self.inflated_radii
 
     @property
     def margins(self) -> Tensor:
-        return self.distances
+        return self.inflated_radii
 
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
-        return self._gaps(p, t.unsqueeze(-1)) - self.distances.unsqueeze(1)
+        return self._gaps(p, t.unsqueeze(-1)) - self.inflated_radii.unsqueeze(1)
 
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
         o = self.centers.unsqueeze(1)
-        gap = _from_origin(a.unsqueeze(2) - o, (b - a).unsqueeze(2)) - self.distances.unsqueeze(1)
+        gap = _from_origin(a.unsqueeze(2) - o, (b - a).unsqueeze(2)) - self.inflated_radii.unsqueeze(1)
         return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
 
     def inflated(self) -> Inflated | None:
         if self.moving:
             return None
-        return Inflated(self.centers, torch.where(self.absent, FAR, self.distances))
+        return Inflated(self.centers, torch.where(self.absent, FAR, self.inflated_radii))
 
     def chord_clearance(self, X: Tensor) -> Tensor:
         o = self.centers.unsqueeze(1)
@@ -201,13 +201,13 @@ class BoundSpheres(Obstacles):
             t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device) * self.dt
             o = o + t.view(1, -1, 1, 1) * self.velocities.unsqueeze(1)
         away = X[:, :, None, self.position] - o
-        gap = _from_origin(away[:, :-1], away.diff(dim=1)) - CONTACT_FACTOR * self.distances.unsqueeze(1)
+        gap = _from_origin(away[:, :-1], away.diff(dim=1)) - CONTACT_FACTOR * self.inflated_radii.unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """False where the vehicle touches an obstacle at the start, (B,)."""
         gap = (x0[:, None, self.position] - self.centers).square().sum(-1).sqrt()
-        return ((gap >= CONTACT_FACTOR * self.distances) | self.absent).all(-1)
+        return ((gap >= CONTACT_FACTOR * self.inflated_radii) | self.absent).all(-1)
 
     def _gaps(self, p: Tensor, t: Tensor) -> Tensor:
         """Distances (B, K, M) of points p (B, K, d) from the centres at times t (K, 1); infinite where absent."""

@@ -17,7 +17,7 @@ class Cost(PerElement):
     """J_var = terminal(x_N) + sum_k stage(x_k, u_k, k).
 
     A subclass defines `stage` and `terminal` on any leading axes; derivatives are exact unless it overrides `expand`
-    too. A Hessian that isn't positive semidefinite is met by the solver's regularisation.
+    too. A Hessian that isn't positive semidefinite is handled by the solver's regularisation.
 
     On a CPU the code is traced and compiled (`torchgco.native`), with what differs between problems (`batched`,
     `per_element`) and between stages (what is indexed with k or computed from it) as numbers. A cost that branches on

@@ -37,7 +37,7 @@ class Dynamics(PerElement):
     dt: float
     integrator: str = "euler"
     position: slice | None = None
-    # A class that says so itself lets its traced step be kept: nothing but the dataclass's fields decides what it does.
+    # True in a class whose step depends on nothing but its dataclass fields: its traced step may then be cached.
     reads_fields_alone: ClassVar[bool]
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:

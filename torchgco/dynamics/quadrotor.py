@@ -67,7 +67,7 @@ class Airframe:
 
     def thrust_rate(self, F: Tensor, speed: Tensor) -> Tensor:
         """F' = 2/T_r sqrt(F) (sqrt(b) u - sqrt(F)) for commanded rotor speeds u in rpm, (..., 4)."""
-        root = F.clamp(min=torch.finfo(F.dtype).tiny).sqrt()  # which has a derivative, as the root of 0 has not
+        root = F.clamp(min=torch.finfo(F.dtype).tiny).sqrt()  # with a derivative, which the root of 0 lacks
         return 2.0 / self.rotor_time_constant * root * (math.sqrt(self.thrust_coefficient) * speed - root)
 
 

@@ -1,1 +1,1 @@
-"""Studies and missions from configs to tables: the floor above everything else."""
+"""Studies, from configurations to tables: the floor above everything else."""

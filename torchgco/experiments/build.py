@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
 from torchgco.errors import InputError
-from torchgco.experiments.presets import register
+from torchgco.experiments.preset_nodes import register
 from torchgco.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 
@@ -27,17 +27,17 @@ register()
 
 
 def config_dir() -> Path:
-    """Absolute path of conf/: beside the package in a checkout, inside it in a wheel."""
+    """Absolute path of conf/: next to the package in a checkout, inside it in a wheel."""
     package = Path(torchgco.__file__).resolve().parent
     for candidate in (package / "conf", package.parent / "conf"):
         if (candidate / "config.yaml").is_file():
             return candidate
-    raise FileNotFoundError(f"no conf/config.yaml in or beside {package}")
+    raise FileNotFoundError(f"no conf/config.yaml in or next to {package}")
 
 
 @dataclass(frozen=True)
 class Setup:
-    """A composed configuration and what it makes: as a study uses it, and a notebook."""
+    """A composed configuration and the objects made from it, for studies and notebooks."""
 
     config: DictConfig
     vehicle: Vehicle
@@ -162,7 +162,7 @@ def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
 
 
 def allotted_cores() -> int:
-    """Cores that this process may use, by the scheduler's word or the system's."""
+    """Cores that this process may use, as the scheduler or else the system says."""
     return int(os.environ.get("SLURM_CPUS_PER_TASK", 0)) or len(os.sched_getaffinity(0))
 
 

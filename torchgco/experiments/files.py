@@ -51,7 +51,7 @@ def checksum(path: Path) -> str:
 
 
 def damaged(path: Path, reason: str) -> InputError:
-    """The line for a file of a study that can't be used as it is: which file, why, and the way out."""
+    """The line for a file of a study that can't be used as it is: which file, why, and how to repair it."""
     return InputError(
         "hydra.run.dir", "whole files of this study", f"{path}, which {reason} (study.repair=true redoes it)"
     )

@@ -58,7 +58,7 @@ def plan_of(setup: Setup) -> Plan:
     return Plan(
         batch_size=None if given.batch_size == "auto" else _count(given.batch_size, "batch_size", ", or auto"),
         shard_size=_count(given.shard_size, "shard_size"),
-        workers=processes if given.workers is None else _count(given.workers, "workers", ", or null for one a core"),
+        workers=processes if given.workers is None else _count(given.workers, "workers", ", or null for one per core"),
         repair=given.repair,
     )
 
@@ -173,7 +173,7 @@ def _now(device: torch.device) -> float:
     return time.perf_counter()
 
 
-# What a worker process runs. It stands here, and not beside the study, so that no worker loads the report's figures.
+# What a worker process runs. It stands here, not with the study, so that no worker loads the report's figures.
 
 
 def prepare(threads: int, in_c: bool) -> None:

@@ -20,7 +20,7 @@ from torchgco.scenarios import Layouts
 from torchgco.scenarios.layouts import BOXES
 
 ARITHMETIC = ("name", "dtype", "kernels")  # keys of `device` that decide results
-# Keys of `model.vehicle` that layouts may overrule, and by which of their fields.
+# Keys of `model.vehicle` that layouts may override, and by which of their fields.
 OVERRULED = {
     "start": "start", "goal": "goal", "radius": "vehicle_radius", "goal_radius": "goal_radius", "stages": "stages",
     "control_lower": "control_lower", "control_upper": "control_upper",
@@ -115,10 +115,10 @@ def digest(value: Any) -> str:
 
 
 def layout_digests(layouts: Layouts, vehicle: Mapping[str, Any]) -> dict[int, str]:
-    """Digest of each layout by its id: the obstacles with all that a flight among them depends on but the solver.
+    """Digest of each layout by its id: the obstacles, and all else that a flight depends on except the solver.
 
-    vehicle  `model.vehicle` of the resolved configuration; layouts overrule it where they say more. What the best
-             known cost is doesn't count.
+    vehicle  `model.vehicle` of the resolved configuration; layouts override it where they say more. The best
+             known cost doesn't count.
     """
     model = {key: value for key, value in vehicle.items() if key not in (*OVERRULED, "name")}
     if layouts.dt is not None:

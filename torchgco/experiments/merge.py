@@ -24,7 +24,7 @@ from torchgco.experiments.variants import UNKNOWN, labels, task_of_runs
 REPEATED = "repeated"  # in the attributes of a merged table: rows left out because another run has the same flight
 OLDER = "older"  # and the folders of runs without digests
 DIGESTS = ("layout_digest", "settings_digest")
-# Two runs of one flight may differ in these: in what was measured, how it was flown, and who else flew.
+# Two runs of one flight may differ in these: in what was measured, how it was flown, and which other solvers flew.
 INCIDENTAL = {"seconds", "batch_size", "threads", "best_cost", "best_from", "success"}
 FOLDER, VARIANT, CONFIGURATION = "_folder", "_variant", "_configuration"
 OWN = [FOLDER, VARIANT, CONFIGURATION]
@@ -166,7 +166,7 @@ def _judged_together(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _sorted(rows: pd.DataFrame) -> pd.DataFrame:
-    """By task and swept variables; solvers that are nobody's baseline first, as a study has its own first."""
+    """By task and swept variables; solvers that are no baseline first, as a study has its own solver first."""
     firsts = rows.groupby(FOLDER, sort=False)["solver"].transform("first")
     baselines = set(rows.loc[rows["solver"] != firsts, "solver"])
     rank = {name: i for i, name in enumerate(rows["solver"].unique())}

@@ -114,7 +114,7 @@ class Records:
         return list(left)
 
     def keep(self, solver: str, flown: Flown) -> None:
-        """Write what a batch of consecutive layouts gave as a shard, named by solver, first and last layout."""
+        """Write the results of a batch of consecutive layouts as a shard, named by solver, first and last layout."""
         rows, U = flown
         numbers = rows["layout"].tolist()
         rows = rows.assign(
@@ -236,7 +236,7 @@ def read_shard(path: Path) -> Flown:
     """The rows and controls in a shard; InputError where it can't be read."""
     try:
         with zipfile.ZipFile(path) as members:
-            if members.testzip() is not None:  # np.load alone doesn't come to the checksum of every member
+            if members.testzip() is not None:  # np.load alone doesn't check every member's checksum
                 raise ValueError("a checksum differs")
         with np.load(path, allow_pickle=False) as held:
             rows, U = pd.DataFrame(json.loads(str(held["rows"]))), held["U"]

@@ -56,7 +56,7 @@ def _bare(solver: str) -> str:
 
 
 def write_report(folder: str | os.PathLike[str], trajectories: Trajectories | None = None) -> str:
-    """Write `summary.csv` and `figures/*.png` beside the `trials.parquet` in a folder, and return the table.
+    """Write `summary.csv` and `figures/*.png` next to the `trials.parquet` in a folder, and return the table.
 
     trajectories  states for the picture of the layouts, which needs `layouts.npz` too: X (L, N+1, n) by
                   solver, row by row as in that file; or a function (layouts, solutions) -> that, called with

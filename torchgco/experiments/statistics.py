@@ -1,8 +1,8 @@
 """Honest counting: rates with their intervals, and paired comparisons, from a table of trials.
 
-A trial is one solver on one layout, a row of `trials.parquet`. Nothing is left out of a count unseen: a trial
+A trial is one solver on one layout, a row of `trials.parquet`. Nothing is left out of a count silently: a trial
 whose start was invalid is a failure, an outcome that isn't defined is subtracted from a denominator that
-stands beside the rate, and a violation that isn't a number counts as infinite.
+is given with the rate, and a violation that isn't a number counts as infinite.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class PairedResult:
 
 
 def task_columns(table: pd.DataFrame) -> list[str]:
-    """What tells one task from another: scenario, model, and the variables swept in a merged table.
+    """The columns that distinguish tasks: scenario, model, and the variables swept in a merged table.
 
     The latter are named by their keys in the configuration, with a dot, as no column of a study is.
     """

@@ -14,7 +14,7 @@ from torchgco.experiments.runs import Run
 from torchgco.experiments.statistics import TASK
 
 UNKNOWN = ""  # variant of a solver in a run of an older version
-SWEPT = ("scenario.", "model.vehicle.")  # of keys that say what is flown; what a solver reads of `model` is its own
+SWEPT = ("scenario.", "model.vehicle.")  # of keys that define the problems; `model` has keys of solvers, too
 NAMES = ("scenario.name", "scenario._target_", "model.vehicle.name", "model.vehicle._target_")  # columns say these
 FILE = "scenario.path"
 RUN = "hydra.run.dir"

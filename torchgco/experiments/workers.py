@@ -84,7 +84,7 @@ def _run_pool(
                         continue
                     keep(result)
                     del left[number]
-    except BrokenProcessPool:  # while jobs were still handed over
+    except BrokenProcessPool:  # while jobs were still being submitted
         pass
     except BaseException:
         for process in set(multiprocessing.active_children()) - others:

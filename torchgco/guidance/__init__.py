@@ -1,4 +1,4 @@
-"""The paper's guidance: find where a trajectory is caught, sample a way past, and attract the trajectory to it."""
+"""The paper's guidance: find where a trajectory is caught, sample a path past the obstacles, and attract it there."""
 
 from torchgco.guidance.gco import GCO as GCO
 from torchgco.guidance.mppi import MPPI as MPPI

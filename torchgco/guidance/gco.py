@@ -63,7 +63,7 @@ class GCO:
     def suited(self, problem: Problem) -> GCO | None:
         """This guidance where it can serve a problem; None where it can't, which a GuidanceWarning explains.
 
-        Without geometric constraints no trajectory is ever caught, and none is needed.
+        Without geometric constraints no trajectory is ever caught, and no guidance is needed.
         """
         if not problem.geometric:
             return None

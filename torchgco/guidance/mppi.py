@@ -18,9 +18,9 @@ from torchgco.native.sampler import Rounds
 from torchgco.problem import Problem
 from torchgco.shapes import check_shape, tensor
 
-CHUNK = 8192  # samples flown side by side: memory stays bounded
+CHUNK = 8192  # samples rolled out together: memory stays bounded
 COLLISION_PENALTY = 1e8  # rho_mp, per knot and obstacle touched
-OPEN = 1e10  # a range of controls that is no range
+OPEN = 1e10  # a range of controls from which on it counts as unbounded
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class MPPI:
         return Noise(z.movedim(1, -1).contiguous(), scale, *self._places(problem))
 
     def _places(self, problem: Problem) -> tuple[Tensor | None, Tensor | None]:
-        """The knot of the noise before each stage (N,), and the share of the way to the next; None for white noise."""
+        """The knot of the noise before each stage (N,), and the share of the interval to the next; None: white."""
         if self.noise_knots == 0:
             return None, None
         place = torch.linspace(0, self.noise_knots - 1, problem.N, dtype=problem.x0.dtype, device=problem.x0.device)
@@ -167,7 +167,7 @@ class MPPI:
             cost = cost + self.dwell_cost * problem.N * problem.cost.stage(flight.x, flight.V[-1], problem.N - 1)
         cost = cost + self.temperature * flight.likelihood
         S = cost.double() + COLLISION_PENALTY * flight.hits.double()
-        # A sample that left the finite numbers must not take the others with it.
+        # A sample that isn't finite must not spoil the others.
         return torch.where(torch.isfinite(S), S, torch.finfo(S.dtype).max)
 
     def _bounds(self, problem: Problem) -> tuple[Tensor, Tensor] | None:

@@ -1,4 +1,4 @@
-"""The guide region from a sampled plan (CPUF, Algorithm 5)."""
+"""The guide region from a sampled trajectory (CPUF, Algorithm 5)."""
 
 from __future__ import annotations
 

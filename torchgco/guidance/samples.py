@@ -1,4 +1,4 @@
-"""Sampled controls and what they cost: the samples of all problems side by side, stage by stage.
+"""Sampled controls and their costs: the samples of all problems side by side, stage by stage.
 
 Costs and collisions are kept apart, so that single precision loses neither.
 """
@@ -20,7 +20,7 @@ class Noise:
     z: Tensor  # (N, B, S, m) white, (knots, B, S, m) else
     scale: Tensor  # (B|1, 1, m): standard deviations
     left: Tensor | None  # (N,) int64: the knot before each stage; None: white
-    share: Tensor | None  # (N,): how far on to the next
+    share: Tensor | None  # (N,): share of the interval to the next knot
 
     @property
     def eps(self) -> Tensor:
@@ -32,7 +32,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Flight:
-    """What samples did."""
+    """Samples, rolled out."""
 
     V: Tensor  # (N, B, S, m) controls
     x: Tensor  # (B, S, n) where they end

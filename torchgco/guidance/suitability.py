@@ -19,7 +19,7 @@ SAMPLES = 2  # of a trial
 
 
 def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None, str | None]:
-    """The sampler that a problem can have, or None, and a sentence on what is lost; None where nothing is.
+    """The sampler that a problem can have, or None, and a sentence on the loss; None where there is none.
 
     Raises:
         InputError: a covariance that doesn't fit the controls.
@@ -34,7 +34,7 @@ def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None,
         return sampler, None
     if wanted != own and failure(_sample, problem, own) is None:
         return replace(sampler, dtype=None), f"samples are drawn in {_name(own)}, as {_name(wanted)} fails ({why})"
-    return None, f"no plan can be sampled ({why})"
+    return None, f"no trajectory can be sampled ({why})"
 
 
 def suited_guide(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None, str | None]:
@@ -57,7 +57,7 @@ def failure(trial: Callable[[Problem], None], problem: Problem, dtype: torch.dty
     """Why a trial with the first problem of a batch, in another precision, fails."""
     try:
         trial(problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device)).cast(dtype))
-    except Exception as error:  # users' functions fail in ways of their own, and none of them is to end the solve
+    except Exception as error:  # users' functions may raise anything, and no such error may end the solve
         return (str(error).splitlines() or [type(error).__name__])[0]
     return None
 

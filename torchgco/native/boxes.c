@@ -1,7 +1,7 @@
 /* Boxes that may be turned, as obstacles: the rows of a knot, where a problem has such (constraints/boxes.py). */
 
 /* Numbers of a box: its centre (DIM), the directions of its sides (DIM, DIM), half of them (DIM), r_veh, and the factor
-   that makes a square of lengths of a distance, 0 where the box is absent. */
+   that turns a distance into a square of lengths, 0 where the box is absent. */
 #define BOX_NUMBERS (DIM * DIM + 2 * DIM + 2)
 
 /* Row j at knot k, and its slopes by the position (DIM) where they are asked for; an absent box is c = -1 everywhere. */
@@ -15,7 +15,7 @@ static inline V solid(const Rows *rows, int64_t j, const V *x, V *slopes) {
         V depth = tgco_fabs(local[i]) - half[i];
         away[i] = tgco_if(depth > zero, depth);
         square += away[i] * away[i];
-        nearest[i] = i == 0 ? zero == zero : depth > deepest; /* of equals the first */
+        nearest[i] = i == 0 ? zero == zero : depth > deepest; /* the first of equals */
         deepest = tgco_choose(nearest[i], depth, deepest);
         for (int a = 0; a < i; a++) nearest[a] &= ~nearest[i];
     }

@@ -21,18 +21,18 @@ from torchgco.native import store
 
 # NaN and infinity carry meaning here, so no -ffast-math: only what doesn't touch them.
 FLAGS = ("-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
-# A vector type may be wider than the registers. Within one library that is nobody's concern.
+# No warning where a vector type is wider than the registers: within one library that does no harm.
 _QUIET = ("-Wno-psabi",)
 _ERROR_LINES = 5
 
 
 class NativeError(RuntimeError):
-    """No native kernel can be had: no compiler, source that doesn't compile, or a library that doesn't load."""
+    """No native kernel is available: no compiler, source that doesn't compile, or a library that doesn't load."""
 
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler: the words that call it, and its path and version, which libraries depend on."""
+    """A C compiler: the command that calls it, and its path and version, which libraries depend on."""
 
     command: tuple[str, ...]
     identity: str
@@ -44,9 +44,9 @@ class Compiler:
 
 
 def find_compiler() -> Compiler | None:
-    """The first that works of CC, cc, gcc, clang, and zig as the package ziglang brings it; None where there is none.
+    """The first that works of CC, cc, gcc, clang, and zig from the package ziglang; None where there is none.
 
-    TORCHGCO_CC names the only one that is tried, a word such as "none" turns native kernels off.
+    TORCHGCO_CC names the only compiler that is tried; a word such as "none" turns native kernels off.
     """
     return _find_compiler(*map(os.environ.get, ("TORCHGCO_CC", "CC", "PATH")))
 
@@ -83,7 +83,7 @@ def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDL
     if kept is not None:
         try:
             return ctypes.CDLL(str(kept))
-        except OSError:  # removed this moment, or in a folder that nothing may be run from
+        except OSError:  # removed meanwhile, or in a folder that nothing may be run from
             pass
     try:
         with TemporaryDirectory(prefix="torchgco-") as room:
@@ -92,7 +92,7 @@ def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDL
             try:
                 return ctypes.CDLL(str(kept or made))
             except OSError:
-                return ctypes.CDLL(str(made))  # stays loaded when its file goes
+                return ctypes.CDLL(str(made))  # stays loaded when its file is deleted
     except OSError as error:
         raise NativeError(f"a compiled library can't be written or loaded: {error}") from error
 

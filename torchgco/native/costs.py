@@ -1,4 +1,4 @@
-"""C of a cost that is traced: value, gradient and Hessian of a stage and of the last knot."""
+"""C of a traced cost: value, gradient and Hessian of a stage and of the last knot."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchgco.tracing import Traced, own_tensors
 
 @dataclass(frozen=True)
 class CostSource:
-    """The code for traced.c, which says what is in it; costs of one problem are these times a factor."""
+    """The code for traced.c, described there; costs of one problem are these times a factor."""
 
     stage: KnotSource
     last: KnotSource
@@ -32,7 +32,7 @@ class CostSource:
 
 def unscaled(problem: Problem) -> tuple[Cost, Tensor]:
     """The cost of a problem without the factors of a ScaledCost, and their product (B,)."""
-    # A cost that scales itself may look otherwise once it is scaled: here it always is, by 1 at least.
+    # A cost that scales itself may have another form once it is scaled, so it always is here, if only by 1.
     factor = problem.x0.new_ones(problem.B)
     cost = problem.cost.scaled(factor)
     while type(cost) is ScaledCost:

@@ -17,7 +17,7 @@ from torchgco.native.sampler import Sampler
 from torchgco.problem import Problem
 
 NUDGE = 1e-14  # share of the controls by which a rollout's sensitivity is tried out
-AMPLIFIED = 1e6  # times that: other last bits are no matter below it
+AMPLIFIED = 1e6  # times that: below it, different last bits don't matter
 
 
 class EagerWarning(UserWarning):
@@ -27,8 +27,8 @@ class EagerWarning(UserWarning):
 def engine_of(problem: Problem) -> Engine | None:
     """The library for problems of this form, compiled at the first call; None where PyTorch's kernels serve.
 
-    They do on a GPU, in single precision, where the process has chosen them (`kernels.use_native`), and where a part
-    can't be traced or nothing compiles, which an EagerWarning explains.
+    PyTorch's serve on a GPU, in single precision, where the process has chosen them (`kernels.use_native`), and where a
+    part can't be traced or nothing compiles, which an EagerWarning explains.
     """
     if not native() or problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
         return None
@@ -78,8 +78,8 @@ def open_loop(problem: Problem, U: Tensor) -> Tensor:
 def reproducible(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """X (B, N+1, n) and U (B, N, m) such that PyTorch's rollout of U is X, from those of native kernels.
 
-    The two differ in the last bits. Where unstable dynamics make much of that, found by a rollout of slightly other
-    controls, PyTorch follows X with the gains K (B, N, m, n), and the controls that it takes are returned.
+    The two differ in the last bits. Where unstable dynamics amplify that, as a rollout of slightly different
+    controls shows, PyTorch tracks X with the gains K (B, N, m, n), and the controls of that rollout are returned.
     """
     engine = engine_of(problem)
     if engine is None:

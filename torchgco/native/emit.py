@@ -27,7 +27,7 @@ def emit(name: str, function: ca.Function) -> str:
     """`static inline void NAME(const V *restrict in0, ..., V *restrict out0, ...)`, as straight-line code.
 
     An input is an array of its entries, an output one of its nonzeros in the order of its sparsity; outputs overlap
-    nothing else. A choice lets nothing of the branch not taken through; least and greatest are C's fmin and fmax.
+    nothing else. A choice ignores the branch not taken, NaN included; minimum and maximum are C's fmin and fmax.
 
     Args:
         name: of the C function.

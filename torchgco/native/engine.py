@@ -29,7 +29,7 @@ MOST = 128  # states and controls: matrices of a stage lie on the stack
 
 @dataclass(frozen=True)
 class Options:
-    """What the loop of iLQR is told (see ILQR and LineSearch)."""
+    """The options of iLQR's loop (see ILQR and LineSearch)."""
 
     ladder: tuple[float, ...]
     back: int
@@ -62,7 +62,7 @@ class Engine:
 
     Raises:
         InputError: a part of the problem that has no counterpart in C.
-        NativeError: no compiler, or one that refuses.
+        NativeError: no compiler, or it refuses the source.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -124,7 +124,7 @@ class Engine:
         return tensors["slopes"], tensors["curvatures"]
 
     def lift(self, problem: Problem, state: dict[str, Tensor], terms: Terms, rounds: int, gain: float) -> Tensor:
-        """Up to `rounds` steps in states and controls together, in place in `state`; who found a better rollout (B,).
+        """Up to `rounds` steps in states and controls together, in place in `state`; which found a better rollout (B,).
 
         Args:
             state: X, U, cost, merit, all contiguous.
@@ -139,7 +139,7 @@ class Engine:
     def iterate(
         self, problem: Problem, state: dict[str, Tensor], terms: Terms, options: Options, limit: int
     ) -> dict[str, Tensor]:
-        """Up to `limit` iterations of every element's inner solve, in place in `state`.
+        """Up to `limit` iterations of every problem's inner solve, in place in `state`.
 
         Args:
             state: X, U, cost, merit, regularisation; inner, iterations, rung (int64): all contiguous.
@@ -164,7 +164,7 @@ class Engine:
         run(getattr(self.library, name), problem.B, LANES, packed)
 
     def packed(self, problem: Problem, tensors: dict[str, Tensor], terms: Terms | None = None) -> Packed:
-        """The problem as the library reads it, which holds what its pointers point to."""
+        """The problem as the library reads it; it keeps alive what its pointers point to."""
         fixed = problem.__dict__.get("packed")
         if fixed is None:
             fixed = self._fixed(problem)
@@ -217,10 +217,10 @@ class Engine:
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> None:
-    """Call a function of a library on all elements, in whole groups, by as many threads as PyTorch has.
+    """Call a function of a library on all problems, in whole groups, by as many threads as PyTorch has.
 
     Raises:
-        MemoryError: the library got none.
+        MemoryError: the library could allocate none.
     """
     if count == 0:
         return

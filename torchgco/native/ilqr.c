@@ -1,5 +1,5 @@
 /* iLQR (Algorithm 2) for problems side by side: the line search, and the loop that keeps the lanes filled.
-   The single lanes of an element agree with PyTorch's kernels up to rounding (tests/native). */
+   The lanes of a problem agree with PyTorch's kernels up to rounding (tests/native). */
 
 /* Commit the trial of lane from[l] to lane l where `won`. */
 static void commit(Lanes *s, I won, const int *from, V alpha, V cost, V merit) {
@@ -13,7 +13,7 @@ static void commit(Lanes *s, I won, const int *from, V alpha, V cost, V merit) {
     s->alpha = tgco_choose(won, __builtin_shuffle(alpha, index), s->alpha);
 }
 
-/* The line search (lines 14-24) of the lanes `moving`. Lanes of one element, `replicas` of them, try rungs side by side. */
+/* The line search (lines 14-24) of the lanes `moving`. The `replicas` lanes of a problem try rungs in parallel. */
 static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
     const Problem *p = s->of;
     int replicas = p->replicas;
@@ -41,7 +41,7 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
                 from[l] = winner < 0 ? l : winner;
                 won[l] = winner < 0 ? 0 : -1;
             }
-            /* The last rung of an element that refuses all is in its last lane. */
+            /* The last rung of a problem that refuses all is in its last lane. */
             for (int l = e; l < e + replicas; l++) (*shortest)[l] = (*shortest)[e + replicas - 1];
         }
         if (any(won)) commit(s, won, from, alpha, cost, merit);
@@ -58,7 +58,7 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
     return done;
 }
 
-/* Returns the lanes that are done: their status, and whether they converged, were refused, or lost their way. */
+/* Returns the lanes that are done: their status, and whether they converged, were refused, or diverge. */
 static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused, I *lost) {
     const Problem *p = s->of;
     V linear, squares, lowest, zero = SET(0.0), old = s->merit, shortest;
@@ -110,7 +110,7 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
     return limit & running;
 }
 
-/* Elements first, first + 1, ..., last - 1: up to `limit` iterations of each inner solve. Returns 0 without memory. */
+/* Problems first, first + 1, ..., last - 1: up to `limit` iterations of each inner solve. Returns 0 without memory. */
 int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
     Lanes lanes, *s = &lanes;
     if (!start(s, p)) return 0;
@@ -118,7 +118,7 @@ int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
     I running = SET(0.0) != SET(0.0);
     int64_t next = first;
     for (int e = 0; e < LANES; e += replicas) {
-        /* Lanes without an element repeat the first one, so that no work is done on what isn't finite. */
+        /* Lanes without a problem repeat the first one, so that no work is done on what isn't finite. */
         int64_t element = next < last ? next : first;
         for (int l = e; l < e + replicas; l++) {
             enter(s, l, element);

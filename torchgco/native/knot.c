@@ -1,4 +1,4 @@
-/* What one knot says of the iterate: cost, constraints, guide and the model's step. */
+/* The terms of one knot of the iterate: cost, constraints, guide and the model's step. */
 
 #define BLOCK 32 /* spheres looked at together: most blocks are far away */
 
@@ -33,7 +33,7 @@ static inline V bound(const Constraint *con, const Rows *rows, int64_t j, const 
 }
 
 #if DIM > 0
-/* Row j of spheres at knot k, and the way there from the centre (DIM); an absent one is c = -1 everywhere. */
+/* Row j of spheres at knot k, and the vector to it from the centre (DIM); an absent one is c = -1 everywhere. */
 static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V *away) {
     const V *o = rows->bound + j * DIM;
     V square = SET(0.0);
@@ -145,7 +145,7 @@ static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x,
 }
 
 #if DIM > 0
-/* The way from the guide's centre at knot k, and its squared length. */
+/* The vector from the guide's centre at knot k, and its squared length. */
 static inline V from_guide(const Lanes *s, int64_t k, const V *x, V *away) {
     V square = SET(0.0);
     for (int a = 0; a < DIM; a++) {

@@ -53,7 +53,7 @@ class Knot:
 class KnotSource:
     """C of one knot's rows (size), and where its numbers come from.
 
-    They stand at `places` (K|1, count) among a problem's own numbers, followed by the constants, of `span`.
+    `places` (K|1, count) are their positions in a problem's own numbers followed by the constants, of `span`.
     """
 
     code: str
@@ -73,7 +73,7 @@ class KnotSource:
         """The numbers (B|1, K|1, count) of B problems of this form, whose own tensors are `own`.
 
         Args:
-            again: their span, for where it takes one.
+            again: makes the span of these problems, where one is needed.
 
         Raises:
             InputError: they have another function.

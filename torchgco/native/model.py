@@ -84,7 +84,7 @@ def trace_dynamics(
     """
     n, m = n or dynamics.n, m or dynamics.m
     known = _traced.get(id(dynamics))
-    # Between two problems of an application that solves one after the other, tracing would take half of the time.
+    # In an application that solves one problem after another, tracing would take half of the time.
     if known is not None and known.dynamics() is dynamics and known.versions == _versions(dynamics, dtype, device):
         return known.source
     source = _trace(dynamics, n, m, dtype, device)
@@ -161,7 +161,7 @@ def elements(column: Any) -> np.ndarray:
 
 @cache
 def makers(*more: str) -> Sequence[str]:
-    """The texts of what makes code: when they change, what was made before doesn't count."""
+    """The texts of the files that generate code: when they change, code made before doesn't count."""
     files = (operations.__file__, arrays.__file__, emit.__file__, __file__, *more)
     try:
         casadi = version("casadi")

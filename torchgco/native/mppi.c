@@ -9,12 +9,12 @@ typedef struct {
     const uint64_t *keys;                   /* (E, rounds) */
     Array deviation, lower, upper;          /* (E, 1, NU) */
     const int32_t *left;                    /* (N): the knot before each stage; unused where white */
-    const double *share;                    /* (N): how far on to the next one */
+    const double *share;                    /* (N): share of the interval to the next */
     const int32_t *geometric;               /* of each constraint: whether samples that touch it are counted */
     double *mean;                           /* (E, N, NU) in and out */
 } Sampling;
 
-/* What one problem needs: the lanes of `s` are all this problem. */
+/* What one problem needs: all lanes of `s` are this problem. */
 typedef struct {
     const Sampling *of;
     Lanes s;
@@ -89,7 +89,7 @@ static void fly(Samples *q, int64_t first) {
     cost += SET(o->temperature) * likelihood;
     for (int l = 0; l < LANES && first + l < o->samples; l++) {
         double score = (double)cost[l] + o->collision_penalty * (double)touched[l];
-        /* A sample that left the finite numbers must not take the others with it. */
+        /* A sample that isn't finite must not spoil the others. */
         q->score[first + l] = score - score == 0 ? score : DBL_MAX;
     }
 }
@@ -115,7 +115,7 @@ static void weigh(const Sampling *o, double *score) {
     for (int64_t i = 0; i < count; i++) score[i] /= sum;
 }
 
-/* The weighted mean of all samples' controls: drawn once more rather than kept, and only where a weight counts. */
+/* The weighted mean of all samples' controls: drawn again rather than kept, and only where a weight counts. */
 static void average(Samples *q, uint64_t key, int64_t rows) {
     const Sampling *o = q->of;
     int64_t N = o->of->N;
@@ -149,7 +149,7 @@ static int begin(Samples *q, const Sampling *o) {
     return 1;
 }
 
-/* Elements first, first + 1, ..., last - 1: all rounds. Returns 0 without memory. */
+/* Problems first, first + 1, ..., last - 1: all rounds. Returns 0 without memory. */
 int tgco_sample(const Sampling *o, int64_t first, int64_t last) {
     Samples samples, *q = &samples;
     if (!begin(q, o)) return 0;

@@ -65,7 +65,7 @@ class Packed(ctypes.Structure):
 
 
 def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: Problem, keep: list[Any]) -> None:
-    """Fill in the parts of a constraint; `numbers` (B|1, K|1, count) are those of one that is traced."""
+    """Fill in the parts of a constraint; `numbers` (B|1, K|1, count) are those of a traced constraint."""
     one = problem.take(slice(0, 1))
     shape = (
         constraint.take(slice(0, 1))
@@ -93,7 +93,7 @@ def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: 
     elif isinstance(constraint, BoundSpheres):
         c.dt = constraint.dt
         c.bound = array(constraint.centers.flatten(1), keep, knots=False)
-        squares = torch.where(constraint.absent, ABSENT, constraint.distances.square())
+        squares = torch.where(constraint.absent, ABSENT, constraint.inflated_radii.square())
         c.squares = array(squares, keep, knots=False)
         if constraint.velocities is not None:
             c.velocities = array(constraint.velocities.flatten(1), keep, knots=False)

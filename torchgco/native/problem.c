@@ -23,7 +23,7 @@ typedef struct { const double *data; int64_t element, knot; int64_t size; } Arra
 
 typedef struct {
     int32_t kind, equality, rows;  /* rows of a knot */
-    const int32_t *place;          /* (N+1): which of the constraint's knots, -1 where it says nothing */
+    const int32_t *place;          /* (N+1): which of the constraint's knots, -1 where it has no rows */
     int64_t knots;
     double *lam;                   /* (E, knots, rows) */
     const int32_t *variable;       /* BOUNDS: (rows) index into [x, u] */

@@ -19,15 +19,17 @@ from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
 from torchgco.native.dispatch import EagerWarning
 
 AT_ONCE = 64  # problems searched together
-HOPS = 32  # edges of a way, at most
+HOPS = 32  # edges of a path, at most
 CLEAR = 0.001  # how far a point has to stay off all spheres, as a share of the largest r_obs + r_veh
 MIDWAY = 4  # spheres whose gap to another is given a point
 SHELLS = {2: (1.05, 1.3), 3: (1.15,)}  # radii of the circles of points around a sphere, by the number of coordinates
 RAYS = 8  # points of a circle
-TIE = 1e-12  # share of the cost by which equal ways may differ
-LEAST = 1e-6  # share of the distance from start to goal that is added to every edge, as none may be free of charge
+TIE = 1e-12  # share of the cost by which equally cheap paths may differ
+LEAST = 1e-6  # share of the distance from start to goal that is added to every edge, as each has to cost something
 
-SOURCE, BOXES = (Path(__file__).with_name(name) for name in ("roadmap.c", "roadmap_boxes.h"))
+POINTS, PATHS, BOXES = (
+    Path(__file__).with_name(name) for name in ("roadmap_points.c", "roadmap_paths.c", "roadmap_boxes.h")
+)
 # Fused products and sums would be rounded once where PyTorch rounds twice.
 FLAGS = ("-ffp-contract=off",)
 SIZES = (
@@ -36,7 +38,7 @@ SIZES = (
 )  # fmt: skip
 NUMBERS = ("margin", "least", "clear", "factor", "tie")
 TENSORS = (
-    "centers", "distances", "start", "goal", "cube", "rays", "shell", "nodes", "ends", "lengths", "price", "way",
+    "centers", "distances", "start", "goal", "cube", "rays", "shell", "nodes", "ends", "lengths", "price", "path",
     "string", "cost", "arrives", "box", "beside", "exists", "reach", "largest",
 )  # fmt: skip
 
@@ -50,7 +52,7 @@ class Graph(NamedTuple):
 
 
 class Packed(ctypes.Structure):
-    """The structure `Search` of roadmap.c."""
+    """The structure `Search` of roadmap_points.c."""
 
     _fields_ = [
         *((name, ctypes.c_int64) for name in SIZES),
@@ -91,24 +93,24 @@ class NativeSearch:
 
     def cheapest(self, graph: Graph, price: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         (B, V, K), d, P = graph.ends.shape, self.o.shape[2], HOPS + 1
-        way, string = self.o.new_empty(B, P, d), self.o.new_empty(B, 2 * P - 1, d)
+        path, string = self.o.new_empty(B, P, d), self.o.new_empty(B, 2 * P - 1, d)
         arrives, ends = torch.zeros(B, dtype=torch.bool), graph.ends.to(torch.int32)
         self._run(
             "tgco_cheapest",
             {"nodes": graph.points, "ends": ends, "lengths": graph.lengths, "price": self._prices(price, V)},
-            {"way": way, "string": string, "arrives": arrives}, points=V, edges=K,
+            {"path": path, "string": string, "arrives": arrives}, points=V, edges=K,
         )  # fmt: skip
-        return way, string, arrives
+        return path, string, arrives
 
-    def taut(self, way: Tensor, string: Tensor, price: Tensor) -> Tensor:
-        tight = way.clone()
-        self._run("tgco_taut", {"string": string, "cost": self._prices(price, string.shape[1])}, {"way": tight})
+    def taut(self, path: Tensor, string: Tensor, price: Tensor) -> Tensor:
+        tight = path.clone()
+        self._run("tgco_taut", {"string": string, "cost": self._prices(price, string.shape[1])}, {"path": tight})
         return tight
 
-    def raised(self, price: Tensor, points: Tensor, way: Tensor, factor: float) -> Tensor:
+    def raised(self, price: Tensor, points: Tensor, path: Tensor, factor: float) -> Tensor:
         V = points.shape[1]
         price = self._prices(price, V).clone(memory_format=torch.contiguous_format)
-        self._run("tgco_raise", {"nodes": points, "way": way}, {"price": price}, points=V, factor=factor)
+        self._run("tgco_raise", {"nodes": points, "path": path}, {"price": price}, points=V, factor=factor)
         return price
 
     def _prices(self, price: Tensor, points: int) -> Tensor:
@@ -120,7 +122,7 @@ class NativeSearch:
         if self.boxes is not None:
             numbers["boxes"] = self.boxes.radius.shape[1]
             read |= {"box": _numbers(self.boxes), "largest": self.boxes.sizes.amax(-1)}
-        read = {field: tensor.contiguous() for field, tensor in read.items()}  # held until the call returns
+        read = {field: tensor.contiguous() for field, tensor in read.items()}  # kept until the call returns
         places: dict[str, Any] = {field: tensor.data_ptr() for field, tensor in (read | written).items()}
         B, M = self.R.shape
         numbers |= {"margin": self.margin, "clear": CLEAR, "least": LEAST, "tie": TIE}
@@ -130,7 +132,7 @@ class NativeSearch:
 
 
 def around_boxes(boxes: Cuboids, o: Tensor, R: Tensor, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (B, C, d) beside boxes and between them, spheres and each other, and whether each belongs to one (B, C).
+    """Points (B, C, d) around boxes, and midway to spheres and other boxes; and whether each exists (B, C).
 
     Args:
         o, R: centres (B, M, d) and radii (B, M) of the spheres.
@@ -165,8 +167,8 @@ def _unit(v: Tensor) -> Tensor:
 def library_for(like: Tensor, boxes: bool = False) -> ctypes.CDLL | None:
     """The library for spheres with centres such as these (..., d), and boxes; None where PyTorch has to search.
 
-    It has to on a GPU, in single precision, where the process has chosen it (`kernels.use_native`), where there is no
-    compiler, which the solver says itself, and where the source doesn't compile, which an EagerWarning explains.
+    PyTorch has to on a GPU, in single precision, where the process has chosen it (`kernels.use_native`), where there is
+    no compiler (the solver warns of that itself), and where the source doesn't compile (an EagerWarning explains it).
     """
     if not native() or find_compiler() is None or like.dtype != torch.float64 or like.device.type != "cpu":
         return None
@@ -178,8 +180,8 @@ def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.C
     # Code for boxes is left out where there are none: the spheres' code is then what it would be without it.
     head = f"#define DIM {dimension}\n#define BOXES {int(boxes)}\n{BOXES.read_text() if boxes else ''}"
     try:
-        return build(f"{head}\n{SOURCE.read_text()}", FLAGS)
+        return build(f"{head}\n{POINTS.read_text()}\n{PATHS.read_text()}", FLAGS)
     except NativeError as error:
         reason = str(error).splitlines()[0]
-        warnings.warn(f"solved by PyTorch's kernels where ways are sought: {reason}", EagerWarning, stacklevel=3)
+        warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)
         return None

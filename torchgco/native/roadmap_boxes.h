@@ -24,7 +24,7 @@ static inline double beyond(double x, double half) {
     return x - (held < half ? held : half);
 }
 
-/* Squared distance of a point, and half its slope where the point moves on along a segment. */
+/* Squared distance of a point, and half its slope where the point moves along a segment. */
 static inline double square_at(const double *half, const double *begin, const double *along, double share, double *slope) {
     double square = 0.0, sum = 0.0;
     for (int i = 0; i < DIM; i++) {

@@ -1,4 +1,4 @@
-"""C of a constraint that is traced: its rows, and what they add to a quadratic model."""
+"""C of a traced constraint: its rows, and what they add to a quadratic model."""
 
 from __future__ import annotations
 

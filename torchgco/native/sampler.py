@@ -52,7 +52,7 @@ class Sampler:
     """The library that samples around the controls of a form of problems, in single or double precision.
 
     Raises:
-        NativeError: no compiler, or one that refuses.
+        NativeError: no compiler, or it refuses the source.
     """
 
     def __init__(self, engine: Engine, dtype: torch.dtype) -> None:

@@ -69,7 +69,7 @@ class Form:
         names = parts if self.cost is None else ["traced.c" if name == COST else name for name in parts]
         texts = [Path(__file__).with_name(name).read_text() for name in names]
         if self.boxes:
-            # Left out elsewhere: what others run is compiled from the same code as if there were no boxes.
+            # Left out elsewhere: problems without boxes are compiled from the same code as if boxes didn't exist.
             head += "#define WITH_BOXES 1\n"
             solid = Path(__file__).with_name("boxes.c").read_text()
             texts = [text.replace(BOXES_STAND_HERE, solid) for text in texts]
@@ -82,7 +82,7 @@ def _products(model: DynamicsSource) -> str:
 
 
 def _looped(model: DynamicsSource) -> str:
-    """Loops over a table of the nonzeros: of many, the code that names each would take long to compile."""
+    """Loops over a table of the nonzeros: where there are many, code that names each would take long to compile."""
     tables = {"row": model.rows, "column": model.columns, "place": model.places}
     lines = [f"static const int F_{name}[] = {{{', '.join(map(str, values))}}};" for name, values in tables.items()]
     lines += [f"static const double F_value[] = {{{', '.join(map(literal, model.values))}}};", LOOPS]

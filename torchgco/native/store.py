@@ -1,6 +1,6 @@
 """The user's cache folder: what was generated or compiled once, under keys that hold all it depends on.
 
-A file is called KEY-CHECKSUM and a suffix, with the checksum of its content. It comes into being whole, by being
+A file is called KEY-CHECKSUM and a suffix, with the checksum of its content. It is written under another name and
 renamed, so processes that write the same one at once do no harm; one that was damaged, cut short or swapped is deleted.
 A folder that can't be written or isn't there costs time, never correctness: nothing here raises OSError.
 """
@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import mkstemp
 
-FILES = 200  # at most, the least recently used go
+FILES = 200  # at most, the least recently used are removed
 _ABANDONED = 3600.0  # s after which a half-written file belongs to a process that was killed
 _PART = ("torchgco-", ".part")
 _OURS = re.compile(r"[0-9a-f]{32}-[0-9a-f]{32}\.[a-z]+")
@@ -100,7 +100,7 @@ def _tidy(place: Path) -> None:
         for entry in entries:
             with suppress(OSError):
                 age = time.time() - entry.stat().st_mtime
-                if _OURS.fullmatch(entry.name):  # whatever else somebody keeps there is left alone
+                if _OURS.fullmatch(entry.name):  # all other files in the folder are left alone
                     ages.append((age, entry.path))
                 elif entry.name.startswith(_PART[0]) and entry.name.endswith(_PART[1]) and age > _ABANDONED:
                     os.unlink(entry.path)

@@ -25,7 +25,7 @@ def convergence_figure(trace: pd.DataFrame, elements: Sequence[int] | None = Non
     """Cost per iteration, a panel per problem: lines at multiplier updates, bands where guidance is on.
 
     trace     a row per problem and iteration, with columns element, iteration, outer (index of the outer
-              iteration), cost (J_var) and guided (bool)
+              iteration), cost (J_var) and guided (bool); with a column attempt, attempts follow each other
     elements  which problems to show; by default the first four
 
     A multiplier update is drawn between the two iterations it stands between. Raises InputError for a missing
@@ -40,22 +40,32 @@ def convergence_figure(trace: pd.DataFrame, elements: Sequence[int] | None = Non
         if element not in held:
             raise InputError("elements", f"elements of the trace, {held[0]} to {held[-1]}", element)
     figure, axes = panels(len(shown), 2, (5.2, 3.0))
+    order = [name for name in ("attempt", "iteration") if name in trace.columns]
     for ax, element in zip(axes, shown, strict=True):
-        _panel(ax, trace[trace["element"] == element].sort_values("iteration"))
+        _panel(ax, trace[trace["element"] == element].sort_values(order))
         tidy(ax, f"problem {element}")
     legend(
         figure,
         [
             Line2D([], [], color=INK, label="cost"),
             Line2D([], [], color=UPDATE, linewidth=1, label="multiplier update"),
+            *([Line2D([], [], color=INK, linestyle="--", label="next attempt")] if _restarts(trace) else []),
             Patch(color=GUIDED, label="guidance on"),
         ],
     )
     return figure
 
 
+def _restarts(trace: pd.DataFrame) -> bool:
+    return "attempt" in trace.columns and trace["attempt"].nunique() > 1
+
+
 def _panel(ax: Axes, rows: pd.DataFrame) -> None:
     iteration = rows["iteration"].to_numpy(dtype=float)
+    if _restarts(rows):
+        iteration = np.arange(len(rows), dtype=float)
+        for change in np.flatnonzero(np.diff(rows["attempt"].to_numpy())):
+            ax.axvline(change + 0.5, color=INK, linewidth=0.8, linestyle="--", zorder=1)
     cost = rows["cost"].to_numpy(dtype=float)
     for first, last in _runs(rows["guided"].to_numpy(dtype=bool)):
         ax.axvspan(iteration[first] - 0.5, iteration[last] + 0.5, color=GUIDED, linewidth=0, zorder=0)

@@ -45,8 +45,8 @@ def violation_histogram(trials: pd.DataFrame) -> Figure:
 
     trials  with columns scenario, model, solver, violation
 
-    What is below 1e-12, zero included, is counted in the bin that begins there. Left of the line at 1e-3
-    stands what success asks for.
+    What is below 1e-12, zero included, is counted in the bin that begins there. Success asks for
+    a violation left of the line at 1e-3.
     """
     tasks = list(tasks_of(trials))
     figure, axes = panels(len(tasks), 2, SIZE)

@@ -37,7 +37,7 @@ def layout_grid(layouts: Arrays, trajectories: Arrays, trials: pd.DataFrame, col
     trials        with columns layout, solver, feasible, reached
 
     Spheres are filled at their own radius and outlined at that plus the vehicle's, as the vehicle is a line
-    here; boxes likewise. In 3-D their shade tells their height. Moving ones fade along their way. A path that
+    here; boxes likewise. In 3-D their shade shows their height. Moving ones fade along their path. A path that
     didn't reach the goal is dashed and ends in a cross if it isn't feasible, in a ring if it only stopped short.
 
     Raises InputError where the trajectories don't fit the layouts, or a trial of theirs isn't in `trials`.

@@ -48,7 +48,7 @@ class Scene:
 def scene_of(layouts: Arrays, stages: int) -> Scene:
     """The scene of all layouts in the arrays of a layout file, for flights of N = `stages`.
 
-    Without `dt` obstacles are drawn where they start, as nobody can say how far they move.
+    Without `dt` obstacles are drawn where they start, as it isn't known how far they move.
     """
     centers, radii = np.asarray(layouts["centers"], dtype=float), np.asarray(layouts["radii"], dtype=float)
     count = len(radii)
@@ -76,7 +76,7 @@ def scene_of(layouts: Arrays, stages: int) -> Scene:
 def map_box(scene: Scene, paths: list[np.ndarray], count: int) -> np.ndarray:
     """Lower and upper corner (2, 2), m, of a map of the first `count` layouts and their paths (N+1, 2).
 
-    Ends and obstacles make the scene. Paths widen it, but only by half its size: one that ran away would
+    Starts, goals and obstacles make the scene. Paths widen it, but only by half its size: a diverged one would
     otherwise shrink all the rest to a dot.
     """
     outer = (scene.radii + scene.margin)[:count, :, None]

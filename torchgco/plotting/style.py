@@ -1,7 +1,7 @@
 """What all figures share: a colour per solver, panels, axes, and how a figure is saved.
 
 Figures are plain `matplotlib.figure.Figure` objects without pyplot, so that no window system and no global
-state is touched, and a figure is gone when nobody holds it.
+state is touched, and a figure is freed when nothing refers to it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, told apart by colour-blind readers too; their yellow is lost on white paper.
+# Okabe and Ito's colours, distinct for colour-blind readers too; their yellow is lost on white paper.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 KNOWN = ("gco", "al_ilqr", "fatrop", "ipopt", "mppi", "ilqr")
 INK, FAINT = "#333333", "#BBBBBB"

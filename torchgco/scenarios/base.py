@@ -13,13 +13,13 @@ from torchgco.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.layouts import Layouts, concatenate
 
-MAX_DRAWS = 5000  # rounds of redrawing what lies too near before a rule is called impossible
+MAX_DRAWS = 5000  # rounds of redrawing points that lie too near, before a rule is called impossible
 
 
 class Scenario(ABC):
     """A named source of obstacle layouts.
 
-    A layout depends on (seed, id) alone: neither on how many others are drawn with it nor on who flies it. A
+    A layout depends on (seed, id) alone: neither on how many others are drawn with it nor on the solver. A
     subclass has a `name` and a `dimension` and overrides `_draw_one`.
     """
 

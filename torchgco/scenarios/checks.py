@@ -138,7 +138,7 @@ def boxes(centers: Any, halves: Any, turns: Any, like: np.ndarray) -> tuple[np.n
     absent = np.asarray(np.isnan(middle).all(axis=2))
     _none_of(~absent & ~np.isfinite(middle).all(axis=2), "layouts.box_centers", "finite rows or rows of NaN", middle)
     if halves is None:
-        raise InputError("layouts.box_half_sizes", "this array beside box_centers", "none")
+        raise InputError("layouts.box_half_sizes", "this array with box_centers", "none")
     half = array(halves, "layouts.box_half_sizes")
     if half.shape != middle.shape:
         raise InputError("layouts.box_half_sizes", f"the shape {middle.shape} of box_centers", half.shape)

@@ -12,7 +12,7 @@ from torchgco.scenarios import checks
 from torchgco.scenarios.base import Family, uniform_clear
 from torchgco.scenarios.layouts import Layouts
 
-# A cup that opens towards the start and stands on the straight way to the goal.
+# A cup that opens towards the start and stands on the straight line to the goal.
 TRAP = ((0.0, -0.25), (0.1, 0.0), (0.12, 0.25), (0.0, 0.5), (-0.2, 0.6), (-0.2, -0.35))
 
 
@@ -60,7 +60,7 @@ class Planar(Family):
 
 @dataclass(frozen=True, kw_only=True)
 class PlanarTrap(Planar):
-    """Discs at `centers` (M, 2) m, each coordinate jittered by N(0, jitter^2): a cup before the goal."""
+    """Discs at `centers` (M, 2) m, each coordinate jittered by N(0, jitter^2): a cup in front of the goal."""
 
     name: str = "planar_trap"
     obstacle_radius: float = 0.10

@@ -100,7 +100,7 @@ class ForestMoving(Forest):
 
 @dataclass(frozen=True, kw_only=True)
 class Walls(Quadrotor):
-    """Walls of spheres across the way, with round holes at random places.
+    """Walls of spheres between start and goal, with round holes at random places.
 
     positions    x of each wall, m
     extent       [[low, high] in y, [low, high] in z] of the grid of centres, which starts at the low ends, m

@@ -1,4 +1,4 @@
-"""Vehicle: a planning model with its weights, limits and habits; with layouts it makes a batch of problems."""
+"""Vehicle: a planning model with its weights, limits and defaults; with layouts it makes a batch of problems."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from torchgco.scenarios.layouts import Layouts
 
 @dataclass(frozen=True)
 class Task:
-    """A batch of planning problems with what a study needs beside them."""
+    """A batch of planning problems with what a study needs in addition."""
 
     problem: Problem
     U0: Tensor  # (B, N, m), the vehicle at rest
@@ -33,11 +33,11 @@ class Task:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What flies: the planning model and what the paper's tables say of it. Layouts overrule the last group.
+    """A planning model with the values of the paper's tables. Layouts override the last group of arguments.
 
     Args:
         name: as the study's column `model` shows it.
-        dynamics: planning model; its time step gives way to the layouts'.
+        dynamics: planning model; the layouts' time step overrides its own.
         state_weight, control_weight, terminal_weight: diagonals of Q, R, Qf.
         control_reference: u_ref (m,), also the initial guess: the vehicle at rest.
         control_lower, control_upper: (m,).

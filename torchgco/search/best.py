@@ -46,7 +46,7 @@ class Best:
         self.keep(rows, self.solver.iterate(call, guidance, penalty, self.recorder, guide_first, by_arrival=True))
 
     def keep(self, rows: Tensor, new: SolveEnd) -> None:
-        """The better of the former trajectories of `rows` and new ones: arrived, then feasible, then cheap."""
+        """The better of the old trajectories of `rows` and new ones: arrived, then feasible, then cheap."""
         problem, limit = self.call.problem.take(rows), self.solver.violation_tolerance
         old = take(self.end.best, rows)
         chosen = is_preferred(problem, new.best, old, limit).nonzero().flatten()
@@ -56,7 +56,7 @@ class Best:
             getattr(self.end, name)[rows] += getattr(new, name)
 
     def _callback(self, call: Call) -> Callback | None:
-        """Progress of an attempt as progress of the batch, which never goes back: what isn't attempted has finished."""
+        """Progress of an attempt as progress of the batch, which never falls: all other problems have finished."""
         if call.callback is None:
             return None
         report, total = call.callback, self.call.problem.B

@@ -1,4 +1,4 @@
-"""The search of the roadmap in PyTorch: the counterpart of native/roadmap.c for every device and precision.
+"""The search of the roadmap in PyTorch: the counterpart of native/roadmap_paths.c for every device and precision.
 
 Both return the same paths, also where several cost the same. Ties are broken by the lowest index, and no comparison
 depends on rounding: sums have a fixed order (there is no matrix product), clearance and nearness are compared as
@@ -17,7 +17,7 @@ from torchgco.constraints.cuboids import Cuboids
 from torchgco.native.roadmap import CLEAR, HOPS, LEAST, MIDWAY, RAYS, SHELLS, TIE, Graph, around_boxes, directions
 from torchgco.search.geometry import squares, squares_from_segments
 
-CLASS = 8  # paths are drawn taut together with those of as many eights of edges
+CLASS = 8  # paths are drawn taut in groups: those of up to 8 edges, of up to 16, ...
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class Search:
         return (self.R if self.boxes is None else torch.cat((self.R, self.boxes.sizes), dim=1)).amax(-1, keepdim=True)
 
     def graph(self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int) -> Graph:
-        """Points and what each is joined to: the nearest of all, the nearest of those spread, the goal.
+        """Points, each joined to the nearest of all, to the nearest of those spread, and to the goal.
 
         Args:
             start, goal: points 0 and 1, (B, d).
             cube: points (spread, d) in the unit cube, spread over the box that start, goal and spheres fill.
-            nodes: free points beside spheres that are added: those of the shortest detours. Places left over lie at
-                the start, without edges.
+            nodes: number of free points around spheres that are added, those of the shortest detours. Unused places
+                lie at the start, without edges.
             neighbours, hubs: edges of a point to the nearest of all and to the nearest of those spread.
         """
         given = torch.cat((torch.stack((start, goal), dim=1), self._spread(start, goal, cube)), dim=1)
@@ -67,7 +67,7 @@ class Search:
         """The cheapest paths from point 0 to point 1, by relaxing all edges at once.
 
         Args:
-            price: of a metre at the points, (B, V).
+            price: cost per metre at the points, (B, V).
 
         Returns:
             Corners (B, HOPS+1, d), the goal repeated at their ends: the straight line where there is no path of at most
@@ -100,14 +100,14 @@ class Search:
         return path, torch.cat((path[:, :1], path[:, -1:], between[:, :-1]), dim=1), arrives
 
     def taut(self, path: Tensor, string: Tensor, price: Tensor) -> Tensor:
-        """The same once more over a path's own corners and what lies between them, all joined: a taut string.
+        """The cheapest path over a path's own corners and the points between them, all joined: a taut string.
 
         Args:
             path: corners (B, HOPS+1, d).
             string: the points that `cheapest` returned with it, (B, 2 HOPS + 1, d).
-            price: of a metre there, (B, 2 HOPS + 1).
+            price: cost per metre there, (B, 2 HOPS + 1).
         """
-        # All corners are joined to all: paths of few corners aren't to pay for the rare ones of many.
+        # All corners are joined to all, and paths grouped by length: short paths shouldn't pay for rare long ones.
         edges = (path != path[:, -1:]).any(-1).sum(-1)
         taut = path.clone()
         for most in range(CLASS, HOPS + 1, CLASS):
@@ -189,7 +189,7 @@ class Search:
             free = free & (away > _signed_square(self.boxes.radius).unsqueeze(1)).all(-1).view(ends.shape)
             gap = torch.minimum(gap, away.sqrt_().sub_(self.boxes.radius.unsqueeze(1)).amin(-1).view(ends.shape))
         length = (b - a).square().sum(-1).sqrt().view(ends.shape)
-        # No edge is free of charge: paths would turn in circles among points that coincide.
+        # Every edge costs something: else paths would circle among points that coincide.
         length = length + LEAST * (points[:, 1] - points[:, 0]).square().sum(-1).sqrt().view(-1, 1, 1)
         margin = self.margin * self.largest.clamp(min=1e-9).view(-1, 1, 1)
         close = 1.0 + ((margin - gap) / margin).clamp(0.0, 1.0)

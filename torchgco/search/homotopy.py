@@ -16,8 +16,8 @@ def one_per_class(paths: Tensor, scene: Scene) -> Tensor:
     """The first path of every class, (B, K) bool, of polylines (B, K, P, d) that share their ends.
 
     In the plane two paths are of one class where they have equal winding angles around every obstacle. Around balls in
-    space all paths are of one class: there, paths count as one that are nowhere farther apart than the largest
-    obstacle's size.
+    space all paths are of one class: there, two paths count as one where they are nowhere farther apart than the
+    largest obstacle's size.
     """
     alike = _wind_alike(paths, scene) if paths.shape[-1] == 2 else _are_close(paths, scene)
     first = torch.ones_like(alike[..., 0])

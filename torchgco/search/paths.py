@@ -24,17 +24,25 @@ from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import cost_unit
 from torchgco.problem import Problem
-from torchgco.search import follow
 from torchgco.search import scene as seen
-from torchgco.search.candidates import Candidates
+from torchgco.search.candidates import PENALTY, Candidates
 from torchgco.search.homotopy import one_per_class
 from torchgco.search.roadmap import Roadmap
+from torchgco.search.tracking import attraction, travel
 from torchgco.shapes import check_shape, tensor
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
+from torchgco.solvers.ilqr import ILQR
+from torchgco.solvers.line_search import LineSearch
 from torchgco.tree import put, take
 
 MOST = 1536  # paths of all problems that are followed together: memory stays bounded
 OFFSET_LASTS = 0.1  # share of the horizon
 ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a share, count as the same
+
+TOLERANCE = 5e-5  # of tracking and relaxing, as a share of L_M; refining takes a tenth of it
+SEARCH = LineSearch(back=2)
+TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
+CHORD_PENETRATION = 0.049  # share of an obstacle's margin, between two knots; the judge accepts 0.05
 
 
 class Proposal(NamedTuple):
@@ -150,12 +158,12 @@ class PathProposals:
         candidates = Candidates.begin(
             problem, starts.repeat(1, self.num_paths, 1, 1), R, torch.where(found, unit, 1.0), live
         )
-        candidates = follow.track(self, candidates, paths)
+        candidates = self.track(candidates, paths)
         candidates = candidates.pick(candidates.order(candidates.arrive())[:, : self.relax_top])
-        candidates, sound = follow.relax(self, candidates)
+        candidates, sound = self.relax(candidates)
         order = candidates.order(sound, ALIKE)[:, : self.refine_top]
         sound = sound[candidates.rows(order).flatten()]
-        candidates, multipliers, best = follow.refine(self, candidates.pick(order), sound)
+        candidates, multipliers, best = self.refine(candidates.pick(order), sound)
         multipliers = take(multipliers, best)
         multipliers = replace(multipliers, mu=torch.where(found, multipliers.mu, torch.nan))
         return Proposal(candidates.U[best], found & sound[best], multipliers, candidates.iterations)
@@ -170,3 +178,59 @@ class PathProposals:
             reach = seen.control_reach(problem, rest, offsets)
             starts[:, 1:, : math.ceil(OFFSET_LASTS * N)] += (reach * offsets).unsqueeze(2)
         return starts
+
+    def track(self, candidates: Candidates, paths: Tensor) -> Candidates:
+        """Each candidate along its path (B, num_paths, P, d), to arrive at its pace, from its start."""
+        paces, K = len(self.paces), paths.shape[1]
+        path = paths.flatten(0, 1).repeat_interleave(paces, dim=0)
+        arrive = path.new_tensor(self.paces).repeat(path.shape[0] // paces)
+        center = travel(path, self.depart, arrive, self.smoothing, candidates.problem.N)
+        problem = torch.arange(candidates.problem.B, device=path.device).repeat_interleave(K * paces) * candidates.count
+        number = torch.arange(candidates.live.numel(), device=path.device)
+        place = number // (candidates.count // K) * paces + number % paces  # of each candidate's path and pace
+        at = candidates.problem.position
+        for stiffness in self.stiffness:
+            weight = stiffness * candidates.unit[problem]
+            penalty = attraction(center, path, at, candidates.R[problem], weight, self.tube)
+            candidates = candidates.solved(_inner(self.track_iterations), TRACK_PENALTY, penalty, place)
+        return candidates
+
+    def relax(self, candidates: Candidates) -> tuple[Candidates, Tensor]:
+        """Candidates that nothing attracts, and whether they arrive without deep penetration (B * count,)."""
+        if self.relax_iterations > 0:
+            relaxed = candidates.solved(_inner(self.relax_iterations), PENALTY)
+            # A candidate that falls back into the trap, where waiting is cheaper, is no longer one.
+            keeps = (relaxed.arrive() | ~candidates.arrive()).view(-1, 1, 1)
+            X, U = torch.where(keeps, relaxed.X, candidates.X), torch.where(keeps, relaxed.U, candidates.U)
+            candidates = replace(relaxed, X=X, U=U)
+        shallow = candidates.penetration() <= self.max_penetration * candidates.R
+        return candidates, candidates.live & candidates.arrive() & shallow
+
+    def refine(self, candidates: Candidates, sound: Tensor) -> tuple[Candidates, Multipliers, Tensor]:
+        """The sound candidates solved to convergence by AL-iLQR.
+
+        Returns the candidates, the multipliers that each is to continue with, and the rows (B,) of the cheapest: the
+        first of each problem where none converges, or `refine_top` is 1.
+        """
+        everyone = torch.arange(candidates.live.numel(), device=sound.device)
+        multipliers = candidates.multipliers(everyone, PENALTY)
+        rows = sound.nonzero().flatten()
+        if self.refine_top == 1 or rows.numel() == 0:
+            return candidates, multipliers, everyone[:: candidates.count]
+        part = candidates.of(rows)
+        inner = replace(_inner(self.track_iterations), tolerance=0.1 * TOLERANCE)
+        solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=20)
+        end = solver.solve(part, candidates.U[rows], warm=take(multipliers, rows))
+        good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.X)
+        good &= seen.chord_penetration(part, end.X, CHORD_PENETRATION) <= 0
+        won = rows[good]
+        X, U, cost = candidates.X.clone(), candidates.U.clone(), torch.full_like(candidates.unit, torch.inf)
+        X[won], U[won], cost[won] = end.X[good], end.U[good], end.cost[good]
+        iterations = candidates.iterations.index_add(0, rows // candidates.count, end.iterations)
+        put(multipliers, won, take(end.multipliers, good.nonzero().flatten()))
+        best = cost.view(-1, candidates.count).argsort(dim=-1, stable=True)[:, :1]
+        return replace(candidates, X=X, U=U, iterations=iterations), multipliers, candidates.rows(best)[:, 0]
+
+
+def _inner(iterations: int) -> ILQR:
+    return ILQR(tolerance=TOLERANCE, max_iterations=iterations, line_search=SEARCH)

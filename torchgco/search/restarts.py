@@ -32,7 +32,7 @@ from torchgco.search.suitability import suited_paths
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Advice, Call, Solver
-from torchgco.solvers.state import STOPPED, SolveEnd
+from torchgco.solvers.state import STOPPED, Iterate, SolveEnd
 from torchgco.solvers.trace import Recorder
 from torchgco.solvers.verdict import finished
 from torchgco.tree import take
@@ -119,33 +119,35 @@ class Restarts(Solver):
             if recorder is not None:
                 recorder.attempt = attempt + 1  # the same for a problem in every batch
             wanted = (stopped if self.all_attempts else stopped & ~best.arrived()).nonzero().flatten()
+            start = take(caught.last, wanted)
             if attempt == 1 and paths is not None:
-                wanted = wanted[~self._along_paths(best, wanted, paths)]
+                wanted, start = self._along_paths(best, wanted, start, paths)
             if sampling is not None and wanted.numel() > 0:
-                self._from_samples(best, wanted, attempt, sampling)
+                self._from_samples(best, wanted, start, attempt, sampling)
         if recorder is not None:
             recorder.attempt = self.attempts + 2
         self._into_the_goal(best, (stopped & ~best.arrived() & best.arrived(CLOSE)).nonzero().flatten())
         return best.end
 
-    def _along_paths(self, best: Best, rows: Tensor, paths: PathProposals) -> Tensor:
-        """An attempt along the proposed path of each problem in `rows`; where there is one (b,)."""
+    def _along_paths(self, best: Best, rows: Tensor, start: Iterate, paths: PathProposals) -> tuple[Tensor, Iterate]:
+        """An attempt along the proposed path of each problem in `rows`; the problems without one, and where they start.
+
+        Also where a proposal is rejected, its penalty keeps the solver from returning to the caught trajectory.
+        """
         if rows.numel() == 0:
-            return torch.zeros_like(rows, dtype=torch.bool)
+            return rows, start
         proposal = paths.propose(best.call.problem.take(rows))
         best.end.iterations[rows] += proposal.iterations
-        found = proposal.found.nonzero().flatten()
-        chosen = rows[found]
-        # Also where the proposal is rejected: a sampled trajectory is kept from returning by the same penalty.
-        best.first.last.multipliers.mu[rows] = torch.fmax(best.first.last.multipliers.mu[rows], proposal.multipliers.mu)
-        warm = replace(take(proposal.multipliers, found), mu=best.first.last.multipliers.mu[chosen])
-        best.end.guided[chosen] += 1
-        best.improve(chosen, replace(best.call.take(chosen), U0=proposal.U[found], warm=warm))
-        return proposal.found
+        mu = torch.fmax(start.multipliers.mu, proposal.multipliers.mu)
+        found, others = proposal.found.nonzero().flatten(), (~proposal.found).nonzero().flatten()
+        best.end.guided[rows[found]] += 1
+        warm = replace(take(proposal.multipliers, found), mu=mu[found])
+        best.improve(rows[found], replace(best.call.take(rows[found]), U0=proposal.U[found], warm=warm))
+        start = take(start, others)
+        return rows[others], replace(start, multipliers=replace(start.multipliers, mu=mu[others]))
 
-    def _from_samples(self, best: Best, rows: Tensor, attempt: int, sampling: GCO) -> None:
+    def _from_samples(self, best: Best, rows: Tensor, start: Iterate, attempt: int, sampling: GCO) -> None:
         """An attempt at the problems in `rows` from their caught trajectories, guided by samples from the start."""
-        start = take(best.first.last, rows)
         call = replace(best.call.take(rows), U0=start.U, warm=start.multipliers)
         if attempt == 1:
             call = replace(call, outer=best.first.outer[rows])

@@ -2,7 +2,7 @@
 
 Points lie around every obstacle, midway between neighbours and, in a fixed low-discrepancy sequence, all over the
 scene; each is joined to a few near ones where the straight line is free. Nothing is random. The search runs in C
-(native/roadmap.c) or, where that can't serve, in PyTorch (search/graph.py), with the same result.
+(native/roadmap_paths.c) or, where that can't serve, in PyTorch (search/graph.py), with the same result.
 """
 
 from __future__ import annotations

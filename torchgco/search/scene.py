@@ -11,9 +11,9 @@ from torchgco.constraints.cuboids import join
 from torchgco.problem import Problem
 from torchgco.search.geometry import FAR, Scene
 
-OPEN = 1e10  # a range of controls that is no range
-LITTLE = 1e-6  # of the unit of cost: a smaller stage cost says nothing of the goal
-FALLEN_BACK = 0.25  # share of the distance from start to goal; a candidate that ends farther away isn't one
+OPEN = 1e10  # a range of controls from which on it counts as unbounded
+LITTLE = 1e-6  # of the unit of cost: a smaller stage cost says nothing about the goal
+FALLEN_BACK = 0.25  # share of the distance from start to goal; candidates that end farther from the goal are dropped
 
 
 def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
@@ -24,7 +24,7 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     forms = [c.inflated() if isinstance(c, Obstacles) else None for c in problem.geometric]
     spheres = [form for form in forms if form is not None]
     boxes = join([form.boxes for form in spheres if form.boxes is not None and form.boxes.radius.shape[1] > 0])
-    count = sum(c.distances.shape[1] for c in spheres)
+    count = sum(c.inflated_radii.shape[1] for c in spheres)
     if (count == 0 and boxes is None) or len(spheres) < len(forms) or problem.goal is None:
         return None
     at = problem.position
@@ -38,8 +38,8 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
         return price.clamp(min=0.0) / first[rows] + 0.1
 
     centers = torch.cat([c.centers for c in spheres], dim=1)
-    inflated_radii = torch.cat([c.distances for c in spheres], dim=1)
-    if count == 0:  # an absent sphere stands for none: no maximum over spheres is one over nothing
+    inflated_radii = torch.cat([c.inflated_radii for c in spheres], dim=1)
+    if count == 0:  # one absent sphere stands for none: maxima over spheres then exist
         centers = problem.x0[:, None, at]
         inflated_radii = torch.full_like(centers[..., 0], FAR)
     return Scene(problem.x0[:, at], problem.goal.position, centers, inflated_radii, traversal_cost, boxes)

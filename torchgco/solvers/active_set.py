@@ -1,4 +1,4 @@
-"""Strictly convex quadratic programs by their dual: which rows push, and how hard."""
+"""Strictly convex quadratic programs by their dual: which rows are active, and their multipliers."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ SLACK = 1e-12  # share of a row's own scale below which nothing is exchanged, an
 def multipliers(S: Tensor, b: Tensor, free: Tensor, start: Tensor) -> Tensor | None:
     """lam (q,) with b - S lam <= 0, lam >= 0, complementary; on `free` rows b - S lam = 0 and lam of any sign.
 
-    None where so many exchanges found none: rows that contradict each other, or nearly.
+    None where no such lam is found: the rows contradict each other, or nearly.
 
-    Rows change sides in blocks: those that pull let go, those that are violated join. Where that makes no progress they
-    change one at a time, the last first, which ends for every positive definite S.
+    Rows enter and leave the working set in blocks: rows with a negative multiplier leave, violated rows enter. Where
+    that makes no progress they change one at a time, the last first, which ends for every positive definite S.
 
     Args:
         S: (q, q) positive semidefinite, b: (q,), free: (q,) bool, start: (q,) bool, rows that are tried first.

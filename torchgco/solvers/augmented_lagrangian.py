@@ -130,7 +130,7 @@ class OuterLoop:
         self.limit = 1 if recorder is not None else solver.inner.max_iterations
 
     def begin(self, rows: Tensor) -> tuple[State, Tensor]:
-        """Rollouts of the initial controls of the problems `rows`, and the statuses of starts that are no starts."""
+        """Rollouts of the initial controls of the problems `rows`, and the statuses of invalid starts."""
         problem, U = self.call.problem.take(rows), self.call.U0[rows]
         X = open_loop(problem, U)
         if self.call.warm is None:
@@ -156,7 +156,7 @@ class OuterLoop:
         return state, status
 
     def regroup(self, rows: Tensor) -> None:
-        """From now on the running problems are these."""
+        """Continue with these problems as the running ones."""
         whole = self.call.problem
         self.problem = whole if rows.numel() == whole.B else whole.take(rows)
 
@@ -223,6 +223,8 @@ class OuterLoop:
         key = DrawKey(self.call.seed, self.call.ids[place], self.call.outer[place] + s.outer[rows])
         advice = self.guidance.update(problem, s.X[rows], s.U[rows], take(s.penalty, rows), key)
         if advice.penalty is not None:
+            if s.penalty is None:
+                raise InputError("guidance.start", "a penalty, as `update` returns one", None)
             put(s.penalty, rows, advice.penalty)
             s.guided[rows] += advice.penalty.is_active
         if advice.stop is not None:

@@ -77,7 +77,7 @@ class Condensed:
         n, m, N = self.problem.n, self.problem.m, self.problem.N
         B = self._cost_curvature() if lam is None else self._curvature(lam)
         H = self.G.new_zeros(N * m, N * m)
-        # Backwards, S_k dU is the change of the costate at k; what comes after stage k never meets its lower triangle.
+        # Backwards, S_k dU is the change of the costate at k; the lower triangle needs controls up to stage k only.
         S = torch.mm(B[N, :n, :n], self.G[N])
         for k in range(N - 1, -1, -1):
             done, here = slice(0, (k + 1) * m), slice(k * m, (k + 1) * m)

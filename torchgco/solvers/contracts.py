@@ -41,7 +41,7 @@ class Call:
     U0: Tensor  # (B, N, m): initial controls
     seed: int
     ids: Tensor  # (B,) int64: key the random draws, together with the seed
-    rows: Tensor  # (B,) int64: places in the batch that the user handed in
+    rows: Tensor  # (B,) int64: places in the batch that the user passed
     outer: Tensor  # (B,) int64: outer iterations that this call continues; draws are keyed by their number
     warm: Multipliers | None
     callback: Callback | None
@@ -99,7 +99,7 @@ class Solver:
             U0: initial controls (B, N, m).
             seed, ids: key the random draws, where a solver makes any: the result of a problem depends on (seed, id),
                 not on its place in the batch. ids is int64 (B,), by default 0..B-1.
-            warm: multipliers and penalties of a former solution, where a solver has any use for them.
+            warm: multipliers and penalties of an earlier solution, for solvers that use them.
             callback: called with the progress after every pass.
 
         Raises:

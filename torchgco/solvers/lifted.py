@@ -1,8 +1,8 @@
-"""A way on where the shortest step fails: Gauss-Newton steps in states and controls together (multiple shooting).
+"""Where even the shortest step fails: Gauss-Newton steps in states and controls together (multiple shooting).
 
-Where the dynamics are unstable and the gains around an iterate don't hold them, rollouts diverge whatever the step
-length. Steps that take the states as variables of their own, with gaps between them that the linearised dynamics close,
-lead to a trajectory whose gains do.
+Where the dynamics are unstable and the gains around an iterate don't stabilise them, rollouts diverge whatever the step
+length. Steps with the states as variables of their own, and with gaps between them that the linearised dynamics close,
+lead to a trajectory whose gains stabilise them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torchgco.solvers.riccati import backward
 
 ROUNDS = 20  # steps at most
 GAIN = 1e-2  # share of L_M by which a rollout must lower it
-LOST = 1e6  # times L_M before: the shortest step makes so much of it where rollouts diverge
+LOST = 1e6  # rollouts diverge where even the shortest step makes L_M this many times as large
 
 
 def diverges(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor, G: Tensor, shortest: float) -> Tensor:
@@ -59,7 +59,7 @@ def native_lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Te
 
 
 def _keep(found: Rollouts, rows: Tensor, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> None:
-    """Write the trajectories that are low enough into `found`."""
+    """Write the trajectories with a low enough L_M into `found`."""
     cost, value = lagrangian.value(X, U)
     low = torch.isfinite(value) & (value < found.merit[rows] - GAIN * found.merit[rows].abs())
     won = rows[low]

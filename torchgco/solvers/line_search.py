@@ -1,7 +1,7 @@
 """The forward pass: step lengths tried in parallel (Algorithm 2, lines 14-24).
 
-The first rung is tried for everyone; only those that refuse it try the rest of the ladder, a few at a time and side by
-side. What an element accepts is the first rung that fits, as if it had tried one after the other.
+The first rung of the ladder is tried for all problems. Only problems that refuse it try the other rungs, several in
+parallel. A problem accepts the first rung that fits, as if it had tried one after the other.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class LineSearch:
 
     @staticmethod
     def _first_accepted(found: Rollouts, tried: Rollouts, refused: Tensor, rungs: int) -> Rollouts:
-        """Write the first accepted rung of each refused element into a copy of `found`."""
+        """Write the first accepted rung of each problem that refused the first into a copy of `found`."""
         ok = tried.accepted.view(-1, rungs)
         rung = ok.to(torch.int8).argmax(dim=1)  # the first True
         pick = torch.arange(refused.numel(), device=refused.device) * rungs + rung

@@ -1,4 +1,4 @@
-"""How many problems fit into memory at once, told before anything runs."""
+"""How many problems fit into memory at once, estimated before anything runs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
 
-CPU_LIMIT = 256  # more problems at once are no faster on a core: what they share is paid for by then
+CPU_LIMIT = 256  # a larger batch is no faster on a core: the overhead that problems share is negligible by then
 SHARE = 0.5  # of the free memory; the rest is the system's and other processes'
 NUMBER = 8  # bytes of float64
 
@@ -33,7 +33,7 @@ def plan_batch(problem: Problem, device: str | torch.device | None = None, proce
     """How many problems like these to work on at once on a device, at least 1.
 
     Args:
-        problem: any batch of the form that is meant; only one element of it is looked at.
+        problem: any batch of problems of this form; only the first problem is used.
         device: default: where the problem is.
         processes: how many share the device's memory.
 
@@ -54,7 +54,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def _free_memory() -> int:
-    """Bytes that can be had without swapping: the kernel's own estimate, else unused pages."""
+    """Bytes that can be allocated without swapping: the kernel's own estimate, else unused pages."""
     try:
         with open("/proc/meminfo") as lines:
             return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))

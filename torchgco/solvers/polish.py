@@ -1,8 +1,8 @@
 """The last stage: from a good trajectory to one that meets its constraints and is stationary, to many digits.
 
-An augmented Lagrangian comes to a millimetre and stops. From there Newton's method on the optimality conditions needs
-a handful of steps: the states are eliminated, so that the dynamics hold exactly throughout; the rows that push are
-found by the dual of a quadratic program; and every step is a real rollout with a line search.
+An augmented Lagrangian stops at a violation of about a millimetre. From there Newton's method on the optimality
+conditions needs a handful of steps: the states are eliminated, so that the dynamics hold exactly throughout; the active
+rows are found by the dual of a quadratic program; and every step is a real rollout with a line search.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from torchgco.status import Status
 from torchgco.tree import copied, put
 
 VIOLATION_TOLERANCE = 1e-3  # metres for lengths, for the status
-STIFFNESS = 1e4  # curvature put across the rows that push, as a share of the Hessian's mean: it changes no solution
-SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)  # shares of the same mean put on the diagonal until the model is convex
+STIFFNESS = 1e4  # curvature added across the active rows, as a share of the Hessian's mean: it changes no solution
+SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)  # shares of the same mean added to the diagonal until the model is convex
 NEAR = 1e-2  # rows this near to their limit, measured as a length of their slope, are in the program from the start
 PIVOT = 1e-3  # the smallest pivot that is convex enough, as a share of the same mean
-ACTIVE = 1e-3  # rows that are so near count as active in the KKT residual, in the same measure
+ACTIVE = 1e-3  # rows this near count as active in the KKT residual, in the same measure
 ROUNDS = 10  # times that rows which a step would violate are added to a program
 SMALLEST = 1e-3  # step length at which the line search gives up
 NOISE = 1e-12  # rounding of a merit, as a share of it
@@ -41,17 +41,18 @@ NOISE = 1e-12  # rounding of a merit, as a share of it
 class Polish:
     """Active-set Newton in the controls alone: violation below 1e-8, and a small KKT residual.
 
-    Elements are taken one at a time, so no result depends on its companions, and memory is that of one dense problem:
-    some (N m)^2 numbers. On a GPU that is slow: the work of one element is too little for it.
+    Problems are taken one at a time, so no result depends on its companions, and memory is that of one dense problem:
+    some (N m)^2 numbers. On a GPU that is slow: the work of one problem is too little for it.
 
     Args:
         iterations: Newton steps at most.
-        tolerance: violation that is aimed at (metres for lengths, all else in the units of its constraint).
-        stationarity: relative KKT residual that is aimed at. Steps end where both are met.
-        reach: elements with a larger violation are left alone, and those whose start was bad or that aren't finite.
-        cost_rise: share by which J_var may rise; giving back a millimetre of violation has its price.
-        curvature: use second derivatives of constraints and dynamics, where the model stays convex on the rows that
-            push; False: those of the cost alone (Gauss-Newton), whose steps converge linearly.
+        tolerance: target of the violation (metres for lengths, all else in the units of its constraint).
+        stationarity: target of the relative KKT residual. Steps end where both are met.
+        reach: problems with a larger violation are left alone, as are those with an invalid start or values that
+            aren't finite.
+        cost_rise: share by which J_var may rise; removing a millimetre of violation raises the cost.
+        curvature: use second derivatives of constraints and dynamics, where the model stays convex on the active
+            rows; False: those of the cost alone (Gauss-Newton), whose steps converge linearly.
 
     Raises:
         InputError: a field out of its range.
@@ -74,15 +75,15 @@ class Polish:
             raise InputError("polish.cost_rise", "at least 0", self.cost_rise)
 
     def refine(self, problem: Problem, solution: Solution) -> Solution:
-        """The solution with the elements that could be improved replaced: X, U, gains, multipliers, cost, violation.
+        """The solution with the problems that could be improved replaced: X, U, gains, multipliers, cost, violation.
 
-        An element is replaced where its violation falls below the tolerance, or stays within it (or within what it was)
-        while the KKT residual falls; never where its cost would rise by more than `cost_rise`, or the straight way
-        between two knots would meet an obstacle that it kept clear of. The status of a replaced element is that of its
-        new trajectory. `iterations` grows by the Newton steps, also those of an element that is left as it was.
+        A trajectory is replaced where its violation falls below the tolerance, or stays within it (or within its former
+        value) while the KKT residual falls; never where its cost would rise by more than `cost_rise`, or the straight
+        segment between two knots would meet an obstacle that it kept clear of. The status of a replaced trajectory is
+        that of the new one. `iterations` grows by the Newton steps, also where the trajectory stays as it was.
 
         Raises:
-            InputError: a problem that isn't float64, or a solution of others.
+            InputError: a problem that isn't float64, or a solution of other problems.
         """
         self.check(problem)
         problem.check_controls(solution.U, "solution.U")
@@ -104,7 +105,7 @@ class Polish:
             raise InputError("polish", "a problem in torch.float64", problem.x0.dtype)
 
     def _polished(self, problem: Problem, solution: Solution) -> tuple[Solution, int]:
-        """One element, `solution` itself where nothing better was found; and the steps that were made."""
+        """The solution of one problem, `solution` itself where nothing better was found; and the number of steps."""
         lam = torch.cat([solution.cost.new_zeros(0), *(part.flatten() for part in solution.multipliers.lam)])
         first = best = now = _Point.at(problem, solution.X, solution.U, lam)
         weight, steps = 0.0, 0
@@ -145,7 +146,7 @@ class Polish:
 
 @dataclass(frozen=True)
 class _Point:
-    """A trajectory of one problem, linearised, and what it is worth."""
+    """A trajectory of one problem, linearised, and its quality."""
 
     model: Condensed
     lam: Tensor  # (r,)
@@ -192,7 +193,7 @@ class _Point:
         fitted = Multipliers(self.model.by_constraint(self.lam), solution.multipliers.mu)
         K, d, left = optimality(Lagrangian(problem, fitted, None, True), X, U)
         cost, worst = torch.full_like(solution.cost, self.cost), torch.full_like(solution.violation, self.worst)
-        # Optimality is that of what is returned; the outer limit no longer is the reason for anything.
+        # The status follows from the new trajectory, not from the limit that ended the solve before.
         ended = torch.full_like(solution.status, Status.MAX_ITERATIONS)
         status = final_status(ended, left, worst, VIOLATION_TOLERANCE, bool(problem.constraints))
         return replace(solution, X=X, U=U, K=K, d=d, multipliers=fitted, cost=cost, violation=worst, status=status)
@@ -210,8 +211,8 @@ def _obstacles(problem: Problem) -> list[Obstacles]:
 def _convex(point: _Point, exact: bool) -> tuple[Tensor, Tensor] | None:
     """Factor L (v, v) of a positive definite Hessian and the gradient (v,) that goes with it; None where there is none.
 
-    Across the rows that push, the program fixes the step anyway: there curvature may be added without changing it.
-    What is indefinite along them too is shifted.
+    Across the active rows the program fixes the step anyway: curvature may be added there without changing it. A
+    Hessian that is indefinite along them too is shifted.
     """
     model, lam = point.model, point.lam
     H = model.hessian(lam if exact else None)
@@ -238,7 +239,7 @@ def _holds(factor: tuple[Tensor, Tensor], mean: Tensor) -> bool:
 def _program(point: _Point, L: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor] | None:
     """Step (v,) and multipliers (r,) of min g'd + 1/2 d'LL'd with A d + c <= 0 (or = 0); None where none was found.
 
-    Rows that can't matter are left out at first, and join where the step found without them would violate them.
+    Rows that can't matter are left out at first, and added where the step found without them would violate them.
     """
     model, lam = point.model, point.lam
     size = model.slopes.norm(dim=-1)

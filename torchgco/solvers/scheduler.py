@@ -1,7 +1,7 @@
 """The one loop: pass after pass over the problems that run, in a limited number of slots.
 
-In nested loops a batch waits for its slowest member at three levels. Here every problem carries its own phase, those
-that end give their slot to one that waits or leave the batch, and nothing here knows any mathematics.
+In nested loops a batch waits for its slowest member at three levels. Here every problem carries its own phase. A
+problem that ends gives its slot to a waiting one, or leaves the batch. Nothing here knows any mathematics.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from torchgco.tree import put, take
 
 
 class Work(Protocol):
-    """Problems by their rows in a batch; statuses are (b,) int64, RUNNING where a problem is not at its end."""
+    """Problems by their rows in a batch; statuses are (b,) int64, RUNNING where a problem has not ended."""
 
     def begin(self, rows: Tensor) -> tuple[State, Tensor]:
         """The first state of the problems `rows`, and the statuses of those that can't start."""
         ...
 
     def regroup(self, rows: Tensor) -> None:
-        """From now on the running problems are these."""
+        """Continue with these problems as the running ones."""
         ...
 
     def advance(self, s: State) -> Tensor:

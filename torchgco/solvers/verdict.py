@@ -1,4 +1,4 @@
-"""What a solver says of the trajectories that it returns: feedback gains, optimality and statuses.
+"""What a solver says about the trajectories that it returns: feedback gains, optimality and statuses.
 
 The test asks how much cost the quadratic model could still save: the expected decrease of one full step on
 J_var + lam'c, and what complementarity leaves open, as a share of the cost. It depends on no scale of cost, controls or
@@ -123,7 +123,7 @@ def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:
 
 
 def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: float, constrained: bool) -> Tensor:
-    """The status (B,) of what is returned, for statuses `ended` that say why the solve stopped.
+    """The status (B,) of the returned trajectories, for statuses `ended` that say why the solve stopped.
 
     CONVERGED: stationary and feasible; FEASIBLE: feasible alone, of a problem that has constraints; INFEASIBLE:
     stationary alone. Where neither holds, and where a solve failed, the reason stays.

@@ -155,7 +155,7 @@ def _same(a: np.ndarray, **_: Any) -> np.ndarray:
     return a
 
 
-# By name of the operation, without its overload. What isn't here, PyTorch first takes apart where it can.
+# By name of the operation, without its overload. Others are first decomposed by PyTorch, where it can.
 OPERATIONS: dict[str, Callable] = {
     # arithmetic
     "aten.add": lambda a, b, alpha=1: _add(a, b if alpha == 1 else _mul(b, alpha)),

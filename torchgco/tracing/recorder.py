@@ -50,7 +50,7 @@ class Call:
 
 
 class Recorder(TorchDispatchMode):
-    """Writes down every operation that reaches PyTorch's kernels, and takes apart those that CasADi doesn't know."""
+    """Writes down every operation that reaches PyTorch's kernels, and decomposes those that CasADi doesn't know."""
 
     def __init__(self, inputs: Iterable[Tensor]) -> None:
         super().__init__()
@@ -63,7 +63,7 @@ class Recorder(TorchDispatchMode):
         self.result = self.inputs[0]
 
     def slot(self, tensor: Tensor) -> Slot:
-        """The slot of a tensor; one that no recorded operation made comes from outside, and is a constant."""
+        """The slot of a tensor; a tensor that no recorded operation made comes from outside, and is a constant."""
         if id(tensor) not in self._seen:
             self.captured[self._new(tensor)] = tensor
         return self._seen[id(tensor)][0]

@@ -31,7 +31,7 @@ class Traced:
         function: tensors in, one tensor out.
         examples: variables of the shapes that it is called with.
         own: tensors that are treated as one problem's own even where all problems of the batch share them: the
-            expressions, and with them the last bits, then don't depend on who else is in the batch.
+            expressions, and with them the last bits, then don't depend on the other problems of the batch.
 
     Raises:
         InputError: the function can't be traced (it branches on values of its arguments, say), or holds an operation
@@ -104,7 +104,7 @@ class Traced:
     def rebound(self, own: Sequence[Tensor], others: Sequence[Tensor]) -> Traced | None:
         """The same function with `others` in the place of its `own` tensors; None where it must be traced again.
 
-        So it must where a row that stood for all problems, which none is picked from, is replaced by one of each.
+        It must where one row for all problems, from which nothing is picked, is replaced by a row per problem.
         """
         if len(own) != len(others) or any(a.shape[:1] == (1,) != b.shape[:1] for a, b in zip(own, others, strict=True)):
             return None

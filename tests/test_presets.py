@@ -1,0 +1,52 @@
+"""One source of settings: YAML, API and preset agree for every solver, and `torchgco.solve` is `solver=gco`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchgco
+from torchgco import InputError, Problem, QuadraticCost, presets, solve
+from torchgco.experiments.build import config_dir
+from torchgco.presets import PRESETS
+
+MODELS = {"planar": (2, "planar_trap"), "quadrotor": (3, "forest")}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("model", MODELS)
+def test_the_configuration_of_a_solver_is_its_preset(model: str, name: str) -> None:
+    space, scenario = MODELS[model]
+    words = [f"model={model}", f"scenario={scenario}", "scenario.stages=5"]
+    setup = torchgco.compose([*words, f"solver={name}"])
+    assert setup.solver == PRESETS[name](space) == PRESETS[name](setup.task(setup.layouts(1)).problem)
+
+
+def test_every_preset_has_a_configuration_and_every_configuration_a_preset() -> None:
+    assert {path.stem for path in Path(config_dir(), "solver").glob("*.yaml")} == set(PRESETS)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_solve_gives_the_bits_of_the_configuration_gco(model: str) -> None:
+    _, scenario = MODELS[model]
+    setup = torchgco.compose([f"model={model}", f"scenario={scenario}", "scenario.stages=40"])
+    task = setup.task(setup.layouts(2))
+    mine, theirs = solve(task.problem), setup.solver.solve(task.problem, task.U0, seed=setup.seed)
+    assert torch.equal(mine.U, theirs.U) and torch.equal(mine.iterations, theirs.iterations)
+
+
+def test_an_option_on_the_command_line_changes_that_option_alone() -> None:
+    setup = torchgco.compose(["solver.paths.num_paths=3", "solver.local.inner.max_iterations=7"])
+    solver = presets.gco(3)
+    assert setup.solver.paths.num_paths == 3 and setup.solver.paths.roadmap == solver.paths.roadmap
+    assert setup.solver.local.inner.max_iterations == 7 and setup.solver.sampling == solver.sampling
+    with pytest.raises(InputError, match="num_path"):
+        torchgco.compose(["solver.paths.num_path=3"])
+
+
+def test_a_problem_without_a_position_gets_the_settings_for_the_plane() -> None:
+    dynamics = torchgco.FunctionDynamics(lambda x, u: u, 1, 1, 0.1)
+    problem = Problem(dynamics, QuadraticCost([1.0], [1.0], [1.0]), [], torch.ones(1, 1, dtype=torch.float64), 5)
+    assert presets.gco(problem) == presets.gco(2) != presets.gco(3)
