@@ -5,7 +5,7 @@
 # make benchmark   speed, side by side with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md
-# make test    the tests; lint, types: the static checks; clean: remove environments, caches and builds
+# make test    the tests; test-all: those that kill processes and fly whole studies, too; lint, types: the static checks; clean: remove environments, caches and builds
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -22,13 +22,16 @@ ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test lint types clean quality oracle benchmark benchmark-gpu families docs figures
+.PHONY: study test test-all lint types clean quality oracle benchmark benchmark-gpu families docs figures
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
 
 test: $(DEV)
 	$(BIN)/python -m pytest -n auto $(ARGS)
+
+test-all: $(DEV)
+	$(BIN)/python -m pytest -n auto -m "slow or not slow" $(ARGS)
 
 families: $(RUNTIME)
 	$(BIN)/python -m benchmarks.quality --write --page families --solvers gco gco_paper al_ilqr mppi hold $(ARGS)

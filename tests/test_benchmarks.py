@@ -272,6 +272,7 @@ def test_no_best_cost_is_above_a_peers() -> None:
         assert best is not None and not bool((best > theirs).any())
 
 
+@pytest.mark.slow
 def test_the_quality_of_one_family(tmp_path: Path, capsys) -> None:
     words = ["--families", "planar_trap", "--solvers", "hold", "--fresh", "3", "--outputs", str(tmp_path)]
     assert quality.main([*words, "study.workers=1"]) == 0

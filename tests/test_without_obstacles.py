@@ -119,6 +119,7 @@ PEERS = ["hold", "mppi", "gco_paper", "al_ilqr", "multistart", "ipopt", "fatrop"
 QUICK = ["scenario.stages=12", "study.layouts=2", "study.workers=1", f"study.baselines=[{','.join(PEERS)}]"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [

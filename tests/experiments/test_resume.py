@@ -83,6 +83,7 @@ def test_the_folder_of_an_older_version_is_refused(run, tmp_path) -> None:
     assert (tmp_path / "out" / "study.json").read_text() == held
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_study_resumes_in_other_pieces_with_equal_bits(run, run_until, tmp_path) -> None:
     words = [TINY[1], TINY[4], "study.layouts=7", "study.baselines=[multistart,hold]"]

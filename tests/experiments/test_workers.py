@@ -20,6 +20,7 @@ from torchgco.errors import InputError
 from torchgco.experiments import workers
 from torchgco.experiments.workers import run_all
 
+pytestmark = pytest.mark.slow
 WAIT = 120  # seconds, for what takes a few
 
 

@@ -25,7 +25,7 @@ def element_bytes(problem: Problem) -> int:
     gains = N * 2 * m * z
     # F and H, with what they are made of: native kernels need them for eight problems at a time.
     expansion = 0 if engine_of(problem) is not None else N * (2 * z * s + 2 * s * s)
-    trajectories = N * (n + m) * 16  # iterate, best, origin, result, and those tried by a line search
+    trajectories = N * (n + m) * 16  # iterate, best, last, result, and those tried by a line search
     return NUMBER * (gains + expansion + trajectories + 12 * rows)
 
 
