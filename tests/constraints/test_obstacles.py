@@ -74,4 +74,4 @@ def test_distances_of_spheres_by_hand() -> None:
             for k in range(4):
                 path = (1 - shares) * p[b, k].numpy() + shares * p[b, k + 1].numpy()
                 assert float(along[b, k, m]) == pytest.approx(np.linalg.norm(path - o, axis=1).min() - R, abs=1e-4)
-    assert torch.equal(spheres.sizes, spheres.margins) and CONTACT_FACTOR == 0.95
+    assert torch.equal(spheres.inflated_radii, spheres.margins) and CONTACT_FACTOR == 0.95

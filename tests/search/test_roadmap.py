@@ -10,7 +10,7 @@ import torch
 from tests.reference.roadmap import cheapest_cost, path_length, point_along, segment_gap
 from torchgco import InputError, compose
 from torchgco.native.roadmap import Graph, NativeSearch, library_for
-from torchgco.search.geometry import FAR, Scene, points_along, segment_gaps, squares_from_segments
+from torchgco.search.geometry import FAR, Scene, points_along, squares_from_segments
 from torchgco.search.graph import Search
 from torchgco.search.roadmap import HALTON_NEIGHBOURS, Roadmap, halton
 from torchgco.search.scene import scene_of
@@ -19,6 +19,11 @@ from torchgco.search.scene import scene_of
 def flat(points, rows):
     """Every metre costs the same."""
     return torch.ones_like(points[..., 0])
+
+
+def segment_gaps(a: torch.Tensor, b: torch.Tensor, centers: torch.Tensor, radii: torch.Tensor) -> torch.Tensor:
+    """Smallest distance (B, E) of the segments a to b (B, E, d) from spheres."""
+    return (squares_from_segments(centers, a, b).sqrt() - radii.unsqueeze(1)).amin(-1)
 
 
 def scene(centers, distances, start=(-1.0, 0.0), goal=(1.0, 0.0), price=flat) -> Scene:

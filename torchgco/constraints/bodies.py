@@ -45,11 +45,6 @@ class Obstacles(Constraint):
         return False
 
     @property
-    def sizes(self) -> Tensor:
-        """How deep the deepest point lies beneath the full surface, (B, M), m; 0 where absent. Guidance's scale."""
-        raise NotImplementedError
-
-    @property
     def margins(self) -> Tensor:
         """The length (B, M), m: bodies touch at (1 - CONTACT_FACTOR) times this beneath the full surface."""
         raise NotImplementedError

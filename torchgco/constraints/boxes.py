@@ -105,10 +105,6 @@ class BoundBoxes(Obstacles):
         return self
 
     @property
-    def sizes(self) -> Tensor:
-        return self.depths
-
-    @property
     def margins(self) -> Tensor:
         return torch.where(self.absent, 0.0, self.vehicle_radius.unsqueeze(-1))
 

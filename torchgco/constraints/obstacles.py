@@ -175,10 +175,6 @@ class BoundSpheres(Obstacles):
         return self.velocities is not None
 
     @property
-    def sizes(self) -> Tensor:
-        return self.inflated_radii
-
-    @property
     def margins(self) -> Tensor:
         return self.inflated_radii
 

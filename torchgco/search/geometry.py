@@ -48,11 +48,6 @@ def points_along(path: Tensor, length: Tensor) -> Tensor:
     return torch.lerp(corner(right - 1), corner(right), share.clamp(0.0, 1.0).unsqueeze(-1))
 
 
-def segment_gaps(a: Tensor, b: Tensor, centers: Tensor, distances: Tensor) -> Tensor:
-    """Smallest distance (B, E) of the segments a to b (B, E, d) from spheres of radius `distances` (B, M)."""
-    return squares_from_segments(centers, a, b).sqrt_().sub_(distances.unsqueeze(1)).amin(-1)
-
-
 def squares_from_segments(points: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """Squared distances (B, E, V) of points (B, V, d) from segments a to b (B, E, d)."""
     along = b - a
