@@ -195,8 +195,8 @@ class Problem:
         try:
             after = self.dynamics.step(self.x0, self.x0.new_zeros(self.B, self.m))
         except RuntimeError as error:
-            told = str(error).splitlines()[0]
-            raise InputError("dynamics.step", f"a step for states {tuple(self.x0.shape)}", told) from error
+            message = str(error).splitlines()[0]
+            raise InputError("dynamics.step", f"a step for states {tuple(self.x0.shape)}", message) from error
         if after.shape != self.x0.shape or after.dtype != self.x0.dtype:
             raise InputError(
                 "dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", f"{after.dtype} {tuple(after.shape)}"

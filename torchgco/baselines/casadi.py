@@ -155,8 +155,8 @@ class PreparedCasADi(Solver):
 
 
 def _refused(plugin: str, error: RuntimeError) -> InputError:
-    told = " ".join(str(error).split())[-300:]  # CasADi says last what is wrong
-    return InputError("solver", f"a problem and options that {plugin} takes", told)
+    message = " ".join(str(error).split())[-300:]  # CasADi says last what is wrong
+    return InputError("solver", f"a problem and options that {plugin} takes", message)
 
 
 def _with_ends(solution: Solution, ends: list[_End]) -> Solution:

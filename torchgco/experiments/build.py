@@ -142,8 +142,8 @@ def as_input_error(error: BaseException, field: str = "configuration") -> InputE
     key = getattr(error, "full_key", None) or next(
         (line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), field
     )
-    told = " ".join(line for line in lines if not line.startswith(("full_key:", "object_type=")))
-    return InputError(str(key) or field, "a value that the configuration knows", told)
+    message = " ".join(line for line in lines if not line.startswith(("full_key:", "object_type=")))
+    return InputError(str(key) or field, "a value that the configuration knows", message)
 
 
 def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:

@@ -124,8 +124,8 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
     except InputError:
         raise  # the function itself says what is wrong
     except Exception as error:  # whatever a function runs into
-        told = next(iter(str(error).strip().splitlines()), type(error).__name__)
-        raise InputError(field, "a function that can be traced", told) from error
+        message = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise InputError(field, "a function that can be traced", message) from error
     recorder.result = recorder.slot(result)
     return recorder
 
