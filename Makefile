@@ -1,11 +1,12 @@
 # make study   the default study, in an environment of its own (ARGS="experiment=planar_trap seed=1" for others)
-# make families   every solver on the public layouts (an hour or more; ARGS="--families walls" for some)
+# make ladder   every solver on the public layouts (ten minutes on one core)
 # make quality   how often gco reaches the goal on the public layouts, and how well (ARGS="--solvers gco gco_max" for more
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
 # make benchmark   speed, side by side with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md
-# make test    the tests; test-all: those that kill processes and fly whole studies, too; lint, types: the static checks; clean: remove environments, caches and builds
+# make test    the tests; test-all: those that kill processes and fly whole studies, too; lint, types: the static checks;
+#              clean: remove environments, caches and builds
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -22,7 +23,7 @@ ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all lint types clean quality oracle benchmark benchmark-gpu families docs figures
+.PHONY: study test test-all lint types clean quality oracle benchmark benchmark-gpu ladder docs figures
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -33,8 +34,9 @@ test: $(DEV)
 test-all: $(DEV)
 	$(BIN)/python -m pytest -n auto -m "slow or not slow" $(ARGS)
 
-families: $(RUNTIME)
-	$(BIN)/python -m benchmarks.quality --write --page families --solvers gco gco_paper al_ilqr mppi hold $(ARGS)
+ladder: $(RUNTIME)
+	$(BIN)/python -m benchmarks.quality --write \
+	    --solvers gco_fast gco gco_max multistart gco_paper al_ilqr mppi $(ARGS)
 
 quality: $(RUNTIME)
 	$(BIN)/python -m benchmarks.quality --write $(ARGS)

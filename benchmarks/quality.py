@@ -29,7 +29,6 @@ PAGES = {
     "quality": "README.md",
     "ladder": "results/ladder.md",
     "drawn": "results/drawn.md",
-    "families": "results/families.md",
 }  # below benchmarks/; a table stands between the marks of its name
 HEAD = (
     "family", "solver", "n", "feasible", "reached", "success", "violation <= 1e-3", "median cost", "iterations",

@@ -40,7 +40,7 @@ PAGES += [
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?<=\n\n)(?:    .*\n)+")
 PYTHON, SHELL = "python", "sh"
-TARGETS = {"quality": quality, "families": quality, "oracle": oracle, "benchmark": speed, "benchmark-gpu": speed}
+TARGETS = {"quality": quality, "ladder": quality, "oracle": oracle, "benchmark": speed, "benchmark-gpu": speed}
 
 
 def blocks(page: Path) -> Iterator[tuple[str, str]]:

@@ -248,6 +248,7 @@ def test_runs_of_an_older_version_are_named_and_never_paired_with_new_ones(tmp_p
     assert [row[2] for row in pairs(table) if "al_ilqr" in row and "gco" in row] == [0]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_sweep_from_the_command_line(run, tmp_path, capsys) -> None:
     sweep = ["-m", "solver=hold,al_ilqr", "study.baselines=[hold]", "scenario.num_obstacles=2,3", *TINY[:4], TINY[5]]

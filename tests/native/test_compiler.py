@@ -150,6 +150,7 @@ def test_eight_processes_at_once(cache: Path, compiled: list[str]) -> None:
     assert times(2) == 6.0 and times(3) == 9.0 and not compiled
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_in_children(method: str) -> None:
