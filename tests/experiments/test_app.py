@@ -130,6 +130,7 @@ BAD = {
     "negative radius": (["scenario.obstacle_radius=-1"], "obstacle_radius"),
     "weights": (["model.vehicle.control_weight=[1,1,1,-1]"], "cost.R"),
     "crossed bounds": (["model.vehicle.control_lower=[9,9,9,9]"], "control_bounds.lower"),
+    "model dimension": (["model.dimension=2"], "model.dimension: expected 3, as its dynamics say, got 2"),
     "solver option": (["solver.local.inner.tolerance=-1"], "ilqr.tolerance"),
     "batch size": (["study.batch_size=0"], "study.batch_size"),
     "kernels": (["device.kernels=compiled"], "device.kernels: expected native or eager"),

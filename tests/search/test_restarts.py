@@ -29,6 +29,7 @@ from torchgco import (
     AugmentedLagrangian,
     InputError,
     PathProposals,
+    Problem,
     Restarts,
     Solution,
     Spheres,
@@ -97,16 +98,17 @@ def test_the_first_attempt_is_along_a_path_and_no_guidance_disturbs_it(solves: l
     assert [s.call.seed for s in (sampled, again)] == [3, 3 + SEED_STEP]
 
 
-def test_without_a_path_and_without_samples_the_caught_trajectory_remains() -> None:
+def test_without_a_path_and_without_samples_the_stopped_solve_continues(solves: list[Solve]) -> None:
     """Any proposal penetrates deeper than is accepted here; its candidates are counted all the same."""
     problem, U0 = gates()
     problem, U0 = problem.take(torch.tensor([PASSES])), U0[:1]
     caught = LOCAL.iterate(Call.checked(problem, U0).in_cost_units()[0], StopWhenCaught(None))
     shallow = replace(PATHS, max_penetration=1e-9)
-    solution, proposal = Restarts(LOCAL, shallow, sampling=None).solve(problem, U0), shallow.propose(problem)
-    assert caught.status.tolist() == [STOPPED] and solution.statuses == [Status.MAX_ITERATIONS]
-    assert torch.equal(solution.U, caught.best.U) and not bool(proposal.found)
-    assert torch.equal(solution.iterations, caught.iterations + proposal.iterations) and int(solution.guided) == 0
+    proposal, solution = shallow.propose(problem), Restarts(LOCAL, shallow, sampling=None).solve(problem, U0)
+    assert caught.status.tolist() == [STOPPED] and not bool(proposal.found) and int(solution.guided) == 0
+    assert torch.equal(solves[-1].call.U0, caught.last.U)
+    counts = caught.iterations + proposal.iterations + solves[-1].end.iterations
+    assert torch.equal(solution.iterations, counts) and int(solves[-1].end.iterations) > 0
 
 
 @pytest.mark.parametrize(("weight", "attracted"), [(1.0, False), (6.0, True), (100.0, False)])
@@ -198,3 +200,22 @@ def test_options_out_of_range_are_named() -> None:
     with pytest.raises(InputError, match=r"^solver\.local\.guidance: .*`sampling`") as caught:
         Restarts(replace(LOCAL, guidance=SAMPLING), None, None)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_caught_problem_without_a_path_or_samples_is_solved_to_its_end() -> None:
+    """Around moving spheres there is no roadmap: the solve that was stopped continues as if nothing had been asked."""
+    problem, U0 = planar_batch(B=4, N=40, obstacles=8, seed=4)
+    spheres = problem.constraints[0]
+    centers = spheres.centers.masked_fill(spheres.absent.unsqueeze(-1), torch.nan)
+    radii = (spheres.inflated_radii - 0.06).masked_fill(spheres.absent, torch.nan)
+    moving = Spheres(centers, radii, 0.06, velocities=torch.full_like(centers, 1e-9))
+    problem = Problem(problem.dynamics, problem.cost, [moving, *problem.constraints[1:]], problem.x0, problem.N)
+    local = AugmentedLagrangian(ILQR(max_iterations=10), initial_penalty=0.1, max_outer_iterations=12)
+    scaled, _ = Call.checked(problem, U0).in_cost_units()
+    stopped, reports = local.iterate(scaled, StopWhenCaught(None)), []
+    assert bool((stopped.status == STOPPED).any())
+    end = Restarts(local, sampling=None).solve(problem, U0, callback=reports.append)
+    assert reports[-1].finished == problem.B
+    caught = stopped.status == STOPPED
+    assert bool((end.iterations[caught] > stopped.iterations[caught]).all())
+    assert bool((end.violation[caught] < stopped.last.violation[caught]).all())

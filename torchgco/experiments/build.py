@@ -108,6 +108,8 @@ def build(config: DictConfig) -> Setup:
         device=device,
         dtype=dtype,
     )
+    if config.model.dimension != setup.vehicle.dimension:
+        raise InputError("model.dimension", f"{setup.vehicle.dimension}, as its dynamics say", config.model.dimension)
     if setup.scenario.dimension != setup.vehicle.dimension:
         other = "quadrotor" if setup.scenario.dimension == 3 else "planar"
         wanted = f"model={other}, as {setup.scenario.name} is {setup.scenario.dimension}-D"

@@ -39,8 +39,8 @@ from torchgco.tree import take
 
 CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal in a last attempt
 WITHIN = 0.95  # share of the goal tolerance to which they are attracted
+STIFF = 1e3  # weight of that attraction, in units of cost per radius^4
 SEED_STEP = 1_000_003  # between the seeds of two attempts
-STIFF = 1e3  # weight of that, in units of cost per radius^4
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Restarts(Solver):
             start = take(caught.last, wanted)
             if attempt == 1 and paths is not None:
                 wanted, start = self._along_paths(best, wanted, start, paths)
-            if sampling is not None and wanted.numel() > 0:
+            if wanted.numel() > 0 and (sampling is not None or attempt == 1):
                 self._from_samples(best, wanted, start, attempt, sampling)
         if recorder is not None:
             recorder.attempt = self.attempts + 2
@@ -146,8 +146,11 @@ class Restarts(Solver):
         start = take(start, others)
         return rows[others], replace(start, multipliers=replace(start.multipliers, mu=mu[others]))
 
-    def _from_samples(self, best: Best, rows: Tensor, start: Iterate, attempt: int, sampling: GCO) -> None:
-        """An attempt at the problems in `rows` from their caught trajectories, guided by samples from the start."""
+    def _from_samples(self, best: Best, rows: Tensor, start: Iterate, attempt: int, sampling: GCO | None) -> None:
+        """An attempt at the problems in `rows` from their caught trajectories, guided by samples from the start.
+
+        Without `sampling` the solve that was stopped continues to its end.
+        """
         call = replace(best.call.take(rows), U0=start.U, warm=start.multipliers)
         if attempt == 1:
             call = replace(call, outer=best.first.outer[rows])

@@ -179,7 +179,7 @@ class OuterLoop:
         if self.phr:
             growth = growth.masked_fill(worst <= solver.violation_tolerance, 1.0)
         multipliers = update(problem, X, U, take(s.multipliers, rows), growth, PENALTY_MAX)
-        self._keep_best(s, rows, Iterate(X, U, multipliers, s.cost[rows], worst))
+        self._keep_best(s, rows, problem, Iterate(X, U, multipliers, s.cost[rows], worst))
         s.multipliers = copied(s.multipliers)
         put(s.multipliers, rows, multipliers)
         s.outer[rows] += 1
@@ -201,8 +201,8 @@ class OuterLoop:
             status[end.converged[rows] & settled & (worst <= self.solver.violation_tolerance)] = Status.CONVERGED
         return status
 
-    def _keep_best(self, s: State, rows: Tensor, new: Iterate) -> None:
-        old, problem = take(s.best, rows), self.problem.take(rows)
+    def _keep_best(self, s: State, rows: Tensor, problem: Problem, new: Iterate) -> None:
+        old = take(s.best, rows)
         chosen = is_preferred(problem, new, old, self.solver.violation_tolerance, self.by_arrival).nonzero().flatten()
         put(s.best, rows[chosen], take(new, chosen))
 

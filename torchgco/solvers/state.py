@@ -10,6 +10,7 @@ from torch import Tensor
 from torchgco.lagrangian import Multipliers
 from torchgco.penalties import Penalty
 from torchgco.problem import Problem
+from torchgco.tree import copied
 
 STOPPED = -1  # ended by guidance, for another attempt; no status that a user sees
 
@@ -82,8 +83,5 @@ class SolveEnd:
         """To be filled, for controls like U (B, N, m)."""
         count = torch.zeros(problem.B, dtype=torch.int64, device=U.device)
         X, worth = U.new_zeros(problem.B, problem.N + 1, problem.n), U.new_zeros(problem.B)
-        best, last = (
-            Iterate(X.clone(), U.clone(), Multipliers.zero(problem, 0.0), worth.clone(), worth.clone())
-            for _ in range(2)
-        )
-        return cls(best, last, count, count.clone(), count.clone(), count.clone())
+        best = Iterate(X, U.clone(), Multipliers.zero(problem, 0.0), worth, worth.clone())
+        return cls(best, copied(best), count, count.clone(), count.clone(), count.clone())
