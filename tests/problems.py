@@ -18,10 +18,12 @@ from torchgco import (
     QuadraticCost,
     QuadrotorPlanning,
     Restarts,
+    Solution,
     Spheres,
     presets,
 )
 
+FIELDS = ("X", "U", "K", "d", "cost", "violation", "status", "iterations", "outer_iterations", "guided")
 HOVER = [0.0, 0.0, 0.0, 9.81]
 START = [-1.0, 1.0, 0.0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 9.81]
 
@@ -129,3 +131,12 @@ def reference_of(problem: Problem, b: int) -> ReferenceProblem:
         u_lower=bounds.lower[0].numpy(),
         u_upper=bounds.upper[0].numpy(),
     )
+
+
+def assert_same_bits(a: Solution, b: Solution) -> None:
+    """Whether two solutions are the same in every field."""
+    for name in FIELDS:
+        assert torch.equal(getattr(a, name), getattr(b, name)), name
+    for lam_a, lam_b in zip(a.multipliers.lam, b.multipliers.lam, strict=True):
+        assert torch.equal(lam_a, lam_b)
+    assert torch.equal(a.multipliers.mu, b.multipliers.mu)

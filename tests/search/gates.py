@@ -21,7 +21,6 @@ from torchgco import (
     Problem,
     QuadraticCost,
     Restarts,
-    Solution,
     Spheres,
 )
 from torchgco.solvers.contracts import Call
@@ -36,7 +35,6 @@ SAMPLING = GCO(SAMPLER, 2.0, start_from_sample=True, sample_from_rest=True, sing
 PATHS = PathProposals(track_iterations=8, max_penetration=0.5)
 SOLVER = Restarts(LOCAL, PATHS, SAMPLING, attempts=2)
 FREE, PASSES, SHORT, CLOSED = range(4)
-FIELDS = ("X", "U", "K", "d", "cost", "violation", "status", "iterations", "outer_iterations", "guided")
 
 
 def gates(weight: float = 6.0) -> tuple[Problem, Tensor]:
@@ -72,11 +70,3 @@ class Solve:
     @property
     def rows(self) -> list[int]:
         return self.call.rows.tolist()
-
-
-def assert_same_bits(a: Solution, b: Solution) -> None:
-    for name in FIELDS:
-        assert torch.equal(getattr(a, name), getattr(b, name)), name
-    for lam_a, lam_b in zip(a.multipliers.lam, b.multipliers.lam, strict=True):
-        assert torch.equal(lam_a, lam_b)
-    assert torch.equal(a.multipliers.mu, b.multipliers.mu)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.problems import planar_batch
+from tests.problems import assert_same_bits, planar_batch
 from tests.search.cup import GOAL, controls, cup
 from tests.search.gates import (
     CLOSED,
@@ -20,7 +20,6 @@ from tests.search.gates import (
     SHORT,
     SOLVER,
     Solve,
-    assert_same_bits,
     gates,
 )
 from torchgco import (

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.problems import assert_same_bits
 from tests.search.gates import (
     CLOSED,
     FREE,
@@ -16,7 +17,6 @@ from tests.search.gates import (
     SHORT,
     SOLVER,
     Solve,
-    assert_same_bits,
     gates,
 )
 from torchgco import (

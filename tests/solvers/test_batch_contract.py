@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.problems import boxed_batch, planar_batch, quadrotor_batch
+from tests.problems import FIELDS, assert_same_bits, boxed_batch, planar_batch, quadrotor_batch
 from torchgco import (
     GCO,
     ILQR,
@@ -54,7 +54,6 @@ BATCHES = {
     "quadrotor": lambda: quadrotor_batch(B=7, N=25, obstacles=7, seed=2),
     "boxes": lambda: boxed_batch(2, B=7, N=25, boxes=6, seed=4),
 }
-FIELDS = ("X", "U", "K", "d", "cost", "violation", "status", "iterations", "outer_iterations", "guided")
 
 
 @pytest.mark.parametrize("solver", ["gco", "restarts"])
@@ -72,14 +71,6 @@ def test_freed_slots_are_taken_by_those_that_wait(batch: str, solver: str) -> No
 
 
 KEPT = torch.tensor([0, 1, 2, 3, 5, 6])
-
-
-def assert_same_bits(a: Solution, b: Solution) -> None:
-    for name in FIELDS:
-        assert torch.equal(getattr(a, name), getattr(b, name)), name
-    for lam_a, lam_b in zip(a.multipliers.lam, b.multipliers.lam, strict=True):
-        assert torch.equal(lam_a, lam_b)
-    assert torch.equal(a.multipliers.mu, b.multipliers.mu)
 
 
 def solve_rows(solver, problem: Problem, U0, rows: list[int]) -> Solution:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,11 +9,11 @@ from torch import Tensor
 
 from torchgco.constraints.bodies import Obstacles
 from torchgco.draws import DrawKey
-from torchgco.errors import GuidanceWarning, InputError
+from torchgco.errors import InputError
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
-from torchgco.guidance.suitability import suited_guide
+from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.native.dispatch import cost_unit
 from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem
@@ -68,9 +67,7 @@ class GCO:
         if not problem.geometric:
             return None
         sampler, lost = suited_guide(self.sampler, problem)
-        if lost is not None:
-            effect = "solved without guidance" if sampler is None else "guided in part"
-            warnings.warn(f"{effect}: {lost}", GuidanceWarning, stacklevel=5)
+        warn_of_losses([] if lost is None else [lost], sampler is None)
         return None if sampler is None else replace(self, sampler=sampler)
 
     def start(self, problem: Problem, X: Tensor) -> GuideRegion:

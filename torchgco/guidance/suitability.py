@@ -6,11 +6,13 @@ user's own functions may fail there. Then the sampler falls back to the problem'
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 
+from torchgco.errors import GuidanceWarning
 from torchgco.guidance.mppi import MPPI
 from torchgco.native.dispatch import engine_of
 from torchgco.problem import Problem
@@ -42,6 +44,13 @@ def suited_guide(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None, s
     if sampler is not None and problem.dynamics.position is None:
         return None, "the dynamics have no position"
     return suited_sampler(sampler, problem)
+
+
+def warn_of_losses(losses: list[str], solved_without: bool) -> None:
+    """One GuidanceWarning that names the parts of guidance that a problem can't have; none where it can have all."""
+    if losses:
+        effect = "solved without guidance" if solved_without else "guided in part"
+        warnings.warn(f"{effect}: {'; '.join(dict.fromkeys(losses))}", GuidanceWarning, stacklevel=6)
 
 
 def _tried(

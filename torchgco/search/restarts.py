@@ -11,18 +11,17 @@ The best trajectory of all attempts is returned: one that arrives before one tha
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchgco.draws import DrawKey
-from torchgco.errors import GuidanceWarning, InputError
+from torchgco.errors import InputError
 from torchgco.evaluation import goal_tolerance
 from torchgco.guidance.detection import caught_knots
 from torchgco.guidance.gco import GCO
-from torchgco.guidance.suitability import suited_guide
+from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.native.dispatch import cost_unit
 from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem
@@ -98,10 +97,7 @@ class Restarts(Solver):
         sampler, unsampled = suited_guide(None if self.sampling is None else self.sampling.sampler, problem)
         paths, unsought = suited_paths(self.paths, problem)
         sampling = None if sampler is None or self.sampling is None else replace(self.sampling, sampler=sampler)
-        lost = list(dict.fromkeys(why for why in (unsampled, unsought) if why is not None))
-        if lost:
-            effect = "solved without guidance" if sampling is None and paths is None else "guided in part"
-            warnings.warn(f"{effect}: {'; '.join(lost)}", GuidanceWarning, stacklevel=5)
+        warn_of_losses([why for why in (unsampled, unsought) if why is not None], sampling is None and paths is None)
         return paths, sampling
 
     def _restarted(
