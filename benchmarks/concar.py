@@ -79,7 +79,7 @@ class Flight:
         counts = ((self.violation <= FEASIBLE), (self.violation <= EXACT), self.reached)
         return [
             self.name, "hard", str(len(self.cost)), *(str(int(count.sum())) for count in counts),
-            f"{median(self.cost):.4f}", f"{of_medians:.4f}", f"{ratio:.4f}", f"{self.seconds:.2f}",
+            f"{median(self.cost):.4f}", f"{of_medians:.4f}", f"{ratio:.4f}", f"{self.seconds:.3f}",
         ]  # fmt: skip
 
 
