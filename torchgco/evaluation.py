@@ -7,6 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bodies import Obstacles
 from torchgco.goal import SHARE
 from torchgco.problem import Problem
 
@@ -30,6 +31,18 @@ def violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     for constraint in problem.constraints:
         worst = torch.maximum(worst, constraint.worst(X, U))
     return worst
+
+
+def chord_clearance(problem: Problem, X: Tensor) -> Tensor:
+    """The smallest distance (B,) from the straight lines between knots to where bodies touch, m; negative in contact.
+
+    Infinite where there is no obstacle.
+    """
+    least = X.new_full(X.shape[:1], torch.inf)
+    for part in problem.constraints:
+        if isinstance(part, Obstacles):
+            least = torch.minimum(least, part.chord_clearance(X))
+    return least
 
 
 def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, limit: float) -> Tensor:

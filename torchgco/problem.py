@@ -142,6 +142,10 @@ class Problem:
         }
         return self._with(parts, form=self.form)
 
+    def grown(self, by: Tensor) -> Self:
+        """The same problems with their obstacles grown by `by` (B,), m."""
+        return self._with({"constraints": tuple(c.grown(by) for c in self.constraints)}, form=self.form)
+
     def cast(self, dtype: torch.dtype) -> Self:
         """The same problems in another precision."""
         parts = {name: cast(getattr(self, name), dtype) for name in ("dynamics", "cost", "constraints", "x0", "goal")}

@@ -53,6 +53,7 @@ def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> S
     problem, U0, local = given()
     monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", share)
     monkeypatch.setattr("torchgco.search.restarts.caught_knots", lambda problem, X, *_: torch.ones_like(X[..., 0]) > 0)
+    monkeypatch.setattr("torchgco.search.restarts.clear_chords", lambda *_: None)  # trajectories here do collide
     return Restarts(local, None, Given(levels=levels), attempts=len(levels), **options).solve(problem, U0)
 
 

@@ -62,6 +62,10 @@ class Constraint(PerElement):
             return self.knots.start <= k < self.knots.stop
         return bool((self.knots == k).any())
 
+    def grown(self, by: Tensor) -> Self:
+        """The same constraint with more distance from its obstacles by `by` (B,), m; itself where it keeps none."""
+        return self
+
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """Whether a problem that starts at x0 (B, n) makes sense, (B,) bool."""
         return torch.ones(x0.shape[0], dtype=torch.bool, device=x0.device)

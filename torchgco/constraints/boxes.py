@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import torch
@@ -24,8 +24,8 @@ class Boxes(Constraint):
 
     The distance is that from the surface, negative inside. The factor with the size s = r_veh + the smallest half side
     makes c a square of lengths with the slope of a sphere of that size: penalties mean the same for both kinds. Rows
-    hold at the knots; between two knots a path may cut a corner, which is rounded by r_veh, by up to the square of its
-    step over 8 r_veh.
+    hold at the knots; between two knots a trajectory may cut a corner, which is rounded by r_veh, by up to the square
+    of its step over 8 r_veh. `gco` solves such trajectories again with grown boxes.
 
     Args:
         centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent boxes (padding); M may be 0, and an
@@ -135,6 +135,10 @@ class BoundBoxes(Obstacles):
         along = boxes.local([(b - a)[..., None, j] for j in range(a.shape[-1])])
         distance = segment_distance(boxes.seen_from(a), along, boxes.halves()) - self.vehicle_radius.view(-1, 1, 1)
         return torch.where(self.absent.unsqueeze(1), torch.inf, distance)
+
+    def grown(self, by: Tensor) -> Self:
+        depths = torch.where(self.absent, 0.0, self.depths + by.unsqueeze(-1))
+        return replace(self, vehicle_radius=self.vehicle_radius + by, depths=depths)
 
     def inflated(self) -> Inflated:
         return Inflated(self.centers[:, :0], self.depths[:, :0], self._cuboids())

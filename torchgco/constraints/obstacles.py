@@ -7,7 +7,7 @@ Gauss-Newton Hessian are products of the weights with moments of o and v in the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import torch
@@ -185,6 +185,12 @@ class BoundSpheres(Obstacles):
         o = self.centers.unsqueeze(1)
         gap = _from_origin(a.unsqueeze(2) - o, (b - a).unsqueeze(2)) - self.inflated_radii.unsqueeze(1)
         return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
+
+    def grown(self, by: Tensor) -> Self:
+        radii = torch.where(self.absent, self.inflated_radii, self.inflated_radii + by.unsqueeze(-1))
+        weights = self.weights.clone()
+        weights[:, self.centers.shape[-1] + 1] += radii.square() - self.inflated_radii.square()
+        return replace(self, inflated_radii=radii, vehicle_radius=self.vehicle_radius + by, weights=weights)
 
     def inflated(self) -> Inflated | None:
         if self.moving:

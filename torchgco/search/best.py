@@ -10,7 +10,7 @@ from torchgco.evaluation import has_arrived, is_preferred
 from torchgco.penalties import Penalty
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress
-from torchgco.solvers.state import STOPPED, SolveEnd
+from torchgco.solvers.state import STOPPED, Iterate, SolveEnd
 from torchgco.solvers.trace import Recorder
 from torchgco.tree import copied, put, take
 
@@ -39,18 +39,31 @@ class Best:
         penalty: Penalty | None = None,
         guide_first: bool = False,
     ) -> None:
-        """One more attempt at the problems in `rows`, by a call for them; see `AugmentedLagrangian.iterate`."""
-        if rows.numel() == 0:
-            return
+        """One more attempt at the problems in `rows`, by a call for them; the better trajectory is kept."""
+        if rows.numel() > 0:
+            self.keep(rows, self.attempt(call, guidance, penalty, guide_first))
+
+    def attempt(
+        self,
+        call: Call,
+        guidance: Guidance | None = None,
+        penalty: Penalty | None = None,
+        guide_first: bool = False,
+    ) -> SolveEnd:
+        """A solve with progress and trace of the whole; see `AugmentedLagrangian.iterate`."""
         call = replace(call, callback=self._callback(call))
-        self.keep(rows, self.solver.iterate(call, guidance, penalty, self.recorder, guide_first, by_arrival=True))
+        return self.solver.iterate(call, guidance, penalty, self.recorder, guide_first, by_arrival=True)
 
     def keep(self, rows: Tensor, new: SolveEnd) -> None:
         """The better of the old trajectories of `rows` and new ones: arrived, then feasible, then cheap."""
         problem, limit = self.call.problem.take(rows), self.solver.violation_tolerance
         old = take(self.end.best, rows)
-        chosen = is_preferred(problem, new.best, old, limit).nonzero().flatten()
-        put(self.end.best, rows[chosen], take(new.best, chosen))
+        self.replace(rows, is_preferred(problem, new.best, old, limit), new.best, new)
+
+    def replace(self, rows: Tensor, where: Tensor, trajectories: Iterate, new: SolveEnd) -> None:
+        """New trajectories of `rows` where a mask (b,) says so, and the counts of their solves."""
+        chosen = where.nonzero().flatten()
+        put(self.end.best, rows[chosen], take(trajectories, chosen))
         self.end.status[rows[chosen]] = new.status[chosen]
         for name in ("iterations", "outer", "guided"):
             getattr(self.end, name)[rows] += getattr(new, name)

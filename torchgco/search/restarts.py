@@ -5,8 +5,8 @@
 3. Without a path, or where that attempt doesn't arrive, further attempts start from the caught trajectory, guided by
    samples.
 4. Where no attempt arrives but the best one ends close to the goal, a last attempt attracts its end to the goal.
-
-The best trajectory of all attempts is returned: one that arrives before one that is feasible, then the cheapest.
+5. The best trajectory of all attempts is taken: one that arrives before one that is feasible, then the cheapest. Where
+   it touches an obstacle between two knots, it is solved again with grown obstacles.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from torchgco.native.dispatch import cost_unit
 from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem
 from torchgco.search.best import Best
+from torchgco.search.chords import clear_chords
 from torchgco.search.paths import PathProposals
 from torchgco.search.suitability import suited_paths
 from torchgco.solution import Solution
@@ -82,13 +83,14 @@ class Restarts(Solver):
         recorder = Recorder() if solver.record else None
         paths, sampling = self._suited(scaled.problem)
         if paths is None and sampling is None:
-            end = solver.iterate(scaled, recorder=recorder, by_arrival=True)
+            best = Best(scaled, solver.iterate(scaled, recorder=recorder, by_arrival=True), solver, recorder)
         else:
             after = None if self.sampling is None else self.sampling.single_contact_after
             caught = solver.iterate(scaled, StopWhenCaught(after), recorder=recorder, by_arrival=True)
-            end = self._restarted(scaled, caught, paths, sampling, recorder)
+            best = self._restarted(scaled, caught, paths, sampling, recorder)
+        clear_chords(best, self.attempts + 3)
         phr = not solver.inner.as_printed
-        return finished(call, scaled, unit, end, phr, solver.violation_tolerance, solver.slots, recorder)
+        return finished(call, scaled, unit, best.end, phr, solver.violation_tolerance, solver.slots, recorder)
 
     def _suited(self, problem: Problem) -> tuple[PathProposals | None, GCO | None]:
         """The parts that can serve these problems; a GuidanceWarning names the others."""
@@ -107,7 +109,7 @@ class Restarts(Solver):
         paths: PathProposals | None,
         sampling: GCO | None,
         recorder: Recorder | None,
-    ) -> SolveEnd:
+    ) -> Best:
         """The best of the solves so far and of all attempts, for the problems that were stopped."""
         best = Best(call, caught, self.local, recorder)
         stopped = caught.status == STOPPED
@@ -123,7 +125,7 @@ class Restarts(Solver):
         if recorder is not None:
             recorder.attempt = self.attempts + 2
         self._into_the_goal(best, (stopped & ~best.arrived() & best.arrived(CLOSE)).nonzero().flatten())
-        return best.end
+        return best
 
     def _along_paths(self, best: Best, rows: Tensor, start: Iterate, paths: PathProposals) -> tuple[Tensor, Iterate]:
         """An attempt along the proposed path of each problem in `rows`; the problems without one, and where they start.

@@ -13,9 +13,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bodies import Obstacles
 from torchgco.errors import InputError
-from torchgco.evaluation import violation
+from torchgco.evaluation import chord_clearance, violation
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
@@ -160,7 +159,7 @@ class _Point:
         model = Condensed.around(problem, X, U)
         cost = float(problem.cost.total(X, U))
         slack = float((lam * model.c).abs().max()) / (1.0 + abs(cost)) if lam.numel() else 0.0
-        clearance = min([float(part.chord_clearance(X)) for part in _obstacles(problem)], default=torch.inf)
+        clearance = float(chord_clearance(problem, X))
         worst = float(violation(problem, X, U))
         return cls(model, lam, cost, worst, max(_slope(model, lam), slack), clearance)
 
@@ -202,10 +201,6 @@ class _Point:
 def _slope(model: Condensed, lam: Tensor) -> float:
     """The largest component of the Lagrangian's gradient, by 1 + that of the cost's."""
     return float(model.lagrangian_gradient(lam).abs().max()) / (1.0 + float(model.gradient.abs().max()))
-
-
-def _obstacles(problem: Problem) -> list[Obstacles]:
-    return [part for part in problem.constraints if isinstance(part, Obstacles)]
 
 
 def _convex(point: _Point, exact: bool) -> tuple[Tensor, Tensor] | None:

@@ -1,0 +1,52 @@
+"""Between two knots: a trajectory that cuts an obstacle there is solved again with grown obstacles.
+
+Constraints hold at the knots. Where the vehicle turns around the corner of a box or a small sphere within one time
+step, the straight line between two knots may come closer than both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from torchgco.evaluation import chord_clearance, has_arrived, violation
+from torchgco.search.best import Best
+from torchgco.tree import take
+
+ROUNDS = 4  # solves at most, each with larger obstacles than the one before
+GROWTH = 1.1  # times the missing clearance: by how much obstacles grow in a round
+
+
+def clear_chords(best: Best, first_attempt: int) -> None:
+    """Replace feasible trajectories that touch an obstacle between two knots by ones that keep clear of it.
+
+    Obstacles grow by `GROWTH` times the missing clearance, in up to `ROUNDS` rounds, and the solve continues from the
+    best trajectory. A trajectory is replaced where the new one is feasible for the obstacles as they are, has arrived
+    if the old one had, and keeps more clearance between the knots. Openings may leave no room for that.
+
+    Args:
+        best: the trajectories so far; changed in place.
+        first_attempt: the number of the first round as an attempt in the trace.
+    """
+    problem, limit = best.call.problem, best.solver.violation_tolerance
+    clearance = chord_clearance(problem, best.end.best.X)
+    by = torch.zeros_like(clearance)
+    rows = ((best.end.best.violation <= limit) & (clearance < 0)).nonzero().flatten()
+    for number in range(ROUNDS):
+        if rows.numel() == 0:
+            return
+        if best.recorder is not None:
+            best.recorder.attempt = first_attempt + number
+        by[rows] -= GROWTH * clearance[rows]
+        whole, old = problem.take(rows), take(best.end.best, rows)
+        call = best.call.take(rows)
+        call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
+        new = best.attempt(call)
+        found = replace(new.best, violation=violation(whole, new.best.X, new.best.U))
+        now = chord_clearance(whole, found.X)
+        serves = (found.violation <= limit) & (now > clearance[rows])
+        serves &= has_arrived(whole, found.X) | ~has_arrived(whole, old.X)
+        best.replace(rows, serves, found, new)
+        clearance[rows] = torch.where(serves, now, clearance[rows])
+        rows = rows[clearance[rows] < 0]
