@@ -37,7 +37,7 @@ from torchgco.solvers.state import PassEnd, State
 from torchgco.solvers.verdict import optimality
 
 DAMPED = ILQR()
-BRIEF = replace(DAMPED, line_search=LineSearch(ratio_min=0.9, shrink=0.8, smallest=0.05, back=2))
+BRIEF = replace(DAMPED, line_search=LineSearch(back=2))
 PRINTED = ILQR(as_printed=True, tolerance=0.1, max_iterations=15)
 
 

@@ -39,18 +39,19 @@ class Given(GCO):
 STAYS, ARRIVES = 1e-3, 4.0  # controls: the first are cheap
 
 
-def given() -> tuple[Problem, torch.Tensor, AugmentedLagrangian]:
+def given(monkeypatch) -> tuple[Problem, torch.Tensor, AugmentedLagrangian]:
     """A problem in which moving is expensive, controls like its own, and a solver that improves nothing."""
+    monkeypatch.setattr(LineSearch, "ratio_min", 1e9)
     problem, U0 = planar_batch(B=1, N=25, obstacles=3, seed=3)
     cost = QuadraticCost(Q=[1e-3] * 6, R=[5.0, 5.0], Qf=[1, 1, 0, 0, 0, 0], x_ref=[1, 0.4, 0, 0, 0, 0])
-    inner = ILQR(tolerance=1e-9, max_iterations=1, line_search=LineSearch(ratio_min=1e9, ratio_max=2e9))
+    inner = ILQR(tolerance=1e-9, max_iterations=1)
     local = AugmentedLagrangian(inner, max_outer_iterations=3, violation_tolerance=10.0, penalty_growth=1.0)
     return replace(problem, cost=cost), U0, local
 
 
 def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> Solution:
     """The choice among trajectories that are given, all caught and none improved; `share` counts as having arrived."""
-    problem, U0, local = given()
+    problem, U0, local = given(monkeypatch)
     monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", share)
     monkeypatch.setattr("torchgco.search.restarts.caught_knots", lambda problem, X, *_: torch.ones_like(X[..., 0]) > 0)
     monkeypatch.setattr("torchgco.search.restarts.clear_chords", lambda *_: None)  # trajectories here do collide
@@ -80,7 +81,7 @@ def test_one_that_arrives_is_worth_more_than_a_cheaper_one(
 def test_one_that_arrives_is_kept_within_an_attempt_too(by_arrival: bool, monkeypatch) -> None:
     """The first inner solve arrives; then guidance replaces it by a trajectory that stays, which is cheaper."""
     monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", 0.5)
-    problem, U0, local = given()
+    problem, U0, local = given(monkeypatch)
     call = Call.checked(problem, torch.full_like(U0, ARRIVES))
     end = local.iterate(call, Given(levels=(STAYS,)), by_arrival=by_arrival)
     assert bool(end.best.U.mean() > 3.0) == by_arrival

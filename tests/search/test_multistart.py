@@ -100,7 +100,8 @@ def test_one_that_arrives_is_worth_more_than_a_cheaper_one(monkeypatch) -> None:
     problem, U0 = planar_batch(B=4, N=25, obstacles=3, seed=7)
     cost = QuadraticCost(Q=[1e-3] * 6, R=[5.0, 5.0], Qf=[1, 1, 0, 0, 0, 0], x_ref=[1, 0.4, 0, 0, 0, 0])
     problem = replace(problem, cost=cost)
-    stays = replace(LOCAL, inner=ILQR(max_iterations=1, line_search=LineSearch(ratio_min=1e9, ratio_max=2e9)))
+    monkeypatch.setattr(LineSearch, "ratio_min", 1e9)
+    stays = replace(LOCAL, inner=ILQR(max_iterations=1))
     many = replace(MANY, local=replace(stays, violation_tolerance=10.0), starts=20)
     solutions = []
     for share in (1e-9, 0.9):

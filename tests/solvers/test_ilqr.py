@@ -89,7 +89,9 @@ def test_statuses(monkeypatch) -> None:
     problem, U0 = planar_batch(B=2, N=20)
     free = replace(problem, constraints=[])
     assert ILQR(max_iterations=1).solve(free, U0).statuses == [Status.MAX_ITERATIONS] * 2
-    stubborn = ILQR(line_search=LineSearch(ratio_min=5.0)).solve(free, U0)
+    with monkeypatch.context() as patch:
+        patch.setattr(LineSearch, "ratio_min", 5.0)
+        stubborn = ILQR().solve(free, U0)
     assert stubborn.statuses == [Status.LINE_SEARCH_FAILED] * 2
     assert torch.equal(stubborn.U, U0)
     impossible = FunctionConstraint(lambda x: x[..., :1].square() + 1.0, sense="equality", knots=[-1])
@@ -107,27 +109,28 @@ def steep() -> Problem:
     return linear_problem(constraints=[curved])
 
 
-def steep_run(as_printed: bool = False, **options) -> Solution:
-    search = LineSearch(**{"ratio_min": 0.95, **options})
-    inner = ILQR(as_printed, max_iterations=25, tolerance=1e-6, line_search=search)
+def steep_run(monkeypatch, as_printed: bool = False, smallest: float = 1e-4, back: int | None = None) -> Solution:
+    monkeypatch.setattr(LineSearch, "ratio_min", 0.95)
+    monkeypatch.setattr(LineSearch, "smallest", smallest)
+    inner = ILQR(as_printed, max_iterations=25, tolerance=1e-6, line_search=LineSearch(back))
     return AugmentedLagrangian(inner=inner, max_outer_iterations=3, record=True).solve(steep(), zeros(steep()))
 
 
-def test_the_ladder_ends_with_a_step_that_is_accepted_as_printed_and_refused_otherwise() -> None:
-    short, printed = steep_run(smallest=0.4), steep_run(True, smallest=0.4)
+def test_the_ladder_ends_with_a_step_that_is_accepted_as_printed_and_refused_otherwise(monkeypatch) -> None:
+    short, printed = steep_run(monkeypatch, smallest=0.4), steep_run(monkeypatch, True, smallest=0.4)
     assert set(short.trace.alpha) <= {1.0, 0.5, 0.0} and (short.trace.alpha == 0).any()
     assert set(printed.trace.alpha) <= {1.0, 0.5, 0.25} and (printed.trace.alpha == 0.25).any()
-    assert ((steep_run().trace.alpha > 0) & (steep_run().trace.alpha < 0.5)).any()
+    assert ((steep_run(monkeypatch).trace.alpha > 0) & (steep_run(monkeypatch).trace.alpha < 0.5)).any()
 
 
-def test_a_failed_search_raises_the_regularisation_and_L_M_never_rises() -> None:
-    damped, printed = steep_run(smallest=0.4), steep_run(True, smallest=0.4)
+def test_a_failed_search_raises_the_regularisation_and_L_M_never_rises(monkeypatch) -> None:
+    damped, printed = steep_run(monkeypatch, smallest=0.4), steep_run(monkeypatch, True, smallest=0.4)
     assert float(damped.trace.regularisation.max()) > 0.0 and float(printed.trace.regularisation.max()) == 0.0
     assert (damped.trace.groupby(["element", "outer"]).merit.diff().dropna() <= 1e-12).all()
 
 
-def test_a_search_begins_a_little_above_the_last_accepted_rung() -> None:
-    plain, kept = steep_run(), steep_run(back=1)
+def test_a_search_begins_a_little_above_the_last_accepted_rung(monkeypatch) -> None:
+    plain, kept = steep_run(monkeypatch), steep_run(monkeypatch, back=1)
     grown = {}
     for name, run in (("plain", plain), ("kept", kept)):
         alpha = run.trace[run.trace.alpha > 0].groupby(["element", "outer"]).alpha
@@ -138,9 +141,9 @@ def test_a_search_begins_a_little_above_the_last_accepted_rung() -> None:
 
 @pytest.mark.parametrize("native", ["eager"], indirect=True)
 def test_rungs_tried_together_are_the_same_rungs(native: bool, monkeypatch) -> None:
-    many = steep_run()
+    many = steep_run(monkeypatch)
     monkeypatch.setattr(line_search, "PARALLEL", 1)
     monkeypatch.setattr(line_search, "SIDE_BY_SIDE", 1)
-    one = steep_run()
+    one = steep_run(monkeypatch)
     torch.testing.assert_close(one.U, many.U, rtol=1e-9, atol=1e-9)
     assert one.iterations.tolist() == many.iterations.tolist()

@@ -24,8 +24,7 @@ CHANGES = {
         inner=ILQR(max_iterations=2), guidance=None, initial_penalty=50.0, penalty_growth=5.0,
         max_outer_iterations=3, violation_tolerance=0.2, record=False,
     ),
-    ILQR: dict(as_printed=False, tolerance=1e3, max_iterations=3, line_search=LineSearch(shrink=0.3)),
-    LineSearch: dict(shrink=0.25, ratio_min=0.9, ratio_max=0.9),
+    ILQR: dict(as_printed=False, tolerance=1e3, max_iterations=3),
     GCO: dict(
         sampler=MPPI(samples=5), initial_penalty=2.0, penalty_growth=1.0, single_contact_after=1,
         sample_from_rest=True,
@@ -35,14 +34,11 @@ CHANGES = {
         noise_knots=3, decay=0.3, elite=4, dwell_cost=10.0, dtype="float32",
     ),
 }  # fmt: skip
-# `slots` decides no result (test_batch_contract), the ladder shows in test_ilqr, replaced iterates in test_restarts.
-ELSEWHERE = {
-    (AugmentedLagrangian, "slots"), (LineSearch, "smallest"), (LineSearch, "back"), (GCO, "start_from_sample"),
-}  # fmt: skip
+# `slots` decides no result (test_batch_contract), line searches show in test_ilqr, replaced iterates in test_restarts.
+ELSEWHERE = {(AugmentedLagrangian, "slots"), (ILQR, "line_search"), (GCO, "start_from_sample")}
 PLACES = {
     AugmentedLagrangian: lambda s, c: replace(s, **c),
     ILQR: lambda s, c: replace(s, inner=replace(s.inner, **c)),
-    LineSearch: lambda s, c: replace(s, inner=replace(s.inner, line_search=replace(s.inner.line_search, **c))),
     GCO: lambda s, c: replace(s, guidance=replace(s.guidance, **c)),
     MPPI: lambda s, c: replace(s, guidance=replace(s.guidance, sampler=replace(s.guidance.sampler, **c))),
 }
@@ -78,9 +74,6 @@ def test_no_option_is_forgotten_above() -> None:
     [
         (lambda: ILQR(tolerance=-1.0), "ilqr.tolerance"),
         (lambda: ILQR(max_iterations=0), "ilqr.max_iterations"),
-        (lambda: LineSearch(shrink=1.0), "line_search.shrink"),
-        (lambda: LineSearch(ratio_min=0.0), "line_search.ratio_min"),
-        (lambda: LineSearch(smallest=2.0), "line_search.smallest"),
         (lambda: LineSearch(back=-1), "line_search.back"),
         (lambda: GCO(initial_penalty=0.0), "gco.initial_penalty"),
         (lambda: GCO(penalty_growth=0.5), "gco.penalty_growth"),

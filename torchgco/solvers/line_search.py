@@ -7,6 +7,7 @@ parallel. A problem accepts the first rung that fits, as if it had tried one aft
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -34,12 +35,9 @@ class Rollouts:
 
 @dataclass(frozen=True)
 class LineSearch:
-    """Backtracking on the ratio of actual to expected change of L_M.
+    """Backtracking on the ratio of actual to expected change of L_M, with the constants of the paper.
 
     Args:
-        shrink: phi, factor from one step length to the next.
-        ratio_min, ratio_max: accepted range of the ratio.
-        smallest: step lengths end with the first one below this.
         back: the next search begins this many rungs above the last accepted one, which spares rollouts and shortens
             steps; None: each search begins with a full step (as printed).
 
@@ -47,19 +45,14 @@ class LineSearch:
         InputError: a field out of its range.
     """
 
-    shrink: float = 0.5
-    ratio_min: float = 1e-4
-    ratio_max: float = 10.0
-    smallest: float = 1e-4
     back: int | None = None
 
+    shrink: ClassVar[float] = 0.5  # phi, factor from one step length to the next
+    ratio_min: ClassVar[float] = 1e-4  # accepted range of the ratio
+    ratio_max: ClassVar[float] = 10.0
+    smallest: ClassVar[float] = 1e-4  # step lengths end with the first one below this
+
     def __post_init__(self) -> None:
-        if not 0 < self.shrink < 1:
-            raise InputError("line_search.shrink", "a factor between 0 and 1", self.shrink)
-        if not 0 < self.ratio_min < self.ratio_max:
-            raise InputError("line_search.ratio_min", f"between 0 and ratio_max {self.ratio_max}", self.ratio_min)
-        if not 0 < self.smallest < 1:
-            raise InputError("line_search.smallest", "between 0 and 1", self.smallest)
         if self.back is not None and self.back < 0:
             raise InputError("line_search.back", "at least 0, or null", self.back)
 
