@@ -33,21 +33,21 @@ from torchgco.problem import Problem
 HERE = Path(__file__).resolve().parent
 LAST = 3  # outer iterations that decide the cause
 CAUSES = {
-    "thrown away": "the penalty has outgrown the model: the last iterate costs over five times the first",
-    "silent": "spheres are touched, but no two at a knot: J is empty, guidance silent (dead-centre, or spoilt before)",
-    "waits": "feasible, free of contact, and stopped in front: waiting is cheaper than the way around",
-    "noise too weak": "the plan lies within half a sphere's radius of the caught path",
-    "guide infeasible": "the plan itself touches obstacles where it is to guide",
-    "guide stops": "the plan ends farther from the goal than a quarter of the way: it stops before the obstacle",
+    "diverged": "the penalty has outgrown the model: the last iterate costs over five times the first",
+    "no pair in contact": "spheres are touched, but no two at one knot: J is empty, and there is no guidance",
+    "stopped in front": "feasible, free of contact, and not at the goal: waiting is cheaper than the detour",
+    "noise too weak": "the sampled plan lies within half a sphere's radius of the caught trajectory",
+    "guide infeasible": "the sampled plan touches obstacles at the knots that it guides",
+    "guide stops": "the sampled plan ends before the obstacle: farther from the goal than a quarter of the distance",
     "guide changes": "plans of successive outer iterations lie over a sphere's radius apart",
-    "other class": "plan and path pass a sphere on different sides: the guide draws through it",
+    "other class": "plan and trajectory pass a sphere on different sides: the guide leads through it",
     "not in time": "none of these: the guide is good and stays, and the limits end the solve",
 }
 
 
 @dataclass
 class Witness:
-    """Guidance that notes what passes through it, and changes nothing. It is its own sampler's witness, too."""
+    """Guidance that records its calls and changes nothing, and the plans of its sampler."""
 
     guidance: GCO
     rows: list[pd.DataFrame] = field(default_factory=list)
@@ -62,7 +62,7 @@ class Witness:
 
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: Any, key: DrawKey) -> Any:
         self.plan = None
-        advice = replace(self.guidance, sampler=_Listening(self.guidance.sampler, self)).update(
+        advice = replace(self.guidance, sampler=_Noted(self.guidance.sampler, self)).update(
             problem, X, U, penalty, key
         )
         self._note(problem, X, U, key)
@@ -95,8 +95,8 @@ class Witness:
 
 
 @dataclass(frozen=True)
-class _Listening:
-    """The sampler, overheard."""
+class _Noted:
+    """The sampler; the witness notes its plans."""
 
     sampler: Any
     witness: Witness
@@ -121,9 +121,9 @@ def cause(history: pd.DataFrame, feasible: bool, R: float) -> str:
     """Of one layout that wasn't reached, from the notes of its outer iterations; R the mean r_obs + r_veh, m."""
     last = history.tail(LAST)
     if last.cost.iloc[-1] > 5 * history.cost.iloc[0] or not np.isfinite(last.cost.iloc[-1]):
-        return "thrown away"
+        return "diverged"
     if not last.caught.any():
-        return "waits" if feasible and last.violation.iloc[-1] <= 1e-3 else "silent"
+        return "stopped in front" if feasible and last.violation.iloc[-1] <= 1e-3 else "no pair in contact"
     caught = last[last.caught]
     tests = {
         "noise too weak": (caught.near < 0.5 * R).mean(),

@@ -24,7 +24,7 @@ def history(rounds: int = 4, **changes) -> pd.DataFrame:
 @pytest.mark.parametrize(
     ("changes", "feasible", "name"),
     [
-        (dict(caught=False), False, "silent"), (dict(caught=False, violation=0.0), True, "waits"),
+        (dict(caught=False), False, "no pair in contact"), (dict(caught=False, violation=0.0), True, "stopped in front"),
         (dict(near=0.2), False, "noise too weak"), (dict(deep=1.0), False, "guide infeasible"),
         (dict(ends=0.6), False, "guide stops"), (dict(moved=1.5), False, "guide changes"),
         (dict(crosses=1.0), False, "other class"), (dict(), False, "not in time"),
@@ -38,7 +38,7 @@ def test_a_history_tells_its_cause(changes: dict, feasible: bool, name: str) -> 
 def test_an_iterate_thrown_far_off_is_told_first() -> None:
     flown = history(near=0.1)
     flown.loc[3, "cost"] = 6.0
-    assert cause(flown, False, 1.0) == "thrown away"
+    assert cause(flown, False, 1.0) == "diverged"
 
 
 def test_only_the_last_outer_iterations_count() -> None:
