@@ -1,11 +1,11 @@
-# make study   the default study, in an environment of its own (ARGS="experiment=planar_trap seed=1" for others)
+# make study   the default study, in its own environment (ARGS="experiment=planar_trap seed=1" for others)
 # make ladder   every solver on the public layouts (ten minutes on one core)
 # make quality   how often gco reaches the goal on the public layouts, and how well (ARGS="--solvers gco gco_max" for more
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
-# make benchmark   speed, side by side with the peers (twenty minutes; ARGS="families targets" for some sections);
+# make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md
-# make test    the tests; test-all: those that kill processes and fly whole studies, too; lint, types: the static checks;
+# make test    the tests; test-all: also the tests that kill processes or fly whole studies; lint, types: the static checks;
 #              clean: remove environments, caches and builds
 
 PYTHON ?= python3
@@ -14,11 +14,11 @@ ARGS ?=
 
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
-# A stamp is newer than what it was made from for as long as there is nothing to install.
+# A stamp is older than its prerequisites only where there is something to install.
 RUNTIME := $(VENV)/.runtime
 DEV := $(VENV)/.dev
 PEERS := $(VENV)/.peers
-# The wheel of acados brings a CasADi that would shadow the real one: an environment without torchgco.
+# A separate environment, without torchgco: the wheel of acados contains a CasADi that would shadow the real one.
 ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
@@ -70,7 +70,7 @@ clean:
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-# An order-only prerequisite: pip touches its folders with every install.
+# Python is an order-only prerequisite: pip touches its folders with every install.
 $(RUNTIME): pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) -e .
 	touch $@

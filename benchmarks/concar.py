@@ -1,8 +1,8 @@
-"""python -m benchmarks.concar: a car among four hard circles, 100 problems, alongside IPOPT.
+"""python -m benchmarks.concar: a car among four hard circles, 100 problems, compared with IPOPT.
 
-torchgco flies all as one batch, IPOPT one after the other, both from zero controls, with one thread; `judge` counts for
+torchgco solves all problems as one batch, IPOPT one by one, both from zero controls, with one thread; `judge` judges
 both. With --write the table goes into benchmarks/results/concar.md. Model, problems and solver are those of
-`notebooks/own_model.ipynb`, whose cells tagged `shared` are run as they stand there, so that nothing is written twice.
+`notebooks/own_model.ipynb`: its cells tagged `shared` are run unchanged, so that nothing is written twice.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "benchmarks" / "data"
 GOAL, GOAL_RADIUS = torch.ones(2, dtype=torch.float64), 0.1  # m
 FEASIBLE, EXACT = 1e-3, 1e-6  # violation of the full radii, m
-NOTABLE = 1.01  # the cost ratio beyond which one path counts as cheaper than another
+NOTABLE = 1.01  # the cost ratio beyond which one trajectory counts as cheaper than another
 HEAD = (
     "solver", "circles", "n", "feasible", "violation <= 1e-6", "reached", "median objective", "ratio of medians",
     "median ratio", "seconds per problem",
@@ -37,7 +37,7 @@ HEAD = (
 
 
 def own_model() -> SimpleNamespace:
-    """What the notebook defines: Car, problem_of and solver."""
+    """The names that the notebook defines: Car, problem_of and solver."""
     notebook = json.loads((ROOT / "notebooks" / "own_model.ipynb").read_text())
     names: dict[str, Any] = {}
     for cell in notebook["cells"]:
@@ -47,7 +47,7 @@ def own_model() -> SimpleNamespace:
 
 
 def read_layouts() -> pd.DataFrame:
-    """One problem per row."""
+    """The table of layouts, one problem per row."""
     return pd.read_csv(DATA / "concar.csv")
 
 
@@ -57,13 +57,13 @@ def zero_controls(problem: Problem) -> Tensor:
 
 @dataclass(frozen=True)
 class Flight:
-    """What a solver made of the problems, counted by the judge."""
+    """Results of a solver on the problems, from the judge."""
 
     name: str
     cost: Tensor  # (B,)
     violation: Tensor  # (B,), m: circles at knots 1..99 and, in their own units, control limits
     reached: Tensor  # (B,) bool
-    converged: int  # by the solver's own word
+    converged: int  # number, by the solver's own status
     seconds: float  # per problem
 
     @classmethod
@@ -73,7 +73,7 @@ class Flight:
         return cls(name, verdict.cost, verdict.violation, verdict.reached, converged, seconds / problem.B)
 
     def cells(self, other: Flight) -> list[str]:
-        """A line of the table; ratios are to `other`."""
+        """A row of the table; ratios are to `other`."""
         ratio = float((self.cost / other.cost).quantile(0.5))
         of_medians = median(self.cost) / median(other.cost)
         counts = ((self.violation <= FEASIBLE), (self.violation <= EXACT), self.reached)
@@ -91,14 +91,14 @@ def fly(layouts: pd.DataFrame, seed: int = 0) -> tuple[Flight, Flight]:
     began = perf_counter()
     solution = model.solver.solve(problem, U0, seed=seed)
     ours = Flight.judged("`torchgco`, one batch", problem, solution, perf_counter() - began)
-    prepared = CasADiSolver(plugin="ipopt").prepare(problem)  # on no clock, as in `benchmarks.speed`
+    prepared = CasADiSolver(plugin="ipopt").prepare(problem)  # not timed, as in `benchmarks.speed`
     began = perf_counter()
     solution = prepared.solve(problem, U0)
     return ours, Flight.judged("`ipopt`, one by one", problem, solution, perf_counter() - began)
 
 
 def published(seeds: pd.Series) -> list[list[str]]:
-    """Lines for what three solvers made of softened circles, where they say that they converged."""
+    """Rows for the published results of three solvers on softened circles, where they report convergence."""
     peers = pd.read_csv(DATA / "concar_peers.csv")
     peers = peers[peers["seed"].isin(seeds) & peers["converged"]]
     dash = "-"
@@ -110,7 +110,7 @@ def published(seeds: pd.Series) -> list[list[str]]:
 
 
 def compared(ours: Flight, peer: Flight) -> str:
-    """Both solvers layout by layout, which the medians don't show."""
+    """A sentence that compares the two solvers layout by layout, as medians don't."""
     ratio = ours.cost / peer.cost
     return (
         f"Layout by layout torchgco is more than 1 % cheaper on {int((ratio < 1 / NOTABLE).sum())} of {len(ratio)} and "
@@ -125,7 +125,7 @@ def median(values: Tensor) -> float:
 
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.concar", description="A car among four hard circles.")
-    parser.add_argument("--first", type=int, default=100, help="so many problems only")
+    parser.add_argument("--first", type=int, default=100, help="only the first problems, this many")
     parser.add_argument("--seed", type=int, default=0, help="of the random draws of guidance")
     parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/concar.md")
     asked = parser.parse_args(words)

@@ -1,7 +1,7 @@
 """python -m benchmarks.failures: why the paper's guidance fails where it does, counted, with one picture per cause.
 
-`gco_paper` flies the public layouts while a witness notes, after every inner solve, what guidance saw and what it
-answered. Every layout whose goal isn't reached gets one cause, derived from its last outer iterations; the table and
+`gco_paper` flies the public layouts while a witness records, after every inner solve, the state that guidance got and
+its answer. Every layout whose goal isn't reached gets one cause, derived from its last outer iterations; the table and
 the pictures go to benchmarks/failures.md and failures.png.
 """
 
@@ -47,11 +47,11 @@ CAUSES = {
 
 @dataclass
 class Witness:
-    """Guidance that records its calls and changes nothing, and the plans of its sampler."""
+    """Guidance that records its calls, and those of its sampler, and changes nothing."""
 
     guidance: GCO
     rows: list[pd.DataFrame] = field(default_factory=list)
-    last: dict[int, Tensor] = field(default_factory=dict)  # of a layout: the plan (N+1, d) when last caught
+    last: dict[int, Tensor] = field(default_factory=dict)  # by layout: the plan (N+1, d), m, when last caught
     plan: tuple[Tensor, Tensor] | None = None  # ids and plans of the last call of the sampler
 
     def suited(self, problem: Problem) -> Any:
@@ -62,9 +62,7 @@ class Witness:
 
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: Any, key: DrawKey) -> Any:
         self.plan = None
-        advice = replace(self.guidance, sampler=_Noted(self.guidance.sampler, self)).update(
-            problem, X, U, penalty, key
-        )
+        advice = replace(self.guidance, sampler=_Noted(self.guidance.sampler, self)).update(problem, X, U, penalty, key)
         self._note(problem, X, U, key)
         return advice
 
@@ -96,7 +94,7 @@ class Witness:
 
 @dataclass(frozen=True)
 class _Noted:
-    """The sampler; the witness notes its plans."""
+    """A sampler that passes its plans on to the witness."""
 
     sampler: Any
     witness: Witness
@@ -108,7 +106,7 @@ class _Noted:
 
 
 def _crosses(problem: Problem, path: Tensor, plan: Tensor) -> bool:
-    """Whether the band between path and plan (N+1, d) sweeps over the middle of a sphere."""
+    """Whether the band between path and plan (N+1, d), knot by knot, covers the middle of a sphere."""
     spheres = problem.geometric[0]
     along = plan - path
     toward = spheres.centers[0].unsqueeze(1) - path
@@ -118,7 +116,10 @@ def _crosses(problem: Problem, path: Tensor, plan: Tensor) -> bool:
 
 
 def cause(history: pd.DataFrame, feasible: bool, R: float) -> str:
-    """Of one layout that wasn't reached, from the notes of its outer iterations; R the mean r_obs + r_veh, m."""
+    """The cause for one layout that wasn't reached, from the records of its outer iterations.
+
+    R is the mean inflated radius r_obs + r_veh, m.
+    """
     last = history.tail(LAST)
     if last.cost.iloc[-1] > 5 * history.cost.iloc[0] or not np.isfinite(last.cost.iloc[-1]):
         return "diverged"
@@ -136,7 +137,7 @@ def cause(history: pd.DataFrame, feasible: bool, R: float) -> str:
 
 
 def fly(family: Family, count: int, seed: int) -> tuple[pd.DataFrame, dict[str, Example]]:
-    """A row for each layout with its cause, and an example of every cause."""
+    """One row per layout with its cause, and one example per cause."""
     setup = compose([*family.overrides(seed=seed), "solver=gco_paper", "device.threads=1"])
     task = setup.task(setup.layouts(count))
     witness = Witness(setup.solver.guidance)
@@ -159,7 +160,7 @@ def fly(family: Family, count: int, seed: int) -> tuple[pd.DataFrame, dict[str, 
 
 
 def table(trials: pd.DataFrame) -> str:
-    """Markdown: a row for each cause with its count in every family."""
+    """Markdown: one row per cause, with its count in every family."""
     families = list(dict.fromkeys(trials.family))
     counts = pd.crosstab(trials.cause, trials.family).reindex(list(CAUSES), fill_value=0)
     lines = [f"| cause | what it means | {' | '.join(families)} |", "|---" * (2 + len(families)) + "|"]
@@ -176,7 +177,7 @@ def main(words: Sequence[str] | None = None) -> int:
         prog="python -m benchmarks.failures", description="Sort the failures of gco_paper."
     )
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(FAMILIES), metavar="NAME")
-    parser.add_argument("--first", type=int, default=32, help="so many layouts of each family")
+    parser.add_argument("--first", type=int, default=32, help="layouts per family, the first ones")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--outputs", type=Path, default=HERE)
     asked = parser.parse_args(words)

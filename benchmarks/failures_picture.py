@@ -1,4 +1,4 @@
-"""The pictures of failures.md: one layout for every cause, seen from above."""
+"""The picture of failures.md: one layout per cause, seen from above."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class Example:
     layout: int
     centers: Tensor  # (M, d)
     inflated_radii: Tensor  # (M,) r_obs + r_veh
-    path: Tensor  # (N+1, d): what was returned
-    plan: Tensor | None  # (N+1, d): the last sampled plan, where there was one
+    path: Tensor  # (N+1, d): of the returned trajectory
+    plan: Tensor | None  # (N+1, d): the last sampled plan; None: none was sampled
     goal: Tensor  # (d,)
 
 
 def _frame(ax: Axes, example: Example) -> None:
-    """Start, goal and obstacles with some room: a plan that flies off is cut."""
+    """Set limits around start, goal and obstacles; a plan that leaves the scene is cut."""
     here = example.inflated_radii > 0
     reach = example.inflated_radii[here].unsqueeze(-1)
     centers = example.centers[here, :2]
@@ -42,7 +42,7 @@ def _frame(ax: Axes, example: Example) -> None:
 
 
 def picture(examples: dict[str, Example], file: Path) -> Path:
-    """A panel for every cause."""
+    """Draw one panel per cause and save the figure; returns the file."""
     figure, axes = panels(len(examples), 2, (4.2, 2.2))
     for ax, (cause, example) in zip(axes, examples.items(), strict=True):
         for center, distance in zip(example.centers, example.inflated_radii, strict=True):

@@ -1,4 +1,4 @@
-"""The five families: where their layouts are, and how new ones are drawn."""
+"""The five families: the files of their layouts, and the overrides that draw new ones."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ DATA = Path(__file__).resolve().parent / "data"
 
 @dataclass(frozen=True)
 class Family:
-    """A family of layouts: 32 in a file, and as many as are wanted from its generator."""
+    """A family of layouts: 32 in a file, and any number from its generator."""
 
     name: str
     model: str
     drawn: tuple[str, ...]  # overrides of the generator
 
     def file(self, fresh: int = 0, seed: int = 0) -> Path:
-        """Where the public layouts are, or the first drawn ones of a seed, with the best costs known."""
+        """The file of the public layouts, or of the first layouts drawn under a seed, with the best known costs."""
         return DATA / (f"drawn/{self.name}-seed{seed}.npz" if fresh else f"{self.name}.npz")
 
     def overrides(self, fresh: int = 0, seed: int = 0) -> list[str]:
-        """Overrides for `torchgco`: the file's layouts, or `fresh` new ones of a seed."""
+        """Overrides for `torchgco`: the file's layouts, or `fresh` new layouts drawn under a seed."""
         if fresh == 0:
             source = ["scenario=layouts", f"scenario.path={self.file()}"]
         else:

@@ -1,9 +1,9 @@
-"""python -m benchmarks.oracle: the best cost known on every layout, and whether a path is known at all.
+"""python -m benchmarks.oracle: the best known cost of every layout.
 
-Minutes per layout, offline. It flies the solvers of SEARCH, and takes the cheapest sound trajectory of any: at the
-goal, within 1 mm of every constraint, clear of the obstacles between the knots. The peers' costs on the public layouts
-come from data/reference.csv. The result is written as `best_cost` into the files of benchmarks/data, where the judge of
-`success` reads it and nothing else; a cost that stands there is only ever lowered, and NaN means that no path is known.
+Minutes per layout, offline. It flies the solvers of SEARCH and takes the cheapest sound trajectory of any: at the
+goal, violations of at most 1 mm, clear of the obstacles between the knots. The peers' costs on the public layouts
+come from data/reference.csv. The result is written as `best_cost` into the files of benchmarks/data; only the judge of
+`success` reads it. A cost in a file is only ever lowered; NaN means that no sound trajectory is known.
 With `--fresh N` the layouts are the first N drawn under `--seed`, kept with their costs in benchmarks/data/drawn.
 """
 
@@ -25,7 +25,7 @@ from torchgco.errors import InputError
 from torchgco.judge import SUCCESS_COST
 from torchgco.scenarios import Layouts
 
-# Solver configs with overrides. `paths` refines 32 candidates along up to 24 paths, `early` at another pace.
+# Solver configurations with overrides. `paths` refines 32 candidates along up to 24 paths, `early` at another pace.
 PATHS = (
     "solver=gco_max", "solver.paths.refine_top=32", "solver.paths.num_paths=24", "solver.paths.roadmap.num_halton=256",
 )  # fmt: skip
@@ -39,7 +39,7 @@ SEARCH = {
     "fatrop": ["solver=fatrop"],
     "ipopt": ["solver=ipopt"],
 }
-PEERS = ("fatrop", "ipopt")  # need the extra `peers`; on the public layouts reference.csv has flown them
+PEERS = ("fatrop", "ipopt")  # need the extra `peers`; reference.csv has their results on the public layouts
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -61,17 +61,17 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(FAMILIES), metavar="NAME")
     parser.add_argument("--search", nargs="+", choices=list(SEARCH), metavar="NAME", help="some of the searches only")
     parser.add_argument("--draws", type=int, nargs="+", default=[0], metavar="SEED", help="seeds of the solvers' draws")
-    parser.add_argument("--fresh", type=int, default=0, metavar="N", help="N drawn layouts a family, not the public 32")
+    parser.add_argument("--fresh", type=int, default=0, metavar="N", help="N drawn layouts per family, not the 32")
     parser.add_argument("--seed", type=int, default=0, help="of the drawn layouts")
-    parser.add_argument("--first", type=int, help="so many layouts of each family only")
+    parser.add_argument("--first", type=int, help="only this many layouts per family")
     return parser
 
 
 def held(family: Family, fresh: int = 0, seed: int = 0) -> Path:
-    """The file of the layouts; drawn ones are drawn and written if it isn't there.
+    """The file of the layouts; a missing file of drawn layouts is written.
 
     Raises:
-        InputError: other layouts lie there, or another number of them.
+        InputError: the file holds other layouts, or another number of layouts.
     """
     path = family.file(fresh, seed)
     if fresh:
@@ -85,7 +85,7 @@ def held(family: Family, fresh: int = 0, seed: int = 0) -> Path:
 
 
 def reference(family: Family) -> np.ndarray:
-    """The cheapest arrival of FATROP and IPOPT on every public layout (L,), NaN where neither arrives."""
+    """The least cost (L,) of FATROP and IPOPT on every public layout that they reach, NaN where neither arrives."""
     table = pd.read_csv(DATA / "reference.csv")
     layouts = Layouts.load(family.file())
     there = (table.family == family.name) & (table.feasible == 1) & (table.goal_distance < layouts.goal_radius)
@@ -94,7 +94,7 @@ def reference(family: Family) -> np.ndarray:
 
 
 def flown(path: Path, overrides: list[str], draw: int, first: int | None) -> np.ndarray:
-    """Costs (L,) of one solver's sound paths, NaN where it has none."""
+    """Costs (L,) of one solver's sound trajectories, NaN where it has none."""
     setup = compose([*overrides, "device.threads=1"])
     layouts = setup.layouts(first)
     task = setup.task(layouts)
@@ -106,7 +106,7 @@ def flown(path: Path, overrides: list[str], draw: int, first: int | None) -> np.
 
 
 def keep(path: Path, costs: np.ndarray, source: str) -> None:
-    """Lower the file's best costs to these, and say what that did."""
+    """Lower the best costs in the file to these, and print the changes."""
     layouts = Layouts.load(path)
     old = layouts.best_cost if layouts.best_cost is not None else np.full(layouts.count, np.nan)
     best = np.fmin(old, costs)

@@ -1,9 +1,9 @@
 """python -m benchmarks.quality: how often the goal is reached, and how well, on the public families.
 
-Every family and solver is a study of its own below outputs/quality, so that a run that was stopped resumes where it
-was. The table is printed and, with --write and where all families flew, put into its page with date and commit: the
-table of `gco` alone goes into benchmarks/README.md, drawn layouts into results/drawn.md, several solvers into
-results/ladder.md, unless --page names another.
+Every family and solver is a separate study below outputs/quality, so that a run that was stopped resumes where it
+was. The table is printed. With --write, and where all families flew, it is put into its page with date and commit: the
+table of `gco` alone into benchmarks/README.md, drawn layouts into results/drawn.md, several solvers into
+results/ladder.md, unless --page names another page.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PAGES = {
     "quality": "README.md",
     "ladder": "results/ladder.md",
     "drawn": "results/drawn.md",
-}  # below benchmarks/; a table stands between the marks of its name
+}  # below benchmarks/; a table is between the marks of its name
 HEAD = (
     "family", "solver", "n", "feasible", "reached", "success", "violation <= 1e-3", "median cost", "iterations",
     "seconds",
@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def fly(family: Family, asked: argparse.Namespace) -> pd.DataFrame:
-    """The trials of every solver, under the family's name."""
+    """The trials of every solver, with the family's name as scenario."""
     return pd.concat([_flown(family, solver, asked) for solver in asked.solvers], ignore_index=True)
 
 
@@ -88,9 +88,9 @@ def _flown(family: Family, solver: str, asked: argparse.Namespace) -> pd.DataFra
 
 
 def succeeded(trials: pd.DataFrame, layouts: Layouts) -> pd.DataFrame:
-    """The trials with their success against the best cost known today, which may be lower than when they flew.
+    """The trials with `success` from the best cost known now, which may be lower than when they flew.
 
-    Of drawn layouts it is known for the first ones alone, those that the oracle has seen.
+    Of drawn layouts only the first have a best cost, those that the oracle has solved.
     """
     sound = trials["reached"] & (trials["violation"] <= SUCCESS_VIOLATION) & (trials["clearance"] >= 0)
     return with_success(trials.assign(sound=sound), layouts, 1)

@@ -1,8 +1,8 @@
-"""python -m benchmarks.unicycle: a user's model without tuning, alongside the best of twelve IPOPT starts.
+"""python -m benchmarks.unicycle: a user's model without tuning, compared with the best of twelve IPOPT starts.
 
-A unicycle given as a Python function drives among discs; `torchgco.solve` has no options. IPOPT solves every problem
-from rest and from eleven random guesses, and its cheapest feasible result counts. `judge` counts for both. With --write
-the table goes into benchmarks/results/unicycle.md.
+A unicycle given as a Python function drives among discs; `torchgco.solve` runs without options. IPOPT solves every
+problem from rest and from eleven random guesses, and its cheapest feasible result counts. `judge` judges both. With
+--write the table goes into benchmarks/results/unicycle.md.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def unicycle(x: Tensor, u: Tensor) -> Tensor:
 
 
 def problems(count: int, seed: int) -> Problem:
-    """From (-2, about 0) to (2, 0), five or six discs in the way; problem i is the same however many are drawn."""
+    """From (-2, about 0) to (2, 0) m with five or six discs in the way; problem i is the same for any `count`."""
     x0, centers, radii = torch.zeros(count, 4, dtype=torch.float64), [], []
     for i in range(count):
         rng = np.random.default_rng((seed, i))
@@ -81,8 +81,8 @@ def sound(verdict: Verdict) -> Tensor:
 
 
 def table(problem: Problem, seed: int) -> str:
-    """What both solvers find, as lines of Markdown."""
-    torchgco.solve(problem.take(slice(0, 1)))  # compiled
+    """The results of both solvers, in Markdown."""
+    torchgco.solve(problem.take(slice(0, 1)))  # compiles
     began = perf_counter()
     solution = torchgco.solve(problem)
     seconds = (perf_counter() - began) / problem.B

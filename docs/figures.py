@@ -1,6 +1,6 @@
 """python docs/figures.py: the figures of docs/algorithm.md, from one solve of `gco` on a public layout.
 
-The solver runs as it is; what passes through the functions named in WATCHED is noted and drawn.
+The solver runs unchanged; arguments and results of the functions named in WATCHED are recorded and drawn.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ FAMILY, LAYOUT = "planar_trap", 0
 STONE, EDGE, PALE = "#CFC8BA", "#A39B8B", "#C8C8C8"
 SIZE, DPI = (4.6, 3.7), 110
 
-# All that these figures know of the package's inside: module:attributes of the function that does a step.
+# All that these figures use of the package's internals: module:attributes of the function of each step.
 WATCHED = {
     "caught": "torchgco.search.restarts:StopWhenCaught.update",  # (guidance, problem, X, ...) -> Advice
     "graph": "torchgco.native.roadmap:NativeSearch.graph",  # -> Graph
-    "classes": "torchgco.search.homotopy:_wind_alike",  # (paths, scene) -> which paths are of one class
+    "classes": "torchgco.search.homotopy:_wind_alike",  # (paths, scene) -> which paths share a class
     "tracked": "torchgco.search.paths:PathProposals.track",  # -> Candidates
     "relaxed": "torchgco.search.paths:PathProposals.relax",  # -> Candidates, which of them are sound
     "refined": "torchgco.search.paths:PathProposals.refine",  # (self, candidates, sound) -> Candidates, ..., best
@@ -74,7 +74,7 @@ def _noting(function: Any, notes: list[tuple[tuple[Any, ...], Any]]) -> Any:
 
 
 def solve(layout: int) -> tuple[Calls, Layouts, np.ndarray]:
-    """One solve of `gco`: what was noted, the layout, and the positions (N+1, 2) of the result."""
+    """Solve one layout by `gco`: the recorded calls, the layout, and the positions (N+1, 2) of the result, m."""
     data = ROOT / "benchmarks" / "data" / f"{FAMILY}.npz"
     setup = compose(["scenario=layouts", f"scenario.path={data}", "model=planar", "device.threads=1"])
     layouts = setup.layouts().take([layout])
@@ -90,7 +90,7 @@ def draw(calls: Calls, layouts: Layouts, final: np.ndarray) -> dict[str, Figure]
     figures = {}
     caught = next(words[2] for words, advice in calls["caught"] if bool(advice.stop.any()))
     (paths, _), alike = calls["classes"][0]
-    label = alike[0].to(torch.int8).argmax(-1).numpy()  # of every path: the first one of its class
+    label = alike[0].to(torch.int8).argmax(-1).numpy()  # per path: the first path of its class
     classes = list(dict.fromkeys(label.tolist()))
     colour = {number: PALETTE[i % len(PALETTE)] for i, number in enumerate(classes)}
 
@@ -127,7 +127,7 @@ def draw(calls: Calls, layouts: Layouts, final: np.ndarray) -> dict[str, Figure]
 
 
 def _scene(layouts: Layouts, title: str) -> tuple[Figure, Axes]:
-    """Obstacles, filled at their own radius and outlined at the inflated one; start and goal."""
+    """Obstacles, filled at their own radius and outlined at the inflated radius; start and goal."""
     figure = Figure(figsize=SIZE, layout="constrained")
     ax = figure.subplots()
     centers, radii = layouts.centers[0], layouts.radii[0]
@@ -147,7 +147,7 @@ def _scene(layouts: Layouts, title: str) -> tuple[Figure, Axes]:
 
 
 def _shaded(ax: Axes, candidates: Any, rows: Sequence[int], width: float) -> None:
-    """Trajectories in shades of their costs' ranks, the cheapest drawn last."""
+    """Draw trajectories in shades by the rank of their cost, the cheapest last."""
     problem = candidates.of(torch.tensor(rows))
     X, U = candidates.X[list(rows)], candidates.U[list(rows)]
     for rank, i in enumerate(problem.cost.total(X, U).argsort(descending=True).tolist()):

@@ -3,7 +3,7 @@
     problem  = Problem(dynamics, cost, constraints, x0, N)
     solution = torchgco.solve(problem)
 
-`torchgco.compose` needs Hydra and is reached lazily: importing torchgco loads neither Hydra nor matplotlib.
+`torchgco.compose` needs Hydra and is imported lazily: importing torchgco loads neither Hydra nor matplotlib.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# On some processors the library behind PyTorch's matrix products picks a kernel by a matrix's address in memory, and
-# so by its place in the batch: a problem's bits would depend on its companions. Read at the library's first use.
+# On some processors the library behind PyTorch's matrix products (MKL) picks a kernel by a matrix's address in memory,
+# and so by its place in the batch: a problem's bits would depend on the other problems. Read at MKL's first use.
 os.environ.setdefault("MKL_CBWR", "AUTO")
 
 

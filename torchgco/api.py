@@ -1,4 +1,4 @@
-"""solve: one call with sensible parts, for notebooks and first steps."""
+"""solve: one call with a default solver, for notebooks and first steps."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ def solve(
         problem: B problems.
         U0: initial controls (B, N, m). Default: those of `warm`, else the cost's reference, else zero.
         solver: default: `presets.gco`, the settings of the configuration `gco`.
-        seed, ids: key the random draws (int64 (B,), default 0..B-1).
-        warm: an earlier solution of problems of this form; the solve starts from its controls and multipliers.
+        seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
+        warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
+            its controls.
 
     Raises:
         InputError: U0, ids or warm don't fit the problem.

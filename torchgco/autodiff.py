@@ -1,7 +1,7 @@
-"""Derivatives of batched functions by `torch.func`, for the parts that bring none of their own.
+"""Derivatives of batched functions by `torch.func`, for parts that define none.
 
 Every basis direction is pushed through the whole batch at once, so a function sees the shapes it was written for and
-may use parameters per problem. `vmap` over the batch itself could not offer that.
+may use parameters per problem. `vmap` over the batch would not allow that.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def jacobian(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
-    """Derivatives of function(*args) (..., out) by the last axis of each argument: one (..., out, in) each."""
+    """Derivatives of function(*args) (..., out) with respect to each argument's last axis: (..., out, in) each."""
     sizes = [arg.shape[-1] for arg in args]
 
     def along(direction: Tensor) -> Tensor:
@@ -25,7 +25,7 @@ def jacobian(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ..
 
 
 def gradients(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
-    """Gradients of function(*args).sum() by each argument; zero where it doesn't depend on that argument.
+    """Gradients of function(*args).sum() with respect to each argument; zero where the sum doesn't depend on it.
 
     `torch.func` differentiates within `torch.no_grad()` and `torch.inference_mode()` too, and through tensors that were
     created there, where `torch.autograd.grad` raises or sees constants.

@@ -1,8 +1,8 @@
-"""What can be proved of a returned trajectory: that it obeys its dynamics, clears the obstacles between the knots too,
-keeps its bounds, and is a stationary point; or by how much it fails to.
+"""Certificates of returned trajectories: whether each obeys its dynamics, clears the obstacles between the knots too,
+keeps its bounds and is a stationary point, or by how much it fails.
 
 No code is shared with the solvers: derivatives come from autograd through the model's own `step`, multipliers from a
-least-squares fit of their own. The words have one meaning everywhere (docs/words.md).
+separate least-squares fit. docs/words.md defines the terms.
 """
 
 from __future__ import annotations
@@ -28,42 +28,42 @@ from torchgco.measure import box_segment_distance
 from torchgco.problem import Problem
 from torchgco.shapes import check_shape
 
-NEGLIGIBLE = 1e-9  # share of the largest scale of all controls that each control's scale has at least
-ACTIVE_WITHIN = 1e-3  # an inequality with at most this to spare (m for lengths) may have a multiplier
+NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
+ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """One value per problem, (B,); NaN where nothing was asked or nothing can be said."""
+    """One value per problem, (B,); NaN for problems that were not asked for, and where X or U isn't finite."""
 
-    # Largest |x_{k+1} - step(x_k, u_k)| and |X_0 - x_0| over all states, in their units. Rounding alone (some 1e-12 in
-    # float64) proves that X is what U does in the planning model; it says nothing about how good that model is.
+    # Largest |x_{k+1} - step(x_k, u_k)| and |X_0 - x_0| over all states, in their units. A residual of rounding size
+    # (1e-12 in float64) proves that X is the planning model's rollout of U; it says nothing about the model's quality.
     dynamics_residual: Tensor
     # Smallest distance to the surface of the full r_obs + r_veh (of a box: grown by r_veh) from the first knot to the
     # last, or a lower bound of it, m; infinite without obstacles. At 0 or more, no obstacle is touched between the
-    # knots either, on the conditions that `certify` states.
+    # knots either, under the conditions that `certify` states.
     clearance: Tensor
     # Largest excess over control and state bounds, in their units; 0 proves that they hold at every knot.
     bound_violation: Tensor
-    # Largest component of the gradient of the Lagrangian by U, with the multipliers (inequalities: at least 0) that
-    # make it smallest in the least-squares sense, as a share of the largest terms that cancel in the gradient of J_var
-    # by the same control: no unit of cost or control changes it. Near 0 it proves a stationary point to first order,
-    # not a minimum, and says nothing about rows that are violated.
+    # Largest component of the Lagrangian's gradient with respect to U, with the multipliers (inequalities: at least 0)
+    # that make it smallest in the least-squares sense, as a share of the largest terms that cancel in the gradient of
+    # J_var with respect to the same control: no unit of cost or control changes it. Near 0 it proves a stationary point
+    # to first order, not a minimum, and says nothing about rows that are violated.
     kkt_residual: Tensor
 
 
 def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None) -> Certificate:
     """Certify trajectories X (B, N+1, n), U (B, N, m).
 
-    The clearance can't miss a collision between knots that lie outside an obstacle. With Euler steps positions move
-    straight from knot to knot, and so do obstacles, hence distances are exact (from boxes, bounds within 1e-9). For
+    The clearance includes collisions between knots that are both outside an obstacle. With Euler steps, positions and
+    obstacles move straight from knot to knot, so distances are exact (for boxes: lower bounds within 1e-9). For
     midpoint and rk4 the path leaves the chord by at most dt^2 / 8 times the largest acceleration; this is subtracted.
     The acceleration is sampled at both ends of the interval and at the half step, and the largest difference between
     samples is added: this is a bound only if the acceleration varies by no more than that between them. Steps without a
     known field (`integrator="none"`, a class that overrides `step` alone) have no path between knots; distances are
     then those of the chord. Geometric constraints other than obstacles count at their knots only, as violations.
 
-    A row may have a multiplier where it is an equality, or an inequality with at most 1e-3 to spare (m for obstacles).
+    Rows that may have a multiplier are equalities, and inequalities with a slack of at most 1e-3 (m for obstacles).
 
     Args:
         problem: the planning problems, float64.
@@ -82,7 +82,7 @@ def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None)
     columns = torch.full((4, problem.B), torch.nan, dtype=X.dtype, device=X.device)
     finite = torch.isfinite(X).flatten(1).all(-1) & torch.isfinite(U).flatten(1).all(-1)
     for b in (asked & finite).nonzero().flatten():
-        # One at a time: no number depends on its companions, and memory stays that of one problem.
+        # One at a time: no number depends on the other problems, and memory stays that of one problem.
         row = b.view(1)
         part, x, u = problem.take(row), X[row], U[row]
         columns[:, b] = torch.stack(
@@ -157,9 +157,9 @@ def _bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 
 def _acceleration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """Second derivative (N, d) of the position by time at x (1, N, n), u (1, N, m): d field_p / dx times field."""
+    """Second time derivative (N, d) of the position at x (1, N, n), u (1, N, m): d field_p / dx times field."""
     at = problem.dynamics.position
-    assert at is not None  # or there would be no spheres
+    assert at is not None  # or there would be no obstacles
     d = at.stop - at.start
     twins = problem.dynamics.take(torch.zeros(d, dtype=torch.int64, device=X.device))
     u = U.repeat(d, 1, 1)
@@ -185,19 +185,19 @@ def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(A, axis=1)
     moves = length > 1e-12 * max(1.0, length.max(initial=0.0))
     A, equality = A[moves] / length[moves, None], equality[moves]
-    cone = np.concatenate((A, -A[equality]))  # an equality pushes to either side
+    cone = np.concatenate((A, -A[equality]))  # an equality's multiplier may have either sign
     rest = g
     if len(cone):
         try:
             lam = nnls(cone.T, -g, maxiter=10 * len(cone))[0]
-        except RuntimeError:  # nearly dependent rows, no convergence: the clipped free fit is an upper bound too
+        except RuntimeError:  # no convergence (nearly dependent rows): the clipped free fit is an upper bound too
             lam = np.linalg.lstsq(cone.T, -g, rcond=None)[0].clip(min=0.0)
         rest = g + lam @ cone
     return rest
 
 
 def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tuple[Tensor, Tensor]]]:
-    """For each constraint with rows that may be active: whether it is an equality, and their gradients by X and U."""
+    """Per constraint with rows that may be active: whether it is an equality, and the rows' gradients (`_local`)."""
     found = []
     for constraint in problem.constraints:
         equality = constraint.sense == "equality"
@@ -213,22 +213,25 @@ def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tup
 
 
 def _spare(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
-    """What each row (1, K, p) has to spare: m for obstacles, else the units of c."""
+    """Slack of each row (1, K, p): m for obstacles, else in the units of c."""
     if isinstance(constraint, Obstacles):
         return constraint.signed_distance(X[:, constraint.knots, constraint.position], constraint.times(X))
     return -constraint.value(X, U)
 
 
 def _local(rows: Any, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of rows(X, U) (q,), row j of repetition j, by X (q, N+1, n) and by U (q, N, m), without dynamics."""
+    """Gradients of rows(X, U) (q,) with respect to X (q, N+1, n) and U (q, N, m), without dynamics.
+
+    Row j is computed from repetition j of the trajectory.
+    """
     gX, gU = gradients(rows, X, U)
     return gX, gU
 
 
 def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> tuple[Tensor, Tensor]:
-    """Total derivatives (q, N, m) by U through the dynamics, by the adjoint recursion for q rows at once.
+    """Total derivatives (q, N, m) with respect to U, by the adjoint recursion through the dynamics for q rows at once.
 
-    And, for the first row, the sizes (N, m) of the terms that are added up in it.
+    Also, for the first row, the sums (N, m) of the magnitudes of its terms.
     """
     n, N = problem.n, problem.N
     twins = problem.dynamics.take(torch.zeros(n, dtype=torch.int64, device=X.device))

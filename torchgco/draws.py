@@ -1,9 +1,9 @@
 """Normal draws that are a function of their key, not of their place in a batch.
 
-A draw is keyed by (seed, problem id, outer iteration, stream) and numbered by a counter within. The key is mixed by the
-SplitMix64 finaliser (Steele, Lea and Flood, OOPSLA 2014) into two 32-bit words; the counter is hashed with them by the
-finaliser of MurmurHash3 (Appleby), in int32 tensors, which processors multiply many at a time. So a problem sees the
-same noise alone, in any batch and in any shard.
+A draw is keyed by (seed, problem id, outer iteration, stream) and numbered by a counter within its key. The key is
+mixed by the SplitMix64 finaliser (Steele, Lea and Flood, OOPSLA 2014) into two 32-bit words; the counter is hashed with
+them by the finaliser of MurmurHash3 (Appleby), in int32 tensors, which processors multiply many at a time. A problem
+thus sees the same noise when it is solved by itself, in any batch and in any shard.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _WEYL = -1640531527  # 0x9E3779B9: neighbouring counters start far apart
 
 @dataclass(frozen=True)
 class DrawKey:
-    """Whose noise it is: one seed for the solve, one id per problem, and the outer iteration it is in."""
+    """The key of the noise: one seed for the solve; an id and the current outer iteration per problem."""
 
     seed: int
     ids: Tensor  # (B,) int64
@@ -36,22 +36,22 @@ class DrawKey:
 
 
 def words(key: DrawKey, stream: int = 0) -> Tensor:
-    """What the draws of each problem depend on, (B,) int64: two words of 32 bits."""
+    """The mixed key of each problem, (B,) int64: two words of 32 bits."""
     return _mix64(_mix64(_mix64(torch.full_like(key.ids, key.seed)) + key.ids) + key.outer * 1_000_003 + stream)
 
 
 def standard_normal(
     key: DrawKey, rows: int, samples: range, dtype: torch.dtype = torch.float32, stream: int = 0
 ) -> Tensor:
-    """Independent N(0, 1) draws (rows, B, S) for the samples in a range, of single precision whatever the dtype.
+    """Independent N(0, 1) draws (rows, B, S) for the samples in a range, made in single precision and cast to `dtype`.
 
-    They are the same for a problem in any batch, and for a sample in any range that contains it. `stream`
-    separates draws of one key that serve different purposes. Row i and row i + ceil(rows / 2) are a Box-Muller pair.
+    A problem's draws are the same in any batch, a sample's in any range that contains it. `stream` separates
+    draws of one key that serve different purposes. Row i and row i + ceil(rows / 2) are a Box-Muller pair.
     """
     half, width = (rows + 1) // 2, len(samples)
     mixed = words(key, stream)
     high, low = ((mixed >> 32).to(torch.int32).view(1, -1, 1), mixed.to(torch.int32).view(1, -1, 1))
-    # Counted by sample first, so that a sample keeps its numbers however many are drawn with it.
+    # Counted by sample first, so that a sample keeps its numbers in a range of any length.
     place = torch.arange(half, dtype=torch.int32, device=key.ids.device).view(half, 1, 1)
     number = torch.arange(samples.start, samples.stop, dtype=torch.int32, device=key.ids.device)
     counter = (number * half).view(1, 1, width) + place

@@ -1,10 +1,10 @@
-"""The error of malformed input, and the warning of a part that can't serve."""
+"""The error for malformed input, and the warning for guidance that can't be used."""
 
 from __future__ import annotations
 
 
 class InputError(ValueError):
-    """Malformed input: the field at fault, what was expected there, and what was given."""
+    """Malformed input: the field at fault, the expected value, and the given one."""
 
     def __init__(self, field: str, expected: str, got: object) -> None:
         self.field, self.expected, self.got = field, expected, got
@@ -15,4 +15,4 @@ class InputError(ValueError):
 
 
 class GuidanceWarning(UserWarning):
-    """Guidance, or a part of it, can't serve a problem, which is solved without it."""
+    """Guidance, or a part of it, can't be used for a problem, which is solved without it."""

@@ -11,7 +11,7 @@ from torchgco.constraints.bodies import Obstacles
 from torchgco.goal import SHARE
 from torchgco.problem import Problem
 
-GOAL_TOLERANCE = SHARE  # of the distance from start to goal
+GOAL_TOLERANCE = SHARE  # share of the distance from start to goal
 
 
 class Rated(Protocol):
@@ -46,16 +46,19 @@ def chord_clearance(problem: Problem, X: Tensor) -> Tensor:
 
 
 def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, limit: float) -> Tensor:
-    """Whether a trajectory is better than an old one (B,): feasible before infeasible, then cost, then violation."""
+    """Whether a trajectory is better than an old one, (B,).
+
+    Feasible is better than infeasible; of two feasible ones the cheaper, of two infeasible ones the less violated.
+    """
     fits, old_fits = worst <= limit, old_worst <= limit
     return (fits & (~old_fits | (cost < old_cost))) | (~fits & ~old_fits & (worst < old_worst))
 
 
 def goal_tolerance(problem: Problem) -> Tensor | None:
-    """The distance from the goal within which a solver takes a trajectory as arrived, (B,), m; None without a goal.
+    """The distance from the goal within which a solver counts a trajectory as arrived, (B,), m; None without a goal.
 
     The smaller of the goal's radius and `GOAL_TOLERANCE` times the distance from the start: a solver that stopped at
-    the edge of a generous goal would return trajectories that a little more work makes cheaper.
+    the edge of a large goal would return trajectories that a few more iterations make cheaper.
     """
     goal = problem.goal
     if goal is None:
@@ -65,7 +68,7 @@ def goal_tolerance(problem: Problem) -> Tensor | None:
 
 
 def has_arrived(problem: Problem, X: Tensor, tolerances: float = 1.0) -> Tensor:
-    """Whether trajectories X (B, N+1, n) end within so many goal tolerances of the goal, (B,); False without a goal."""
+    """Whether X (B, N+1, n) ends within `tolerances` goal tolerances of the goal, (B,) bool; False without a goal."""
     near = goal_tolerance(problem)
     if near is None or problem.goal is None:
         return torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
@@ -73,7 +76,7 @@ def has_arrived(problem: Problem, X: Tensor, tolerances: float = 1.0) -> Tensor:
 
 
 def is_preferred(problem: Problem, new: Rated, old: Rated, limit: float, by_arrival: bool = True) -> Tensor:
-    """Whether a trajectory is to be kept in place of an old one (B,): arrival first, then `is_better`."""
+    """Whether a trajectory should replace an old one, (B,) bool: feasible arrival counts first, then `is_better`."""
     better = is_better(new.cost, new.violation, old.cost, old.violation, limit)
     if not by_arrival:
         return better

@@ -1,4 +1,4 @@
-"""The goal of a problem: the one place that solver, search and judge ask where it is and how near is near enough."""
+"""The goal of a problem, its position and radius, for solver, search and judge alike."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torchgco.errors import InputError
 from torchgco.shapes import Dimensions, check_shape, tensor
 from torchgco.tree import PerElement
 
-SHARE = 0.09  # of the distance from start to goal: the radius of a goal that is derived from a cost
+SHARE = 0.09  # radius of a goal that is derived from a cost, as a share of the distance from start to goal
 
 
 @dataclass(frozen=True)
 class Goal(PerElement):
-    """A ball that the last knot is to end in.
+    """A ball in which the last knot should lie.
 
     Args:
         position: its centre (d,), or (B, d) one per problem, m.
@@ -35,7 +35,7 @@ class Goal(PerElement):
     batched: ClassVar[tuple[str, ...]] = ("position", "radius")
 
     def bind(self, dims: Dimensions) -> Goal:
-        """The goal with a row per problem; called once, by Problem."""
+        """The goal with one row per problem; called once, by Problem."""
         if dims.position is None:
             raise InputError("goal", "dynamics with a position", "dynamics without one")
         d = dims.position.stop - dims.position.start
@@ -53,7 +53,7 @@ class Goal(PerElement):
 
     @classmethod
     def derived(cls, state: Tensor | None, dims: Dimensions) -> Goal | None:
-        """The goal in the state (B, n) that a cost asks for; None where there is no such state, or no position."""
+        """The goal at the state (B, n) that a cost asks for; None without such a state or without a position."""
         if state is None or dims.position is None:
             return None
         check_shape(state, (dims.B, dims.n), "cost.goal")

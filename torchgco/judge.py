@@ -1,7 +1,7 @@
 """The quality of controls: a re-simulation from U alone, in float64, that shares no code with a solver.
 
-It rolls the planning model out again, adds the cost up stage by stage, and measures distances by plain differences. The
-words it returns have one meaning everywhere (docs/words.md).
+It rolls the planning model out again, adds the cost up stage by stage, and measures distances by plain differences.
+docs/words.md defines the terms that it returns.
 """
 
 from __future__ import annotations
@@ -31,34 +31,34 @@ class Verdict:
 
     cost: Tensor  # J_var
     violation: Tensor  # largest violation of the planning problem, full radii; lengths in metres
-    # m to a surface of 0.95 (r_obs + r_veh), of a box grown by 0.95 r_veh, at the knots; infinite without obstacles. A
-    # constraint given as a function has no distance: its rows count as a violation alone.
+    # Smallest distance, m, to a surface of 0.95 (r_obs + r_veh), of a box grown by 0.95 r_veh, at the knots; infinite
+    # without obstacles. A constraint given as a function has no distance: its rows count only as violations.
     clearance_knots: Tensor
     clearance: Tensor  # the same along the straight segments between the knots
     goal_distance: Tensor  # m, last knot to goal, positions only
     feasible: Tensor  # bool: clearance_knots >= 0, every other constraint within 1e-3
     reached: Tensor  # bool: feasible, and closer to the goal than the goal radius
-    sound: Tensor  # bool: reached, violation <= 1e-3, clearance >= 0: success, but for the cost
+    sound: Tensor  # bool: reached, violation <= 1e-3, clearance >= 0: success without its condition on the cost
 
     def success(self, best_cost: Tensor) -> Tensor:
-        """Sound, and within 5 % of the best known cost (B,); where that is NaN the answer means nothing."""
+        """Whether sound, and within 5 % of the best known cost (B,); False, without meaning, where that is NaN."""
         return self.sound & (self.cost <= SUCCESS_COST * best_cost)
 
 
 def judge(
     problem: Problem, U: Tensor, goal: Tensor | None = None, goal_radius: Tensor | float | None = None
 ) -> Verdict:
-    """Judge controls U (B, N, m) by what they do from x0.
+    """Judge controls U (B, N, m) by their rollout from x0.
 
     Args:
         problem: the planning problems, float64.
-        U: controls; NaN where a solver returned none, which is then neither feasible nor reached.
+        U: controls; NaN where a solver returned none: such a problem is neither feasible nor reached.
         goal: positions (B, d) or (d,), m. None: the problem's goal.
         goal_radius: number or (B,), m. None: that of the problem's goal.
 
     Raises:
-        InputError: U doesn't fit the problem, the problem isn't float64, no goal is given and the problem has none, or
-            obstacles are of a kind that can't be judged.
+        InputError: U doesn't fit the problem, the problem isn't float64, the dynamics have no position, no goal is
+            given and the problem has none, or obstacles are of a kind that can't be judged.
     """
     problem.check_controls(U, "U")
     if problem.x0.dtype != torch.float64:
@@ -111,9 +111,8 @@ def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor,
 def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest distance (B,) to a surface of 0.95 (r_obs + r_veh), at the knots and along the segments between, m.
 
-    Infinite where there is no obstacle.
-    All knots count, the given start too. Both vehicle and obstacle move straight from knot to knot, so the nearest
-    point of a segment to the obstacle's centre is exact; for an integrator other than Euler, the chord is meant.
+    Infinite where there is no obstacle. All knots count, the given start too. With Euler steps vehicle and obstacle
+    both move straight from knot to knot, so the distance is exact; for other integrators it is that of the chord.
     """
     contact = torch.where(spheres.absent, -torch.inf, CONTACT_FACTOR * spheres.inflated_radii)
     at_knots = between = torch.full_like(X[:, 0, 0], torch.inf)
@@ -157,7 +156,7 @@ def by_kind(measures: dict[type[Obstacles], Any], obstacles: Obstacles) -> Any:
     """The function that measures obstacles of this kind.
 
     Raises:
-        InputError: there is none. Without the error these obstacles would count as absent.
+        InputError: no function measures this kind. Without the error these obstacles would count as absent.
     """
     for kind, measure in measures.items():
         if isinstance(obstacles, kind):

@@ -1,8 +1,8 @@
-"""Which kernels a process works with: native ones in C, or PyTorch's own.
+"""Which kernels a process uses: native ones in C, or PyTorch's own.
 
-Native kernels serve float64 on a CPU, several problems side by side, and are the default there. PyTorch's kernels serve
-everything else, GPUs, single precision and problems that can't be traced, and are the reference for the native ones:
-the two differ in the last bits. `device.kernels` chooses for a study, `use_native` for a process.
+Native kernels are for float64 on a CPU, where they are the default, and solve several problems side by side. PyTorch's
+kernels are for everything else (GPUs, single precision, problems that can't be traced), and are the reference for the
+native ones: the two differ in the last bits. `device.kernels` chooses for a study, `use_native` for a process.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ class _Switch:
 
 
 def use_native(on: bool) -> None:
-    """Native kernels where they serve (the default), or PyTorch's everywhere."""
+    """Use native kernels where they can be used (the default), or PyTorch's everywhere."""
     _Switch.native = on
 
 
 def native() -> bool:
-    """Whether this process uses native kernels where they serve."""
+    """Whether this process uses native kernels where they can be used."""
     return _Switch.native

@@ -25,7 +25,7 @@ class Multipliers:
     @classmethod
     def zero(cls, problem: Problem, mu: float) -> Multipliers:
         """lam = 0 and the same penalty for all."""
-        # One problem shows the shapes of all: evaluating a large batch for its shape alone takes long.
+        # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
         one = problem.take(slice(0, 1))
         X, U = one.x0.new_zeros(one.B, problem.N + 1, problem.n), one.x0.new_zeros(one.B, problem.N, problem.m)
         lam = tuple(X.new_zeros(problem.B, *c.value(X, U).shape[1:]) for c in one.constraints)
@@ -57,7 +57,7 @@ def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool)
 
 
 def _penalty_value(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> Tensor:
-    """What the rows of a constraint add to L_M, (B,)."""
+    """The terms that a constraint's rows add to L_M, (B,)."""
     rho = penalty_weights(sense, c, lam, mu, phr)
     terms = (lam + 0.5 * rho * c) * c
     if phr and sense == "inequality":
@@ -68,7 +68,7 @@ def _penalty_value(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) 
 
 
 def _penalty_slopes(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> tuple[Tensor, Tensor]:
-    """First and second derivative of that by c, (B, K, p) each."""
+    """First and second derivative of `_penalty_value` with respect to c, (B, K, p) each."""
     rho = penalty_weights(sense, c, lam, mu, phr)
     g = lam + rho * c
     return (torch.where(rho == 0, 0.0, g) if phr and sense == "inequality" else g), rho

@@ -7,11 +7,11 @@ from torch import Tensor
 
 from torchgco.constraints.boxes import BoundBoxes
 
-ROUNDS = 70  # of shrinking a segment by a third
+ROUNDS = 70  # each shrinks a segment by a third
 
 
 def box_distance(boxes: BoundBoxes, p: Tensor) -> Tensor:
-    """Signed distances (B, K, M) of points p (B, K, d) from the surfaces as they are, m; absent boxes count too."""
+    """Signed distances (B, K, M) of points p (B, K, d) from the boxes' own surfaces, m; absent boxes count too."""
     return _distance(boxes, p.unsqueeze(2))
 
 
@@ -19,8 +19,8 @@ def box_segment_distance(boxes: BoundBoxes, p: Tensor) -> Tensor:
     """Lower bounds (B, K-1, M) of the signed distances along the straight segments between points p (B, K, d), m.
 
     The signed distance from a convex body is a convex function along a segment: comparing it at two points shows which
-    third can be dropped. The returned value lies below the smallest distance by at most the length of the piece that is
-    left, as the distance changes no faster than the point moves.
+    third can be dropped. The distance changes no faster than the point moves, so the returned value lies below the
+    smallest distance by at most the length of the remaining piece.
     """
     a, along = p[:, :-1].unsqueeze(2), p.diff(dim=1).unsqueeze(2)  # (B, K-1, 1, d)
     low = torch.zeros(*a.shape[:2], boxes.centers.shape[1], dtype=p.dtype, device=p.device)

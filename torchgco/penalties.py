@@ -66,7 +66,7 @@ class GuidePath:
         return torch.ones_like(self.weight, dtype=torch.bool)
 
     def value(self, X: Tensor) -> Tensor:
-        """What the springs cost, (B,)."""
+        """The springs' cost, (B,)."""
         return 0.5 * self.weight * (X[..., self.position] - self.center).square().sum(-1).sum(-1)
 
     def accumulate(self, X: Tensor, H: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""Every solver by name: the one place where its settings stand.
+"""Every solver by name, with its settings.
 
 Each preset is a function of the space that the problems live in: a Problem, or the dimension 2 or 3. The configurations
 in conf/solver name these presets, `torchgco.solve` uses `gco`, and `dataclasses.replace` changes an option.
@@ -77,7 +77,7 @@ def gco_fast(space: Space) -> Restarts:
 
 
 def gco_max(space: Space) -> Restarts:
-    """Up to sixteen paths, all candidates refined, then sampled attempts; the cheapest result is kept."""
+    """Up to sixteen paths, the sixteen best candidates refined, then sampled attempts; the cheapest result is kept."""
     solver = gco(space)
     assert solver.paths is not None
     paths = replace(solver.paths, num_paths=16, relax_top=None, refine_top=16)
@@ -108,7 +108,7 @@ def mppi(space: Space) -> IteratedMPPI:
 
 
 def multistart(space: Space) -> MultiStart:
-    """AL-iLQR from random guesses, with as many iterations as `gco` makes in the family where it makes most."""
+    """AL-iLQR from random guesses, with as many iterations as `gco` makes in the family where it makes the most."""
     if _in_the_plane(space):
         return MultiStart(_local(space), starts=1000, budget=8000, covariance=50.0, noise_knots=8)
     return MultiStart(_local(space), starts=1000, budget=125)
@@ -125,15 +125,15 @@ def ipopt(space: Space) -> CasADiSolver:
 
 
 def fatrop(space: Space) -> CasADiSolver:
-    """FATROP through CasADi: as `ipopt`, with a Riccati recursion over the stages for its linear algebra."""
+    """FATROP through CasADi: like `ipopt`, with a Riccati recursion over the stages as linear algebra."""
     return CasADiSolver("fatrop")
 
 
 def fatrop_guided(space: Space) -> GuidedCasADi:
-    """FATROP from the cheapest of four paths, as iLQR tracks them; it accepts a guess inside an obstacle."""
+    """FATROP from the cheapest of four tracked candidates; guesses that penetrate an obstacle are accepted."""
     paths = gco(space).paths
     assert paths is not None
-    relaxed = 0 if _in_the_plane(space) else 20  # in the plane, relaxed candidates fall back
+    relaxed = 0 if _in_the_plane(space) else 20  # in the plane, relaxed candidates fall back into the trap
     paths = replace(
         paths, num_paths=4, initial_offsets=(), arrive=paths.paces[:1], relax_iterations=relaxed, relax_top=None,
         refine_top=1, max_penetration=1.0,
@@ -169,7 +169,7 @@ def _local(space: Space) -> AugmentedLagrangian:
 
 def _printed_sampler(space: Space) -> MPPI:
     if _in_the_plane(space):
-        # Wider than the bounds where these are not symmetric, on purpose.
+        # On purpose wider than the bounds where these are not symmetric.
         return MPPI(samples=500, covariance=100.0, saturation="symmetric")
     return MPPI(samples=100, covariance=1.0)
 

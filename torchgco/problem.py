@@ -26,11 +26,12 @@ class Problem:
     """minimise J_var(X, U) subject to x_{k+1} = step(x_k, u_k), x_0 given, and the constraints: B problems at once.
 
     Args:
-        dynamics, cost, constraints: the parts; whatever is given per problem has the batch of x0.
+        dynamics, cost, constraints: the parts; values given per problem have the batch of x0.
         x0: (B, n), fixes batch, device and dtype.
         N: number of stages.
-        goal: where the last knot is to end. None: the position in the state that the cost names (`Cost.goal`; the
-            reference of a quadratic one), within 0.09 of the distance from the start; or none, where it names none.
+        goal: where the last knot should lie. None: derived from the cost, around the position in `Cost.goal` (the
+            terminal reference of a quadratic cost) with 0.09 of the distance from the start as radius; no goal where
+            the cost names none.
 
     Raises:
         InputError: names the part at fault, what was expected and what was given. A start that is bad in one problem
@@ -44,7 +45,8 @@ class Problem:
     N: int
     goal: Goal | None = None
 
-    # A cache for all that depends on the problems' form alone (native kernels, say), shared by all subsets of a batch.
+    # A cache for everything that depends only on the problems' form (native kernels, say), shared by all subsets of a
+    # batch.
     form: ClassVar[dict[Any, Any]]
 
     def __post_init__(self) -> None:
@@ -75,7 +77,7 @@ class Problem:
 
     @property
     def position(self) -> slice:
-        """Where the position stands in the state.
+        """The position's place in the state.
 
         Raises:
             InputError: dynamics without a position.
@@ -87,7 +89,7 @@ class Problem:
 
     @property
     def geometric(self) -> tuple[Constraint, ...]:
-        """The constraints on position that sampling and guidance look at."""
+        """The constraints on position that sampling and guidance consider."""
         return tuple(c for c in self.constraints if c.geometric)
 
     @cached_property
@@ -102,7 +104,7 @@ class Problem:
     def cost_unit(self) -> Tensor:
         """A scale of each problem's cost, (B,), above 0: the mean cost per stage of staying at the start at rest.
 
-        A thousandth of the controls' mean curvature is added, which alone is left where the start is the goal.
+        A thousandth of the controls' mean curvature is added; only this is left where the start is the goal.
         """
         X, U = self.at_rest
         s = self.n + 1 + self.m
@@ -117,14 +119,14 @@ class Problem:
         return self.x0.unsqueeze(1).repeat(1, self.N + 1, 1), self.cost.rest_controls(like)
 
     def unit_of(self, total: Tensor, Huu: Tensor) -> Tensor:
-        """`cost_unit` from the cost (B,) of staying at the start and its Hessians by the controls (B, N, m, m)."""
-        # Sums that keep their order.
+        """`cost_unit` from the cost (B,) of staying at the start and its Hessians in the controls (B, N, m, m)."""
+        # Contiguous and one axis at a time: the order of summation must not depend on the batch.
         curvature = Huu.diagonal(dim1=-2, dim2=-1).abs().contiguous().sum(-1).sum(-1) / (self.N * self.m)
         unit = total.abs() / self.N + LEAST_UNIT * curvature
         return torch.where(torch.isfinite(unit) & (unit > 0), unit, 1.0)
 
     def in_cost_units(self) -> Self:
-        """The same problems with their costs divided by `cost_unit`: no option of a solver depends on its scale."""
+        """The same problems with costs divided by `cost_unit`: no solver option then depends on the cost's scale."""
         return self._with({"cost": self.cost.scaled(1.0 / self.cost_unit)}, form=self.form)
 
     def __getstate__(self) -> dict[str, Any]:

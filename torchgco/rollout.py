@@ -1,4 +1,4 @@
-"""Trajectories from controls, and from feedback along a nominal one."""
+"""Trajectories from controls, and from feedback along a nominal trajectory."""
 
 from __future__ import annotations
 

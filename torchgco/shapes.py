@@ -1,4 +1,4 @@
-"""The glossary of dimensions, and the checks at the border.
+"""The glossary of dimensions, and the checks of input.
 
 Dimensions, always these letters in this order:
 
@@ -44,7 +44,7 @@ def tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
 
 @dataclass(frozen=True)
 class Dimensions:
-    """What a part must know of its problem in order to check and shape its tensors."""
+    """The facts about a problem that a part needs to check and shape its tensors."""
 
     B: int
     N: int
@@ -56,7 +56,7 @@ class Dimensions:
 
 
 def check_shape(value: Tensor, shape: tuple[int | str, ...], field: str) -> None:
-    """Raise InputError unless `value` has `shape`; a letter stands for any length and says which dimension it is."""
+    """Raise InputError unless `value` has `shape`; a letter stands for any length and names the dimension."""
     fits = value.dim() == len(shape) and all(
         isinstance(want, str) or want == got for want, got in zip(shape, value.shape, strict=True)
     )

@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Status(IntEnum):
-    """Ends of a solve; `sentence` says what each means for the user."""
+    """How a solve ended; `sentence` explains each status to the user."""
 
     RUNNING = 0
     CONVERGED = 1

@@ -1,5 +1,5 @@
-"""How fast torchgco is, and how fast others are, measured side by side: `python -m benchmarks.speed`.
+"""The speed of torchgco and of other solvers, measured under the same conditions: `python -m benchmarks.speed`.
 
-All measurements of a section come from one process on one core with one thread, so that a ratio of two of them holds
-where a time alone does not. Set-up and compilation are never part of a time; they are rows of their own.
+All measurements of a section come from one process on one core with one thread, so that their ratios transfer to other
+machines better than times. Set-up and compilation are never part of a time; they have separate rows.
 """

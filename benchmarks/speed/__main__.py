@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-# The longest last: they take what time is left. Then what is read off all of them.
+# The longest sections are last, as they take the time that is left; only `targets`, which reads the others, follows.
 SECTIONS = (
     "first_use", "latency", "own_model", "paper", "mppi", "share", "growth", "batch", "families", "targets",
 )  # fmt: skip
@@ -20,7 +20,7 @@ HERE = Path(__file__).resolve().parents[1]
 def main(words: Sequence[str] | None = None) -> int:
     asked = _parser().parse_args(words)
     _one_core()
-    # torch reads the number of threads when it is loaded, hence only now.
+    # torch reads the number of threads when it is imported, hence the late import.
     import torch
 
     torch.set_num_threads(1)
@@ -37,9 +37,9 @@ def main(words: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description="Measure torchgco and its peers.")
     parser.add_argument("sections", nargs="*", metavar="section", help=", ".join(SECTIONS) + "; default: all")
-    parser.add_argument("--quick", action="store_true", help="small sizes; the published tables are left alone")
+    parser.add_argument("--quick", action="store_true", help="small sizes; the published tables stay unchanged")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cuda: " + ", ".join(ON_GPU))
-    parser.add_argument("--minutes", type=float, default=20.0, help="what would take longer is left out (20)")
+    parser.add_argument("--minutes", type=float, default=20.0, help="limit; longer measurements are left out (20)")
     parser.add_argument("--results", type=Path, help="the csv; default benchmarks/results/speed.csv")
     parser.add_argument("--pages", type=Path, help="folder of README.md and results/speed.md; default benchmarks")
     return parser
@@ -86,7 +86,7 @@ def _measure(asked: argparse.Namespace) -> int:
 
 
 def _files(asked: argparse.Namespace) -> tuple[Path, Path | None]:
-    """Where rows and tables go: a quick look doesn't overwrite what is published."""
+    """Where rows and tables go: a quick look doesn't overwrite the published files."""
     if asked.quick:
         return asked.results or HERE.parent / "outputs" / "speed" / "results.csv", asked.pages
     return asked.results or HERE / "results" / "speed.csv", asked.pages or HERE

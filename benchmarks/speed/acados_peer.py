@@ -1,7 +1,7 @@
-"""acados as a peer: the problem's own model, cost and constraints, solved in an environment of acados' own.
+"""acados as a peer: the problem's own model, cost and constraints, solved in a separate environment.
 
-The expressions are those that FATROP gets (`torchgco.baselines.nlp`), as instructions in a file: two versions of CasADi
-can't read each other's files otherwise.
+The expressions are those that FATROP gets (`torchgco.baselines.nlp`), written to a file as instructions: two versions
+of CasADi can't read each other's own files.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ WORKER = Path(__file__).with_name("acados_worker.py")
 
 @dataclass(frozen=True)
 class Answer:
-    """What acados found for B problems. Times leave out set-up and the setting of a problem's numbers."""
+    """Results of acados for B problems. Times exclude set-up and setting a problem's numbers."""
 
     U: Tensor  # (B, N, m)
     status: np.ndarray  # (B,): 0 converged, 2 out of iterations, 4 no solution of a quadratic program
     iterations: np.ndarray  # (B,), of SQP
     wall: np.ndarray  # (B,), s
     processor: np.ndarray  # (B,), s
-    setup: float  # s: code generated and compiled
+    setup: float  # s: to generate and compile code
 
 
 def version() -> str:
-    """Of the wheel that is installed here, or that none is."""
+    """The version of the installed wheel, or "not installed"."""
     found = ENVIRONMENT.glob("lib/python*/site-packages/comma_deps_acados-*.dist-info")
     return next((path.name.removesuffix(".dist-info").split("-")[1] for path in found), "not installed")
 
@@ -54,7 +54,7 @@ def fly(problem: Problem, X: Tensor, U: Tensor, folder: Path) -> Answer:
 
     Raises:
         InputError: a problem that can't be written down for acados.
-        RuntimeError: acados ended before its time; the message is its own.
+        RuntimeError: acados failed; the message holds the end of its output.
     """
     write(problem, X, U, folder)
     python = str(ENVIRONMENT / "bin" / "python")
@@ -72,10 +72,11 @@ def read(folder: Path) -> Answer:
 
 
 def write(problem: Problem, X: Tensor, U: Tensor, folder: Path) -> None:
-    """The problems as the worker reads them (its docstring says how).
+    """Write the problems in the format of the worker (see its docstring).
 
     Raises:
-        InputError: a cost that isn't a diagonal quadratic one, bounds on states, rows that differ from knot to knot.
+        InputError: a cost that isn't diagonal and quadratic, bounds on states, unbounded controls, rows that differ
+            from knot to knot.
     """
     program = transcribe(problem)
     B, N, n, m = problem.B, problem.N, problem.n, problem.m
@@ -137,7 +138,7 @@ def _form(problem: Problem, program: Program) -> dict[str, Any]:
 
 
 def _knot(program: Program, k: int, n: int, m: int, N: int) -> tuple[list[ca.SX], ca.SX]:
-    """Variables of knot k, and its rows other than the step."""
+    """Variables of knot k, and its rows except the step."""
     at, end = k * (n + m), sum(program.path_rows[: k + 1]) + n * min(k + 1, N)
     u = program.variables[at + n : at + n + m] if k < N else ca.SX.sym("none", m)
     rows = program.rows[end - program.path_rows[k] : end]
@@ -145,7 +146,7 @@ def _knot(program: Program, k: int, n: int, m: int, N: int) -> tuple[list[ca.SX]
 
 
 def instructions(name: str, function: tuple[list[ca.SX], ca.SX]) -> dict[str, Any]:
-    """A function of scalar expressions as the list of what it does: operation, places written and read, constant."""
+    """A function of scalar expressions as a list of operations: name, places written, places read, constant."""
     inputs, result = function
     names = {getattr(ca, word): word for word in dir(ca) if word.startswith("OP_")}
     f = ca.Function(name, inputs, [ca.densify(result)])

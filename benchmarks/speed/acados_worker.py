@@ -1,7 +1,7 @@
-"""acados on problems that lie in a folder: `python acados_worker.py FOLDER`, in an environment of its own.
+"""acados on the problems in a folder: `python acados_worker.py FOLDER`, in a separate environment.
 
-That environment holds acados' wheel and NumPy alone, as the wheel brings a CasADi that would shadow torchgco's.
-So nothing of torchgco is imported here; `acados_peer.py` writes the folder, and reads what comes back.
+That environment has only acados' wheel and NumPy, as the wheel contains a CasADi that would shadow torchgco's.
+So nothing of torchgco is imported here; `acados_peer.py` writes the folder and reads the answer.
 
     form.json      N, n, m; step, rows, last_rows: functions of (x, u, p) by instructions; equality, last_equality
     problems.npz   p (B, P), x0 (B, n), lower, upper (B, N, m), weight, reference (B, n + m), last_weight,
@@ -47,7 +47,7 @@ def main(folder: Path) -> None:
 
 
 def _acados() -> Any:
-    """The module acados_template of the wheel, which looks for its files in the layout of acados' sources."""
+    """The module acados_template of the wheel, which expects the folders of acados' source tree."""
     import acados
 
     root = Path(acados.__file__).parent
@@ -55,11 +55,11 @@ def _acados() -> Any:
     link = install / "interfaces" / "acados_template" / "acados_template"
     link.parent.mkdir(parents=True, exist_ok=True)
     if not link.exists():
-        link.unlink(missing_ok=True)  # one that leads to where the environment was before
+        link.unlink(missing_ok=True)  # a broken link, after the environment was moved
         link.symlink_to(templates)
     libraries = str(install / "lib")
     if libraries not in os.environ.get("LD_LIBRARY_PATH", "").split(":"):
-        # The loader reads this once, when a process starts.
+        # The loader reads this only when a process starts.
         os.environ["LD_LIBRARY_PATH"] = f"{libraries}:{os.environ.get('LD_LIBRARY_PATH', '')}".rstrip(":")
         os.execv(sys.executable, [sys.executable, *sys.argv])
     os.environ["ACADOS_SOURCE_DIR"], os.environ["TERA_PATH"] = str(install), str(install / "bin" / "t_renderer")
@@ -70,7 +70,7 @@ def _acados() -> Any:
 
 
 def _program(template: Any, form: dict[str, Any], problems: SimpleNamespace) -> Any:
-    """SQP with HPIPM on the stages as they are, Gauss-Newton; each problem's numbers are set later."""
+    """SQP with Gauss-Newton and HPIPM without condensing; each problem's numbers are set later."""
     import casadi as ca
 
     N, n, m = form["N"], form["n"], form["m"]
@@ -95,7 +95,7 @@ def _program(template: Any, form: dict[str, Any], problems: SimpleNamespace) -> 
         model.con_h_expr_e = replay(form["last_rows"], x, u, p)
         constraints.lh_e, constraints.uh_e = _sides(form["last_equality"])
 
-    options.tf = float(N)  # the cost of a stage is weighed by its time step, which is 1 so
+    options.tf = float(N)  # acados weights the cost of a stage by its time step; this makes the step 1
     options.integrator_type, options.nlp_solver_type, options.hessian_approx = "DISCRETE", "SQP", "GAUSS_NEWTON"
     options.qp_solver, options.qp_solver_cond_N, options.hpipm_mode = "PARTIAL_CONDENSING_HPIPM", N, "SPEED"
     options.nlp_solver_max_iter, options.tol = ITERATIONS, TOLERANCE
@@ -104,12 +104,12 @@ def _program(template: Any, form: dict[str, Any], problems: SimpleNamespace) -> 
 
 
 def _sides(equality: list[bool]) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest values of rows that are zero or, where not `equality`, at most zero."""
+    """Lower and upper bounds of rows: zero where `equality`, else at most zero."""
     return np.where(equality, 0.0, -NO_BOUND), np.zeros(len(equality))
 
 
 def _fly(solver: Any, form: dict[str, Any], problems: SimpleNamespace, b: int) -> tuple:
-    """Problem b: its numbers, which aren't on the clock, then the solve."""
+    """Set the numbers of problem b, untimed, then solve it, timed."""
     N = form["N"]
     solver.reset()
     for k in range(N + 1):

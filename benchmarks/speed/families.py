@@ -1,4 +1,4 @@
-"""Seconds per problem on drawn layouts: `gco` in batches, other solvers on the first of the same layouts."""
+"""Seconds per problem on drawn layouts: `gco` in batches, other solvers on the first of these layouts."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def run(bench: Bench) -> None:
 
 
 def _family(bench: Bench, name: str, share: float) -> None:
-    """Peers, ours, peers again: a machine that drifts meanwhile shows in the peers' two times.
+    """Run peers, `gco`, peers again: if the machine's speed drifts, the peers' two times differ.
 
-    `share` is of the time left, what this family may take.
+    `share` of the time left may be used for this family.
     """
     setup = bench.setup(*FAMILIES[name])
     with tempfile.TemporaryDirectory() as folder:
@@ -63,7 +63,7 @@ def _family(bench: Bench, name: str, share: float) -> None:
 
 
 def _peers(bench: Bench, name: str, setup: Setup, folder: Path) -> list[Peer]:
-    """Those that are installed, made ready; none on a GPU, which they have no use for."""
+    """The installed peers, prepared; none on a GPU, which they can't use."""
     if bench.device != "cpu":
         return []
     sizes = bench.sizes
@@ -79,7 +79,7 @@ def _peers(bench: Bench, name: str, setup: Setup, folder: Path) -> list[Peer]:
 
 
 def _flown(bench: Bench, name: str, peer: Peer) -> bool:
-    """Fly for the first time; a peer that can't is named, and flies no more."""
+    """Fly a peer for the first time; False, with a row that says why, where it fails."""
     try:
         peer.fly(bench)
     except (InputError, RuntimeError) as error:
@@ -89,11 +89,11 @@ def _flown(bench: Bench, name: str, peer: Peer) -> bool:
 
 
 def _fly(bench: Bench, name: str, setup: Setup, share: float) -> list[Ours]:
-    """`gco` on every batch that fits into the time."""
+    """Fly `gco` on every batch that fits into the time."""
     flights: list[Ours] = []
     batches = (bench.sizes.family_batch, bench.sizes.large_batch if name.startswith("forest") else None)
     for batch in batches:
-        known = flights[-1].took.wall if flights else 0.0  # per problem: in a larger batch they take no longer
+        known = flights[-1].took.wall if flights else 0.0  # per problem: no longer in a larger batch
         if batch is not None and bench.fits(SECTION, f"{name}, B = {batch}", known * batch, share):
             flights.append(_flight(bench, name, setup, batch))
     return flights
@@ -104,7 +104,7 @@ def _flight(bench: Bench, name: str, setup: Setup, batch: int) -> Ours:
     task = setup.task(layouts)
     bench.warm(setup, task)
     solution, took = bench.timed(lambda: setup.solver.solve(task.problem, task.U0, seed=setup.seed))
-    checked = setup.vehicle.task(layouts)  # on the CPU, where the judge sits
+    checked = setup.vehicle.task(layouts)  # on the CPU, where the judge runs
     verdict = judge(checked.problem, solution.U.to("cpu", torch.float64), checked.goal, checked.goal_radius)
     case, ours = f"{name}, B = {batch}", Ours(batch, took.each(batch), verdict)
     _say(bench, case, "gco", ours.took, verdict, ours.per_reached)
@@ -133,13 +133,13 @@ def _say_peer(bench: Bench, name: str, peer: Peer) -> None:
 
 
 def _compare(bench: Bench, name: str, ours: Ours, peer: Peer) -> None:
-    """A line of ratios: seconds, and costs on the layouts that both reached."""
+    """Rows of ratios: of seconds, and of costs on the layouts that both reached."""
     assert peer.verdict is not None
-    case, told = f"{name}, B = {ours.batch}", f"{peer.name} / gco"
-    bench.row(SECTION, case, told, "seconds, ratio", peer.seconds / ours.took.seconds, "", told)
+    case, pair = f"{name}, B = {ours.batch}", f"{peer.name} / gco"
+    bench.row(SECTION, case, pair, "seconds, ratio", peer.seconds / ours.took.seconds, "", pair)
     if int(ours.verdict.reached.sum()) > 0:
-        bench.row(SECTION, case, told, "per layout reached, ratio", peer.per_reached / ours.per_reached, "", told)
+        bench.row(SECTION, case, pair, "per layout reached, ratio", peer.per_reached / ours.per_reached, "", pair)
     shared = min(ours.batch, peer.count)
     both = ours.verdict.reached[:shared] & peer.verdict.reached[:shared]
     ratio = (peer.verdict.cost[:shared] / ours.verdict.cost[:shared])[both]
-    bench.row(SECTION, case, told, "cost, ratio", float(ratio.quantile(0.5)) if ratio.numel() else "", "", told)
+    bench.row(SECTION, case, pair, "cost, ratio", float(ratio.quantile(0.5)) if ratio.numel() else "", "", pair)

@@ -1,4 +1,4 @@
-"""The first solve of a process: `first_use` starts this with a cache folder of its own."""
+"""The first solve of a process: `first_use` starts this with a new cache folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MODELS = {
 
 
 def measure(name: str) -> dict[str, float]:
-    """Seconds of the processor, compilers that it starts included, and those by the clock on the wall."""
+    """Processor seconds, compilers included, by name; for "both, wall" elapsed seconds."""
     problem = _problem(name)
     solver = presets.gco(problem)
     solver = replace(solver, local=replace(solver.local, max_outer_iterations=2), attempts=1)
@@ -43,7 +43,7 @@ def measure(name: str) -> dict[str, float]:
 
 
 def _problem(name: str) -> Problem:
-    """At rest, with an obstacle near the straight line where there is space for one."""
+    """One problem from rest; with an obstacle near the straight line where the model has a position."""
     dynamics = MODELS[name]()
     n, m, at = dynamics.n, dynamics.m, dynamics.position
     x0 = torch.zeros(1, n, dtype=torch.float64)
@@ -64,14 +64,14 @@ def _controls(problem: Problem) -> torch.Tensor:
 
 
 def _took(work: Callable) -> tuple[float, float]:
-    """Seconds of the processor, and by the clock on the wall."""
+    """Processor seconds and elapsed seconds."""
     before, wall = _processor(), time.perf_counter()
     work()
     return _processor() - before, time.perf_counter() - wall
 
 
 def _processor() -> float:
-    """Of this process and of those that it has started and that have ended."""
+    """Processor seconds of this process and of its child processes that have ended."""
     times = os.times()
     return time.process_time() + times.children_user + times.children_system
 

@@ -1,4 +1,4 @@
-"""What the first use costs: `import torchgco`, and a model's first solve with nothing in the cache folder."""
+"""The time of a first use: `import torchgco`, and a model's first solve with an empty and a full cache folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from benchmarks.speed.first_solve import MODELS
 from benchmarks.speed.provenance import ROOT
 
 SECTION = "first_use"
-IMPORTS = 5  # of which the median counts
+IMPORTS = 5  # number; their median counts
 IMPORT = "import time; t = time.process_time(); import {}; print(time.process_time() - t)"
 
 
@@ -25,13 +25,17 @@ def run(bench: Bench) -> None:
     for name in list(MODELS)[: bench.sizes.models]:
         with tempfile.TemporaryDirectory() as folder:
             for cache in ("empty", "full"):
-                told = json.loads(_started(["-m", "benchmarks.speed.first_solve", name], {"TORCHGCO_CACHE": folder}))
-                for quantity, seconds in told.items():
+                found = json.loads(_started(["-m", "benchmarks.speed.first_solve", name], {"TORCHGCO_CACHE": folder}))
+                for quantity, seconds in found.items():
                     bench.row(SECTION, f"{name}, cache {cache}", "torchgco.solve", quantity, seconds, "s")
 
 
 def _started(words: list[str], environment: dict[str, str]) -> str:
-    """The last line that a new Python prints."""
+    """The last line that a new Python process prints.
+
+    Raises:
+        RuntimeError: the process failed.
+    """
     done = subprocess.run(
         [sys.executable, *words], cwd=ROOT, capture_output=True, text=True, env={**os.environ, **environment}
     )

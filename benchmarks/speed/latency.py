@@ -1,4 +1,4 @@
-"""One problem alone: how long until there is a solution, cold and from the solution before."""
+"""The time to solve a single problem, cold and from the previous solution."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from torchgco.scenarios import Task
 from torchgco.solution import Solution
 
 SECTION = "latency"
-SHARE = 0.15  # of the time left, what a layout may take
+SHARE = 0.15  # of the time left that a layout may take
 
 
 @dataclass
 class Flights:
-    """Of one solver, from one kind of start."""
+    """Flights of one solver from one kind of start."""
 
     times: list[Took] = field(default_factory=list)
     setups: list[float] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
 
     def add(self, took: Took, setup: float, verdict: Verdict) -> None:
-        """One more."""
+        """Add one flight."""
         self.times.append(took)
         self.setups.append(setup)
         self.verdicts.append(verdict)
 
     def count(self, word: str) -> str:
-        """How many are feasible, or reached."""
+        """The share of flights that are feasible, or reached, as "hits/count"."""
         return f"{sum(int(getattr(verdict, word).sum()) for verdict in self.verdicts)}/{len(self.verdicts)}"
 
 
@@ -46,7 +46,7 @@ AllFlights = defaultdict[tuple[str, str], Flights]  # by start and solver
 
 
 def run(bench: Bench) -> None:
-    """Layout by layout, as many as fit into the time: cold, then from what that gave."""
+    """Measure as many layouts as fit into the time: cold, then warm from the cold solution."""
     setup = bench.setup("scenario=forest")
     tasks = [setup.task(setup.scenario.draw([i], setup.seed)) for i in range(bench.sizes.latency_layouts)]
     bench.warm(setup, tasks[0])
@@ -63,7 +63,7 @@ def run(bench: Bench) -> None:
 
 
 def _fly(bench: Bench, setup: Setup, task: Task, start: str, warm: Multipliers | None, flights: AllFlights) -> Solution:
-    """FATROP, `gco`, FATROP: a machine that drifts meanwhile does no harm to the ratio."""
+    """Fly FATROP, `gco`, FATROP, so that a drift of the machine's speed cancels in the ratio."""
     peer = CasADiPeer.ready(bench, "fatrop", task)
     peer.fly(bench)
     setup_time = bench.timed(lambda: engine_of(task.problem))[1]
@@ -91,7 +91,7 @@ def _say(bench: Bench, flights: AllFlights) -> None:
 
 
 def _next(task: Task, solution: Solution) -> Task:
-    """The problem one stage later, with the rest of the controls and the last one repeated."""
+    """The problem one stage later, with the remaining controls and the last control repeated."""
     return replace(task, problem=replace(task.problem, x0=solution.X[:, 1]), U0=_shift(solution.U))
 
 
@@ -100,5 +100,5 @@ def _shifted(multipliers: Multipliers) -> Multipliers:
 
 
 def _shift(values: Tensor) -> Tensor:
-    """Knot k takes what belonged to k + 1; the last one stays."""
+    """Knot k takes the values of knot k + 1; the last knot keeps its own."""
     return torch.cat((values[:, 1:], values[:, -1:]), dim=1)

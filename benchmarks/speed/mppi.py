@@ -1,4 +1,4 @@
-"""Sample-steps per second of one MPPI round, against pytorch-mppi on the same problem."""
+"""Sample-steps per second of one MPPI round, compared with pytorch-mppi on the same problem."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ def run(bench: Bench) -> None:
 
 
 def _measure(bench: Bench, samples: int, stages: int, rounds: dict[str, Callable[[], Any]]) -> None:
-    """Both in turns, so that both meet the same machine; medians."""
+    """Time both in turns, under the same conditions; medians count."""
     case = f"S = {samples}"
     for work in rounds.values():
-        work()  # traced and compiled
+        work()  # traces and compiles
     times: dict[str, list[Took]] = {name: [] for name in rounds}
     for _ in range(bench.sizes.mppi_repeats):
         for name, work in rounds.items():
@@ -57,14 +57,14 @@ def _measure(bench: Bench, samples: int, stages: int, rounds: dict[str, Callable
 
 
 def _say_rollout(bench: Bench, task: Task) -> None:
-    """What our rounds spend, whatever their samples, on the mean's own rollout, which pytorch-mppi leaves out."""
+    """Time the rollout of the mean: part of every round of torchgco, absent from pytorch-mppi."""
     fly = lambda: open_loop(task.problem, task.U0)
     times = [bench.timed(fly)[1].seconds for _ in range(1 + bench.sizes.mppi_repeats)]
     bench.row(SECTION, "rollout of the mean", "torchgco", "per round", 1000 * median(times[1:]), "ms")
 
 
 def _ours(task: Task, samples: int) -> Callable[[], Any]:
-    """Draw, fly, weigh; the mean is rolled out as well, in double precision, as every caller has it."""
+    """One round: draw, roll out, weight; also roll out the mean, in double precision."""
     sampler = torchgco.MPPI(
         samples=samples, covariance=SIGMA, temperature=TEMPERATURE, rounds=1, noise_knots=0, dtype="float32"
     )
@@ -73,9 +73,9 @@ def _ours(task: Task, samples: int) -> Callable[[], Any]:
 
 
 def _theirs(task: Task, samples: int) -> Callable[[], Any]:
-    """`command` of pytorch-mppi, refining the plan where it stands.
+    """`command` of pytorch-mppi, which refines the plan without shifting it.
 
-    Without a terminal cost, one evaluation in N: with one, it would store every state and be slower.
+    The terminal cost, one evaluation in N, is left out: with it pytorch-mppi would store every state and be slower.
     """
     from pytorch_mppi import MPPI
 

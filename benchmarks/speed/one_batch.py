@@ -1,4 +1,4 @@
-"""One batch size in a process of its own, as its peak of memory can't be measured otherwise: `batch` starts this."""
+"""One batch size in a separate process, which `batch` starts: only so can its peak memory be measured."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchgco.search import Restarts
 
 
 def measure(order: dict[str, Any]) -> dict[str, Any]:
-    """Seconds and iterations per problem, and the peak of memory above what was held before (None: unknown)."""
+    """Seconds and iterations per problem, and the peak memory above the start, in bytes (None: unknown)."""
     sizes = Sizes(**order["sizes"])
     bench = Bench(sizes, device=order["device"])
     setup = bench.setup("scenario=forest")
@@ -29,7 +29,7 @@ def measure(order: dict[str, Any]) -> dict[str, Any]:
     _warm_up(setup, min(batch, 2))
     held = _start_of_memory(bench.device)
     total, iterations, flown = Took(0.0, 0.0), 0, 0
-    # Few problems say little: small batches fly until as many layouts are flown as for the others.
+    # A mean of few problems is uncertain: small batches repeat until `fewest_layouts` layouts are flown.
     while flown < max(batch, sizes.fewest_layouts):
         problem, U0 = _problem(setup, flown, batch)
         engine_of(problem)
@@ -46,7 +46,7 @@ def _problem(setup: Setup, start: int, batch: int) -> tuple[Problem, torch.Tenso
 
 
 def _warm_up(setup: Setup, batch: int) -> None:
-    """Compilation, and what libraries allocate once."""
+    """Solve once, so that kernels are compiled and one-time memory is allocated."""
     problem, U0 = _problem(setup, 0, batch)
     _limited(setup.solver).solve(problem, U0)
 
@@ -57,7 +57,7 @@ def _limited(solver: Restarts) -> Restarts:
 
 
 def _start_of_memory(device: str) -> int | None:
-    """Bytes held now; from here on the peak is counted."""
+    """Bytes held now; restarts the measurement of the peak. None: unknown."""
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
         return torch.cuda.memory_allocated()
@@ -73,7 +73,7 @@ def _peak_of_memory(device: str) -> int | None:
 
 
 def _memory(name: str) -> int | None:
-    """Bytes, as Linux counts them."""
+    """Bytes, from Linux' status of this process; None where there is no such file."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""A user's own model, a Python function, solved by `torchgco.solve` without options; and by FATROP, to compare."""
+"""A user's own model, a Python function, solved by `torchgco.solve` without options, and by FATROP for comparison."""
 
 from __future__ import annotations
 

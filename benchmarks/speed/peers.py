@@ -1,7 +1,7 @@
-"""Other solvers on the first layouts of a task, one after the other: FATROP, IPOPT and acados.
+"""Other solvers on the first layouts of a task, one problem at a time: FATROP, IPOPT and acados.
 
-All get the problem's own model, cost and constraints, traced; all start from the vehicle at rest, or from a trajectory
-along the roadmap's best path, the time for which counts. Of a peer's result the controls alone count.
+All get the problem's own model, cost and constraints, traced. They start from the vehicle at rest, or from a trajectory
+along the roadmap's best path, whose time counts. Only the controls of a peer's result are judged.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def first(task: Task, count: int) -> Task:
 
 @dataclass
 class Peer(ABC):
-    """A solver made ready for a few problems; its set-up is on no clock but its own."""
+    """A solver prepared for a few problems; its set-up is timed separately."""
 
     name: str
     task: Task
@@ -47,7 +47,7 @@ class Peer(ABC):
 
     @abstractmethod
     def solve(self, bench: Bench) -> tuple[Tensor, float, Took]:
-        """Controls (B, N, m) from the task's own start, mean iterations, and the time of all problems."""
+        """Controls (B, N, m) from the task's initial guess, mean iterations, and the time of all problems."""
 
     @property
     def count(self) -> int:
@@ -55,7 +55,7 @@ class Peer(ABC):
 
     @property
     def took(self) -> Took:
-        """Per problem, the mean of all flights."""
+        """Time per problem, the mean of all flights."""
         return sum(self.times, Took(0.0, 0.0)).each(len(self.times))
 
     @property
@@ -70,7 +70,7 @@ class Peer(ABC):
 
     @property
     def per_reached(self) -> float:
-        """Seconds for each layout that was reached; infinite where none was."""
+        """Seconds per layout reached; infinite where none was reached."""
         reached = 0 if self.verdict is None else int(self.verdict.reached.sum())
         return self.seconds * self.count / reached if reached else float("inf")
 
@@ -84,7 +84,7 @@ class Peer(ABC):
 
 @dataclass
 class CasADiPeer(Peer):
-    """FATROP or IPOPT through CasADi, as the configuration `name` has it."""
+    """FATROP or IPOPT through CasADi, with the settings of the configuration `name`."""
 
     prepared: Any = None
 
@@ -94,7 +94,7 @@ class CasADiPeer(Peer):
         prepared, took = bench.timed(lambda: solver.prepare(task.problem))
         if isinstance(solver, GuidedCasADi):
             warm = first(task, 1)
-            solver.guess(warm.problem, warm.U0)  # what it compiles
+            solver.guess(warm.problem, warm.U0)  # compiles
         return cls(name, task, took.seconds, prepared=prepared)
 
     def solve(self, bench: Bench) -> tuple[Tensor, float, Took]:
@@ -104,7 +104,7 @@ class CasADiPeer(Peer):
 
 @dataclass
 class AcadosPeer(Peer):
-    """acados in an environment of its own, from the vehicle at rest or from the guess of `fatrop_guided`."""
+    """acados in its separate environment, from the vehicle at rest or from the guess of `fatrop_guided`."""
 
     folder: Path = Path()  # where it writes and compiles
     guided: GuidedCasADi | None = None

@@ -1,4 +1,4 @@
-"""Where a measurement comes from: day, commit, processor, versions."""
+"""The origin of a measurement: date, commit, processor, versions."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-WRITTEN = (":!benchmarks/README.md", ":!benchmarks/results")  # what a benchmark itself changes
+WRITTEN = (":!benchmarks/README.md", ":!benchmarks/results")  # files that a benchmark itself changes
 
 
 def provenance(device: str) -> dict[str, str]:
-    """What every row of a run carries, by column."""
+    """The columns that all rows of a run share, with their values."""
     import torch
 
     from benchmarks.speed import acados_peer
@@ -33,7 +33,7 @@ def provenance(device: str) -> dict[str, str]:
 
 
 def _commit() -> str:
-    """Short hash of what is checked out, with a word where files were changed since."""
+    """Short hash of the commit checked out; followed by "and changes" where tracked files differ from it."""
     try:
         head = _git("rev-parse", "--short", "HEAD")
         return head + (" and changes" if _git("status", "--porcelain", "-uno", "--", ".", *WRITTEN) else "")
@@ -46,7 +46,7 @@ def _git(*words: str) -> str:
 
 
 def _processor() -> str:
-    """The name that the system gives its processor."""
+    """The processor's name, from the operating system."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -1,6 +1,6 @@
 """The quadrotor among spheres as a user of pytorch-mppi writes it: batched torch over states (K, 14).
 
-It is written for speed: few operations, each on all samples, distances by one matrix product.
+Written for speed: few operations, each on all samples, distances by one matrix product.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ class QuadrotorAmongSpheres:
 
     Args:
         problem: quadrotor planning problems (Euler) with a diagonal quadratic cost and static spheres.
-        collision_penalty: cost of an obstacle touched.
+        collision_penalty: cost per obstacle touched.
+
+    Raises:
+        ValueError: two different time constants, or another integrator.
     """
 
     def __init__(self, problem: Problem, collision_penalty: float) -> None:
@@ -37,7 +40,7 @@ class QuadrotorAmongSpheres:
         self.one3, self.ones = torch.ones_like(self.fall), torch.ones_like(self.offset)
 
     def dynamics(self, x: Tensor, u: Tensor) -> Tensor:
-        """The states (K, 14) after a step."""
+        """The states (K, 14) after one step from x (K, 14) with u (K, m)."""
         p, v, q, rest = x[:, :3], x[:, 3:6], x[:, 6:10], x[:, 10:]
         q0, q1, q2, q3 = q.unbind(1)
         axis = torch.stack((2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3), 1)

@@ -1,4 +1,4 @@
-"""The rows of `speed.csv`: kept as they are measured, taken over section by section."""
+"""The rows of `speed.csv`: stored as they are measured, published section by section."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ COLUMNS = (*MEASURED, "date", "commit", "processor", "torch", "casadi", "pytorch
 
 
 class Results:
-    """The file that is kept, and next to it the one that grows.
+    """The kept file, and next to it a growing file.
 
-    A row is on disk as soon as it is measured. A section's rows replace those of former runs once it has ended:
-    after a stop half way, the kept file holds whole sections, each from one run.
+    A row is written to the growing file as soon as it is measured. When a section ends, its rows replace those of
+    former runs in the kept file. So after a stop the kept file holds complete sections, each from one run.
     """
 
     def __init__(self, path: Path) -> None:
@@ -26,7 +26,11 @@ class Results:
         _write(self.growing, [])
 
     def add(self, row: Row) -> None:
-        """One measurement, every column of it."""
+        """Add one measurement.
+
+        Raises:
+            ValueError: the row hasn't exactly the columns of COLUMNS.
+        """
         if set(row) != set(COLUMNS):
             raise ValueError(f"a row has the columns {COLUMNS}, not {tuple(row)}")
         self.rows.append(row)
@@ -34,21 +38,21 @@ class Results:
             csv.DictWriter(file, COLUMNS).writerow(row)
 
     def finish(self, section: str, device: str) -> None:
-        """Put the section's new rows in place of those that a former run measured on that device."""
+        """Replace the section's rows of former runs on that device by the new rows."""
         new = [row for row in self.rows if row["section"] == section]
         former = read_rows(self.path)
         kept = [row for row in former if (row["section"], row["device"]) != (section, device)]
-        beside = self.path.with_suffix(".tmp")
-        _write(beside, kept + new)
-        os.replace(beside, self.path)
+        temporary = self.path.with_suffix(".tmp")
+        _write(temporary, kept + new)
+        os.replace(temporary, self.path)
 
     def close(self) -> None:
-        """Drop the growing file: all that it holds is in the kept one."""
+        """Delete the growing file: all its rows are in the kept file."""
         self.growing.unlink(missing_ok=True)
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The rows of a kept file, none where there is none; a column that it doesn't have is empty."""
+    """The rows of a kept file, [] where there is no file; missing columns are empty."""
     if not path.is_file():
         return []
     with path.open(newline="") as file:

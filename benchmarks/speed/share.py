@@ -1,4 +1,4 @@
-"""Where the time of a `gco` solve goes: by phase of the method, and in each by function of the native libraries."""
+"""Shares of the time of a `gco` solve: by phase of the method, and in each phase by native function."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.speed.families import FAMILIES
 
 SECTION = "share"
 
-# A phase lasts while its function (module:attributes) runs, but for the phases inside it; the rest is the outer loop.
+# A phase lasts while its function (module:attributes) runs, except for phases inside it; the rest is the outer loop.
 PHASES = {
     "paths sought": "torchgco.search.roadmap:Roadmap.paths",
     "paths tracked": "torchgco.search.paths:PathProposals.track",
@@ -26,13 +26,13 @@ PHASES = {
     "set-up": "torchgco.native.engine:Engine.__init__",
 }
 OUTER = "outer loop"
-# What calls the libraries: with a function of theirs first, or with the name of one.
+# These call the native libraries; an argument is the native function or its name.
 CALLS = ("torchgco.native.engine:run", "torchgco.native.sampler:run", "torchgco.native.roadmap:NativeSearch._run")
 PYTHON = "Python and PyTorch"
 
 
 class Shares:
-    """Seconds by phase and native function, each without those of the timers inside it; and calls of the latter."""
+    """Seconds by phase and native function, each without the timers inside it; and native calls by phase."""
 
     def __init__(self, wait: Callable[[], None]) -> None:
         self.seconds: Counter[tuple[str, str]] = Counter()
@@ -42,12 +42,12 @@ class Shares:
         self.since = 0.0
 
     def begin(self, phase: str | None, function: str) -> None:
-        """Book the time until now, and what follows on this pair; no phase: that which runs."""
+        """Book the time until now, then time this pair; phase None: the phase that runs."""
         self._book()
         self.open.append((phase or self.open[-1][0], function))
 
     def end(self) -> None:
-        """Continue with what ran before."""
+        """Book the time until now, then time the previous pair again."""
         self._book()
         self.open.pop()
 
@@ -59,7 +59,7 @@ class Shares:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Timers in the place of all functions, for a while."""
+        """Wrap all functions of PHASES and CALLS in timers; restored at the end."""
         originals = []
         places = [(place, phase) for phase, place in PHASES.items()] + [(place, None) for place in CALLS]
         for place, phase in places:
@@ -105,7 +105,7 @@ def run(bench: Bench) -> None:
 
 
 def _measure(bench: Bench, name: str, batch: int) -> None:
-    """One solve of problems that are new to a process that has solved others."""
+    """Time one solve of new problems, in a process that has solved other problems."""
     setup = bench.setup(*FAMILIES[name])
     bench.warm(setup, setup.task(setup.scenario.draw([batch, batch + 1], setup.seed)))
     task = setup.task(setup.layouts(batch))
@@ -114,7 +114,7 @@ def _measure(bench: Bench, name: str, batch: int) -> None:
         setup.solver.solve(task.problem, task.U0, seed=setup.seed)
     case, total = f"{name}, B = {batch}", sum(shares.seconds.values())
     functions = [f for f in dict.fromkeys(f for _, f in shares.seconds) if f != PYTHON]
-    for phase in ("all", *PHASES, OUTER):  # the line of all first: it has all columns
+    for phase in ("all", *PHASES, OUTER):  # "all" first: its row has all columns
         own = {f: s for (p, f), s in shares.seconds.items() if p == phase}
         if phase == "all":
             own = {f: sum(s for (_, g), s in shares.seconds.items() if g == f) for f in (*functions, PYTHON)}

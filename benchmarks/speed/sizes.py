@@ -1,4 +1,4 @@
-"""How much is measured: the default, a quick look, and whatever a test asks for."""
+"""The sizes of all measurements: the default, and a quick look."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Sizes:
     families: tuple[str, ...] = EVERY
     family_batch: int = 32
     large_batch: int | None = 256  # forests alone
-    layouts: int = 32  # the first of the same layouts, flown by each peer but:
+    layouts: int = 32  # the first of the same layouts, flown by each peer, except:
     slow_layouts: int = 12  # where FATROP takes a second or more
     slow_families: tuple[str, ...] = ("walls", "planar_random")
     ipopt_layouts: int = 4
@@ -31,7 +31,7 @@ class Sizes:
     # batch
     whole_batches: tuple[int, ...] = (1, 8, 64)
     limited_batches: tuple[int, ...] = (1, 16, 256, 2048)
-    fewest_layouts: int = 8  # batches smaller than this fly several times, until so many layouts are flown
+    fewest_layouts: int = 8  # smaller batches are repeated until so many layouts are flown
     # growth
     growth_batch: int = 16
     stages: tuple[int, ...] = (50, 100, 200, 500, 1000)

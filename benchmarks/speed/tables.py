@@ -1,4 +1,4 @@
-"""Rows as tables for people, and the parts of benchmarks/README.md and results/speed.md that hold them."""
+"""Rows as Markdown tables, and the parts of benchmarks/README.md and results/speed.md that hold them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SPEED = "<!-- speed -->", "<!-- end speed -->"  # in results/speed.md: all other
 NOT_MEASURED = "Not measured yet: `make benchmark` does."
 NO_GPU = "No GPU was at hand: `make benchmark-gpu` measures `families`, `batch` and `mppi` where there is one."
 
-# What stands above each section's table, in the order of the file.
+# The text above each section's table, in the order of the page. The published pages repeat it.
 WORDS = {
     "targets": "Processor time per problem, set-up apart. Under a peer's name: how many times as fast the solver is,\n"
     "per problem and, after the comma, per layout reached, as a peer that stops short of the goal may be fast.",
@@ -38,7 +38,7 @@ WORDS = {
 
 
 def section_table(rows: list[Row]) -> str:
-    """A Markdown table: a line per case and solver, a column per quantity, in the order they were measured."""
+    """A Markdown table: a row per case and solver, a column per quantity, in the order of measurement."""
     lines = list(dict.fromkeys((row["case"], row["solver"]) for row in rows))
     heads = list(dict.fromkeys(_head(row) for row in rows))
     cells = {(row["case"], row["solver"], _head(row)): _rounded(row["value"]) for row in rows}
@@ -50,7 +50,7 @@ def section_table(rows: list[Row]) -> str:
 
 
 def _rounded(value: str) -> str:
-    """Three digits of a number; anything else as it is."""
+    """A number with three digits; other text unchanged."""
     try:
         number = float(value)
     except ValueError:
@@ -77,7 +77,7 @@ def speed_text(rows: list[Row]) -> str:
 
 
 def _device_text(rows: list[Row]) -> str:
-    """Tables of one device, each section below where it comes from unless that is where the one before came from."""
+    """Tables of one device; a line on the source precedes a section where it differs from the section before."""
     blocks, before = [], ""
     present = {row["section"] for row in rows}
     for section in [name for name in WORDS if name in present]:
@@ -105,10 +105,10 @@ def rewrite(folder: Path, rows: list[Row]) -> None:
 
 
 def put_between(file: Path, begin: str, end: str, new: str) -> None:
-    """Put text between two marks; everything else of the file stays as it is.
+    """Put text between two marks; the rest of the file stays unchanged.
 
     Raises:
-        ValueError: the marks aren't there, once each and in order.
+        ValueError: the file doesn't contain each mark once, in order.
     """
     text = file.read_text()
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):

@@ -1,4 +1,4 @@
-"""The compact table: what the other sections measured, in this run or a former one, against the peers."""
+"""The compact table: results of the other sections, from this run or a former run, compared with the peers."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ NOT_MEASURED = "not measured"
 
 @dataclass(frozen=True)
 class Measured:
-    """A row of another section, and how it reads in the table: its value goes into `text`.
+    """A row of another section; its value goes into `text` for the table.
 
     Args:
         section, quantity: of the row.
-        case: of the row; None: of all cases the largest value.
+        case: of the row; None: the case with the largest value.
         solver: of the row.
-        text: a format; {} takes two digits, or a whole number.
+        text: a format; {} shows two significant digits, from 100 on a whole number.
     """
 
     section: str
@@ -29,7 +29,7 @@ class Measured:
     text: str
 
     def read(self, rows: list[Row], commit: str) -> str:
-        """The text, with the commit where that isn't this one; or that there is no such row."""
+        """The text, followed by the commit where it isn't this run's; NOT_MEASURED where there is no such row."""
         wanted = (self.section, self.solver, self.quantity)
         found = [
             row
@@ -47,7 +47,7 @@ class Measured:
 
 
 def _ratios(case: str, peer: str) -> tuple[Measured, Measured]:
-    """Of seconds per problem, and per layout reached: a peer that stops short of the goal is fast."""
+    """Ratios of seconds per problem, and per layout reached, as a peer that stops short of the goal may be fast."""
     source = "families", case, f"{peer} / gco"
     return Measured(*source, "seconds, ratio", "{} x"), Measured(*source, "per layout reached, ratio", "{} x")
 
@@ -58,12 +58,12 @@ def _seconds(case: str) -> Measured:
 
 @dataclass(frozen=True)
 class Target:
-    """A line of the table: what is measured, how long it takes, and how that compares.
+    """A line of the table: a case, its times, and their ratios to peers.
 
     Args:
         case, solver: the line's name.
-        times: rows with what the case takes.
-        ratios: rows that divide a peer's time by it, under the peer's name.
+        times: rows with the times of the case.
+        ratios: by peer, rows that divide the peer's time by it.
     """
 
     case: str
@@ -132,7 +132,7 @@ def _texts(measured: tuple[Measured, ...], rows: list[Row], commit: str) -> list
 
 
 def _known(bench: Bench) -> list[Row]:
-    """This run's rows, and of the sections that it doesn't hold those that are kept; of its device."""
+    """Rows of this run's device: its own, and for all other sections the kept rows."""
     assert bench.results is not None
     own = bench.results.rows
     present = {row["section"] for row in own}

@@ -1,7 +1,7 @@
-"""IPOPT and FATROP through CasADi, for any Problem: the yardsticks of constrained trajectory optimisation.
+"""IPOPT and FATROP through CasADi, for any Problem: established solvers to compare with.
 
-The model isn't written a second time: its step, cost and constraints are traced (`torchgco.tracing`) and become one
-nonlinear program with exact derivatives (`nlp`), of which every problem of the batch is a set of parameters.
+The model isn't written twice: its step, cost and constraints are traced (`torchgco.tracing`) and become one nonlinear
+program with exact derivatives (`nlp`). Every problem of the batch is a set of its parameters.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class CasADiSolver(Solver):
     Args:
         plugin: "ipopt" (with MUMPS) or "fatrop" (a Riccati recursion by stages).
         max_iterations: of each problem.
-        tolerance: the solver's own, on its optimality conditions.
-        violation_tolerance: what counts as feasible in the end (metres for lengths).
+        tolerance: the plugin's own, on its optimality conditions.
+        violation_tolerance: violation (metres for lengths) up to which a result counts as feasible.
         options: further options of the plugin, by its names.
 
     Raises:
@@ -59,10 +59,10 @@ class CasADiSolver(Solver):
             if not getattr(self, name) > 0:
                 raise InputError(f"solver.{name}", "above 0", getattr(self, name))
         if find_spec("casadi") is None:
-            raise InputError("solver", "CasADi, which `pip install casadi` brings", "no such module")
+            raise InputError("solver", "CasADi (`pip install casadi`)", "no such module")
 
     def prepare(self, problem: Problem) -> Solver:
-        """The program and the solver built for one batch; solving it then costs the solver's time alone.
+        """The program and the solver built for one batch, so that a solve takes the plugin's time alone.
 
         Raises:
             InputError: a part of the problem that can't be traced, an operation without a counterpart in CasADi, an
@@ -85,7 +85,7 @@ class CasADiSolver(Solver):
         return self.prepare(call.problem).run(call)
 
     def _options(self, problem: Problem, program: Program) -> dict[str, Any]:
-        """Options of the plugin and of CasADi around it; both say nothing while they work."""
+        """Options of the plugin and of CasADi around it; neither prints."""
         quiet = {"print_time": False, "show_eval_warnings": False}
         given = dict(self.options or {})
         if self.plugin == "ipopt":
@@ -120,13 +120,13 @@ class PreparedCasADi(Solver):
             raise InputError("problem", "the one that was prepared", "another")
         X0 = open_loop(problem.dynamics, problem.x0, U0)
         X0 = torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1))
-        sound = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
+        valid = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
         U, ends = U0.clone(), [(Status.CONVERGED, 0)] * problem.B
         for b in range(problem.B):
-            if bool(sound[b]):
+            if bool(valid[b]):
                 U[b], ends[b] = self._one(b, X0[b], U0[b])
             if call.callback is not None:
-                rows = torch.arange(b, b + int(sound[b]), device=U.device)
+                rows = torch.arange(b, b + int(valid[b]), device=U.device)
                 call.callback(Progress(b + 1, rows, b + 1, problem.B))
         solution = rolled_out(problem, U, self.solver.violation_tolerance, iterations=0)
         return _with_ends(solution, ends)
@@ -143,8 +143,8 @@ class PreparedCasADi(Solver):
         try:
             found = self.function(x0=guess, p=p, lbx=lower, ubx=upper, lbg=lowest, ubg=highest)
             stats = self.function.stats()
-        except RuntimeError as error:  # with bounds that cross, say: the others are solved all the same
-            if "option" in str(error).lower():  # FATROP reads them only now
+        except RuntimeError as error:  # crossed bounds, for example; the other problems are still solved
+            if "option" in str(error).lower():  # FATROP reads its options only here
                 raise _refused(self.solver.plugin, error) from error
             return U0, (Status.LINE_SEARCH_FAILED, 0)
         v = torch.from_numpy(np.array(found["x"]).reshape(-1)[:-n]).to(U0)
@@ -155,12 +155,12 @@ class PreparedCasADi(Solver):
 
 
 def _refused(plugin: str, error: RuntimeError) -> InputError:
-    message = " ".join(str(error).split())[-300:]  # CasADi says last what is wrong
+    message = " ".join(str(error).split())[-300:]  # CasADi names the cause last
     return InputError("solver", f"a problem and options that {plugin} takes", message)
 
 
 def _with_ends(solution: Solution, ends: list[_End]) -> Solution:
-    """CONVERGED where the plugin says so of a feasible trajectory."""
+    """CONVERGED where the plugin reports success and the trajectory is feasible."""
     status = solution.status
     ended = status.new_tensor([int(end) for end, _ in ends])
     iterations = status.new_tensor([count for _, count in ends])

@@ -1,4 +1,4 @@
-"""FATROP from a proposal along the best path of the roadmap: the value of the search to another solver."""
+"""FATROP from a proposal along the best path of the roadmap: shows what the search gains for another solver."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ class GuidedCasADi(Solver):
     paths: PathProposals = PathProposals(num_paths=4, relax_iterations=0, max_penetration=1.0)
 
     def prepare(self, problem: Problem) -> Solver:
-        """As `CasADiSolver.prepare`; the guess belongs to the solve.
+        """As `CasADiSolver.prepare`; the guess is part of the solve.
 
         Raises:
-            InputError: what `CasADiSolver.prepare` raises; no position, or initial offsets that don't fit.
+            InputError: as from `CasADiSolver.prepare`; no position, or initial offsets that don't fit the controls.
         """
         self.paths.starts(problem, problem.at_rest[1])
         engine_of(problem)  # compiled now, so that no solve waits for it
         return PreparedGuided(self, self.solver.prepare(problem))
 
     def run(self, call: Call) -> Solution:
-        """As `CasADiSolver.run`; `guided` is 1 where the guess follows a path, and `iterations` counts its solves."""
+        """As `CasADiSolver.run`; `guided` is 1 where the guess follows a path; its candidates count in `iterations`."""
         return self.prepare(call.problem).run(call)
 
     def guess(self, problem: Problem, U0: Tensor) -> Guess:

@@ -1,4 +1,4 @@
-"""Hold: the initial guess flown as it is, the floor that shows what feasible alone is worth."""
+"""Hold: the initial guess flown unchanged. It shows how weak the outcome `feasible` alone is."""
 
 from __future__ import annotations
 
@@ -18,7 +18,11 @@ from torchgco.status import Status
 
 @dataclass(frozen=True)
 class Hold(Solver):
-    """Solves nothing: the trajectory of U0, with the statuses of bad starts."""
+    """Solves nothing: returns the trajectory of U0.
+
+    Args:
+        violation_tolerance: violation (metres for lengths) up to which a trajectory counts as feasible.
+    """
 
     violation_tolerance: float = 1e-3
 

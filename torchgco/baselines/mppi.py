@@ -19,14 +19,15 @@ from torchgco.solvers.contracts import Call, Solver
 
 @dataclass(frozen=True)
 class IteratedMPPI(Solver):
-    """Algorithm 3 again and again, each time around its own mean; the best iterate is kept.
+    """Algorithm 3 repeated, each time around its last mean; the best iterate is kept.
 
-    Best is: feasible before infeasible, then by cost, then by violation. The initial guess doesn't count.
+    Feasible before infeasible; of feasible iterates the cheapest, of infeasible ones the least violated. The initial
+    guess doesn't count.
 
     Args:
-        sampler: draws and weighs.
+        sampler: draws and weighs the samples.
         iterations: number of repetitions.
-        violation_tolerance: what counts as feasible (metres for lengths).
+        violation_tolerance: violation (metres for lengths) up to which an iterate counts as feasible.
 
     Raises:
         InputError: a field out of its range.

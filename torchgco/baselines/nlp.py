@@ -1,7 +1,7 @@
 """A Problem as one nonlinear program of CasADi by multiple shooting, built once for the whole batch.
 
-Variables stand by stage, [x_0, u_0, x_1, u_1, ..., x_N], and so do the rows: x_{k+1} - step(x_k, u_k) first, then what
-the constraints say of knot k. Interior-point solvers for optimal control find their blocks by this order.
+Variables are ordered by stage, [x_0, u_0, x_1, u_1, ..., x_N], and so are the rows: x_{k+1} - step(x_k, u_k) first,
+then the constraint rows of knot k. Interior-point solvers for optimal control find their blocks by this order.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torchgco.problem import Problem
 from torchgco.tracing import Traced, own_tensors
 from torchgco.tree import PerElement
 
-UNBOUNDED = 1e19  # and above: a bound that is there for other problems of the batch only
+UNBOUNDED = 1e19  # and above: no bound for this problem; others of the batch have one
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Program:
     objective: ca.SX
     rows: ca.SX
     equality: list[bool]
-    path_rows: list[int]  # rows of each knot 0..N, without the step to the next
+    path_rows: list[int]  # number of rows of each knot 0..N, without x_{k+1} - step(x_k, u_k)
     limits: _Limits
     sources: tuple[Traced, ...]
 
@@ -65,7 +65,7 @@ def transcribe(problem: Problem) -> Program:
     """The program of a batch.
 
     Raises:
-        InputError: a part that can't be traced, or that uses what CasADi has no counterpart for.
+        InputError: a part that can't be traced, or that uses an operation without a counterpart in CasADi.
     """
     N, n, m = problem.N, problem.n, problem.m
     step, cost, constraints = _traces(problem)
@@ -115,9 +115,9 @@ def _traces(problem: Problem) -> tuple[Traced, Traced, list[Traced]]:
 def _limits(
     at_knot: list[list[tuple[ca.SX, bool]]], variables: ca.SX, parameters: ca.SX
 ) -> tuple[_Limits, list[list[tuple[ca.SX, bool]]]]:
-    """Inequalities that bound a single variable, and what is left. Rows without any variable are dropped.
+    """Inequalities that bound a single variable, and the remaining rows. Rows without any variable are dropped.
 
-    A solver keeps strictly inside bounds that it knows as such, and saves a slack for each.
+    A solver stays strictly inside variable bounds, and needs no slack for them.
     """
     rows = _column([row for knot in at_knot for row, _ in knot])
     jacobian = ca.jacobian(rows, variables)

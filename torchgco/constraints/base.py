@@ -22,8 +22,8 @@ Knots = slice | Sequence[int] | Tensor
 class Constraint(PerElement):
     """Rows c (B, K, p) at K knots of a trajectory.
 
-    `geometric` marks constraints on the position: those that sampling counts as collisions, and in which the
-    guidance looks for rows that cancel each other (F_k of Equation 53).
+    `geometric` marks constraints on the position: sampling counts their violations as collisions, and guidance looks
+    among them for rows that cancel each other (F_k of Equation 53).
     """
 
     sense: Sense = "inequality"
@@ -67,7 +67,7 @@ class Constraint(PerElement):
         return self
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
-        """Whether a problem that starts at x0 (B, n) makes sense, (B,) bool."""
+        """Whether the constraint admits a start at x0 (B, n), (B,) bool."""
         return torch.ones(x0.shape[0], dtype=torch.bool, device=x0.device)
 
 
@@ -75,7 +75,7 @@ def resolve_knots(knots: Knots, last: int, field: str, device: torch.device) -> 
     """Knots as a slice where they are contiguous, else as indices; negative ones count from the end.
 
     Raises:
-        InputError: none at all, a repeated one, or one outside 0..last.
+        InputError: no knot, a repeated knot, or a knot outside 0..last.
     """
     if isinstance(knots, slice):
         chosen = list(range(last + 1)[knots])

@@ -1,4 +1,4 @@
-"""What all kinds of obstacles have in common: distances of the vehicle from them, for solver, search and polish."""
+"""The interface of all kinds of obstacles: distances of the vehicle from them, for solver, search and polish."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Inflated(NamedTuple):
 class Obstacles(Constraint):
     """Obstacles that the vehicle's position keeps clear of, M per problem, once bound.
 
-    A kind of obstacles is a subclass. In addition to a constraint's methods it defines the abstract ones. Distances
+    Each kind of obstacles is a subclass, which defines a constraint's methods and the abstract ones below. Distances
     count from the full surface, the obstacle's own grown by the vehicle's radius: positive outside, negative inside,
-    infinite where an obstacle is absent. The judge and the certificate measure distances by code of their own, which a
-    new kind joins through `judge.CLEARANCES` and `certificate.CHORDS`.
+    infinite where an obstacle is absent. The judge and the certificate measure distances by separate code; a new kind
+    is added to it in `judge.CLEARANCES` and `certificate.CHORDS`.
     """
 
     sense: ClassVar[Sense] = "inequality"
@@ -46,19 +46,19 @@ class Obstacles(Constraint):
 
     @property
     def margins(self) -> Tensor:
-        """The length (B, M), m: bodies touch at (1 - CONTACT_FACTOR) times this beneath the full surface."""
+        """Lengths (B, M), m: bodies touch at (1 - CONTACT_FACTOR) times these beneath the full surface."""
         raise NotImplementedError
 
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
-        """Distances (B, K, M) of points p (B, K, d) at times t (K,), s, m."""
+        """Distances (B, K, M), m, of points p (B, K, d), m, at times t (K,), s."""
         raise NotImplementedError
 
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
-        """Smallest distances (B, E, M) of the straight segments from a to b (B, E, d), obstacles as at t = 0, m."""
+        """Smallest distances (B, E, M), m, of the straight segments from a to b (B, E, d), from obstacles at t = 0."""
         raise NotImplementedError
 
     def inflated(self) -> Inflated | None:
-        """The obstacles as the roadmap takes them; None: it can't, and no path is sought."""
+        """The obstacles in the roadmap's form; None where it has no form for them, and no path is sought."""
         return None
 
     def chord_clearance(self, X: Tensor) -> Tensor:
@@ -81,7 +81,7 @@ class Obstacles(Constraint):
 
 
 def least(distances: Tensor) -> Tensor:
-    """The smallest of distances (B, K, M) of each problem, (B,); infinite where there is none."""
+    """The smallest of distances (B, K, M) per problem, (B,); infinite where there is none."""
     if distances.shape[1] == 0 or distances.shape[2] == 0:
         return distances.new_full(distances.shape[:1], torch.inf)
     return distances.flatten(1).amin(-1)

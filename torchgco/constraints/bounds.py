@@ -15,9 +15,9 @@ from torchgco.shapes import Dimensions, check_shape, tensor
 
 @dataclass(frozen=True)
 class _Bounds(Constraint):
-    """lower <= z <= upper, as rows [z - upper, lower - z] of those components that are bounded at all.
+    """lower <= z <= upper, as rows [z - upper, lower - z] of the bounded components.
 
-    Bounds are (size,) or, one per problem, (B, size); infinity means unbounded.
+    Bounds are (size,) or, per problem, (B, size); infinity means unbounded.
 
     Raises:
         InputError: on `Problem(...)`: wrong shape, NaN, bounds crossed, nothing bounded.
@@ -43,7 +43,7 @@ class _Bounds(Constraint):
         above, below = (torch.isfinite(bound).any(dim=0).nonzero().flatten() for bound in (upper, lower))
         if above.numel() + below.numel() == 0:
             raise InputError(name, "at least one finite bound", "none")
-        # A component bounded in one problem and free in the next: 0 * infinity would poison the free one.
+        # A component may be bounded in one problem and free in another, where 0 * infinity would give NaN.
         lower, upper = lower.nan_to_num(neginf=-1e20), upper.nan_to_num(posinf=1e20)
         knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", lower.device)
         return replace(self, lower=lower, upper=upper, knots=knots, above=_range(above), below=_range(below))
@@ -79,7 +79,7 @@ class _Bounds(Constraint):
 
 
 def _range(components: Tensor) -> slice | Tensor:
-    """Components as a slice where they follow each other: views cost nothing."""
+    """Components as a slice where they are adjacent: indexing then makes a view, not a copy."""
     first, count = int(components[0]) if components.numel() else 0, components.numel()
     adjacent = components.tolist() == list(range(first, first + count))
     return slice(first, first + count) if adjacent else components

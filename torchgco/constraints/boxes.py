@@ -1,4 +1,4 @@
-"""Boxes as obstacles: aligned with the axes or turned, in the plane and in space, at rest."""
+"""Boxes as static obstacles, aligned with the axes or turned, in the plane and in space."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
 class Boxes(Constraint):
     """2 s (r_veh - distance of p_k from box i) <= 0 for every box i.
 
-    The distance is that from the surface, negative inside. The factor with the size s = r_veh + the smallest half side
-    makes c a square of lengths with the slope of a sphere of that size: penalties mean the same for both kinds. Rows
-    hold at the knots; between two knots a trajectory may cut a corner, which is rounded by r_veh, by up to the square
-    of its step over 8 r_veh. `gco` solves such trajectories again with grown boxes.
+    Distances count from the surface, negative inside. The factor 2 s, with s = r_veh + the smallest half side, makes c
+    a squared length with the slope of a sphere of radius s: penalties then mean the same for both kinds. Rows hold at
+    the knots; between two knots a trajectory may cut a corner, which is rounded by r_veh, by up to the square of its
+    step over 8 r_veh. `gco` solves such trajectories again with grown boxes.
 
     Args:
         centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent boxes (padding); M may be 0, and an
             empty list stands for (0, d).
         half_sizes: as centers: half the lengths of the sides, m, above 0; NaN where the centre is.
         vehicle_radius: number or (B,), m. Bodies touch at CONTACT_FACTOR of it from the surface.
-        rotations: from the box's sides to the axes of space. In the plane angles (M,) or (B, M), rad; in space unit
-            quaternions [w, x, y, z], (M, 4) or (B, M, 4). None: sides along the axes.
+        rotations: those that turn the axes of space into the box's sides. In the plane angles (M,) or (B, M), rad; in
+            space unit quaternions [w, x, y, z], (M, 4) or (B, M, 4). None: sides along the axes.
         knots: default 1..N.
 
     Raises:
-        InputError: on `Problem(...)`: wrong shapes, NaN centre with finite sides, sides that aren't above 0,
-            quaternions of another length than 1, dynamics without a position in the boxes' plane or space.
+        InputError: on `Problem(...)`: wrong shapes, NaN centre with finite sides, sides that aren't above 0, negative
+            vehicle radius, quaternions of another length than 1, dynamics without a position in 2-D or 3-D.
     """
 
     centers: Any
@@ -157,7 +157,7 @@ class BoundBoxes(Obstacles):
         return torch.where(self.absent.unsqueeze(1), -1.0, -2.0 * self.depths.unsqueeze(1) * self._outside(p))
 
     def _normals(self, p: Tensor) -> Tensor:
-        """Unit vectors (B, K, M, d) in which the distance grows: from the nearest point, inside to the nearest side."""
+        """Unit vectors (B, K, M, d) along which the distance grows: away from the box, inside to the nearest side."""
         boxes = self._cuboids()
         local, half = boxes.seen_from(p), boxes.halves()
         away = torch.stack(excess(local, half), dim=-1)
@@ -165,7 +165,7 @@ class BoundBoxes(Obstacles):
         outside = away / torch.where(square > 0, square, 1.0).sqrt()
         place = torch.stack(local, dim=-1)
         inner = place.abs() - torch.stack(half, dim=-1)
-        # The first of the nearest sides; at the centre, where no side is nearer, the positive one.
+        # The first of the nearest sides; of two opposite sides at equal distance, the positive one.
         side = torch.nn.functional.one_hot(inner.argmax(-1), place.shape[-1]).to(p.dtype)
         inside = torch.where(place < 0, -side, side)
         normal = torch.where(square > 0, outside, inside)

@@ -41,7 +41,7 @@ class Cuboids(NamedTuple):
         return Cuboids(*(part[index] for part in self))
 
     def cut(self, share: float) -> Cuboids:
-        """The same boxes, grown by so much less of the radius."""
+        """The same boxes, with the radius reduced by this share."""
         return self._replace(radius=torch.where(self.here, (1.0 - share) * self.radius, self.radius))
 
     def local(self, v: Coordinates) -> list[Tensor]:
@@ -50,16 +50,16 @@ class Cuboids(NamedTuple):
         return [reduce(torch.add, (axes[..., i, j] * v[j] for j in range(len(v)))) for i in range(len(v))]
 
     def seen_from(self, points: Tensor) -> list[Tensor]:
-        """Coordinates along the sides of each box, counted from its centre, (B, V, K) each, of points (B, V, d)."""
+        """Coordinates along the sides of each box, from its centre, (B, V, K) each, of points (B, V, d)."""
         o = self.centers.unsqueeze(1)
         return self.local([points[..., None, j] - o[..., j] for j in range(points.shape[-1])])
 
     def halves(self) -> list[Tensor]:
-        """Half the sides (B, 1, K), one after the other."""
+        """Half the side lengths, d tensors (B, 1, K)."""
         return list(self.half_sizes.unsqueeze(1).unbind(-1))
 
     def squares(self, points: Tensor) -> Tensor:
-        """Squared distances (B, V, K) of points (B, V, d) from the boxes as they are; 0 inside."""
+        """Squared distances (B, V, K) of points (B, V, d) from the boxes before they are grown; 0 inside."""
         return _square(excess(self.seen_from(points), self.halves()))
 
     def squares_from_segments(self, a: Tensor, b: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ class Cuboids(NamedTuple):
         return _square(excess(_at(begin, along, nearest(begin, along, half)), half))
 
     def reach(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Lower and upper corner (B, d) of what points (B, V, d) and the boxes, half as large again, fill."""
+        """Lower and upper corner (B, d) of the region that holds points (B, V, d) and the boxes enlarged by half."""
         half = (self.axes.abs() * self.half_sizes.unsqueeze(-1)).sum(-2)
         wide, here = 1.5 * (half + self.radius.unsqueeze(-1)), self.here.unsqueeze(-1)
         low = torch.where(here, self.centers - wide, torch.inf)
@@ -91,12 +91,12 @@ def signed_distance(p: Coordinates, half: Coordinates) -> Tensor:
     """Distance of p from a box's surface in the box's frame, m; inside minus the distance from the nearest side."""
     deepest = reduce(torch.maximum, (x.abs() - h for x, h in zip(p, half, strict=True)))
     outside = deepest > 0
-    # The root of 0 has no slope: inside, where it isn't used, 1 stands in for it.
+    # The root of 0 has no slope: inside, where the root isn't used, it is taken of 1.
     return torch.where(outside, torch.where(outside, _square(excess(p, half)), 1.0).sqrt(), deepest)
 
 
 def nearest(begin: Coordinates, along: Coordinates, half: Coordinates) -> Tensor:
-    """The share of a segment at which it is nearest to a box, in the box's frame: the first, where there are several.
+    """The share of a segment at which it is nearest to a box, in the box's frame; of several, the first.
 
     The squared distance is convex and smooth in the share, and quadratic between the shares at which the segment passes
     the planes of the box's sides. Its slope brackets the minimum between two of these.
@@ -122,7 +122,7 @@ def nearest(begin: Coordinates, along: Coordinates, half: Coordinates) -> Tensor
 def segment_distance(begin: Coordinates, along: Coordinates, half: Coordinates) -> Tensor:
     """Smallest signed distance of a segment from a box's surface, in the box's frame."""
     outside = signed_distance(_at(begin, along, nearest(begin, along, half)), half)
-    # Where it enters the box: the depth is the largest of 2 d linear functions, smallest at an end or where two cross.
+    # Inside the box the distance is the largest of 2 d linear functions, smallest at an end or where two cross.
     shares = [torch.zeros_like(outside), torch.ones_like(outside)]
     sides = [(s * a, s * d, h) for a, d, h in zip(begin, along, half, strict=True) for s in (-1.0, 1.0)]
     for i, (a, d, h) in enumerate(sides):
@@ -135,7 +135,7 @@ def segment_distance(begin: Coordinates, along: Coordinates, half: Coordinates) 
 
 
 def beside(boxes: Cuboids, start: Tensor, goal: Tensor, shells: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Points (B, C, d) around the corners, edges and sides of the boxes, and whether each belongs to one (B, C).
+    """Points (B, C, d) around corners, edges and sides of the boxes, and whether each one's box is present (B, C).
 
     Along edges and sides a point lies where the straight line from start to goal (B, d) comes nearest.
     """
@@ -159,7 +159,7 @@ def beside(boxes: Cuboids, start: Tensor, goal: Tensor, shells: Sequence[float])
 
 
 def between(boxes: Cuboids, centers: Tensor, radii: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The middles (B, C, d) of the gaps of each box to the `count` nearest spheres and to as many boxes; which exist.
+    """Middles (B, C, d) of each box's gaps to the `count` nearest boxes and spheres each; whether each exists (B, C).
 
     Args:
         centers, radii: of spheres, (B, M, d) and (B, M), m; negative where absent.
@@ -178,7 +178,7 @@ def between(boxes: Cuboids, centers: Tensor, radii: Tensor, count: int) -> tuple
     return torch.cat([p for p, _ in found], dim=1), torch.cat([e for _, e in found], dim=1)
 
 
-ROUNDS = 8  # of projections from one box to the other and back, until the two points are the nearest of both
+ROUNDS = 8  # projections from one box to the other and back; the two points converge to the nearest of both
 
 
 def _projected(boxes: Cuboids, points: Tensor) -> Tensor:

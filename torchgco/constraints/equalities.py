@@ -16,7 +16,7 @@ from torchgco.shapes import Dimensions, check_shape, tensor
 
 @dataclass(frozen=True)
 class FirstStepRates(Constraint):
-    """What the rotors can do in the first control period (section 5.2.1):
+    """The body rates at knot 1 are those that the rotors' thrusts at x_0 produce (section 5.2.1):
 
         0 = w(t1) - w(t0) - J^-1 (T F(t0) - w x (J w) - D w) T_s,   at knot 1, with w = w(t0) of x_0.
 

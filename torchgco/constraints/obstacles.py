@@ -19,7 +19,7 @@ from torchgco.constraints.bodies import Inflated, Obstacles, least
 from torchgco.errors import InputError
 from torchgco.shapes import Dimensions, check_shape, tensor
 
-FAR = -1e9  # the radius of an obstacle that isn't there
+FAR = -1e9  # the radius of an absent obstacle
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class BoundSpheres(Obstacles):
         dims: Dimensions,
     ) -> BoundSpheres:
         assert dims.position is not None
-        o, one = centers, (~absent).to(centers.dtype).unsqueeze(-1)  # no sum counts an absent one
+        o, one = centers, (~absent).to(centers.dtype).unsqueeze(-1)  # absent: left out of sums
         rows = [2 * o, -one, (inflated_radii.square() - o.square().sum(-1)).unsqueeze(-1)]
         first, second = [one, o], [_outer(o, o)]
         if velocities is not None:
@@ -258,7 +258,11 @@ def _outer(a: Tensor, b: Tensor) -> Tensor:
 
 
 def per_problem(value: Any, name: str, dim: int, dims: Dimensions) -> Tensor:
-    """`value` with its batch axis, repeated for every problem where it came without one."""
+    """`value` with its batch axis, repeated for every problem where it came without one.
+
+    Raises:
+        InputError: not numbers, another number of axes than `dim` or `dim` - 1, or another batch.
+    """
     given = tensor(value, name, dims.like)
     if given.dim() == dim - 1:
         given = given.unsqueeze(0).expand(dims.B, *given.shape)

@@ -1,4 +1,4 @@
-"""Cost: what a trajectory is worth, and its expansion. Users' own costs subclass `Cost`."""
+"""Cost of a trajectory, and its quadratic expansion. A user's own cost is a subclass of `Cost`."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ class Cost(PerElement):
     A subclass defines `stage` and `terminal` on any leading axes; derivatives are exact unless it overrides `expand`
     too. A Hessian that isn't positive semidefinite is handled by the solver's regularisation.
 
-    On a CPU the code is traced and compiled (`torchgco.native`), with what differs between problems (`batched`,
-    `per_element`) and between stages (what is indexed with k or computed from it) as numbers. A cost that branches on
-    the values of x, u or k, or that joins several knots, is evaluated by PyTorch, and a warning names it.
+    On a CPU the code is traced and compiled (`torchgco.native`). Values that differ between problems (`batched`,
+    `per_element`) or between stages (indexed with k or computed from it) become inputs of the compiled code. A cost
+    that branches on the values of x, u or k, or that joins several knots, is evaluated by PyTorch, and a warning
+    names it.
     """
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
@@ -40,7 +41,7 @@ class Cost(PerElement):
         return self
 
     def rest_controls(self, like: Tensor) -> Tensor:
-        """Controls (B, N, m) that ask nothing of the vehicle: the references of a quadratic cost, else zero."""
+        """Controls (B, N, m) at rest, shaped as `like`: the references of a quadratic cost, else zero."""
         return torch.zeros_like(like)
 
     def goal(self, x0: Tensor) -> Tensor | None:
@@ -104,7 +105,7 @@ def add_blocks(
     luu: Tensor | None,
     lux: Tensor | None = None,
 ) -> None:
-    """Add the pieces of a quadratic model to homogeneous blocks H (..., s, s) with z = [x, 1, u], in place."""
+    """Add the blocks of a quadratic model to homogeneous blocks H (..., s, s) with z = [x, 1, u], in place."""
     if lx is not None:
         H[..., :n, n] += lx
         H[..., n, :n] += lx

@@ -65,7 +65,7 @@ class QuadraticCost(Cost):
 
 @dataclass(frozen=True)
 class BoundQuadratic(Cost):
-    """A QuadraticCost shaped for its problem: tensors with a batch and a stage axis of their length or 1.
+    """A QuadraticCost shaped for its problem: batch and stage axes have their full length, or 1 where shared.
 
     Diagonal weights are kept as diagonals: most are, and products then replace matrix products.
     """
@@ -98,7 +98,7 @@ class BoundQuadratic(Cost):
             if not isinstance(k, int):
                 return part
             part = part[:, k if part.shape[1] > 1 else 0]
-            # Samples, if any, stand between the batch axis and the last ones.
+            # The axis of samples, if any, follows the batch axis.
             return part if x.dim() == 2 else part.unsqueeze(1)
 
         ex, eu = x - at_k(self.x_ref), u - at_k(self.u_ref)
@@ -145,7 +145,7 @@ class BoundQuadratic(Cost):
     def _hessians(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """The second derivatives in homogeneous blocks: of the stages (B|1, N|1, s, s), of the last knot (B|1, s, s).
 
-        As many as there are different ones, so that most problems fill H with copies of a single block.
+        Axes that all weights share keep length 1, so that most problems fill H with copies of a single block.
         """
         n, s = self.Q.shape[-1], like.shape[-1]
         parts = [part for part in (self.Q, self.R, self.H) if part is not None]
@@ -157,7 +157,7 @@ class BoundQuadratic(Cost):
         return stage, terminal
 
     def _times(self, W: Tensor, e: Tensor) -> Tensor:
-        # Products and sums keep each problem's bits independent of the batch; a shared matrix in one GEMM would not.
+        # With products and sums, a problem's bits don't depend on the batch; with one GEMM by a shared matrix they do.
         return W * e if self.diagonal else (W * e.unsqueeze(-2)).sum(-1)
 
 

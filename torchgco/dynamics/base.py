@@ -27,9 +27,9 @@ class Dynamics(PerElement):
                 (_, _, angle, speed), (force, turn) = x.unbind(-1), u.unbind(-1)
                 return torch.stack((speed * angle.cos(), speed * angle.sin(), turn, force), dim=-1)
 
-    Derivatives and native kernels are made from that. `position` says which states are the position in metres that
-    obstacles are compared with, or is None. A parameter that may be a tensor (B,), one value per problem, is named in
-    `per_element` and shaped by `shapes.lead`.
+    Derivatives and native kernels are made from this method. `position` says which states are the position in metres
+    that obstacles are compared with, or is None. A parameter that may be a tensor (B,), one value per problem, is named
+    in `per_element` and shaped by `shapes.lead`.
     """
 
     n: int
@@ -37,7 +37,7 @@ class Dynamics(PerElement):
     dt: float
     integrator: str = "euler"
     position: slice | None = None
-    # True in a class whose step depends on nothing but its dataclass fields: its traced step may then be cached.
+    # Set in a class whose step depends on nothing but its dataclass fields: its traced step may then be cached.
     reads_fields_alone: ClassVar[bool]
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
@@ -55,7 +55,7 @@ class Dynamics(PerElement):
 
 
 def check_model(dynamics: Any, name: str) -> None:
-    """Raise InputError unless time step and integrator of a model can be used."""
+    """Raise InputError unless a model's time step is positive and its integrator known."""
     if not dynamics.dt > 0:
         raise InputError(f"{name}.dt", "a positive time step in seconds", dynamics.dt)
     if dynamics.integrator not in INTEGRATORS:
@@ -64,7 +64,7 @@ def check_model(dynamics: Any, name: str) -> None:
 
 @dataclass(frozen=True)
 class FunctionDynamics(Dynamics):
-    """Dynamics from a function: x' = function(x, u), integrated; or the step itself with integrator="none".
+    """Dynamics from function(x, u) on (..., n), (..., m): the derivative x', or with integrator="none" the next state.
 
     Raises:
         InputError: non-positive dt, unknown integrator.

@@ -1,4 +1,4 @@
-"""The quadrotor at three depths: planning model (14 states), plant (17), rotor tracking (7).
+"""The quadrotor at three levels of detail: planning model (14 states), plant (17), rotor tracking (7).
 
 Quaternions are scalar first; q' = 1/2 Qx(w) q, and R(q) e3 is the body's thrust axis in the world.
 """
@@ -22,7 +22,7 @@ Components = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class Airframe:
-    """What the quadrotor is made of (Table 2), shared by plant, tracking model and first-step consistency.
+    """The quadrotor's parameters (Table 2), shared by plant, tracking model and `FirstStepRates`.
 
     Raises:
         InputError: non-positive mass, or thrust limits crossed.
@@ -40,7 +40,7 @@ class Airframe:
     rotor_time_constant: float = 0.10  # T_r, s
     thrust_min: float = 0.1046  # N per rotor
     thrust_max: float = 6.0  # N per rotor
-    hover_speed: float = 5000.0  # rpm that carries the weight
+    hover_speed: float = 5000.0  # rpm at which the rotors carry the weight
 
     def __post_init__(self) -> None:
         if not self.mass > 0:
@@ -67,7 +67,7 @@ class Airframe:
 
     def thrust_rate(self, F: Tensor, speed: Tensor) -> Tensor:
         """F' = 2/T_r sqrt(F) (sqrt(b) u - sqrt(F)) for commanded rotor speeds u in rpm, (..., 4)."""
-        root = F.clamp(min=torch.finfo(F.dtype).tiny).sqrt()  # with a derivative, which the root of 0 lacks
+        root = F.clamp(min=torch.finfo(F.dtype).tiny).sqrt()  # the root of 0 has no derivative
         return 2.0 / self.rotor_time_constant * root * (math.sqrt(self.thrust_coefficient) * speed - root)
 
 
@@ -131,8 +131,11 @@ class QuadrotorPlanning(Dynamics):
 class QuadrotorPlant(Dynamics):
     """Full quadrotor: x = [p, v, q, w, F (N)], u = commanded rotor speeds (rpm), n = 17, m = 4 (section 2).
 
-    A step ends with the thrusts limited to [f_min, f_max] and the quaternion renormalised, and so do its derivatives
-    (beyond a limit, the derivative of that thrust is zero).
+    A step ends by limiting the thrusts to [f_min, f_max] and renormalising the quaternion. Derivatives include both:
+    beyond a limit, the derivative of that thrust is zero.
+
+    Raises:
+        InputError: non-positive dt, unknown integrator.
     """
 
     dt: float = 0.01
@@ -165,7 +168,11 @@ class QuadrotorPlant(Dynamics):
 
 @dataclass(frozen=True)
 class RotorTracking(Dynamics):
-    """Tracking model: x = [w (rad/s), F (N)], u = rotor speeds (rpm), n = 7, m = 4 (section 5.2, Table 5)."""
+    """Tracking model: x = [w (rad/s), F (N)], u = rotor speeds (rpm), n = 7, m = 4 (section 5.2, Table 5).
+
+    Raises:
+        InputError: non-positive dt, unknown integrator.
+    """
 
     dt: float = 0.01
     integrator: str = "euler"

@@ -1,1 +1,1 @@
-"""Studies, from configurations to tables: the floor above everything else."""
+"""Studies, from configurations to tables: the top layer of the library."""

@@ -23,7 +23,7 @@ from torchgco.experiments.identity import decisive, digest, plain, settings_of
 
 
 def study_folder(_root_: Any) -> str:
-    """A name for what a configuration computes: no clock in it, so a second start finds the first one's work."""
+    """A folder name from the settings that decide results. It holds no time, so a second start resumes the first."""
     held = plain(OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"]))
     solvers = {held["solver"]["name"]: {key: value for key, value in held["solver"].items() if key != "name"}}
     recompose = _recomposer(_root_.hydra)
@@ -43,7 +43,7 @@ OmegaConf.register_new_resolver("torchgco.folder", study_folder, replace=True)
 
 
 def _recomposer(job: Any) -> Callable[[str], DictConfig]:
-    """What composes the running job's configuration (its node `hydra`) with another solver in it."""
+    """A function that composes the running job's configuration (its node `hydra`) with another solver."""
     given = [o for o in job.overrides.task if not o.lstrip("+~").startswith(("solver=", "solver."))]
     folders = [source.path for source in job.runtime.config_sources if source.schema == "file"]
     others = [f"file://{path}" for path in folders if str(config_dir()) not in path]
@@ -52,7 +52,7 @@ def _recomposer(job: Any) -> Callable[[str], DictConfig]:
 
 @cache
 def _composed(overrides: tuple[str, ...], searchpath: tuple[str, ...]) -> DictConfig:
-    return compose_config(overrides, searchpath)  # asked for by the folder's name several times, and by the study
+    return compose_config(overrides, searchpath)  # needed several times by the folder's name
 
 
 @hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="config")
@@ -65,7 +65,7 @@ def _run(config: DictConfig) -> None:
         if run_study(config, folder, _recomposer(job), lambda: _keep_configuration(config, folder)) == 0:
             raise InputError("scenario", "a layout whose start is outside its obstacles", "none")
     except InputError as error:
-        # An exit, as Hydra would put a line of its own before an exception.
+        # An exit, because Hydra would print a line before an exception.
         print(f"torchgco: {error}", file=sys.stderr)
         sys.exit(2)
 
@@ -84,7 +84,7 @@ def main() -> int:
     if "--version" in sys.argv[1:]:
         print(f"torchgco {torchgco.__version__}")
         return 0
-    # Hydra would print and exit by itself; with this it raises its errors, for one line about each.
+    # Hydra would print and exit by itself; with this it raises its errors, and each is printed as one line.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     _composed.cache_clear()  # the files of conf/ may have changed since the last call
     try:
@@ -92,7 +92,7 @@ def main() -> int:
     except (HydraException, OmegaConfBaseException) as error:
         print(f"torchgco: {as_input_error(error)}", file=sys.stderr)
         return 2
-    except OSError as error:  # of the study's folder, which Hydra makes; the study's files have their own line
+    except OSError as error:  # Hydra can't make the study's folder; the study's own files raise InputError
         print(f"torchgco: {InputError('hydra.run.dir', 'a folder that can be made', error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

@@ -77,7 +77,7 @@ def compose(overrides: Sequence[str] = ()) -> Setup:
 def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> DictConfig:
     """The configuration alone; `searchpath` names further folders of configs."""
     extra = [f"hydra.searchpath=[{','.join(searchpath)}]"] if searchpath else []
-    running = Singleton.get_state()  # a study composes its baselines while Hydra's own main is at work
+    running = Singleton.get_state()  # a study composes its baselines while Hydra's own main runs
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
@@ -149,7 +149,7 @@ def as_input_error(error: BaseException, field: str = "configuration") -> InputE
 
 
 def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
-    """The device, once threads and kernels of this process are set."""
+    """The device and dtype; also sets the threads and kernels of this process."""
     if node.name not in ("cpu", "cuda"):
         raise InputError("device.name", "cpu or cuda", node.name)
     if node.name == "cuda" and not torch.cuda.is_available():
@@ -164,7 +164,7 @@ def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
 
 
 def allotted_cores() -> int:
-    """Cores that this process may use, as the scheduler or else the system says."""
+    """Cores that this process may use, according to Slurm or else the system."""
     return int(os.environ.get("SLURM_CPUS_PER_TASK", 0)) or len(os.sched_getaffinity(0))
 
 

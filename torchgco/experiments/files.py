@@ -1,4 +1,4 @@
-"""How an experiment writes and checks a file: whole or not at all, and one line for everything that goes wrong."""
+"""How an experiment writes and checks a file: whole or not at all, with every failure as one line."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def checksum(path: Path) -> str:
 
 
 def damaged(path: Path, reason: str) -> InputError:
-    """The line for a file of a study that can't be used as it is: which file, why, and how to repair it."""
+    """The error for a file of a study that can't be used: which file, why, and how to repair it."""
     return InputError(
         "hydra.run.dir", "whole files of this study", f"{path}, which {reason} (study.repair=true redoes it)"
     )

@@ -78,7 +78,7 @@ class Bar(Protocol):
 
 
 class NoBar:
-    """Shows warnings only, in worker processes: even a disabled tqdm makes a semaphore, which would leak in a kill."""
+    """Shows warnings only, in worker processes: even a disabled tqdm makes a semaphore, which leaks in a kill."""
 
     def update(self, n: float) -> None:
         """Nothing is shown."""
@@ -132,9 +132,9 @@ class Flight:
     def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, np.ndarray]:
         """The solution, seconds per problem, and how many problems at most ran at the same time as each of them (L,).
 
-        After each lack of memory half as many run at once. A solver that reports no pass runs all of them together.
+        Each time memory runs out, half as many run at once. A solver that reports no pass runs all of them together.
         """
-        # What a solver builds or compiles for a batch is set-up: the clock starts after it.
+        # Building and compiling for a batch are set-up: the clock starts after them.
         engine_of(problem)
         solver, at_once = self.solver.prepare(problem), problem.B
         if solver.in_slots(1) is not None:
@@ -160,7 +160,7 @@ class Flight:
             return solution, seconds, together.cpu().numpy()
 
     def _progress(self, together: Tensor, progress: Progress) -> None:
-        """Show a pass, and note in `together` how many problems ran side by side in it."""
+        """Show a pass, and note in `together` how many problems ran together in it."""
         together[progress.rows] = together[progress.rows].clamp(min=progress.rows.numel())
         self.bar.update(max(0, progress.finished - self.shown))
         self.bar.set_postfix({"pass": progress.passes}, refresh=False)
@@ -173,11 +173,11 @@ def _now(device: torch.device) -> float:
     return time.perf_counter()
 
 
-# What a worker process runs. It stands here, not with the study, so that no worker loads the report's figures.
+# Functions of worker processes. They are here, not in `study`, so that no worker loads the report's figures.
 
 
 def prepare(threads: int, in_c: bool) -> None:
-    """Set up a worker process as the study's own is."""
+    """Give a worker process the threads and kernels of the study's own."""
     torch.set_num_threads(threads)
     use_native(in_c)
 

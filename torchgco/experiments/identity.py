@@ -1,7 +1,7 @@
-"""What makes two studies, two layouts or two solvers the same: the content of study.json.
+"""The identity of studies, layouts and solvers: the content of study.json.
 
 Results depend on the version, the seed, the layouts, the planning model, the settings of the solvers and the
-arithmetic of the device. How a study is cut into batches and processes decides no bit of them (CONTRIBUTING, "The
+arithmetic of the device. How a study is cut into batches and processes changes no bit of them (CONTRIBUTING, "The
 batch contract") and is no part of its identity.
 """
 
@@ -26,7 +26,7 @@ OVERRULED = {
     "control_lower": "control_lower", "control_upper": "control_upper",
 }  # fmt: skip
 DIGITS = 16  # hexadecimal, of a digest: 64 bits
-EXACT = 2**53  # beyond it neighbouring whole numbers, as seeds, are one float
+EXACT = 2**53  # above it neighbouring integers, such as seeds, become the same float
 LONGEST = 40  # letters of a value in a message
 
 
@@ -55,7 +55,7 @@ def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> di
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a study flies: the content of its study.json.
+    """The flights of a study: the content of its study.json.
 
     configuration  resolved, with `version`, as the study was first started
     solvers        resolved settings by name, the solver under study first
@@ -73,7 +73,7 @@ class Manifest:
 
     @property
     def constants(self) -> dict[str, Any]:
-        """What all rows of the study have in common, by column."""
+        """Values that all rows of the study share, by column."""
         device, given = self.configuration["device"], self.configuration
         return {
             "seed": given["seed"], "version": given["version"], "device": device["name"], "dtype": device["dtype"]
@@ -87,14 +87,14 @@ class Manifest:
         return _normal({**given, **held, "layouts": {str(i): code for i, code in self.layouts.items()}})
 
     def to_json(self) -> bytes:
-        """The text of study.json; the digests of the settings stand in it for readers alone."""
+        """The text of study.json; it includes the digests of the settings for readers only."""
         held = {"configuration": self.configuration, "solvers": self.solvers, "settings": self.settings}
         held["layouts"] = {str(number): code for number, code in self.layouts.items()}
         return json.dumps({**held, "checksum": digest(held)}, indent=1, default=str).encode()
 
     @classmethod
     def from_json(cls, text: bytes) -> Self | None:
-        """What `to_json` wrote, or None for the study.json of an older version.
+        """The manifest that `to_json` wrote, or None for the study.json of an older version.
 
         Raises:
             ValueError, TypeError, KeyError, AttributeError: the text is neither.
@@ -117,7 +117,7 @@ def digest(value: Any) -> str:
 def layout_digests(layouts: Layouts, vehicle: Mapping[str, Any]) -> dict[int, str]:
     """Digest of each layout by its id: the obstacles, and all else that a flight depends on except the solver.
 
-    vehicle  `model.vehicle` of the resolved configuration; layouts override it where they say more. The best
+    vehicle  `model.vehicle` of the resolved configuration; layouts override it where they hold values. The best
              known cost doesn't count.
     """
     model = {key: value for key, value in vehicle.items() if key not in (*OVERRULED, "name")}

@@ -1,4 +1,4 @@
-"""One table from the trials of many runs, never mixing under one name what differs.
+"""One table from the trials of many runs, in which different solvers and layouts never share a name.
 
 A layout is known by its digest and a solver by the digest of its settings, both columns of a study's trials. Runs of
 older versions have neither: they are distinguished by their configurations and results alone.
@@ -22,9 +22,9 @@ from torchgco.experiments.success import judged, sound
 from torchgco.experiments.variants import UNKNOWN, labels, task_of_runs
 
 REPEATED = "repeated"  # in the attributes of a merged table: rows left out because another run has the same flight
-OLDER = "older"  # and the folders of runs without digests
+OLDER = "older"  # likewise: the folders of runs without digests
 DIGESTS = ("layout_digest", "settings_digest")
-# Two runs of one flight may differ in these: in what was measured, how it was flown, and which other solvers flew.
+# Columns in which runs of one flight may differ: they depend on timing, batching and the other solvers that flew.
 INCIDENTAL = {"seconds", "batch_size", "threads", "best_cost", "best_from", "success"}
 FOLDER, VARIANT, CONFIGURATION = "_folder", "_variant", "_configuration"
 OWN = [FOLDER, VARIANT, CONFIGURATION]
@@ -33,11 +33,11 @@ OWN = [FOLDER, VARIANT, CONFIGURATION]
 def merge(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
     """All trials found in and below `folders`, as one table with the columns of a study.
 
-    - Keys of scenario and vehicle in which runs of one (scenario, model) differ become columns, named as they are
-      typed: `scenario.num_obstacles`. Runs that flew other layouts although no key says so get their folder in a
+    - Keys of scenario and vehicle in which runs of one (scenario, model) differ become columns, named as on the
+      command line: `scenario.num_obstacles`. Runs that flew other layouts without such a key get their folder in a
       column `hydra.run.dir`.
-    - A solver that flew under several settings, versions or devices has a name for each, with what differs:
-      "gco [max_outer_iterations=10]". Seeds don't count: other seeds are more trials of the same thing.
+    - A solver that flew under several settings, versions or devices has a name for each, with the differing settings:
+      "gco [max_outer_iterations=10]". Seeds don't count: other seeds are further trials of the same solver.
     - A flight that several runs hold counts once, as the first run has it.
     - Best costs are those of the merged table: success is judged again where layouts have no best cost in their file.
 
@@ -45,8 +45,8 @@ def merge(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
     folders of runs without digests. Of those, different results for one trial get the run's folder as label.
 
     Raises:
-        InputError: a folder that isn't there, folders without trials, a damaged file, and rows with different content
-            for one flight.
+        InputError: a missing folder, folders without trials, a damaged file, and rows with different content for one
+            flight.
     """
     runs = find_runs(folders)
     settings = {digest(held): held for run in runs for held in run.solvers.values()}
@@ -109,7 +109,7 @@ def _of_older_runs(group: pd.DataFrame, content: list[str]) -> pd.DataFrame:
     disputed = rows[rows.duplicated(ROW, keep=False)]
     if disputed.empty:
         return rows
-    # Labelled as a whole: left under the bare name, a run's other rows would pass for all there is.
+    # All rows get a label: under the bare name, a run's undisputed rows would look like the whole run.
     rows = group.drop_duplicates([*content, CONFIGURATION])
     same = rows[rows.duplicated([*ROW, CONFIGURATION], keep=False)]
     if len(same) or (disputed[CONFIGURATION] == "").any():
@@ -132,7 +132,7 @@ def _named(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _short(folders: Iterable[str]) -> dict[str, str]:
-    """A short name for each folder, without what they have in common."""
+    """A short name for each folder, without their common part."""
     names = list(folders)
     common = os.path.commonpath(names)
     return {name: Path(name).name if name == common else os.path.relpath(name, common) for name in names}
@@ -152,7 +152,7 @@ def _dispute(rows: pd.DataFrame, content: list[str]) -> InputError:
 
 
 def _judged_together(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows with success against one best cost per layout: its file's, else the best of all that flew it."""
+    """The rows with success against one best cost per layout: its file's, else the best of all solvers that flew it."""
     if "best_from" not in rows.columns:
         return rows
     new = rows[rows["layout_digest"].notna() & rows["settings_digest"].notna()]

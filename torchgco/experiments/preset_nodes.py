@@ -1,4 +1,4 @@
-"""The presets as nodes of Hydra's configuration store: group `preset`, for conf/solver to name.
+"""The presets as nodes of Hydra's configuration store: group `preset`, which conf/solver refers to.
 
 The values are those of `torchgco.presets`. An option that differs between the plane and space becomes an interpolation
 that chooses by `model.dimension`.

@@ -1,8 +1,8 @@
 """The folder of a study: shards while it runs, tables and arrays when it is done.
 
 Every file is moved to its place whole (`files.write`), so that a study killed at any moment leaves whole files and a
-second start resumes from them. What is read again is checked against the study's manifest first: a damaged or foreign
-file is named, and redone with `study.repair=true`.
+second start resumes from them. Files are checked against the study's manifest when they are read again: a damaged or
+foreign file is named in an error, and redone with `study.repair=true`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Save = Callable[[IO[bytes]], Any]
 
 @dataclass(frozen=True)
 class Records:
-    """One study's folder; with `repair`, what is damaged in it is dropped and redone."""
+    """One study's folder; with `repair`, damaged files are dropped and redone."""
 
     folder: Path
     manifest: Manifest
@@ -72,10 +72,10 @@ class Records:
         write(path, lambda file: file.write(self.manifest.to_json()))
 
     def finished(self, layouts: Layouts) -> bool:
-        """Whether all files of the study are there, whole.
+        """Whether all files of the study are present and undamaged.
 
         Raises:
-            InputError: one is damaged or missing. With `repair`, `layouts.npz` is written again, and for any other
+            InputError: a file is damaged or missing. With `repair`, `layouts.npz` is written again, and for any other
                 file the study counts as unfinished.
         """
         path = self.folder / DONE
@@ -95,7 +95,7 @@ class Records:
         return True
 
     def missing(self, solver: str) -> list[int]:
-        """Ids of the layouts that a solver has not flown yet.
+        """Ids of the layouts that a solver hasn't flown.
 
         Raises:
             InputError: a shard is damaged or isn't of this study; with `repair` it is removed.
@@ -127,7 +127,7 @@ class Records:
         write(path, _arrays({"U": U, "rows": np.array(columns)}))
 
     def flown(self, solver: str) -> Flown:
-        """All that `keep` kept of a solver, by layout, however it was cut into shards.
+        """All results of a solver that `keep` wrote, in the order of the layouts.
 
         Raises:
             InputError: a shard is damaged or isn't of this study.
@@ -148,7 +148,7 @@ class Records:
     def replace(self, trials: pd.DataFrame, layouts: Layouts) -> None:
         """Put other trials and layouts in the place of a finished study's."""
         new = {TRIALS: _bytes(_table(trials)), LAYOUTS: _bytes(_arrays(layouts.arrays()))}
-        # Both contents count as whole until `close`: a stop in between damages nothing.
+        # Old and new content both count as whole until `close`: a stop in between damages nothing.
         sums = self._checksums()
         both = {name: [*held, sha256(new[name]).hexdigest()] if name in new else held for name, held in sums.items()}
         write(self.folder / DONE, _json(both))
@@ -167,7 +167,7 @@ class Records:
         return sorted(path for path in self.folder.glob("shards/*.npz") if name.fullmatch(path.name))
 
     def _read(self, path: Path, solver: str) -> Flown:
-        """A shard's rows and controls; InputError where it is damaged, or holds anything but what its name says."""
+        """A shard's rows and controls; InputError where it is damaged, or doesn't match its name or the study."""
         rows, U = read_shard(path)
         first, last = map(int, path.stem.split("-")[-2:])
         numbers = list(range(first, last + 1))
@@ -181,7 +181,7 @@ class Records:
         return rows, U
 
     def _checksums(self) -> dict[str, list[str]]:
-        """By file, the checksums under which it is whole; with `repair`, none where that isn't known."""
+        """The valid checksums of each file; with `repair`, an empty dict if they can't be read."""
         try:
             sums = read_checksums(self.folder / DONE)
             if sums.keys() != set(FILES):
@@ -198,7 +198,7 @@ class Records:
         for path in [self.folder / TRIALS, *self.folder.glob("shards/*.npz")]:
             try:
                 rows = pd.read_parquet(path) if path.name == TRIALS else read_shard(path)[0]
-            except Exception:  # unreadable, whatever the reader makes of it: to be redone
+            except Exception:  # unreadable: to be redone
                 continue
             allowed = {"solver": wanted.keys(), "settings_digest": wanted.values()}
             allowed |= {name: [value] for name, value in self.manifest.constants.items()}
@@ -221,7 +221,7 @@ def read_manifest(path: Path) -> Manifest | None:
 
 
 def read_checksums(path: Path) -> dict[str, list[str]]:
-    """By file, the checksums under which it is whole; none for a study of an older version, whose mark is empty."""
+    """The valid checksums of each file; an empty dict for a study of an older version, whose mark is empty."""
     try:
         text = path.read_bytes()
         sums = json.loads(text) if text else {}

@@ -1,4 +1,4 @@
-"""From the files of finished studies to what a person reads: a table, `summary.csv` and figures.
+"""Reports on finished studies: a table, `summary.csv` and figures.
 
 `torchgco-report DIR [DIR ...]` merges every `trials.parquet` below the folders and reports on all of them
 together.
@@ -31,7 +31,7 @@ from torchgco.scenarios.layouts import Layouts
 __all__ = ["compare", "format_table", "main", "merge", "write_report"]
 
 Arrays = Mapping[str, np.ndarray]
-# X (L, N+1, n) by solver, or what makes them of the arrays in layouts.npz and in solutions.npz.
+# X (L, N+1, n) by solver, or a function that makes them from the arrays in layouts.npz and in solutions.npz.
 Trajectories = Arrays | Callable[[Arrays, Arrays], Arrays]
 
 
@@ -39,7 +39,7 @@ def compare(trials: pd.DataFrame) -> pd.DataFrame:
     """For each task the solver that comes first, the one under study, against every other.
 
     Where it flew in several variants ("gco [...]"), each of them is compared with all that follow. Columns as
-    `paired_table` has them; no rows where a solver flew alone.
+    `paired_table` has them; no rows for a task that one solver flew.
     """
     tables = []
     for _, task in trials.groupby(task_columns(trials), sort=False, dropna=False):
@@ -59,8 +59,8 @@ def write_report(folder: str | os.PathLike[str], trajectories: Trajectories | No
     """Write `summary.csv` and `figures/*.png` next to the `trials.parquet` in a folder, and return the table.
 
     trajectories  states for the picture of the layouts, which needs `layouts.npz` too: X (L, N+1, n) by
-                  solver, row by row as in that file; or a function (layouts, solutions) -> that, called with
-                  the arrays of the two files (`solutions` is empty without `solutions.npz`). None: no such
+                  solver, in the order of that file; or a function of (layouts, solutions), the arrays of the two
+                  files, that returns this (`solutions` is empty without `solutions.npz`). None: no such
                   picture.
 
     Raises InputError if the table is missing, unreadable or empty, and where the trajectories don't fit the
@@ -102,8 +102,8 @@ def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
 
     summary, paired  as `summarise` and `paired_table` return them; `paired` may have no rows
 
-    A rate reads "30/32 94 % [80, 98]": attained of defined, and the 95 % Wilson interval. "-" stands for what
-    isn't defined. Costs are medians, over the trials that reached the goal and over all that are finite.
+    A rate reads "30/32 94 % [80, 98]": attained of defined, and the 95 % Wilson interval. "-" stands for an
+    undefined value. Costs are medians, over the trials that reached the goal and over all that are finite.
     """
     blocks = []
     for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
@@ -190,7 +190,7 @@ def _align(rows: Sequence[Sequence[str]], left: int) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """`torchgco-report`: merge, print and write. Returns the exit code, 2 for input that is at fault."""
+    """`torchgco-report`: merge, print and write. Returns the exit code, 2 for malformed input."""
     parser = argparse.ArgumentParser(prog="torchgco-report", description="One report on many studies.")
     parser.add_argument("folders", nargs="+", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")

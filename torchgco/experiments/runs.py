@@ -25,7 +25,7 @@ ROW = [*PAIR, "solver"]
 
 @dataclass(frozen=True)
 class Run:
-    """One table of trials with what is known of its origin.
+    """One table of trials with its known origin.
 
     configuration  of the study, from its study.json, else from `.hydra/`; empty where there is neither
     solvers        resolved settings by name; empty for a run of an older version
@@ -43,7 +43,7 @@ def find_runs(folders: Iterable[str | os.PathLike[str]]) -> list[Run]:
     Tables that a merge wrote are passed over below a folder, and read where the folder itself is given.
 
     Raises:
-        InputError: a folder that isn't there, folders without trials, a damaged file.
+        InputError: a missing folder, folders without trials, a damaged file.
     """
     given = [Path(folder) for folder in folders]
     tables = {path.resolve(): (path.parent, trials) for path, trials in _tables(given)}
@@ -81,7 +81,7 @@ def is_merged(trials: pd.DataFrame) -> bool:
 def _tables(folders: list[Path]) -> Iterator[tuple[Path, pd.DataFrame]]:
     for folder in folders:
         if not folder.is_dir():
-            raise InputError("folders", "a folder that is there", folder)
+            raise InputError("folders", "an existing folder", folder)
         for path in sorted(folder.rglob(TRIALS)):
             trials = read_trials(path)
             if path.parent == folder or not is_merged(trials):

@@ -1,4 +1,4 @@
-"""Honest counting: rates with their intervals, and paired comparisons, from a table of trials.
+"""Rates with their intervals, and paired comparisons, counted from a table of trials.
 
 A trial is one solver on one layout, a row of `trials.parquet`. Nothing is left out of a count silently: a trial
 whose start was invalid is a failure, an outcome that isn't defined is subtracted from a denominator that
@@ -30,11 +30,11 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class PairedResult:
-    """Two solvers on the same trials, counted by who attained the outcome.
+    """Two solvers on the same trials, counted by which of them attained the outcome.
 
     n              trials in which both solvers flew and the outcome is defined for both
     both, only_a, only_b, neither
-                   how many of those n were attained by both, by one alone, by none
+                   how many of the n trials were attained by both, by one only, by neither
     difference     rate of a minus rate of b over the n trials, nan where n is 0
     p_value        exact McNemar, two-sided: a fair coin for the trials that only one of the two attained
     undefined      trials that both flew, left out because the outcome isn't defined
@@ -58,7 +58,7 @@ class PairedResult:
 def task_columns(table: pd.DataFrame) -> list[str]:
     """The columns that distinguish tasks: scenario, model, and the variables swept in a merged table.
 
-    The latter are named by their keys in the configuration, with a dot, as no column of a study is.
+    The latter are named by their keys in the configuration, with a dot, which no column of a study has.
     """
     return [*TASK, *(str(name) for name in table.columns if "." in str(name))]
 
@@ -190,13 +190,13 @@ def _pairs(trials: pd.DataFrame, solver: str) -> Iterator[dict[str, object]]:
 
 
 def _pair(trials: pd.DataFrame) -> list[str]:
-    """Columns that name a trial whatever the solver."""
+    """Columns that identify a trial for any solver."""
     digest = ["layout_digest"] if "layout_digest" in trials.columns else []
     return [*task_columns(trials), *PAIR[len(TASK) :], *digest]
 
 
 def _by_trial(trials: pd.DataFrame, solver: str, outcome: str) -> pd.DataFrame:
-    """What names a trial, and `hit`, the outcome there, of one solver."""
+    """The columns that identify a trial, and `hit`, one solver's outcome there."""
     group = trials[trials["solver"] == solver]
     if group.empty:
         raise InputError("solver", f"one of {', '.join(trials['solver'].unique())}", solver)

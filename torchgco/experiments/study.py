@@ -28,7 +28,7 @@ from torchgco.rollout import open_loop
 from torchgco.scenarios import Layouts
 from torchgco.status import Status
 
-# How the configuration of a baseline is found: its name in, the whole configuration with that solver out.
+# From a baseline's name to the whole configuration with that solver.
 Recompose = Callable[[str], DictConfig]
 
 
@@ -41,7 +41,7 @@ def run_study(
 ) -> int:
     """Fly, judge, write and report; returns how many trials could be flown at all.
 
-    Started again on the same folder it resumes where it was stopped; finished, it only shows the table.
+    Started again on the same folder it resumes where it was stopped; a finished study only shows its table.
 
     Args:
         recompose: makes the configuration of a baseline.
@@ -70,7 +70,7 @@ def run_study(
 
 @dataclass(frozen=True)
 class _Study:
-    """All that a configuration says, checked and built."""
+    """A configuration, checked and built."""
 
     setup: Setup
     plan: Plan
@@ -101,7 +101,7 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
 def _baselines(config: DictConfig) -> Sequence[str]:
     names = config.study.baselines
     if isinstance(names, str) or not all(isinstance(name, str) for name in names or ()):
-        raise InputError("study.baselines", "a list of solver names, as [al_ilqr]", repr(names))
+        raise InputError("study.baselines", "a list of solver names, such as [al_ilqr]", repr(names))
     return list(names or ())
 
 

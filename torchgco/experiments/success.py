@@ -21,7 +21,7 @@ def judged(rows: pd.DataFrame, best: pd.Series, rivals: pd.Series, layout: Seque
     Args:
         rows: with columns cost and sound.
         best: best cost of the layout's file, by row; NaN where there is none.
-        rivals: by row, whether several solvers flew the layout: then the cheapest sound row stands in for a file's.
+        rivals: by row, whether several solvers flew the layout; then the cheapest sound row replaces a missing `best`.
         layout: columns that name a layout.
 
     Where no best cost is known (a single solver, none in the file) success is NA.

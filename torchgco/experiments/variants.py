@@ -1,4 +1,4 @@
-"""What runs differ in: variables swept over scenarios and vehicles, and the settings of solvers."""
+"""Differences between runs: variables swept over scenarios and vehicles, and the settings of solvers."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torchgco.experiments.runs import Run
 from torchgco.experiments.statistics import TASK
 
 UNKNOWN = ""  # variant of a solver in a run of an older version
-SWEPT = ("scenario.", "model.vehicle.")  # of keys that define the problems; `model` has keys of solvers, too
-NAMES = ("scenario.name", "scenario._target_", "model.vehicle.name", "model.vehicle._target_")  # columns say these
+SWEPT = ("scenario.", "model.vehicle.")  # prefixes of keys that define the problems; `model` has keys for solvers, too
+NAMES = ("scenario.name", "scenario._target_", "model.vehicle.name", "model.vehicle._target_")  # have columns
 FILE = "scenario.path"
 RUN = "hydra.run.dir"
 MOST = 3  # settings named in a label
@@ -24,8 +24,8 @@ MOST = 3  # settings named in a label
 def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
     """For each run the columns that its rows get: the swept variables of each row's (scenario, model).
 
-    A key is swept where all runs of a (scenario, model) have it, with different values. `scenario.path` is not, as
-    long as the layouts agree. Runs that differ in their layouts without such a key are distinguished by their folder.
+    A key is swept where all runs of a (scenario, model) have it, with different values. `scenario.path` is left
+    out while the layouts agree. Runs that differ in their layouts without such a key are distinguished by their folder.
     """
     tasks = [list(run.trials[TASK].drop_duplicates().itertuples(index=False, name=None)) for run in runs]
     chosen: dict[tuple[int, Any], dict[str, Any]] = {}
@@ -118,8 +118,8 @@ def _text(value: Any) -> str:
 def labels(variants: Sequence[str]) -> dict[str, str]:
     """A label for each variant of a solver (settings by key, as JSON): the settings that differ, with their values.
 
-    Where the versions alone tell the variants apart, the label is the version. Of many settings the first are named,
-    and a number keeps the labels apart.
+    Where the versions alone distinguish the variants, the label is the version. Of many settings the first are named,
+    and a number makes equal labels unique.
     """
     held = {variant: json.loads(variant) for variant in variants}
     keys = dict.fromkeys(key for settings in held.values() for key in settings)

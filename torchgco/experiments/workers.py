@@ -1,4 +1,4 @@
-"""Work for several processes that survives the death of some of them."""
+"""Work in several processes that survives the death of some of them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from torchgco.errors import InputError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-POLL = 1.0  # seconds after which an interrupt is noticed that Python dropped
-NEW_POOLS = 3  # that take the place of broken ones, before giving up
+POLL = 1.0  # seconds until an interrupt that Python dropped is noticed
+NEW_POOLS = 3  # replacements of broken pools before giving up
 
 
 def run_all(
@@ -96,7 +96,7 @@ def _run_pool(
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Ctrl-C waits until the end of the block. Processes started in it never see it: it is the parent's to answer."""
+    """Ctrl-C waits until the end of the block. Processes started in it never see it: the parent handles it."""
     held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -106,7 +106,7 @@ def _interrupts_held() -> Iterator[None]:
 
 @contextmanager
 def _interrupts_noted() -> Iterator[list[int]]:
-    """A list that is empty until Ctrl-C: Python drops the exception where it is raised within a destructor."""
+    """A list that is empty until Ctrl-C: Python drops an exception raised within a destructor."""
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield noted
@@ -129,7 +129,7 @@ def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...]) -> Non
 
 
 def _end_with_parent() -> None:
-    """A worker whose parent was killed would wait for its next job for ever."""
+    """End a worker whose parent was killed: it would wait for its next job forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

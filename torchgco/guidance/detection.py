@@ -21,8 +21,8 @@ def caught_knots(
 ) -> Tensor:
     """J (B, N+1) bool: knots with |F_k| >= 2, the given start and the unguided end left out.
 
-    One active sphere is left to the gradient, as the gradients of two can cancel. But a sphere met dead-centre has no
-    gradient to the side: from the outer iteration `single_contact_after` on, one is enough.
+    A single active sphere is left to its gradient; the gradients of two can cancel. But a sphere hit at its centre has
+    no gradient to the side: from the outer iteration `single_contact_after` on, a single one counts.
 
     Args:
         outer: outer iterations of each problem so far (B,).

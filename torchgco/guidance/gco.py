@@ -21,26 +21,26 @@ from torchgco.solvers.contracts import Advice
 from torchgco.tree import put, take
 
 REACH = 0.02  # r_guide as a share of the distance to be flown; the paper's vehicles have radii of 0.017 and 0.03 of it
-DIVERGED = 1e3  # times the cost of staying at the start: a sample mean that costs more leads nowhere
+DIVERGED = 1e3  # times the cost of staying at the start: a costlier sample mean is not used
 
 
 @dataclass(frozen=True)
 class GCO:
     """Where a solved trajectory is caught between obstacles, attract it to a region that MPPI found.
 
-    r_guide is the vehicle's radius, or without spheres `REACH` times the distance from start to goal (to the farthest
-    knot where the cost names no goal).
+    r_guide is the vehicle's radius, or without spheres and boxes `REACH` times the distance from start to goal
+    (to the farthest knot where the problem has no goal).
 
     Args:
-        sampler: finds a trajectory to pass the obstacles.
+        sampler: finds a trajectory past the obstacles.
         initial_penalty, penalty_growth: mu_gco and its factor nu per outer iteration; with nu above the solver's eta
             the guide prevails.
         start_from_sample: where the sampled trajectory touches nothing, it replaces the iterate instead of attracting
             it (not in the paper).
         sample_from_rest: sample around the cost's reference controls (the vehicle at rest), not around the caught
             trajectory (not in the paper).
-        single_contact_after: from this outer iteration on, a single active sphere counts as caught, too; None: never,
-            as in the paper.
+        single_contact_after: from this outer iteration on, a knot inside one obstacle counts as caught, too; None:
+            never, as in the paper.
 
     Raises:
         InputError: a field out of its range; on `suited`, a covariance that doesn't fit the controls.

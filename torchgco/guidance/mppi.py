@@ -20,7 +20,7 @@ from torchgco.shapes import check_shape, tensor
 
 CHUNK = 8192  # samples rolled out together: memory stays bounded
 COLLISION_PENALTY = 1e8  # rho_mp, per knot and obstacle touched
-OPEN = 1e10  # a range of controls from which on it counts as unbounded
+OPEN = 1e10  # a range of controls at least this wide counts as unbounded
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,14 @@ class MPPI:
         S   = J_var + rho_mp (collisions) + sum_k lambda u' Sigma^-1 eps,   w = softmax(-(S - min S)/lambda)
 
     One round with white noise is Algorithm 3. Beyond the paper, rounds can follow each other with smoother and
-    shrinking noise, and with a temperature that follows the spread of the better samples.
+    shrinking noise, and with a temperature that follows the cost spread of the best samples.
 
     Args:
         samples: S per problem and round.
         covariance: diagonal of Sigma (m,), or one number for all controls; in squared units of u. None: from `spread`.
-        spread: standard deviation as a share of the range between the control bounds, and 1 where there are none; where
-            `covariance` is None.
-        temperature: lambda, in units of cost.
+        spread: standard deviation as a share of the range between the control bounds, and 1 where there are none; used
+            if `covariance` is None.
+        temperature: lambda, in the units of the problem's cost.
         saturation: "bounds" clamps samples to the problem's control bounds; "symmetric" to [-upper, upper], wider
             than the bounds on purpose (planar study); None leaves them.
         rounds: number of rounds; each draws around the mean of the round before.
@@ -92,7 +92,7 @@ class MPPI:
         self._sigma(problem)
 
     def improve(self, problem: Problem, U: Tensor, key: DrawKey) -> tuple[Tensor, Tensor]:
-        """X (B, N+1, n) and U (B, N, m): the mean of the last round's samples, the first drawn around U."""
+        """The weighted mean of the last round's samples, X (B, N+1, n) and U (B, N, m); round 1 draws around U."""
         dtype = U.dtype if self.dtype is None else getattr(torch, self.dtype)
         sampler = sampler_of(problem, dtype)
         if sampler is not None:
@@ -102,7 +102,7 @@ class MPPI:
         return open_loop(problem, plan), plan
 
     def _native(self, problem: Problem, key: DrawKey) -> Rounds:
-        """The same for the native library."""
+        """The rounds as the native library takes them."""
         bounds = self._bounds(problem)
         if bounds is None:
             wide = problem.x0.new_full((1, 1, problem.m), torch.inf)
@@ -134,7 +134,7 @@ class MPPI:
             scores = [self.scores(problem, fly(problem, mean, draws(block), bounds)) for block in blocks]
             weights = self._weights(torch.cat(scores, dim=-1)).to(U.dtype)
             new = torch.zeros_like(mean)
-            for block in blocks:  # drawn again rather than kept: memory stays bounded whatever S
+            for block in blocks:  # drawn again rather than kept: bounds the memory for any S
                 new = new + average(draw(mean, draws(block), bounds), weights[:, block.start : block.stop])
             mean = new
         return mean.squeeze(2).transpose(0, 1)
@@ -171,7 +171,7 @@ class MPPI:
         return torch.where(torch.isfinite(S), S, torch.finfo(S.dtype).max)
 
     def _bounds(self, problem: Problem) -> tuple[Tensor, Tensor] | None:
-        """What samples are clamped to as `saturation` says (line 7): two (B|1, 1, m)."""
+        """Limits of the samples as `saturation` says (Algorithm 3, line 7): two tensors (B|1, 1, m)."""
         if self.saturation is None:
             return None
         for constraint in problem.constraints:
@@ -181,7 +181,7 @@ class MPPI:
         return None
 
     def _sigma(self, problem: Problem) -> Tensor:
-        """Diagonal of Sigma, (m, B|1, 1)."""
+        """Diagonal of Sigma, (B|1, 1, m)."""
         if self.covariance is None:
             return self._from_bounds(problem)
         sigma = tensor(self.covariance, "mppi.covariance", problem.x0)

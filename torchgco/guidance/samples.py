@@ -32,11 +32,11 @@ class Noise:
 
 @dataclass(frozen=True)
 class Flight:
-    """Samples, rolled out."""
+    """Rolled-out samples."""
 
     V: Tensor  # (N, B, S, m) controls
-    x: Tensor  # (B, S, n) where they end
-    cost: Tensor  # (B, S) of all stages
+    x: Tensor  # (B, S, n) final states
+    cost: Tensor  # (B, S) of all stages, without the terminal cost
     hits: Tensor  # (B, S) obstacles touched, counted at every knot
     likelihood: Tensor  # (B, S): sum_k u' Sigma^-1 eps, zero for smooth noise
 
@@ -48,13 +48,13 @@ def draw(mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tensor] | None) -> Te
 
 
 def fly(problem: Problem, mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tensor] | None) -> Flight:
-    """The same samples rolled out (Algorithm 3, lines 5-11)."""
+    """The samples of `draw`, rolled out (Algorithm 3, lines 5-11)."""
     V = draw(mean, noise, bounds)
     x = problem.x0.unsqueeze(1).expand(-1, V.shape[2], -1)
     cost, hits = x.new_zeros(2, *x.shape[:2]).unbind(0)
     for k, u in enumerate(V.unbind(0)):
         cost = cost + problem.cost.stage(x, u, k)
-        x = problem.dynamics.step(x, u).contiguous()  # sums over components then add in one order, whatever the batch
+        x = problem.dynamics.step(x, u).contiguous()  # so that sums over components add in one order for any batch
         for constraint in problem.geometric:
             if constraint.holds_at(k + 1):
                 hits = hits + (constraint.at(x, k + 1) >= 0).sum(-1)

@@ -1,4 +1,4 @@
-"""Whether a problem can be sampled, found out before anything is solved.
+"""Whether a problem can be sampled, checked before anything is solved.
 
 MPPI evaluates a problem in forms that the solver itself never needs: many samples at a time, in single precision. A
 user's own functions may fail there. Then the sampler falls back to the problem's own precision, or is left out.
@@ -21,7 +21,7 @@ SAMPLES = 2  # of a trial
 
 
 def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None, str | None]:
-    """The sampler that a problem can have, or None, and a sentence on the loss; None where there is none.
+    """The usable sampler, or None; and a sentence on what is lost, or None.
 
     Raises:
         InputError: a covariance that doesn't fit the controls.
@@ -40,14 +40,14 @@ def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None,
 
 
 def suited_guide(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None, str | None]:
-    """The same for a sampler that guides a solver, which needs positions to compare."""
+    """`suited_sampler` for a sampler that guides a solver, which needs a position."""
     if sampler is not None and problem.dynamics.position is None:
         return None, "the dynamics have no position"
     return suited_sampler(sampler, problem)
 
 
 def warn_of_losses(losses: list[str], solved_without: bool) -> None:
-    """One GuidanceWarning that names the parts of guidance that a problem can't have; none where it can have all."""
+    """One GuidanceWarning that names the parts of guidance that can't serve; none where all can."""
     if losses:
         effect = "solved without guidance" if solved_without else "guided in part"
         warnings.warn(f"{effect}: {'; '.join(dict.fromkeys(losses))}", GuidanceWarning, stacklevel=6)
@@ -56,7 +56,7 @@ def warn_of_losses(losses: list[str], solved_without: bool) -> None:
 def _tried(
     trial: Callable[[Problem], None], problem: Problem, dtype: str | None
 ) -> tuple[torch.dtype, torch.dtype, str | None]:
-    """The problem's own precision, the one that is asked for, and why the trial fails there."""
+    """The problem's own precision, the requested one, and why the trial fails in the latter."""
     own = problem.x0.dtype
     wanted = own if dtype is None else getattr(torch, dtype)
     return own, wanted, failure(trial, problem, wanted)

@@ -1,10 +1,10 @@
-/* Boxes that may be turned, as obstacles: the rows of a knot, where a problem has such (constraints/boxes.py). */
+/* Boxes that may be turned, as obstacles: the rows of a knot, for problems with boxes (constraints/boxes.py). */
 
-/* Numbers of a box: its centre (DIM), the directions of its sides (DIM, DIM), half of them (DIM), r_veh, and the factor
-   that turns a distance into a square of lengths, 0 where the box is absent. */
+/* Numbers of a box: its centre (DIM), the directions of its sides (DIM, DIM), half their lengths (DIM), r_veh, and the
+   factor that turns a distance into a squared length, 0 where the box is absent. */
 #define BOX_NUMBERS (DIM * DIM + 2 * DIM + 2)
 
-/* Row j at knot k, and its slopes by the position (DIM) where they are asked for; an absent box is c = -1 everywhere. */
+/* Row j at a knot, and its derivatives by position (DIM) unless `slopes` is NULL; an absent box is c = -1. */
 static inline V solid(const Rows *rows, int64_t j, const V *x, V *slopes) {
     const V *o = rows->bound + j * BOX_NUMBERS, *axes = o + DIM, *half = axes + DIM * DIM, *radius = half + DIM;
     V factor = radius[1], zero = SET(0.0), local[DIM], away[DIM], square = zero, deepest = zero;

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 
 from torchgco.native import store
 
-# NaN and infinity carry meaning here, so no -ffast-math: only what doesn't touch them.
+# NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact.
 FLAGS = ("-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
 # No warning where a vector type is wider than the registers: within one library that does no harm.
 _QUIET = ("-Wno-psabi",)
@@ -56,15 +56,15 @@ def build(source: str, flags: Sequence[str] = ()) -> ctypes.CDLL:
 
     Args:
         source: one file of C11.
-        flags: further ones. They come last, so that -O2 here replaces the -O3 of `FLAGS`.
+        flags: further flags. They come last, so that -O2 here replaces the -O3 of `FLAGS`.
 
     Raises:
-        NativeError: there is no compiler, it refuses the source (its first errors are named), or what it makes can't be
-            loaded.
+        NativeError: there is no compiler, it refuses the source (its first errors are named), or the library can't be
+            written or loaded.
     """
     compiler = find_compiler()
     known = (source, tuple(flags), compiler)
-    # No lock: two threads that compile the same do no harm, and a lock held across a fork would.
+    # No lock: two threads that compile the same source do no harm, and a lock held across a fork would.
     if known not in _loaded:
         if compiler is None:
             raise NativeError(
@@ -83,7 +83,7 @@ def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDL
     if kept is not None:
         try:
             return ctypes.CDLL(str(kept))
-        except OSError:  # removed meanwhile, or in a folder that nothing may be run from
+        except OSError:  # removed meanwhile, or in a folder mounted without execution rights
             pass
     try:
         with TemporaryDirectory(prefix="torchgco-") as room:
@@ -150,7 +150,7 @@ def _candidates(named: str | None, usual: str | None) -> Iterator[list[str]]:
 
 @functools.cache
 def _processor() -> str:
-    """What -march=native depends on."""
+    """The properties of this processor that -march=native depends on."""
     words = {platform.machine(), platform.processor()}
     try:
         lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()

@@ -20,7 +20,7 @@ from torchgco.tracing import Traced, own_tensors
 
 @dataclass(frozen=True)
 class CostSource:
-    """The code for traced.c, described there; costs of one problem are these times a factor."""
+    """The generated code that traced.c describes; a problem's cost is this cost times a factor."""
 
     stage: KnotSource
     last: KnotSource
@@ -32,7 +32,7 @@ class CostSource:
 
 def unscaled(problem: Problem) -> tuple[Cost, Tensor]:
     """The cost of a problem without the factors of a ScaledCost, and their product (B,)."""
-    # A cost that scales itself may have another form once it is scaled, so it always is here, if only by 1.
+    # A cost that overrides `scaled` may have another form once scaled, so it is always scaled here, if only by 1.
     factor = problem.x0.new_ones(problem.B)
     cost = problem.cost.scaled(factor)
     while type(cost) is ScaledCost:
@@ -41,7 +41,7 @@ def unscaled(problem: Problem) -> tuple[Cost, Tensor]:
 
 
 def trace_cost(problem: Problem) -> CostSource:
-    """The C of a problem's cost, from the cache folder where it was made before.
+    """The C of a problem's cost, taken from the cache folder if it was made before.
 
     Derivatives are exact, or those of the cost's own `expand`.
 
@@ -69,7 +69,7 @@ def cost_numbers(problem: Problem, source: CostSource) -> tuple[Tensor, Tensor, 
 
 
 def spans_of_cost(problem: Problem) -> tuple[Span, Span]:
-    """Stages and last knot, traced: the value, followed by the block (s, s) of an `expand` that the cost brings."""
+    """Stages and last knot, traced: the value, followed by the block (s, s) of the cost's own `expand`, if any."""
     (cost, _), N, n, m = unscaled(problem), problem.N, problem.n, problem.m
     own = own_tensors(cost)
 
@@ -139,13 +139,13 @@ def _derivatives(knot: Knot) -> tuple[Any, Any]:
     import casadi as ca
 
     z, forward = ca.vertcat(knot.x, knot.u), {"allow_reverse": False}
-    # Forward only: backwards, a NaN of the branch not taken would come through as 0 * NaN.
+    # Forward mode only: in reverse mode, a NaN of the branch not taken would come through as 0 * NaN.
     gradient = ca.jacobian(knot.rows[0], z, forward).T
     return gradient, ca.jacobian(gradient, z, forward)
 
 
 def _blocks(knot: Knot, s: int) -> tuple[Any, Any]:
-    """The same from a block (s, s) of order [x, 1, u] that stands, row by row, after the value."""
+    """Gradient and Hessian from a block (s, s) in the order [x, 1, u] that follows the value, row by row."""
     import casadi as ca
 
     n = knot.x.numel()

@@ -1,4 +1,4 @@
-"""Native kernels where they serve, PyTorch's everywhere else: one choice for a form of problems, explained once."""
+"""Native kernels where they can be used, PyTorch's elsewhere: one choice and one warning per form of problems."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from torchgco.native.engine import Engine, Terms
 from torchgco.native.sampler import Sampler
 from torchgco.problem import Problem
 
-NUDGE = 1e-14  # share of the controls by which a rollout's sensitivity is tried out
-AMPLIFIED = 1e6  # times that: below it, different last bits don't matter
+NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
+AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
 
 
 class EagerWarning(UserWarning):
-    """Native kernels can't serve a problem; PyTorch's do, which takes longer."""
+    """Native kernels can't be used for a problem; PyTorch's are, which takes longer."""
 
 
 def engine_of(problem: Problem) -> Engine | None:
-    """The library for problems of this form, compiled at the first call; None where PyTorch's kernels serve.
+    """The library for problems of this form, compiled at the first call; None where PyTorch's kernels are used.
 
-    PyTorch's serve on a GPU, in single precision, where the process has chosen them (`kernels.use_native`), and where a
-    part can't be traced or nothing compiles, which an EagerWarning explains.
+    PyTorch's are used on a GPU, in single precision, where the process has chosen them (`kernels.use_native`), and
+    where a part can't be traced or nothing compiles, which an EagerWarning explains.
     """
     if not native() or problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
         return None
@@ -43,7 +43,7 @@ def engine_of(problem: Problem) -> Engine | None:
 
 
 def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:
-    """The library that samples for problems of this form in some precision; None where PyTorch does.
+    """The library that samples for problems of this form in precision `dtype`; None where PyTorch samples.
 
     Compiled at the first call: most solves never sample.
     """
@@ -56,7 +56,7 @@ def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:
 
 
 def cost_unit(problem: Problem) -> Tensor:
-    """`problem.cost_unit` (B,), which the native library finds where PyTorch would need autodiff for it.
+    """`problem.cost_unit` (B,), computed by the native library where PyTorch would need autodiff for it.
 
     The problem keeps it: `problem.in_cost_units()` then needs no autodiff either.
     """
@@ -76,10 +76,10 @@ def open_loop(problem: Problem, U: Tensor) -> Tensor:
 
 
 def reproducible(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """X (B, N+1, n) and U (B, N, m) such that PyTorch's rollout of U is X, from those of native kernels.
+    """X (B, N+1, n) and U (B, N, m) of native kernels, mended where PyTorch's rollout of U would not give X.
 
-    The two differ in the last bits. Where unstable dynamics amplify that, as a rollout of slightly different
-    controls shows, PyTorch tracks X with the gains K (B, N, m, n), and the controls of that rollout are returned.
+    The two kinds of kernels differ in the last bits. Where unstable dynamics amplify this, as a rollout of slightly
+    different controls shows, PyTorch tracks X with the gains K (B, N, m, n), and X and U of that rollout are returned.
     """
     engine = engine_of(problem)
     if engine is None:
@@ -102,5 +102,5 @@ def value(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]
 
 
 def terms_of(lagrangian: Lagrangian) -> Terms:
-    """What the Lagrangian adds to the cost, as the library takes it."""
+    """The terms that the Lagrangian adds to the cost, in the library's form."""
     return Terms(lagrangian.multipliers, lagrangian.penalty, lagrangian.phr)

@@ -1,7 +1,7 @@
 """C over vectors whose lanes are problems, from the instructions of a CasADi function of scalar expressions.
 
 A file that holds such code defines REAL (double or float) and LANES (a power of two), then PRELUDE, then the functions.
-No operation mixes lanes: a problem's bits depend on no other lane, whatever stands there.
+No operation mixes lanes: a problem's bits don't depend on the content of other lanes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def emit(name: str, function: ca.Function) -> str:
         function: of scalar expressions (SX).
 
     Raises:
-        ValueError: `function` isn't one, or holds an operation without a counterpart in C.
+        ValueError: `function` isn't an SX function, or holds an operation without a counterpart in C.
     """
     if not function.is_a("SXFunction"):
         raise ValueError(f"{name}: expected a CasADi function of scalar expressions, got {function.class_name()}")
@@ -66,7 +66,7 @@ def _statement(function: ca.Function, k: int) -> str:
 
 
 def literal(value: float) -> str:
-    """A number in C to the last bit."""
+    """A number as a literal of C, exact to the last bit."""
     if math.isfinite(value):
         return float(value).hex()
     return '__builtin_nan("")' if math.isnan(value) else f"{'-' if value < 0 else ''}__builtin_inf()"

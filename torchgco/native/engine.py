@@ -1,4 +1,4 @@
-"""iLQR in C for a batch of problems: what PyTorch holds, as the library reads it."""
+"""iLQR in C for a batch of problems: PyTorch's tensors in the form that the library reads."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from torchgco.native.source import LANES, Form
 from torchgco.penalties import GuidePath, GuideRegion, Penalty
 from torchgco.problem import Problem
 
-MOST = 128  # states and controls: matrices of a stage lie on the stack
+MOST = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Terms:
-    """What the Lagrangian adds to the cost (see Lagrangian)."""
+    """The terms that the Lagrangian adds to the cost (see Lagrangian)."""
 
     multipliers: Multipliers
     penalty: Penalty | None
@@ -61,7 +61,7 @@ class Engine:
     """The library of a form of problems.
 
     Raises:
-        InputError: a part of the problem that has no counterpart in C.
+        InputError: not float64 on a CPU, too many states and controls, or a part without a counterpart in C.
         NativeError: no compiler, or it refuses the source.
     """
 
@@ -98,7 +98,9 @@ class Engine:
     def gains(
         self, problem: Problem, X: Tensor, U: Tensor, terms: Terms, mu_r: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """G = [K d] (B, N, m, n+1) for J_var + lam'c, sums of its expected change (B,), and where the pass failed."""
+        """Gains G = [K d] (B, N, m, n+1) for J_var + lam'c, the two sums of its expected change, (B,) each, and where
+        the backward pass failed, (B,) bool; mu_r (B,) is the regularisation.
+        """
         N, m, z = problem.N, problem.m, problem.n + 1
         tensors = {"X": X.contiguous(), "U": U.contiguous(), "regularisation": mu_r.contiguous()}
         tensors |= {name: torch.zeros_like(mu_r) for name in ("cost", "merit")}
@@ -109,9 +111,9 @@ class Engine:
         return tensors["gains"], tensors["cost"], tensors["merit"], tensors["status"] != 0
 
     def expand(self, problem: Problem, X: Tensor, U: Tensor, terms: Terms | None) -> tuple[Tensor, Tensor]:
-        """Gradients (B, N+1, n+m) and Hessians (B, N+1, n+m, n+m) of L_M, or without terms of J_var.
+        """Gradients (B, N+1, n+m) and Hessians (B, N+1, n+m, n+m) of L_M; of J_var where `terms` is None.
 
-        Of the Hessians the upper triangle is filled.
+        Only the upper triangles of the Hessians are filled.
         """
         B, N, size = problem.B, problem.N, problem.n + problem.m
         tensors = {"X": X.contiguous(), "U": U.contiguous(), "slopes": X.new_empty(B, N + 1, size)}
@@ -124,7 +126,7 @@ class Engine:
         return tensors["slopes"], tensors["curvatures"]
 
     def lift(self, problem: Problem, state: dict[str, Tensor], terms: Terms, rounds: int, gain: float) -> Tensor:
-        """Up to `rounds` steps in states and controls together, in place in `state`; which found a better rollout (B,).
+        """Up to `rounds` steps in states and controls together, in place in `state`; where one gave a better rollout.
 
         Args:
             state: X, U, cost, merit, all contiguous.
@@ -145,7 +147,7 @@ class Engine:
             state: X, U, cost, merit, regularisation; inner, iterations, rung (int64): all contiguous.
 
         Returns:
-            status, converged, refused, lost (int32), and alpha and used: step length and mu_r of the last iteration.
+            status, converged, refused, lost (int32); alpha and used: step length and mu_r of the last iteration.
         """
         out = {name: _flags(problem.B) for name in FLAGS}
         out |= {name: torch.zeros(problem.B, dtype=torch.float64) for name in ("alpha", "used")}
@@ -164,7 +166,7 @@ class Engine:
         run(getattr(self.library, name), problem.B, LANES, packed)
 
     def packed(self, problem: Problem, tensors: dict[str, Tensor], terms: Terms | None = None) -> Packed:
-        """The problem as the library reads it; it keeps alive what its pointers point to."""
+        """The problem in the form that the library reads; it keeps the tensors alive that its pointers point to."""
         fixed = problem.__dict__.get("packed")
         if fixed is None:
             fixed = self._fixed(problem)
@@ -194,7 +196,7 @@ class Engine:
         return packed
 
     def _fixed(self, problem: Problem) -> tuple[Packed, Any, list[Any]]:
-        """What doesn't change from call to call: model, cost and constraints, without multipliers."""
+        """The parts that don't change from call to call: model, cost and constraints, without multipliers."""
         packed, keep, cost = Packed(), [], problem.cost
         if problem.B == 0:
             return packed, (Rows * max(1, len(problem.constraints)))(), keep
@@ -217,10 +219,10 @@ class Engine:
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> None:
-    """Call a function of a library on all problems, in whole groups, by as many threads as PyTorch has.
+    """Call a function of a library on all problems, in whole groups, by as many threads as PyTorch uses.
 
     Raises:
-        MemoryError: the library could allocate none.
+        MemoryError: the library could not allocate memory.
     """
     if count == 0:
         return

@@ -1,5 +1,5 @@
 /* iLQR (Algorithm 2) for problems side by side: the line search, and the loop that keeps the lanes filled.
-   The lanes of a problem agree with PyTorch's kernels up to rounding (tests/native). */
+   A problem's results agree with PyTorch's kernels up to rounding (tests/native). */
 
 /* Commit the trial of lane from[l] to lane l where `won`. */
 static void commit(Lanes *s, I won, const int *from, V alpha, V cost, V merit) {
@@ -41,7 +41,7 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
                 from[l] = winner < 0 ? l : winner;
                 won[l] = winner < 0 ? 0 : -1;
             }
-            /* The last rung of a problem that refuses all is in its last lane. */
+            /* Where a problem refuses all rungs, its last lane holds the last rung. */
             for (int l = e; l < e + replicas; l++) (*shortest)[l] = (*shortest)[e + replicas - 1];
         }
         if (any(won)) commit(s, won, from, alpha, cost, merit);
@@ -58,7 +58,7 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
     return done;
 }
 
-/* Returns the lanes that are done: their status, and whether they converged, were refused, or diverge. */
+/* One iteration. Returns the lanes that are done, their status, and whether they converged, were refused or diverge. */
 static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused, I *lost) {
     const Problem *p = s->of;
     V linear, squares, lowest, zero = SET(0.0), old = s->merit, shortest;
@@ -118,7 +118,7 @@ int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
     I running = SET(0.0) != SET(0.0);
     int64_t next = first;
     for (int e = 0; e < LANES; e += replicas) {
-        /* Lanes without a problem repeat the first one, so that no work is done on what isn't finite. */
+        /* Lanes without a problem repeat the first problem, so that all lanes hold finite numbers. */
         int64_t element = next < last ? next : first;
         for (int l = e; l < e + replicas; l++) {
             enter(s, l, element);

@@ -1,8 +1,8 @@
 /* The terms of one knot of the iterate: cost, constraints, guide and the model's step. */
 
-#define BLOCK 32 /* spheres looked at together: most blocks are far away */
+#define BLOCK 32 /* spheres evaluated together: most blocks are far away and add nothing */
 
-/* What a row adds to L_M. */
+/* The term that a row adds to L_M. */
 static inline V worth(const Lanes *s, int equality, V c, V lam) {
     V half = SET(0.5), mu = s->mu;
     if (equality) return (lam + half * mu * c) * c;
@@ -14,7 +14,7 @@ static inline V worth(const Lanes *s, int equality, V c, V lam) {
     return (lam + half * tgco_if(~idle, mu) * c) * c;
 }
 
-/* First and second derivative of that by c; of lam c, with the penalty's curvature, where optimality is asked for. */
+/* First and second derivative of `worth` by c; where `optimality` is set, of lam c with the penalty's curvature. */
 static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
     const Problem *p = s->of;
     V mu = s->mu;
@@ -33,7 +33,7 @@ static inline V bound(const Constraint *con, const Rows *rows, int64_t j, const 
 }
 
 #if DIM > 0
-/* Row j of spheres at knot k, and the vector to it from the centre (DIM); an absent one is c = -1 everywhere. */
+/* Row j of spheres at knot k, and the vector from the centre to the position (DIM); an absent sphere is c = -1. */
 static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V *away) {
     const V *o = rows->bound + j * DIM;
     V square = SET(0.0);

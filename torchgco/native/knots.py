@@ -1,8 +1,8 @@
 """The function of one knot, found in a traced function of whole trajectories: PyTorch code sees the shapes that it is
 written for, and C works knot by knot.
 
-What PyTorch computes from k (a reference for each knot, say) becomes the knot's own numbers; nothing else may differ
-from knot to knot.
+Values that PyTorch computes from k (a reference for each knot, say) become the knot's own numbers; nothing else may
+differ from knot to knot.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Knot:
 class KnotSource:
     """C of one knot's rows (size), and where its numbers come from.
 
-    `places` (K|1, count) are their positions in a problem's own numbers followed by the constants, of `span`.
+    `places` (K|1, count) are the numbers' positions in a problem's own numbers followed by the constants of `span`.
     """
 
     code: str
@@ -73,10 +73,10 @@ class KnotSource:
         """The numbers (B|1, K|1, count) of B problems of this form, whose own tensors are `own`.
 
         Args:
-            again: makes the span of these problems, where one is needed.
+            again: traces these problems, where a new trace is needed.
 
         Raises:
-            InputError: they have another function.
+            InputError: the problems have another function.
         """
         if self.shared is not None:
             return self.shared
@@ -91,11 +91,11 @@ class KnotSource:
 
 
 def knot_source(kind: str, span: Span, code_of: Callable[[Knot, str], str], *files: str) -> KnotSource:
-    """The C that `code_of` makes of a knot and a key, from the cache folder where it was made before.
+    """The C that `code_of` makes of a knot and a key, taken from the cache folder if it was made before.
 
     Args:
-        kind: a word of the key, for what is made.
-        files: the code depends on their texts.
+        kind: the word of the key that names the kind of code.
+        files: files on whose texts the code depends.
 
     Raises:
         InputError: an operation without a counterpart; rows that join knots, or whose operations differ between knots.
@@ -114,13 +114,13 @@ def knot_source(kind: str, span: Span, code_of: Callable[[Knot, str], str], *fil
 
 
 def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
-    """The function that all knots share, and where the numbers of each stand (K|1, count)."""
+    """The function that all knots share, and the places (K|1, count) of each knot's numbers."""
     import casadi as ca
 
     traced, count = span.traced, span.traced.count
     constants = traced.constants
     X, U = ca.SX.sym("X", span.states * span.n), ca.SX.sym("U", span.controls * span.m)
-    # Constants are symbols until it is known which differ: a 0 or 1 among them would change the form of its knot.
+    # Constants are symbols until it is known which ones differ: a 0 or 1 among them would change its knot's form.
     numbers = ca.SX.sym("p", count + len(constants))
     each = elements(numbers)
     found = traced(
@@ -154,7 +154,7 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
 
 
 def _form(function: Any) -> tuple[list[tuple], list[int]]:
-    """The instructions of a function (x, u, numbers), its numbers named by their turn, and which these are."""
+    """The instructions of a function (x, u, numbers), its numbers renamed in order of first use, and that order."""
     reads, holds = _operations()
     turn: dict[int, int] = {}
     form: list[tuple] = []

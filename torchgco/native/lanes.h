@@ -1,4 +1,4 @@
-/* Vectors V of LANES numbers of type REAL (double or float), a problem or sample to each lane; lanes are never mixed. */
+/* Vectors V of LANES numbers of type REAL (double or float), one problem or sample per lane; lanes are never mixed. */
 
 #include <math.h>
 
@@ -35,7 +35,7 @@ static inline int tgco_any(I where) {
 static inline V tgco_fabs(V a) { return (V)(~(I)SET(-0.0) & (I)a); }
 static inline V tgco_copysign(V a, V b) { return (V)((I)tgco_fabs(a) | ((I)SET(-0.0) & (I)b)); }
 static inline V tgco_sign(V a) { return tgco_choose(tgco_is(a) & (a == a), tgco_copysign(SET(1.0), a), a); }
-/* Of a number and a NaN the number, as C's fmin and fmax. */
+/* Of a number and a NaN these return the number, like C's fmin and fmax. */
 static inline V tgco_fmin(V a, V b) { return tgco_choose((a < b) | (b != b), a, b); }
 static inline V tgco_fmax(V a, V b) { return tgco_choose((a > b) | (b != b), a, b); }
 
@@ -60,7 +60,7 @@ TGCO_BY_LANE_2(pow) TGCO_BY_LANE_2(fmod) TGCO_BY_LANE_2(atan2) TGCO_BY_LANE_2(hy
 
 /* Sine and cosine of all lanes at once: x = k pi/2 + r with |r| <= pi/4, and the Taylor series of both in r up to the
    first term that no longer counts. pi/2 comes in three parts, of which the first two are short enough for their
-   products with k to be exact. Where |x| is too large for that, or not finite, the C library does it lane by lane. */
+   products with k to be exact. Where |x| is too large for that, or not finite, the C library is called lane by lane. */
 #if TGCO_IS_DOUBLE
 #define TGCO_WHOLE 0x1.8p52 /* adding it leaves the nearest whole number in the lowest bits */
 #define TGCO_FAR 1e5

@@ -30,8 +30,8 @@ class DynamicsSource:
                                      V *restrict x_next)       n
         static inline void tgco_jacobian(the same three, V *restrict entries)      computed
 
-    No output may overlap an input. [fx, fu] (n, n+m) is zero but at `rows`, `columns`, which go column by column. Its
-    entry i there is `values[i]` where `places[i]` is -1, else `entries[places[i]]`.
+    No output may overlap an input. [fx, fu] (n, n+m) is zero except at `rows`, `columns`, listed column by column.
+    Nonzero i is `values[i]` where `places[i]` is -1, else `entries[places[i]]`.
     """
 
     n: int
@@ -44,17 +44,17 @@ class DynamicsSource:
     values: tuple[float, ...]  # 0.0 where the entry is computed
     key: str  # says what `code` computes, the same in every process
     traced: Traced = field(repr=False, compare=False)
-    own: list[Tensor] = field(repr=False, compare=False)  # what the model has per problem
+    own: list[Tensor] = field(repr=False, compare=False)  # the model's tensors per problem
 
     @property
     def computed(self) -> int:
-        """How many entries of the Jacobian `tgco_jacobian` writes."""
+        """Number of the Jacobian's entries that `tgco_jacobian` writes."""
         return sum(place >= 0 for place in self.places)
 
     def parameters(self, index: Tensor, of: Dynamics | None = None) -> Tensor:
         """The own numbers (B, count) float64 of the problems in `index` (B,) int64, on its device.
 
-        They are those of the model that was traced, or of another with the same step, as `take` makes it.
+        They belong to the traced model, or to `of`, a model with the same step such as `take` returns.
         """
         if of is None or self.count == 0:
             return self.traced.parameters_of(index)
@@ -69,10 +69,10 @@ def trace_dynamics(
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> DynamicsSource:
-    """The C of `dynamics.step`, from the cache folder where it was made before.
+    """The C of `dynamics.step`, taken from the cache folder if it was made before.
 
-    Tensors in `per_element` and `batched` are numbers of each problem; all others, those that a function closes over
-    too, become constants in the code.
+    Tensors in `per_element` and `batched` are numbers of each problem; all others, including those that a function
+    closes over, become constants in the code.
 
     Args:
         dynamics: of the whole batch.
@@ -105,7 +105,7 @@ _traced: dict[int, _Known] = {}
 
 
 def _versions(dynamics: Dynamics, dtype: torch.dtype, device: torch.device | str) -> tuple[Any, ...]:
-    """Changes with every write into a tensor of the model."""
+    """A tuple that changes with every write into a tensor of the model."""
     return dtype, str(device), *(value._version for value in vars(dynamics).values() if isinstance(value, Tensor))
 
 
@@ -130,7 +130,7 @@ def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:
     x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", traced.count)
     ahead = traced(elements(p), elements(x)[None], elements(u)[None]).reshape(-1)
     ahead = ca.densify(ca.vertcat(*ahead))
-    # Forward only, as `torch.func.jvp`: backwards, a NaN of the branch not taken would come through as 0 * NaN.
+    # Forward mode only, as `torch.func.jvp`: reverse mode would let a NaN of the branch not taken through as 0 * NaN.
     jacobian = ca.sparsify(ca.jacobian(ahead, ca.vertcat(x, u), {"allow_reverse": False}))
     step, jacobian = ca.cse([ahead, jacobian])
     rows, columns = jacobian.sparsity().get_triplet()
@@ -161,7 +161,7 @@ def elements(column: Any) -> np.ndarray:
 
 @cache
 def makers(*more: str) -> Sequence[str]:
-    """The texts of the files that generate code: when they change, code made before doesn't count."""
+    """CasADi's version and the texts of the files that generate code: when they change, cached code isn't used."""
     files = (operations.__file__, arrays.__file__, emit.__file__, __file__, *more)
     try:
         casadi = version("casadi")
@@ -169,5 +169,5 @@ def makers(*more: str) -> Sequence[str]:
         casadi = ""
     try:
         return (casadi, *(Path(str(name)).read_text() for name in files))
-    except OSError:  # in an archive, say, which has one version of them
+    except OSError:  # in an archive, say; then the package's version stands for them
         return (casadi, version("torchgco"))

@@ -14,7 +14,7 @@ typedef struct {
     double *mean;                           /* (E, N, NU) in and out */
 } Sampling;
 
-/* What one problem needs: all lanes of `s` are this problem. */
+/* The working data of one problem, which all lanes of `s` hold. */
 typedef struct {
     const Sampling *of;
     Lanes s;
@@ -38,7 +38,7 @@ static inline void draw(const Samples *q, int64_t k, V *eps, V *u) {
     }
 }
 
-/* How many obstacles samples touch at knot k. */
+/* The number of obstacles that each sample touches at knot k. */
 static V hits(const Samples *q, int64_t k, const V *x) {
     const Problem *p = q->of->of;
     V count = SET(0.0);
@@ -115,7 +115,7 @@ static void weigh(const Sampling *o, double *score) {
     for (int64_t i = 0; i < count; i++) score[i] /= sum;
 }
 
-/* The weighted mean of all samples' controls: drawn again rather than kept, and only where a weight counts. */
+/* The weighted mean of all samples' controls: they are drawn again, not stored, and only where a weight isn't 0. */
 static void average(Samples *q, uint64_t key, int64_t rows) {
     const Sampling *o = q->of;
     int64_t N = o->of->N;

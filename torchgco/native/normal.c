@@ -26,7 +26,8 @@ static inline F radius(F a) {
     F m = (F)((bits & 0x7fffff) + 0x3f3504f3), f = (m - single(1.0f)) / (m + single(1.0f)), s = f * f;
     F series = single(1.0f / 9);
     for (int i = 7; i > 0; i -= 2) series = series * s + single(1.0f / i);
-    F square = single(-2.0f) * (__builtin_convertvector(e, F) * single(0x1.62e43p-1f) + single(2.0f) * f * series), root;
+    F square = single(-2.0f) * (__builtin_convertvector(e, F) * single(0x1.62e43p-1f) + single(2.0f) * f * series),
+      root;
     for (int l = 0; l < LANES; l++) root[l] = __builtin_sqrtf(square[l] > 0 ? square[l] : 0);
     return root;
 }

@@ -14,9 +14,9 @@ from torchgco.constraints.boxes import BoundBoxes
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.problem import Problem
 
-ABSENT = -1.0  # squared distance of an obstacle that isn't there
+ABSENT = -1.0  # stands for the squared inflated radius of an absent obstacle
 BOUNDS, SPHERES, FUNCTION, BOXES = range(4)
-# All others, their subclasses too, are traced.
+# All other constraints, subclasses of these too, are traced.
 KINDS = {ControlBounds: BOUNDS, StateBounds: BOUNDS, BoundSpheres: SPHERES, BoundBoxes: BOXES}
 NO_GUIDE, REGION, PATH = range(3)
 
@@ -65,7 +65,7 @@ class Packed(ctypes.Structure):
 
 
 def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: Problem, keep: list[Any]) -> None:
-    """Fill in the parts of a constraint; `numbers` (B|1, K|1, count) are those of a traced constraint."""
+    """Fill `c` from a constraint; `numbers` (B|1, K|1, count) are those of a traced constraint."""
     one = problem.take(slice(0, 1))
     shape = (
         constraint.take(slice(0, 1))
@@ -102,7 +102,7 @@ def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: 
 
 
 def _box_numbers(boxes: BoundBoxes) -> Tensor:
-    """What boxes.c reads of each box, (B, M, ...)."""
+    """The numbers that boxes.c reads per box, (B, M, ...)."""
     radius = boxes.vehicle_radius.view(-1, 1, 1).expand(-1, boxes.centers.shape[1], 1)
     factor = 2.0 * boxes.depths.unsqueeze(-1)
     return torch.cat((boxes.centers, boxes.axes.flatten(2), boxes.half_sizes, radius, factor), dim=-1)

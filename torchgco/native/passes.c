@@ -1,4 +1,4 @@
-/* Passes along a trajectory: rollouts with the gains, and the backward pass that makes them. */
+/* Passes along a trajectory: rollouts with the gains, and the backward pass that computes them. */
 
 /* The forward pass (line 16) from the nominal X, U along G with step lengths alpha; writes Xn, Un, J_var and L_M. */
 static void roll(Lanes *s, V alpha, V *cost, V *merit) {
@@ -23,8 +23,8 @@ static void roll(Lanes *s, V alpha, V *cost, V *merit) {
     *merit = total + (more + part);
 }
 
-/* The backward pass (lines 4-13): gains into G; the expected change's two sums, and the smallest pivot. `gap` (N, NX) is
-   how far each step ends from the knot after it, NULL along a rollout. */
+/* The backward pass (lines 4-13): gains into G, the two sums of the expected change, and the smallest pivot. `gap`
+   (N, NX) is how far each step ends from the knot after it, NULL along a rollout. */
 static void backward(Lanes *s, const V *gap, V *linear, V *squares, V *lowest) {
     const Problem *p = s->of;
     V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[NU * NU], Y[NU * NZ];
@@ -89,7 +89,7 @@ static void backward(Lanes *s, const V *gap, V *linear, V *squares, V *lowest) {
     *linear = sum; *squares = square; *lowest = least;
 }
 
-/* Whether all that the backward pass reads is finite. */
+/* Whether everything that the backward pass reads is finite. */
 static I is_finite(const Lanes *s) {
     const Problem *p = s->of;
     V g[S], H[S * S], f[NJ ? NJ : 1], sum = SET(0.0);
@@ -115,7 +115,7 @@ static void gaps(const Lanes *s, V *gap) {
     }
 }
 
-/* A full step of the linearised dynamics, which close the gaps, under the gains: into X and U. */
+/* A full step of the linearised dynamics under the gains, which closes the gaps; added to X and U. */
 static void linear_step(Lanes *s, const V *gap) {
     V one[NX * NX], F[NX * S], f[NJ ? NJ : 1], z[S], dx[NX];
     for (int i = 0; i < NX * NX; i++) one[i] = SET(i % (NX + 1) == 0);

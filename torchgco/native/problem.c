@@ -1,4 +1,4 @@
-/* Problems side by side, one to a lane of the vectors V; no operation mixes lanes.
+/* Problems side by side, one per lane of the vectors V; no operation mixes lanes.
 
    The generated part before this file defines NX, NU, NP, NJ, DIM, POSITION, QUADRATIC_FULL, COST_ARRAYS, MAX_ROWS, and
 
@@ -18,19 +18,19 @@ enum { BOUNDS = 0, SPHERES = 1, FUNCTION = 2, BOXES = 3 };
 enum { NO_GUIDE = 0, REGION = 1, PATH = 2 };
 enum { GOING = 0, ENDED = 1, NOT_POSITIVE_DEFINITE = 4, NON_FINITE = 5 };
 
-/* An array over (elements, knots, numbers); a stride of 0 stands for an axis of length 1. */
+/* An array over (problems, knots, numbers); a stride of 0 stands for an axis of length 1. E below counts problems. */
 typedef struct { const double *data; int64_t element, knot; int64_t size; } Array;
 
 typedef struct {
     int32_t kind, equality, rows;  /* rows of a knot */
-    const int32_t *place;          /* (N+1): which of the constraint's knots, -1 where it has no rows */
+    const int32_t *place;          /* (N+1): index among the constraint's knots, -1 where it has no rows */
     int64_t knots;
     double *lam;                   /* (E, knots, rows) */
     const int32_t *variable;       /* BOUNDS: (rows) index into [x, u] */
     const double *sign;            /* BOUNDS: (rows) +1 for an upper bound, -1 for a lower one */
-    Array bound;                   /* BOUNDS: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ..);
-                                      BOXES: (E, 1, rows * BOX_NUMBERS) */
-    Array squares;                 /* SPHERES: squared distances (E, 1, rows) */
+    Array bound;                   /* BOUNDS: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM);
+                                      FUNCTION: p (E, knots, ...); BOXES: (E, 1, rows * BOX_NUMBERS) */
+    Array squares;                 /* SPHERES: squared inflated radii (E, 1, rows), negative where absent */
     Array velocities;              /* SPHERES: as centres, or NULL */
     double dt;
 } Constraint;
@@ -59,7 +59,7 @@ typedef struct {
     I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
 } Rows;
 
-/* What a group of lanes works on. */
+/* The working data of a group of lanes. */
 typedef struct {
     const Problem *of;
     V *X, *U, *Xn, *Un, *G, *parameters, *cost_data[COST_ARRAYS], *center, *radius;
@@ -129,7 +129,7 @@ static int start(Lanes *s, const Problem *p) {
 
 static void finish(Lanes *s) { free(s->memory); free(s->rows); }
 
-/* The problem itself: model, cost, and bounds and obstacles. */
+/* Load problem e into a lane: first state, model, cost, and the numbers of its constraints. */
 static void enter_problem(Lanes *s, int lane, int64_t e) {
     const Problem *p = s->of;
     int64_t N = p->N;
@@ -145,7 +145,7 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
     }
 }
 
-/* The iterate with its multipliers and guide. */
+/* Load problem e with its iterate, multipliers and guide. */
 static void enter(Lanes *s, int lane, int64_t e) {
     const Problem *p = s->of;
     int64_t N = p->N;
@@ -166,7 +166,8 @@ static void enter(Lanes *s, int lane, int64_t e) {
             s->rows[i].pushed[k][lane] = -pushed;
         }
     }
-    s->mu[lane] = p->mu[e]; s->inverse_mu[lane] = 1 / p->mu[e]; s->mu_r[lane] = p->regularisation ? p->regularisation[e] : 0;
+    s->mu[lane] = p->mu[e]; s->inverse_mu[lane] = 1 / p->mu[e];
+    s->mu_r[lane] = p->regularisation ? p->regularisation[e] : 0;
     s->merit[lane] = p->merit[e]; s->cost[lane] = p->cost[e];
     s->inner[lane] = p->inner ? p->inner[e] : 0; s->made[lane] = 0; s->rung[lane] = p->rung ? p->rung[e] : 0;
 }

@@ -1,4 +1,4 @@
-/* The quadratic cost: its value, gradient and Hessian at a knot. Weights are diagonals, or matrices (QUADRATIC_FULL). */
+/* The quadratic cost: value, gradient and Hessian at a knot. Weights are diagonals, or matrices (QUADRATIC_FULL). */
 
 enum { Q, R, Q_LAST, X_REF, X_REF_LAST, U_REF, Q_LINEAR, R_LINEAR, Q_LINEAR_LAST, CROSS };
 
@@ -49,7 +49,7 @@ static inline void quadratic_expand(Quadratic of, int size, int first, const V *
     if (of.w) for (int i = 0; i < size; i++) g[first + i] += of.w[i];
 }
 
-/* The cost of knot k: of stage x, u, or where u is NULL of the last knot. */
+/* The cost of stage k at x, u; of the last knot where u is NULL. */
 static inline V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
     V total = SET(0.0), ex[NX], eu[NU];
     quadratic_value(quadratic_of_x(s, k, !u), NX, x, ex, &total);
@@ -62,7 +62,7 @@ static inline V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
     return total;
 }
 
-/* Adds gradient g (S) and upper triangle H (S, S) of that. */
+/* Adds gradient g (S) and upper triangle H (S, S) of `cost_value`. */
 static inline void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
     V ex[NX], eu[NU];
     quadratic_expand(quadratic_of_x(s, k, !u), NX, 0, x, ex, g, H);

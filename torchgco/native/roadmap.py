@@ -1,4 +1,4 @@
-"""The roadmap's search in C, the counterpart of search.graph: every step is one call for all problems of a batch."""
+"""The roadmap's search in C, the counterpart of search.graph: each step is one call for all problems of a batch."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from torchgco.native.dispatch import EagerWarning
 
 AT_ONCE = 64  # problems searched together
 HOPS = 32  # edges of a path, at most
-CLEAR = 0.001  # how far a point has to stay off all spheres, as a share of the largest r_obs + r_veh
-MIDWAY = 4  # spheres whose gap to another is given a point
+CLEAR = 0.001  # smallest gap between a point and all obstacles, as a share of the largest r_obs + r_veh
+MIDWAY = 4  # nearest neighbours of an obstacle: each gap to one gets a point
 SHELLS = {2: (1.05, 1.3), 3: (1.15,)}  # radii of the circles of points around a sphere, by the number of coordinates
 RAYS = 8  # points of a circle
 TIE = 1e-12  # share of the cost by which equally cheap paths may differ
-LEAST = 1e-6  # share of the distance from start to goal that is added to every edge, as each has to cost something
+LEAST = 1e-6  # share of the distance from start to goal that is added to every edge: no edge may cost nothing
 
 POINTS, PATHS, BOXES = (
     Path(__file__).with_name(name) for name in ("roadmap_points.c", "roadmap_paths.c", "roadmap_boxes.h")
@@ -64,7 +64,7 @@ class Packed(ctypes.Structure):
 
 @dataclass(frozen=True)
 class NativeSearch:
-    """The methods of search.graph.Search, documented there, by a library."""
+    """The methods of search.graph.Search, documented there, in a C library."""
 
     library: ctypes.CDLL
     o: Tensor
@@ -142,7 +142,7 @@ def around_boxes(boxes: Cuboids, o: Tensor, R: Tensor, start: Tensor, goal: Tens
 
 
 def _numbers(boxes: Cuboids) -> Tensor:
-    """What C reads of each box, (B, K, ...): centre, directions of its sides, half of them, radius."""
+    """The numbers that C reads per box, (B, K, ...): centre, directions of its sides, half their lengths, radius."""
     parts = boxes.centers, boxes.axes.flatten(-2), boxes.half_sizes, boxes.radius.unsqueeze(-1)
     return torch.cat(parts, dim=-1)
 
@@ -165,10 +165,10 @@ def _unit(v: Tensor) -> Tensor:
 
 
 def library_for(like: Tensor, boxes: bool = False) -> ctypes.CDLL | None:
-    """The library for spheres with centres such as these (..., d), and boxes; None where PyTorch has to search.
+    """The library for spheres with centres like `like` (..., d), and boxes; None where PyTorch searches.
 
-    PyTorch has to on a GPU, in single precision, where the process has chosen it (`kernels.use_native`), where there is
-    no compiler (the solver warns of that itself), and where the source doesn't compile (an EagerWarning explains it).
+    PyTorch searches on a GPU, in single precision, where the process has chosen it (`kernels.use_native`), where there
+    is no compiler (the solver itself warns of that), and where the source doesn't compile (an EagerWarning explains).
     """
     if not native() or find_compiler() is None or like.dtype != torch.float64 or like.device.type != "cpu":
         return None
@@ -177,7 +177,7 @@ def library_for(like: Tensor, boxes: bool = False) -> ctypes.CDLL | None:
 
 @functools.cache
 def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.CDLL | None:
-    # Code for boxes is left out where there are none: the spheres' code is then what it would be without it.
+    # Without boxes their code is left out, so that it can't change how the spheres' code is compiled.
     head = f"#define DIM {dimension}\n#define BOXES {int(boxes)}\n{BOXES.read_text() if boxes else ''}"
     try:
         return build(f"{head}\n{POINTS.read_text()}\n{PATHS.read_text()}", FLAGS)

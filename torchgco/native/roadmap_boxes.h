@@ -1,7 +1,7 @@
 /* Distances from boxes grown by a radius: constraints/cuboids.py in C, with the same operations in the same order.
 
-   The numbers of a box: its centre (DIM), the directions of its sides (DIM, DIM), half of them (DIM), the radius, which is
-   negative where there is no box. */
+   The numbers of a box: its centre (DIM), the directions of its sides (DIM, DIM), half their lengths (DIM), and the
+   radius, which is negative where there is no box. */
 
 #include <float.h>
 #include <math.h>
@@ -25,7 +25,8 @@ static inline double beyond(double x, double half) {
 }
 
 /* Squared distance of a point, and half its slope where the point moves along a segment. */
-static inline double square_at(const double *half, const double *begin, const double *along, double share, double *slope) {
+static inline double square_at(
+    const double *half, const double *begin, const double *along, double share, double *slope) {
     double square = 0.0, sum = 0.0;
     for (int i = 0; i < DIM; i++) {
         double away = beyond(begin[i] + share * along[i], half[i]);
@@ -43,7 +44,7 @@ static double square_from_box(const double *box, const double *p) {
     return square_at(BOX_HALF(box), local, none, 0.0, &slope);
 }
 
-/* Smallest squared distance of the segment that begins at a point and goes a step. */
+/* Smallest squared distance of the segment from `start` to `start + step`. */
 static inline double square_of_segment(const double *box, const double *start, const double *step) {
     double seen[DIM], begin[DIM], along[DIM], low = 0.0, high = 1.0, falls, rises, found;
     const double *half = BOX_HALF(box);

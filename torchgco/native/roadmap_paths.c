@@ -18,7 +18,7 @@ static Room room_at(void *memory, int64_t n, int64_t k) {
     return r;
 }
 
-/* Edges sorted by the point where they end: those that matter to others once its cost has fallen. */
+/* Sort edges by the point where they end: once that point's cost has fallen, they pass the change on. */
 static void turn(Room *r, int64_t n, int64_t k, const int32_t *ends) {
     int32_t *first = r->first;
     memset(first, 0, (n + 2) * sizeof(int32_t));
@@ -33,7 +33,7 @@ static void turn(Room *r, int64_t n, int64_t k, const int32_t *ends) {
         }
 }
 
-/* Costs of the cheapest paths to point 1 of at most so many edges: a round sees the costs of the one before it. */
+/* Costs of the cheapest paths to point 1 with at most `rounds` edges: a round reads the costs of the round before. */
 static void relax(Room *r, int64_t n, int64_t rounds) {
     int64_t fresh = 1;
     for (int64_t v = 0; v < n; v++) r->cost[v] = INFINITY, r->seen[v] = -1;
@@ -55,7 +55,7 @@ static void relax(Room *r, int64_t n, int64_t rounds) {
     }
 }
 
-/* The cheapest path from point 0 to point 1, as corners; whether there is one. */
+/* The cheapest path from point 0 to point 1, as corners; returns whether there is one. */
 static int cheapest(
     const Search *s, Room r, const double *p, int64_t n, int64_t k, const int32_t *ends, const double *lengths,
     const double *price, double *path
@@ -82,7 +82,7 @@ static int cheapest(
     return stop == 1;
 }
 
-/* How many edges a path has: its corners that are not its end. */
+/* Number of edges of a path: its corners that differ from its end. */
 static int64_t edges_of(const double *path, int64_t corners) {
     int64_t edges = 0;
     for (int64_t c = 0; c < corners; c++) {
@@ -93,7 +93,7 @@ static int64_t edges_of(const double *path, int64_t corners) {
     return edges;
 }
 
-/* Start and goal of a path, then the middles of its edges and its other corners in turn. */
+/* Start and goal of a path, then alternately the middles of its edges and its other corners. */
 static void lay(const double *path, int64_t corners, double *string) {
     memcpy(string, path, DIM * sizeof(double));
     memcpy(string + DIM, path + (corners - 1) * DIM, DIM * sizeof(double));

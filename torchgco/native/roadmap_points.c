@@ -1,4 +1,4 @@
-/* The search for short paths between spheres, one problem after the other: search/graph.py in C.
+/* The search for short paths between obstacles, one problem after the other: search/graph.py in C.
 
    Both do the same operations in the same order, and none is fused here (-ffp-contract=off): all numbers but square
    roots, which PyTorch doesn't always round correctly, agree to the last bit. Clearance and nearness are therefore
@@ -29,8 +29,8 @@ typedef struct {
     double *string;                     /* (B, 2 P - 1, DIM) */
     const double *cost;                 /* (B, 2 P - 1) */
     uint8_t *arrives;                   /* (B) */
-    /* Read where there are boxes alone: their numbers (B, boxes, BOX_NUMBERS), points around them (B, extras, DIM) and
-       whether each exists, corners of the box that start, goal and they fill (B, 2, DIM), the largest size (B). */
+    /* Read only where there are boxes: their numbers (B, boxes, BOX_NUMBERS), points around them (B, extras, DIM) and
+       whether each exists, corners (B, 2, DIM) of the region that holds start, goal and boxes, the largest size (B). */
     const double *box, *beside;
     const uint8_t *exists;
     const double *reach, *largest;
@@ -90,7 +90,7 @@ static int is_free(const double *p, const Spheres *o, double gap) {
     return all;
 }
 
-/* Squared distance of a point from the segment that begins at a and goes along; 1 / its squared length is given. */
+/* Squared distance of a point from the segment from a to a + along; `inverse` is 1 / its squared length. */
 static inline double square_away(const double *p, const double *a, const double *along, double inverse) {
     double toward[DIM], lead = 0.0, away = 0.0;
     for (int i = 0; i < DIM; i++) {
@@ -105,7 +105,7 @@ static inline double square_away(const double *p, const double *a, const double 
     return away;
 }
 
-/* Put a value below the last of a list into its order, after its equals. */
+/* Insert a value smaller than the last of a sorted list, after its equals; the last is dropped. */
 static inline void put(double value, int32_t index, double *values, int32_t *indices, int64_t size) {
     int64_t at = size - 1;
     for (; at > 0 && values[at - 1] > value; at--) {
@@ -128,7 +128,7 @@ static double square_of(const double *a, const double *b) {
     return square;
 }
 
-/* Candidates around the spheres and midway between each and its nearest; returns how many there are. */
+/* Candidates around the spheres, midway between each and its nearest, and around boxes; returns their number. */
 static int64_t propose(const Search *s, int64_t b, double *values, int32_t *near, double *to) {
     const double *o = s->centers + b * s->spheres * DIM, *R = s->distances + b * s->spheres;
     const double *rays = s->rays + b * s->directions * DIM;
@@ -158,7 +158,7 @@ static int64_t propose(const Search *s, int64_t b, double *values, int32_t *near
     return (p - to) / DIM;
 }
 
-/* Start, goal and points all over the box that they and the spheres fill. */
+/* Start, goal, and points spread over the region that holds start, goal and obstacles. */
 static void scatter(const Search *s, int64_t b, double *to) {
     const double *start = s->start + b * DIM, *goal = s->goal + b * DIM, *R = s->distances + b * s->spheres;
     for (int i = 0; i < DIM; i++) {
@@ -178,7 +178,8 @@ static void scatter(const Search *s, int64_t b, double *to) {
     }
 }
 
-/* The points of a graph, those of the shortest detours among the candidates; places left over lie at the start. */
+/* The points of a graph: those of `scatter`, then the candidates with the shortest detours; unused places lie at the
+   start. */
 static void choose(
     const Search *s, int64_t b, const Spheres *o, const double *others, int64_t count, double *values,
     int32_t *indices, uint8_t *usable
@@ -200,7 +201,7 @@ static void choose(
     }
 }
 
-/* Each free point's edges: to the nearest, to the nearest of those spread, to the goal. */
+/* Each free point's edges: to the nearest points, to the nearest of those from `scatter`, to the goal. */
 static void join(const Search *s, int64_t b, const uint8_t *usable, double *at, double *values, int32_t *found) {
     const double *nodes = s->nodes + b * s->points * DIM;
     int64_t n = s->points, k = s->edges, given = 2 + s->spread, near = s->neighbours, hubs = s->hubs;
@@ -229,7 +230,7 @@ static void join(const Search *s, int64_t b, const uint8_t *usable, double *at, 
 
 /* Lengths ---------------------------------------------------------------------------------------------------------- */
 
-/* Lengths of the edges of n points, k each, to `ends`: more close to a sphere, infinite through one. */
+/* Lengths of the edges of n points, k each, to `ends`: longer close to an obstacle, infinite through one. */
 static void measure(
     const Search *s, const Spheres *o, const double *p, int64_t n, int64_t k, const int32_t *ends, double *lengths
 ) {
@@ -249,7 +250,7 @@ static void measure(
             }
             inverse[e] = 1.0 / (square[e] < TINY ? TINY : square[e]);
             gap[e] = open[e] = INFINITY;
-            if (++slot == k) slot = 0, from += from + 1 < n;  // after the last edge, those of its point again
+            if (++slot == k) slot = 0, from += from + 1 < n;  // past the last edge, the last point's again
         }
         for (int64_t m = 0; m < o->count; m++)
             for (int e = 0; e < BLOCK; e++) {
@@ -279,7 +280,7 @@ static void measure(
     }
 }
 
-/* Free edges first, then the blocked ones, marked. */
+/* Free edges first, then the blocked ones, marked by -1. */
 static void pack(int64_t n, int64_t k, int32_t *ends, double *lengths) {
     for (int64_t v = 0; v < n; v++, ends += k, lengths += k) {
         int64_t held = 0;

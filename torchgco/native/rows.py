@@ -1,4 +1,4 @@
-"""C of a traced constraint: its rows, and what they add to a quadratic model."""
+"""C of a traced constraint: its rows, and the terms that they add to a quadratic model."""
 
 from __future__ import annotations
 

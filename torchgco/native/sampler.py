@@ -20,7 +20,7 @@ REALS = {torch.float64: ("double", 8), torch.float32: ("float", 16)}  # type and
 
 @dataclass(frozen=True)
 class Rounds:
-    """What the rounds of MPPI draw (see guidance.MPPI)."""
+    """The settings of MPPI's rounds (see guidance.MPPI)."""
 
     samples: int
     knots: int
@@ -28,13 +28,13 @@ class Rounds:
     elite: int
     temperature: float
     collision_penalty: float
-    linger: float
+    linger: float  # MPPI's `dwell_cost`
     keys: Tensor  # (B, rounds) int64
     deviation: Tensor  # (B|1, m): standard deviations in the first round
-    lower: Tensor  # (B|1, m): infinite where nothing clamps
+    lower: Tensor  # (B|1, m): infinite where nothing is clamped
     upper: Tensor  # (B|1, m)
     left: Tensor | None  # (N,) int64: the knot of the noise before each stage; None: white
-    share: Tensor | None  # (N,): how far on to the next knot
+    share: Tensor | None  # (N,): the stage's place between that knot (0) and the next (1)
 
 
 class _Sampling(ctypes.Structure):

@@ -13,7 +13,7 @@ from torchgco.native.model import DynamicsSource
 from torchgco.native.packing import COST_ARRAYS
 
 LANES = 8
-WRITTEN_OUT = 400  # nonzeros of a Jacobian that are named one by one
+WRITTEN_OUT = 400  # nonzeros of a Jacobian, at most, that are written out one by one
 LOOPS = """
 static inline V entry(int e, const V *f) { return F_place[e] < 0 ? SET(F_value[e]) : f[F_place[e]]; }
 static void tgco_gather(const V *restrict P, const V *restrict f, V *restrict T) {
@@ -45,12 +45,12 @@ SAMPLER = ("problem.c", COST, "knot.c", "normal.c", "mppi.c")
 
 @dataclass(frozen=True)
 class Form:
-    """What the code of a problem depends on; two problems of one form share a library."""
+    """Everything that a problem's code depends on; two problems of one form share a library."""
 
     dynamics: DynamicsSource
     position: slice | None
     cost: CostSource | None  # None: quadratic
-    dense: bool  # its weights are matrices
+    dense: bool  # the quadratic cost's weights are matrices
     functions: tuple[tuple[int, KnotSource], ...]  # the constraints that are traced, by their place
     boxes: bool = False  # whether there are boxes among the obstacles
 
@@ -69,7 +69,7 @@ class Form:
         names = parts if self.cost is None else ["traced.c" if name == COST else name for name in parts]
         texts = [Path(__file__).with_name(name).read_text() for name in names]
         if self.boxes:
-            # Left out elsewhere: problems without boxes are compiled from the same code as if boxes didn't exist.
+            # Left out elsewhere, so that it can't change how problems without boxes are compiled.
             head += "#define WITH_BOXES 1\n"
             solid = Path(__file__).with_name("boxes.c").read_text()
             texts = [text.replace(BOXES_STAND_HERE, solid) for text in texts]
@@ -77,12 +77,12 @@ class Form:
 
 
 def _products(model: DynamicsSource) -> str:
-    """The products of a value function with F = [fx fu], which name its nonzeros alone."""
+    """The products of a value function with F = [fx fu], over the nonzeros of F alone."""
     return _looped(model) if len(model.rows) > WRITTEN_OUT else _written_out(model)
 
 
 def _looped(model: DynamicsSource) -> str:
-    """Loops over a table of the nonzeros: where there are many, code that names each would take long to compile."""
+    """Loops over a table of the nonzeros: code that writes out many of them would take long to compile."""
     tables = {"row": model.rows, "column": model.columns, "place": model.places}
     lines = [f"static const int F_{name}[] = {{{', '.join(map(str, values))}}};" for name, values in tables.items()]
     lines += [f"static const double F_value[] = {{{', '.join(map(literal, model.values))}}};", LOOPS]

@@ -1,8 +1,8 @@
-"""The user's cache folder: what was generated or compiled once, under keys that hold all it depends on.
+"""The user's cache folder: generated and compiled code, under keys made from everything that the code depends on.
 
 A file is called KEY-CHECKSUM and a suffix, with the checksum of its content. It is written under another name and
-renamed, so processes that write the same one at once do no harm; one that was damaged, cut short or swapped is deleted.
-A folder that can't be written or isn't there costs time, never correctness: nothing here raises OSError.
+renamed, so processes that write the same file at once do no harm; a damaged, truncated or swapped file is deleted.
+A folder that is missing or can't be written costs time, never correctness: nothing here raises OSError.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import mkstemp
 
-FILES = 200  # at most, the least recently used are removed
+FILES = 200  # at most; the least recently used are removed
 _ABANDONED = 3600.0  # s after which a half-written file belongs to a process that was killed
 _PART = ("torchgco-", ".part")
 _OURS = re.compile(r"[0-9a-f]{32}-[0-9a-f]{32}\.[a-z]+")
@@ -27,12 +27,12 @@ def folder() -> Path:
     own, shared = os.environ.get("TORCHGCO_CACHE"), os.environ.get("XDG_CACHE_HOME")
     if own:
         return Path(own)
-    # Without a home expanduser leaves the ~, which would make a folder of that name here.
+    # Without a home, expanduser leaves the ~, which would become the name of a folder here.
     return Path(shared or os.path.expanduser("~/.cache")) / "torchgco"
 
 
 def key_of(parts: Iterable[str]) -> str:
-    """A key that no other sequence of texts has."""
+    """A key that differs from that of any other sequence of texts."""
     digest = hashlib.sha256()
     for part in parts:
         text = part.encode(errors="surrogateescape")
@@ -41,17 +41,17 @@ def key_of(parts: Iterable[str]) -> str:
 
 
 def find(key: str, suffix: str) -> Path | None:
-    """The sound file under a key, or None. It may be gone before the caller opens it."""
+    """The path of the intact file under a key, or None. The file may be gone before the caller opens it."""
     return next((path for path, _ in _sound(key, suffix)), None)
 
 
 def read(key: str, suffix: str) -> bytes | None:
-    """The content of the sound file under a key, or None."""
+    """The content of the intact file under a key, or None."""
     return next((content for _, content in _sound(key, suffix)), None)
 
 
 def _sound(key: str, suffix: str) -> Iterator[tuple[Path, bytes]]:
-    """Files under a key that hold what their checksum says, and their content; the others are removed."""
+    """Files under a key that match their checksum, and their content; the others are removed."""
     paths: list[Path] = []
     with suppress(OSError):
         paths = sorted(folder().glob(f"{key}-*{suffix}"))
@@ -61,13 +61,13 @@ def _sound(key: str, suffix: str) -> Iterator[tuple[Path, bytes]]:
             if path.name != _name(key, suffix, content):
                 path.unlink()
                 continue
-            with suppress(OSError):  # another user's file may be read, not touched
+            with suppress(OSError):  # another user's file can be read, but not its time changed
                 os.utime(path)
             yield path, content
 
 
 def save(key: str, suffix: str, content: bytes) -> Path | None:
-    """Keep `content` under a key; None where the folder takes nothing."""
+    """Store `content` under a key; returns the file's path, None where the folder can't be written."""
     place = folder()
     if str(place).startswith("~"):
         return None
@@ -89,12 +89,12 @@ def save(key: str, suffix: str, content: bytes) -> Path | None:
 
 
 def _name(key: str, suffix: str, content: bytes) -> str:
-    # The key is part of the checksum: a file that was renamed to another key isn't sound.
+    # The key is part of the checksum: a file that was renamed to another key doesn't match.
     return f"{key}-{hashlib.sha256(key.encode() + content).hexdigest()[:32]}{suffix}"
 
 
 def _tidy(place: Path) -> None:
-    """Remove the least recently used files over the limit; another process may do the same, or use one meanwhile."""
+    """Remove the least recently used files over the limit; another process may use or remove them meanwhile."""
     ages: list[tuple[float, str]] = []
     with suppress(OSError), os.scandir(place) as entries:
         for entry in entries:

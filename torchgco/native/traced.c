@@ -3,12 +3,12 @@
    The generated part defines, for `stage` and `last` alike, with a knot's own numbers p:
 
        tgco_stage_value(x, u, p, value)
-       tgco_stage_entries(x, u, p, e)   STAGE_ENTRIES derivatives: first STAGE_SLOPES of the gradient's, then the Hessian's
+       tgco_stage_entries(x, u, p, e)   STAGE_ENTRIES derivatives: STAGE_SLOPES of the gradient, then the Hessian's
        tgco_stage_places                where they belong in g and H */
 
 enum { FACTOR, STAGE, LAST };
 
-/* The cost of knot k: of stage x, u, or where u is NULL of the last knot. */
+/* The cost of stage k at x, u; of the last knot where u is NULL. */
 static inline V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
     V value;
     if (u) tgco_stage_value(x, u, cost_at(s, STAGE, k), &value);
@@ -21,7 +21,7 @@ static inline void add_entries(V factor, int slopes, int count, const int *place
     for (int i = slopes; i < count; i++) H[places[i]] += factor * e[i];
 }
 
-/* Adds gradient g (S) and upper triangle H (S, S) of that. */
+/* Adds gradient g (S) and upper triangle H (S, S) of `cost_value`. */
 static inline void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
     if (u) {
         V e[STAGE_ENTRIES + 1];

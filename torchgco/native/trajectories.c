@@ -1,4 +1,4 @@
-/* What Python calls along given trajectories: values, expansions, gains, rollouts, and steps where rollouts diverge. */
+/* Functions that Python calls on given trajectories: values, expansions, gains, rollouts, and `lift`. */
 
 /* J_var and L_M of given trajectories. */
 int tgco_value(const Problem *p, int64_t first, int64_t last) {
@@ -85,8 +85,8 @@ int tgco_expand(const Problem *p, int64_t first, int64_t last) {
     return 1;
 }
 
-/* Up to `limit` Gauss-Newton steps in states and controls together (solvers/lifted.py). The first rollout that lowers L_M
-   by the share `gain` takes the iterate's place, and `converged` says whether there was one. */
+/* Up to `limit` Gauss-Newton steps in states and controls together, where rollouts diverge (solvers/lifted.py). The
+   first rollout that lowers L_M by the share `gain` replaces the iterate; `converged` says whether there was one. */
 int tgco_lift(const Problem *p, int64_t first, int64_t last) {
     Lanes lanes, *s = &lanes;
     int64_t N = p->N;

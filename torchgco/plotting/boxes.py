@@ -1,4 +1,4 @@
-"""Boxes as a map shows them: the outline from above of each, and the same grown by the vehicle's radius."""
+"""Boxes as a map shows them: their outlines from above, also grown by the vehicle's radius."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Outline(NamedTuple):
 
 
 def outlines(layouts: Mapping[str, np.ndarray], i: int) -> tuple[Outline, ...]:
-    """The boxes that are there in layout i of the arrays of a layout file."""
+    """The boxes present in layout i of the arrays of a layout file."""
     if "box_centers" not in layouts:
         return ()
     centers, halves = (np.asarray(layouts[name], dtype=float)[i] for name in ("box_centers", "box_half_sizes"))

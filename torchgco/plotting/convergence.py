@@ -24,12 +24,12 @@ LOGARITHMIC = 50.0  # ratio of the largest to the smallest cost from which the a
 def convergence_figure(trace: pd.DataFrame, elements: Sequence[int] | None = None) -> Figure:
     """Cost per iteration, a panel per problem: lines at multiplier updates, bands where guidance is on.
 
-    trace     a row per problem and iteration, with columns element, iteration, outer (index of the outer
+    trace     a row per problem and iteration, with columns element (the problem), iteration, outer (index of the outer
               iteration), cost (J_var) and guided (bool); with a column attempt, attempts follow each other
     elements  which problems to show; by default the first four
 
-    A multiplier update is drawn between the two iterations it stands between. Raises InputError for a missing
-    column, an empty trace and an element that isn't in it.
+    A multiplier update is drawn between the iterations before and after it. Raises InputError for a missing
+    column, an empty trace and a problem that isn't in it.
     """
     missing = [name for name in COLUMNS if name not in trace.columns]
     if missing or trace.empty:
@@ -38,7 +38,7 @@ def convergence_figure(trace: pd.DataFrame, elements: Sequence[int] | None = Non
     shown = held[:SHOWN] if elements is None else list(elements)
     for element in shown:
         if element not in held:
-            raise InputError("elements", f"elements of the trace, {held[0]} to {held[-1]}", element)
+            raise InputError("elements", f"problems of the trace, {held[0]} to {held[-1]}", element)
     figure, axes = panels(len(shown), 2, (5.2, 3.0))
     order = [name for name in ("attempt", "iteration") if name in trace.columns]
     for ax, element in zip(axes, shown, strict=True):

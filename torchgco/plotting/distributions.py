@@ -15,16 +15,16 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from torchgco.plotting.style import INK, legend, panels, solver_colours, tasks_of, tidy
 
 FLOOR = 1e-12
-TOLERANCE = 1e-3  # what still counts as no violation, metres for lengths
+TOLERANCE = 1e-3  # violations up to this count as none, metres for lengths
 SIZE = (5.2, 3.2)  # of a panel, inches
 
 
 def clearance_histogram(trials: pd.DataFrame) -> Figure:
-    """Layouts by clearance along the path (m), solvers side by side, a panel per (scenario, model).
+    """Layouts by clearance along the trajectory (m), solvers side by side, a panel per (scenario, model).
 
     trials  with columns scenario, model, solver, clearance
 
-    Left of the line at 0 the path cuts a sphere. Clearances that aren't finite are counted below the axis.
+    Left of the line at 0 the trajectory cuts an obstacle. Clearances that aren't finite are counted below the axis.
     """
     tasks = list(tasks_of(trials))
     figure, axes = panels(len(tasks), 2, SIZE)
@@ -32,7 +32,7 @@ def clearance_histogram(trials: pd.DataFrame) -> Figure:
         clearance = _by_solver(task, "clearance")
         finite = np.concatenate([_finite(values) for values in clearance.values()])
         low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
-        # Round edges, 0 among them wherever both signs occur: no bin holds both collisions and clear paths.
+        # Round edges, 0 among them wherever both signs occur: no bin holds both collisions and clear trajectories.
         edges = MaxNLocator(nbins=16).tick_values(low, high)
         _bars(ax, clearance, edges, "clearance [m]", mark=0.0)
         tidy(ax, title)
@@ -45,7 +45,7 @@ def violation_histogram(trials: pd.DataFrame) -> Figure:
 
     trials  with columns scenario, model, solver, violation
 
-    What is below 1e-12, zero included, is counted in the bin that begins there. Success asks for
+    Violations below 1e-12, zero included, are counted in the bin that begins there. Success requires
     a violation left of the line at 1e-3.
     """
     tasks = list(tasks_of(trials))

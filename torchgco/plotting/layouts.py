@@ -21,26 +21,26 @@ from torchgco.plotting.style import INK, SMALL, TEXT, legend, panels, solver_col
 STONE, EDGE = "#CFC8BA", "#A39B8B"
 # Greys, away from all solvers' colours.
 HEIGHTS = LinearSegmentedColormap.from_list("heights", ["#E4DFD4", "#5E564A"])
-SHEER = 0.6  # of spheres in 3-D: a gap below others shows through
+SHEER = 0.6  # opacity of spheres in 3-D: a gap below others shows through
 GHOSTS = 4  # later positions at which a moving obstacle is drawn
 PANEL = 3.1  # width in inches
 INFEASIBLE, SHORT = "infeasible", "feasible, short of the goal"
 
 
 def layout_grid(layouts: Arrays, trajectories: Arrays, trials: pd.DataFrame, columns: int = 4, rows: int = 3) -> Figure:
-    """Maps of the first columns x rows layouts with what each solver flew there; in 3-D seen from above.
+    """Maps of the first columns x rows layouts with each solver's trajectories; in 3-D seen from above.
 
-    layouts       arrays of a layout file: centers (L, M, d) and radii (L, M) in metres, and what there is of
+    layouts       arrays of a layout file: centers (L, M, d) and radii (L, M) in metres, and, where present,
                   velocities (L, M, d), boxes, start and goal ((n,) or (L, n)), vehicle_radius, goal_radius, dt,
                   layout (L,) ids
     trajectories  states X (L, N+1, n) by solver, positions first, nan where there is none
     trials        with columns layout, solver, feasible, reached
 
-    Spheres are filled at their own radius and outlined at that plus the vehicle's, as the vehicle is a line
-    here; boxes likewise. In 3-D their shade shows their height. Moving ones fade along their path. A path that
-    didn't reach the goal is dashed and ends in a cross if it isn't feasible, in a ring if it only stopped short.
+    Spheres are filled at their own radius and outlined at the inflated radius, as the vehicle is drawn as a point;
+    boxes likewise. In 3-D the shade shows the height. Moving spheres fade along their motion. A trajectory that didn't
+    reach the goal is dashed and ends in a cross if it isn't feasible, in a ring if it only stopped short.
 
-    Raises InputError where the trajectories don't fit the layouts, or a trial of theirs isn't in `trials`.
+    Raises InputError where the trajectories don't fit the layouts, or one has no row in `trials`.
     """
     flown = len(layouts["radii"])
     paths = {solver: np.asarray(states, dtype=float) for solver, states in trajectories.items()}
@@ -75,7 +75,7 @@ def layout_grid(layouts: Arrays, trajectories: Arrays, trials: pd.DataFrame, col
 
 
 def _ends(ids: np.ndarray, solvers: list[str], trials: pd.DataFrame) -> dict[tuple[str, int], str]:
-    """How each solver's path on each layout shown ended: "" at the goal, else INFEASIBLE or SHORT."""
+    """How each solver's trajectory on each shown layout ended: "" at the goal, else INFEASIBLE or SHORT."""
     table = trials.drop_duplicates(["solver", "layout"]).set_index(["solver", "layout"])
     verdicts = table[["feasible", "reached"]].astype("boolean").fillna(False)
     found = {}

@@ -1,4 +1,4 @@
-"""How often each solver attains what it should."""
+"""How often each solver attains each outcome."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ def rates_figure(summary: pd.DataFrame) -> Figure:
 
     summary  as `experiments.statistics.summarise` returns it
 
-    Above a bar stands how many trials attained the outcome, of how many; what isn't defined has no bar.
+    The label above a bar counts the trials that attained the outcome, of all where it is defined. An outcome that is
+    defined nowhere has no bar.
     """
     tasks = list(tasks_of(summary))
     colours = solver_colours(summary["solver"])
@@ -47,7 +48,7 @@ def _bar(ax: Axes, x: float, width: float, row: pd.Series, name: str, colour: st
         return
     rate, low, high = (row[f"{name}_{part}"] for part in ("rate", "low", "high"))
     ax.bar(x, rate, width, color=colour, alpha=0.85)
-    # Rounding can put an end of the interval a hair inside the rate at 0 and at 1.
+    # Rounding can put an end of the interval slightly inside the rate at 0 and at 1.
     spread = [[max(rate - low, 0)], [max(high - rate, 0)]]
     ax.errorbar(x, rate, spread, color=INK, capsize=3, linewidth=1.2)
     ax.text(x, max(high, rate) + 0.015, f"{count}/{n}", ha="center", va="bottom", fontsize=SMALL, color=INK)

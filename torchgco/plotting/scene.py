@@ -1,4 +1,4 @@
-"""What a map shows of layouts, brought to one form: seen from above, with every optional array filled in."""
+"""Layouts in the form that a map shows: seen from above, with every optional array filled in."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Scene:
     """L layouts from above, lengths in metres, nan rows for obstacles that are absent.
 
     centers   (L, M, 2); radii (L, M); heights (L, M) or None in the plane
-    drift     (L, M, 2) what each obstacle moves during the flight, 0 at rest
+    drift     (L, M, 2) displacement of each obstacle during the flight, 0 at rest
     start, goal
               (L, 2), nan where unknown
     margin    the vehicle's radius; goal_radius: nan where unknown
     ids       (L,) index of each layout in its file or generator
-    boxes     of each layout, the boxes that are there
+    boxes     the boxes present in each layout
     """
 
     centers: np.ndarray

@@ -1,4 +1,4 @@
-"""What all figures share: a colour per solver, panels, axes, and how a figure is saved.
+"""Shared by all figures: a colour per solver, panels, axes, and saving.
 
 Figures are plain `matplotlib.figure.Figure` objects without pyplot, so that no window system and no global
 state is touched, and a figure is freed when nothing refers to it.
@@ -28,8 +28,8 @@ SMALL, TEXT, TITLE = 8, 9, 10  # points
 def solver_colours(solvers: Iterable[str]) -> dict[str, str]:
     """A colour (hex) for each solver, the same in every figure.
 
-    The names in KNOWN have theirs. Any other starts at a place that follows from its letters and takes the
-    first colour free there; only with more solvers than colours do two share one.
+    Names in KNOWN have fixed colours. Any other name starts at a place computed from its letters and takes the
+    first free colour from there; two share a colour only if there are more solvers than colours.
     """
     names = list(dict.fromkeys(solvers))
     colours = {name: PALETTE[KNOWN.index(name)] for name in names if name in KNOWN}
@@ -70,7 +70,7 @@ def tidy(axes: Axes, title: str = "", grid: str | None = "y") -> None:
 
 def legend(figure: Figure, handles: Sequence[Artist]) -> None:
     """One legend above all panels, where it covers no data, in as few rows as the figure's width allows."""
-    # Some 0.07 inches a letter, and as much again for handle and gap as for nine letters.
+    # Some 0.07 inches per letter, and the width of nine letters for handle and gap.
     needed = sum(0.65 + 0.07 * len(str(handle.get_label())) for handle in handles)
     rows = ceil(needed / figure.get_figwidth())
     columns = ceil(len(handles) / rows)

@@ -1,4 +1,4 @@
-"""What a scenario is: a named source of layouts, drawn by number from a seed or read from a file."""
+"""A scenario: a named source of layouts, drawn by number from a seed or read from a file."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from torchgco.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.layouts import Layouts, concatenate
 
-MAX_DRAWS = 5000  # rounds of redrawing points that lie too near, before a rule is called impossible
+MAX_DRAWS = 5000  # rounds of redrawing points that lie too near, before an InputError
 
 
 class Scenario(ABC):
     """A named source of obstacle layouts.
 
-    A layout depends on (seed, id) alone: neither on how many others are drawn with it nor on the solver. A
+    A layout depends only on (seed, id), not on the solver or on the other layouts drawn with it. A
     subclass has a `name` and a `dimension` and overrides `_draw_one`.
     """
 
@@ -57,7 +57,7 @@ def generator(seed: int, number: int) -> np.random.Generator:
 
 @dataclass(frozen=True, kw_only=True)
 class Family(Scenario):
-    """What the built-in random families share: equal spheres, one start at rest, one goal.
+    """Base of the built-in random families: equal spheres, one start at rest, one goal.
 
     start, goal      positions (d,) m; the full states are at rest
     obstacle_radius  m; vehicle_radius: m; goal_radius: m
@@ -119,7 +119,7 @@ def uniform_clear(
     """`count` points (count, d) uniform in the box `region`, each redrawn until it is clear.
 
     `region` is d pairs [low, high] in m; clear means farther than `distance` from `point` for every
-    (point, distance) in `keep_clear`. Raises InputError where some point never is.
+    (point, distance) in `keep_clear`. Raises InputError if some point isn't after `MAX_DRAWS` rounds.
     """
     low, high = np.array(region, np.float64).T
     points = rng.uniform(low, high, (count, len(low)))
@@ -135,5 +135,5 @@ def uniform_clear(
     raise InputError(
         "scenario.region",
         f"room for scenario.num_obstacles = {count} centres more than {distances}",
-        f"{[list(pair) for pair in region]}, where {MAX_DRAWS} draws found too little",
+        f"{[list(pair) for pair in region]}, where {MAX_DRAWS} draws found no room",
     )

@@ -1,4 +1,4 @@
-"""Checks of what scenarios and layouts are given.
+"""Checks of the arguments of scenarios and layouts.
 
 Each returns the value in one plain form or raises InputError. Letters as in `layouts`: L layouts,
 M spheres, K boxes, d the dimension of space, n states, m controls.
@@ -182,7 +182,7 @@ def states(value: Any, field: str, centers: np.ndarray) -> np.ndarray | None:
 
 
 def control_bounds(lower: Any, upper: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Bounds (m,) of the controls, either of them possibly None, infinite where there is none."""
+    """Bounds (m,) of the controls, either of them possibly None, infinite where unbounded."""
     bounds: list[np.ndarray | None] = []
     for value, field in ((lower, "layouts.control_lower"), (upper, "layouts.control_upper")):
         bound = None if value is None else array(value, field)

@@ -1,4 +1,4 @@
-"""Obstacle layouts: what a scenario draws, and what a layout file holds.
+"""Obstacle layouts, as scenarios draw them and layout files hold them.
 
 L layouts, M spheres and K boxes each, d the dimension of space (2 or 3). A layout with fewer of them is padded with
 rows of NaN. Lengths in metres, times in seconds.
@@ -20,7 +20,7 @@ import numpy as np
 from torchgco.errors import InputError
 from torchgco.scenarios import checks
 
-# What a file may hold, in the order of the fields of Layouts. `layout` are the ids, if they are not 0..L-1.
+# Arrays of a file, in the order of the fields of Layouts. `layout` holds the ids, if they are not 0..L-1.
 REQUIRED = ("centers", "radii")
 SCALARS = ("vehicle_radius", "goal_radius", "dt", "stages")
 CONTROLS = ("control_lower", "control_upper")
@@ -28,13 +28,13 @@ BOXES = ("box_centers", "box_half_sizes", "box_rotations")
 NAMED = (*REQUIRED, "velocities", *BOXES, "start", "goal", *SCALARS, *CONTROLS, "best_cost")
 IDS = "layout"
 
-# What np.load raises on a file that is no npz, holds pickles or is damaged; a lone .npy fails as a context.
+# Raised by np.load for a file that is no npz, holds pickles or is damaged; an .npy file fails as a context manager.
 UNREADABLE = (OSError, EOFError, AttributeError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, eq=False)
 class Layouts:
-    """A batch of obstacle layouts with what is known of the task in them.
+    """A batch of obstacle layouts, with start, goal and other parts of the task where known.
 
     centers         (L, M, d) m, rows of NaN where an obstacle is absent
     radii           (L, M) m, NaN where absent
@@ -107,7 +107,7 @@ class Layouts:
         return self.centers.shape[2]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays a file of these layouts holds, by name; what is None isn't among them."""
+        """The arrays that a file of these layouts holds, by name, without those that are None."""
         held = {name: np.asarray(getattr(self, name)) for name in NAMED if getattr(self, name) is not None}
         if not np.array_equal(self.ids, np.arange(self.count)):
             held[IDS] = self.ids
@@ -217,7 +217,7 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
 
 
 def _joined_boxes(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
-    """The boxes of all parts, as many in each; None where no part has any."""
+    """The boxes of all parts, padded to the same number; None where no part has any."""
     width = max(0 if part.box_centers is None else part.box_centers.shape[1] for part in parts)
     turned = any(part.box_rotations is not None for part in parts)
     columns: dict[str, list[Any]] = {name: [] for name in BOXES}
@@ -236,7 +236,7 @@ def _joined_boxes(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
 
 
 def _behind(value: np.ndarray, missing: int) -> list[tuple[int, int]]:
-    """How np.pad adds so many rows along the second axis."""
+    """The widths with which np.pad adds `missing` rows along the second axis."""
     return [(0, 0), (0, missing), (0, 0)][: value.ndim]
 
 

@@ -1,4 +1,4 @@
-"""Scenarios in the plane: discs before the planar vehicle."""
+"""Scenarios in the plane: disc obstacles for the planar vehicle."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TRAP = ((0.0, -0.25), (0.1, 0.0), (0.12, 0.25), (0.0, 0.5), (-0.2, 0.6), (-0.2, 
 
 @dataclass(frozen=True, kw_only=True)
 class Planar(Family):
-    """What the planar families share: state n = 6 [p, theta, p', theta'], control m = 2 [a_left, a_right].
+    """Base of the planar families: state n = 6 [p, theta, p', theta'], control m = 2 [a_left, a_right].
 
     control_lower, control_upper
         one number for both wheels, or one each, or None for the model's own. Without reversing (a lower bound

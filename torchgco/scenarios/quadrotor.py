@@ -1,4 +1,4 @@
-"""Scenarios in space: spheres before the quadrotor's planning model."""
+"""Scenarios in space: sphere obstacles for the quadrotor's planning model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HOVER = 9.81  # thrust acceleration that holds the vehicle, m/s^2
 
 @dataclass(frozen=True, kw_only=True)
 class Quadrotor(Family):
-    """What the quadrotor families share: state n = 14 [p, v, q, w, a], at rest upright and hovering.
+    """Base of the quadrotor families: state n = 14 [p, v, q, w, a], at rest upright and hovering.
 
     Control bounds are the model's.
     """
@@ -44,7 +44,7 @@ class Forest(Quadrotor):
     """Spheres with centres uniform in `region` (3 pairs [low, high], m), which may overlap.
 
     num_obstacles  how many
-    density        per m^3 of the region; where given it overrides num_obstacles by the nearest whole number
+    density        per m^3 of the region; if given, num_obstacles is the nearest whole number that it implies
     clearance      a centre is redrawn until it is more than this from start and goal, m
     """
 
@@ -132,7 +132,7 @@ class Walls(Quadrotor):
 
     def _grid(self) -> np.ndarray:
         """Centres in the plane of a wall, (G, 2): all z for each y."""
-        # The small addition keeps an end that a whole number of pitches reaches but for rounding.
+        # The small addition keeps an end that a whole number of pitches reaches up to rounding.
         steps = [int((high - low) / self.pitch + 1e-9) for low, high in self.extent]
         y, z = (low + self.pitch * np.arange(n + 1) for n, (low, _) in zip(steps, self.extent, strict=True))
         return np.stack(np.meshgrid(y, z, indexing="ij"), axis=-1).reshape(-1, 2)

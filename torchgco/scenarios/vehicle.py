@@ -22,7 +22,7 @@ from torchgco.scenarios.layouts import Layouts
 
 @dataclass(frozen=True)
 class Task:
-    """A batch of planning problems with what a study needs in addition."""
+    """A batch of planning problems, with initial guess, goal and layouts."""
 
     problem: Problem
     U0: Tensor  # (B, N, m), the vehicle at rest
@@ -33,15 +33,18 @@ class Task:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """A planning model with the values of the paper's tables. Layouts override the last group of arguments.
+    """A planning model with the values of the paper's tables. Layouts override the control bounds and all below.
 
     Args:
         name: as the study's column `model` shows it.
         dynamics: planning model; the layouts' time step overrides its own.
         state_weight, control_weight, terminal_weight: diagonals of Q, R, Qf.
         control_reference: u_ref (m,), also the initial guess: the vehicle at rest.
-        control_lower, control_upper: (m,).
-        start, goal: states (n,); radius: r_veh, m; goal_radius: m; stages: N.
+        control_lower, control_upper: (m,), in the units of the inputs.
+        start, goal: states (n,).
+        radius: r_veh, m.
+        goal_radius: m.
+        stages: N.
 
     Raises:
         InputError: on `task`: layouts of another dimension or with states of another length.
@@ -63,7 +66,7 @@ class Vehicle:
 
     @property
     def dimension(self) -> int:
-        """d of the space the vehicle moves in, 2 or 3."""
+        """d of the space that the vehicle moves in; 0 for dynamics without a position."""
         position = self.dynamics.position
         return 0 if position is None else position.stop - position.start
 

@@ -16,7 +16,7 @@ from torchgco.tree import copied, put, take
 
 
 class Best:
-    """Keeps the best trajectory of each problem and the sums of all counts; created and dropped by one solve."""
+    """Keeps the best trajectory of each problem and the sums of all counts, during one solve."""
 
     def __init__(
         self, call: Call, first: SolveEnd, solver: AugmentedLagrangian, recorder: Recorder | None = None
@@ -26,7 +26,7 @@ class Best:
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
 
     def arrived(self, tolerances: float = 1.0) -> Tensor:
-        """Whether the best trajectory of each problem is feasible and ends within so many goal tolerances, (B,)."""
+        """Whether each problem's best trajectory is feasible and ends within `tolerances` goal tolerances, (B,)."""
         best = self.end.best
         fits = best.violation <= self.solver.violation_tolerance
         return fits & has_arrived(self.call.problem, best.X, tolerances)
@@ -55,7 +55,7 @@ class Best:
         return self.solver.iterate(call, guidance, penalty, self.recorder, guide_first, by_arrival=True)
 
     def keep(self, rows: Tensor, new: SolveEnd) -> None:
-        """The better of the old trajectories of `rows` and new ones: arrived, then feasible, then cheap."""
+        """Keep the better of the old and the new trajectories of `rows`: arrived, then feasible, then cheapest."""
         problem, limit = self.call.problem.take(rows), self.solver.violation_tolerance
         old = take(self.end.best, rows)
         self.replace(rows, is_preferred(problem, new.best, old, limit), new.best, new)
@@ -69,7 +69,7 @@ class Best:
             getattr(self.end, name)[rows] += getattr(new, name)
 
     def _callback(self, call: Call) -> Callback | None:
-        """Progress of an attempt as progress of the batch, which never falls: all other problems have finished."""
+        """Reports an attempt's progress as the batch's, where all other problems have finished; it never falls."""
         if call.callback is None:
             return None
         report, total = call.callback, self.call.problem.B

@@ -16,8 +16,8 @@ from torchgco.search import scene as seen
 from torchgco.solvers.ilqr import ILQR, descend
 from torchgco.tree import take
 
-AT_ONCE = 256  # candidates solved at once: memory stays bounded, however large the batch
-PENALTY = 80.0  # of obstacles once nothing attracts a candidate, in q0 / R^4
+AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
+PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,11 @@ class Candidates:
     """
 
     problem: Problem  # of the B problems
-    X: Tensor
-    U: Tensor
-    R: Tensor  # m
-    unit: Tensor  # q0 / R^4
-    live: Tensor  # bool: the others are left as they are, and come last
+    X: Tensor  # (B * count, N+1, n)
+    U: Tensor  # (B * count, N, m)
+    R: Tensor  # (B * count,): mean inflated radius, m
+    unit: Tensor  # (B * count,): q0 / R^4
+    live: Tensor  # bool: the others are never solved, and come last
     count: int  # candidates of each problem
     iterations: Tensor  # (B,) int64: of all solves so far, those of dropped candidates included
 
@@ -60,19 +60,19 @@ class Candidates:
         return self.problem.take(rows // self.count)
 
     def multipliers(self, rows: Tensor, penalty: float) -> Multipliers:
-        """No multipliers yet, and a penalty in q0 / R^4, of the candidates in `rows` (b,)."""
+        """Zero multipliers and a penalty in q0 / R^4 for the candidates in `rows` (b,)."""
         return replace(Multipliers.zero(self.of(rows), 0.0), mu=penalty * self.unit[rows])
 
     def parts(self) -> Iterator[Tensor]:
-        """Rows of the live candidates, some at a time."""
+        """Rows of the live candidates, `AT_ONCE` at a time."""
         return (rows for rows in self.live.nonzero().flatten().split(AT_ONCE) if rows.numel() > 0)
 
     def arrive(self) -> Tensor:
-        """Whether each candidate ends near the goal."""
+        """Whether each candidate ends near the goal, (B * count,)."""
         return seen.arrives(self.problem, self.X.view(self.problem.B, self.count, *self.X.shape[1:])).flatten()
 
     def penetration(self) -> Tensor:
-        """The deepest penetration of each live candidate into an obstacle, m."""
+        """The deepest penetration of each live candidate into an obstacle, (B * count,), m."""
         depth = torch.zeros_like(self.R)
         for rows in self.parts():
             depth[rows] = seen.penetration(self.of(rows), self.X[rows], self.U[rows])
@@ -95,7 +95,7 @@ class Candidates:
         return replace(self, X=X, U=U, iterations=iterations)
 
     def order(self, first: Tensor, alike: float | None = None) -> Tensor:
-        """The candidates of each problem as places in their order, (B, count).
+        """Places (B, count) of each problem's candidates, the best first.
 
         Candidates in `first` come before the others; then the penalised cost decides. Of those in `first` whose costs
         differ by at most `alike`, as a share, all but the cheapest come after the others.

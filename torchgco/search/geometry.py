@@ -15,7 +15,7 @@ from torchgco.constraints.obstacles import FAR as FAR
 
 @dataclass(frozen=True)
 class Scene:
-    """Start, goal and obstacles of B problems; m."""
+    """Start, goal and obstacles of B problems; lengths in m."""
 
     start: Tensor  # (B, d)
     goal: Tensor  # (B, d)

@@ -1,6 +1,6 @@
 """The search of the roadmap in PyTorch: the counterpart of native/roadmap_paths.c for every device and precision.
 
-Both return the same paths, also where several cost the same. Ties are broken by the lowest index, and no comparison
+Both return the same paths, even where several cost the same. Ties are broken by the lowest index, and no comparison
 depends on rounding: sums have a fixed order (there is no matrix product), clearance and nearness are compared as
 squares (PyTorch's square roots are not always correctly rounded), and detours and costs that differ by rounding alone
 are equal.
@@ -42,14 +42,14 @@ class Search:
         return (self.R if self.boxes is None else torch.cat((self.R, self.boxes.sizes), dim=1)).amax(-1, keepdim=True)
 
     def graph(self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int) -> Graph:
-        """Points, each joined to the nearest of all, to the nearest of those spread, and to the goal.
+        """Points, each joined to its nearest of all points, its nearest of the spread points, and the goal.
 
         Args:
             start, goal: points 0 and 1, (B, d).
             cube: points (spread, d) in the unit cube, spread over the box that start, goal and spheres fill.
             nodes: number of free points around spheres that are added, those of the shortest detours. Unused places
                 lie at the start, without edges.
-            neighbours, hubs: edges of a point to the nearest of all and to the nearest of those spread.
+            neighbours, hubs: edges of a point to its nearest of all points and of the spread points.
         """
         given = torch.cat((torch.stack((start, goal), dim=1), self._spread(start, goal, cube)), dim=1)
         kept, taken = self._beside(start, goal, nodes)
@@ -64,26 +64,26 @@ class Search:
         return Graph(points, ends, torch.where(joined, self._lengths(points, ends), torch.inf))
 
     def cheapest(self, graph: Graph, price: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The cheapest paths from point 0 to point 1, by relaxing all edges at once.
+        """The cheapest paths from point 0 to point 1, by Bellman and Ford's algorithm on all edges at once.
 
         Args:
             price: cost per metre at the points, (B, V).
 
         Returns:
-            Corners (B, HOPS+1, d), the goal repeated at their ends: the straight line where there is no path of at most
-            HOPS edges; start, goal, and then the middles of the edges and the other corners in turn,
-            (B, 2 HOPS + 1, d); whether there is a path (B,).
+            Corners (B, HOPS+1, d), the goal repeated at their ends; the straight line where no path has at most HOPS
+            edges. Points (B, 2 HOPS + 1, d): start, goal, then in turn the middles of the edges and the other corners.
+            Whether there is a path (B,).
         """
         points, ends, lengths = graph
         edges = lengths * 0.5 * (price.unsqueeze(-1) + _rows(price, ends))
-        edges = torch.where(edges < torch.inf, edges, torch.inf)  # where a price is no number there is no edge
+        edges = torch.where(edges < torch.inf, edges, torch.inf)  # a price of NaN removes the edge
         cost = torch.full_like(price, torch.inf)
         cost[:, 1] = 0.0
         through = edges + _rows(cost, ends)
         for _ in range(HOPS):
             before, cost = cost, torch.minimum(cost, through.amin(-1))
             if torch.equal(before, cost):
-                break  # nor would further rounds change anything
+                break  # further rounds would change nothing
             through = edges + _rows(cost, ends)
         best = through.amin(-1, keepdim=True)
         first = (through <= best + TIE * best.abs()).to(torch.uint8).argmax(-1, keepdim=True)
@@ -105,7 +105,7 @@ class Search:
         Args:
             path: corners (B, HOPS+1, d).
             string: the points that `cheapest` returned with it, (B, 2 HOPS + 1, d).
-            price: cost per metre there, (B, 2 HOPS + 1).
+            price: cost per metre at the points of `string`, (B, 2 HOPS + 1).
         """
         # All corners are joined to all, and paths grouped by length: short paths shouldn't pay for rare long ones.
         edges = (path != path[:, -1:]).any(-1).sum(-1)
@@ -178,7 +178,7 @@ class Search:
         return free & (self.boxes.squares(points) > _signed_square(least).unsqueeze(1)).all(-1)
 
     def _lengths(self, points: Tensor, ends: Tensor) -> Tensor:
-        """Lengths (B, V, K) of the edges to the points `ends`, more close to a sphere, infinite through one."""
+        """Lengths (B, V, K) of the edges to the points `ends`, raised close to an obstacle, infinite through one."""
         a = points.unsqueeze(2).expand(-1, -1, ends.shape[2], -1).flatten(1, 2)
         b = _rows(points, ends.flatten(1))
         away = squares_from_segments(self.o, a, b)
@@ -189,7 +189,7 @@ class Search:
             free = free & (away > _signed_square(self.boxes.radius).unsqueeze(1)).all(-1).view(ends.shape)
             gap = torch.minimum(gap, away.sqrt_().sub_(self.boxes.radius.unsqueeze(1)).amin(-1).view(ends.shape))
         length = (b - a).square().sum(-1).sqrt().view(ends.shape)
-        # Every edge costs something: else paths would circle among points that coincide.
+        # Every edge costs something: otherwise paths could circle among points that coincide.
         length = length + LEAST * (points[:, 1] - points[:, 0]).square().sum(-1).sqrt().view(-1, 1, 1)
         margin = self.margin * self.largest.clamp(min=1e-9).view(-1, 1, 1)
         close = 1.0 + ((margin - gap) / margin).clamp(0.0, 1.0)
@@ -197,7 +197,7 @@ class Search:
 
 
 def _lowest(values: Tensor, count: int) -> Tensor:
-    """Indices (..., count) of the lowest values in their order, of equals the first."""
+    """Indices (..., count) of the lowest values in ascending order; of equal values the first."""
     return values.sort(dim=-1, stable=True).indices[..., :count]
 
 

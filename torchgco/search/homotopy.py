@@ -37,7 +37,7 @@ def _wind_alike(paths: Tensor, scene: Scene) -> Tensor:
 
 
 def _are_close(paths: Tensor, scene: Scene) -> Tensor:
-    """(B, K, K): nowhere farther apart than the largest r_obs + r_veh, at the same shares of their lengths."""
+    """(B, K, K): nowhere farther apart than the largest obstacle's size, at the same shares of their lengths."""
     flat = paths.flatten(0, 1)
     length = (flat[:, 1:] - flat[:, :-1]).square().sum(-1).sqrt().sum(-1, keepdim=True)
     share = torch.linspace(0.0, 1.0, POINTS, dtype=flat.dtype, device=flat.device)

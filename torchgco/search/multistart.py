@@ -1,4 +1,4 @@
-"""Random restarts: many guesses, the best result kept. Guidance has to do better than this to be worth anything."""
+"""Random restarts: many guesses, the best result kept. Guidance is useful only if it beats them."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class MultiStart(Solver):
 
     Args:
         local: solves from each guess.
-        starts: guesses, at most, the given one included.
+        starts: number of guesses at most, the given one included.
         budget: iterations per problem, of all its starts together, after which no further guess is tried: the last
             start may exceed it. None: all are tried.
         covariance: of the guesses around the given one, a diagonal (m,) or one number, in squared units of the
             controls.
-        noise_knots: guesses are linear between so many random points in time.
+        noise_knots: number of random values, evenly spaced in time; the noise is linear between them.
 
     Raises:
         InputError: a field out of its range; on `solve`, a covariance that doesn't fit the controls.
@@ -62,7 +62,7 @@ class MultiStart(Solver):
         scaled, unit = solver.inner.in_units(call)
         guidance = None if solver.guidance is None else solver.guidance.suited(scaled.problem)
         best = Best(scaled, solver.iterate(scaled, guidance), solver)
-        left = call.problem.start_is_clear & torch.isfinite(call.problem.x0).all(-1)  # elsewhere no guess helps
+        left = call.problem.start_is_clear & torch.isfinite(call.problem.x0).all(-1)  # no guess helps an invalid start
         for start in range(1, self.starts):
             rows = (left if self.budget is None else left & (best.end.iterations < self.budget)).nonzero().flatten()
             if rows.numel() == 0:

@@ -1,9 +1,9 @@
 """Proposals along paths: for each problem, the best of several trajectories that follow short paths past obstacles.
 
-1. The roadmap gives short paths; one of each homotopy class is kept.
-2. A candidate tracks each path, from rest and from each initial offset of the controls, at each pace.
-3. The candidates are relaxed: nothing attracts them any more, and a penalty keeps them out of the obstacles.
-4. The best, by their penalised cost, are refined: the augmented Lagrangian solves them to convergence.
+1. The roadmap gives short paths; one per homotopy class is kept.
+2. Candidates track each path, from rest and from each initial offset of the controls, at each pace.
+3. The candidates are relaxed: solved further without a guide; a penalty keeps them out of the obstacles.
+4. The best by penalised cost are refined: the augmented Lagrangian solves them to convergence.
 5. The cheapest is proposed, with the multipliers to continue with.
 
 A proposal may touch obstacles slightly: the solver removes that. Candidates that penetrate deeper are rejected, since
@@ -35,8 +35,8 @@ from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
 from torchgco.tree import put, take
 
-MOST = 1536  # paths of all problems that are followed together: memory stays bounded
-OFFSET_LASTS = 0.1  # share of the horizon
+MOST = 1536  # paths of all problems that are tracked together: bounds the memory
+OFFSET_LASTS = 0.1  # share of the horizon that an initial offset lasts
 ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a share, count as the same
 
 TOLERANCE = 5e-5  # of tracking and relaxing, as a share of L_M; refining takes a tenth of it
@@ -49,7 +49,7 @@ class Proposal(NamedTuple):
     """Trajectories to continue from."""
 
     U: Tensor  # (B, N, m)
-    found: Tensor  # (B,) bool: whether there is one; U means nothing where not
+    found: Tensor  # (B,) bool: whether there is a proposal; elsewhere U is not to be used
     multipliers: Multipliers  # to continue with; mu keeps the solver from leaving the path, NaN where there is none
     iterations: Tensor  # (B,) int64: of all solves of all candidates, also where none is found
 
@@ -63,23 +63,23 @@ class PathProposals:
         num_paths: paths per problem, before those of one homotopy class are merged.
         initial_offsets: offsets (m,) of the controls over the first tenth of the horizon, as shares of the range from
             rest to the control bounds; every path is tracked from rest and once from each offset. An initial turn lets
-            a vehicle that turns slowly find reversing and three-point turns. Left out where they don't fit the number
-            of controls.
+            a vehicle that turns slowly find reversing and three-point turns. `Restarts` leaves them out where they
+            don't fit the number of controls.
         depart, arrive: shares of the horizon at which the vehicle leaves the start and reaches the goal. Several
             values of `arrive`: every path is tracked at each pace.
         smoothing: share of the horizon over which the corners of a path are averaged.
         tube: radius of the tube that a candidate is kept in, as a share of the mean inflated radius; None: a spring to
             the path instead. A spring takes half the iterations; a vehicle that can't move sideways ends closer to the
             path in a tube.
-        stiffness: of tube or spring, one solve after the other, in units of the cost of resting at the start per
+        stiffness: of tube or spring, one tracking solve per value, in units of the cost of resting at the start per
             squared distance to the goal.
         track_iterations, relax_iterations: iLQR iterations of each of these solves, at most; relax_iterations=0
             compares the candidates as tracked.
         relax_top: candidates per problem that are relaxed, the cheapest as tracked; None: all.
         refine_top: candidates per problem that AL-iLQR solves to convergence, of the relaxed ones that differ; 1: the
             best relaxed candidate is proposed as it is.
-        max_penetration: of a relaxed candidate into an obstacle, as a share of the mean inflated radius; candidates
-            that penetrate deeper are rejected.
+        max_penetration: largest accepted penetration of a relaxed candidate into an obstacle, as a share of the mean
+            inflated radius.
 
     Raises:
         InputError: a field out of its range.
@@ -127,7 +127,7 @@ class PathProposals:
 
     @property
     def paces(self) -> tuple[float, ...]:
-        """All of `arrive`."""
+        """The values of `arrive`, as a tuple."""
         return tuple(self.arrive) if isinstance(self.arrive, Sequence) else (self.arrive,)
 
     def propose(self, problem: Problem) -> Proposal:
@@ -180,7 +180,7 @@ class PathProposals:
         return starts
 
     def track(self, candidates: Candidates, paths: Tensor) -> Candidates:
-        """Each candidate along its path (B, num_paths, P, d), to arrive at its pace, from its start."""
+        """The candidates, tracked along their paths (B, num_paths, P, d) from their initial controls at their paces."""
         paces, K = len(self.paces), paths.shape[1]
         path = paths.flatten(0, 1).repeat_interleave(paces, dim=0)
         arrive = path.new_tensor(self.paces).repeat(path.shape[0] // paces)
@@ -196,10 +196,10 @@ class PathProposals:
         return candidates
 
     def relax(self, candidates: Candidates) -> tuple[Candidates, Tensor]:
-        """Candidates that nothing attracts, and whether they arrive without deep penetration (B * count,)."""
+        """The candidates, solved further without a guide, and whether they are sound, (B * count,)."""
         if self.relax_iterations > 0:
             relaxed = candidates.solved(_inner(self.relax_iterations), PENALTY)
-            # A candidate that falls back into the trap, where waiting is cheaper, is no longer one.
+            # A candidate that falls back into the trap, where waiting is cheaper, stays as tracked.
             keeps = (relaxed.arrive() | ~candidates.arrive()).view(-1, 1, 1)
             X, U = torch.where(keeps, relaxed.X, candidates.X), torch.where(keeps, relaxed.U, candidates.U)
             candidates = replace(relaxed, X=X, U=U)
@@ -209,7 +209,7 @@ class PathProposals:
     def refine(self, candidates: Candidates, sound: Tensor) -> tuple[Candidates, Multipliers, Tensor]:
         """The sound candidates solved to convergence by AL-iLQR.
 
-        Returns the candidates, the multipliers that each is to continue with, and the rows (B,) of the cheapest: the
+        Returns the candidates, the multipliers for each to continue with, and the rows (B,) of the cheapest: the
         first of each problem where none converges, or `refine_top` is 1.
         """
         everyone = torch.arange(candidates.live.numel(), device=sound.device)

@@ -48,16 +48,16 @@ class Restarts(Solver):
     """AL-iLQR, and where it is caught between obstacles, further attempts; the best trajectory is returned.
 
     Args:
-        local: solves every attempt; it brings no guidance of its own.
+        local: solves every attempt; its `guidance` is None.
         paths: proposals along paths between static obstacles, for the first attempt after a trajectory is caught; None:
-            without them.
+            no such attempt.
         sampling: guidance of the other attempts; its `single_contact_after` also says when a trajectory counts as
-            caught. None: without them.
-        attempts: per problem, after its trajectory is caught.
-        all_attempts: make them all even if one arrives, and return the cheapest.
+            caught. None: no sampled attempts.
+        attempts: number per problem, after its trajectory is caught.
+        all_attempts: make all attempts even if one arrives, and return the cheapest result.
 
     Raises:
-        InputError: a field out of its range.
+        InputError: a field out of its range, or a `local` with guidance.
     """
 
     local: AugmentedLagrangian = AugmentedLagrangian()
@@ -115,7 +115,7 @@ class Restarts(Solver):
         stopped = caught.status == STOPPED
         for attempt in range(1, self.attempts + 1):
             if recorder is not None:
-                recorder.attempt = attempt + 1  # the same for a problem in every batch
+                recorder.attempt = attempt + 1  # a problem gets the same number in any batch
             wanted = (stopped if self.all_attempts else stopped & ~best.arrived()).nonzero().flatten()
             start = take(caught.last, wanted)
             if attempt == 1 and paths is not None:
@@ -128,9 +128,9 @@ class Restarts(Solver):
         return best
 
     def _along_paths(self, best: Best, rows: Tensor, start: Iterate, paths: PathProposals) -> tuple[Tensor, Iterate]:
-        """An attempt along the proposed path of each problem in `rows`; the problems without one, and where they start.
+        """An attempt from the proposal of each problem in `rows`; returns the problems without one, and their start.
 
-        Also where a proposal is rejected, its penalty keeps the solver from returning to the caught trajectory.
+        The penalty of a rejected proposal is kept: it keeps the solver from returning to the caught trajectory.
         """
         if rows.numel() == 0:
             return rows, start
@@ -152,7 +152,7 @@ class Restarts(Solver):
         call = replace(best.call.take(rows), U0=start.U, warm=start.multipliers)
         if attempt == 1:
             call = replace(call, outer=best.first.outer[rows])
-        else:  # draws of its own
+        else:  # other random draws
             call = replace(call, seed=call.seed + SEED_STEP * (attempt - 1))
         best.improve(rows, call, guidance=sampling, guide_first=True)
 
@@ -171,7 +171,7 @@ class StopWhenCaught:
         self.single_contact_after = single_contact_after
 
     def suited(self, problem: Problem) -> StopWhenCaught:
-        """Itself: any problem will do."""
+        """This guidance, which serves any problem."""
         return self
 
     def start(self, problem: Problem, X: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""Short paths between spheres, over a graph of points: where to pass, not yet how to fly.
+"""Short paths between spheres and boxes over a graph of points: geometry alone, without time or controls.
 
 Points lie around every obstacle, midway between neighbours and, in a fixed low-discrepancy sequence, all over the
 scene; each is joined to a few near ones where the straight line is free. Nothing is random. The search runs in C
@@ -22,9 +22,9 @@ from torchgco.search.graph import Search
 
 AT_ONCE = 4  # problems that PyTorch searches together: memory holds the distances of all edges from all obstacles
 NODES = 128  # points around obstacles: those of the shortest detours
-NEIGHBOURS, HALTON_NEIGHBOURS = 12, 6  # edges of a point: to the nearest of all and of the Halton points
-MARGIN = 0.15  # distance from an obstacle, as a share of the inflated radius, below which an edge costs up to double
-DIVERSITY = 1.0  # extra cost of a further path, as a share, within the inflated radius of a former path
+NEIGHBOURS, HALTON_NEIGHBOURS = 12, 6  # edges of a point to its nearest of all points and of the Halton points
+MARGIN = 0.15  # distance from an obstacle, in largest inflated radii, below which an edge costs up to double
+DIVERSITY = 1.0  # extra cost of later paths, as a share, within the largest inflated radius of an earlier path
 PRIMES = (2, 3, 5)  # bases of the low-discrepancy sequence
 
 
@@ -33,8 +33,8 @@ class Roadmap:
     """A graph of points around obstacles, and the cheapest paths over it.
 
     Args:
-        num_halton: points of a Halton sequence all over the scene, besides `NODES` points around the obstacles.
-        max_overlap: penetration of a path into an obstacle that is allowed, as a share of the inflated radius; below
+        num_halton: points of a Halton sequence all over the scene, added to `NODES` points around the obstacles.
+        max_overlap: allowed penetration of a path into an obstacle, as a share of the inflated radius. Keep it below
             0.05, which the judge accepts between two knots. A gap closed by no more than this can be flown through.
 
     Raises:
@@ -54,8 +54,8 @@ class Roadmap:
         """Different paths, the cheapest first; each further one avoids those before it unless that costs too much.
 
         Returns:
-            Corners (B, count, HOPS+1, d), the goal repeated at their ends; and whether there is a path (B,), the
-            straight line where not.
+            Corners (B, count, HOPS+1, d), m, the goal repeated at their ends, or the straight line where there is no
+            path; and whether there is a path (B,).
         """
         library = roadmap.library_for(scene.centers, scene.boxes is not None)
         most = AT_ONCE if library is None else roadmap.AT_ONCE

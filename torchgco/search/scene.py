@@ -11,15 +11,15 @@ from torchgco.constraints.cuboids import join
 from torchgco.problem import Problem
 from torchgco.search.geometry import FAR, Scene
 
-OPEN = 1e10  # a range of controls from which on it counts as unbounded
-LITTLE = 1e-6  # of the unit of cost: a smaller stage cost says nothing about the goal
+OPEN = 1e10  # a range of controls at least this wide counts as unbounded
+LITTLE = 1e-6  # in units of cost: a smaller stage cost says nothing about the goal
 FALLEN_BACK = 0.25  # share of the distance from start to goal; candidates that end farther from the goal are dropped
 
 
 def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
-    """Start, goal and obstacles, with what it costs to be at a point under the controls `rest` (B, N, m).
+    """Start, goal and obstacles, and the cost of being at a point under the controls `rest` (B, N, m).
 
-    None where there are no obstacles, or some that the roadmap can't take, or space is neither 2-D nor 3-D.
+    None without a goal or obstacles, with obstacles that the roadmap can't take, or if space is neither 2-D nor 3-D.
     """
     forms = [c.inflated() if isinstance(c, Obstacles) else None for c in problem.geometric]
     spheres = [form for form in forms if form is not None]
@@ -46,10 +46,10 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
 
 
 def scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """R and q0 / R^4 (B,), the units of lengths and penalties, of problems in units of cost.
+    """R and q0 / R^4 (B,), the units of lengths and penalties, for problems in units of cost.
 
-    q0 is the stage cost of resting at the start, or, where a cost asks for the goal at its end alone, what staying
-    there costs per stage.
+    R is the mean size of the obstacles, m. q0 is the stage cost of resting at the start, or, where only the
+    terminal cost depends on the goal, the mean cost per stage of staying there.
     """
     here = scene.sizes > 0
     R = torch.where(here, scene.sizes, 0.0).sum(-1) / here.sum(-1).clamp(min=1)
@@ -59,7 +59,7 @@ def scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor
 
 
 def arrives(problem: Problem, X: Tensor) -> Tensor:
-    """Whether candidates X (B, ..., N+1, n) end near the goal, (B, ...): in a looser sense than that of a solution."""
+    """Whether candidates X (B, ..., N+1, n) end near the goal, (B, ...): looser than the goal tolerance."""
     at = problem.position
     assert problem.goal is not None
     first = problem.goal.distance(problem.x0[:, at]).view(-1, *([1] * (X.dim() - 3)))

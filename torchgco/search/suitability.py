@@ -1,4 +1,4 @@
-"""Whether paths can be sought for a problem, found out before anything is solved."""
+"""Whether paths can be sought for a problem, checked before anything is solved."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchgco.search.scene import scene_of
 
 
 def suited_paths(paths: PathProposals | None, problem: Problem) -> tuple[PathProposals | None, str | None]:
-    """The proposals that a problem can have, or None, and a sentence on the loss; None where there is none.
+    """The usable proposals, or None; and a sentence on what is lost, or None.
 
     Obstacles that the roadmap doesn't know by design, such as moving ones, are no loss. Initial offsets for another
     number of controls are left out.
@@ -29,20 +29,20 @@ def suited_paths(paths: PathProposals | None, problem: Problem) -> tuple[PathPro
         return None, "the dynamics have no position"
     d = position.stop - position.start
     if d not in (2, 3) and any(isinstance(c, Obstacles) for c in problem.geometric):
-        return None, f"no path is sought around obstacles in {d}-D, as the roadmap knows 2-D and 3-D alone"
+        return None, f"no path is sought around obstacles in {d}-D, as the roadmap knows only 2-D and 3-D"
     if any(len(offset) != problem.m for offset in paths.initial_offsets):
         paths = replace(paths, initial_offsets=())
     one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
     rest = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))
     if scene_of(one, rest) is None:
         return paths, None
-    paths.starts(one, rest)  # raises where an offset isn't one
+    paths.starts(one, rest)  # raises for malformed offsets
     why = None if engine_of(problem) is not None else failure(_expand, problem, problem.x0.dtype)
     return (paths, None) if why is None else (None, f"no path can be followed ({why})")
 
 
 def _expand(problem: Problem) -> None:
-    """What an iLQR iteration evaluates, for one problem that stays at its start."""
+    """Evaluate the parts of an iLQR iteration, for one problem that stays at its start."""
     X = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1)
     U = X.new_zeros(1, problem.N, problem.m)
     check_form("dynamics", problem.dynamics.step(X[:, :-1], U), X[:, :-1])

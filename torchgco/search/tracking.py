@@ -1,4 +1,4 @@
-"""What attracts a candidate to a path: the positions that it is to take, and the penalty that pulls it there."""
+"""The guide of a tracked candidate: target positions along its path, and the penalty that pulls knots there."""
 
 from __future__ import annotations
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 BLOCK_TRIES = 10  # exchanges of whole blocks without progress before rows are exchanged one at a time
-EXCHANGES = 200
-SLACK = 1e-12  # share of a row's own scale below which nothing is exchanged, and by which dependent rows are told apart
+EXCHANGES = 200  # at most
+SLACK = 1e-12  # share of a row's scale: exchange tolerance, and regularisation of dependent rows
 
 
 def multipliers(S: Tensor, b: Tensor, free: Tensor, start: Tensor) -> Tensor | None:
@@ -16,10 +16,13 @@ def multipliers(S: Tensor, b: Tensor, free: Tensor, start: Tensor) -> Tensor | N
     None where no such lam is found: the rows contradict each other, or nearly.
 
     Rows enter and leave the working set in blocks: rows with a negative multiplier leave, violated rows enter. Where
-    that makes no progress they change one at a time, the last first, which ends for every positive definite S.
+    that makes no progress they change one at a time, the last first, which terminates for every positive definite S.
 
     Args:
-        S: (q, q) positive semidefinite, b: (q,), free: (q,) bool, start: (q,) bool, rows that are tried first.
+        S: (q, q), positive semidefinite.
+        b: (q,).
+        free: (q,) bool, equality rows.
+        start: (q,) bool, the first working set, to which free rows are added.
     """
     if b.numel() == 0:
         return torch.zeros_like(b)

@@ -1,4 +1,4 @@
-"""Augmented Lagrangian around iLQR, with a place for guidance (Algorithms 1 and 4)."""
+"""Augmented Lagrangian around iLQR, with optional guidance (Algorithms 1 and 4)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from torchgco.status import Status
 from torchgco.tree import copied, put, take
 
 PENALTY_MAX = 1e12  # ceiling of mu
-SETTLED = 1e-3  # share of J_var: a solve ends where an inner solve changed it by less, and is feasible
-HOLD = 2.0  # the penalty on an abandoned trajectory, as a multiple of the extra cost of its replacement
+SETTLED = 1e-3  # share of J_var: a solve ends once an inner solve changes it by less and is feasible
+HOLD = 2.0  # penalty on an abandoned trajectory, as a multiple of the extra cost of its replacement
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,14 @@ class AugmentedLagrangian(Solver):
     """AL-iLQR, for each problem: inner solve, multiplier update, penalty update, guidance, until it has converged.
 
     With `inner.as_printed` the loop is that of the paper: mu grows after every inner solve, inequalities have the
-    printed form (see `lagrangian.penalty_weights`), and max_outer_iterations is the only end. Otherwise mu grows while
+    printed form (see `lagrangian.penalty_weights`), and only max_outer_iterations ends it. Otherwise mu grows while
     the violation is over its tolerance, inequalities have the Powell-Hestenes-Rockafellar form, and a solve ends where
     an inner solve has converged to a feasible trajectory that changes the cost by less than 0.1 %.
 
     Args:
         inner: the local solver.
         guidance: called after every inner solve for a penalty on the next one, or for controls that replace the
-            iterate; None for none.
+            iterate; None: no guidance.
         initial_penalty, penalty_growth: mu and its factor eta per outer iteration; mu in units of the cost with
             `inner.as_printed`, else of `Problem.cost_unit`.
         max_outer_iterations: outer limit; the only end of the paper's loop.
@@ -99,8 +99,8 @@ class AugmentedLagrangian(Solver):
         """The solve without its verdict, in the units of the call: with guidance, or with a fixed penalty.
 
         Args:
-            guide_first: guidance is called before the first inner solve, too.
-            by_arrival: an iterate that has arrived at the goal is kept in place of any that hasn't.
+            guide_first: also call guidance before the first inner solve.
+            by_arrival: an iterate that has arrived at the goal is preferred to any that hasn't.
         """
         loop = OuterLoop(self, call, guidance, penalty, recorder, guide_first, by_arrival)
         B = call.problem.B
@@ -161,7 +161,7 @@ class OuterLoop:
         self.problem = whole if rows.numel() == whole.B else whole.take(rows)
 
     def advance(self, s: State) -> Tensor:
-        """One inner solve of every running problem (one iteration on a GPU), and the outer update where it ended."""
+        """One inner solve of every running problem (one iteration by PyTorch or if recorded), then the outer update."""
         lagrangian = Lagrangian(self.problem, s.multipliers, s.penalty, self.phr)
         end = advance(self.solver.inner, s, lagrangian, self.limit)
         if self.recorder is not None:
@@ -235,8 +235,8 @@ class OuterLoop:
     def _replace_iterate(self, s: State, rows: Tensor, problem: Problem, advice: Advice) -> None:
         """Continue from the advised controls where they are taken.
 
-        The multipliers belong to the abandoned trajectory, so they start again at zero. Its penalty has to keep the
-        solver from returning to it: mu is raised until that is `HOLD` times the extra cost of the new trajectory.
+        The multipliers belong to the abandoned trajectory, so they start again at zero. To keep the solver from
+        returning there, mu is raised until the penalty there is `HOLD` times the extra cost of the new trajectory.
         """
         assert advice.U is not None and advice.taken is not None
         taken = advice.taken.nonzero().flatten()

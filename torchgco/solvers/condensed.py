@@ -1,7 +1,7 @@
-"""One problem around a trajectory with its states eliminated: all that a Newton step needs, in the controls alone.
+"""One problem linearised along a trajectory, its states eliminated: the parts of a Newton step in the controls alone.
 
-With dx_0 = 0 the linearised dynamics give dX = G dU, so that v = N m numbers are left. G and the reduced Hessian are
-dense: for some hundred stages they cost less than the bookkeeping of a sparse factorisation would.
+With dx_0 = 0 the linearised dynamics give dX = G dU, which leaves v = N m unknowns. G and the reduced Hessian are
+dense: for some hundred stages they cost less than the bookkeeping of a sparse factorisation.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ class Condensed:
     U: Tensor
     F: Tensor  # (N, n, n + m): dx_{k+1} = F_k [dx_k, du_k]
     G: Tensor  # (N+1, n, v): dx_k = G_k dU
-    local: Tensor  # (N+1, n + m): gradient of J_var by the x and u of each knot
-    gradient: Tensor  # (v,): gradient of J_var by U
+    local: Tensor  # (N+1, n + m): gradient of J_var w.r.t. the x and u of each knot
+    gradient: Tensor  # (v,): gradient of J_var w.r.t. U
     c: Tensor  # (r,): values of all rows, constraint by constraint, c <= 0 or c = 0
-    slopes: Tensor  # (r, n + m): their derivatives by the x and u of their knot
+    slopes: Tensor  # (r, n + m): their derivatives w.r.t. the x and u of their knot
     knots: Tensor  # (r,) int64
     equality: Tensor  # (r,) bool
 
     @classmethod
     def around(cls, problem: Problem, X: Tensor, U: Tensor) -> Condensed:
-        """Linearise one problem."""
+        """Linearise one problem along X (1, N+1, n), U (1, N, m)."""
         n, m, N = problem.n, problem.m, problem.N
         homogeneous = linearise(problem, X, U)[:, 0, :n]
         F = torch.cat((homogeneous[..., :n], homogeneous[..., n + 1 :]), dim=-1)
@@ -50,7 +50,7 @@ class Condensed:
         return cls(problem, X, U, F, G, local, gradient, *_rows(problem, X, U))
 
     def dense(self, rows: Tensor) -> Tensor:
-        """A (q, v): derivatives of the rows (q,) by U."""
+        """A (q, v): derivatives of the rows (q,) w.r.t. U."""
         n, m, N = self.problem.n, self.problem.m, self.problem.N
         slopes, knots = self.slopes[rows], self.knots[rows]
         A = torch.bmm(slopes[:, None, :n], self.G[knots])[:, 0]
@@ -64,13 +64,13 @@ class Condensed:
         return (self.slopes * z[self.knots]).sum(-1)
 
     def lagrangian_gradient(self, lam: Tensor) -> Tensor:
-        """Gradient (v,) of J_var + lam'c by U, for multipliers lam (r,)."""
+        """Gradient (v,) of J_var + lam'c w.r.t. U, for multipliers lam (r,)."""
         n = self.problem.n
         local = self.local.index_add(0, self.knots, lam.unsqueeze(-1) * self.slopes)
         return (self.G * local[:, :n, None]).flatten(0, 1).sum(0) + local[:-1, n:].flatten()
 
     def hessian(self, lam: Tensor | None) -> Tensor:
-        """Hessian (v, v) of J_var + lam'c by U: exact for multipliers lam (r,), that of the cost alone for None.
+        """Hessian (v, v) of J_var + lam'c w.r.t. U: exact for multipliers lam (r,), that of the cost alone for None.
 
         The exact one holds the curvature of the constraints and of the dynamics, the latter weighted by the costates.
         """
@@ -94,9 +94,9 @@ class Condensed:
         return quadratise(self.problem, self.X, self.U)[0][:, keep][:, :, keep]
 
     def _curvature(self, lam: Tensor) -> Tensor:
-        """Blocks (N+1, s, s), s = n + m: second derivatives of the Lagrangian by the x and u of each knot.
+        """Blocks (N+1, s, s), s = n + m: second derivatives of the Lagrangian w.r.t. the x and u of each knot.
 
-        The problem is repeated once for each of the s directions, and differentiated twice all at once.
+        The problem is repeated once per direction, so that one pass gives the derivatives along all s of them.
         """
         n, N, s = self.problem.n, self.problem.N, self.F.shape[-1]
         local = self.local.index_add(0, self.knots, lam.unsqueeze(-1) * self.slopes)
@@ -120,7 +120,7 @@ class Condensed:
         return blocks.movedim(0, 1)
 
     def by_constraint(self, rows: Tensor) -> tuple[Tensor, ...]:
-        """Numbers for all rows (r,) as one (1, K, p) for each constraint."""
+        """Values (r,) of all rows, split into one (1, K, p) per constraint."""
         shapes = [c.value(self.X, self.U).shape for c in self.problem.constraints]
         parts = rows.split([shape.numel() for shape in shapes])
         return tuple(part.view(shape) for part, shape in zip(parts, shapes, strict=True))
@@ -141,9 +141,9 @@ def _rows(problem: Problem, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 
 def _slopes(constraint: Constraint, z: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """c (K, p) and its derivatives (K, p, n + m) by the x and u of each knot.
+    """c (K, p) and its derivatives (K, p, n + m) w.r.t. the x and u of each knot.
 
-    The problem is repeated p times, and row j of repetition j differentiated: a row depends on its own knot alone.
+    The problem is repeated p times, and row j is differentiated in repetition j: a row depends on its own knot alone.
     """
     c = constraint.value(z[..., :n], z[:, :-1, n:])[0]
     p = c.shape[-1]

@@ -1,4 +1,4 @@
-"""The contracts that solvers, guidance and callers share; the penalties of guidance have theirs in `penalties`."""
+"""The contracts that solvers, guidance and callers share; those of guidance penalties are in `penalties`."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from torchgco.tree import Rows, take
 
 @dataclass(frozen=True)
 class Progress:
-    """What a callback receives after every pass, or after every problem from a solver that takes them one by one."""
+    """The argument of a callback: after every pass, or after every problem where a solver takes one at a time."""
 
     passes: int
-    rows: Tensor  # (b,) int64: places in the batch of the problems that this pass worked on together
+    rows: Tensor  # (b,) int64: places in the batch of the problems in this pass
     finished: int
     total: int
     state: Any = None  # the running state of a batched solver, after the pass
@@ -56,7 +56,11 @@ class Call:
         warm: Multipliers | None = None,
         callback: Callback | None = None,
     ) -> Call:
-        """Raises InputError where U0, ids or warm don't fit the problem."""
+        """The call of `Solver.solve`.
+
+        Raises:
+            InputError: U0, ids or warm don't fit the problem.
+        """
         problem.check_controls(U0)
         rows = torch.arange(problem.B, device=problem.x0.device)
         if ids is None:
@@ -112,7 +116,7 @@ class Solver:
         raise NotImplementedError
 
     def prepare(self, problem: Problem) -> Solver:
-        """The solver with everything built that solving this batch needs, for callers that measure time."""
+        """The solver with everything built that this batch needs, so that a caller can time the solve alone."""
         return self
 
     def in_slots(self, slots: int) -> Solver | None:
@@ -126,7 +130,7 @@ class Advice:
 
     penalty: GuideRegion | None  # of the next inner solve
     U: Tensor | None = None  # (B', N, m): controls that replace the iterate
-    taken: Tensor | None = None  # (B',) bool: where they do
+    taken: Tensor | None = None  # (B',) bool: where U replaces the iterate
     stop: Tensor | None = None  # (B',) bool: where the solve is to end, for another attempt
 
 
@@ -134,16 +138,19 @@ class Guidance(Protocol):
     """Plug-in of the outer loop (Algorithm 4), called after every inner solve."""
 
     def suited(self, problem: Problem) -> Guidance | None:
-        """The guidance that can serve these problems, called once per solve; None: they are solved without.
+        """The guidance that can serve these problems, called once per solve; None: solve without guidance.
 
         A part that can't serve is no error: a GuidanceWarning names it and the reason.
         """
         ...
 
     def start(self, problem: Problem, X: Tensor) -> GuideRegion | None:
-        """The penalty of the first inner solve, inactive for every problem."""
+        """The penalty of the first inner solve, inactive for every problem; X (B, N+1, n)."""
         ...
 
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
-        """Advice for problems whose inner solve has ended with X, U; `key` numbers the outer iteration."""
+        """Advice for problems whose inner solve ended with X (B', N+1, n), U (B', N, m).
+
+        `key` holds the number of the outer iteration.
+        """
         ...

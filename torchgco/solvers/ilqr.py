@@ -23,10 +23,10 @@ from torchgco.solvers.verdict import finished, start_status
 from torchgco.status import Status
 from torchgco.tree import put, take
 
-ROUNDING = 1e-14  # share of L_M: an expected change below it means nothing
-# mu_r after a failed Cholesky (Algorithm 2, line 9): its first value, its growth, and where a problem ends.
+ROUNDING = 1e-14  # share of L_M: a smaller expected change is rounding error
+# mu_r after a failed Cholesky (Algorithm 2, line 9): first value, growth factor, and the limit that ends a problem.
 REGULARISATION_FIRST, REGULARISATION_GROWTH, REGULARISATION_MAX = 1e-6, 10.0, 1e10
-# mu_r after a failed line search, in units of `Problem.cost_unit`, and its factors after further ones and successes.
+# mu_r after a failed line search: first value in units of `Problem.cost_unit`, factor per failure, divisor per success.
 DAMPING, DAMPING_GROWTH, DAMPING_DECAY = 0.02, 10.0, 3.0
 VIOLATION_TOLERANCE = 1e-3  # metres for lengths, for the status of iLQR without an outer loop
 
@@ -35,12 +35,12 @@ VIOLATION_TOLERANCE = 1e-3  # metres for lengths, for the status of iLQR without
 class ILQR(Solver):
     """Iterative LQR: expansions, backward pass, line search, until L_M no longer falls.
 
-    As a solver of its own it makes one inner solve; constraints count by the multipliers and penalties of a warm start
-    alone, which stay fixed.
+    Used alone, it makes one inner solve; constraints count only through the multipliers and penalties of a warm start,
+    which stay fixed.
 
     Args:
         as_printed: the algorithm as the paper prints it: costs in their own units, the last step of a line search is
-            accepted whatever it does to L_M, and the inner solve ends with the first failed one. Otherwise costs are in
+            accepted even if L_M rises, and the inner solve ends with the first failed search. Otherwise costs are in
             units of `Problem.cost_unit`, so that scaling all weights changes no iterate, no step raises L_M, and a
             failed line search raises mu_r (Levenberg-Marquardt).
         tolerance: an inner solve has converged where actual and expected change of L_M are at most this share of it;
@@ -106,7 +106,7 @@ class ILQR(Solver):
     def _forward(
         self, s: InnerState, lagrangian: Lagrangian, step: BackwardPass, moving: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Line search of the problems in `moving`; the merit before, the step lengths, and the problems refused."""
+        """Line search of the problems in `moving`; returns old merit, step lengths, and where none was accepted."""
         old_merit = s.merit
         alpha, refused = torch.zeros_like(old_merit), torch.zeros_like(moving)
         rows = moving.nonzero().flatten()
@@ -129,7 +129,7 @@ class ILQR(Solver):
         return old_merit, alpha, refused
 
     def _damping(self, now: Tensor, refused: Tensor) -> Tensor:
-        """mu_r of the next iteration (B,): zero as printed, else up where the search failed and down elsewhere."""
+        """mu_r (B,) of the next iteration: 0 as printed; otherwise raised where the search failed, else lowered."""
         if self.as_printed:
             return torch.zeros_like(now)
         up, down = (DAMPING_GROWTH * now).clamp(min=DAMPING), now / DAMPING_DECAY
@@ -137,9 +137,9 @@ class ILQR(Solver):
         return torch.where(refused, up, torch.where(down < DAMPING, 0.0, down))
 
     def _lift(self, s: InnerState, lagrangian: Lagrangian, step: BackwardPass, refused: Tensor) -> Tensor:
-        """Another search for problems whose rollouts diverge whatever the step length; which are still refused.
+        """A lifted search where rollouts diverge at every step length; returns which problems are still refused.
 
-        In the first iteration of an inner solve alone: later on there are gains that have held the states.
+        Only in the first iteration of an inner solve: later iterates come from gains that kept the states bounded.
         """
         rows = (refused & (s.inner == 0)).nonzero().flatten()
         if self.as_printed or rows.numel() == 0:
@@ -155,7 +155,7 @@ class ILQR(Solver):
 def advance(inner: ILQR, s: InnerState, lagrangian: Lagrangian, limit: int) -> PassEnd:
     """The inner solve of every running problem, in place: up to `limit` native iterations, or one by PyTorch.
 
-    Both leave the same state, up to rounding.
+    Both make the same iterates, up to rounding.
     """
     engine = engine_of(lagrangian.problem)
     if engine is None:
@@ -179,9 +179,9 @@ def advance(inner: ILQR, s: InnerState, lagrangian: Lagrangian, limit: int) -> P
 def descend(
     inner: ILQR, lagrangian: Lagrangian, U: Tensor, start_is_clear: Tensor | None = None
 ) -> tuple[InnerState, Tensor]:
-    """One inner solve of each problem from controls U (B, N, m), and its status (B,).
+    """One inner solve of each problem from controls U (B, N, m); returns the end states and the statuses (B,).
 
-    A problem without a finite L_M, or where `start_is_clear` (B,) is False, stays as it starts. Tolerances are in the
+    A problem whose L_M isn't finite, or whose `start_is_clear` (B,) is False, stays as it starts. Tolerances are in the
     units of the problem's cost.
     """
     problem = lagrangian.problem
@@ -216,7 +216,7 @@ def _native_options(inner: ILQR) -> Options:
 
 
 def _raise_regularisation(s: InnerState, step: BackwardPass, F: Tensor, H: Tensor, status: Tensor) -> None:
-    """mu_r up for problems whose Cholesky failed (Algorithm 2, line 9): they try again in the next pass."""
+    """Raise mu_r of problems whose Cholesky failed (Algorithm 2, line 9): they try again in the next iteration."""
     higher = (s.regularisation * REGULARISATION_GROWTH).clamp(min=REGULARISATION_FIRST)
     s.regularisation = torch.where(step.failed, higher, s.regularisation)
     finite = torch.isfinite(F).all(-1).all(-1).all(0) & torch.isfinite(H).all(-1).all(-1).all(0)
@@ -225,7 +225,7 @@ def _raise_regularisation(s: InnerState, step: BackwardPass, F: Tensor, H: Tenso
 
 
 def _lifted(s: InnerState, lagrangian: Lagrangian, rows: Tensor, native: bool) -> Tensor:
-    """Replace the iterates in `rows` by the result of a lifted search; which of them have one."""
+    """Replace the iterates in `rows` by the result of a lifted search; returns which rows have one."""
     search = native_lifted_search if native else lifted_search
     found = search(lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows])
     won = rows[found.accepted]

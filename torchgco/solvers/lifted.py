@@ -1,8 +1,8 @@
-"""Where even the shortest step fails: Gauss-Newton steps in states and controls together (multiple shooting).
+"""If even the shortest step fails: Gauss-Newton steps in states and controls together (multiple shooting).
 
-Where the dynamics are unstable and the gains around an iterate don't stabilise them, rollouts diverge whatever the step
-length. Steps with the states as variables of their own, and with gaps between them that the linearised dynamics close,
-lead to a trajectory whose gains stabilise them.
+Where the dynamics are unstable and the gains around an iterate don't stabilise them, rollouts diverge at every step
+length. With the states as variables, and gaps between them that the linearised dynamics close, the steps lead to a
+trajectory whose gains stabilise the dynamics.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ LOST = 1e6  # rollouts diverge where even the shortest step makes L_M this many 
 
 
 def diverges(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor, G: Tensor, shortest: float) -> Tensor:
-    """Whether even the shortest step along the gains G (N, B, m, n+1) raises L_M = merit (B,) beyond measure, (B,)."""
+    """Whether even the shortest step along the gains G (N, B, m, n+1) makes L_M more than `LOST` |merit|, (B,)."""
     value = lagrangian.value(*closed_loop(lagrangian.problem.dynamics, X, U, G, torch.full_like(merit, shortest)))[1]
     return ~(value <= LOST * merit.abs())
 
 
 def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Rollouts:
-    """The first rollout that lowers L_M = merit (B,) markedly, from X (B, N+1, n), U (B, N, m); else not accepted."""
+    """The first rollout that lowers L_M = merit (B,) by `GAIN`, from X (B, N+1, n), U (B, N, m); else not accepted."""
     none = torch.zeros_like(merit, dtype=torch.bool)
     found = Rollouts(X.clone(), U.clone(), merit.clone(), merit.clone(), torch.ones_like(merit), none)
     rows = torch.arange(X.shape[0], device=X.device)
@@ -49,7 +49,7 @@ def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -
 
 
 def native_lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -> Rollouts:
-    """The same by the native library."""
+    """`lifted_search` by the native library."""
     engine = engine_of(lagrangian.problem)
     assert engine is not None
     state = {name: t.clone(memory_format=torch.contiguous_format) for name, t in (("X", X), ("U", U), ("merit", merit))}

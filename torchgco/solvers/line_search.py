@@ -18,18 +18,18 @@ from torchgco.rollout import closed_loop
 from torchgco.solvers.riccati import BackwardPass
 
 SIDE_BY_SIDE = 256  # rollouts that cost little more than one
-PARALLEL = 4  # rungs that are tried together at least, by problems that refused the first
+PARALLEL = 4  # least number of rungs tried together, by problems that refused the first
 
 
 @dataclass(frozen=True)
 class Rollouts:
     """One rollout per problem with its cost and L_M."""
 
-    X: Tensor
-    U: Tensor
-    cost: Tensor
-    merit: Tensor
-    alpha: Tensor
+    X: Tensor  # (B, N+1, n)
+    U: Tensor  # (B, N, m)
+    cost: Tensor  # (B,): J_var
+    merit: Tensor  # (B,): L_M
+    alpha: Tensor  # (B,): step length
     accepted: Tensor  # (B,) bool
 
 
@@ -39,7 +39,7 @@ class LineSearch:
 
     Args:
         back: the next search begins this many rungs above the last accepted one, which spares rollouts and shortens
-            steps; None: each search begins with a full step (as printed).
+            steps; None: each search begins with a full step.
 
     Raises:
         InputError: a field out of its range.
@@ -50,14 +50,14 @@ class LineSearch:
     shrink: ClassVar[float] = 0.5  # phi, factor from one step length to the next
     ratio_min: ClassVar[float] = 1e-4  # accepted range of the ratio
     ratio_max: ClassVar[float] = 10.0
-    smallest: ClassVar[float] = 1e-4  # step lengths end with the first one below this
+    smallest: ClassVar[float] = 1e-4  # no shorter step is tried, but for one as printed: the first below this
 
     def __post_init__(self) -> None:
         if self.back is not None and self.back < 0:
             raise InputError("line_search.back", "at least 0, or null", self.back)
 
     def ladder(self, accept_last: bool) -> list[float]:
-        """1, phi, phi^2, ... down to the first below `smallest`, which is there only to be accepted in any case."""
+        """1, phi, phi^2, ... down to `smallest`, and with `accept_last` the first one below."""
         rungs = [1.0]
         while rungs[-1] >= self.smallest:
             rungs.append(rungs[-1] * self.shrink)
@@ -75,7 +75,7 @@ class LineSearch:
     ) -> Rollouts:
         """The first acceptable rollout of each problem, from X, U with L_M = merit (B,), by the ladder from `rung`.
 
-        Where there is none, the last rung is accepted whatever it does to L_M (`accept_last`, as printed), or
+        Where no rung is acceptable: with `accept_last` (as printed) the last one is accepted if its L_M is finite, else
         `accepted` is False, alpha is 0, and the rollout is not to be used.
         """
         ladder = merit.new_tensor(self.ladder(accept_last))
@@ -89,7 +89,7 @@ class LineSearch:
             chunk, rungs = rungs[:width], rungs[width:]
             rows = refused.repeat_interleave(len(chunk))
             places = rung[rows] + torch.tensor(chunk, device=rung.device).repeat(refused.numel())
-            alpha = ladder[places.clamp(max=len(ladder) - 1)]  # the last one once more does no harm
+            alpha = ladder[places.clamp(max=len(ladder) - 1)]  # trying the last rung twice does no harm
             part = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
             tried = self._try(lagrangian.take(rows), X[rows], U[rows], merit[rows], part, alpha, accept_last)
             found = self._first_accepted(found, tried, refused, len(chunk))

@@ -23,19 +23,19 @@ def element_bytes(problem: Problem) -> int:
     one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
     rows = sum(lam.numel() for lam in Multipliers.zero(one, 0.0).lam)
     gains = N * 2 * m * z
-    # F and H, with what they are made of: native kernels need them for eight problems at a time.
+    # F, H and the derivatives they are built from; native kernels hold them for eight problems only.
     expansion = 0 if engine_of(problem) is not None else N * (2 * z * s + 2 * s * s)
     trajectories = N * (n + m) * 16  # iterate, best, last, result, and those tried by a line search
     return NUMBER * (gains + expansion + trajectories + 12 * rows)
 
 
 def plan_batch(problem: Problem, device: str | torch.device | None = None, processes: int = 1) -> int:
-    """How many problems like these to work on at once on a device, at least 1.
+    """How many problems of this form to solve at once on a device, at least 1.
 
     Args:
         problem: any batch of problems of this form; only the first problem is used.
-        device: default: where the problem is.
-        processes: how many share the device's memory.
+        device: by default the problem's.
+        processes: number of processes that share the device's memory.
 
     Raises:
         InputError: fewer than one process.
@@ -49,7 +49,7 @@ def plan_batch(problem: Problem, device: str | torch.device | None = None, proce
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory ran out, on whatever device."""
+    """Whether an error says that memory ran out, on any device."""
     return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "can't allocate memory" in str(error)
 
 

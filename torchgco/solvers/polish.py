@@ -1,8 +1,8 @@
-"""The last stage: from a good trajectory to one that meets its constraints and is stationary, to many digits.
+"""Polish: from a good trajectory to one that is feasible and stationary to many digits.
 
 An augmented Lagrangian stops at a violation of about a millimetre. From there Newton's method on the optimality
-conditions needs a handful of steps: the states are eliminated, so that the dynamics hold exactly throughout; the active
-rows are found by the dual of a quadratic program; and every step is a real rollout with a line search.
+conditions needs a handful of steps. The states are eliminated, so the dynamics hold exactly throughout. The dual of a
+quadratic program finds the active rows. Every step is rolled out, with a line search.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from torchgco.status import Status
 from torchgco.tree import copied, put
 
 VIOLATION_TOLERANCE = 1e-3  # metres for lengths, for the status
-STIFFNESS = 1e4  # curvature added across the active rows, as a share of the Hessian's mean: it changes no solution
+STIFFNESS = 1e4  # curvature added across the active rows, times the Hessian's mean diagonal; no solution changes
 SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)  # shares of the same mean added to the diagonal until the model is convex
-NEAR = 1e-2  # rows this near to their limit, measured as a length of their slope, are in the program from the start
+NEAR = 1e-2  # rows with c above minus this share of their slope's length are in the program from the start
 PIVOT = 1e-3  # the smallest pivot that is convex enough, as a share of the same mean
-ACTIVE = 1e-3  # rows this near count as active in the KKT residual, in the same measure
-ROUNDS = 10  # times that rows which a step would violate are added to a program
+ACTIVE = 1e-3  # in the same measure: rows that count as active in the KKT residual
+ROUNDS = 10  # rounds of adding the rows that a step would violate to a program
 SMALLEST = 1e-3  # step length at which the line search gives up
 NOISE = 1e-12  # rounding of a merit, as a share of it
 
@@ -40,13 +40,13 @@ NOISE = 1e-12  # rounding of a merit, as a share of it
 class Polish:
     """Active-set Newton in the controls alone: violation below 1e-8, and a small KKT residual.
 
-    Problems are taken one at a time, so no result depends on its companions, and memory is that of one dense problem:
-    some (N m)^2 numbers. On a GPU that is slow: the work of one problem is too little for it.
+    Problems are taken one at a time, so no result depends on the rest of the batch, and memory is that of one dense
+    problem: some (N m)^2 numbers. On a GPU this is slow: one problem is too little work for it.
 
     Args:
         iterations: Newton steps at most.
         tolerance: target of the violation (metres for lengths, all else in the units of its constraint).
-        stationarity: target of the relative KKT residual. Steps end where both are met.
+        stationarity: target of the relative KKT residual. Iteration ends once both targets are met.
         reach: problems with a larger violation are left alone, as are those with an invalid start or values that
             aren't finite.
         cost_rise: share by which J_var may rise; removing a millimetre of violation raises the cost.
@@ -78,8 +78,8 @@ class Polish:
 
         A trajectory is replaced where its violation falls below the tolerance, or stays within it (or within its former
         value) while the KKT residual falls; never where its cost would rise by more than `cost_rise`, or the straight
-        segment between two knots would meet an obstacle that it kept clear of. The status of a replaced trajectory is
-        that of the new one. `iterations` grows by the Newton steps, also where the trajectory stays as it was.
+        segments between knots would cut an obstacle deeper than before. The status of a replaced trajectory is that of
+        the new one. `iterations` grows by the Newton steps, even where the trajectory isn't replaced.
 
         Raises:
             InputError: a problem that isn't float64, or a solution of other problems.
@@ -99,12 +99,12 @@ class Polish:
         return replace(result, trace=solution.trace)
 
     def check(self, problem: Problem) -> None:
-        """Raise InputError where rounding is above any tolerance of use here."""
+        """Raise InputError for a problem that isn't float64: its rounding exceeds any useful tolerance."""
         if problem.x0.dtype != torch.float64:
             raise InputError("polish", "a problem in torch.float64", problem.x0.dtype)
 
     def _polished(self, problem: Problem, solution: Solution) -> tuple[Solution, int]:
-        """The solution of one problem, `solution` itself where nothing better was found; and the number of steps."""
+        """The solution of one problem, `solution` itself if nothing better was found; and the number of steps."""
         lam = torch.cat([solution.cost.new_zeros(0), *(part.flatten() for part in solution.multipliers.lam)])
         first = best = now = _Point.at(problem, solution.X, solution.U, lam)
         weight, steps = 0.0, 0
@@ -129,7 +129,7 @@ class Polish:
         return gained or (new.worst <= max(self.tolerance, old.worst) and new.fitted < old.fitted)
 
     def _step(self, point: _Point, weight: float) -> tuple[_Point, float] | None:
-        """The next point and the weight of its merit; None where neither model of the problem leads anywhere."""
+        """The next point and the weight of its merit; None where neither model gives a step that lowers it."""
         for exact in (True, False) if self.curvature else (False,):
             convex = _convex(point, exact)
             found = None if convex is None else _program(point, *convex)
@@ -165,7 +165,7 @@ class _Point:
 
     @cached_property
     def fitted(self) -> float:
-        """The KKT residual with least-squares multipliers: those of a solver that stopped early fit nothing yet."""
+        """The KKT residual with least-squares multipliers: those of a solver that stopped early don't fit yet."""
         model = self.model
         rows = (model.equality | (model.c >= -ACTIVE * model.slopes.norm(dim=-1))).nonzero().flatten()
         A = model.dense(rows)
@@ -187,7 +187,7 @@ class _Point:
         return float(total)
 
     def put_into(self, solution: Solution) -> Solution:
-        """The solution with this trajectory in place of its own, and gains along it."""
+        """The solution with its trajectory replaced by this one, and gains along it."""
         problem, X, U = self.model.problem, self.model.X, self.model.U
         fitted = Multipliers(self.model.by_constraint(self.lam), solution.multipliers.mu)
         K, d, left = optimality(Lagrangian(problem, fitted, None, True), X, U)
@@ -199,15 +199,15 @@ class _Point:
 
 
 def _slope(model: Condensed, lam: Tensor) -> float:
-    """The largest component of the Lagrangian's gradient, by 1 + that of the cost's."""
+    """The largest component of the Lagrangian's gradient, divided by 1 + that of the cost's."""
     return float(model.lagrangian_gradient(lam).abs().max()) / (1.0 + float(model.gradient.abs().max()))
 
 
 def _convex(point: _Point, exact: bool) -> tuple[Tensor, Tensor] | None:
-    """Factor L (v, v) of a positive definite Hessian and the gradient (v,) that goes with it; None where there is none.
+    """Factor L (v, v) of a positive definite Hessian and the matching gradient (v,); None if no shift helps.
 
-    Across the active rows the program fixes the step anyway: curvature may be added there without changing it. A
-    Hessian that is indefinite along them too is shifted.
+    The active rows fix the step across them, so curvature added there doesn't change it. A Hessian that is also
+    indefinite along them is shifted.
     """
     model, lam = point.model, point.lam
     H = model.hessian(lam if exact else None)
@@ -227,14 +227,14 @@ def _convex(point: _Point, exact: bool) -> tuple[Tensor, Tensor] | None:
 
 
 def _holds(factor: tuple[Tensor, Tensor], mean: Tensor) -> bool:
-    """Whether a factorisation succeeded, with pivots so large that no step runs away."""
+    """Whether a factorisation succeeded, with pivots large enough to keep steps bounded."""
     return not bool(factor[1]) and bool(factor[0].diagonal().square().min() > PIVOT * mean)
 
 
 def _program(point: _Point, L: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Step (v,) and multipliers (r,) of min g'd + 1/2 d'LL'd with A d + c <= 0 (or = 0); None where none was found.
+    """Step (v,) and multipliers (r,) of min g'd + 1/2 d'LL'd with A d + c <= 0 (or = 0); None if not found.
 
-    Rows that can't matter are left out at first, and added where the step found without them would violate them.
+    Rows far from their limit are left out at first, and added if the step found without them would violate them.
     """
     model, lam = point.model, point.lam
     size = model.slopes.norm(dim=-1)

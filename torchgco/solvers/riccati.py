@@ -20,15 +20,17 @@ class BackwardPass(NamedTuple):
     failed: Tensor  # (B,) bool: Quu + mu_r I was not positive definite at some stage
 
     def expected_change(self, alpha: Tensor) -> Tensor:
-        """alpha sum Qu'd + alpha^2/2 sum d'Quu d, negative for a descent (line 18)."""
+        """alpha sum Qu'd + alpha^2/2 sum d'Quu d, (B,), negative for a descent (line 18)."""
         return alpha * self.linear + 0.5 * alpha.square() * self.quadratic
 
 
 def backward(F: Tensor, H: Tensor, regularisation: Tensor) -> BackwardPass:
-    """Gains along a trajectory.
+    """Gains along a trajectory, and the change of L_M expected from them.
 
     Args:
-        F: (N, B, n+1, s) dynamics, H: (N+1, B, s, s) quadratic model, regularisation: mu_r (B,).
+        F: dynamics, (N, B, n+1, s).
+        H: quadratic model, (N+1, B, s, s).
+        regularisation: mu_r, (B,).
     """
     z, mu = F.shape[2], regularisation.view(-1, 1, 1)
     added = mu * torch.eye(F.shape[3] - z, dtype=F.dtype, device=F.device)
@@ -39,7 +41,7 @@ def backward(F: Tensor, H: Tensor, regularisation: Tensor) -> BackwardPass:
         Q = H_k + F_k.mT @ (V @ F_k)
         Qzz, Quz, Quu = Q[:, :z, :z], Q[:, z:, :z], Q[:, z:, z:]
         L, info = torch.linalg.cholesky_ex(Quu + added)
-        positive = (L.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # not all libraries report NaN
+        positive = (L.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # on NaN some libraries report success
         failed = failed | (info != 0) | ~positive
         Y = torch.linalg.solve_triangular(L, Quz, upper=False)
         G = -torch.linalg.solve_triangular(L.mT, Y, upper=True)

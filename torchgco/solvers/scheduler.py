@@ -1,7 +1,7 @@
-"""The one loop: pass after pass over the problems that run, in a limited number of slots.
+"""The batched loop: passes over the running problems, in a limited number of slots.
 
-In nested loops a batch waits for its slowest member at three levels. Here every problem carries its own phase. A
-problem that ends gives its slot to a waiting one, or leaves the batch. Nothing here knows any mathematics.
+Nested loops would wait for the slowest problem of the batch at three levels. Here every problem is at its own place in
+the loops. A problem that ends frees its slot for a waiting one; if none waits, the running batch shrinks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torchgco.tree import put, take
 
 
 class Work(Protocol):
-    """Problems by their rows in a batch; statuses are (b,) int64, RUNNING where a problem has not ended."""
+    """The work on problems, given by their rows in a batch; statuses are (b,) int64, RUNNING until a problem ends."""
 
     def begin(self, rows: Tensor) -> tuple[State, Tensor]:
         """The first state of the problems `rows`, and the statuses of those that can't start."""
@@ -29,7 +29,7 @@ class Work(Protocol):
         ...
 
     def advance(self, s: State) -> Tensor:
-        """One pass over all running problems, in place; their statuses."""
+        """One pass over all running problems, in place; returns their statuses."""
         ...
 
     def end(self, s: State, places: Tensor, status: Tensor) -> None:
@@ -38,7 +38,7 @@ class Work(Protocol):
 
 
 def run_all(work: Work, rows: Tensor, slots: int, report: Callable[[int, Tensor, int, State], None]) -> None:
-    """Bring all `rows` to their end, at most `slots` at a time.
+    """Run the problems `rows` to their end, at most `slots` at a time.
 
     `report(passes, rows of the pass, rows left, state)` follows every pass.
     """
@@ -48,14 +48,14 @@ def run_all(work: Work, rows: Tensor, slots: int, report: Callable[[int, Tensor,
     state, waiting = _replaced(work, state, status, waiting)
     passes = 0
     while state.rows.numel() > 0:
-        worked = state.rows.clone()  # slots are filled again in place
+        worked = state.rows.clone()  # a copy: slots are refilled in place
         state, waiting = _replaced(work, state, work.advance(state), waiting)
         passes += 1
         report(passes, worked, state.rows.numel() + waiting.numel(), state)
 
 
 def _replaced(work: Work, state: State, status: Tensor, waiting: Tensor) -> tuple[State, Tensor]:
-    """The state without the problems that have ended, with waiting ones in their slots; and those that still wait."""
+    """The state with ended problems replaced by waiting ones, or removed; and the rows still waiting."""
     while True:
         ended = (status != Status.RUNNING).nonzero().flatten()
         if ended.numel() == 0:

@@ -12,29 +12,29 @@ from torchgco.penalties import Penalty
 from torchgco.problem import Problem
 from torchgco.tree import copied
 
-STOPPED = -1  # ended by guidance, for another attempt; no status that a user sees
+STOPPED = -1  # ended by guidance, for another attempt; users never see this status
 
 
 @dataclass(frozen=True)
 class Iterate:
     """A trajectory with its multipliers, cost and violation."""
 
-    X: Tensor
-    U: Tensor
+    X: Tensor  # (B, N+1, n)
+    U: Tensor  # (B, N, m)
     multipliers: Multipliers
-    cost: Tensor
-    violation: Tensor
+    cost: Tensor  # (B,): J_var
+    violation: Tensor  # (B,)
 
 
 @dataclass
 class InnerState:
-    """The state of inner solves; every tensor starts with the running batch."""
+    """The state of inner solves; the first dimension of every tensor is the running batch, b problems."""
 
     rows: Tensor  # place in the batch
-    X: Tensor
-    U: Tensor
-    cost: Tensor
-    merit: Tensor
+    X: Tensor  # (b, N+1, n)
+    U: Tensor  # (b, N, m)
+    cost: Tensor  # (b,): J_var
+    merit: Tensor  # (b,): L_M
     regularisation: Tensor  # mu_r
     inner: Tensor  # iterations of this inner solve
     iterations: Tensor
@@ -62,9 +62,9 @@ class State(InnerState):
     penalty: Penalty | None  # of guidance
     outer: Tensor  # inner solves ended
     guided: Tensor  # outer iterations with guidance on
-    replaced: Tensor  # bool: the iterate was replaced by guidance, which is silent from then on
-    last_cost: Tensor  # J_var at the end of the inner solve before
-    best: Iterate  # of those that ended an inner solve; infinite violation while there is none
+    replaced: Tensor  # bool: guidance replaced the iterate, and isn't called again
+    last_cost: Tensor  # J_var at the end of the previous inner solve
+    best: Iterate  # best iterate that ended an inner solve; infinite violation before the first
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class SolveEnd:
 
     @classmethod
     def blank(cls, problem: Problem, U: Tensor) -> SolveEnd:
-        """To be filled, for controls like U (B, N, m)."""
+        """An end to be filled in, for controls like U (B, N, m)."""
         count = torch.zeros(problem.B, dtype=torch.int64, device=U.device)
         X, worth = U.new_zeros(problem.B, problem.N + 1, problem.n), U.new_zeros(problem.B)
         best = Iterate(X, U.clone(), Multipliers.zero(problem, 0.0), worth, worth.clone())

@@ -1,4 +1,4 @@
-"""The history of every problem, a row per iteration; the solves that a search makes for its candidates have none."""
+"""The history of every problem, a row per iteration; solves of candidates are not recorded."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Recorder:
         self.attempt = 1
 
     def add(self, problem: Problem, rows: Tensor, state: State, end: PassEnd) -> None:
-        """Note the iteration just made by the problems `rows` of the batch whose backward pass succeeded."""
+        """Record the iteration just made by the problems `rows` of the batch, except where the backward pass failed."""
         guided = state.penalty.is_active if state.penalty is not None else torch.zeros_like(end.failed)
         row = {
             "element": rows,
@@ -41,7 +41,10 @@ class Recorder:
         self._passes.append({name: value[~end.failed].clone() for name, value in row.items()})
 
     def frame(self, unit: Tensor) -> pd.DataFrame:
-        """The table, sorted by element, attempt and iteration; `unit` (B,) is what costs were divided by."""
+        """The table, sorted by element (the problem), attempt and iteration.
+
+        `unit` (B,) is the unit that costs were divided by; the table holds the undivided costs.
+        """
         import pandas as pd
 
         columns = (

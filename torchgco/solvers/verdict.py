@@ -1,8 +1,7 @@
-"""What a solver says about the trajectories that it returns: feedback gains, optimality and statuses.
+"""The verdict on returned trajectories: feedback gains, optimality and statuses.
 
-The test asks how much cost the quadratic model could still save: the expected decrease of one full step on
-J_var + lam'c, and what complementarity leaves open, as a share of the cost. It depends on no scale of cost, controls or
-constraints.
+Optimality is the share of the cost that the quadratic model could still save: the expected decrease of one full step on
+J_var + lam'c, plus the complementarity gap. It doesn't depend on the scale of cost, controls or constraints.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from torchgco.solvers.trace import Recorder
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
-LEAST_COST = 1e-6  # the cost counts at least this share of the cost of staying at the start
+LEAST_COST = 1e-6  # the cost counts as at least this share of the cost of staying at the start
 FIRST, GROWTH, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
 
 
@@ -45,7 +44,7 @@ def finished(
     """The best trajectories of a solve with gains and statuses, in the units of the call as it was given.
 
     Args:
-        scaled, unit: the call that was solved, and what its costs were divided by (B,).
+        scaled, unit: the call in the solver's units of cost, and these units (B,).
         phr, tolerance: of the solver, see Lagrangian and `final_status`.
         slots: problems whose gains are computed together; None: all.
     """
@@ -69,7 +68,7 @@ def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Ten
     status = torch.full((problem.B,), int(Status.RUNNING), device=X.device)
     if start_is_clear is not None:
         status[~start_is_clear] = Status.INVALID_START
-    # NaN compares as clear of every obstacle, hence this test comes after.
+    # NaN compares as clear of every obstacle, so this test comes last.
     finite = torch.isfinite(merit) & torch.isfinite(X).flatten(1).all(-1)
     status[~finite] = Status.NON_FINITE
     return status
@@ -89,7 +88,7 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
     mu = torch.zeros_like(slack)
     step = run(mu)
     for i in range(TRIES):
-        # A control that costs nothing, or values beyond the precision: gains all the same, by regularisation.
+        # Where a control costs nothing, or rounding spoils the Hessian, regularisation still gives gains.
         if not bool(step.failed.any()):
             break
         mu = torch.where(step.failed, FIRST * GROWTH**i * cost_unit(problem), mu)
@@ -125,8 +124,8 @@ def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:
 def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: float, constrained: bool) -> Tensor:
     """The status (B,) of the returned trajectories, for statuses `ended` that say why the solve stopped.
 
-    CONVERGED: stationary and feasible; FEASIBLE: feasible alone, of a problem that has constraints; INFEASIBLE:
-    stationary alone. Where neither holds, and where a solve failed, the reason stays.
+    CONVERGED: stationary and feasible. FEASIBLE: feasible but not stationary, for problems with constraints.
+    INFEASIBLE: stationary but not feasible. Where neither holds, and where a solve failed, the reason stays.
     """
     stationary, fits = left <= STATIONARY, violation <= tolerance
     reason = torch.where(ended == Status.CONVERGED, int(Status.MAX_ITERATIONS), ended)

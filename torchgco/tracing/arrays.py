@@ -1,6 +1,6 @@
 """Shapes and places of arrays whose elements are CasADi expressions, by the conventions of PyTorch.
 
-Nothing writes into what it is given: the operations that call this are functional.
+No function here writes into its arguments: the operations that call them are functional.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def diagonal_scatter(a: np.ndarray, source: np.ndarray, offset: int = 0, dim1: i
 
 def _written(a: np.ndarray, place: tuple[Any, ...], source: np.ndarray) -> np.ndarray:
     copy = a.astype(object)
-    copy[(*place, ...)] = source  # the dots keep it an assignment of arrays where one element is meant
+    copy[(*place, ...)] = source  # with the ellipsis, a single element is assigned as an array too
     return copy
 
 

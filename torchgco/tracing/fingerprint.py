@@ -1,4 +1,4 @@
-"""A text that says what a traced function computes, the same in every process."""
+"""A digest of a traced function's computation, the same in every process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from torchgco.tracing.recorder import Call, Slot
 
-FORMAT = 1  # changes with what is written here, and with what a replay makes of it
+FORMAT = 1  # to be raised when the digested text changes, or its meaning in a replay
 
 
 def fingerprint(
@@ -24,12 +24,12 @@ def fingerprint(
     """Hexadecimal digits that two functions share only where they have the same operations, constants and shapes.
 
     Args:
-        variables, own: shapes of what the function is called with, and of the numbers that differ between problems.
+        variables, own: shapes of the function's arguments, and of the numbers that differ between problems.
         constants: all other tensors that no call makes.
         calls: in order, with slots in the place of tensors.
         result: the slot of the result.
     """
-    # Slots are numbered in the order of a process; here, in the order in which they stand.
+    # A slot's own number may differ between recordings: here, slots are numbered in the order in which they occur.
     order = count()
     made = (slot for call in calls for slot in call.outputs)
     names = {slot: f"${next(order)}" for slot in (*variables, *own, *constants, *made)}

@@ -1,9 +1,9 @@
-"""What each ATen operation does to arrays whose elements are CasADi expressions.
+"""The counterparts of ATen operations for arrays whose elements are CasADi expressions.
 
 An array is a NumPy array of objects, each a number or a scalar `casadi.SX`: NumPy brings shapes, broadcasting and
 indexing, CasADi the arithmetic. Where all arguments are numbers the result is a number.
 
-To record a function the names in `OPERATIONS` are enough: CasADi is loaded by the first replay that computes something.
+Recording a function needs only the names in `OPERATIONS`: CasADi is loaded by the first replay that computes something.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _divide(a: Any, b: Any, rounding_mode: str | None = None) -> np.ndarray:
 
 
 def _clamp(a: Any, min: Any = None, max: Any = None) -> np.ndarray:
-    # Choices, not fmin and fmax: at a bound the derivative is 1, as PyTorch's, and a NaN stays one.
+    # Choices, not fmin and fmax: at a bound the derivative is 1, as PyTorch's, and NaN stays NaN.
     a = a if min is None else _where(_binary(operator.lt)(a, min), min, a)
     return a if max is None else _where(_binary(operator.gt)(a, max), max, a)
 
@@ -79,7 +79,7 @@ def _softplus(a: np.ndarray, beta: float = 1.0, threshold: float = 20.0) -> np.n
 
 
 def _matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    # CasADi's own product: one by one, the thousands of entries of an obstacle constraint would take their time.
+    # CasADi's own product: entry by entry, the thousands of entries of an obstacle constraint would take long.
     ca = _casadi()
     if a.ndim == 2:
         product = ca.mtimes(_matrix(a), _matrix(b))
@@ -135,7 +135,7 @@ def _cumsum(a: np.ndarray, dim: int, **_: Any) -> np.ndarray:
 
 def _to_copy(a: np.ndarray, dtype: torch.dtype | None = None, **_: Any) -> np.ndarray:
     if dtype is not None and not dtype.is_floating_point:
-        raise NoCounterpart  # rounding to whole numbers, or to true and false
+        raise NoCounterpart  # conversion to integers or booleans
     return a
 
 

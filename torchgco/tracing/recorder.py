@@ -1,4 +1,4 @@
-"""Writes down the operations that a function of PyTorch tensors consists of."""
+"""Records the operations that a function of PyTorch tensors consists of."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchgco.tracing.operations import OPERATIONS
 
 @dataclass(frozen=True)
 class Slot:
-    """Stands for a tensor in what was recorded."""
+    """Stands for a tensor in a recording."""
 
     number: int
 
@@ -42,7 +42,7 @@ class Call:
         return [leaf for leaf in tree_leaves(self.result) if isinstance(leaf, Slot)]
 
     def replay(self, operation: Callable, known: dict[Slot, Any]) -> None:
-        """Apply `operation` to what is known, which afterwards holds the result too."""
+        """Apply `operation` to known values, and add its result to `known`."""
         args, kwargs = tree_map(lambda leaf: known[leaf] if isinstance(leaf, Slot) else leaf, (self.args, self.kwargs))
         made = operation(*args, **kwargs)
         for slot, value in zip(self.outputs, made if isinstance(made, (list, tuple)) else [made], strict=True):
@@ -50,11 +50,11 @@ class Call:
 
 
 class Recorder(TorchDispatchMode):
-    """Writes down every operation that reaches PyTorch's kernels, and decomposes those that CasADi doesn't know."""
+    """Records every operation that reaches PyTorch's kernels, and decomposes those that CasADi doesn't know."""
 
     def __init__(self, inputs: Iterable[Tensor]) -> None:
         super().__init__()
-        self._seen: dict[int, tuple[Slot, Tensor]] = {}  # with the tensor, so that its id stays its own
+        self._seen: dict[int, tuple[Slot, Tensor]] = {}  # holds the tensor: its id isn't reused
         self._numbers = count()
         self.calls: list[Call] = []
         self.captured: dict[Slot, Tensor] = {}
@@ -74,18 +74,18 @@ class Recorder(TorchDispatchMode):
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        return False  # PyTorch would load its compiler, which takes seconds, to say that this isn't to be compiled
+        return False  # True would load PyTorch's compiler, which takes seconds, only to exclude this mode from it
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         if func is torch.ops.aten._local_scalar_dense.default:
             if self.slot(args[0]) in self._followers:
                 raise _LooksAtValues
-            return func(*args, **kwargs)  # a constant's value may be looked at
+            return func(*args, **kwargs)  # a constant's value may be read
         if name_of(func) not in OPERATIONS:
-            with self:  # the parts come here in their turn
+            with self:  # the parts are dispatched here in turn
                 parts = func.decompose(*args, **kwargs)
-                # The table takes half a second to load, and what PyTorch will compute itself may stay whole.
+                # The table takes half a second to load, and an operation that PyTorch computes itself may stay whole.
                 if parts is NotImplemented and self._follows(args, kwargs) and func in _decompositions():
                     parts = _decompositions()[func](*args, **kwargs)
             if parts is not NotImplemented:
@@ -100,7 +100,7 @@ class Recorder(TorchDispatchMode):
         return out
 
     def _follows(self, *tree: Any) -> bool:
-        """Whether a tensor in there depends on the function's arguments."""
+        """Whether a tensor in `tree` depends on the function's arguments."""
         return any(isinstance(leaf, Tensor) and self.slot(leaf) in self._followers for leaf in tree_leaves(tree))
 
 
@@ -110,20 +110,20 @@ class _LooksAtValues(Exception):
 
 
 def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Recorder:
-    """What function(*examples) consists of; `field` says what the function is, for errors.
+    """The recorded operations of function(*examples); `field` names the function in errors.
 
     Raises:
-        InputError: it can't be traced.
+        InputError: the function can't be traced.
     """
     recorder = Recorder(examples)
-    # Writing in place becomes writing into a copy: PyTorch's part and CasADi's must not share memory.
+    # Writes in place become writes into a copy: PyTorch's part and CasADi's must not share memory.
     pure = torch.func.functionalize(function, remove="mutations")
     try:
         with torch.no_grad(), recorder:
             result = pure(*examples)
     except InputError:
         raise  # the function itself says what is wrong
-    except Exception as error:  # whatever a function runs into
+    except Exception as error:  # any error of the function
         message = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise InputError(field, "a function that can be traced", message) from error
     recorder.result = recorder.slot(result)

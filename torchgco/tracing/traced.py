@@ -1,7 +1,7 @@
 """A function of PyTorch tensors, recorded once and replayed with CasADi expressions.
 
-What doesn't depend on the variables, PyTorch computes itself: constants once, and what belongs to one problem of the
-batch for each problem. Only the rest needs a counterpart in CasADi.
+PyTorch itself computes the parts that don't depend on the variables: constants once, and a problem's own numbers for
+each problem. Only the rest needs a counterpart in CasADi.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
 
 
 class Traced:
-    """function(index, *variables), where index (1,) int64 says which problem of the batch is meant.
+    """function(index, *variables), where index (1,) int64 selects the problem of the batch.
 
     Args:
-        field: what the function is, for errors.
+        field: the function's name in errors.
         function: tensors in, one tensor out.
-        examples: variables of the shapes that it is called with.
+        examples: variables of the shapes that the function is called with.
         own: tensors that are treated as one problem's own even where all problems of the batch share them: the
             expressions, and with them the last bits, then don't depend on the other problems of the batch.
 
@@ -69,25 +69,25 @@ class Traced:
 
     @property
     def count(self) -> int:
-        """How many numbers differ from problem to problem."""
+        """Number of the values that differ from problem to problem."""
         return sum(int(np.prod(shape)) for shape in self._own_shapes)
 
     @property
     def constants(self) -> np.ndarray:
-        """The numbers (c,) that all problems share, but for those that pick elements."""
+        """The numbers (c,) that all problems share, except those used as indices."""
         return np.concatenate([np.zeros(0), *(self._constants[s].astype(float).reshape(-1) for s in self._replaceable)])
 
     def parameters(self, index: Tensor) -> np.ndarray:
-        """Those numbers (count,) for the problem that index (1,) int64 names."""
+        """The numbers (count,) that differ between problems, for the problem that index (1,) int64 selects."""
         if not self._own:
             return np.zeros(0)
         computed = self._computed(index)
         return torch.cat([computed[slot].double().flatten() for slot in self._own]).detach().cpu().numpy()
 
     def parameters_of(self, index: Tensor) -> Tensor:
-        """The same for many problems at once: (B, count) float64 for index (B,) int64, on its device.
+        """`parameters` for many problems at once: (B, count) float64 for index (B,) int64, on its device.
 
-        A problem's numbers don't depend on which others are asked for.
+        A problem's numbers don't depend on the other problems in `index`.
         """
         if not self._own:
             return torch.zeros(len(index), 0, dtype=torch.float64, device=index.device)
@@ -98,13 +98,13 @@ class Traced:
 
         try:
             return torch.func.vmap(one)(index)
-        except RuntimeError:  # an operation that can't be done for many at once
+        except RuntimeError:  # an operation that vmap can't batch
             return torch.stack([one(i) for i in index])
 
     def rebound(self, own: Sequence[Tensor], others: Sequence[Tensor]) -> Traced | None:
         """The same function with `others` in the place of its `own` tensors; None where it must be traced again.
 
-        It must where one row for all problems, from which nothing is picked, is replaced by a row per problem.
+        A new trace is needed where a row that all problems share, and that isn't indexed, becomes a row per problem.
         """
         if len(own) != len(others) or any(a.shape[:1] == (1,) != b.shape[:1] for a, b in zip(own, others, strict=True)):
             return None
@@ -115,9 +115,9 @@ class Traced:
         return copy
 
     def fingerprint(self) -> str:
-        """Digits that stand for what `__call__` computes, the same in every process. CasADi isn't needed for them.
+        """A hexadecimal digest of the computation of `__call__`, the same in every process, made without CasADi.
 
-        The values of the numbers that differ from problem to problem have no part in it.
+        It doesn't depend on the values of the numbers that differ from problem to problem.
         """
         variables = dict(zip(self._variables, self._shapes, strict=True))
         own = dict(zip(self._own, self._own_shapes, strict=True))
@@ -131,7 +131,7 @@ class Traced:
         Args:
             parameters: (count,).
             variables: shaped as the examples.
-            constants: (c,), what stands in the place of `self.constants`; those by default.
+            constants: (c,), used in place of `self.constants`, which are the default.
 
         Raises:
             InputError: an operation that CasADi has no counterpart for with these arguments.
@@ -143,7 +143,7 @@ class Traced:
         for call in self._symbolic:
             try:
                 call.replay(OPERATIONS[name_of(call.operation)], known)
-            except Exception as error:  # whatever CasADi or NumPy make of these arguments
+            except Exception as error:  # any error of CasADi or NumPy with these arguments
                 raise _unknown(self.field, call) from error
         return boxed(known[self._result])
 
@@ -179,7 +179,7 @@ def _needed(calls: list[Call], result: Slot) -> list[Call]:
 
 
 def _followers(calls: Iterable[Call], sources: Iterable[Slot]) -> set[Slot]:
-    """`sources`, and what depends on them."""
+    """`sources`, and all slots that depend on them."""
     reached = set(sources)
     for call in calls:
         if not reached.isdisjoint(call.inputs):
@@ -188,7 +188,7 @@ def _followers(calls: Iterable[Call], sources: Iterable[Slot]) -> set[Slot]:
 
 
 def _placed(numbers: np.ndarray, shapes: Mapping[Slot, tuple[int, ...]]) -> dict[Slot, np.ndarray]:
-    """One array per slot, cut from all numbers in turn."""
+    """One array per slot, cut from `numbers` in turn."""
     arrays, place = {}, 0
     for slot, shape in shapes.items():
         size = int(np.prod(shape))
@@ -198,7 +198,7 @@ def _placed(numbers: np.ndarray, shapes: Mapping[Slot, tuple[int, ...]]) -> dict
 
 
 def _array(value: Tensor) -> np.ndarray:
-    """Numbers as objects; whole numbers and truth values stay what they are, to index with."""
+    """Floating-point numbers as objects; integers and booleans keep their type, so that they can index."""
     plain = value.detach().cpu()
     return plain.double().numpy().astype(object) if value.is_floating_point() else plain.numpy()
 
