@@ -24,7 +24,8 @@ def history(rounds: int = 4, **changes) -> pd.DataFrame:
 @pytest.mark.parametrize(
     ("changes", "feasible", "name"),
     [
-        (dict(caught=False), False, "no pair in contact"), (dict(caught=False, violation=0.0), True, "stopped in front"),
+        (dict(caught=False), False, "no pair in contact"),
+        (dict(caught=False, violation=0.0), True, "stopped in front"),
         (dict(near=0.2), False, "noise too weak"), (dict(deep=1.0), False, "guide infeasible"),
         (dict(ends=0.6), False, "guide stops"), (dict(moved=1.5), False, "guide changes"),
         (dict(crosses=1.0), False, "other class"), (dict(), False, "not in time"),

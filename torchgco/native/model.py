@@ -88,7 +88,7 @@ def trace_dynamics(
     if known is not None and known.dynamics() is dynamics and known.versions == _versions(dynamics, dtype, device):
         return known.source
     source = _trace(dynamics, n, m, dtype, device)
-    if "reads_fields_alone" in type(dynamics).__dict__:
+    if type(dynamics).__dict__.get("reads_fields_alone", False):
         place = id(dynamics)
         forget = weakref.ref(dynamics, lambda _: _traced.pop(place, None))
         _traced[place] = _Known(forget, _versions(dynamics, dtype, device), source)
