@@ -1,4 +1,4 @@
-"""What holds for every test: one thread, as the workers of a parallel run share the cores."""
+"""Settings of all tests: one thread each, because parallel test workers share the cores."""
 
 import os
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ torch.set_num_threads(1)
 
 @pytest.fixture(params=["native", "eager"])
 def native(request: pytest.FixtureRequest) -> Iterator[bool]:
-    """Both kinds of kernels, one after the other."""
+    """Native and eager kernels in turn; True for native ones."""
     if request.param == "native" and find_compiler() is None:
         pytest.skip("no C compiler")
     kernels.use_native(request.param == "native")

@@ -1,4 +1,4 @@
-"""Small problems that many tests share, and their twins in the NumPy reference."""
+"""Small problems that many tests share, and the same problems for the NumPy reference."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def quadrotor_batch(B: int = 3, N: int = 40, obstacles: int = 6, seed: int = 0) 
 
 
 def boxed_batch(d: int = 2, B: int = 4, N: int = 30, boxes: int = 4, seed: int = 0) -> tuple[Problem, Tensor]:
-    """The same with turned boxes among the discs or spheres, one of the boxes absent in every other problem."""
+    """Planar (d = 2) or quadrotor problems with rotated boxes too; in every other problem one box is absent."""
     plain, U = planar_batch(B, N, 3, seed) if d == 2 else quadrotor_batch(B, N, 3, seed)
     rng = np.random.default_rng(seed + 1)
     scale, start = (1.0, plain.x0[0, :2].numpy()) if d == 2 else (4.0, plain.x0[0, :3].numpy())
@@ -88,7 +88,7 @@ def boxed_batch(d: int = 2, B: int = 4, N: int = 30, boxes: int = 4, seed: int =
 
 
 def quick_gco(problem: Problem) -> Restarts:
-    """The default solver of a problem with all its parts, but few paths, offsets and samples: tenths of a second."""
+    """The default solver with few paths, offsets and samples: it solves in tenths of a second."""
     solver = presets.gco(problem)
     assert solver.paths is not None and solver.sampling is not None
     paths = replace(
@@ -100,7 +100,7 @@ def quick_gco(problem: Problem) -> Restarts:
 
 
 def random_trajectory(problem: Problem, seed: int = 0, spread: float = 0.3) -> tuple[Tensor, Tensor]:
-    """X, U near the start, no solution of the dynamics: for derivative tests."""
+    """X (B, N+1, n) and U (B, N, m) near the start that do not satisfy the dynamics: for derivative tests."""
     generator = torch.Generator().manual_seed(seed)
     shape_X, shape_U = (problem.B, problem.N + 1, problem.n), (problem.B, problem.N, problem.m)
     X = problem.x0.unsqueeze(1) + spread * torch.randn(shape_X, generator=generator, dtype=torch.float64)
@@ -110,7 +110,7 @@ def random_trajectory(problem: Problem, seed: int = 0, spread: float = 0.3) -> t
 
 
 def reference_of(problem: Problem, b: int) -> ReferenceProblem:
-    """Element b of a planar or quadrotor batch, as the NumPy reference takes it (absent spheres left out)."""
+    """Problem b of a planar or quadrotor batch for the NumPy reference, without its absent spheres."""
     spheres, bounds = problem.constraints[0], problem.constraints[1]
     present = ~spheres.absent[b].numpy()
     planar = problem.n == 6
@@ -134,7 +134,7 @@ def reference_of(problem: Problem, b: int) -> ReferenceProblem:
 
 
 def assert_same_bits(a: Solution, b: Solution) -> None:
-    """Whether two solutions are the same in every field."""
+    """Assert that two solutions are equal bit by bit in every field, multipliers included."""
     for name in FIELDS:
         assert torch.equal(getattr(a, name), getattr(b, name)), name
     for lam_a, lam_b in zip(a.multipliers.lam, b.multipliers.lam, strict=True):

@@ -1,4 +1,4 @@
-"""The benchmarks at their smallest: every section gives whole rows, and the tables are rewritten in place."""
+"""The smallest benchmarks: every section gives complete rows, and the tables are rewritten in place."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ TINY = Sizes(
 
 @pytest.fixture(autouse=True)
 def few_processes(monkeypatch) -> None:
-    """What `first_use` would start new Pythons for, in this one: a number for an import, a first solve for a model."""
+    """Run the measurements of `first_use` in this process: a fixed number per import, a first solve per model."""
 
     def started(words: list[str], environment: dict[str, str]) -> str:
         return "1.5" if words[0] == "-c" else json.dumps(first_solve.measure(words[-1]))
@@ -65,13 +65,13 @@ def few_processes(monkeypatch) -> None:
 
 @pytest.fixture(autouse=True)
 def without_acados(monkeypatch, tmp_path: Path) -> None:
-    """Whatever is installed here: acados compiles for seconds, and has tests of its own."""
+    """Hide an installed acados: it compiles for seconds, and tests/test_speed_peers.py tests it."""
     monkeypatch.setattr(acados_peer, "ENVIRONMENT", tmp_path)
 
 
 @pytest.fixture
 def studies_here(monkeypatch) -> None:
-    """The studies of `quality` in this process, without their figures; one test leaves it as it is."""
+    """Run the studies of `quality` in this process, without figures."""
 
     def started(command: list[str], cwd: Path, **_: object) -> None:
         assert command[:3] == [sys.executable, "-m", "torchgco"]
@@ -102,7 +102,7 @@ def test_a_section_gives_whole_rows(section, tmp_path: Path) -> None:
     assert not any(row["quantity"].startswith(("left out", "ended with")) for row in rows)
     assert all(row["quantity"] and row["case"] and row["solver"] and row["commit"] for row in rows)
     with (tmp_path / "results.part.csv").open(newline="") as file:
-        assert list(csv.DictReader(file)) == rows  # on disk as they are measured
+        assert list(csv.DictReader(file)) == rows  # each row is written when it is measured
     for case, solver in {(row["case"], row["solver"]) for row in rows}:
         assert f"| {case} | `{solver}` |" in section_table(rows)
 
@@ -119,7 +119,7 @@ def test_ratios_are_those_of_their_rows(tmp_path: Path) -> None:
 
 
 def test_shares_add_up(tmp_path: Path) -> None:
-    """By phase, by native function, and all together; what is patched for the timers is as before."""
+    """By phase, by native function, and in total. Afterwards the functions patched for the timers are restored."""
     run = native_engine.run
     bench = tiny(tmp_path)
     share.run(bench)
@@ -134,7 +134,7 @@ def test_shares_add_up(tmp_path: Path) -> None:
 
 
 def test_the_targets_are_read_off_the_rows(tmp_path: Path) -> None:
-    """This run's before those that are kept; a row from another commit says so."""
+    """Rows of this run come before kept ones; a row from another commit names that commit."""
     path = tmp_path / "results.csv"
     former = Results(path)
     for section, value in (("mppi", "3"), ("paper", "7.25")):
@@ -148,21 +148,21 @@ def test_the_targets_are_read_off_the_rows(tmp_path: Path) -> None:
     bench = Bench(TINY, Results(path), {**provenance("cpu"), "commit": "1111111"}, say=lambda text: None)
     bench.row("mppi", "S = 1000", "torchgco", mppi.RATIO, 21.04)
     targets.run(bench)
-    said = {(row["case"], row["quantity"]): row["value"] for row in bench.results.rows}
-    assert said["one round of MPPI, S = 1000", "pytorch-mppi"] == "21 x"
-    assert said["walls, B = 32", "time"] == "not measured"
-    assert said["planar_trap_paper, N = 1000, all of 8 problems", "time"] == "7.2 s (at 0000000)"
-    assert [case for case, quantity in said if quantity == "time"] == [target.case for target in targets.TARGETS]
+    values = {(row["case"], row["quantity"]): row["value"] for row in bench.results.rows}
+    assert values["one round of MPPI, S = 1000", "pytorch-mppi"] == "21 x"
+    assert values["walls, B = 32", "time"] == "not measured"
+    assert values["planar_trap_paper, N = 1000, all of 8 problems", "time"] == "7.2 s (at 0000000)"
+    assert [case for case, quantity in values if quantity == "time"] == [target.case for target in targets.TARGETS]
 
 
-def test_what_takes_too_long_is_left_out_and_named(tmp_path: Path) -> None:
+def test_a_solver_that_takes_too_long_is_left_out_and_named(tmp_path: Path) -> None:
     bench = tiny(tmp_path)
     bench.deadline = 0.0
     families.run(bench)
     assert [row["quantity"] for row in bench.results.rows] == ["left out: would take"]
 
 
-def test_the_model_for_pytorch_mppi_is_the_planner_s_own(tmp_path: Path) -> None:
+def test_the_model_for_pytorch_mppi_equals_the_planners(tmp_path: Path) -> None:
     setup = Bench(TINY).setup("scenario=forest")
     problem = setup.task(setup.layouts(1)).problem
     model = QuadrotorAmongSpheres(problem, 1e8)
@@ -174,7 +174,7 @@ def test_the_model_for_pytorch_mppi_is_the_planner_s_own(tmp_path: Path) -> None
     inside = (x[:, None, :3] - spheres.centers[0]).norm(dim=-1) < spheres.inflated_radii[0]
     assert bool(inside.any()) and torch.equal(model.hits(x.float()).long(), inside.sum(1))
     cost = model.running_cost(x.float(), u.float()).double() - 1e8 * inside.sum(1)
-    clear = ~inside.any(1)  # where no collision takes the digits
+    clear = ~inside.any(1)  # a collision's 1e8 would swallow the digits of the cost
     torch.testing.assert_close(cost[clear], problem.cost.stage(x, u, 0)[clear], rtol=1e-4, atol=1e-3)
 
 
@@ -190,7 +190,7 @@ def test_a_finished_section_replaces_its_former_rows_and_no_others(tmp_path: Pat
         results = Results(path)
         results.add(row_of(section, value, device))
         results.finish(section, device)
-    Results(path).add(row_of("share", "5"))  # stopped before its end
+    Results(path).add(row_of("share", "5"))  # stopped before finish
     assert sorted(row["value"] for row in read_rows(path)) == ["2", "3", "4"]
 
 
@@ -214,7 +214,7 @@ def test_the_tables_are_rewritten_in_place(tmp_path: Path) -> None:
         rewrite(tmp_path, rows)
 
 
-def test_the_published_page_says_what_the_published_rows_say(tmp_path: Path) -> None:
+def test_the_published_page_matches_the_published_rows(tmp_path: Path) -> None:
     folder, pages = ROOT / "benchmarks", ("README.md", "results/speed.md")
     (tmp_path / "results").mkdir()
     for page in pages:
@@ -248,16 +248,16 @@ def test_the_oracle_only_ever_lowers_a_cost(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("studies_here")
-def test_the_oracle_keeps_drawn_layouts_and_success_is_told_for_them(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_the_oracle_keeps_drawn_layouts_and_success_is_judged_for_them(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr("benchmarks.families.DATA", tmp_path)
     monkeypatch.setattr(oracle, "SEARCH", {"hold": ["solver=hold"]})
     words = ["--families", "planar_random", "--fresh", "2", "--seed", "7"]
-    for _ in range(2):  # the second finds the file
+    for _ in range(2):  # the second call finds the file
         assert oracle.main([*words, "--search", "hold"]) == 0
     family = FAMILIES["planar_random"]
     drawn = Layouts.load(family.file(2, 7))
     np.testing.assert_array_equal(drawn.centers, compose(family.overrides(3, 7)).layouts(2).centers)
-    assert drawn.best_cost is None  # nothing arrives by holding still
+    assert drawn.best_cost is None  # a vehicle that holds still never arrives
     with pytest.raises(InputError, match="fresh: expected the layouts that"):
         oracle.held(family, 3, 7)
     oracle.keep(family.file(2, 7), np.array([100.0, np.nan]), "here")
@@ -281,26 +281,26 @@ def test_the_quality_of_one_family(tmp_path: Path, capsys) -> None:
 
 
 @pytest.mark.usefixtures("studies_here")
-def test_success_is_told_against_the_best_cost_of_today(tmp_path: Path, monkeypatch) -> None:
+def test_success_is_judged_with_the_current_best_cost(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("benchmarks.families.DATA", tmp_path)
     family = FAMILIES["planar_trap"]
     layouts = Layouts.load(ROOT / "benchmarks/data/planar_trap.npz").take([0, 1])
     layouts.save(family.file())
-    asked = quality._parser().parse_args(["--solvers", "hold", "--outputs", str(tmp_path / "quality")])
-    asked.overrides = ["study.layouts=2", "study.workers=1"]
-    flown = quality.fly(family, asked)
+    arguments = quality._parser().parse_args(["--solvers", "hold", "--outputs", str(tmp_path / "quality")])
+    arguments.overrides = ["study.layouts=2", "study.workers=1"]
+    flown = quality.fly(family, arguments)
     assert flown["solver"].unique().tolist() == ["hold"] and not flown["success"].any()
     lower = replace(layouts, best_cost=0.9 * layouts.best_cost)
     lower.save(family.file())
-    again = quality.fly(family, asked)  # the study that has flown isn't refused
+    again = quality.fly(family, arguments)  # a finished study may be judged again
     np.testing.assert_array_equal(again["best_cost"], lower.best_cost)
     there = flown.assign(reached=True, violation=[0.0, 2e-3], clearance=0.1, cost=flown["best_cost"])
     assert quality.succeeded(there, layouts)["success"].tolist() == [True, False]
     assert quality.succeeded(there, lower)["success"].tolist() == [False, False]
 
 
-def test_families_are_what_the_generators_draw() -> None:
-    """Fresh layouts are of the files' kind: as many obstacles of the same size, the same ends."""
+def test_the_generators_draw_the_families_of_the_files() -> None:
+    """Fresh layouts have as many obstacles as the files' layouts, of the same size, and the same start and goal."""
     for family in FAMILIES.values():
         drawn, held = compose(family.overrides(fresh=2)).layouts(), Layouts.load(family.file())
         task, other = (compose(family.overrides(fresh=f)).task(layouts) for f, layouts in ((2, drawn), (0, held)))

@@ -87,10 +87,10 @@ def test_an_arc_that_bulges_into_a_sphere_is_caught() -> None:
     )
     assert chord > 0.02 + 0.015
     clearance = float(certify(problem, X, U).clearance)
-    # The acceleration is 1 m/s^2 throughout: the bulge is at most dt^2 / 8 and a little for what its samples differ.
+    # The acceleration is 1 m/s^2 throughout: the bulge is at most dt^2 / 8, plus a little for sampled accelerations.
     assert chord - 0.02 - 2 * 0.5**2 / 8 < clearance < chord - 0.02 - 0.5**2 / 8 + 1e-9
-    assert clearance <= 0.01 - 0.02  # as near as the true arc comes
-    straight = circling(0.02, "none")[0]  # a step without a field: the chord is meant
+    assert clearance <= 0.01 - 0.02  # the clearance of the true arc
+    straight = circling(0.02, "none")[0]  # a step without a field is judged by its chord
     assert float(certify(straight, X, U).clearance) == pytest.approx(chord - 0.02)
 
 
@@ -109,7 +109,7 @@ def test_the_plants_bound_holds_for_its_true_path() -> None:
     assert true - 0.02 < float(certify(problem, X, U).clearance) <= true
 
 
-def test_absent_spheres_and_none_at_all_are_no_obstacle() -> None:
+def test_absent_or_missing_spheres_are_no_obstacle() -> None:
     problem, U = planar_batch(B=2, N=10, obstacles=2, seed=1)
     empty = Problem(problem.dynamics, problem.cost, [], problem.x0, problem.N)
     assert certified(empty, U).clearance.tolist() == [float("inf")] * 2
@@ -119,7 +119,7 @@ def test_absent_spheres_and_none_at_all_are_no_obstacle() -> None:
         problem.x0, problem.N,
     )  # fmt: skip
     gap = (problem.x0[:, :2] - first.constraints[0].centers[:, 0]).norm(dim=-1) - 0.16
-    torch.testing.assert_close(certified(first, U).clearance, gap)  # nothing moves
+    torch.testing.assert_close(certified(first, U).clearance, gap)  # the vehicles stay at the start
 
 
 def test_dynamics_and_bounds_are_measured() -> None:
@@ -134,13 +134,13 @@ def test_dynamics_and_bounds_are_measured() -> None:
     off, hard = X.clone(), U.clone()
     off[0, 4, 1] += 0.25
     hard[1, 3, 2] = -5.5
-    told = certify(bounded, off, hard)
-    assert told.dynamics_residual.tolist()[0] == pytest.approx(0.25)
-    assert told.bound_violation.tolist() == [0.0, 0.5]
+    certificate = certify(bounded, off, hard)
+    assert certificate.dynamics_residual.tolist()[0] == pytest.approx(0.25)
+    assert certificate.bound_violation.tolist() == [0.0, 0.5]
     off = X.clone()
     off[0, 7, 13] = 11.25
     assert certify(bounded, off, U).bound_violation.tolist() == [1.25, 0.0]
-    off[0] = X[0] + 0.5 * (torch.arange(14) == 0)  # every state moved along: only the start tells
+    off[0] = X[0] + 0.5 * (torch.arange(14) == 0)  # all states are shifted alike: only the start differs
     assert float(certify(bounded, off, U).dynamics_residual[0]) == pytest.approx(0.5)
 
 
@@ -158,7 +158,7 @@ def test_known_optima_have_no_residual() -> None:
         )
 
     assert residual(1.0) == pytest.approx(0.0, abs=1e-15)
-    assert residual(0.5) == pytest.approx(1.0 / 2.0)  # gradient 2 u - 2 = -1, by 1 + 1
+    assert residual(0.5) == pytest.approx(1.0 / 2.0)  # gradient 2 u - 2 = -1, divided by the terms 1 + 1
     assert residual(0.5, ControlBounds([-1.0], [0.5])) == pytest.approx(0.0, abs=1e-15)
     assert residual(1.5, ControlBounds([-1.0], [1.5])) == pytest.approx(1.0 / 2.0)  # the bound would have to pull
     assert residual(0.5, ControlBounds([-1.0], [0.6])) == pytest.approx(1.0 / 2.0)  # too far from the bound
@@ -175,7 +175,7 @@ def test_a_fit_that_does_not_end_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> 
     assert float(certified(problem, U).kkt_residual) == pytest.approx(0.0, abs=1e-15)
 
 
-def test_a_velocity_that_is_commanded_has_no_acceleration() -> None:
+def test_a_commanded_velocity_has_no_acceleration() -> None:
     dynamics = FunctionDynamics(lambda x, u: u, 2, 2, 0.5, "rk4", slice(0, 2))
     x0 = torch.zeros(1, 2, dtype=torch.float64)
     problem = Problem(dynamics, QuadraticCost([1, 1], [1, 1], [1, 1]), [Spheres([[0.25, 0.2]], [0.1])], x0, 2)
@@ -184,10 +184,10 @@ def test_a_velocity_that_is_commanded_has_no_acceleration() -> None:
 
 
 def terms(problem: Problem, X: torch.Tensor, U: torch.Tensor, h: float = 1e-6) -> np.ndarray:
-    """Sizes (N, m) of all terms of dJ/du_k: the stage's own, and one that every state of knot k + 1 passes on."""
+    """Sum (N, m) of the absolute terms of dJ/du_k: the stage's own, and one through each state of knot k + 1."""
 
     def cost_of(k: int, x: torch.Tensor) -> float:
-        """J where knot k is x and the controls after it stay."""
+        """J with knot k at x and the same controls after it."""
         path = [*X[0, :k], x]
         for u in U[0, k:]:
             path.append(problem.dynamics.step(path[-1][None], u[None])[0])
@@ -242,7 +242,7 @@ def test_the_residual_is_that_of_finite_differences(batch) -> None:
     assert float(certify(problem, X, U).kkt_residual) == pytest.approx(expected, rel=1e-4)
 
 
-def test_only_what_is_asked_is_certified_and_alone_as_in_company() -> None:
+def test_only_requested_problems_are_certified_each_on_its_own() -> None:
     problem, U = planar_batch(B=3, N=10)
     U = U.clone()
     X = open_loop(problem.dynamics, problem.x0, U)

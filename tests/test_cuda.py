@@ -1,4 +1,4 @@
-"""The same solve on a CUDA device, where there is one."""
+"""A solve on a CUDA device equals that on the CPU; skipped without a device."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from torchgco.problem import Problem
 pytestmark = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 
 
-def test_a_device_gives_what_the_processor_gives() -> None:
+def test_gpu_and_cpu_agree() -> None:
     problem, U0 = planar_batch(B=3, N=15, obstacles=4)
     spheres, bounds = problem.constraints
     moved = Problem(
@@ -30,6 +30,6 @@ def test_a_device_gives_what_the_processor_gives() -> None:
     solver = AugmentedLagrangian(
         inner=ILQR(max_iterations=5), guidance=GCO(sampler=MPPI(samples=10)), max_outer_iterations=3
     )
-    here, there = solver.solve(problem, U0), solver.solve(moved, U0.cuda())
-    torch.testing.assert_close(there.U.cpu(), here.U, rtol=1e-6, atol=1e-6)
-    assert there.status.tolist() == here.status.tolist()
+    on_cpu, on_gpu = solver.solve(problem, U0), solver.solve(moved, U0.cuda())
+    torch.testing.assert_close(on_gpu.U.cpu(), on_cpu.U, rtol=1e-6, atol=1e-6)
+    assert on_gpu.status.tolist() == on_cpu.status.tolist()

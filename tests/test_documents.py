@@ -64,7 +64,7 @@ def links(page: Path) -> list[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """The names that a page's headings have in links."""
+    """The anchors of a page's headings."""
     names = (
         re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
         for heading in re.findall(r"^#+ (.*)$", FENCE.sub("", page.read_text()), re.MULTILINE)
@@ -80,7 +80,7 @@ def name_of(page: Path) -> str:
 
 
 def accept(command: str) -> None:
-    """Raise, or exit, unless the program accepts the command's arguments; nothing is flown."""
+    """Raise, or exit, unless the program accepts the command's arguments; runs nothing."""
     program, *words = shlex.split(command, comments=True)
     if program == "torchgco":
         accept_overrides(words)
@@ -145,18 +145,18 @@ def test_every_command_is_accepted(page: Path) -> None:
 
 
 def run(page: Path) -> dict[str, object]:
-    """Run the Python blocks of a page in order; the names that they define, which a later block may use."""
+    """Run the Python blocks of a page in order, in one namespace; returns that namespace."""
     names: dict[str, object] = {"__name__": page.name}
     for language, text in blocks(page):
         if language == PYTHON:
-            # Without the future statement of this file, as a reader's own file runs it.
+            # A reader's file lacks this file's future statement.
             exec(compile(text, page.name, "exec", dont_inherit=True), names)
     return names
 
 
 @pytest.fixture
 def registries() -> Iterator[None]:
-    """What a page adds to the registries of obstacles is taken out again."""
+    """Restore the registries of obstacles after a page has added to them."""
     before = [(registry, dict(registry)) for registry in (CLEARANCES, CHORDS)]
     yield
     for registry, entries in before:
@@ -174,7 +174,7 @@ def test_every_python_block_runs(page: Path, registries: None) -> None:
         names = run(page)
     for problem in names.values():
         for part in problem.constraints if isinstance(problem, Problem) else ():
-            if type(part).__module__ == page.name:  # natively, nothing calls `accumulate`
+            if type(part).__module__ == page.name:  # native kernels do not call `accumulate`
                 check_expansion(problem, part)
 
 

@@ -1,4 +1,4 @@
-"""Why gco_paper fails: the causes derived from synthetic histories, and the whole run at its smallest."""
+"""Causes of gco_paper's failures: derived from synthetic histories, and the smallest whole run."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def history(rounds: int = 4, **changes) -> pd.DataFrame:
         (dict(deep=1.0, ends=0.6), False, "guide infeasible"),
     ],
 )  # fmt: skip
-def test_a_history_tells_its_cause(changes: dict, feasible: bool, name: str) -> None:
+def test_a_history_has_its_cause(changes: dict, feasible: bool, name: str) -> None:
     assert name in CAUSES and cause(history(**changes), feasible, 1.0) == name
 
 
-def test_an_iterate_thrown_far_off_is_told_first() -> None:
+def test_an_iterate_thrown_far_off_is_the_first_cause() -> None:
     flown = history(near=0.1)
     flown.loc[3, "cost"] = 6.0
     assert cause(flown, False, 1.0) == "diverged"

@@ -30,7 +30,7 @@ class AtTheEnd(Cost):
 
 
 def terminal_problem(goal: Goal | None, N: int = 100) -> tuple[Problem, Tensor]:
-    """A planar vehicle before a cup that opens towards it, drawn to the other side by a terminal function."""
+    """A planar vehicle in front of a cup that opens towards it; its cost draws it to a goal behind the cup."""
     x0 = torch.tensor([[-1.0, 0, 0, 0, 0, 0]], dtype=torch.float64)
     problem = Problem(Planar(dt=0.1), AtTheEnd(), [Spheres(CUP, [0.1] * 6, 0.06)], x0, N, goal)
     return problem, torch.zeros(1, N, 2, dtype=torch.float64)
@@ -62,15 +62,15 @@ def test_a_given_goal_prevails_over_the_cost_and_is_aimed_at_closely() -> None:
     problem = Problem(problem.dynamics, problem.cost, problem.constraints, problem.x0, 5, given)
     assert problem.goal is not None and problem.goal.position.tolist() == [[1.0, 0.3], [0.9, 0.4]]
     near = goal_tolerance(problem)
-    assert near is not None and float(near[0]) == 0.01  # a small goal is aimed at as it is,
-    assert float(near[1]) == pytest.approx(SHARE * (1.9**2 + 0.16) ** 0.5)  # a generous one closer than it asks
+    assert near is not None and float(near[0]) == 0.01  # a goal radius below 9 % is the tolerance,
+    assert float(near[1]) == pytest.approx(SHARE * (1.9**2 + 0.16) ** 0.5)  # a larger one is reduced to 9 %
     X = ending(problem, (1.0, 0.32), (0.9, 0.5))
     assert has_arrived(problem, X).tolist() == [False, True] and arrives(problem, X).tolist() == [True, True]
     assert judge(problem, U).reached.tolist() == [False, bool(judge(problem, U).feasible[1])]
     assert judge(problem, U, problem.goal.position, 0.01).reached.tolist() == [False, False]
 
 
-def test_the_goal_goes_wherever_its_problem_goes() -> None:
+def test_copies_of_a_problem_keep_its_goal() -> None:
     problem, _ = planar_batch(B=3, N=5)
     centers = torch.tensor([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]], dtype=torch.float64)
     given = replace(problem, goal=Goal(centers, 0.5))
@@ -79,7 +79,7 @@ def test_the_goal_goes_wherever_its_problem_goes() -> None:
     assert part.goal.position.dtype == torch.float32
     again = replace(given, constraints=[])
     assert again.goal is not None and torch.equal(again.goal.position, centers)
-    other = replace(problem, cost=AtTheEnd())  # a goal that was derived from one cost is not another's
+    other = replace(problem, cost=AtTheEnd())  # a goal derived from the cost is not kept for another cost
     assert other.goal is None and not bool(has_arrived(other, ending(other, *[(1.0, 0.4)] * 3)).any())
 
 
@@ -95,11 +95,11 @@ def test_a_terminal_function_with_a_goal_is_guided() -> None:
         judge(blind, U0)
 
 
-NOWHERE = FunctionDynamics(lambda x, u: x + u, n=1, m=1, dt=0.1)
+WITHOUT_POSITION = FunctionDynamics(lambda x, u: x + u, n=1, m=1, dt=0.1)
 
 
 @pytest.mark.parametrize(
-    ("goal", "told"),
+    ("goal", "message"),
     [
         (Goal([1.0], 0.1), r"goal.position: expected shape \(2, 2\), got \(2, 1\)"),
         (Goal([[1.0, 0.0]] * 3, 0.1), r"goal.position: expected shape \(2, 2\), got \(3, 2\)"),
@@ -110,12 +110,12 @@ NOWHERE = FunctionDynamics(lambda x, u: x + u, n=1, m=1, dt=0.1)
         ([1.0, 0.0], "goal: expected a Goal, or None, got list"),
     ],
 )
-def test_a_malformed_goal_is_named(goal: object, told: str) -> None:
+def test_a_malformed_goal_is_named(goal: object, message: str) -> None:
     problem, _ = planar_batch(B=2, N=5)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         Problem(problem.dynamics, problem.cost, problem.constraints, problem.x0, 5, goal)  # type: ignore[arg-type]
 
 
 def test_a_goal_needs_a_position() -> None:
     with pytest.raises(InputError, match="goal: expected dynamics with a position, got dynamics without one"):
-        Problem(NOWHERE, AtTheEnd(), [], torch.zeros(1, 1, dtype=torch.float64), 3, Goal([0.0], 0.1))
+        Problem(WITHOUT_POSITION, AtTheEnd(), [], torch.zeros(1, 1, dtype=torch.float64), 3, Goal([0.0], 0.1))

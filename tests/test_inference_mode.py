@@ -1,4 +1,4 @@
-"""Derivatives within torch.inference_mode() and torch.no_grad() are those outside, whoever made the tensors where."""
+"""torch.inference_mode() and torch.no_grad() change no derivative, wherever the tensors were made."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchgco.autodiff import gradients
 
 
 class Race(Cost):
-    """To 1 m along a line; derivatives by torch.func."""
+    """Cost of a race to 1 m along a line; its derivatives come from torch.func."""
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         return (x[..., 0] - 1).square() + 0.1 * x[..., 1].square() + 0.01 * u.square().sum(-1)
@@ -25,7 +25,7 @@ class Race(Cost):
 
 
 def functions() -> tuple[Problem, Tensor]:
-    """A user's own parts, closed over tensors of their own."""
+    """A problem of user functions that close over tensors."""
     A = torch.tensor([[0.0, 1.0], [0.0, 0.0]], dtype=torch.float64)
     limit = torch.tensor([0.6], dtype=torch.float64)
 
@@ -50,7 +50,7 @@ MAKERS = {
 
 
 def everything(problem: Problem, U0: Tensor) -> list[Tensor]:
-    """What solve, Polish, judge and certify say."""
+    """All results of solve, Polish, judge and certify."""
     quick = quick_gco(problem)
     solver = replace(quick, local=replace(quick.local, max_outer_iterations=4))
     solved, held = torchgco.solve(problem, U0, solver), Hold().solve(problem, U0)
@@ -70,8 +70,8 @@ def everything(problem: Problem, U0: Tensor) -> list[Tensor]:
 @pytest.mark.parametrize("name", MAKERS)
 def test_every_mode_gives_the_same_bits(name: str) -> None:
     outside = MAKERS[name]()
-    want = everything(*outside)
-    assert float(certify(outside[0], *_held(*outside)).kkt_residual.max()) > 0.05  # 0.0 would hide a constant
+    expected = everything(*outside)
+    assert float(certify(outside[0], *_held(*outside)).kkt_residual.max()) > 0.05  # a constant 0 would pass
     with torch.inference_mode():
         inside = MAKERS[name]()
         runs = [everything(*outside), everything(*inside)]
@@ -79,7 +79,7 @@ def test_every_mode_gives_the_same_bits(name: str) -> None:
     with torch.no_grad():
         runs.append(everything(*outside))
     for got in runs:
-        for mine, theirs in zip(got, want, strict=True):
+        for mine, theirs in zip(got, expected, strict=True):
             torch.testing.assert_close(mine, theirs, rtol=0.0, atol=0.0, equal_nan=True)
 
 
@@ -88,7 +88,7 @@ def _held(problem: Problem, U0: Tensor) -> tuple[Tensor, Tensor]:
     return held.X, held.U
 
 
-def test_gradients_are_zero_by_what_does_not_matter() -> None:
+def test_gradients_by_unused_arguments_are_zero() -> None:
     x, y = torch.tensor([2.0]), torch.tensor([3.0, 4.0])
     with torch.inference_mode():
         by_x, by_y = gradients(lambda x, y: y.square(), x, y)

@@ -1,4 +1,4 @@
-"""The judge against plain NumPy, and its words against hand-made cases."""
+"""The judge against plain NumPy, and its verdicts against hand-made cases."""
 
 import numpy as np
 import pytest
@@ -88,14 +88,14 @@ def test_a_moving_obstacle_is_followed_between_the_knots() -> None:
     assert float(verdict.clearance_knots) > float(verdict.clearance) + 1e-4
 
 
-def test_what_the_words_mean() -> None:
+def test_feasible_reached_sound_and_success() -> None:
     problem, U = passing(speed=1.0, offset=0.098)  # 0.098 from the centre: inside the full radius, outside 0.95 of it
     goal = torch.tensor([1.0, 0.0], dtype=torch.float64)
     verdict = judge(problem, U, goal, 0.1)
     assert float(verdict.violation) == pytest.approx(0.002) and bool(verdict.feasible) and not bool(verdict.sound)
     assert not bool(judge(problem, U, goal + 0.2, 0.1).reached)
     hard = U.clone()
-    hard[:, -1] = 1.01  # after which nothing moves any more, but the bound is broken
+    hard[:, -1] = 1.01  # moves no later knot, but breaks the bound
     assert not bool(judge(problem, hard, goal, 0.1).feasible)
     free, U = passing(speed=1.0, offset=0.5)
     sound = judge(free, U, goal, 0.1)

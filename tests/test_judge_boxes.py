@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.problems import boxed_batch, random_trajectory
-from tests.reference import boxes as slow
+from tests.reference import boxes as brute_force
 from torchgco import Boxes, Problem, certify, judge
 from torchgco.certificate import CHORDS
 from torchgco.constraints.boxes import BoundBoxes
@@ -17,8 +17,8 @@ from torchgco.rollout import open_loop
 SAMPLES = 601
 
 
-def made(d: int, N: int = 8) -> tuple[Problem, BoundBoxes, tuple[np.ndarray, ...]]:
-    """Two problems with turned boxes of their own, and what these were made from."""
+def boxed_problem(d: int, N: int = 8) -> tuple[Problem, BoundBoxes, tuple[np.ndarray, ...]]:
+    """Two problems with different rotated boxes, the boxes, and their centres, half sizes and rotations."""
     rng = np.random.default_rng(5)
     plain, _ = boxed_batch(d, B=2, N=N)
     start = plain.x0[0, :d].numpy()
@@ -32,29 +32,29 @@ def made(d: int, N: int = 8) -> tuple[Problem, BoundBoxes, tuple[np.ndarray, ...
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_clearances_by_walking_along(d: int) -> None:
-    problem, boxes, parts = made(d)
+def test_clearances_against_sampled_segments(d: int) -> None:
+    problem, boxes, parts = boxed_problem(d)
     X, _ = random_trajectory(problem, spread=0.5)
     X[:, 3] = X[:, 2]  # a segment of no length
     X[:, 5, :d] = 2 * boxes.centers[:, 0] - X[:, 4, :d]  # and one right through a box
     at_knots, between = box_clearance(boxes, X)
     for b in range(2):
         chords = CHORDS[BoundBoxes](boxes.take(torch.tensor([b])), X[b])
-        p, knots, ways = X[b, :, :d].numpy(), np.inf, np.inf
+        p, knots, nearest = X[b, :, :d].numpy(), np.inf, np.inf
         for i in range(3):
             box = tuple(part[b, i] for part in parts)
-            knots = min([knots, *(slow.distance(q, *box) for q in p)])
+            knots = min([knots, *(brute_force.distance(q, *box) for q in p)])
             for k in range(problem.N):
-                way = slow.segment_distance(p[k], p[k + 1], *box, samples=SAMPLES)
+                distance = brute_force.segment_distance(p[k], p[k + 1], *box, samples=SAMPLES)
                 step = np.linalg.norm(p[k + 1] - p[k]) / (SAMPLES - 1)
-                assert way - step - 1e-12 <= float(chords[k, i]) + 0.1 <= way + 1e-12
-                ways = min(ways, way)
+                assert distance - step - 1e-12 <= float(chords[k, i]) + 0.1 <= distance + 1e-12
+                nearest = min(nearest, distance)
         assert float(at_knots[b]) == pytest.approx(knots - 0.095, abs=1e-12)
-        assert ways - 0.095 - 0.01 <= float(between[b]) <= ways - 0.095 + 1e-12
+        assert nearest - 0.095 - 0.01 <= float(between[b]) <= nearest - 0.095 + 1e-12
         assert float(between[b]) < 0
 
 
-def test_a_way_through_a_wall_is_seen_between_knots_alone() -> None:
+def test_a_path_through_a_wall_is_seen_between_knots_alone() -> None:
     plain, _ = boxed_batch(2, B=1, N=1)
     wall = Boxes([[0.0, 0.0]], [[0.01, 5.0]], 0.06)
     problem = Problem(plain.dynamics, plain.cost, [wall], plain.x0, 1)
@@ -80,10 +80,10 @@ def test_a_verdict_and_a_certificate_among_boxes_and_spheres(d: int) -> None:
     assert float(alone.clearance) == float(verdict.clearance[2])
 
 
-def test_boxes_that_are_all_absent_leave_room_without_end() -> None:
+def test_absent_boxes_give_infinite_clearance() -> None:
     plain, U = boxed_batch(2, B=1, N=4)
-    nowhere = Boxes([[np.nan, np.nan]], [[np.nan, np.nan]], 0.06)
-    problem = Problem(plain.dynamics, plain.cost, [nowhere], plain.x0, 4)
+    absent = Boxes([[np.nan, np.nan]], [[np.nan, np.nan]], 0.06)
+    problem = Problem(plain.dynamics, plain.cost, [absent], plain.x0, 4)
     assert float(judge(problem, U).clearance) == float("inf")
     X = open_loop(problem.dynamics, problem.x0, U)
     assert float(certify(problem, X, U).clearance) == float("inf")

@@ -72,7 +72,7 @@ def test_gradient_is_the_derivative_of_the_value(batch: str, phr: bool) -> None:
 
 @pytest.mark.parametrize("batch", BATCHES)
 def test_hessian_is_gauss_newton(batch: str) -> None:
-    """J_var's Hessian plus rho c_z' c_z, rebuilt from autodiff Jacobians of every row."""
+    """J_var's Hessian plus rho c_z' c_z, from autodiff Jacobians of every row."""
     problem = _with_more(BATCHES[batch](B=2, N=9)[0])
     X, U = random_trajectory(problem)
     multipliers, n = _random_multipliers(problem, X, U), problem.n
@@ -115,7 +115,7 @@ def test_printed_rule_of_the_penalty() -> None:
     assert penalty_weights("inequality", c, lam, mu, phr=True).flatten().tolist() == [0, 0, 4, 4]
 
 
-def test_phr_value_is_continuous_where_a_row_lets_go() -> None:
+def test_phr_value_is_continuous_where_a_row_becomes_inactive() -> None:
     problem, _ = planar_batch(B=1, N=3, obstacles=1)
     spheres, mu, lam = problem.constraints[0], 4.0, 0.6
     X = problem.x0.unsqueeze(1).repeat(1, 4, 1)

@@ -1,4 +1,4 @@
-"""One source of settings: YAML, API and preset agree for every solver, and `torchgco.solve` is `solver=gco`."""
+"""YAML, API and preset hold the same settings for every solver, and `torchgco.solve` uses those of `solver=gco`."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_an_option_on_the_command_line_changes_that_option_alone() -> None:
         torchgco.compose(["solver.paths.num_path=3"])
 
 
-def test_a_problem_without_a_position_gets_the_settings_for_the_plane() -> None:
+def test_a_problem_without_a_position_gets_the_planar_settings() -> None:
     dynamics = torchgco.FunctionDynamics(lambda x, u: u, 1, 1, 0.1)
     problem = Problem(dynamics, QuadraticCost([1.0], [1.0], [1.0]), [], torch.ones(1, 1, dtype=torch.float64), 5)
     assert presets.gco(problem) == presets.gco(2) != presets.gco(3)

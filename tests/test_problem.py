@@ -1,4 +1,4 @@
-"""Malformed input is one error that names the part at fault; constraints hold where they say."""
+"""Malformed input raises one error that names the part at fault; constraints hold at their knots."""
 
 import pickle
 from dataclasses import dataclass
@@ -98,7 +98,7 @@ def test_knots_of_a_constraint() -> None:
     assert [problem.constraints[0].holds_at(k) for k in range(6)] == [False, False, True, False, False, True]
 
 
-def test_moving_spheres_are_where_they_say() -> None:
+def test_moving_spheres_are_at_their_positions() -> None:
     centers, velocities = torch.rand(2, 3, 2, dtype=torch.float64), torch.rand(2, 3, 2, dtype=torch.float64)
     problem = planar([Spheres(centers, [0.1, 0.2, 0.3], torch.tensor([0.05, 0.1]).double(), velocities)])
     spheres = problem.constraints[0]

@@ -1,4 +1,4 @@
-"""What the README shows runs as it stands there; links and commands of all pages are in test_documents.py."""
+"""The README's example runs as printed, and every status is explained; test_documents.py tests links and commands."""
 
 import re
 from pathlib import Path

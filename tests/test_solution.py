@@ -1,4 +1,4 @@
-"""Solutions are saved and loaded, and the plain baselines return them, too."""
+"""Solutions are saved and loaded, and the plain baselines return them too."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""acados as a peer: its worker reads what the problem says, and its answers are judged like all others."""
+"""acados as a peer: its worker reads the same problem, and its solutions are judged like all others."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from torchgco.rollout import open_loop
 needs_acados = pytest.mark.skipif(not acados_peer.installed(), reason="acados isn't installed: `make benchmark` does")
 
 
-def told(folder: Path) -> tuple[dict, dict[str, np.ndarray]]:
+def read_problem(folder: Path) -> tuple[dict, dict[str, np.ndarray]]:
     with np.load(folder / "problems.npz") as file:
         return json.loads((folder / "form.json").read_text()), dict(file)
 
@@ -33,7 +33,7 @@ def guess(problem: Problem, U: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor
     return open_loop(problem.dynamics, problem.x0, U), U
 
 
-def test_instructions_say_what_the_function_says() -> None:
+def test_instructions_compute_the_function() -> None:
     x, p = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
     result = ca.vertcat(
         ca.sin(x[0]) * p[1] - 2.5,
@@ -49,11 +49,11 @@ def test_instructions_say_what_the_function_says() -> None:
 
 
 @pytest.mark.parametrize("batch", [planar_batch, quadrotor_batch])
-def test_the_worker_is_told_the_problem(batch, tmp_path: Path) -> None:
-    """Step, rows, cost and bounds at random points, against those of the problem in PyTorch."""
+def test_the_worker_gets_the_problem(batch, tmp_path: Path) -> None:
+    """Step, rows, cost and bounds at random points equal those of the problem in PyTorch."""
     problem, U0 = batch(B=2, N=10)
     acados_peer.write(problem, *guess(problem, U0), tmp_path)
-    form, numbers = told(tmp_path)
+    form, numbers = read_problem(tmp_path)
     n, m = problem.n, problem.m
     draw = torch.Generator().manual_seed(1)
     X = problem.x0.unsqueeze(1) + torch.randn(2, problem.N + 1, n, generator=draw, dtype=torch.float64)
@@ -81,11 +81,11 @@ def test_the_worker_is_told_the_problem(batch, tmp_path: Path) -> None:
         np.testing.assert_allclose(numbers[side], getattr(bounds, side).expand(2, problem.N, m))
 
 
-def refused(problem: Problem, U0: torch.Tensor, folder: Path) -> None:
+def write_problem(problem: Problem, U0: torch.Tensor, folder: Path) -> None:
     acados_peer.write(problem, *guess(problem, U0), folder)
 
 
-def test_what_acados_is_not_told_is_named(tmp_path: Path) -> None:
+def test_problems_without_a_form_for_acados_are_named(tmp_path: Path) -> None:
     plain, U0 = planar_batch(B=2, N=8)
     spheres, bounds = plain.constraints
     some = ControlBounds([-9.0, -9.0], [9.0, 9.0], knots=[1, 2])
@@ -97,11 +97,11 @@ def test_what_acados_is_not_told_is_named(tmp_path: Path) -> None:
         (linear, [bounds], "linear"),
     ):
         with pytest.raises(InputError, match=field):
-            refused(Problem(plain.dynamics, cost, constraints, plain.x0, 8), U0, tmp_path)
+            write_problem(Problem(plain.dynamics, cost, constraints, plain.x0, 8), U0, tmp_path)
 
 
-def test_a_worker_that_fails_is_a_row_and_no_end(tmp_path: Path, monkeypatch) -> None:
-    """The other peers fly on, and nothing of the one that failed stays behind."""
+def test_a_failed_worker_gives_a_row_and_stops_nothing(tmp_path: Path, monkeypatch) -> None:
+    """The other peers still run; the failed ones leave one row each, with the error."""
     monkeypatch.setattr(acados_peer, "installed", lambda: True)
     monkeypatch.setattr(acados_peer, "ENVIRONMENT", tmp_path)
     (tmp_path / "bin").mkdir()
@@ -116,10 +116,10 @@ def test_a_worker_that_fails_is_a_row_and_no_end(tmp_path: Path, monkeypatch) ->
 
 
 @needs_acados
-def test_acados_finds_what_fatrop_finds(tmp_path: Path) -> None:
-    """And again from what was compiled; one problem's numbers don't stay for the next."""
+def test_acados_agrees_with_fatrop(tmp_path: Path) -> None:
+    """Twice, the second time without compiling; no number of one problem carries over to the next."""
     problem, U0 = planar_batch(B=3, N=30, obstacles=3, seed=2)
-    rows = torch.tensor([1, 2])  # around the first one's obstacles there are two paths
+    rows = torch.tensor([1, 2])  # the first has two paths around its obstacles
     first = acados_peer.fly(problem, *guess(problem, U0), tmp_path)
     solution = CasADiSolver("fatrop").solve(problem, U0)
     X = open_loop(problem.dynamics, problem.x0, first.U)

@@ -1,4 +1,4 @@
-"""The house: imports go one way, `import torchgco` stays light, and no file or function outgrows its reader."""
+"""Imports go one way through the layers, `import torchgco` stays light, and files and functions stay short."""
 
 import ast
 import subprocess
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "torchgco"
-FLOORS = [
+LAYERS = [
     ["errors", "tree", "status", "autodiff", "draws", "kernels"],
     ["shapes"],
     ["dynamics", "costs", "constraints", "penalties", "goal"],
@@ -32,13 +32,13 @@ MODULES = sorted(
 )
 
 
-def floor_of(name: str) -> tuple[int, str]:
-    """Floor and room of a module, the longest matching room first."""
-    rooms = [(level, room) for level, rooms in enumerate(FLOORS) for room in rooms]
-    for level, room in sorted(rooms, key=lambda pair: -len(pair[1])):
-        if name == room or name.startswith(f"{room}."):
-            return level, room
-    raise AssertionError(f"{name} stands on no floor")
+def layer_of(name: str) -> tuple[int, str]:
+    """Layer and package of a module; of several matching packages, the one with the longest name."""
+    entries = [(level, package) for level, packages in enumerate(LAYERS) for package in packages]
+    for level, package in sorted(entries, key=lambda pair: -len(pair[1])):
+        if name == package or name.startswith(f"{package}."):
+            return level, package
+    raise AssertionError(f"{name} is in no layer")
 
 
 def imports_of(path: Path) -> set[str]:
@@ -50,7 +50,7 @@ def imports_of(path: Path) -> set[str]:
 
 
 def modules_of(path: Path) -> set[str]:
-    """The same with every imported name, which may be a module itself."""
+    """All modules that a file may import: each imported name may be a module itself."""
     froms = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom) and node.module]
     named = {f"{node.module}.{alias.name}" for node in froms for alias in node.names} | {node.module for node in froms}
     return {name.removeprefix("torchgco.") for name in named if name.startswith("torchgco.")}
@@ -61,15 +61,15 @@ def test_imports_go_one_way(path: Path) -> None:
     name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
     if name == "__main__":
         return
-    level, room = floor_of(name)
+    level, package = layer_of(name)
     for imported in imports_of(path):
-        other, other_room = floor_of(imported)
-        same_house = {room.split(".")[0], other_room.split(".")[0]} <= {"dynamics", "costs", "constraints"}
-        assert other < level or other_room == room or same_house, f"{name} imports {imported}"
+        other, other_package = layer_of(imported)
+        parts = {package.split(".")[0], other_package.split(".")[0]} <= {"dynamics", "costs", "constraints"}
+        assert other < level or other_package == package or parts, f"{name} imports {imported}"
 
 
 def test_no_files_import_each_other_in_a_circle() -> None:
-    """Imports for type checkers count, too."""
+    """Imports for type checkers count too."""
     names = {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in MODULES}
     known = {name: modules_of(path) & set(names) - {name} for name, path in names.items()}
     while leaves := [name for name, others in known.items() if not others]:
@@ -77,15 +77,15 @@ def test_no_files_import_each_other_in_a_circle() -> None:
     assert not known
 
 
-def test_solvers_do_not_know_guidance_and_problems_know_no_solver() -> None:
+def test_solvers_import_no_guidance_and_problems_no_solver() -> None:
     for path in (PACKAGE / "solvers").glob("*.py"):
         assert not any(name.startswith(("guidance", "search")) for name in imports_of(path)), path
-    for room in ("dynamics", "costs", "constraints"):
-        for path in (PACKAGE / room).glob("*.py"):
+    for package in ("dynamics", "costs", "constraints"):
+        for path in (PACKAGE / package).glob("*.py"):
             assert not any(name.startswith(("solvers", "lagrangian", "guidance")) for name in imports_of(path)), path
 
 
-def test_only_experiments_know_hydra() -> None:
+def test_only_experiments_import_hydra() -> None:
     for path in PACKAGE.rglob("*.py"):
         if path.parent.name != "experiments":
             text = path.read_text()
@@ -93,7 +93,7 @@ def test_only_experiments_know_hydra() -> None:
 
 
 def test_importing_torchgco_loads_neither_hydra_nor_matplotlib_nor_casadi() -> None:
-    """And a worker process of a study, which imports the command and what it flies with, no figures either."""
+    """A worker process of a study imports the command and the flight; it must not load plotting either."""
     heavy = ("hydra", "matplotlib", "pandas", "casadi")
     code = (
         f"import sys, torchgco, torchgco.baselines; print([m for m in {heavy} if m in sys.modules])\n"
@@ -104,7 +104,7 @@ def test_importing_torchgco_loads_neither_hydra_nor_matplotlib_nor_casadi() -> N
     assert done.stdout.split() == ["[]", "[]"]
 
 
-def test_a_model_is_recorded_without_what_takes_seconds_to_load() -> None:
+def test_tracing_a_model_loads_no_slow_module() -> None:
     heavy = ("casadi", "sympy", "torch._dynamo")
     code = (
         "import sys, torch, torchgco; from torchgco.tracing import Traced\n"
@@ -123,12 +123,12 @@ def test_instantiate_is_called_in_one_place() -> None:
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.[ch]")), ids=lambda p: p.name)
-def test_files_in_c_fit_their_reader(path: Path) -> None:
+def test_c_files_are_short(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= 300
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_files_and_functions_fit_their_reader(path: Path) -> None:
+def test_files_and_functions_are_short(path: Path) -> None:
     text = path.read_text()
     assert len(text.splitlines()) <= 300
     for node in ast.walk(ast.parse(text)):

@@ -1,4 +1,4 @@
-"""No obstacle at all is a problem like any other, and a constraint without rows is satisfied."""
+"""A problem may have no obstacles, and a constraint without rows is satisfied."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ def planar(*constraints) -> tuple[Problem, torch.Tensor]:
 
 @pytest.mark.parametrize("kind", EMPTY)
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_nothing_in_the_way_changes_nothing(kind: str, solver: str) -> None:
+def test_empty_constraints_change_nothing(kind: str, solver: str) -> None:
     free, U0 = planar(BOUNDS)
     problem, _ = planar(EMPTY[kind], BOUNDS)
-    want, got = (torchgco.solve(p, U0, SOLVERS[solver]) for p in (free, problem))
-    assert torch.equal(got.U, want.U) and got.status.tolist() == want.status.tolist()
-    assert got.violation.tolist() == want.violation.tolist() and got.guided.tolist() == [0, 0]
+    expected, got = (torchgco.solve(p, U0, SOLVERS[solver]) for p in (free, problem))
+    assert torch.equal(got.U, expected.U) and got.status.tolist() == expected.status.tolist()
+    assert got.violation.tolist() == expected.violation.tolist() and got.guided.tolist() == [0, 0]
     wanted, verdict = (judge(p, got.U, GOAL, 0.3) for p in (free, problem))
     for mine, theirs in zip(vars(verdict).values(), vars(wanted).values(), strict=True):
         assert mine.tolist() == theirs.tolist()
@@ -72,16 +72,16 @@ def test_nothing_in_the_way_changes_nothing(kind: str, solver: str) -> None:
     certificate = certify(problem, got.X, got.U)
     assert certificate.clearance.tolist() == [torch.inf] * 2
     assert certificate.kkt_residual.tolist() == certify(free, got.X, got.U).kkt_residual.tolist()
-    assert torch.equal(POLISH.refine(problem, got).U, POLISH.refine(free, want).U)
+    assert torch.equal(POLISH.refine(problem, got).U, POLISH.refine(free, expected).U)
 
 
 def test_polish_needs_no_constraint() -> None:
-    """Nor one that depends on anything."""
+    """No constraint, or a constant one: Polish converges in both cases."""
     free, U0 = planar()
     constant, _ = planar(FunctionConstraint(lambda x: torch.full_like(x[..., :1], -1.0)))
-    want, got = (POLISH.refine(p, torchgco.solve(p, U0, GUIDED)) for p in (free, constant))
-    assert float(certify(free, want.X, want.U).kkt_residual.max()) < 1e-8
-    torch.testing.assert_close(got.U, want.U)
+    expected, got = (POLISH.refine(p, torchgco.solve(p, U0, GUIDED)) for p in (free, constant))
+    assert float(certify(free, expected.X, expected.U).kkt_residual.max()) < 1e-8
+    torch.testing.assert_close(got.U, expected.U)
 
 
 @pytest.mark.parametrize("kind", ["shared", "absent", "geometric"])
@@ -93,10 +93,10 @@ def test_no_path_is_proposed(kind: str) -> None:
 def test_empty_spheres_next_to_others_are_as_good_as_none() -> None:
     problem, U0 = planar_batch(B=2, N=25, obstacles=6, seed=4)
     more = Problem(problem.dynamics, problem.cost, [EMPTY["shared"], *problem.constraints], problem.x0, problem.N)
-    want, got = (torchgco.solve(p, U0, GUIDED) for p in (problem, more))
-    assert int(want.guided.sum()) > 0 and torch.equal(got.U, want.U)
-    alone, company = (PathProposals(refine_top=2).propose(p) for p in (problem, more))
-    assert torch.equal(alone.found, company.found) and torch.equal(alone.U, company.U)
+    expected, got = (torchgco.solve(p, U0, GUIDED) for p in (problem, more))
+    assert int(expected.guided.sum()) > 0 and torch.equal(got.U, expected.U)
+    alone, with_empty = (PathProposals(refine_top=2).propose(p) for p in (problem, more))
+    assert torch.equal(alone.found, with_empty.found) and torch.equal(alone.U, with_empty.U)
 
 
 def test_a_negative_radius_is_named_where_there_is_no_obstacle() -> None:
@@ -105,11 +105,11 @@ def test_a_negative_radius_is_named_where_there_is_no_obstacle() -> None:
 
 
 def test_a_constraint_that_is_no_sphere_decides_feasibility() -> None:
-    """Its clearance is infinite, as no distance is known; its violation counts all the same."""
+    """Its clearance is infinite, because no distance is known; its violation counts."""
     wall = FunctionConstraint(lambda x: x[..., :1] - 0.5, geometric=True)  # the goal lies behind it
     problem, U0 = planar(wall, BOUNDS)
-    there = torchgco.solve(planar(BOUNDS)[0], U0).U
-    beyond, before = judge(problem, there, GOAL, 0.3), judge(problem, U0, GOAL, 0.3)
+    at_goal = torchgco.solve(planar(BOUNDS)[0], U0).U
+    beyond, before = judge(problem, at_goal, GOAL, 0.3), judge(problem, U0, GOAL, 0.3)
     assert beyond.clearance.tolist() == before.clearance.tolist() == [torch.inf] * 2
     assert float(beyond.violation.min()) > 0.1
     assert beyond.feasible.tolist() == [False] * 2 and before.feasible.tolist() == [True] * 2

@@ -1,4 +1,4 @@
-"""Trials by hand: a table with every column of a study, in which a test writes only what it is about."""
+"""Tables of trials made by hand, with every column of a study; a test gives only the columns it needs."""
 
 from collections.abc import Iterable
 from itertools import count
@@ -39,13 +39,13 @@ PLAIN = {
 
 
 def trials(*rows: dict[str, Any]) -> pd.DataFrame:
-    """A table of rows that say only in what they differ from PLAIN."""
+    """A table of rows, each given by its differences from PLAIN."""
     table = pd.DataFrame([PLAIN | row for row in rows])
     return table.astype({"success": "boolean"})
 
 
 def flights(solver: str, reached: Iterable[bool], **more: Any) -> list[dict[str, Any]]:
-    """One row per layout 0, 1, ..., that reached the goal or failed altogether."""
+    """One row per layout 0, 1, ...: feasible, reached and success are all True or all False."""
     return [
         {"solver": solver, "layout": i, "feasible": hit, "reached": hit, "success": hit, **more}
         for i, hit in zip(count(), reached, strict=False)

@@ -1,4 +1,4 @@
-"""IPOPT and FATROP on the problem's own model: the same optimum, statuses per problem, no memory."""
+"""IPOPT and FATROP with the problem's model: the same optimum, statuses per problem, no state between problems."""
 
 import importlib.util
 from dataclasses import dataclass, fields, replace
@@ -49,8 +49,8 @@ def solved() -> dict:
     return {plugin: CasADiSolver(plugin).solve(*three_problems()) for plugin in PLUGINS}
 
 
-def test_both_find_what_al_ilqr_finds(solved) -> None:
-    """In the last two: in the first one, obstacles part the paths that solvers take."""
+def test_both_agree_with_al_ilqr(solved) -> None:
+    """In the last two problems; in the first, solvers pass the obstacles on different sides."""
     problem, U0 = three_problems()
     al_ilqr = AugmentedLagrangian(max_outer_iterations=15).solve(problem, U0)
     for solution in solved.values():
@@ -63,8 +63,8 @@ def test_both_find_what_al_ilqr_finds(solved) -> None:
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
-def test_companions_change_nothing(plugin: str, solved) -> None:
-    """Bit by bit, and in another order: the program is the same, and the solver keeps nothing from one to the next."""
+def test_the_rest_of_the_batch_changes_nothing(plugin: str, solved) -> None:
+    """Bit by bit and in any order: the program is the same, and the solver keeps no state between problems."""
     problem, U0 = three_problems()
     for rows in ([1], [2, 0]):
         index = torch.tensor(rows)
@@ -72,8 +72,8 @@ def test_companions_change_nothing(plugin: str, solved) -> None:
         assert torch.equal(alone.U, solved[plugin].U[index]) and torch.equal(alone.status, solved[plugin].status[index])
 
 
-def test_alone_and_in_company_it_is_the_same_program() -> None:
-    """A goal that is one problem's own in a batch looks like a shared one when that problem is taken out of it."""
+def test_the_program_is_the_same_alone_and_in_a_batch() -> None:
+    """A problem taken out of the batch has one goal, which must not count as shared."""
     goals = torch.tensor([[1.0, 0.4, 0, 0, 0, 0], [0.0, 0.2, 0, 0, 0, 0]], dtype=torch.float64).unsqueeze(1)
     cost = QuadraticCost(Q=[5.0, 1, 0, 1, 0, 1], R=[0.1, 0.1], Qf=[50.0] * 6, x_ref=goals)
     plain, _ = planar_batch(B=2, N=8)
@@ -86,24 +86,24 @@ def test_alone_and_in_company_it_is_the_same_program() -> None:
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
-def test_a_bad_start_is_one_problem_s_own(plugin: str) -> None:
+def test_a_bad_start_affects_its_own_problem_alone(plugin: str) -> None:
     problem, U0 = planar_batch(B=4, N=12, obstacles=2, seed=1)
     x0 = problem.x0.clone()
     x0[1, 0] = torch.nan
     x0[2, :2] = problem.constraints[0].centers[2, 0]
-    told = []
+    reports = []
     bad = Problem(problem.dynamics, problem.cost, problem.constraints, x0, problem.N)
-    solution = CasADiSolver(plugin).solve(bad, U0, callback=told.append)
+    solution = CasADiSolver(plugin).solve(bad, U0, callback=reports.append)
     assert solution.statuses == [Status.CONVERGED, Status.NON_FINITE, Status.INVALID_START, Status.CONVERGED]
     good = CasADiSolver(plugin).solve(problem, U0)
     assert torch.equal(solution.U[[0, 3]], good.U[[0, 3]])
-    assert [(p.finished, p.total) for p in told] == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert [(p.finished, p.total) for p in reports] == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def test_every_kind_of_row_holds() -> None:
-    """Equalities, bounds on some knots, a control held still, a bound that differs, a row of x and u together.
+    """Equalities, bounds at some knots, a fixed control, a bound per problem, a row of x and u.
 
-    FATROP gets there too, but not always to its own tolerance.
+    FATROP finds the same optimum, but not always to its own tolerance.
     """
     upper = torch.tensor([[0.5] * 5 + [torch.inf], [9.0, 0.6, 9, 0.4, 9, 9]], dtype=torch.float64)
     problem, U0 = with_constraints(
@@ -123,8 +123,8 @@ def test_every_kind_of_row_holds() -> None:
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
-def test_what_cannot_be_met_is_infeasible(plugin: str) -> None:
-    """The second problem's bounds cross, so that CasADi refuses it; the first is solved all the same."""
+def test_contradictory_bounds_are_infeasible(plugin: str) -> None:
+    """The second problem's bounds cross, so that CasADi refuses it; the first is still solved."""
     above = torch.tensor([[-1.0, -9.0], [3.0, -9.0]], dtype=torch.float64)
     problem, U0 = with_constraints(ControlBounds(above, [9.0, 9.0]), ControlBounds([-9.0, -9.0], [2.0, 9.0]))
     assert CasADiSolver(plugin).solve(problem, U0).statuses == [Status.CONVERGED, Status.INFEASIBLE]
@@ -151,7 +151,7 @@ def test_rows_that_join_knots_are_for_ipopt_alone() -> None:
         CasADiSolver("fatrop").solve(problem, U0)
 
 
-def test_what_cannot_be_traced_names_the_part() -> None:
+def test_a_function_that_cannot_be_traced_names_its_part() -> None:
     problem, U0 = with_constraints(FunctionConstraint(lambda x: torch.erfinv(x[..., :1])))
     with pytest.raises(InputError, match=r"constraints\[0\].*erfinv"):
         CasADiSolver().solve(problem, U0)
@@ -173,7 +173,7 @@ def test_every_option_is_read(plugin: str) -> None:
     base = CasADiSolver(plugin)
     full = base.solve(problem, U0)
     stopped = replace(base, max_iterations=3, violation_tolerance=10.0).solve(problem, U0)
-    assert stopped.statuses == [Status.FEASIBLE] and stopped.iterations.item() in (3, 4)  # FATROP: one more
+    assert stopped.statuses == [Status.FEASIBLE] and stopped.iterations.item() in (3, 4)  # FATROP counts one more
     assert replace(base, violation_tolerance=1e-12).solve(problem, U0).statuses == [Status.INFEASIBLE]
     assert replace(base, tolerance=1e-2).solve(problem, U0).iterations < full.iterations
     assert not torch.equal(replace(base, options={"mu_init": 10.0}).solve(problem, U0).U, full.U)
@@ -222,7 +222,7 @@ def test_the_configuration_holds_the_defaults_of_the_code(plugin: str) -> None:
 
 
 def test_a_study_prepares_before_the_clock_starts(monkeypatch) -> None:
-    """The clock is read twice, and what is prepared is done by then."""
+    """The clock is read before and after the solve, and the preparation comes before."""
     setup = compose(["scenario=layouts", f"scenario.path={DATA / 'planar_trap.npz'}", "model=planar"])
     layouts, events = replace(setup.layouts(2), stages=5), []
 

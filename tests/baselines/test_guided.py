@@ -1,4 +1,4 @@
-"""FATROP from a path proposal: around the trap, its own in any batch, and plain FATROP where there is no path."""
+"""FATROP from a path proposal: around the trap, the same in any batch, and plain FATROP without a path."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ GUIDED = GuidedCasADi(
 
 
 def test_the_trap_is_left_along_the_path() -> None:
-    """From rest both end in the trap; the path leads both out of it."""
+    """From rest both problems end in the trap; with a path both reach the goal."""
     setups = [
         compose(["scenario=planar_trap", "model=planar", "seed=1000", f"solver={name}"])
         for name in ("fatrop", "fatrop_guided")
@@ -37,7 +37,7 @@ def test_the_trap_is_left_along_the_path() -> None:
     assert solution.guided.tolist() == [1, 1] and float(solution.violation.max()) < 1e-3
 
 
-def test_companions_change_nothing() -> None:
+def test_the_rest_of_the_batch_changes_nothing() -> None:
     problem, U0 = planar_batch(B=3, N=30, obstacles=3, seed=2)
     whole = GUIDED.solve(problem, U0)
     for rows in ([1], [2, 0]):
@@ -47,14 +47,14 @@ def test_companions_change_nothing() -> None:
 
 
 def test_without_a_path_it_is_fatrop() -> None:
-    """Nothing to go around: the given guess, to the bit."""
+    """Without obstacles the given guess is used, to the bit."""
     plain, U0 = planar_batch(B=2, N=20)
     problem = Problem(plain.dynamics, plain.cost, [ControlBounds([-9.0] * 2, [9.0] * 2)], plain.x0, 20)
     guided, alone = GUIDED.solve(problem, U0), CasADiSolver("fatrop").solve(problem, U0)
     assert torch.equal(guided.U, alone.U) and guided.guided.tolist() == [0, 0]
 
 
-def test_a_bad_start_is_one_problem_s_own() -> None:
+def test_a_bad_start_affects_its_own_problem_alone() -> None:
     problem, U0 = planar_batch(B=4, N=12, obstacles=2, seed=1)
     x0 = problem.x0.clone()
     x0[1, 0] = torch.nan
@@ -80,7 +80,7 @@ def test_every_option_is_read(change: dict) -> None:
 
 @pytest.mark.parametrize("model", ["scenario=planar_trap model=planar", "scenario=forest model=quadrotor"])
 def test_the_configuration_serves_every_model(model: str) -> None:
-    """FATROP is that of the configuration `fatrop`, and what is tracked that of `gco`, but for few paths."""
+    """FATROP has the settings of `fatrop`, and the paths those of `gco`, but for the fields below."""
     solvers = [compose([*model.split(), f"solver={name}"]).solver for name in ("fatrop_guided", "fatrop", "gco")]
     guided, fatrop, gco = solvers
     own = dict(

@@ -1,4 +1,4 @@
-"""Boxes against a slow, obvious NumPy version, against autodiff, and their border checks."""
+"""Boxes against a brute_force, simple NumPy version and against autodiff, and the checks of their input."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.problems import boxed_batch, planar_batch, random_trajectory
-from tests.reference import boxes as slow
+from tests.reference import boxes as brute_force
 from torchgco import Boxes, InputError, Problem, Spheres
 from torchgco.constraints.boxes import BoundBoxes
 from torchgco.constraints.cuboids import Cuboids
@@ -28,7 +28,7 @@ def turned(d: int, M: int = 6, seed: int = 0) -> tuple[np.ndarray, np.ndarray, n
 
 
 def bound(d: int, radius: float = 0.1, seed: int = 0) -> tuple[BoundBoxes, tuple[np.ndarray, ...]]:
-    """The boxes of one problem, and what they were made from."""
+    """The boxes of one problem, and their centres, half sizes and rotations."""
     parts = turned(d, seed=seed)
     plain, _ = boxed_batch(d, B=1, N=3)
     centers, half, rotations = parts
@@ -43,11 +43,11 @@ def points(d: int, count: int, seed: int = 1) -> Tensor:
 @pytest.mark.parametrize("d", [2, 3])
 def test_distances_by_hand(d: int) -> None:
     boxes, (centers, half, rotations) = bound(d)
-    p = torch.cat((points(d, 60), torch.as_tensor(centers)[None] + 0.01), dim=1)  # the last lie inside
+    p = torch.cat((points(d, 60), torch.as_tensor(centers)[None] + 0.01), dim=1)  # the last six lie inside
     found = boxes.signed_distance(p, torch.zeros(p.shape[1], dtype=p.dtype))
     for k in range(p.shape[1]):
         for i in range(len(centers)):
-            expected = slow.distance(p[0, k].numpy(), centers[i], half[i], rotations[i]) - 0.1
+            expected = brute_force.distance(p[0, k].numpy(), centers[i], half[i], rotations[i]) - 0.1
             assert float(found[0, k, i]) == pytest.approx(expected, abs=1e-12)
 
 
@@ -55,7 +55,7 @@ def test_distances_by_hand(d: int) -> None:
 def test_segments_by_hand(d: int) -> None:
     boxes, (centers, half, rotations) = bound(d)
     a, b = points(d, 25, seed=2), points(d, 25, seed=3)
-    b[:, :5] = a[:, :5]  # no length
+    b[:, :5] = a[:, :5]  # segments of no length
     b[:, 5:10, 1:] = a[:, 5:10, 1:]  # along the first axis
     found = boxes.segment_clearance(a, b)
     cuboids = boxes.inflated().boxes
@@ -64,7 +64,7 @@ def test_segments_by_hand(d: int) -> None:
     for e in range(25):
         for i in range(len(centers)):
             ends = a[0, e].numpy(), b[0, e].numpy()
-            sampled = slow.segment_distance(*ends, centers[i], half[i], rotations[i], samples=801)
+            sampled = brute_force.segment_distance(*ends, centers[i], half[i], rotations[i], samples=801)
             assert sampled - 3e-3 <= float(found[0, e, i]) + 0.1 <= sampled + 1e-12
             assert float(squares[0, e, i]) ** 0.5 == pytest.approx(max(float(found[0, e, i]) + 0.1, 0.0), abs=1e-7)
 
@@ -97,8 +97,8 @@ def test_rows_and_their_expansion(d: int) -> None:
             torch.testing.assert_close(H[b, k, : problem.n, : problem.n], J.T @ torch.diag(h[b, k - 1]) @ J)
 
 
-def test_a_slope_leads_out_of_every_place_inside() -> None:
-    """At the centre, on the medial axis, and right on the surface, where others have no slope."""
+def test_every_point_inside_has_a_gradient_that_leads_out() -> None:
+    """At the centre, on the medial axis and on the surface, where the distance itself has no gradient."""
     plain, U = planar_batch(B=1, N=4)
     problem = Problem(plain.dynamics, plain.cost, [Boxes([[0.0, 0.0]], [[0.3, 0.1]], 0.05)], plain.x0, 4)
     X = plain.x0.unsqueeze(1).repeat(1, 5, 1)
@@ -109,7 +109,7 @@ def test_a_slope_leads_out_of_every_place_inside() -> None:
     torch.testing.assert_close(slope, slope.new_tensor([[0.0, 1.0], [0.0, 1.0], [1.0, 0.0], [-1.0, 0.0]]))
 
 
-def test_a_box_without_turn_is_one_with_none() -> None:
+def test_a_rotation_by_zero_is_no_rotation() -> None:
     centers, half, _ = turned(2)
     plain, U = planar_batch(B=2, N=4)
     X, _ = random_trajectory(plain)
@@ -129,7 +129,7 @@ def test_a_start_within_touching_distance_is_refused() -> None:
     assert problem.start_is_clear.tolist() == [True, False, True]
 
 
-def test_none_at_all() -> None:
+def test_no_boxes_at_all() -> None:
     plain, U = planar_batch(B=2, N=4)
     problem = Problem(plain.dynamics, plain.cost, [Boxes([], [], 0.1)], plain.x0, 4)
     X, _ = random_trajectory(problem)
@@ -138,7 +138,7 @@ def test_none_at_all() -> None:
     assert boxes.chord_clearance(X).tolist() == [torch.inf] * 2
 
 
-def test_the_box_that_they_fill() -> None:
+def test_the_bounding_box_of_points_and_boxes() -> None:
     boxes = Cuboids(
         torch.zeros(1, 2, 2, dtype=torch.float64), torch.eye(2, dtype=torch.float64).expand(1, 2, 2, 2),
         torch.tensor([[[1.0, 2.0], [9.0, 9.0]]], dtype=torch.float64), torch.tensor([[0.0, -1e9]], dtype=torch.float64),
@@ -150,7 +150,7 @@ def test_the_box_that_they_fill() -> None:
 BAD = {
     "shape": (dict(centers=[[0.0, 0.0, 0.0]]), r"boxes.centers: expected shape \(2, M, 2\), got \(2, 1, 3\)"),
     "sides": (dict(half_sizes=[[0.1, 0.1]] * 2), r"boxes.half_sizes: expected shape \(2, 1, 2\), got \(2, 2, 2\)"),
-    "a side of none": (
+    "side of length 0": (
         dict(half_sizes=[[0.1, 0.0]]),
         "boxes.half_sizes: expected finite half sides above 0 m",
     ),
@@ -161,21 +161,24 @@ BAD = {
         dict(rotations=[[1.0, 0, 0, 0]]),
         "boxes.rotations: expected one set for all",
     ),
-    "turn of none": (dict(rotations=[np.nan]), "boxes.rotations: expected finite numbers for every box that is there"),
-    "words": (dict(centers="here"), "boxes.centers: expected numbers"),
+    "missing rotation": (
+        dict(rotations=[np.nan]),
+        "boxes.rotations: expected finite numbers for every box that is there",
+    ),
+    "text": (dict(centers="here"), "boxes.centers: expected numbers"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_malformed_boxes_are_named(case: str) -> None:
-    changes, told = BAD[case]
+    changes, message = BAD[case]
     plain, _ = planar_batch(B=2, N=4)
     given = dict(centers=[[0.5, 0.5]], half_sizes=[[0.1, 0.1]], vehicle_radius=0.05) | changes
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         Problem(plain.dynamics, plain.cost, [Boxes(**given)], plain.x0, 4)
 
 
-def test_a_quaternion_that_turns_nothing_into_nothing_is_named() -> None:
+def test_a_quaternion_without_unit_length_is_named() -> None:
     plain, _ = boxed_batch(3, B=1, N=3)
     for turn in ([0.0, 0, 0, 0], [1.0, 1.0, 0, 0]):
         box = Boxes([[3.0, 1, 0]], [[0.1] * 3], 0.1, [turn])
@@ -184,7 +187,7 @@ def test_a_quaternion_that_turns_nothing_into_nothing_is_named() -> None:
 
 
 def test_scales_of_both_kinds_agree() -> None:
-    """A box as thick as a disc is of the same size, and its rows have the same slope at its surface."""
+    """A box as thick as a disc has rows with the same slope at its surface."""
     plain, U = planar_batch(B=1, N=1)
     X = plain.x0.unsqueeze(1).repeat(1, 2, 1)
     X[0, 1, :2] = torch.tensor([0.15, 0.0], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""What all kinds of obstacles promise: distances, chords, starts, and that no kind goes unjudged."""
+"""The contract of all obstacles: distances, chords, starts; a kind that cannot be judged raises an error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchgco.shapes import Dimensions
 
 @dataclass(frozen=True)
 class HalfPlane(Obstacles):
-    """All points with x > `edge`: a kind that nobody knows."""
+    """All points with x > `edge`: a kind that no registry has."""
 
     edge: float
 
@@ -44,7 +44,7 @@ class HalfPlane(Obstacles):
         return X[:, self.knots, :1] - self.edge
 
 
-def test_a_kind_that_nobody_can_judge_is_named() -> None:
+def test_a_kind_that_cannot_be_judged_is_named() -> None:
     problem, U = planar_batch(B=1, N=5)
     problem = Problem(problem.dynamics, problem.cost, [HalfPlane(0.5)], problem.x0, problem.N)
     with pytest.raises(InputError, match=r"constraints: expected obstacles that can be judged .*, got HalfPlane"):

@@ -32,7 +32,7 @@ FULL = {
         Q=semidefinite(N, n), R=semidefinite(N, m, seed=1), Qf=semidefinite(n, seed=2), x_ref=normal(N + 1, n),
         u_ref=normal(N, m), q=normal(N, n), r=normal(N, m), qf=normal(n),
     ),
-    "per element": dict(
+    "per problem": dict(
         Q=semidefinite(B, N, n) + 2 * torch.eye(n), R=semidefinite(B, N, m, seed=1) + 2 * torch.eye(m),
         Qf=semidefinite(B, n, seed=2), x_ref=normal(B, N + 1, n), u_ref=normal(B, N, m), q=normal(B, N, n),
         r=normal(B, N, m), qf=normal(B, n), H=0.1 * normal(B, N, m, n),
@@ -86,7 +86,7 @@ def test_expansion_is_the_derivative(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", FULL)
-def test_samples_cost_what_trajectories_cost(kind: str) -> None:
+def test_samples_have_the_cost_of_their_trajectories(kind: str) -> None:
     problem = problem_with(QuadraticCost(**FULL[kind]))
     X, U = normal(B, 6, N + 1, n, seed=7), normal(B, 6, N, m, seed=8)
     sampled = sum(problem.cost.stage(X[:, :, k], U[:, :, k], k) for k in range(N)) + problem.cost.terminal(X[:, :, N])
@@ -94,8 +94,8 @@ def test_samples_cost_what_trajectories_cost(kind: str) -> None:
         torch.testing.assert_close(sampled[:, s], problem.cost.total(X[:, s], U[:, s]))
 
 
-def test_taking_elements() -> None:
-    problem = problem_with(QuadraticCost(**FULL["per element"]))
+def test_taking_problems() -> None:
+    problem = problem_with(QuadraticCost(**FULL["per problem"]))
     X, U = normal(B, N + 1, n, seed=7), normal(B, N, m, seed=8)
     index = torch.tensor([2, 2, 0])
     torch.testing.assert_close(

@@ -1,4 +1,4 @@
-"""Models and their derivatives against the NumPy reference, order of the integrators."""
+"""Models and their derivatives against the NumPy reference, and the order of the integrators."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def states_of(model, lead=(3, 5), seed=0):
 
 
 def differences(step, x, u, h=1e-6):
-    """[fx, fu] (..., n, n+m) by central differences, which no model has a hand in."""
+    """[fx, fu] (..., n, n+m) by central differences of `step`."""
     z = torch.cat((x, u), dim=-1)
     columns = []
     for i in range(z.shape[-1]):
@@ -72,7 +72,7 @@ def test_jacobians_equal_differences_of_the_reference(cls, integrator) -> None:
 
 @pytest.mark.parametrize("cls", [Planar, QuadrotorPlanning])
 def test_the_linearisation_holds_the_jacobians(cls) -> None:
-    """F, stage first and in homogeneous form, of vehicles that differ."""
+    """F (N, B, n+1, n+1+m) in homogeneous form, for vehicles with different parameters."""
     model = cls(**{cls.per_element[0]: torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)})
     x, u = states_of(model)
     n, knots = model.n, torch.cat((x, x[:, :1]), dim=1)
@@ -95,7 +95,7 @@ def test_a_subclass_steps_and_is_linearised_by_its_own_step() -> None:
 
 
 def test_plant_at_a_thrust_limit() -> None:
-    """A thrust beyond its limit stays there, whatever the controls; so does one of zero, which has a derivative."""
+    """A thrust beyond its limit is clamped to it for any controls; a thrust of zero is too, with finite derivatives."""
     model = QuadrotorPlant()
     x, u = states_of(model, lead=(3,))
     x[0, -4], u[0, 0] = 6.0, 9000.0
@@ -159,8 +159,8 @@ def test_order_of_the_integrators(integrator: str, order: int) -> None:
     assert slope == pytest.approx(order, abs=0.15)
 
 
-def test_parameters_per_element() -> None:
-    """A batch of vehicles with different coefficients steps as each does alone."""
+def test_parameters_per_problem() -> None:
+    """Vehicles with different coefficients step in a batch as each does alone."""
     drag = torch.tensor([5.0, 10.0, 20.0], dtype=torch.float64)
     model = Planar(drag=drag)
     x, u = states_of(model)

@@ -1,4 +1,4 @@
-"""The notebook's own model: the car is the one that is printed, and what the notebook says of all holds for some."""
+"""The notebook's model equals the printed one, and its result holds for some of the layouts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from benchmarks.concar import EXACT, GOAL, GOAL_RADIUS, main, own_model, read_la
 from torchgco import judge
 from torchgco.constraints.obstacles import BoundSpheres
 
-SOME = [0, 1, 2, 3, 4, 5, 11, 51]  # guidance has to help with the last two
+SOME = [0, 1, 2, 3, 4, 5, 11, 51]  # the last two need guidance
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def random_flight(model: SimpleNamespace):
 def test_the_car_is_the_printed_one(model) -> None:
     problem, X, U = random_flight(model)
     x, u, h = X[:, 0], U[:, 0], 0.05
-    theta, v = x[:, 2] + 0.5 * h * u[:, 1], x[:, 3] + 0.5 * h * u[:, 0]  # half-way, both are linear in time
+    theta, v = x[:, 2] + 0.5 * h * u[:, 1], x[:, 3] + 0.5 * h * u[:, 0]  # at half the step; both are linear in time
     slope = torch.stack((v * theta.cos(), v * theta.sin(), u[:, 1], u[:, 0]), dim=-1)
     torch.testing.assert_close(problem.dynamics.step(x, u), x + h * slope, rtol=1e-14, atol=1e-14)
 
@@ -65,11 +65,11 @@ def test_some_are_feasible_in_one_batch(model) -> None:
     torch.testing.assert_close(verdict.cost, solution.cost)
 
 
-def test_the_table_stands_beside_ipopt(capsys) -> None:
+def test_the_table_compares_with_ipopt(capsys) -> None:
     assert main(["--first", "1"]) == 0
     table = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
     ours, peer, *published = table[2:]
     assert len(published) == 3 and {len(line) for line in table} == {10}
     assert ours[2:5] == ["1", "1", "1"] == peer[2:5]
-    # Both end in a local optimum: on this one IPOPT's is no better.
+    # Both end in a local optimum; on this layout IPOPT's is not better.
     assert float(ours[6]) <= 1.01 * float(peer[6])

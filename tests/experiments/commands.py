@@ -1,4 +1,4 @@
-"""The command line as tests type it."""
+"""Commands that tests run."""
 
 import os
 import subprocess
@@ -15,18 +15,18 @@ TINY = [
     "solver.local.max_outer_iterations=2",
     "study.workers=1",
 ]
-# Nothing is solved: a study of it takes as long as its files.
+# `hold` solves nothing: such a study takes only the time of its files.
 HOLD = ["solver=hold", "study.baselines=[]", "study.layouts=4", "scenario.stages=5", "study.workers=1"]
 
 
 def command(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """torchgco in a process of its own, to its end."""
+    """Run torchgco in a new process, to its end."""
     line = [sys.executable, "-m", "torchgco", *words]
     return subprocess.run(line, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
 
 
 def begin(*words: str, cwd: Path) -> subprocess.Popen[str]:
-    """torchgco in a process group of its own, started."""
+    """Start torchgco in a new process group."""
     return subprocess.Popen(
         [sys.executable, "-m", "torchgco", *words], cwd=cwd, env=ENVIRONMENT, text=True, start_new_session=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -34,7 +34,7 @@ def begin(*words: str, cwd: Path) -> subprocess.Popen[str]:
 
 
 def problem_line(err: str) -> str:
-    """The one line of an error; the progress bar aside, nothing else may stand there."""
+    """The line of an error: the only line of `err` but for the progress bar."""
     lines = [line for line in err.splitlines() if line.strip() and "trial/s" not in line and "s/trial" not in line]
     assert len(lines) == 1, err
     return lines[0]

@@ -1,4 +1,4 @@
-"""Commands in this process, and ways to stop them."""
+"""Fixtures that run commands in this process and interrupt them."""
 
 import sys
 
@@ -10,7 +10,7 @@ from torchgco.experiments.records import Records
 
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
-    """torchgco in this process: (exit code, stdout, stderr). Quicker than a new one for every case."""
+    """Run torchgco in this process, quicker than in a new one: returns (exit code, stdout, stderr)."""
 
     def call(*words: str) -> tuple[int, str, str]:
         monkeypatch.chdir(tmp_path)
@@ -27,7 +27,7 @@ def run(tmp_path, monkeypatch, capsys):
 
 @pytest.fixture
 def run_until(run, monkeypatch):
-    """The same, interrupted once so many shards are written."""
+    """Run torchgco in this process and interrupt it when `shards` shards are written."""
 
     def call(shards: int, *words: str) -> None:
         written = []
@@ -47,5 +47,5 @@ def run_until(run, monkeypatch):
 
 @pytest.fixture
 def without_report(monkeypatch):
-    """Studies write no summary and no figures: these take longer than all else in a study where nothing is solved."""
+    """Studies write no summary and no figures, which take most of the time of a small study."""
     monkeypatch.setattr(study, "write_report", lambda folder, trajectories: "")

@@ -1,4 +1,4 @@
-"""Work and solvers that kill the process they run in, as the system does where memory is short."""
+"""Work and solvers that kill their process, as the system does when memory is short."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ def prepare(*_: object) -> None:
 
 
 def work(job: tuple[int, str]) -> int:
-    """The job's number doubled; a job with a path kills its process as long as there is no file."""
+    """The job's number doubled. A job with a path kills its process unless the file exists; it makes the file first."""
     number, path = job
     if path == "always":
         time.sleep(1.0)  # the others are done by then
@@ -29,7 +29,7 @@ def work(job: tuple[int, str]) -> int:
 
 @dataclass(frozen=True)
 class Doomed(Hold):
-    """Hold, but a process that flies layout 2 or a later one is killed, unless the file `spared` is in its folder."""
+    """Hold, but a process that flies layout 2 or a later one is killed, unless the file `spared` exists."""
 
     def solve(self, problem, U0, seed=0, ids=None, warm=None, callback=None):
         if int(ids.max()) >= 2 and not Path("spared").exists():

@@ -1,4 +1,4 @@
-"""The command line as a user types it: results, resuming, sweeps, and one clear line for every mistake."""
+"""The command line: results, resuming, sweeps, and one clear line for every mistake."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SOLVERS = sorted(p.stem for p in (ROOT / "conf" / "solver").glob("*.yaml"))
 EXPERIMENTS = sorted(p.stem for p in (ROOT / "conf" / "experiment").glob("*.yaml"))
 
 
-def test_a_study_writes_what_the_design_says(run, tmp_path) -> None:
+def test_a_study_writes_all_its_files(run, tmp_path) -> None:
     words = [*TINY, "hydra.run.dir=out", "study.baselines=[hold,gco]"]
     done = command(*words, "seed=3", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -52,7 +52,7 @@ def test_a_study_writes_what_the_design_says(run, tmp_path) -> None:
 
 
 def test_the_configuration_chooses_the_kernels() -> None:
-    """For the whole process, and as a part of the study's identity: results differ in the last bits."""
+    """For the whole process, and in the study's identity, because results differ in the last bits."""
     try:
         for name in ("eager", "native"):
             setup = compose([f"device.kernels={name}"])
@@ -64,14 +64,14 @@ def test_the_configuration_chooses_the_kernels() -> None:
 
 @pytest.mark.usefixtures("without_report")
 def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:
-    """Nor on the number of processes, as a test of resumed studies shows."""
+    """test_resume.py tests the same for the number of processes."""
     for size in (1, 3):  # one after the other, and in three slots
         pieces = [f"study.batch_size={size}", f"study.shard_size={size}", f"hydra.run.dir=b{size}"]
         assert run(*TINY[:2], *pieces, "study.workers=1", "study.baselines=[]")[0] == 0
     one, three = (pd.read_parquet(tmp_path / f"b{size}" / "trials.parquet") for size in (1, 3))
     measured = ["seconds", "batch_size"]
     pd.testing.assert_frame_equal(one.drop(columns=measured), three.drop(columns=measured), check_exact=True)
-    assert one.success.isna().all()  # nobody to compare with
+    assert one.success.isna().all()  # no best cost: one solver, and none in a file
 
 
 def test_out_of_memory_halves_the_batch(run, tmp_path, monkeypatch) -> None:
@@ -181,7 +181,7 @@ def test_every_solver_fits_both_models(model: str, solver: str) -> None:
 
 @pytest.mark.parametrize("scenario", [s for s in SCENARIOS if s != "layouts"])
 def test_scenario_configs_hold_the_defaults_of_the_code(scenario: str) -> None:
-    """The numbers in YAML are there to be seen and overridden; they must be those of the class."""
+    """The numbers in YAML, which users read and override, are the defaults of the class."""
     model = "planar" if scenario.startswith("planar") else "quadrotor"
     made = compose([f"model={model}", f"scenario={scenario}"]).scenario
     assert made == type(made)(name=scenario)

@@ -21,7 +21,7 @@ WORDS = [*HOLD, "study.shard_size=2", "hydra.run.dir=out"]
 
 
 def flip(path: Path) -> None:
-    """Turn one bit of the content: of a digit in a text, in the middle of an archive."""
+    """Flip one bit of the content: of the seed in a JSON file, else at a third of the file."""
     held = bytearray(path.read_bytes())
     place = held.index(b'"seed": ') + 8 if path.suffix == ".json" else len(held) // 3
     held[place] ^= 1
@@ -40,13 +40,13 @@ FINISHED = ["study.json", "trials.parquet", "solutions.npz", "layouts.npz"]
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory) -> Path:
-    """A place for a finished study, made by the first test that needs it."""
+    """The folder of a finished study; the first test that needs the study makes it."""
     return tmp_path_factory.mktemp("whole") / "out"
 
 
 @pytest.fixture
 def out(run, tmp_path, whole) -> Path:
-    """A finished study."""
+    """A copy of a finished study."""
     if not whole.exists():
         assert run(*WORDS)[0] == 0
         shutil.copytree(tmp_path / "out", whole)
@@ -88,7 +88,7 @@ def test_a_damaged_shard_is_named_and_repaired(damage: str, run, run_until, tmp_
     shard = out / "shards" / "hold-000000-000001.npz"
     kept = (out / "shards" / "hold-000002-000003.npz").stat().st_mtime_ns
     DAMAGE[damage](shard)
-    if damage != "missing":  # a missing one is simply flown
+    if damage != "missing":  # a missing one is flown again
         code, _, err = run(*WORDS)
         line = problem_line(err)
         assert code == 2 and str(shard) in line and "study.repair=true" in line
@@ -175,7 +175,7 @@ def test_a_full_disk_gets_one_line_and_leaves_no_parts(name: str, run, tmp_path,
 
 
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt(), KeyError()])
-def test_whatever_fails_while_a_file_is_written_the_old_one_stays(failure: BaseException, tmp_path) -> None:
+def test_a_failed_write_keeps_the_old_file(failure: BaseException, tmp_path) -> None:
     path = tmp_path / "table"
     write(path, lambda file: file.write(b"old"))
 

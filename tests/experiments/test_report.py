@@ -15,7 +15,7 @@ HITS = [i < 30 for i in range(32)]
 
 
 def study(folder: Path, *rows: dict[str, Any], config: str | None = None) -> Path:
-    """A folder as a study leaves it, with its configuration if there is one."""
+    """A study's folder with a table of trials, and with a configuration if one is given."""
     folder.mkdir(parents=True, exist_ok=True)
     trials(*rows).to_parquet(folder / "trials.parquet", index=False)
     if config is not None:
@@ -41,7 +41,7 @@ def test_columns_are_aligned() -> None:
         assert len({len(line) for line in block}) == 1
 
 
-def test_what_is_not_defined_is_a_dash() -> None:
+def test_undefined_values_are_a_dash() -> None:
     text = table({"success": pd.NA, "reached": False, "iterations": np.nan})
     rates, effort = text.split("\n\n")[1:3]
     assert rates.split()[-1] == "-"
@@ -101,7 +101,7 @@ def test_a_folder_without_trials_is_named(tmp_path: Path) -> None:
         write_report(tmp_path)
 
 
-def test_merging_joins_what_differs_in_seed(tmp_path: Path) -> None:
+def test_merging_joins_studies_that_differ_in_seed(tmp_path: Path) -> None:
     study(tmp_path / "a", *flights("gco", HITS))
     study(tmp_path / "deep" / "b", *flights("gco", HITS, seed=1))
     merged = merge([tmp_path])
@@ -182,7 +182,7 @@ def test_the_command_prints_and_writes_the_merged_report(tmp_path: Path, capsys)
     assert capsys.readouterr().out == first
 
 
-def test_the_command_writes_where_it_is_told(tmp_path: Path, capsys) -> None:
+def test_the_command_writes_into_the_given_folder(tmp_path: Path, capsys) -> None:
     study(tmp_path / "a", *flights("gco", HITS))
     assert main([str(tmp_path / "a"), "--output", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "summary.csv").is_file() and not (tmp_path / "a" / "report").exists()

@@ -1,4 +1,4 @@
-"""Studies that are stopped, started again, refused, or flown in other pieces."""
+"""Studies that are stopped, resumed, refused, or flown in other shards and batches."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchgco.scenarios import Layouts
 from torchgco.solvers import AugmentedLagrangian
 from torchgco.solvers.augmented_lagrangian import OuterLoop
 
-HOW = ["seconds", "batch_size", "threads"]  # columns that say how a trial was flown
+HOW = ["seconds", "batch_size", "threads"]  # columns that describe how a trial was flown
 
 
 def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
@@ -27,7 +27,7 @@ def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
 
 
 def mine(folder: Path, limit: int) -> list[str]:
-    """The words for a study with a baseline of a user's own, written into `folder`."""
+    """Arguments of a study with a user's baseline, whose configuration is written into `folder`."""
     (folder / "conf" / "solver").mkdir(parents=True, exist_ok=True)
     text = f"defaults: [al_ilqr, _self_]\nname: mine\nmax_outer_iterations: {limit}\n"
     (folder / "conf" / "solver" / "mine.yaml").write_text(text)
@@ -162,7 +162,7 @@ def test_out_of_memory_reaches_a_wrapped_solver(run, tmp_path, monkeypatch) -> N
 
 @pytest.fixture
 def filed(tmp_path):
-    """Words for a study of a layout file, and a way to change the best costs in it."""
+    """Arguments of a study of a layout file, and a function that writes best costs into the file."""
 
     def save(*best: float) -> None:
         start, goal = np.array([-1.0, 0, 0, 0, 0, 0]), np.array([-0.9, 0, 0, 0, 0, 0])

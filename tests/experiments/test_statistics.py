@@ -31,7 +31,7 @@ def test_a_row_per_scenario_model_and_solver_in_order_of_appearance() -> None:
 
 
 @pytest.mark.parametrize(("hits", "n"), [(30, 32), (0, 7), (7, 7), (1, 3)])
-def test_rates_stand_with_their_wilson_interval(hits: int, n: int) -> None:
+def test_rates_have_their_wilson_interval(hits: int, n: int) -> None:
     row = only(summarise(trials(*flights("gco", [i < hits for i in range(n)]))))
     assert (row["reached_count"], row["reached_n"]) == (hits, n)
     assert row["reached_rate"] == pytest.approx(hits / n)
@@ -40,7 +40,7 @@ def test_rates_stand_with_their_wilson_interval(hits: int, n: int) -> None:
     assert row["reached_high"] == pytest.approx(high, abs=1e-9)
 
 
-def test_an_invalid_start_counts_as_a_failure_whatever_its_row_says() -> None:
+def test_an_invalid_start_counts_as_a_failure_in_every_rate() -> None:
     invalid = {"layout": 1, "status": "INVALID_START", "violation": nan, "cost": nan, "iterations": 0}
     row = only(summarise(trials({}, {**invalid, "success": pd.NA})))
     assert (row["n"], row["invalid"]) == (2, 1)
@@ -137,7 +137,7 @@ def test_the_same_layout_under_another_seed_is_another_trial() -> None:
     assert isnan(result.difference)
 
 
-def test_what_cannot_be_compared_is_counted() -> None:
+def test_trials_that_cannot_be_compared_are_counted() -> None:
     rows = [
         *flights("a", [True, True, True]),
         *flights("b", [False, False]),
@@ -164,7 +164,7 @@ def test_unknown_names_are_refused(a: str, b: str, outcome: str) -> None:
         paired(trials(*flights("a", A), *flights("b", B)), a, b, outcome)
 
 
-def test_the_table_sets_a_solver_against_each_other_one_in_each_task() -> None:
+def test_the_table_compares_a_solver_with_each_other_one_in_each_task() -> None:
     rows = [
         *flights("a", A),
         *flights("b", B),

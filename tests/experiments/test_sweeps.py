@@ -1,4 +1,4 @@
-"""Reports on runs that differ: in layouts, settings, versions."""
+"""Reports on runs that differ in layouts, settings or versions."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def study(
     manifest: bool = True,
     **more: Any,
 ) -> Path:
-    """A finished study: hits by solver (their order is that of the study), on layouts that follow from the rest.
+    """Write a finished study; `hits` gives per solver, in the study's order, the layouts that reached the goal.
 
-    solver  settings by solver, in addition to its iteration limit
-    scene   what the layouts depend on; the number of obstacles unless given
+    solver  settings per solver, in addition to its iteration limit
+    scene   determines the layouts, together with the seed; by default the number of obstacles
     """
     settings = {name: {"limit": LIMIT[name], **(solver or {}).get(name, {})} for name in hits}
     scene = obstacles if scene is None else scene
@@ -68,14 +68,14 @@ def study(
 
 
 def counts(table: pd.DataFrame, *columns: str) -> dict[tuple[Any, ...] | Any, tuple[int, int]]:
-    """(attained, n) of reaching the goal, by the swept columns and solver."""
+    """(reached, n) per combination of swept columns and solver."""
     summary = summarise(table)
     rows = summary.set_index([*columns, "solver"])[["reached_count", "n"]]
     return {key: tuple(row) for key, row in zip(rows.index, rows.to_numpy().tolist(), strict=True)}
 
 
 def pairs(table: pd.DataFrame, *columns: str) -> list[tuple[Any, ...]]:
-    """Swept columns, solvers, n and unmatched trials of every comparison of who reached the goal."""
+    """Swept columns, solvers, n and unmatched trials of every comparison by `reached`."""
     rows = compare(table).query("outcome == 'reached'")
     return list(rows[[*columns, "solver_a", "solver_b", "n", "unmatched"]].itertuples(index=False, name=None))
 
@@ -100,7 +100,7 @@ def test_one_solver_on_different_scenes_has_a_row_for_each(tmp_path) -> None:
 
 
 def test_a_sweep_of_solvers_and_scenes_pairs_within_each_scene(tmp_path) -> None:
-    """README's sweep: al_ilqr flies alone, and as the baseline of gco."""
+    """al_ilqr flies alone, and as the baseline of gco."""
     for number, reached in ((10, [HIT, MISS]), (30, [MISS, MISS])):
         study(tmp_path / f"al_ilqr{number}", {"al_ilqr": reached}, obstacles=number, seconds=9.0)
         study(tmp_path / f"gco{number}", {"gco": [HIT, HIT], "al_ilqr": reached}, obstacles=number)
@@ -125,7 +125,7 @@ def test_other_seeds_are_more_trials_of_the_same(tmp_path) -> None:
     assert not [name for name in table.columns if "." in name]
 
 
-def test_other_settings_of_a_solver_are_rows_of_their_own(tmp_path) -> None:
+def test_other_settings_of_a_solver_get_separate_rows(tmp_path) -> None:
     for limit, reached in ((10, [HIT, MISS]), (20, [HIT, HIT])):
         hits = {"gco": reached, "al_ilqr": [MISS, MISS]}
         study(tmp_path / str(limit), hits, solver={"gco": {"inner": {"samples": limit}}})
@@ -145,7 +145,7 @@ def test_other_settings_with_equal_results_and_other_seeds_are_not_pooled(tmp_pa
 @pytest.mark.parametrize(
     ("key", "label"), [("version", "version"), ("dtype", "device.dtype"), ("device", "device.name")]
 )
-def test_versions_and_devices_are_rows_of_their_own(key: str, label: str, tmp_path) -> None:
+def test_versions_and_devices_get_separate_rows(key: str, label: str, tmp_path) -> None:
     for name in ("one", "two"):
         study(
             tmp_path / name,
@@ -192,7 +192,7 @@ def test_many_settings_make_a_short_label(tmp_path) -> None:
 
 
 def test_layouts_that_differ_without_a_reason_are_distinguished_by_folder(tmp_path) -> None:
-    """A layout file that was changed in place, say."""
+    """As after a change of a layout file in place."""
     study(tmp_path / "a", {"gco": [HIT] * 2}, scene="old")
     study(tmp_path / "b", {"al_ilqr": [HIT] * 2}, scene="new")
     study(tmp_path / "c", {"ipopt": [HIT] * 2}, scene="old")
@@ -218,14 +218,14 @@ def test_success_is_judged_against_the_best_of_the_merged_table(tmp_path) -> Non
     assert set(table.index[table["success"].astype(bool)]) == cheap
 
 
-def test_a_best_cost_of_a_file_stays(tmp_path) -> None:
+def test_a_best_cost_from_a_file_is_kept(tmp_path) -> None:
     study(tmp_path / "a", {"gco": [HIT]}, best_cost=98.0)
     study(tmp_path / "b", {"ipopt": [HIT]}, cost=10.0, best_cost=98.0)
     table = merge([tmp_path])
     assert set(table["best_cost"]) == {98.0} and table["success"].all()
 
 
-def test_the_manifest_counts_not_the_hydra_folder(tmp_path) -> None:
+def test_the_manifest_is_read_not_the_hydra_folder(tmp_path) -> None:
     for number in (10, 30):
         folder = study(tmp_path / str(number), {"gco": [HIT]}, obstacles=number)
         (folder / ".hydra").mkdir()
@@ -271,15 +271,15 @@ def scene(**more: Any) -> Layouts:
     return Layouts(centers, np.where(np.isnan(centers[:, :, 0]), np.nan, 0.1), **more)
 
 
-def test_a_layout_is_what_is_flown() -> None:
+def test_a_layout_digest_depends_only_on_what_is_flown() -> None:
     codes = layout_digests(scene(), PLANE)
     assert len(set(codes.values())) == 2
     assert layout_digests(scene().take([1]), PLANE) == {1: codes[1]}
-    assert layout_digests(scene().pad(4), PLANE) == codes, "absent obstacles aren't there"
+    assert layout_digests(scene().pad(4), PLANE) == codes, "absent obstacles do not count"
     assert layout_digests(scene(best_cost=np.ones(2)), PLANE) == codes
     assert layout_digests(scene(velocities=0 * scene().centers), PLANE) == codes
     assert layout_digests(scene(), PLANE | {"name": "other", "radius": 0.10, "stages": 5.0}) == codes
-    assert layout_digests(scene(vehicle_radius=0.1), PLANE) == codes, "whoever says it"
+    assert layout_digests(scene(vehicle_radius=0.1), PLANE) == codes, "radius from the layouts or from the vehicle"
     assert layout_digests(scene(vehicle_radius=0.1), PLANE | {"radius": 7}) == codes, "layouts overrule the vehicle"
 
 
@@ -289,7 +289,7 @@ OTHERS = {
 }  # fmt: skip
 
 
-def test_boxes_make_another_layout_where_they_are_there() -> None:
+def test_boxes_make_another_layout_unless_absent() -> None:
     boxes = {"box_centers": np.zeros((2, 1, 2)), "box_half_sizes": np.ones((2, 1, 2))}
     absent = {name: np.full((2, 1, 2), np.nan) for name in boxes}
     turned = boxes | {"box_rotations": np.ones((2, 1))}
@@ -298,7 +298,7 @@ def test_boxes_make_another_layout_where_they_are_there() -> None:
 
 
 @pytest.mark.parametrize("field", OTHERS)
-def test_all_that_a_flight_depends_on_makes_another_layout(field: str) -> None:
+def test_every_input_of_a_flight_changes_the_digest(field: str) -> None:
     one, other = layout_digests(scene(), PLANE), layout_digests(scene(**{field: OTHERS[field]}), PLANE)
     assert not set(one.values()) & set(other.values())
 

@@ -1,4 +1,4 @@
-"""Worker processes that are killed, interrupted or left behind."""
+"""Worker processes that are killed, interrupted or orphaned."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from torchgco.experiments import workers
 from torchgco.experiments.workers import run_all
 
 pytestmark = pytest.mark.slow
-WAIT = 120  # seconds, for what takes a few
+WAIT = 120  # s, an upper limit for steps that take a few
 
 
-def flown(jobs: list[tuple[int, str]], kept: list[int], said: list[str]) -> None:
-    run_all(doomed.work, jobs, 2, doomed.prepare, (), kept.append, said.append)
+def flown(jobs: list[tuple[int, str]], kept: list[int], messages: list[str]) -> None:
+    run_all(doomed.work, jobs, 2, doomed.prepare, (), kept.append, messages.append)
 
 
 def test_the_jobs_of_a_killed_worker_are_done_by_a_new_pool(tmp_path) -> None:
     kept: list[int] = []
-    said: list[str] = []
-    flown([(0, ""), (1, str(tmp_path / "killed")), (2, ""), (3, "")], kept, said)
+    messages: list[str] = []
+    flown([(0, ""), (1, str(tmp_path / "killed")), (2, ""), (3, "")], kept, messages)
     assert sorted(kept) == [0, 2, 4, 6]
-    assert len(said) == 1 and "worker process died" in said[0]
+    assert len(messages) == 1 and "worker process died" in messages[0]
 
 
 def test_workers_that_always_die_end_in_one_line_and_lose_no_result(monkeypatch) -> None:
     monkeypatch.setattr(workers, "NEW_POOLS", 1)
     kept: list[int] = []
-    said: list[str] = []
+    messages: list[str] = []
     with pytest.raises(InputError, match=r"study\.workers: .*same command resumes"):
-        flown([(1, "always"), (2, ""), (3, "")], kept, said)
-    assert sorted(kept) == [4, 6] and len(said) == 1
+        flown([(1, "always"), (2, ""), (3, "")], kept, messages)
+    assert sorted(kept) == [4, 6] and len(messages) == 1
 
 
 def test_an_error_in_a_worker_is_raised_and_ends_the_pool() -> None:
@@ -50,13 +50,13 @@ def test_an_error_in_a_worker_is_raised_and_ends_the_pool() -> None:
         flown([(-1, ""), (1, "")], [], [])
 
 
-def words(folder: Path, solver: str) -> list[str]:
-    """A study of one of the solvers in `doomed`, four layouts in two shards, by two processes."""
+def arguments(folder: Path, solver: str) -> list[str]:
+    """Arguments of a study of a solver in `doomed`: four layouts, two shards, two processes."""
     (folder / "conf" / "solver").mkdir(parents=True)
     text = f"name: doomed\n_target_: tests.experiments.doomed.{solver}\n"
     (folder / "conf" / "solver" / "doomed.yaml").write_text(text)
     given = ["solver=doomed", "study.baselines=[]", "study.layouts=4", "scenario.stages=5", "study.shard_size=2"]
-    # Hovering needs more than this thrust: a path out of bounds gets no certificate, which takes seconds to load.
+    # The bound is below hover thrust: infeasible trajectories get no certificate, whose import takes seconds.
     bounds = "model.vehicle.control_upper=[5,5,5,9]"
     return ["--config-dir", str(folder / "conf"), *given, bounds, "study.workers=2", "hydra.run.dir=out"]
 
@@ -64,7 +64,7 @@ def words(folder: Path, solver: str) -> list[str]:
 @pytest.mark.usefixtures("without_report")
 def test_a_study_whose_workers_die_ends_and_resumes(run, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(workers, "NEW_POOLS", 1)
-    study = words(tmp_path, "Doomed")
+    study = arguments(tmp_path, "Doomed")
     code, _, err = run(*study)
     lines = [line for line in err.splitlines() if "worker process died" not in line]
     assert code == 2 and "study.workers" in problem_line("\n".join(lines))
@@ -77,8 +77,8 @@ def test_a_study_whose_workers_die_ends_and_resumes(run, tmp_path, monkeypatch) 
 
 @pytest.fixture
 def slow(tmp_path):
-    """A study with one shard written and a worker that is busy with the other, and its words."""
-    study = words(tmp_path, "Slow")
+    """A running study with one shard written and a worker busy with the other, and the study's arguments."""
+    study = arguments(tmp_path, "Slow")
     process = begin(*study, cwd=tmp_path)
     wait_for(lambda: list((tmp_path / "out" / "shards").glob("*.npz")) or process.poll() is not None)
     yield process, study
@@ -129,7 +129,7 @@ def test_ctrl_c_ends_all_processes_with_one_line(slow) -> None:
 
 
 @pytest.mark.usefixtures("without_report")
-def test_a_killed_study_leaves_no_workers_and_goes_on(slow, run, tmp_path) -> None:
+def test_a_killed_study_leaves_no_workers_and_resumes(slow, run, tmp_path) -> None:
     process, study = slow
     assert workers_of(process)
     process.kill()
@@ -137,7 +137,7 @@ def test_a_killed_study_leaves_no_workers_and_goes_on(slow, run, tmp_path) -> No
     wait_for(lambda: not workers_of(process))
     (shard,) = (tmp_path / "out" / "shards").glob("*.npz")
     assert not (tmp_path / "out" / "done").exists()
-    with np.load(shard) as held:  # make it recognisable: what is done must not be done again
+    with np.load(shard) as held:  # mark the shard: finished layouts must not be flown again
         rows, U = json.loads(str(held["rows"])), held["U"]
     rows["iterations"] = [777] * len(rows["iterations"])
     np.savez(shard, U=U, rows=np.array(json.dumps(rows)))

@@ -1,4 +1,4 @@
-"""MPPI, detection and region against the NumPy reference; the draws by their promises."""
+"""MPPI, detection and guide region against the NumPy reference; statistics and keys of the draws."""
 
 from dataclasses import replace
 
@@ -55,13 +55,13 @@ def test_improve_equals_algorithm_3(batch: str, saturation: str, native: bool, m
 
 
 def flown(problem, V: torch.Tensor) -> Flight:
-    """Samples with the controls V (B, S, N, m)."""
+    """Rollouts of samples with the controls V (B, S, N, m)."""
     noise = Noise(V.permute(2, 0, 1, 3).contiguous(), torch.ones(1, 1, problem.m, dtype=V.dtype), None, None)
     return fly(problem, torch.zeros_like(noise.z[:, :, :1]), noise, None)
 
 
 def through_the_obstacles(problem):
-    """X (B, N+1, n) straight through the scene, which no dynamics would fly."""
+    """X (B, N+1, n) straight through the scene, which no dynamics can produce."""
     X = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1)
     X[..., 0] += torch.linspace(0, 6 if problem.n == 14 else 2, problem.N + 1, dtype=torch.float64)
     return X
@@ -95,7 +95,7 @@ def test_detection_and_region_equal_algorithm_5(batch: str, native: bool) -> Non
 
 
 def test_a_sample_that_touches_nothing_replaces_the_iterate() -> None:
-    """The path is caught, the sample stays where the vehicle stands: with `start_from_sample` no region is left."""
+    """The iterate is caught, but a sample at rest is free: `start_from_sample` takes it, and no guide is left."""
     problem, U = planar_batch(B=4, N=30, obstacles=14)
     X = through_the_obstacles(problem)
     caught = caught_knots(problem, X, U).any(-1)
@@ -182,7 +182,7 @@ def test_draws_are_standard_normal_and_independent() -> None:
     assert float(samples.abs().max()) < 5.0 / 500**0.5
 
 
-def test_draws_are_keyed_by_element_and_sample_not_by_place() -> None:
+def test_draws_are_keyed_by_problem_and_sample_not_by_position() -> None:
     whole = standard_normal(DrawKey(7, torch.tensor([3, 9, 4]), torch.tensor([1, 2, 1])), 9, range(5))
     mine = DrawKey(7, torch.tensor([9]), torch.tensor([2]))
     alone = standard_normal(mine, 9, range(5))
@@ -200,8 +200,8 @@ def test_draws_are_keyed_by_element_and_sample_not_by_place() -> None:
 @pytest.mark.parametrize("samples", [33, 100])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("batch", BATCHES)
-def test_samples_do_not_know_their_companions(batch: str, dtype: str, samples: int, native: bool) -> None:
-    """Bit by bit: sums and products over the samples of all problems must not mix their order."""
+def test_samples_are_the_same_in_every_batch(batch: str, dtype: str, samples: int, native: bool) -> None:
+    """Bit by bit: the order of sums and products over samples must not depend on the batch."""
     problem, U = BATCHES[batch](B=7, N=12)
     sampler = MPPI(samples=samples, noise_knots=4, elite=3, rounds=2, dtype=dtype)
     whole = sampler.improve(problem, U, key(7))[1]

@@ -1,4 +1,4 @@
-"""Guidance that a problem can't have: the solve goes ahead without it, and one warning says why."""
+"""Guidance that a problem does not support: the solve continues without it, and one warning says why."""
 
 from __future__ import annotations
 
@@ -39,21 +39,21 @@ from torchgco.search import PathProposals
 
 @pytest.fixture
 def in_pytorch() -> Iterator[None]:
-    """Guidance by PyTorch's kernels, which call the users' functions with samples, in single precision too."""
+    """Use PyTorch's kernels, which call user functions with samples, also in single precision."""
     kernels.use_native(False)
     yield
     kernels.use_native(True)
 
 
 def vehicle(d: int, kind: str = "plain") -> FunctionDynamics:
-    """A point in d dimensions that is accelerated."""
+    """A double integrator in d dimensions; `kind` is the way the controls enter."""
     turn, gain = torch.eye(d, dtype=torch.float64), torch.ones(d, dtype=torch.float64)
     force = {"plain": lambda u: u, "product": lambda u: u @ turn, "promoted": lambda u: u * gain}[kind]
     return FunctionDynamics(lambda x, u: torch.cat((x[..., d:], force(u)), -1), 2 * d, d, 0.1, "euler", slice(0, d))
 
 
-def posed(d: int, obstacles: Any, kind: str = "plain", dynamics: FunctionDynamics | None = None) -> Problem:
-    """Two starts: obstacles stand before the first, and the second has a free path in more than one dimension."""
+def make_problem(d: int, obstacles: Any, kind: str = "plain", dynamics: FunctionDynamics | None = None) -> Problem:
+    """Two problems: obstacles block the first one's path; the second one's is free if d > 1."""
     x0 = torch.zeros(2, 2 * d, dtype=torch.float64)
     x0[1, 1 if d > 1 else 0] = 3.0
     cost = QuadraticCost(Q=[1.0] * 2 * d, R=[0.1] * d, Qf=[50.0] * 2 * d, x_ref=[2.0] + [0.0] * (2 * d - 1))
@@ -62,14 +62,14 @@ def posed(d: int, obstacles: Any, kind: str = "plain", dynamics: FunctionDynamic
 
 
 def spheres(d: int) -> Spheres:
-    """Two that overlap across the path; on a line, two that overlap along it."""
+    """Two overlapping spheres, across the path; for d = 1, along it."""
     centers = torch.zeros(2, d, dtype=torch.float64)
     centers[:, 0] = 1.0
     centers[:, min(1, d - 1)] += torch.tensor([0.2, -0.2], dtype=torch.float64)
     return Spheres(centers, [0.4, 0.4], 0.1)
 
 
-BASE = presets.gco(posed(2, spheres(2)))
+BASE = presets.gco(make_problem(2, spheres(2)))
 assert BASE.sampling is not None
 SAMPLER = replace(BASE.sampling.sampler, samples=64, rounds=4)
 SINGLE = replace(
@@ -82,7 +82,7 @@ SINGLE = replace(
 
 
 def pillars(x: Tensor) -> Tensor:
-    """The same in the plane, as a function."""
+    """The spheres of the plane as a function constraint."""
     centers = x.new_tensor([[1.0, 0.2], [1.0, -0.2]])
     return 0.25 - (x[..., None, :2] - centers).square().sum(-1)
 
@@ -104,21 +104,21 @@ def alone(problem: Problem, b: int, solver: Any = SINGLE) -> Tensor:
 
 
 CASES = {
-    "a function for obstacles": (lambda: posed(2, FunctionConstraint(pillars, geometric=True)), None),
-    "a product with float64": (lambda: posed(2, spheres(2), "product"), "samples are drawn in float64"),
-    "promoted to float64": (lambda: posed(2, spheres(2), "promoted"), "samples are drawn in float64"),
-    "a line": (lambda: posed(1, spheres(1)), "no path is sought around obstacles in 1-D"),
-    "four dimensions": (lambda: posed(4, spheres(4)), "no path is sought around obstacles in 4-D"),
+    "a function for obstacles": (lambda: make_problem(2, FunctionConstraint(pillars, geometric=True)), None),
+    "a product with float64": (lambda: make_problem(2, spheres(2), "product"), "samples are drawn in float64"),
+    "promoted to float64": (lambda: make_problem(2, spheres(2), "promoted"), "samples are drawn in float64"),
+    "a line": (lambda: make_problem(1, spheres(1)), "no path is sought around obstacles in 1-D"),
+    "four dimensions": (lambda: make_problem(4, spheres(4)), "no path is sought around obstacles in 4-D"),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_what_can_be_had_is_had(case: str, in_pytorch: None) -> None:
-    """The caught problem is guided, the other left alone, each as if it were by itself, and one warning is given."""
+def test_available_guidance_is_used(case: str, in_pytorch: None) -> None:
+    """The caught problem is guided, the other is not; each is solved as if alone. Lost parts give one warning."""
     make, why = CASES[case]
     problem = make()
     solution, warned = solved(problem)
-    # The free problem is stationary; from a sampled trajectory, held by a stiff penalty, it may take more iterations.
+    # The free problem converges. The caught one starts from a sample with a stiff penalty and may need more iterations.
     assert int(solution.guided[0]) > 0 and solution.statuses[1] == Status.CONVERGED
     assert solution.statuses[0] in (Status.CONVERGED, Status.FEASIBLE) and bool((solution.violation <= 1e-3).all())
     assert all(torch.equal(solution.U[b], alone(problem, b)) for b in (0, 1))
@@ -131,38 +131,38 @@ def test_what_can_be_had_is_had(case: str, in_pytorch: None) -> None:
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("kind", ["product", "promoted"])
-def test_native_samples_ask_nothing_of_the_users_functions(kind: str) -> None:
-    problem = posed(2, spheres(2), kind)
+def test_native_sampling_does_not_call_the_users_functions(kind: str) -> None:
+    problem = make_problem(2, spheres(2), kind)
     solution, warned = solved(problem)
     assert warned == [] and int(solution.guided[0]) > 0
     assert all(torch.equal(solution.U[b], alone(problem, b)) for b in (0, 1))
 
 
 def test_without_a_position_nothing_is_guided() -> None:
-    problem = posed(2, FunctionConstraint(pillars, geometric=True))
-    nowhere = replace(problem, dynamics=replace(problem.dynamics, position=None))
-    solution, warned = solved(nowhere)
+    problem = make_problem(2, FunctionConstraint(pillars, geometric=True))
+    without_position = replace(problem, dynamics=replace(problem.dynamics, position=None))
+    solution, warned = solved(without_position)
     assert warned == ["solved without guidance: the dynamics have no position"]
     assert solution.guided.tolist() == [0, 0]
-    want = torchgco.solve(nowhere, solver=SINGLE.local)
-    assert torch.equal(solution.U, want.U)
+    expected = torchgco.solve(without_position, solver=SINGLE.local)
+    assert torch.equal(solution.U, expected.U)
 
 
 @pytest.mark.parametrize("native", ["native", "eager"], indirect=True)
 def test_the_sampler_alone_needs_no_position(native: bool) -> None:
-    problem = posed(2, FunctionConstraint(pillars, geometric=True))
-    nowhere = replace(problem, dynamics=replace(problem.dynamics, position=None))
-    (want, _), (got, warned) = (solved(p, IteratedMPPI(SAMPLER, iterations=2)) for p in (problem, nowhere))
-    assert warned == [] and torch.equal(got.U, want.U)
+    problem = make_problem(2, FunctionConstraint(pillars, geometric=True))
+    without_position = replace(problem, dynamics=replace(problem.dynamics, position=None))
+    (expected, _), (got, warned) = (solved(p, IteratedMPPI(SAMPLER, iterations=2)) for p in (problem, without_position))
+    assert warned == [] and torch.equal(got.U, expected.U)
 
 
-def test_without_obstacles_no_guidance_is_missed() -> None:
-    problem = posed(2, FunctionConstraint(pillars), dynamics=replace(vehicle(2), position=None))
+def test_without_obstacles_there_is_no_warning() -> None:
+    problem = make_problem(2, FunctionConstraint(pillars), dynamics=replace(vehicle(2), position=None))
     solution, warned = solved(problem)
     assert warned == [] and solution.guided.tolist() == [0, 0]
 
 
-class Fussy(FunctionDynamics):
+class RefusesSamples(FunctionDynamics):
     """Accepts trajectories, but not several samples at once."""
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
@@ -171,42 +171,42 @@ class Fussy(FunctionDynamics):
         return super().step(x, u)
 
 
-def test_dynamics_that_bear_no_samples_are_led_by_paths_alone(in_pytorch: None) -> None:
+def test_dynamics_that_accept_no_samples_are_guided_by_paths_alone(in_pytorch: None) -> None:
     plain = vehicle(2)
-    fussy = Fussy(plain.function, 4, 2, 0.1, "euler", plain.position)
-    problem, lost = posed(2, spheres(2), dynamics=fussy), "no trajectory can be sampled (no samples here)"
+    refusing = RefusesSamples(plain.function, 4, 2, 0.1, "euler", plain.position)
+    problem, lost = make_problem(2, spheres(2), dynamics=refusing), "no trajectory can be sampled (no samples here)"
     solution, warned = solved(problem, replace(SINGLE, attempts=3))
     assert warned == [f"guided in part: {lost}"]
     assert int(solution.guided[0]) == 1 and solution.status.tolist() == [1, 1]
     solution, warned = solved(problem, replace(SINGLE, paths=None))
     assert warned == [f"solved without guidance: {lost}"]
-    want = torchgco.solve(posed(2, spheres(2)), solver=SINGLE.local)
-    assert torch.equal(solution.U, want.U) and solution.guided.tolist() == [0, 0]
+    expected = torchgco.solve(make_problem(2, spheres(2)), solver=SINGLE.local)
+    assert torch.equal(solution.U, expected.U) and solution.guided.tolist() == [0, 0]
     with pytest.raises(InputError, match="got no trajectory can be sampled"):
         torchgco.solve(problem, solver=IteratedMPPI(iterations=1))
 
 
 @pytest.mark.parametrize("kind", ["product", "promoted"])
 def test_the_sampler_alone_falls_back_to_the_problems_precision(kind: str, in_pytorch: None) -> None:
-    problem, sampler = posed(2, spheres(2), kind), replace(SAMPLER, dtype="float32")
+    problem, sampler = make_problem(2, spheres(2), kind), replace(SAMPLER, dtype="float32")
     solution, warned = solved(problem, IteratedMPPI(sampler, iterations=2))
     assert len(warned) == 1 and "samples are drawn in float64" in warned[0]
-    want = torchgco.solve(problem, solver=IteratedMPPI(replace(sampler, dtype="float64"), iterations=2))
-    assert torch.equal(solution.U, want.U)
-    suited, why = suited_sampler(sampler, posed(2, spheres(2)))
+    expected = torchgco.solve(problem, solver=IteratedMPPI(replace(sampler, dtype="float64"), iterations=2))
+    assert torch.equal(solution.U, expected.U)
+    suited, why = suited_sampler(sampler, make_problem(2, spheres(2)))
     assert suited is sampler and why is None
 
 
-def test_the_radius_without_spheres_is_a_share_of_the_way() -> None:
-    problem = posed(2, FunctionConstraint(pillars, geometric=True))
+def test_the_radius_without_spheres_is_a_share_of_the_distance_to_the_goal() -> None:
+    problem = make_problem(2, FunctionConstraint(pillars, geometric=True))
     X = problem.x0.unsqueeze(1).repeat(1, 41, 1)
     X[0, 7, :2] = torch.tensor([3.0, 4.0], dtype=torch.float64)
     far = torch.tensor([2.0, 13.0**0.5], dtype=torch.float64)
     torch.testing.assert_close(_radius(problem, X), REACH * far)
-    assert _radius(posed(2, spheres(2)), X).tolist() == [0.1, 0.1]
+    assert _radius(make_problem(2, spheres(2)), X).tolist() == [0.1, 0.1]
 
-    aimless = Problem(problem.dynamics, Cost(), problem.constraints, problem.x0, problem.N)
-    torch.testing.assert_close(_radius(aimless, X), X.new_tensor([REACH * 5.0, 0.0]))
+    without_goal = Problem(problem.dynamics, Cost(), problem.constraints, problem.x0, problem.N)
+    torch.testing.assert_close(_radius(without_goal, X), X.new_tensor([REACH * 5.0, 0.0]))
 
 
 @pytest.mark.parametrize(
@@ -216,15 +216,15 @@ def test_the_radius_without_spheres_is_a_share_of_the_way() -> None:
         (dict(paths=PathProposals(initial_offsets=(("left", "right"),))), "paths.initial_offsets"),  # type: ignore
     ],
 )
-def test_options_that_do_not_fit_are_named_before_any_element_is_caught(options: dict[str, Any], field: str) -> None:
+def test_options_that_do_not_fit_are_named_before_any_problem_is_caught(options: dict[str, Any], field: str) -> None:
     far = Spheres([[50.0, 50.0]], [0.1])
     with pytest.raises(InputError) as error:
-        torchgco.solve(posed(2, far), solver=replace(SINGLE, **options))
+        torchgco.solve(make_problem(2, far), solver=replace(SINGLE, **options))
     assert error.value.field == field
 
 
 def test_offsets_for_another_number_of_controls_are_left_out() -> None:
-    """Presets hold offsets for two controls, and serve every vehicle."""
-    problem = posed(2, spheres(2))
+    """Presets hold offsets for two controls but serve every vehicle."""
+    problem = make_problem(2, spheres(2))
     plain, more = (solved(problem, replace(SINGLE, paths=PathProposals(initial_offsets=o))) for o in ((), ((1.0,),)))
     assert plain[1] == more[1] == [] and torch.equal(plain[0].U, more[0].U)

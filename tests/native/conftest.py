@@ -1,4 +1,4 @@
-"""An empty cache folder for each test, and nothing loaded."""
+"""Each test has an empty cache folder and no loaded library."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Emitted functions, called with problems one by one or in any company."""
+"""Emitted C functions, called on any number of problems."""
 
 import ctypes
 from pathlib import Path
@@ -17,7 +17,7 @@ LANES = 8
 
 
 class Emitted:
-    """A C function `name` of inputs and outputs with so many entries each, on arrays (B, size) of numbers."""
+    """A C function `name` on arrays (B, size); `inputs` and `outputs` are the sizes of its arguments."""
 
     def __init__(
         self, code: str, name: str, inputs: list[int], outputs: list[int], real: str = "double", lanes: int = LANES
@@ -40,7 +40,7 @@ class Emitted:
         )
 
     def __call__(self, *values: np.ndarray) -> list[np.ndarray]:
-        """Outputs (B, size). The last group is filled with its first problem."""
+        """Outputs (B, size). The last group of lanes is filled up by repeating its problems."""
         B = len(values[0])
         made = [np.zeros((B, size), self._dtype) for size in self._outputs]
         for first in range(0, B, self._lanes):
@@ -55,7 +55,7 @@ class Emitted:
 
 
 def drawn(key: DrawKey, rows: int, samples: int, stream: int = 0) -> Tensor:
-    """Normal draws (rows, B, samples) float64, as the native sampler makes them."""
+    """Standard normal draws (rows, B, samples), float64, of the native sampler."""
     code = (
         Path(model.__file__).with_name("normal.c").read_text()
         + """
@@ -90,7 +90,7 @@ class Model:
         return torch.from_numpy(self._step(*self._inputs(x, u))[0])
 
     def jacobian(self, x: Tensor, u: Tensor) -> Tensor:
-        """[fx, fu] (B, n, n+m), put together by the pattern."""
+        """[fx, fu] (B, n, n+m), assembled from computed and constant entries."""
         source, (entries,) = self._source, self._jacobian(*self._inputs(x, u))
         whole = torch.zeros(len(x), source.n, source.n + source.m, dtype=torch.from_numpy(entries).dtype)
         places = zip(source.rows, source.columns, source.places, source.values, strict=True)

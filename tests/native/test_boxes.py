@@ -1,4 +1,4 @@
-"""Native rows of boxes against PyTorch's: outside, at the surface, inside, absent; and traced, for CasADi's solvers."""
+"""Native rows of boxes against PyTorch's: outside, at the surface, inside, absent; and traced for CasADi's solvers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is compiled is kept, and nothing that happens to the cache folder can change a result."""
+"""Libraries are compiled once, and no damage to the cache folder changes a result."""
 
 import ctypes
 import multiprocessing
@@ -20,7 +20,7 @@ def source(factor: int) -> str:
 
 
 def times(factor: int, x: float = 3.0) -> float:
-    """factor * x, by a library."""
+    """factor * x, computed by a compiled library."""
     function = build(source(factor)).tgco_times
     function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double]
     return function(x)
@@ -70,7 +70,7 @@ def test_a_bad_entry_is_made_again(cache: Path, compiled: list[str], harm: str) 
     times(2)
     (entry,) = set(cache.iterdir()) - {other}
     content = entry.read_bytes()
-    entry.unlink()  # what is mapped into this process keeps its own
+    entry.unlink()  # the library mapped into this process keeps the old file
     if harm == "flipped":
         entry.write_bytes(content[:5000] + bytes([content[5000] ^ 1]) + content[5001:])
     elif harm == "truncated":
@@ -79,7 +79,7 @@ def test_a_bad_entry_is_made_again(cache: Path, compiled: list[str], harm: str) 
         entry.touch()
     elif harm == "foreign":
         entry.write_bytes(other_content)
-    elif harm == "renamed":  # a library that is sound, under the key of another
+    elif harm == "renamed":  # an intact library under the key of another
         key, checksum = entry.name.split("-")[0], other.name.split("-")[1]
         (cache / f"{key}-{checksum}").write_bytes(other_content)
     else:
@@ -87,7 +87,7 @@ def test_a_bad_entry_is_made_again(cache: Path, compiled: list[str], harm: str) 
     next_process()
     assert times(2) == 6.0 and len(compiled) == 3
     if harm != "folder":
-        next_process()  # finds a sound one
+        next_process()  # finds the new entry
         assert times(2) == 6.0 and len(compiled) == 3
 
 
@@ -108,7 +108,7 @@ def test_without_a_folder_it_is_compiled_every_time(
 
 
 @needs_compiler
-def test_a_full_or_forbidding_disk(monkeypatch, cache: Path) -> None:
+def test_a_full_disk(monkeypatch, cache: Path) -> None:
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -117,7 +117,7 @@ def test_a_full_or_forbidding_disk(monkeypatch, cache: Path) -> None:
 
 
 @needs_compiler
-def test_a_folder_that_nothing_may_be_run_from(monkeypatch, cache: Path) -> None:
+def test_a_folder_that_libraries_cannot_be_loaded_from(monkeypatch, cache: Path) -> None:
     plain = ctypes.CDLL
 
     def forbidding(name: str) -> ctypes.CDLL:
@@ -212,14 +212,14 @@ def test_old_files_go_and_used_ones_stay(cache: Path, monkeypatch) -> None:
     (cache / "torchgco-killed.part").write_text("")
     for name in ("mine-and-old.txt", "torchgco-killed.part"):
         os.utime(cache / name, (0.0, 0.0))
-    assert store.read(keys[0], ".json") == b"0"  # so it is the latest
+    assert store.read(keys[0], ".json") == b"0"  # now the most recently used
     store.save(keys[5], ".json", b"5")
     store.save(keys[6], ".json", b"6")
     assert [store.read(key, ".json") for key in keys] == [b"0", None, None, b"3", b"4", b"5", b"6", None]
     assert (cache / "mine-and-old.txt").exists() and not (cache / "torchgco-killed.part").exists()
 
 
-def test_the_folder(monkeypatch) -> None:
+def test_the_cache_folder(monkeypatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
     monkeypatch.setenv("TORCHGCO_CACHE", "/here")
     assert store.folder() == Path("/here")
@@ -229,5 +229,5 @@ def test_the_folder(monkeypatch) -> None:
     assert store.folder() == Path.home() / ".cache/torchgco"
 
 
-def test_keys_tell_their_parts_apart() -> None:
+def test_keys_distinguish_their_parts() -> None:
     assert store.key_of(("ab", "c")) != store.key_of(("a", "bc")) != store.key_of(("abc",))

@@ -1,4 +1,4 @@
-"""What is emitted computes what CasADi computes, lane by lane."""
+"""Emitted code computes the same as CasADi, in every lane."""
 
 import casadi as ca
 import numpy as np
@@ -53,7 +53,7 @@ def test_exact_operations(name: str) -> None:
     expected, (made,) = by_casadi(function, *pairs()), emitted(*pairs())
     np.testing.assert_array_equal(made, expected)
     unlike = np.signbit(made) != np.signbit(expected)
-    assert not np.any(unlike & ~np.isnan(expected)) or name in ("least", "choices")  # either zero will do there
+    assert not np.any(unlike & ~np.isnan(expected)) or name in ("least", "choices")  # either zero is right there
 
 
 @pytest.mark.parametrize("name", CLOSE)
@@ -92,7 +92,7 @@ def test_single_precision(name: str) -> None:
 
 @pytest.mark.parametrize("name", [*EXACT, *CLOSE])
 @pytest.mark.parametrize("lanes", [1, 4, 16])
-def test_lanes_know_nothing_of_each_other(name: str, lanes: int) -> None:
+def test_lanes_do_not_affect_each_other(name: str, lanes: int) -> None:
     function, emitted = functions(name)
     code, size = emit("tgco_made", function), function.numel_out()
     x, y = pairs()
@@ -115,7 +115,7 @@ def test_sparse_outputs_and_several_inputs() -> None:
     np.testing.assert_array_equal(last, [[-2.0], [-2.0]])
 
 
-def test_what_has_no_counterpart_is_named() -> None:
+def test_unsupported_operations_are_named() -> None:
     x = ca.SX.sym("x")
     with pytest.raises(ValueError, match="ERFINV"):
         emit("tgco_made", ca.Function("made", [x], [ca.erfinv(x)]))

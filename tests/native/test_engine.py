@@ -1,4 +1,4 @@
-"""Inner solves in C against those of PyTorch, on all that a problem may be made of."""
+"""Inner solves in C against those in PyTorch, with every kind of part that a problem may have."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ PRINTED = ILQR(as_printed=True, tolerance=0.1, max_iterations=15)
 
 @pytest.fixture(autouse=True)
 def cache() -> None:
-    """The user's own: libraries are compiled once for all of these tests."""
+    """Use the user's cache folder: libraries are compiled once for all tests of this file."""
 
 
 @pytest.fixture(autouse=True)
@@ -57,7 +57,7 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 
 
 def user_problem(B: int = 5, N: int = 12) -> Problem:
-    """A car given as a function, with weights that are matrices, functions as constraints, and bounded states."""
+    """A car as a function, with weight matrices, function constraints and bounded states."""
 
     def field(x: Tensor, u: Tensor) -> Tensor:
         speed = torch.tanh(x[..., 3])
@@ -111,7 +111,7 @@ def linear_problem(n: int, m: int, N: int, B: int = 3) -> Problem:
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "planar": lambda: planar_batch(B=5, N=20, obstacles=5)[0],
     "quadrotor": lambda: quadrotor_batch(B=5, N=15, obstacles=5)[0],
-    "a user's own": user_problem,
+    "a user's model": user_problem,
     "moving": moving_problem,
     "boxes": lambda: boxed_batch(2, B=5, N=20)[0],
     "boxes in space": lambda: boxed_batch(3, B=5, N=15)[0],
@@ -119,8 +119,10 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
 }
 
 
-def begun(problem: Problem, guided: str | None = None, phr: bool = True, seed: int = 0) -> tuple[State, Lagrangian]:
-    """A state as a loop holds it, along random controls, with multipliers and penalties at work."""
+def running_state(
+    problem: Problem, guided: str | None = None, phr: bool = True, seed: int = 0
+) -> tuple[State, Lagrangian]:
+    """The state of a running loop at random controls, and its Lagrangian with nonzero multipliers and penalties."""
     B = problem.B
     U = problem.cost.rest_controls(problem.x0.new_zeros(B, problem.N, problem.m)) + 0.5 * normal(
         B, problem.N, problem.m, seed=seed
@@ -152,13 +154,13 @@ def begun(problem: Problem, guided: str | None = None, phr: bool = True, seed: i
 
 
 def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict[int, tuple[bool, bool, int]]:
-    """Iterations by PyTorch until every problem has ended or made `count`; how each ended."""
+    """PyTorch iterations until each problem ends or made `count`: per problem (converged, stuck, iterations)."""
     ends: dict[int, tuple[bool, bool, int]] = {}
     for _ in range(3 * count):
         frozen = replace(state)
         end = inner.iterate(state, lagrangian)
         for b in range(lagrangian.problem.B):
-            if b in ends:  # a problem that had ended before stays where it was
+            if b in ends:  # an ended problem keeps its state
                 for name in ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation"):
                     getattr(state, name)[b] = getattr(frozen, name)[b]
             elif bool(end.ended[b]) or int(state.iterations[b]) == count:
@@ -179,7 +181,7 @@ def natively(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> P
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None, phr: bool) -> None:
     problem = PROBLEMS[name]()
-    state, lagrangian = begun(problem, guided, phr)
+    state, lagrangian = running_state(problem, guided, phr)
     engine = engine_of(problem)
     assert engine is not None
     for mine, theirs in zip(engine.value(problem, state.X, state.U, terms_of(lagrangian)), lagrangian.value(
@@ -188,7 +190,7 @@ def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None
         torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(engine.open_loop(problem, state.U), state.X, rtol=1e-10, atol=1e-12)
     for inner, count in ((DAMPED, 1), (DAMPED, 4), (BRIEF, 4), (PRINTED, 4)):
-        (a, first), (b, second) = begun(problem, guided, phr), begun(problem, guided, phr)
+        (a, first), (b, second) = running_state(problem, guided, phr), running_state(problem, guided, phr)
         ends = eager(inner, a, first, count)
         out = natively(inner, b, second, count)
         torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
@@ -202,7 +204,7 @@ def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_gains_and_optimality_are_pytorchs(name: str) -> None:
     problem = PROBLEMS[name]()
-    state, lagrangian = begun(problem)
+    state, lagrangian = running_state(problem)
     native = optimality(lagrangian, state.X, state.U)
     kernels.use_native(False)
     plain = optimality(lagrangian, state.X, state.U)
@@ -214,7 +216,7 @@ def test_gains_and_optimality_are_pytorchs(name: str) -> None:
 @pytest.mark.parametrize(("n", "m", "N"), [(1, 1, 1), (2, 3, 4), (5, 1, 9), (20, 20, 3), (13, 4, 1), (40, 3, 2)])
 def test_models_of_any_size(n: int, m: int, N: int) -> None:
     problem = linear_problem(n, m, N)
-    (a, first), (b, second) = begun(problem), begun(problem)
+    (a, first), (b, second) = running_state(problem), running_state(problem)
     eager(DAMPED, a, first, 5)
     natively(DAMPED, b, second, 5)
     torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
@@ -222,11 +224,11 @@ def test_models_of_any_size(n: int, m: int, N: int) -> None:
 
 
 @pytest.mark.parametrize("B", [1, 2, 3, 7, 8, 9, 40])
-def test_an_element_has_its_bits_in_every_batch(B: int) -> None:
+def test_a_problem_has_the_same_bits_in_every_batch(B: int) -> None:
     whole = planar_batch(B=40, N=15, obstacles=5)[0]
-    all_of_them, lagrangian = begun(whole)
+    all_of_them, lagrangian = running_state(whole)
     natively(DAMPED, all_of_them, lagrangian, 6)
-    state, lagrangian = begun(whole)
+    state, lagrangian = running_state(whole)
     rows = torch.arange(B).flip(0)
     part = replace(state, **{
         name: getattr(state, name)[rows]
@@ -240,9 +242,9 @@ def test_an_element_has_its_bits_in_every_batch(B: int) -> None:
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_neighbour_that_is_not_finite_changes_no_bits(threads: int) -> None:
     problem = quadrotor_batch(B=19, N=10, obstacles=4)[0]
-    want, lagrangian = begun(problem)
-    natively(DAMPED, want, lagrangian, 5)
-    state, lagrangian = begun(problem)
+    expected, lagrangian = running_state(problem)
+    natively(DAMPED, expected, lagrangian, 5)
+    state, lagrangian = running_state(problem)
     state.X[3], state.U[11, 4] = torch.nan, torch.inf
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
@@ -253,17 +255,17 @@ def test_a_neighbour_that_is_not_finite_changes_no_bits(threads: int) -> None:
     rest = torch.tensor([b for b in range(19) if b not in (3, 11)])
     assert end.status[3] > 1 and bool((end.status[rest] == 0).all())
     for name in ("X", "U", "merit", "iterations"):
-        assert torch.equal(getattr(state, name)[rest], getattr(want, name)[rest]), name
+        assert torch.equal(getattr(state, name)[rest], getattr(expected, name)[rest]), name
 
 
 def test_statuses_are_those_of_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A concave cost without bounds has no minimum to find; one that nothing regularises enough ends with a status."""
+    """A concave cost has no minimum; where no regularisation suffices, the solve ends with a status."""
     free = planar_batch(B=2, N=6)[0]
     concave = replace(free.cost, R=-free.cost.R)
     problem = free._with({"cost": concave, "constraints": ()})
     for inner, limit in ((DAMPED, 1e-4), (replace(DAMPED, max_iterations=3), ilqr.REGULARISATION_MAX)):
         monkeypatch.setattr(ilqr, "REGULARISATION_MAX", limit)
-        (a, first), (b, second) = begun(problem), begun(problem)
+        (a, first), (b, second) = running_state(problem), running_state(problem)
         native = natively(inner, b, second, 3)
         statuses = torch.zeros(2, dtype=torch.int64)
         for _ in range(20):
@@ -294,7 +296,7 @@ def test_a_problem_travels_without_its_library() -> None:
     assert torch.equal(DAMPED.solve(copy.deepcopy(problem), U0).U, first.U)
 
 
-def test_a_problem_that_cannot_be_native_says_why_once() -> None:
+def test_a_problem_that_cannot_be_native_gives_one_warning() -> None:
     def looks(x: Tensor, u: Tensor) -> Tensor:
         return x if float(x.sum()) > 1e9 else x + 0.1 * u
 

@@ -1,4 +1,4 @@
-"""A model in C is the model: its step, its derivatives, and the numbers of each problem."""
+"""A model in C equals that in PyTorch: its step, its derivatives, and the parameters of each problem."""
 
 import gc
 import subprocess
@@ -26,7 +26,7 @@ from torchgco.native.model import trace_dynamics
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 DOUBLE = dict(dtype=torch.float64)
-B = 19  # two full groups of lanes and a part
+B = 19  # two full groups of lanes and a partial one
 
 
 def each(low: float, high: float) -> Tensor:
@@ -34,7 +34,7 @@ def each(low: float, high: float) -> Tensor:
 
 
 def users(x: Tensor, u: Tensor) -> Tensor:
-    """A user's step with what users write."""
+    """A user's field, with common operations of PyTorch."""
     speed, angle, load = x.unbind(-1)
     return torch.stack(
         (
@@ -64,12 +64,12 @@ MODELS: dict[str, Dynamics] = {
 
 
 def points(model: Dynamics, kind: str) -> tuple[Tensor, Tensor]:
-    """Where a model is asked: near rest, tumbling, or far away."""
+    """States (B, n) and controls (B, m) near rest, tumbling, far away, or without thrust."""
     generator = torch.Generator().manual_seed(5)
     x = torch.randn(B, model.n, generator=generator, **DOUBLE)
     u = torch.randn(B, model.m, generator=generator, **DOUBLE)
     rotors = isinstance(model, (QuadrotorPlant, RotorTracking))
-    if rotors:  # newtons, and turns a minute
+    if rotors:  # thrusts in N, rotor speeds in rpm
         x[:, -4:], u = 3.0 + 0.5 * x[:, -4:], 5000.0 + 300.0 * u
     if kind == "tumbling":
         x, u = 30.0 * x, 30.0 * u
@@ -95,7 +95,7 @@ def test_steps_and_derivatives(name: str) -> None:
 
 
 def assert_close(made: Tensor, expected: Tensor) -> None:
-    """To 1e-12 of the largest number of a problem, and not finite at the same places."""
+    """Equal to 1e-12 of the largest finite entry of a problem, and non-finite at the same entries."""
     scale = torch.where(expected.isfinite(), expected.abs(), 1.0).flatten(1).amax(1).clamp(min=1.0)
     scale = scale.view(-1, *[1] * (expected.dim() - 1))
     torch.testing.assert_close(made / scale, expected / scale, rtol=1e-12, atol=1e-12, equal_nan=True)
@@ -127,7 +127,7 @@ def test_a_problem_depends_on_no_other(name: str) -> None:
     assert torch.equal(alone.jacobian(x[7:8], u[7:8]), whole[1][7:8])
 
 
-def test_what_is_constant_is_not_computed() -> None:
+def test_constant_entries_are_not_computed() -> None:
     source = trace_dynamics(Planar(dt=0.1, drag=2.0))
     pattern = {
         (r, c): (p, v) for r, c, p, v in zip(source.rows, source.columns, source.places, source.values, strict=True)
@@ -140,7 +140,7 @@ def test_what_is_constant_is_not_computed() -> None:
     assert source.count == 0 and source.parameters(torch.arange(4)).shape == (4, 0)
 
 
-def test_own_numbers() -> None:
+def test_parameters_of_each_problem() -> None:
     source = trace_dynamics(MODELS["planar, one each"])
     assert source.count == 3
     whole = source.parameters(torch.arange(B))
@@ -150,8 +150,8 @@ def test_own_numbers() -> None:
     assert torch.equal(source.parameters(torch.tensor([7, 2])), whole[[7, 2]])
 
 
-def test_own_numbers_that_must_be_computed() -> None:
-    """PyTorch's part may be anything, with the same bits however many problems are asked for."""
+def test_parameters_that_must_be_computed() -> None:
+    """PyTorch may compute the parameters in any way; their bits do not depend on the number of problems."""
 
     class Own(Planar):
         def step(self, x: Tensor, u: Tensor) -> Tensor:
@@ -166,7 +166,7 @@ def test_own_numbers_that_must_be_computed() -> None:
 
 
 def test_made_once(monkeypatch) -> None:
-    """Another process reads what was made, without CasADi, and a changed number is another model."""
+    """Another process reads the stored code without CasADi; another parameter makes another model."""
     first, other = trace_dynamics(Planar(drag=2.0)), trace_dynamics(Planar(drag=2.5))
     each_own = trace_dynamics(Planar(drag=each(1.0, 2.0)))
     assert len({first.key, other.key, each_own.key}) == 3
@@ -181,11 +181,11 @@ def test_made_once(monkeypatch) -> None:
     monkeypatch.setattr(made_by, "_made", None)
     assert trace_dynamics(Planar(drag=2.0)) == first
     again = trace_dynamics(Planar(drag=each(3.0, 4.0)))
-    assert again == each_own  # the same code, other numbers
+    assert again == each_own  # the same code, other parameters
     assert torch.equal(again.parameters(torch.arange(B))[:, 0], each(3.0, 4.0))
 
 
-def test_a_damaged_text_is_made_again(cache: Path) -> None:
+def test_damaged_code_is_made_again(cache: Path) -> None:
     source = trace_dynamics(Planar())
     (entry,) = cache.iterdir()
     entry.write_bytes(entry.read_bytes()[:-40])
@@ -210,9 +210,9 @@ def test_different_functions_have_different_keys(one, other) -> None:
     assert sources[0].key == sources[2].key != sources[1].key
 
 
-def test_what_cannot_be_traced() -> None:
-    for function, said in ((torch.erfinv, "erfinv"), (lambda x: x if x.sum() > 0 else -x, "traced")):
-        with pytest.raises(InputError, match=said):
+def test_functions_that_cannot_be_traced() -> None:
+    for function, message in ((torch.erfinv, "erfinv"), (lambda x: x if x.sum() > 0 else -x, "traced")):
+        with pytest.raises(InputError, match=message):
             trace_dynamics(FunctionDynamics(lambda x, u, f=function: f(x), n=2, m=1, dt=0.1))
 
 
@@ -242,14 +242,14 @@ def test_a_models_trace_is_kept_for_as_long_as_nothing_changes(monkeypatch) -> N
     assert len(counted) == 2
 
 
-def test_own_numbers_of_a_part_of_the_batch() -> None:
+def test_parameters_of_a_part_of_the_batch() -> None:
     whole = Planar(drag=torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), thrust_gain=2.0)
     source, rows = trace_dynamics(whole), torch.tensor([2, 0, 2])
     own = source.parameters(torch.arange(3), whole.take(rows))
     assert torch.equal(own, source.parameters(rows)) and own.shape == (3, 1)
 
 
-def test_own_numbers_of_a_batch_of_which_one_problem_was_traced() -> None:
+def test_parameters_of_a_batch_of_which_one_problem_was_traced() -> None:
     whole = Planar(drag=torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
     source = trace_dynamics(whole.take(torch.tensor([1])))
     assert source.parameters(torch.arange(3), whole).flatten().tolist() == [1.0, 2.0, 3.0]

@@ -1,4 +1,4 @@
-"""Rounds of MPPI in C against those of PyTorch with the same noise, on all that a problem may be made of."""
+"""Rounds of MPPI in C against those in PyTorch with the same noise, with every kind of part of a problem."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 @pytest.fixture(autouse=True)
 def cache() -> None:
-    """The user's own: libraries are compiled once for all of these tests."""
+    """Use the user's cache folder: libraries are compiled once for all tests of this file."""
 
 
 @pytest.fixture(autouse=True)
@@ -72,11 +72,11 @@ SAMPLERS = {
 LENIENT = {
     "as printed": 50.0,
     "rounds of smooth noise": 10.0,
-}  # with those penalties of collisions, the costs of samples matter, too
+}  # collision penalties small enough for the costs of samples to matter
 
 
 def sampler_of(name: str, monkeypatch: pytest.MonkeyPatch) -> MPPI:
-    """A sampler, with its penalty of collisions."""
+    """A sampler; sets its collision penalty."""
     monkeypatch.setattr(mppi, "COLLISION_PENALTY", LENIENT.get(name, mppi.COLLISION_PENALTY))
     return SAMPLERS[name]
 
@@ -104,7 +104,7 @@ def test_rounds_equal_those_of_pytorch(made: str, sampler: str, monkeypatch) -> 
     X, V = drawing.improve(problem, U, key(3))
     kernels.use_native(False)
     want_X, want_V = drawing.improve(problem, U, key(3))
-    # A round passes rounding on to the next one, magnified by what a sample gains or loses over the temperature.
+    # Rounding grows from round to round, by a sample's change of score divided by the temperature.
     torch.testing.assert_close(V, want_V, rtol=1e-7, atol=1e-7)
     torch.testing.assert_close(X, want_X, rtol=1e-7, atol=1e-7)
     assert made in ("functions", "a user's cost") or sampler == "one sample" or not torch.equal(V, U)
@@ -112,7 +112,7 @@ def test_rounds_equal_those_of_pytorch(made: str, sampler: str, monkeypatch) -> 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("made", ["planar", "quadrotor"])
-def test_elements_know_nothing_of_each_other(made: str, dtype: str, monkeypatch) -> None:
+def test_problems_do_not_affect_each_other(made: str, dtype: str, monkeypatch) -> None:
     problem, U = PROBLEMS[made]()
     sampler = replace(sampler_of("rounds of smooth noise", monkeypatch), dtype=dtype)
     _, V = sampler.improve(problem, U, key(3))
@@ -136,7 +136,7 @@ def test_single_precision_follows_double(made: str, monkeypatch) -> None:
     torch.testing.assert_close(single, double, rtol=1e-2, atol=1e-2)
 
 
-def test_a_sample_that_leaves_the_finite_numbers_takes_no_other_along() -> None:
+def test_a_sample_that_overflows_affects_no_other() -> None:
     problem, U = PROBLEMS["planar"]()
     wild = MPPI(samples=64, covariance=1e300, saturation=None, temperature=1.0)
     _, V = wild.improve(problem, U, key(3))

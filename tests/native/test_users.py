@@ -1,4 +1,4 @@
-"""Users' own costs and constraints in C against PyTorch's of the same."""
+"""User costs and constraints in C against the same in PyTorch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 import torchgco
-from tests.native.test_engine import DAMPED, begun, eager, natively, normal
+from tests.native.test_engine import DAMPED, eager, natively, normal, running_state
 from tests.native.users import PROBLEMS, Each, Smooth, Tube, each, errands, with_cost
 from tests.problems import planar_batch, quick_gco
 from torchgco import Problem, Status, kernels
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 @pytest.fixture(autouse=True)
 def cache() -> None:
-    """The user's own: libraries are compiled once for all of these tests."""
+    """Use the user's cache folder: libraries are compiled once for all tests of this file."""
 
 
 @pytest.fixture(autouse=True)
@@ -39,7 +39,7 @@ def native_again() -> Iterator[None]:
 
 
 def blocks(slopes: Tensor, curvatures: Tensor) -> Tensor:
-    """Gradient and upper triangle as one (..., n+m, n+m+1)."""
+    """Gradient and the Hessian's upper triangle as one tensor (..., n+m, n+m+1)."""
     return torch.cat((slopes.unsqueeze(-1), curvatures.triu()), dim=-1)
 
 
@@ -48,7 +48,7 @@ def blocks(slopes: Tensor, curvatures: Tensor) -> Tensor:
 def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> None:
     problem = PROBLEMS[name]()
     problem = problem.in_cost_units() if unit else problem
-    state, lagrangian = begun(problem)
+    state, lagrangian = running_state(problem)
     engine, n = engine_of(problem), problem.n
     assert engine is not None
     values = engine.value(problem, state.X, state.U, terms_of(lagrangian))
@@ -56,12 +56,12 @@ def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> N
         torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
     z = [i for i in range(n + 1 + problem.m) if i != n]
     H = lagrangian.expand(state.X, state.U).transpose(0, 1)
-    want = blocks(H[..., z, n], H[..., z, :][..., z])
+    expected = blocks(H[..., z, n], H[..., z, :][..., z])
     torch.testing.assert_close(
-        blocks(*engine.expand(problem, state.X, state.U, terms_of(lagrangian))), want, rtol=1e-10, atol=1e-10
+        blocks(*engine.expand(problem, state.X, state.U, terms_of(lagrangian))), expected, rtol=1e-10, atol=1e-10
     )
     for count in (1, 4):
-        (a, first), (b, second) = begun(problem), begun(problem)
+        (a, first), (b, second) = running_state(problem), running_state(problem)
         ends = eager(DAMPED, a, first, count)
         out = natively(DAMPED, b, second, count)
         torch.testing.assert_close(b.merit, a.merit, rtol=1e-10, atol=1e-10)
@@ -88,46 +88,46 @@ def test_at_rest_kinks_have_pytorchs_derivatives() -> None:
 
 def test_a_subset_has_the_numbers_of_its_problems() -> None:
     problem = PROBLEMS["constraints"]()
-    state, lagrangian = begun(problem)
+    state, lagrangian = running_state(problem)
     whole = engine_of(problem).value(problem, state.X, state.U, terms_of(lagrangian))[1]
     for rows in (torch.tensor([3]), torch.tensor([4, 0, 0, 2])):
-        part = problem.take(rows)  # after the whole has found its numbers, and, below, before
+        part = problem.take(rows)  # of a batch whose parameters are known; `alone` is of a new batch
         alone = PROBLEMS["constraints"]().take(rows)
         for some in (part, alone, part.take(torch.arange(len(rows)))):
             terms = terms_of(lagrangian.take(rows))
             assert torch.equal(engine_of(some).value(some, state.X[rows], state.U[rows], terms)[1], whole[rows])
 
 
-def test_the_library_may_be_made_for_one_problem_first() -> None:
-    """A weight (1, 1) then stands for one problem alone, and the batch must not take it for one that all share."""
+def test_the_library_may_be_compiled_for_one_problem_first() -> None:
+    """The weight (1, 1) of one problem must not be taken for one that the whole batch shares."""
     problem, other = PROBLEMS["constraints"](), PROBLEMS["constraints"]()
-    state, lagrangian = begun(problem)
-    want = engine_of(problem).value(problem, state.X, state.U, terms_of(lagrangian))[1]
+    state, lagrangian = running_state(problem)
+    expected = engine_of(problem).value(problem, state.X, state.U, terms_of(lagrangian))[1]
     assert engine_of(other.take(torch.tensor([2]))) is not None
     terms = terms_of(replace(lagrangian, problem=other))
-    assert torch.equal(engine_of(other).value(other, state.X, state.U, terms)[1], want)
+    assert torch.equal(engine_of(other).value(other, state.X, state.U, terms)[1], expected)
 
 
-@pytest.mark.parametrize("name", ["one of each problem", "by knot", "constraints"])
-def test_an_element_has_its_bits_in_every_batch(name: str) -> None:
+@pytest.mark.parametrize("name", ["per problem", "by knot", "constraints"])
+def test_a_problem_has_the_same_bits_in_every_batch(name: str) -> None:
     whole = PROBLEMS[name]()
-    all_of_them, lagrangian = begun(whole)
+    all_of_them, lagrangian = running_state(whole)
     natively(DAMPED, all_of_them, lagrangian, 5)
     names = ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation", "rows", "outer")
     for rows in (torch.tensor([2]), torch.arange(5).flip(0), torch.tensor([1, 3] * 6)):
-        state, lagrangian = begun(whole)
+        state, lagrangian = running_state(whole)
         part = replace(state, **{name: getattr(state, name)[rows] for name in names})
         natively(DAMPED, part, lagrangian.take(rows), 5)
         for name in ("X", "U", "cost", "merit", "iterations"):
             assert torch.equal(getattr(part, name), getattr(all_of_them, name)[rows]), name
 
 
-def test_a_problem_of_its_own_has_the_bits_of_the_batch() -> None:
-    """The cost's tensors have one row there, which nothing picks."""
+def test_a_problem_built_alone_has_the_bits_of_the_batch() -> None:
+    """A cost built for one problem has tensors with one row."""
     cost, whole = each(), with_cost(each())
     own = Each(cost.target[3:4], cost.weight[3:4], cost.shared)
     alone = Problem(whole.dynamics, own, whole.constraints, whole.x0[3:4], whole.N)
-    (a, first), (b, second) = begun(whole), begun(alone)
+    (a, first), (b, second) = running_state(whole), running_state(alone)
     b.X, b.U, b.cost, b.merit = a.X[3:4], a.U[3:4], a.cost[3:4], a.merit[3:4]
     second = replace(second, multipliers=first.take(torch.tensor([3])).multipliers)
     natively(DAMPED, a, first, 5)
@@ -137,24 +137,24 @@ def test_a_problem_of_its_own_has_the_bits_of_the_batch() -> None:
 
 def test_a_neighbour_that_is_not_finite_changes_no_bits() -> None:
     problem = PROBLEMS["by knot"]()
-    want, lagrangian = begun(problem)
-    natively(DAMPED, want, lagrangian, 5)
+    expected, lagrangian = running_state(problem)
+    natively(DAMPED, expected, lagrangian, 5)
     target = problem.cost.own_path.clone()
     target[1] = torch.nan
-    ill = problem._with({"cost": replace(problem.cost, own_path=target)})
-    state, lagrangian = begun(problem)
+    broken = problem._with({"cost": replace(problem.cost, own_path=target)})
+    state, lagrangian = running_state(problem)
     state.X[3] = torch.nan
-    end = natively(DAMPED, state, replace(lagrangian, problem=ill), 5)
+    end = natively(DAMPED, state, replace(lagrangian, problem=broken), 5)
     assert [int(s) for s in end.status] == [0, 0, 0, int(Status.NON_FINITE), 0]
-    assert torch.equal(state.U[1], begun(problem)[0].U[1]) and not torch.equal(state.U[1], want.U[1])
+    assert torch.equal(state.U[1], running_state(problem)[0].U[1]) and not torch.equal(state.U[1], expected.U[1])
     for name in ("X", "U", "merit", "iterations"):
-        assert torch.equal(getattr(state, name)[[0, 2, 4]], getattr(want, name)[[0, 2, 4]]), name
+        assert torch.equal(getattr(state, name)[[0, 2, 4]], getattr(expected, name)[[0, 2, 4]]), name
 
 
 def test_steps_in_states_and_controls_together_are_pytorchs() -> None:
-    """From states that no rollout joins, until one is low enough: at the first step, or some steps later."""
+    """Search from states that are no rollout until the merit is low enough, in one or several steps."""
     problem = planar_batch(B=11, N=30, obstacles=3)[0]
-    state, lagrangian = begun(problem)
+    state, lagrangian = running_state(problem)
     X = state.X + 0.1 * normal(*state.X.shape, seed=40)
     X[:, 0] = problem.x0
     merit = torch.full_like(state.merit, 1e9)
@@ -182,7 +182,7 @@ def test_solve_is_native_for_a_users_own_car_and_cost() -> None:
     assert bool((solution.cost < 0.3 * problem.cost.total(*problem.at_rest)).all())
 
 
-def test_such_a_solve_loads_nothing_that_takes_seconds() -> None:
+def test_a_native_solve_does_not_load_dynamo() -> None:
     code = (
         "import sys, torchgco; from tests.native.users import errands; from dataclasses import replace;"
         "problem = errands(1, 20); solver = torchgco.presets.gco(problem);"
@@ -241,7 +241,7 @@ def with_rows(row: Constraint) -> Problem:
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: with_cost(Looks()), r"cost.stage \(Looks\): expected a function that can be traced"),
         (lambda: with_cost(Jerky()), r"cost.total \(Jerky\)"),
@@ -252,8 +252,8 @@ def with_rows(row: Constraint) -> Problem:
         (lambda: with_rows(Tube(torch.zeros(13, 2), torch.ones(5), slice(1, 1))), "at least one knot"),
     ],
 )
-def test_what_cannot_be_native_is_named_once(make, said: str) -> None:
+def test_parts_that_cannot_be_native_are_named_once(make, message: str) -> None:
     problem = make()
-    with pytest.warns(EagerWarning, match=said) as caught:
+    with pytest.warns(EagerWarning, match=message) as caught:
         assert engine_of(problem) is None and engine_of(problem.in_cost_units()) is None
     assert len(caught) == 1

@@ -20,7 +20,7 @@ B, N = 5, 12
 
 
 def rows_of(own: Tensor, x: Tensor) -> Tensor:
-    """A vector of each problem (B, d) shaped to fit states (B, n), (B, N, n) or samples (B, S, n)."""
+    """A vector per problem (B, d), shaped to fit states (B, n), (B, N, n) or samples (B, S, n)."""
     return own if x.dim() == 2 else own.unsqueeze(1)
 
 
@@ -38,7 +38,7 @@ class Smooth(Cost):
 
 @dataclass(frozen=True)
 class Each(Cost):
-    """A target of each problem, a weight of each, and one for all."""
+    """A target and a weight per problem, and a shared weight."""
 
     target: Tensor  # (B, 4)
     weight: Tensor  # (B, 1)
@@ -58,7 +58,7 @@ class Each(Cost):
 
 @dataclass(frozen=True)
 class ByKnot(Cost):
-    """References by knot, of all problems and of each, and weights that are computed from k."""
+    """References per knot, shared and per problem, and weights computed from k."""
 
     path: Tensor  # (N, 4)
     own_path: Tensor  # (B, N, 2)
@@ -77,7 +77,7 @@ class ByKnot(Cost):
 
 @dataclass(frozen=True)
 class AllAtOnce(ByKnot):
-    """The same for one who takes arange(N) to mean that all stages stand there."""
+    """The same, but any k that is not an int is taken for all stages."""
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         path, own = (self.path[k], self.own_path[:, k]) if isinstance(k, int) else (self.path, self.own_path)
@@ -98,7 +98,7 @@ class Dense(Cost):
 
 
 class Kinks(Cost):
-    """Terms with kinks, which a start at rest lies on."""
+    """Terms with kinks at rest."""
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         inside = torch.where(u.abs() < 0.5, u.square(), u.abs() - 0.25).sum(-1)
@@ -109,7 +109,7 @@ class Kinks(Cost):
 
 
 class GaussNewton(Smooth):
-    """Brings an expansion of its own."""
+    """Overrides `expand`."""
 
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         n = X.shape[-1]
@@ -123,7 +123,7 @@ class GaussNewton(Smooth):
 
 @dataclass(frozen=True)
 class ScalesItself(Cost):
-    """A number that becomes a tensor where it is scaled."""
+    """Overrides `scaled`, which turns its number into a tensor."""
 
     weight: Any = 2.0
 
@@ -145,7 +145,7 @@ class ScalesItself(Cost):
 
 @dataclass(frozen=True)
 class Around(Cost):
-    """A quadratic cost, and something more."""
+    """Another cost plus a term in states and controls."""
 
     inner: Cost
 
@@ -181,7 +181,7 @@ def around() -> Around:
 
 @dataclass(frozen=True)
 class Tube(Constraint):
-    """|p_k - center_k| within a radius of each problem, at some knots."""
+    """|p_k - center_k| within a radius per problem, at some knots."""
 
     centers: Tensor  # (N+1, 2)
     radius: Tensor  # (B,)
@@ -207,7 +207,7 @@ class Tube(Constraint):
 
 
 class Power(FunctionConstraint):
-    """u_0 v <= 1 / 10, half of it with `value` of its own."""
+    """u_0 v <= 1 / 10 as a function constraint whose overridden `value` halves it."""
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return 0.5 * super().value(X, U)
@@ -244,12 +244,12 @@ def first_step() -> Problem:
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "smooth": lambda: with_cost(Smooth()),
-    "one of each problem": lambda: with_cost(each()),
+    "per problem": lambda: with_cost(each()),
     "by knot": lambda: with_cost(by_knot()),
     "all at once": lambda: with_cost(by_knot(AllAtOnce)),
     "dense": lambda: with_cost(Dense(0.4 * normal(8, 6, seed=29))),
     "kinks": lambda: with_cost(Kinks()),
-    "an expansion of its own": lambda: with_cost(GaussNewton()),
+    "overridden expand": lambda: with_cost(GaussNewton()),
     "scales itself": lambda: with_cost(ScalesItself()),
     "around a quadratic one": lambda: with_cost(around()),
     "constraints": with_constraints,
@@ -264,7 +264,7 @@ def unicycle(x: Tensor, u: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Errand(Cost):
-    """To a target of each problem, the more urgent the later; fast turns are expensive."""
+    """Distance to a target per problem, with a weight that grows with k; fast turns are expensive."""
 
     target: Tensor  # (B, 2)
 
@@ -282,7 +282,7 @@ class Errand(Cost):
 
 
 def errands(B: int = 2, N: int = 100) -> Problem:
-    """Unicycles that drive through five discs."""
+    """Unicycles that drive between five discs."""
     start, target = torch.zeros(2, B, 4, dtype=torch.float64)
     start[:, 1], target[:, 0], target[:, 1] = 0.3 * normal(B, seed=30), 5.0, 0.3 * normal(B, seed=31)
     centers = [[1.5, 0.3], [2.2, -0.6], [3.0, 0.5], [3.8, -0.3], [2.7, 1.4]]

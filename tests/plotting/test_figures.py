@@ -35,7 +35,7 @@ def test_figures_need_no_pyplot() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_a_solver_keeps_its_colour_in_any_company() -> None:
+def test_a_solver_keeps_its_colour_among_any_others() -> None:
     names = ["gco", "al_ilqr", "mine", "fatrop"]
     together = solver_colours(names)
     assert together == solver_colours(names[::-1])
@@ -102,7 +102,7 @@ def test_violations_are_counted_by_decade_from_the_floor_on() -> None:
 
 
 @pytest.mark.parametrize("histogram", [clearance_histogram, violation_histogram])
-def test_a_histogram_of_nothing_finite_says_so(histogram: Any) -> None:
+def test_a_histogram_of_non_finite_values_has_no_bars(histogram: Any) -> None:
     (ax,) = histogram(trials({"clearance": np.nan, "violation": np.nan})).axes
     assert sum(bar.get_height() for bar in bars(ax)) == 0 and "gco 1" in ax.get_xlabel()
 
@@ -120,7 +120,7 @@ def straight(count: int = 3, knots: int = 5, n: int = 6) -> np.ndarray:
 
 
 def discs(ax: Axes) -> list[float]:
-    """Radii of all obstacles drawn in a panel, ghosts included."""
+    """Radii of all obstacles drawn in a panel, the faded copies of moving ones included."""
     paths = [path for held in ax.collections for path in held.get_paths()]
     return sorted(round(float(np.ptp(path.vertices[:, 0])) / 2, 6) for path in paths)
 
@@ -133,11 +133,11 @@ ENDS = trials(
 )
 
 
-def test_a_panel_per_layout_with_obstacles_ends_and_a_path_per_solver() -> None:
+def test_a_panel_per_layout_with_obstacles_ends_and_a_trajectory_per_solver() -> None:
     figure = layout_grid(plane(), {"gco": straight(), "mine": straight()}, ENDS, columns=2, rows=2)
     assert [ax.get_title(loc="left") for ax in figure.axes] == ["layout 0", "layout 1", "layout 2"]
     ax = figure.axes[0]
-    assert discs(ax) == [0.1, 0.15], "one obstacle, at its radius and with the vehicle's; the absent one isn't there"
+    assert discs(ax) == [0.1, 0.15], "one obstacle, at its radius and with the vehicle's; the absent one is not drawn"
     rings = [patch.get_radius() for patch in ax.patches if isinstance(patch, Circle)]
     assert rings == [0.3]
     points = [tuple(line.get_xydata()[0]) for line in ax.lines if line.get_marker() in ("s", "*")]
@@ -145,7 +145,7 @@ def test_a_panel_per_layout_with_obstacles_ends_and_a_path_per_solver() -> None:
     assert sum(len(line.get_xdata()) == 5 for line in ax.lines) == 2
 
 
-def test_paths_that_fail_are_dashed_and_end_in_a_mark() -> None:
+def test_failed_trajectories_are_dashed_and_end_in_a_mark() -> None:
     figure = layout_grid(plane(), {"mine": straight()}, ENDS)
     looks = []
     for ax in figure.axes:
@@ -164,12 +164,12 @@ def test_a_solver_without_a_trajectory_is_marked_at_the_start() -> None:
     assert [tuple(line.get_xydata()[0]) for line in ax.lines if line.get_marker() == "X"] == [(0, 0)]
 
 
-def test_only_so_many_layouts_are_shown() -> None:
+def test_at_most_rows_times_columns_layouts_are_shown() -> None:
     table = trials(*flights("gco", [True] * 9))
     assert len(layout_grid(plane(9), {"gco": straight(9)}, table, columns=2, rows=2).axes) == 4
 
 
-def test_ids_tell_which_trial_belongs_to_a_layout() -> None:
+def test_ids_assign_trials_to_layouts() -> None:
     layouts = plane(2, layout=np.array([2, 0]))
     axes = layout_grid(layouts, {"mine": straight(2)}, ENDS).axes
     assert [ax.get_title(loc="left") for ax in axes] == ["layout 2", "layout 0"]
@@ -184,20 +184,20 @@ def test_ends_may_differ_by_layout() -> None:
     assert stars == [(1, 1), (2, 0), (0, 2)]
 
 
-def test_a_path_that_runs_away_does_not_shrink_the_map() -> None:
+def test_a_diverging_trajectory_does_not_shrink_the_map() -> None:
     states = straight()
     states[1, -1] = 1e6
     ax = layout_grid(plane(), {"gco": states}, ENDS).axes[0]
     assert ax.get_xlim()[1] < 3 and ax.get_xlim()[0] < 0 and ax.get_ylim()[1] > 1.3
 
 
-def test_moving_obstacles_leave_a_fading_path() -> None:
+def test_moving_obstacles_leave_a_fading_trail() -> None:
     velocities = np.zeros((3, 2, 2))
     velocities[1, 0] = [0.1, 0.0]
     axes = layout_grid(plane(velocities=velocities), {"gco": straight()}, ENDS).axes
     assert len(discs(axes[0])) == 2 and len(discs(axes[1])) > 3
-    way = next(line for line in axes[1].lines if line.get_linestyle() == ":")
-    assert way.get_xydata() == pytest.approx(np.array([[0.5, 0.5], [0.7, 0.5]])), "4 stages of 0.5 s at 0.1 m/s"
+    trail = next(line for line in axes[1].lines if line.get_linestyle() == ":")
+    assert trail.get_xydata() == pytest.approx(np.array([[0.5, 0.5], [0.7, 0.5]])), "4 stages of 0.5 s at 0.1 m/s"
     alphas = [held.get_alpha() for held in axes[1].collections[:4]]
     assert alphas == sorted(alphas), "the farther in time, the fainter"
 
@@ -212,7 +212,7 @@ def test_in_space_obstacles_are_shaded_by_height_highest_on_top() -> None:
     fills = panel.collections[-2]
     radii = [round(float(np.ptp(path.vertices[:, 0])) / 2, 6) for path in fills.get_paths()]
     low, high = fills.get_facecolor()[:, :3].sum(axis=1)
-    assert radii == [0.2, 0.1] and low > high, "drawn from the lowest to the highest, and darker"
+    assert radii == [0.2, 0.1] and low > high, "the highest is drawn last and darkest"
 
 
 def test_trajectories_that_do_not_fit_are_refused() -> None:
@@ -222,8 +222,8 @@ def test_trajectories_that_do_not_fit_are_refused() -> None:
         layout_grid(plane(), {"other": straight()}, ENDS)
 
 
-def trace(cost: list[float], outer: list[int], guided: list[int], element: int = 0) -> pd.DataFrame:
-    rows = {"element": element, "iteration": range(len(cost)), "outer": outer, "cost": cost}
+def trace(cost: list[float], outer: list[int], guided: list[int], problem: int = 0) -> pd.DataFrame:
+    rows = {"element": problem, "iteration": range(len(cost)), "outer": outer, "cost": cost}
     return pd.DataFrame(rows).assign(guided=np.array(guided, bool), merit=cost, violation=0.0)
 
 
@@ -253,8 +253,8 @@ def test_costs_of_many_magnitudes_are_drawn_logarithmically() -> None:
     assert ax.get_yscale() == "log"
 
 
-def test_the_first_problems_are_shown_or_those_asked_for() -> None:
-    rows = pd.concat([trace([2.0, 1.0], [0, 0], [0, 0], element) for element in (3, 5, 7, 9, 11)])
+def test_the_first_or_the_requested_problems_are_shown() -> None:
+    rows = pd.concat([trace([2.0, 1.0], [0, 0], [0, 0], problem) for problem in (3, 5, 7, 9, 11)])
     titles = [ax.get_title(loc="left") for ax in convergence_figure(rows).axes]
     assert titles == ["problem 3", "problem 5", "problem 7", "problem 9"]
     (ax,) = convergence_figure(rows, [11]).axes

@@ -1,4 +1,4 @@
-"""Quadratic programs by trying every set of rows: slow, obvious, and exact for a handful of rows."""
+"""Quadratic programs by trying every set of active rows: slow, simple, and exact for few rows."""
 
 from itertools import chain, combinations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def quadratic_program(H, g, A, c, equality):
-    """d (v) and lam (q) of min g'd + 1/2 d'Hd with A d + c <= 0, or = 0 where `equality` (q) says so."""
+    """d (v) and lam (q) of min g'd + 1/2 d'Hd with A d + c <= 0, or = 0 where `equality` (q) is true."""
     q, best = len(c), None
     free = [i for i in range(q) if not equality[i]]
     for chosen in chain.from_iterable(combinations(free, r) for r in range(len(free) + 1)):

@@ -1,4 +1,4 @@
-"""Algorithm 1, the augmented Lagrangian method, and Algorithm 4, the same with the guidance in between."""
+"""Algorithm 1, the augmented Lagrangian method, and Algorithm 4, the same with guidance between its solves."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from tests.reference.problem import rollout
 
 @dataclass(frozen=True)
 class Schedule:
-    """Limits and penalty growth, Tables A3 and 4. `nu` None stands for eta^2, as in the tables."""
+    """Limits and penalty growth, Tables A3 and 4. `nu` None means eta^2, as in the tables."""
 
     outer_iterations: int = 20
     mu0: float = 20.0
@@ -26,9 +26,9 @@ class Schedule:
 
 @dataclass
 class OuterIteration:
-    """One outer iteration: what was in force during its iLQR solve, and what came of it.
+    """One outer iteration: the inputs of its iLQR solve, and its results.
 
-    lam, mu, guide (None: not used), mu_gco: in force. X, U, cost (L_M), status, inner: results of that solve.
+    Inputs: lam, mu, guide (None: not used), mu_gco. Results: X, U, cost (L_M), status, inner.
     J: the knots of X with two or more active spheres, from which the next guide is made.
     """
 

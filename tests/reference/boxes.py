@@ -1,4 +1,4 @@
-"""Distances from boxes, one at a time: by the box's own sides, and by walking along segments."""
+"""Distances from one box at a time: of points in the box's frame, of segments by dense sampling."""
 
 from __future__ import annotations
 
@@ -35,5 +35,5 @@ def distance(p: Array, center: Array, half: Array, rotation: Array | float | Non
 def segment_distance(
     a: Array, b: Array, center: Array, half: Array, rotation: Array | float | None = None, samples: int = 2001
 ) -> float:
-    """Smallest distance along a segment, never too small: by dense sampling."""
+    """Smallest distance over samples of a segment: an upper bound of the true one."""
     return min(distance(a + s * (b - a), center, half, rotation) for s in np.linspace(0, 1, samples))

@@ -1,4 +1,4 @@
-"""Where the local solver is caught (F_k, J) and Algorithm 5, which says where to go (CPUF)."""
+"""Detection of caught knots (F_k, J), and Algorithm 5 (CPUF), which makes the guide region."""
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def cpuf(problem, X, U, z, settings, r_vehicle, r_far=R_FAR):
 
 
 def cpuf_hook(problem, noise, settings, r_vehicle, r_far=R_FAR):
-    """The `guidance` of `augmented_lagrangian.solve`; noise(outer) -> z (K, N, m), if J is not empty."""
+    """The `guidance` of `augmented_lagrangian.solve`; noise(outer) -> z (K, N, m), called only if J is not empty."""
 
     def guidance(outer, X, U):
         z = noise(outer) if stuck_knots(problem, X) else None

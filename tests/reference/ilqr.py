@@ -15,7 +15,7 @@ ZERO_DECREASE = 1e-14
 
 @dataclass
 class Backward:
-    """Gains K (N, m, n), d (N, m), the two sums of the expected decrease, and mu_r they were found with."""
+    """Gains K (N, m, n), d (N, m), the two sums of the expected decrease, and the mu_r used."""
 
     K: np.ndarray
     d: np.ndarray
@@ -71,7 +71,7 @@ def backward(problem, X, U, lam, mu, guide, mu_gco, mu_r):
         Q_uu = L.uu + f_u.T @ V_xx @ f_u
 
         regular = Q_uu + mu_r * np.eye(m)
-        np.linalg.cholesky(regular)  # only to learn whether it fails
+        np.linalg.cholesky(regular)  # raises LinAlgError where it is not positive definite
         d = -np.linalg.solve(regular, Q_u)
         K = -np.linalg.solve(regular, Q_ux)
 
@@ -85,7 +85,7 @@ def backward(problem, X, U, lam, mu, guide, mu_gco, mu_r):
 
 
 def regularised_backward(problem, X, U, lam, mu, guide, mu_gco):
-    """Lines 3-13: the first mu_r of the ladder for which every stage factors, or None past its end."""
+    """Lines 3-13: the first mu_r of REGULARISATION for which every stage factors, or None."""
     for mu_r in REGULARISATION:
         try:
             return backward(problem, X, U, lam, mu, guide, mu_gco, mu_r)
@@ -108,7 +108,7 @@ def line_search(problem, X, U, J_prev, gains, lam, mu, guide, mu_gco):
     """Lines 14-24: halve alpha until eps is within its limits, or alpha < 1e-4: then step anyway."""
     alpha = 1.0
     while True:
-        # A long step may overflow; nan and inf fail the test on eps, which is all that is asked of them.
+        # A long step may overflow; nan and inf then fail the test on eps.
         with np.errstate(over="ignore", invalid="ignore"):
             X_new, U_new = forward(problem, X, U, gains, alpha)
             J_curr = lagrangian(problem, X_new, U_new, lam, mu, guide, mu_gco)

@@ -10,7 +10,7 @@ from tests.reference.problem import constraint_rows, cost
 
 @dataclass
 class Multipliers:
-    """lambda: spheres (N, M) for knots 1..N, bounds (N, 2m), and one array (p,) for each users' function."""
+    """lambda: spheres (N, M) for knots 1..N, bounds (N, 2m), and one array (p,) for each user function."""
 
     spheres: np.ndarray
     bounds: np.ndarray
@@ -58,7 +58,7 @@ def guide_value(problem, k, x, guide):
 
 
 def guide_acts(problem, k, guide):
-    """Neither the given x_0 nor the terminal knot carries guidance."""
+    """Whether guidance acts at knot k: neither at the given x_0 nor at the terminal knot."""
     return guide is not None and 1 <= k <= problem.N - 1
 
 
@@ -101,7 +101,7 @@ def cost_expansion(problem, k, x, u):
 
 
 def expansion(problem, k, x, u, lam, mu, guide=None, mu_gco=0.0):
-    """Knot k's part of Eqs. (31)-(37) but for V: cost, Gauss-Newton constraint terms, guide."""
+    """Knot k's terms of Eqs. (31)-(37) without V: cost, Gauss-Newton constraint terms, guide."""
     L = cost_expansion(problem, k, x, u)
     for row in constraint_rows(problem, k, x, u):
         rho = penalty_weight(row, lam.of(row), mu)

@@ -12,7 +12,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class QuadrotorParameters:
-    """Table 2 of the paper, SI units. `inertia` (3, 3); `hover_rpm`, the speed that hovers, fixes b."""
+    """Table 2 of the paper, SI units. `inertia` (3, 3); the hover speed `hover_rpm` determines b."""
 
     mass: float = 1.608
     inertia: np.ndarray = field(
@@ -141,7 +141,7 @@ def plant_step(dt, parameters=None, integrator=None):
 
 
 def first_step_consistency(w0, F0, T_s, parameters=None):
-    """The equality imposed at knot 1 of the plan: returns g(x1) -> (3), zero where the rotors can do it.
+    """The equality imposed at knot 1 of the plan: returns g(x1) -> (3), zero where the rotors can produce x1's rates.
 
     0 = w(t1) - w(t0) - J^-1 (T F(t0) - w x (J w) - D w) T_s, all but w(t1) known. w0 (3), F0 (4), x1 (14).
     """

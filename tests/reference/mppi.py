@@ -9,7 +9,7 @@ from tests.reference.problem import cost, rollout
 
 @dataclass(frozen=True)
 class MppiSettings:
-    """sigma (m): diagonal of the covariance Sigma; lower, upper (m): where samples saturate (no bounds)."""
+    """sigma (m): diagonal of the covariance Sigma; lower, upper (m): where samples saturate, infinite for no bounds."""
 
     sigma: np.ndarray
     lower: np.ndarray

@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass
 class ReferenceProblem:
-    """min J_var(X, U) s.t. x_{k+1} = step(x_k, u_k), x_0 = x0, spheres, control bounds, users' constraints.
+    """min J_var(X, U) s.t. x_{k+1} = step(x_k, u_k), x_0 = x0, spheres, control bounds, user constraints.
 
     Shapes: Q, S (n, n) and R (m, m) symmetric; q, q_N (n), r (m), H (m, n) default to zero; x_ref (N+1, n)
     or (n); u_ref (N, m) or (m); centers, velocities (M, d); an obstacle's centre at knot k is
@@ -167,7 +167,7 @@ def bound_rows(problem, k, u):
 
 
 def function_rows(problem, k, x, block):
-    """Users' functions of the state at knot k; multiplier i is the entry in the list, j the component."""
+    """User functions of the state at knot k; multiplier i is the entry in the list, j the component."""
     rows = []
     for i, (knot, function) in enumerate(getattr(problem, block)):
         if knot == k:

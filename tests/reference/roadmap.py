@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 def segment_gap(a: Array, b: Array, centers: Array, distances: Array, samples: int = 4001) -> float:
-    """Smallest distance of the segment a to b from all spheres, by walking along it."""
+    """Smallest distance of the segment a to b from all spheres, by sampling it."""
     points = a + np.linspace(0, 1, samples)[:, None] * (b - a)
     return float((np.linalg.norm(points[:, None] - centers, axis=-1) - distances).min())
 
@@ -37,7 +37,7 @@ def path_length(path: Array) -> float:
 
 
 def point_along(path: Array, length: float) -> Array:
-    """The point at one arc length, walking from corner to corner."""
+    """The point at one arc length from the start of a polyline."""
     for a, b in pairwise(path):
         step = float(np.linalg.norm(b - a))
         if length <= step and step > 0:

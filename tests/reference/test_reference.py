@@ -1,4 +1,4 @@
-"""The NumPy reference against finite differences, SciPy, dense linear algebra and cases done by hand."""
+"""The NumPy reference against finite differences, SciPy, dense linear algebra and hand-made cases."""
 
 from itertools import pairwise
 
@@ -98,7 +98,7 @@ def random_multipliers(problem, seed=0):
 
 
 def some_guide(problem):
-    """Acts at knots 0, 4 and N, were 0 and N not exempt."""
+    """A guide with small radii at knots 0, 4 and N; 0 and N are exempt."""
     guide = Guide(np.zeros((problem.N + 1, 2)), np.full(problem.N + 1, 1e6))
     guide.p[:] = 0.4
     guide.r[[0, 4, problem.N]] = 0.05
@@ -568,7 +568,7 @@ def test_a_failed_stage_restarts_the_pass_with_a_larger_mu_r_for_all_stages():
     np.testing.assert_allclose(record.U, forward(problem, X, U, gains, record.alpha)[1])
 
 
-def test_hopeless_and_non_finite_elements_end_with_a_status():
+def test_hopeless_and_non_finite_problems_end_with_a_status():
     hopeless = scalar_problem(lambda x, u: x + u, R=-1e11)
     U = np.ones((1, 1))
     result = ilqr(hopeless, rollout(hopeless, U), U, Multipliers.zeros(hopeless), 1.0)
@@ -656,7 +656,7 @@ def test_schedule_and_records():
 
 
 def integrator(**options):
-    """p+ = p + u in the plane, N = 2, costs u only: everything about MPPI can be done by hand."""
+    """p+ = p + u in the plane with N = 2 and a cost of u alone, so that MPPI can be computed by hand."""
     zero = np.zeros((2, 2))
     return ReferenceProblem(
         lambda x, u: x + u, np.zeros(2), 2, zero, np.eye(2), zero, np.zeros(2), np.zeros(2), **options
@@ -668,8 +668,8 @@ def test_mppi_by_hand():
     settings = MppiSettings(np.array([4.0, 9.0]), np.array([-1.5, -9]), np.array([2.5, 9]), 2.0, 100.0)
     U = np.array([[1.0, 0.0], [0.5, 0.0]])
     z = np.array([[[1.0, 0], [0, 0]], [[-0.25, 0], [0, 1.0]]])
-    # Sample 0: eps = 2 at stage 0, v = 3 cut to 2.5; x = 2.5, 3.0: touches at knot 1, hits at 2.
-    # Its likelihood uses the drawn 2: 2 * 1 * 2 / 4. Sample 1: v = (0.5, 0), (0.5, 3).
+    # Sample 0: eps = 2 at stage 0, v = 3 clipped to 2.5; x = 2.5, 3.0: touches at knot 1, collides at 2.
+    # Its score uses the drawn eps = 2: 2 * 1 * 2 / 4. Sample 1: v = (0.5, 0), (0.5, 3).
     S = np.array([1.0 + (6.25 + 0.25) / 2 + 200, -0.25 + 0.25 / 2 + 9.25 / 2])
     result = mppi(problem, U, z, settings)
     np.testing.assert_allclose(result.S, S, rtol=1e-14)
@@ -711,7 +711,7 @@ def test_detection_by_hand():
 
 
 def trap():
-    """Two discs that overlap across the path: their gradients cancel between them. Too slow to jump across."""
+    """Two overlapping discs across the path, whose gradients cancel; the vehicle is too slow to jump across."""
     discs = dict(centers=[[0.0, 0.25], [0.0, -0.25]], contact=[0.4, 0.4])
     return point_mass(20, 0.1, (-1.0, 0.0), R=0.001, u_lower=[-6.0, -6], u_upper=[6.0, 6], **discs)
 

@@ -1,4 +1,4 @@
-"""Boxes in layout files: read, checked, joined, made into problems, drawn."""
+"""Boxes in layout files: reading, checking, joining, plotting, and the problems made from them."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_parts_with_and_without_boxes_are_joined() -> None:
     assert concatenate([in_space(), in_space(box_rotations=None)]).box_rotations[1, 0].tolist() == [1, 0, 0, 0]
 
 
-def test_a_task_has_them_as_obstacles() -> None:
+def test_a_task_has_boxes_as_obstacles() -> None:
     task = CAR.task(example())
     (boxes,) = (c for c in task.problem.constraints if isinstance(c, BoundBoxes))
     assert boxes.absent.tolist() == [[False, False], [False, True]] and boxes.vehicle_radius.tolist() == [0.06] * 2
@@ -98,15 +98,15 @@ ERRORS = {
     ),
     "turns": (dict(box_rotations=np.zeros((2, 2, 4))), "layouts.box_rotations: expected shape (2, 2): angles"),
     "no angle": (dict(box_rotations=np.full((2, 2), NAN)), "layouts.box_rotations: expected finite angles"),
-    "words": (dict(box_centers="here"), "layouts.box_centers: expected an array of real numbers"),
+    "text": (dict(box_centers="here"), "layouts.box_centers: expected an array of real numbers"),
 }
 
 
-@pytest.mark.parametrize(("changes", "told"), ERRORS.values(), ids=ERRORS.keys())
-def test_malformed_boxes_are_named(changes: dict, told: str) -> None:
+@pytest.mark.parametrize(("changes", "message"), ERRORS.values(), ids=ERRORS.keys())
+def test_malformed_boxes_are_named(changes: dict, message: str) -> None:
     with pytest.raises(InputError) as caught:
         example(**changes)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -116,7 +116,7 @@ def test_a_quaternion_of_another_length_is_named() -> None:
 
 
 def test_an_outline_from_above() -> None:
-    (box,) = outlines(in_space().arrays(), 0)  # turned by 90 degrees about x: 0.6 m wide along y now
+    (box,) = outlines(in_space().arrays(), 0)  # rotated by 90 degrees about x: 0.6 m wide along y
     assert box.height == 1.0
     assert sorted(map(tuple, box.corners.round(12))) == [(-0.1, -0.3), (-0.1, 0.3), (0.1, -0.3), (0.1, 0.3)]
     ring = box.grown(0.5)

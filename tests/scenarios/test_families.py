@@ -1,4 +1,4 @@
-"""The random families: their rules, their seeding, and agreement with the public draws of the same rules."""
+"""The random families: their rules, their seeding, and agreement with the public layouts drawn by the same rules."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,19 +27,19 @@ def names(scenario) -> str:
 
 
 def present(layouts: Layouts) -> np.ndarray:
-    """Centres of all obstacles that are there, (count, d)."""
+    """Centres (count, d) of all present obstacles."""
     return layouts.centers[~np.isnan(layouts.radii)]
 
 
 def nearest(layouts: Layouts, state: np.ndarray) -> float:
-    """Smallest distance of a centre to the position in `state` (L, n)."""
+    """Smallest distance of a centre from the position in `state` (L, n), over all layouts."""
     position = state[:, None, : layouts.dimension]
     return float(np.nanmin(np.linalg.norm(layouts.centers - position, axis=-1)))
 
 
 @pytest.mark.parametrize("scenario", FAMILIES, ids=names)
 class TestSeeding:
-    def test_independent_of_companions(self, scenario):
+    def test_independent_of_other_layouts(self, scenario):
         many = scenario.draw(range(20), seed=3)
         assert many.ids.tolist() == list(range(20)) and many.name == scenario.name
         assert scenario.draw([17], seed=3) == many.take([17])
@@ -75,7 +75,7 @@ def test_stream_of_a_number():
 
 @pytest.mark.parametrize(("family", "scenario"), PUBLIC.items(), ids=PUBLIC)
 def test_task_is_the_public_one(family, scenario):
-    """Start, goal, radii, horizon: everything but the centres; quadrotor bounds are left to the model."""
+    """Start, goal, radii and horizon are equal; control bounds too in the plane, else the model sets them."""
     file, drawn = Layouts.load(DATA / f"{family}.npz"), scenario.draw(range(32), seed=0)
     for name in ("start", "goal", "vehicle_radius", "goal_radius", "dt", "stages"):
         assert np.array_equal(getattr(drawn, name), getattr(file, name)), name
@@ -124,7 +124,7 @@ def test_forest_fills_its_region(scenario):
         assert high >= drawn.centers[..., axis].max() > high - 0.05
 
 
-def test_forest_keeps_clear_where_it_matters():
+def test_forest_keeps_clear_of_start_and_goal():
     drawn = Forest(region=[[-3, 22], [-1, 3], [-1, 1]], clearance=2.0).draw(range(100), seed=0)
     assert drawn.start is not None and drawn.goal is not None
     assert 2.0 < nearest(drawn, drawn.start) < 2.1 and 2.0 < nearest(drawn, drawn.goal) < 2.1
@@ -151,17 +151,17 @@ def test_moving_forest():
 
 
 def grid_of(layouts: Layouts) -> list[np.ndarray]:
-    """The values each coordinate takes."""
+    """The distinct values of each coordinate."""
     return [np.unique(np.round(present(layouts)[:, axis], 9)) for axis in range(3)]
 
 
-def test_walls_stand_on_the_public_grid():
+def test_walls_are_on_the_public_grid():
     file, drawn = Layouts.load(DATA / "walls.npz"), Walls().draw(range(64), seed=0)
     for ours, theirs in zip(grid_of(drawn), grid_of(file), strict=True):
         assert ours == pytest.approx(theirs)
     counts = [(~np.isnan(layouts.radii)).sum(axis=1) for layouts in (drawn, file)]
     assert counts[0].mean() == pytest.approx(counts[1].mean(), abs=5 * counts[1].std() / np.sqrt(32))
-    assert drawn.radii.shape == (64, 196)  # two full grids, whatever was left out
+    assert drawn.radii.shape == (64, 196)  # two full grids, holes as NaN
 
 
 def test_walls_have_one_round_hole_each():
@@ -184,7 +184,7 @@ def test_walls_by_other_parameters():
 
     assert count(holes=0) == 2 * 14 * 7
     assert count(holes=0, positions=[5.0]) == 14 * 7
-    assert count(holes=0, pitch=1.0) == 2 * 13 * 7  # both ends of both axes
+    assert count(holes=0, pitch=1.0) == 2 * 13 * 7  # a grid includes both ends of an axis
     assert count(holes=0, extent=[[0.0, 0.3], [0.0, 0.0]], pitch=0.1) == 2 * 4  # 0.3 / 0.1 is just under 3
     assert count(holes=3) < count(holes=1) < count(holes=1, hole_radius=0.5)
     pinned = present(Walls(hole_region=[[1.0, 1.0], [0.0, 0.0]]).draw([0], seed=0))
@@ -254,8 +254,8 @@ def test_refuses(make, message):
     assert message in str(caught.value)
 
 
-def test_plain_tuples_whatever_came():
-    """Lists, arrays and a config's own list type become tuples of floats: a scenario can be hashed."""
+def test_sequences_become_plain_tuples():
+    """Lists, arrays and OmegaConf's lists become tuples of floats, so that a scenario can be hashed."""
     omegaconf = pytest.importorskip("omegaconf")
     config = omegaconf.OmegaConf.create({"region": [[2, 16], [-1, 3], [-1, 1]], "start": [-1, 1, 0]})
     forest = Forest(region=config.region, start=config.start, goal=np.array([20, 1, 0.2]))  # type: ignore
@@ -265,7 +265,7 @@ def test_plain_tuples_whatever_came():
     assert PlanarTrap(control_lower=None).draw([0], 0).control_lower is None
 
 
-def test_a_scenario_of_ones_own():
+def test_a_users_own_scenario():
     @dataclass(frozen=True)
     class Pair(Scenario):
         name: str = "pair"

@@ -1,4 +1,4 @@
-"""Layouts: what they accept, what they refuse and in which words, files, taking, padding and joining."""
+"""Layouts: accepted and refused input, error messages, files, taking, padding and joining."""
 
 import os
 from dataclasses import replace

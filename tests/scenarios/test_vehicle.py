@@ -1,4 +1,4 @@
-"""A vehicle and layouts make planning problems; what the layouts leave open, the vehicle knows."""
+"""A vehicle and layouts make planning problems; values missing in the layouts come from the vehicle."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def vehicle(name: str):
 
 
 def test_public_layouts_make_the_published_problem() -> None:
-    """Every number of the file arrives in the problem."""
+    """The problem has the numbers of the file."""
     layouts = Layouts.load(ROOT / "benchmarks" / "data" / "forest30.npz")
     task = vehicle("quadrotor").task(layouts)
     problem = task.problem
@@ -32,7 +32,7 @@ def test_public_layouts_make_the_published_problem() -> None:
     assert task.goal[0].tolist() == [20, 1, 0.2] and task.U0[3, 7].tolist() == [0, 0, 0, 9.81]
 
 
-def test_what_the_file_leaves_open_comes_from_the_vehicle() -> None:
+def test_values_missing_in_the_file_come_from_the_vehicle() -> None:
     bare = Layouts(centers=[[[0.0, 0.0]]], radii=[[0.1]])
     task = vehicle("planar").task(bare)
     assert (task.problem.N, task.goal_radius) == (200, 0.3)
@@ -48,7 +48,7 @@ def test_the_layouts_time_step_rules() -> None:
 
 
 @pytest.mark.parametrize(("name", "other"), [("planar", "forest30"), ("quadrotor", "planar_trap")])
-def test_a_misfit_says_which_model_to_give(name: str, other: str) -> None:
+def test_a_mismatch_names_the_model_to_give(name: str, other: str) -> None:
     layouts = Layouts.load(ROOT / "benchmarks" / "data" / f"{other}.npz")
     wanted = "quadrotor" if name == "planar" else "planar"
     with pytest.raises(InputError, match=f"model: expected model={wanted}"):

@@ -15,7 +15,7 @@ from torchgco import (
 
 @pytest.fixture
 def solves(monkeypatch) -> Iterator[list[Solve]]:
-    """All solves from here on."""
+    """All local solves made after this fixture, in order."""
     made, iterate = [], AugmentedLagrangian.iterate
 
     def noted(self, call, guidance=None, penalty=None, *rest, **options):
@@ -28,7 +28,7 @@ def solves(monkeypatch) -> Iterator[list[Solve]]:
 
 @pytest.fixture(scope="module")
 def whole() -> Solution:
-    """By a path, by samples, and attracted to the goal."""
+    """A solution with attempts along a path, from samples, and into the goal."""
     solution = SOLVER.solve(*gates(), seed=3)
     assert solution.guided[PASSES] == 1 < int(solution.guided[SHORT]) and int(solution.guided[CLOSED]) > 1
     return solution

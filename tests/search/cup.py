@@ -16,7 +16,7 @@ WEIGHTS = [5, 5, 1e-8, 1, 1, 1e-8]
 
 
 def cup(B: int = 2, N: int = 100, closed: bool = False, **spheres) -> Problem:
-    """B times the same trap; closed: all around the start."""
+    """B problems with the same trap; `closed`: a ring of discs around the start."""
     if closed:
         angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
         centers, radius = np.stack((-1 + 0.5 * np.cos(angle), 0.5 * np.sin(angle)), axis=-1), 0.08
@@ -34,17 +34,17 @@ def cup(B: int = 2, N: int = 100, closed: bool = False, **spheres) -> Problem:
 
 
 def cups(N: int = 100) -> Problem:
-    """Three that start at different heights."""
+    """Three cups with different starts."""
     x0 = torch.tensor([[-1.0, y, 0, 0, 0, 0] for y in (-0.2, 0.0, 0.1)], dtype=torch.float64)
     return replace(cup(B=3, N=N), x0=x0)
 
 
 def cost(controls: float = 0.1, unit: float = 1.0) -> QuadraticCost:
-    """A cost with some weight of the controls, counted in some unit."""
+    """A quadratic cost; `controls` is the weight of the controls, `unit` multiplies all weights."""
     Q = [unit * w for w in WEIGHTS]
     return QuadraticCost(Q=Q, R=[unit * controls] * 2, Qf=Q, x_ref=[1, 0.4, 0, 0, 0, 0])
 
 
 def controls(problem: Problem) -> Tensor:
-    """Controls of a vehicle at rest."""
+    """Controls (B, N, m) of vehicles at rest."""
     return torch.zeros(problem.B, problem.N, problem.m, dtype=torch.float64)

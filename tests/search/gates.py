@@ -1,4 +1,4 @@
-"""Four vehicles that need different attempts, and a small solver that makes them all."""
+"""Four problems that need different attempts, and a small solver that makes all of these attempts."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ FREE, PASSES, SHORT, CLOSED = range(4)
 
 
 def gates(weight: float = 6.0) -> tuple[Problem, Tensor]:
-    """Four vehicles on the line to a goal: FREE; PASSES a gate on a path; SHORT does so, but its optimum ends short of
-    the goal for this terminal weight; CLOSED in by a ring, where there is no path.
+    """Four vehicles on the line to a goal. FREE meets no obstacle. PASSES is led around a gate by a path. SHORT has the
+    same gate, but its optimum ends short of the goal for this terminal weight. CLOSED is in a ring, without a path.
     """
     angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     centers, radii = np.full((4, 12, 2), np.nan), np.full((4, 12), np.nan)
@@ -60,7 +60,7 @@ def gates(weight: float = 6.0) -> tuple[Problem, Tensor]:
 
 @dataclass
 class Solve:
-    """One of the inner solves of a call."""
+    """One local solve: its call, guidance, penalty and end."""
 
     call: Call
     guidance: Any

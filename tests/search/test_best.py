@@ -1,4 +1,4 @@
-"""The choice among attempts: one that arrives, then one that is feasible, then the cheapest."""
+"""The choice among attempts: arrived before feasible before cheap."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from torchgco.solvers.state import SolveEnd
 
 @dataclass(frozen=True)
 class Given(GCO):
-    """In place of samples the constant controls `levels`, one for each attempt."""
+    """Guidance that proposes constant controls instead of samples: one of `levels` per attempt."""
 
     levels: tuple[float, ...] = ()
 
@@ -36,11 +36,11 @@ class Given(GCO):
         return Advice(penalty, torch.full_like(U, level), torch.ones_like(X[:, 0, 0], dtype=torch.bool))
 
 
-STAYS, ARRIVES = 1e-3, 4.0  # controls: the first are cheap
+STAYS, ARRIVES = 1e-3, 4.0  # constant controls; the first are cheap
 
 
 def given(monkeypatch) -> tuple[Problem, torch.Tensor, AugmentedLagrangian]:
-    """A problem in which moving is expensive, controls like its own, and a solver that improves nothing."""
+    """A problem in which moving is expensive, zero controls, and a solver that improves nothing."""
     monkeypatch.setattr(LineSearch, "ratio_min", 1e9)
     problem, U0 = planar_batch(B=1, N=25, obstacles=3, seed=3)
     cost = QuadraticCost(Q=[1e-3] * 6, R=[5.0, 5.0], Qf=[1, 1, 0, 0, 0, 0], x_ref=[1, 0.4, 0, 0, 0, 0])
@@ -50,7 +50,7 @@ def given(monkeypatch) -> tuple[Problem, torch.Tensor, AugmentedLagrangian]:
 
 
 def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> Solution:
-    """The choice among trajectories that are given, all caught and none improved; `share` counts as having arrived."""
+    """The choice among given trajectories, all caught, none improved; `share` is the goal tolerance."""
     problem, U0, local = given(monkeypatch)
     monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", share)
     monkeypatch.setattr("torchgco.search.restarts.caught_knots", lambda problem, X, *_: torch.ones_like(X[..., 0]) > 0)
@@ -69,7 +69,7 @@ def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> S
         ((ARRIVES, ARRIVES), 0.5, dict(all_attempts=True), 2, ARRIVES),
     ],
 )
-def test_one_that_arrives_is_worth_more_than_a_cheaper_one(
+def test_an_arrived_trajectory_is_preferred_to_a_cheaper_one(
     levels, share, options, attempts, kept, solves: list[Solve], monkeypatch
 ) -> None:
     solution = choose(levels, monkeypatch, share, **options)
@@ -78,8 +78,8 @@ def test_one_that_arrives_is_worth_more_than_a_cheaper_one(
 
 
 @pytest.mark.parametrize("by_arrival", [True, False])
-def test_one_that_arrives_is_kept_within_an_attempt_too(by_arrival: bool, monkeypatch) -> None:
-    """The first inner solve arrives; then guidance replaces it by a trajectory that stays, which is cheaper."""
+def test_an_arrived_iterate_is_kept_within_an_attempt_too(by_arrival: bool, monkeypatch) -> None:
+    """The first inner solve arrives; then guidance replaces it by a cheaper trajectory that stays."""
     monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", 0.5)
     problem, U0, local = given(monkeypatch)
     call = Call.checked(problem, torch.full_like(U0, ARRIVES))
@@ -88,13 +88,13 @@ def test_one_that_arrives_is_kept_within_an_attempt_too(by_arrival: bool, monkey
 
 
 def test_arrived_comes_before_feasible_and_feasible_before_cheap() -> None:
-    """Of two ends, as (arrived, violation, cost): the first is the better one, whichever comes first."""
+    """Of any two ends (arrived, violation, cost), the better one is kept, in either order."""
     problem, U0 = planar_batch(B=1, N=5, obstacles=1)
     call = Call.checked(problem, U0)
 
-    def end(there: bool, violation: float, cost: float) -> SolveEnd:
+    def end(arrived: bool, violation: float, cost: float) -> SolveEnd:
         made = SolveEnd.blank(problem, U0)
-        made.best.X[:, -1, :2] = torch.tensor([1.0, 0.4]) if there else -1.0
+        made.best.X[:, -1, :2] = torch.tensor([1.0, 0.4]) if arrived else -1.0
         made.best.violation[:], made.best.cost[:], made.status[:] = violation, cost, int(cost)
         made.iterations[:], made.outer[:], made.guided[:] = 1, 2, 3
         return made

@@ -1,4 +1,4 @@
-"""The roadmap among boxes: free paths, the same by C and by PyTorch; classes; and walls that are flown through."""
+"""The roadmap among boxes: free paths, the same in C and in PyTorch; classes; and walls with an opening."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.reference import boxes as slow
+from tests.reference import boxes as brute_force
 from torchgco import (
     Boxes,
     ControlBounds,
@@ -33,12 +33,12 @@ from torchgco.search.scene import scales, scene_of
 
 
 def uneven(points: Tensor, rows: slice) -> Tensor:
-    """A price that has no mirror image."""
+    """A price without mirror symmetry."""
     return 1.0 + 0.1 * (points[..., 0] * 0.3 + points[..., 1]).sin()
 
 
 def scene(d: int, B: int = 4, seed: int = 0, spheres: int = 3, boxes: int = 5) -> tuple[Scene, list[np.ndarray]]:
-    """Turned boxes, one absent in every other problem, and spheres within 2 m; and what the boxes are made of."""
+    """Rotated boxes, one absent in every other problem, with spheres; and the boxes' centres, half sizes, rotations."""
     rng = np.random.default_rng(seed)
     plain = Planar(dt=0.1) if d == 2 else QuadrotorPlanning(dt=0.1)
     x0 = torch.zeros(B, plain.n, dtype=torch.float64)
@@ -65,7 +65,7 @@ def scene(d: int, B: int = 4, seed: int = 0, spheres: int = 3, boxes: int = 5) -
 
 @pytest.mark.parametrize("spheres", [0, 3])
 @pytest.mark.parametrize("d", [2, 3])
-def test_ways_are_the_same_by_c_and_by_pytorch_and_free(d: int, spheres: int) -> None:
+def test_paths_are_free_and_the_same_in_c_and_in_pytorch(d: int, spheres: int) -> None:
     s, parts = scene(d, B=6, spheres=spheres)
     roadmap = Roadmap()
     paths, found = roadmap.paths(s, 3)
@@ -85,17 +85,17 @@ def test_ways_are_the_same_by_c_and_by_pytorch_and_free(d: int, spheres: int) ->
                 continue
             for p, q in pairwise(path):
                 if not np.array_equal(p, q):
-                    assert slow.segment_distance(p, q, *box, samples=301) > 0.05 - 1e-9
+                    assert brute_force.segment_distance(p, q, *box, samples=301) > 0.05 - 1e-9
 
 
 def test_without_its_boxes_a_scene_is_that_of_spheres_alone() -> None:
     s, _ = scene(2)
     assert s.boxes is not None
-    nowhere = s.boxes._replace(radius=torch.full_like(s.boxes.radius, FAR))
+    absent_boxes = s.boxes._replace(radius=torch.full_like(s.boxes.radius, FAR))
     for native in (True, False):
         use_native(native)
         try:
-            with_boxes = Roadmap().paths(Scene(s.start, s.goal, s.centers, s.inflated_radii, uneven, nowhere), 2)
+            with_boxes = Roadmap().paths(Scene(s.start, s.goal, s.centers, s.inflated_radii, uneven, absent_boxes), 2)
             alone = Roadmap().paths(Scene(s.start, s.goal, s.centers, s.inflated_radii, uneven), 2)
         finally:
             use_native(True)
@@ -116,7 +116,7 @@ def test_paths_on_either_side_of_a_box_are_of_different_classes() -> None:
 
 
 def wall_in_the_plane(B: int = 2) -> Problem:
-    """A wall across the path, 2.4 m long, with an opening of 0.22 m that isn't straight ahead; a disc behind it."""
+    """A wall across the path with an opening of 0.22 m off the straight line, and a disc behind it."""
     x0 = torch.zeros(B, 6, dtype=torch.float64)
     x0[:, 0], x0[:, 1] = -1.0, torch.linspace(-0.1, 0.1, B, dtype=torch.float64)
     wall = Boxes([[0.0, -0.55], [0.0, 0.92]], [[0.04, 0.75], [0.04, 0.5]], 0.06, [0.0, 0.0])
@@ -135,7 +135,7 @@ def wall_in_space(B: int = 2) -> Problem:
     x0[:, 1] = torch.linspace(0.8, 1.2, B, dtype=torch.float64)
     middle = np.array([5.0, 3.2, 0.3])
     reach, thick, gap = 3.0, 0.2, 0.8
-    turn = np.array([np.cos(np.pi / 4), 0.0, np.sin(np.pi / 4), 0.0])  # about y: the slab's first side becomes its last
+    turn = np.array([np.cos(np.pi / 4), 0.0, np.sin(np.pi / 4), 0.0])  # about y: exchanges the first and last sides
     offsets = [[0, reach + gap, 0], [0, -reach - gap, 0], [0, 0, reach + gap], [0, 0, -reach - gap]]
     sides = [[2 * reach, reach, thick]] * 2 + [[reach, 2 * gap + reach, thick]] * 2
     slabs = Boxes(middle + np.array(offsets), sides, 0.36, np.tile(turn, (4, 1)))

@@ -1,4 +1,4 @@
-"""Candidates of a problem: their order, their depth within obstacles, and those that are left alone."""
+"""Candidates of a problem: their order, their penetration of obstacles, and those that are not live."""
 
 from dataclasses import replace
 
@@ -11,9 +11,9 @@ from torchgco.search.candidates import Candidates
 from torchgco.search.scene import chord_penetration
 
 
-def begun(problem: Problem, U: torch.Tensor, *words: torch.Tensor) -> Candidates:
-    """Candidates with the trajectories of their controls (1, count, N, m)."""
-    candidates = Candidates.begin(problem, U, *words)
+def make_candidates(problem: Problem, U: torch.Tensor, *terms: torch.Tensor) -> Candidates:
+    """Candidates with controls (1, count, N, m) and their rollouts."""
+    candidates = Candidates.begin(problem, U, *terms)
     return replace(candidates, X=open_loop(problem.dynamics, problem.x0.repeat(candidates.count, 1), candidates.U))
 
 
@@ -21,16 +21,16 @@ def test_trajectories_that_are_alike_count_once() -> None:
     problem = cup(B=1)
     U, one = controls(problem).repeat(1, 3, 1, 1).view(1, 3, -1, 2), torch.ones(1, dtype=torch.float64)
     U[:, 2] = -1.0  # drives away, which costs more
-    candidates = begun(problem, U, one, one, torch.ones(1, 3, dtype=torch.bool))
+    candidates = make_candidates(problem, U, one, one, torch.ones(1, 3, dtype=torch.bool))
     first = torch.ones(3, dtype=torch.bool)
     assert candidates.order(first).tolist() == [[0, 1, 2]]
     assert candidates.order(first, alike=1e-3).tolist() == [[0, 2, 1]]
-    first[0] = False  # what isn't sound stands for nobody
+    first[0] = False  # an unsound one does not represent the others
     assert candidates.order(first, alike=1e-3).tolist() == [[1, 2, 0]]
 
 
 def test_obstacles_count_in_the_order(monkeypatch) -> None:
-    """Of two trajectories that start inside a disc, the one that leaves it comes first for the penalty alone."""
+    """Of two trajectories that start inside a disc, only the penalty puts the one that leaves it first."""
     problem = cup(B=2, N=20)
     problem.x0[0, :2] = problem.constraints[0].centers[0, 2]
     U, one = controls(problem)[:, None].repeat(1, 2, 1, 1), torch.full((2,), 1e4, dtype=torch.float64)
@@ -44,12 +44,12 @@ def test_obstacles_count_in_the_order(monkeypatch) -> None:
     assert with_penalty[0].tolist() != candidates.order(first)[0].tolist()
 
 
-def test_what_is_not_live_is_left_as_it_is_and_comes_last() -> None:
+def test_candidates_that_are_not_live_are_unchanged_and_come_last() -> None:
     problem = cup(B=1, N=60)
     R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
     U = controls(problem).repeat(1, 2, 1, 1).view(1, 2, -1, 2)
     U[:, 1] = -1.0  # drives away, which costs more
-    candidates = begun(problem, U, R, unit, torch.tensor([[False, True]]))
+    candidates = make_candidates(problem, U, R, unit, torch.tensor([[False, True]]))
     assert candidates.order(torch.ones(2, dtype=torch.bool)).tolist() == [[1, 0]]
     relaxed, sound = replace(QUICK, relax_iterations=2).relax(candidates)
     assert 1 <= int(relaxed.iterations) <= 2
@@ -69,7 +69,7 @@ def test_picked_candidates_stay_with_their_problem() -> None:
 
 
 def test_the_penetration_of_a_chord() -> None:
-    """A step across a disc is as deep as its middle, whatever lies at its ends; an absent disc counts for nothing."""
+    """A step across a disc penetrates as deep as its deepest point; its end points do not matter."""
     problem = cup(B=1, N=2)
     X = torch.zeros(1, 3, 6, dtype=torch.float64)
     X[0, :, 0] = torch.tensor([-5.0, 5.0, 6.0])

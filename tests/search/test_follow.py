@@ -1,4 +1,4 @@
-"""From paths to trajectories: candidates track them, are relaxed where that serves, and refined to convergence."""
+"""From paths to trajectories: candidates track paths, are relaxed where that helps, and refined to convergence."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
     for tube, stiffness in ((0.05, 20.0), (None, 500.0)):
         options = replace(QUICK, tube=tube, stiffness=(stiffness,), track_iterations=4)
         path = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
-        candidates = options.track(begun(problem, controls(problem)[:, None]), path[:, None])
+        candidates = options.track(make_candidates(problem, controls(problem)[:, None]), path[:, None])
         X = open_loop(problem.dynamics, problem.x0, candidates.U)
         torch.testing.assert_close(candidates.X, X)
         off.append(
@@ -41,19 +41,19 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
     assert off[1] < 0.5 * off[0]
 
 
-def begun(problem: Problem, U: torch.Tensor) -> Candidates:
-    """Live candidates with controls U (1, count, N, m), with radii and units as in the cup."""
+def make_candidates(problem: Problem, U: torch.Tensor) -> Candidates:
+    """Live candidates with controls U (1, count, N, m), and the radius and unit of the cup."""
     R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
     return Candidates.begin(problem, U, R, unit, torch.ones(1, U.shape[1], dtype=torch.bool))
 
 
 def test_every_candidate_tracks_its_own_path_at_its_own_pace() -> None:
-    """Two paths, each from two starts at two paces: eight candidates, the paces of a start next to each other."""
+    """Two paths, each from two starts at two paces: eight candidates; paces vary fastest."""
     problem = cup(B=1, N=120)
     options = replace(QUICK, arrive=(0.9, 0.5), tube=None, stiffness=(1e4,), track_iterations=20)
     ends = (-1.0, 0.0), (1.0, 0.4)
     paths = torch.tensor([[[ends[0], (0.0, y), ends[1]] for y in (-0.9, 1.2)]], dtype=torch.float64)
-    found = options.track(begun(problem, controls(problem)[:, None].repeat(1, 8, 1, 1)), paths)
+    found = options.track(make_candidates(problem, controls(problem)[:, None].repeat(1, 8, 1, 1)), paths)
     for i, X in enumerate(found.X):
         apart = []
         for path in paths[0]:
@@ -81,7 +81,7 @@ def test_candidates_that_are_not_among_the_first_are_not_relaxed(monkeypatch) ->
 
 
 def test_a_candidate_that_falls_back_into_the_trap_is_not_relaxed() -> None:
-    """Flying is so expensive that waiting is cheaper: the candidate stays as it was tracked."""
+    """With such expensive controls, waiting is cheaper: the candidate stays as it was tracked."""
     problem = replace(cup(B=1), cost=cost(controls=20.0))
     tracked, relaxed = (PathProposals(depart=0.1, arrive=0.8, relax_iterations=n).propose(problem).U for n in (0, 20))
     assert torch.equal(tracked, relaxed)
@@ -108,7 +108,7 @@ def test_the_cheapest_refined_candidate_is_proposed_and_saves_the_solver_work() 
     relaxed, refined = (replace(four, refine_top=n).propose(problem) for n in (1, 3))
     verdicts = [judge(problem, proposal.U, GOAL, 0.3) for proposal in (relaxed, refined)]
     assert not bool(verdicts[0].sound.any()) and bool(verdicts[1].sound.all())
-    for k in range(2):  # on either side alone
+    for k in range(2):  # with paths on one side only
         other = judge(problem, alone(replace(four, refine_top=3), problem, k).U, GOAL, 0.3)
         assert bool(other.sound.all()) and bool((verdicts[1].cost <= other.cost).all())
     assert not any(bool(lam.any()) for lam in relaxed.multipliers.lam) and bool(refined.multipliers.lam[0].any())
@@ -121,7 +121,7 @@ def test_the_cheapest_refined_candidate_is_proposed_and_saves_the_solver_work() 
 
 
 def test_a_refined_candidate_that_cuts_through_an_obstacle_between_two_knots_is_rejected(monkeypatch) -> None:
-    """Where nobody keeps such a distance, the best relaxed candidate is proposed as it is."""
+    """If all refined candidates are rejected, the best relaxed one is proposed."""
     problem, one = cup(B=1, N=120), replace(QUICK, num_paths=2, track_iterations=20, refine_top=2)
     refined = one.propose(problem)
     assert bool(refined.found) and bool(refined.multipliers.lam[0].any())

@@ -1,4 +1,4 @@
-"""The roadmap's search in C and in PyTorch: the same paths, also where several cost the same."""
+"""The roadmap's search in C and in PyTorch returns the same paths, also where several cost the same."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def flat(points: Tensor, rows: slice) -> Tensor:
 
 
 def scene(centers, distances, start, goal, price=uneven) -> Scene:
-    """B times the same start and goal among spheres (M, d), or their own (B, M, d)."""
+    """B problems with the same start and goal, among shared spheres (M, d) or their own (B, M, d)."""
     o, R = (torch.as_tensor(np.asarray(v, dtype=float)) for v in (centers, distances))
     ends = (torch.tensor(end, dtype=torch.float64).expand(B, -1) for end in (start, goal))
     return Scene(*ends, o.expand(B, *o.shape[-2:]), R.expand(B, R.shape[-1]), price)
 
 
 def drawn(d: int, M: int, seed: int) -> Scene:
-    """Spheres of several sizes, some of which aren't there."""
+    """Spheres of several sizes, some of them absent."""
     rng = np.random.default_rng(seed)
     R = rng.uniform(0.02, 0.7, (B, M)) * M ** (-1 / d)
     R[rng.uniform(size=R.shape) < 0.2] = FAR
@@ -53,7 +53,7 @@ def drawn(d: int, M: int, seed: int) -> Scene:
 
 
 def lattice(d: int) -> Scene:
-    """Spheres of one size at the corners of a grid that start and goal lie askew to: everything has a mirror image."""
+    """Spheres of one size on a grid, start and goal on its diagonal: every path has a mirror image of equal cost."""
     axis = np.linspace(-0.6, 0.6, 4)
     o = np.stack(np.meshgrid(*[axis] * d), axis=-1).reshape(-1, d)
     return scene(o, np.full(len(o), 0.15), (-1.0,) * d, (1.0,) * d, flat)
@@ -69,8 +69,8 @@ SCENES = {
     **{f"drawn {d}-D, {M} spheres": drawn(d, M, M) for d in (2, 3) for M in (1, 2, 3, 5, 12, 100)},
     "lattice": lattice(2),
     "lattice in space": lattice(3),
-    "nothing there": scene([[0.0, 0.0]] * 3, [FAR] * 3, (-1.0, 0.0), (1.0, 0.0)),
-    "nothing there in space": scene([[0.0, 0.0, 0.0]], [FAR], (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)),
+    "no spheres": scene([[0.0, 0.0]] * 3, [FAR] * 3, (-1.0, 0.0), (1.0, 0.0)),
+    "no spheres in space": scene([[0.0, 0.0, 0.0]], [FAR], (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)),
     "one before many places": scene([[0.0, 0.0]] + [[9.0, 9.0]] * 40, [0.3] + [FAR] * 40, (-1.0, 0.0), (1.0, 0.0)),
     "in the middle": scene([[0.0, 0.0]], [0.4], (-1.0, 0.0), (1.0, 0.0), flat),
     "in the middle of a diagonal": scene([[0.0, 0.0]], [0.4], (-1.0, -1.0), (1.0, 1.0), flat),
@@ -81,7 +81,7 @@ SCENES = {
     "one in another": scene([[0.0, 0.0]] * 3 + [[0.1, 0.0]], [0.3, 0.3, 0.2, 0.1], (-1.0, 0.0), (1.0, 0.0), flat),
     "goal at start": scene([[0.5, 0.0]], [0.2], (0.0, 0.0), (0.0, 0.0)),
     "goal at start in space": scene([[0.5, 0.0, 0.0], [0.0, 0.4, 0.0]], [0.2, 0.1], (0.0,) * 3, (0.0,) * 3),
-    "goal at start, nothing there": scene([[0.5, 0.0]], [FAR], (0.0, 0.0), (0.0, 0.0)),
+    "goal at start, no spheres": scene([[0.5, 0.0]], [FAR], (0.0, 0.0), (0.0, 0.0)),
     "start inside": scene([[-1.0, 0.1], [0.0, 0.0]], [0.3, 0.3], (-1.0, 0.0), (1.0, 0.0)),
     "no path": ring(),
 }
@@ -102,9 +102,9 @@ def test_both_return_the_same_paths(name: str, size: str, monkeypatch: pytest.Mo
         roadmap = Roadmap(num_halton=12)
         for constant, value in {"NODES": 9, "NEIGHBOURS": 3, "HALTON_NEIGHBOURS": 5, "MARGIN": 1.0}.items():
             monkeypatch.setattr(f"torchgco.search.roadmap.{constant}", value)
-    (paths, found), (wanted, exist) = both(roadmap, SCENES[name], 4)
-    assert torch.equal(found, exist)
-    torch.testing.assert_close(paths, wanted, rtol=0, atol=1e-9)
+    (paths, found), (expected, expected_found) = both(roadmap, SCENES[name], 4)
+    assert torch.equal(found, expected_found)
+    torch.testing.assert_close(paths, expected, rtol=0, atol=1e-9)
 
 
 def test_no_path_is_the_straight_line() -> None:
@@ -117,7 +117,7 @@ def test_no_path_is_the_straight_line() -> None:
 
 @pytest.mark.parametrize("name", [name for name in SCENES if name.startswith("drawn") or "lattice" in name])
 def test_both_make_the_same_graph(name: str) -> None:
-    """As matrices of lengths: the order of a point's edges is their own."""
+    """Compared as matrices of lengths, because the order of a point's edges may differ."""
     s = SCENES[name]
     d, made = s.start.shape[1], []
     for search in searches(s.centers, s.inflated_radii, 0.15):
@@ -144,14 +144,14 @@ def chain(points: int) -> Graph:
     return Graph(p, ends, torch.ones(1, points, 1, dtype=torch.float64))
 
 
-def nowhere() -> tuple[Tensor, Tensor]:
+def no_spheres() -> tuple[Tensor, Tensor]:
     return torch.zeros(1, 1, 2, dtype=torch.float64), torch.full((1, 1), FAR, dtype=torch.float64)
 
 
 @pytest.mark.parametrize("edges", [1, 2, HOPS - 1, HOPS, HOPS + 1, HOPS + 2])
-def test_a_path_has_so_many_edges_at_most(edges: int) -> None:
+def test_a_path_has_at_most_hops_edges(edges: int) -> None:
     graph = chain(edges + 1)
-    for search in searches(*nowhere(), 0.15):
+    for search in searches(*no_spheres(), 0.15):
         path, string, arrives = search.cheapest(graph, torch.ones(1, edges + 1, dtype=torch.float64))
         assert bool(arrives) == (edges <= HOPS)
         corners = min(edges, HOPS) if edges <= HOPS else 1
@@ -160,26 +160,26 @@ def test_a_path_has_so_many_edges_at_most(edges: int) -> None:
         assert torch.equal(string[0, 2::2], 0.5 * (path[0, 1:] + path[0, :-1]))
 
 
-def test_of_equals_the_first_is_taken() -> None:
-    """Three paths around, the first two different by rounding alone; the last is cheaper by little, or by less."""
+def test_of_equally_cheap_paths_the_first_is_taken() -> None:
+    """Three paths, the first two equal but for rounding; the last is cheaper by rounding (1e-14) or by more (1e-10)."""
     points = torch.tensor([[[0.0, 0.0], [2.0, 0.0], [1.0, 1.0], [1.0, -1.0], [1.0, 2.0]]], dtype=torch.float64)
     ends = torch.tensor([[[2, 3, 4], [1, 1, 1], [1, 1, 1], [1, 1, 1], [1, 1, 1]]])
     for least, taken in ((1.0 - 1e-14, 2), (1.0 - 1e-10, 4)):
         lengths = torch.ones(1, 5, 3, dtype=torch.float64)
         lengths[0, 0] = torch.tensor([1.0, 1.0 - 1e-15, least], dtype=torch.float64)
-        for search in searches(*nowhere(), 0.15):
+        for search in searches(*no_spheres(), 0.15):
             path, _, arrives = search.cheapest(Graph(points, ends, lengths), torch.ones(1, 5, dtype=torch.float64))
             assert bool(arrives) and torch.equal(path[0, 1], points[0, taken])
 
 
-def test_a_price_that_is_no_number_closes_its_edges() -> None:
+def test_a_nan_price_closes_its_edges() -> None:
     price = torch.ones(1, 5, dtype=torch.float64)
     price[0, 3] = torch.nan
-    for search in searches(*nowhere(), 0.15):
+    for search in searches(*no_spheres(), 0.15):
         assert not bool(search.cheapest(chain(5), price)[2])
 
 
-def test_a_problem_has_its_bits_in_every_batch() -> None:
+def test_a_problem_has_the_same_bits_in_every_batch() -> None:
     s = Scene(*(torch.cat([getattr(drawn(3, 12, seed), name) for seed in range(27)]) for name in (
         "start", "goal", "centers", "inflated_radii",
     )), uneven)  # fmt: skip
@@ -207,7 +207,7 @@ def test_pytorch_searches_in_single_precision_and_without_a_compiler(monkeypatch
     assert library_for(s.centers) is None
     paths, _ = Roadmap().paths(s)
     monkeypatch.undo()
-    monkeypatch.setattr(native, "POINTS", Path(__file__))  # no C
+    monkeypatch.setattr(native, "POINTS", Path(__file__))  # not C code
     native._library.cache_clear()
     with pytest.warns(EagerWarning, match=r"PyTorch's kernels where \w+ are sought"):
         assert library_for(s.centers) is None

@@ -1,4 +1,4 @@
-"""Paths of one class count once: in the plane by how they wind, in space by how far they are apart."""
+"""Paths of one class count once: in the plane by their winding, in space by their distance."""
 
 import torch
 
@@ -15,13 +15,13 @@ def scene(centers: list[list[float]], distances: list[float], B: int = 1) -> Sce
 
 
 def through(*corners: list[float]) -> torch.Tensor:
-    """A path by some corners, its goal repeated."""
+    """A path (P, d) through some corners, padded with its goal."""
     d = len(corners[0])
     ends = [[-1.0] + [0.0] * (d - 1)], [[1.0] + [0.0] * (d - 1)] * (4 - len(corners))
     return torch.tensor([*ends[0], *corners, *ends[1]], dtype=torch.float64)
 
 
-def test_in_the_plane_sides_tell_paths_apart() -> None:
+def test_in_the_plane_paths_on_different_sides_differ() -> None:
     paths = torch.stack([
         through([0.0, 0.5]), through([-0.2, 0.9], [0.4, 0.8]),  # over both discs
         through([0.0, -0.5]),  # under both
@@ -30,11 +30,11 @@ def test_in_the_plane_sides_tell_paths_apart() -> None:
     ])  # fmt: skip
     two = scene([[-0.5, 0.0], [0.5, 0.0]], [0.2, 0.2], B=2)
     assert one_per_class(paths.expand(2, -1, -1, -1), two).tolist() == [[True, False, True, True, False]] * 2
-    one = scene([[-0.5, 0.0], [0.5, 0.0]], [0.2, FAR])  # the second isn't there
+    one = scene([[-0.5, 0.0], [0.5, 0.0]], [0.2, FAR])  # the second is absent
     assert one_per_class(paths[None], one).tolist() == [[True, False, True, False, False]]
 
 
-def test_a_loop_around_a_disc_is_a_path_of_its_own() -> None:
+def test_a_loop_around_a_disc_is_another_class() -> None:
     straight = through([0.0, 0.5])
     loop = through([0.5, 0.5], [0.0, -0.5], [-0.5, 0.5])
     assert one_per_class(torch.stack([straight, loop])[None], scene([[0.0, 0.0]], [0.2])).tolist() == [[True, True]]

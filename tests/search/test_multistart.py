@@ -1,4 +1,4 @@
-"""Many guesses: the best is kept, the budget is kept to, and a problem's guesses are its own."""
+"""MultiStart: the best solution is kept, the budget holds, and a problem's guesses do not depend on its batch."""
 
 from dataclasses import fields, replace
 from itertools import pairwise
@@ -26,7 +26,7 @@ def test_the_best_of_all_starts_is_kept() -> None:
     assert not torch.equal(results[0].U, results[2].U)
 
 
-def test_an_element_has_its_own_guesses_whatever_its_company() -> None:
+def test_a_problem_has_its_own_guesses_in_any_batch() -> None:
     problem, U0 = planar_batch(B=4, N=25, obstacles=8, seed=2)
     whole = MANY.solve(problem, U0, seed=1)
     rows = torch.tensor([3, 1])
@@ -46,7 +46,7 @@ def test_a_spent_budget_ends_the_starts() -> None:
 
 
 def test_the_budget_counts_the_iterations_of_every_start(monkeypatch) -> None:
-    """No start begins with the budget spent, and none is left out while it isn't, as the solves themselves say."""
+    """A start begins if and only if the iterations of the earlier solves are below the budget."""
     made: dict[int, list[int]] = {b: [] for b in range(4)}
     iterate = AugmentedLagrangian.iterate
 
@@ -95,8 +95,8 @@ def test_no_option_is_forgotten_above() -> None:
     assert {f.name for f in fields(MultiStart)} == set(CHANGES)
 
 
-def test_one_that_arrives_is_worth_more_than_a_cheaper_one(monkeypatch) -> None:
-    """Where no step is accepted, every guess stays as it is, and that of the vehicle at rest is the cheapest."""
+def test_an_arrived_trajectory_is_preferred_to_a_cheaper_one(monkeypatch) -> None:
+    """No step is accepted, so that every guess stays as it is; that of the vehicle at rest is the cheapest."""
     problem, U0 = planar_batch(B=4, N=25, obstacles=3, seed=7)
     cost = QuadraticCost(Q=[1e-3] * 6, R=[5.0, 5.0], Qf=[1, 1, 0, 0, 0, 0], x_ref=[1, 0.4, 0, 0, 0, 0])
     problem = replace(problem, cost=cost)
@@ -126,7 +126,7 @@ def test_options_out_of_range_are_named(change: dict, field: str) -> None:
 
 
 @pytest.mark.parametrize("covariance", [-1.0, [1.0, 1.0, 1.0], "wide"])
-def test_a_covariance_that_fits_nothing_is_named(covariance) -> None:
+def test_a_malformed_covariance_is_named(covariance) -> None:
     problem, U0 = planar_batch(B=1, N=10)
     with pytest.raises(InputError, match=r"multistart\.covariance"):
         replace(MANY, covariance=covariance).solve(problem, U0)

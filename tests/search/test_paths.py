@@ -1,4 +1,4 @@
-"""Proposals along paths: they lead to the goal, say where they can't, and count what they cost."""
+"""Proposals along paths: they lead to the goal, report where there is none, and count their iterations."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,8 +24,8 @@ def test_a_proposal_ends_near_the_goal_and_has_a_penalty() -> None:
     assert float(judge(cup(), U, GOAL, 0.3).goal_distance.max()) < 0.3
 
 
-def test_units_are_the_problems_own() -> None:
-    """A problem whose cost is counted in cents has the same proposal, with penalties in cents."""
+def test_a_proposal_scales_with_the_unit_of_cost() -> None:
+    """With 100 times the cost a problem has the same proposal, and 100 times the penalty."""
     problem = cup(B=1)
     cents = replace(problem, cost=cost(unit=100.0))
     one, hundred = (replace(QUICK, track_iterations=1, relax_iterations=0).propose(p) for p in (problem, cents))
@@ -51,7 +51,7 @@ def test_no_problems_have_no_proposals() -> None:
 
 @contextmanager
 def only(k: int) -> Iterator[None]:
-    """Of all paths, the first of class k alone."""
+    """Keep only the first path of class k."""
 
     def one(paths: torch.Tensor, scene) -> torch.Tensor:
         first = one_per_class(paths, scene)
@@ -68,10 +68,10 @@ def alone(options: PathProposals, problem: Problem, k: int):
 
 
 def test_the_cheapest_relaxed_candidate_is_proposed() -> None:
-    """On the left, on the right, and nowhere else; the cheaper of the two sides with both."""
+    """There is a path on the left and one on the right; with both, the cheaper candidate is proposed."""
     problem, many = cup(B=1), replace(QUICK, num_paths=3)
-    left, right, nowhere = (alone(many, problem, k) for k in range(3))
-    assert [bool(p.found) for p in (left, right, nowhere)] == [True, True, False]
+    left, right, neither = (alone(many, problem, k) for k in range(3))
+    assert [bool(p.found) for p in (left, right, neither)] == [True, True, False]
     both, merits = many.propose(problem), []
     for proposal in (left, right, both):
         X = open_loop(problem.dynamics, problem.x0, proposal.U)
@@ -80,7 +80,7 @@ def test_the_cheapest_relaxed_candidate_is_proposed() -> None:
     assert merits[0] != merits[1] and merits[2] == min(merits)
 
 
-def test_many_paths_are_followed_by_chunks_that_nobody_notices(monkeypatch) -> None:
+def test_chunks_change_no_result(monkeypatch) -> None:
     problem, two = cups(N=40), replace(QUICK, num_paths=2, track_iterations=2, relax_iterations=1)
     whole = two.propose(problem)
     for size in ("paths.MOST", "candidates.AT_ONCE"):
@@ -97,12 +97,12 @@ def test_a_proposal_is_the_same_in_every_batch() -> None:
     for rows in ([1], [2, 0], [2, 1, 0]):
         part, index = two.propose(problem.take(torch.tensor(rows))), torch.tensor(rows)
         assert torch.equal(part.U, whole.U[index]) and torch.equal(part.iterations, whole.iterations[index])
-        for lam, wanted in zip(part.multipliers.lam, whole.multipliers.lam, strict=True):
-            assert torch.equal(lam, wanted[index])
+        for lam, expected in zip(part.multipliers.lam, whole.multipliers.lam, strict=True):
+            assert torch.equal(lam, expected[index])
 
 
 def test_the_iterations_of_every_candidate_are_counted(monkeypatch) -> None:
-    """Of those tracked, relaxed and refined: as many as their solves say, whichever is proposed."""
+    """The iterations of all candidates, tracked, relaxed and refined, equal the sum over their solves."""
     made = []
 
     def noted(solve):
@@ -125,8 +125,8 @@ def test_the_iterations_of_every_candidate_are_counted(monkeypatch) -> None:
         assert int(single.iterations) == int(together.iterations[b]) == sum(made) > 0
 
 
-def test_paths_of_one_class_are_followed_once(monkeypatch) -> None:
-    """The cup has a left and a right side: of five paths two are tracked, from every start at each pace."""
+def test_paths_of_one_class_are_tracked_once(monkeypatch) -> None:
+    """The cup has two classes: of five paths two are tracked, from every start at each pace."""
     counts = []
     monkeypatch.setattr(
         "torchgco.search.candidates.descend",
@@ -144,7 +144,7 @@ def test_paths_of_one_class_are_followed_once(monkeypatch) -> None:
 
 
 def test_an_offset_turns_the_vehicle_before_it_departs() -> None:
-    """By shares of the range from rest to the bound on that side, or by 1 where there is none."""
+    """Offsets are shares of the distance from rest to the bound on their side, or of 1 where there is none."""
     problem, starts_of = cup(B=3, N=40), replace(QUICK, initial_offsets=((0.75, -0.5), (0.0, 0.25))).starts
     limits = ControlBounds([[-10.0, -4.0], [-10.0, -4.0], [-10.0, -torch.inf]], [10.0, 10.0])
     problem = Problem(problem.dynamics, problem.cost, [problem.constraints[0], limits], problem.x0, problem.N)
@@ -160,7 +160,7 @@ def test_an_offset_turns_the_vehicle_before_it_departs() -> None:
         replace(QUICK, initial_offsets=((1.0,),)).propose(cup())
 
 
-# One other value for every option, and with it what else the option needs to show.
+# Another value for every option.
 CHANGES = dict(
     roadmap=Roadmap(num_halton=8), num_paths=1, initial_offsets=((0.7, -0.7),), depart=0.2, arrive=(0.7,),
     smoothing=0.2, tube=None, stiffness=(50.0,), track_iterations=2, relax_iterations=2, relax_top=1, refine_top=2,
@@ -200,7 +200,7 @@ def test_every_constant_is_read(name: str, usual: tuple, monkeypatch) -> None:
     assert outcome(BASE) != usual
 
 
-def test_a_quadrotor_is_led_too() -> None:
+def test_a_quadrotor_is_guided_too() -> None:
     problem, _ = quadrotor_batch(B=2, N=60)
     U = PathProposals(smoothing=0.16).propose(problem).U
     verdict = judge(problem, U, problem.cost.goal(problem.x0)[:, :3], 2.0)

@@ -1,4 +1,4 @@
-"""Restarts: where a trajectory is caught, further attempts start, the best is kept, and all of them are counted."""
+"""Restarts: a caught trajectory starts further attempts, the best is kept, and all are counted."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def arrived(solve: Solve) -> Tensor:
 
 
 def rank(solve: Solve, place: int) -> tuple:
-    """Arrived, then feasible, then cheap; of infeasible ones the less violated."""
+    """Sort key of a result: arrived, then feasible, then cheap; of infeasible ones the less violated."""
     best, fits = solve.end.best, bool(solve.end.best.violation[place] <= LOCAL.violation_tolerance)
     return not bool(arrived(solve)[place]), not fits, float((best.cost if fits else best.violation)[place])
 
@@ -71,17 +71,19 @@ def test_sampled_attempts_start_from_the_caught_trajectory_and_the_best_is_kept(
 
 
 @pytest.mark.parametrize("all_attempts", [False, True])
-def test_one_that_arrives_ends_the_attempts_unless_all_are_wanted(all_attempts: bool, solves: list[Solve]) -> None:
+def test_arriving_ends_the_attempts_unless_all_are_wanted(all_attempts: bool, solves: list[Solve]) -> None:
     problem, U0 = gates()
     Restarts(LOCAL, None, SAMPLING, attempts=3, all_attempts=all_attempts).solve(problem, U0)
-    wanted = [PASSES, SHORT, CLOSED]
+    expected = [PASSES, SHORT, CLOSED]
     for attempt in solves[1:4]:
-        assert attempt.rows == wanted
-        wanted = [b for b, there in zip(wanted, arrived(attempt).tolist(), strict=True) if all_attempts or not there]
-    assert (PASSES in wanted) == all_attempts
+        assert attempt.rows == expected
+        expected = [
+            b for b, there in zip(expected, arrived(attempt).tolist(), strict=True) if all_attempts or not there
+        ]
+    assert (PASSES in expected) == all_attempts
 
 
-def test_the_first_attempt_is_along_a_path_and_no_guidance_disturbs_it(solves: list[Solve]) -> None:
+def test_the_first_attempt_is_along_a_path_without_guidance(solves: list[Solve]) -> None:
     problem, U0 = gates()
     SOLVER.solve(problem, U0, seed=3)
     caught, along, sampled, again, last = solves
@@ -92,13 +94,13 @@ def test_the_first_attempt_is_along_a_path_and_no_guidance_disturbs_it(solves: l
     before = caught.end.last.multipliers.mu[1:3]
     assert torch.equal(along.call.warm.mu, torch.maximum(proposal.multipliers.mu[1:3], before))
     assert not any(bool(lam.any()) for lam in along.call.warm.lam)
-    # Where there is no path, the first attempt is sampled; the second is, where the first doesn't arrive.
+    # Without a path the first attempt is sampled. A second, sampled one follows where the first does not arrive.
     assert sampled.rows == [CLOSED] and again.rows == [SHORT, CLOSED] and last.rows == [SHORT]
     assert [s.call.seed for s in (sampled, again)] == [3, 3 + SEED_STEP]
 
 
 def test_without_a_path_and_without_samples_the_stopped_solve_continues(solves: list[Solve]) -> None:
-    """Any proposal penetrates deeper than is accepted here; its candidates are counted all the same."""
+    """All proposals penetrate deeper than `max_penetration`; their candidates' iterations still count."""
     problem, U0 = gates()
     problem, U0 = problem.take(torch.tensor([PASSES])), U0[:1]
     caught = LOCAL.iterate(Call.checked(problem, U0).in_cost_units()[0], StopWhenCaught(None))
@@ -111,10 +113,10 @@ def test_without_a_path_and_without_samples_the_stopped_solve_continues(solves: 
 
 
 @pytest.mark.parametrize(("weight", "attracted"), [(1.0, False), (6.0, True), (100.0, False)])
-def test_a_trajectory_that_ends_close_to_the_goal_is_attracted_to_it_at_last(
+def test_a_trajectory_that_ends_close_to_the_goal_is_finally_attracted_to_it(
     weight: float, attracted: bool, solves: list[Solve], monkeypatch
 ) -> None:
-    """Where the optimum stays short of the goal: far (left as it is), slightly (attracted), hardly."""
+    """The optimum ends far from the goal (unchanged), slightly short of it (attracted), or at it (unchanged)."""
     problem, U0 = gates(weight)
     solution = SOLVER.solve(problem, U0)
     last = solves[-1]
@@ -128,12 +130,12 @@ def test_a_trajectory_that_ends_close_to_the_goal_is_attracted_to_it_at_last(
     assert torch.equal(solution.U[others], plain.U[others])
     if attracted:
         assert last.rows == [SHORT] and last.guidance is None and isinstance(last.penalty, GuideRegion)
-        assert torch.isfinite(last.penalty.radius).nonzero().tolist() == [[0, 40]]  # of the last knot alone
+        assert torch.isfinite(last.penalty.radius).nonzero().tolist() == [[0, 40]]  # at the last knot alone
         assert away[SHORT] > 0.8 and solution.cost[SHORT] < 1.05 * plain.cost[SHORT]
         assert solution.statuses[SHORT] == Status.FEASIBLE  # the optimum lies elsewhere
 
 
-def test_one_that_is_never_caught_has_the_bits_of_its_own_solve() -> None:
+def test_a_problem_that_is_never_caught_has_the_bits_of_the_local_solve() -> None:
     problem, U0 = gates()
     solution, plain = SOLVER.solve(problem, U0), LOCAL.solve(problem, U0)
     index = torch.tensor([FREE])
@@ -147,18 +149,18 @@ def test_counts_are_those_of_all_attempts_and_candidates(solves: list[Solve], mo
     monkeypatch.setattr(PathProposals, "propose", lambda self, part: made.append(propose(self, part)) or made[-1])
     problem, U0 = gates()
     solution = SOLVER.solve(problem, U0)
-    wanted = torch.zeros(3, 4, dtype=torch.int64)
+    expected = torch.zeros(3, 4, dtype=torch.int64)
     for s in solves:
-        wanted[:, s.call.rows] += torch.stack((s.end.iterations, s.end.outer, s.end.guided))
+        expected[:, s.call.rows] += torch.stack((s.end.iterations, s.end.outer, s.end.guided))
         if s.guidance is None and s.penalty is None:
-            wanted[2, s.call.rows] += 1  # along a path
+            expected[2, s.call.rows] += 1  # along a path
     assert len(made) == 1 and int(made[0].iterations.min()) == 0 < int(made[0].iterations[:2].min())
-    wanted[0, PASSES:] += made[0].iterations
-    assert torch.equal(torch.stack((solution.iterations, solution.outer_iterations, solution.guided)), wanted)
+    expected[0, PASSES:] += made[0].iterations
+    assert torch.equal(torch.stack((solution.iterations, solution.outer_iterations, solution.guided)), expected)
     assert solution.guided[FREE] == 0 and solution.guided[PASSES] == 1 < int(solution.guided[SHORT])
 
 
-def test_it_leads_around_a_trap_that_catches_the_solver() -> None:
+def test_restarts_lead_around_a_trap_that_catches_the_solver() -> None:
     problem = cup(B=1, N=120)
     local = AugmentedLagrangian(ILQR(tolerance=1e-2, max_iterations=20), max_outer_iterations=12)
     solver = Restarts(local, PathProposals(depart=0.1, arrive=0.8), SAMPLING, attempts=1)
@@ -182,7 +184,7 @@ def test_no_option_is_forgotten_above() -> None:
     assert {f.name for f in fields(Restarts)} == set(CHANGES)
 
 
-def test_a_single_contact_counts_as_caught_from_the_iteration_that_sampling_says(solves: list[Solve]) -> None:
+def test_a_single_contact_counts_as_caught_from_the_given_iteration(solves: list[Solve]) -> None:
     problem, U0 = planar_batch(B=1, N=60, obstacles=1, seed=1)
     problem = replace(problem, constraints=[Spheres([[[0.0, 0.2]]], [[0.2]], 0.1), problem.constraints[1]])
     counts = []
@@ -202,7 +204,7 @@ def test_options_out_of_range_are_named() -> None:
 
 
 def test_a_caught_problem_without_a_path_or_samples_is_solved_to_its_end() -> None:
-    """Around moving spheres there is no roadmap: the solve that was stopped continues as if nothing had been asked."""
+    """Among moving spheres there is no roadmap: the stopped solve continues without a proposal."""
     problem, U0 = planar_batch(B=4, N=40, obstacles=8, seed=4)
     spheres = problem.constraints[0]
     centers = spheres.centers.masked_fill(spheres.absent.unsqueeze(-1), torch.nan)

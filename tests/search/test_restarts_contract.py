@@ -1,4 +1,4 @@
-"""Restarts in a batch: the same bits in any company, progress that never goes back, and a trace that names attempts."""
+"""Restarts in a batch: the same bits in any batch, progress that never decreases, and a trace that names attempts."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ def reports(solver: Restarts, problem: Problem, U0: Tensor, **options) -> list[P
 
 
 @pytest.mark.parametrize("change", [{}, dict(paths=None), dict(all_attempts=True), dict(sampling=None)])
-def test_progress_never_goes_back_and_ends_at_the_total(change: dict, solves: list[Solve]) -> None:
+def test_progress_never_decreases_and_ends_at_the_total(change: dict, solves: list[Solve]) -> None:
     seen = reports(replace(SOLVER, **change), *gates())
     finished = [now.finished for now in seen]
     assert finished == sorted(finished) and finished[-1] == 4 and {now.total for now in seen} == {4}
     first = next(now for now in seen if now.passes == 1)
     assert first.rows.tolist() == [0, 1, 2, 3] and first.finished <= 1
     again = {b for s in solves[1:] for b in s.rows}
-    assert {b for now in seen[12:] for b in now.rows.tolist()} <= again  # places in the whole batch, not in a part
+    assert {b for now in seen[12:] for b in now.rows.tolist()} <= again  # positions in the whole batch, not in a part
 
 
 @pytest.mark.parametrize("rows", [[FREE], [PASSES], [SHORT], [CLOSED], [CLOSED, SHORT, PASSES, FREE], [SHORT, FREE]])
-def test_alone_and_in_any_order_a_problem_has_its_bits(rows: list[int], whole: Solution) -> None:
+def test_a_problem_has_the_same_bits_alone_and_in_any_order(rows: list[int], whole: Solution) -> None:
     problem, U0 = gates()
     index = torch.tensor(rows)
     part = SOLVER.solve(problem.take(index), U0[index], seed=3, ids=index)
@@ -62,7 +62,9 @@ def test_slots_change_no_bits(slots: int, whole: Solution) -> None:
     assert_same_bits(solution, whole)
 
 
-def test_a_problem_that_cannot_start_is_not_attempted_and_disturbs_nobody(whole: Solution, solves: list[Solve]) -> None:
+def test_a_problem_that_cannot_start_is_not_attempted_and_disturbs_no_other(
+    whole: Solution, solves: list[Solve]
+) -> None:
     problem, U0 = gates()
     x0 = problem.x0.clone()
     x0[FREE, :2], x0[CLOSED, 0] = problem.constraints[0].centers[FREE, 0], torch.nan
@@ -74,7 +76,7 @@ def test_a_problem_that_cannot_start_is_not_attempted_and_disturbs_nobody(whole:
 
 
 def test_the_trace_names_the_attempt() -> None:
-    """Counted from 1 for each problem, whatever its company: the first solve, the attempts, the one into the goal."""
+    """Counted from 1 per problem in any batch: the first solve, the attempts, the attraction to the goal."""
     problem, U0 = gates()
     solver = replace(SOLVER, local=replace(LOCAL, record=True))
     solution = solver.solve(problem, U0, seed=3)

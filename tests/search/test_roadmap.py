@@ -41,7 +41,7 @@ def random_scene(d: int, B: int = 5, M: int = 12, seed: int = 0) -> Scene:
 
 
 def ring(open_at: int | None = None) -> Scene:
-    """Discs that touch each other all around the goal, or all but one."""
+    """Ten overlapping discs in a ring around the goal; the disc `open_at` is absent."""
     angle = np.arange(10) * 0.2 * np.pi
     o = np.stack((1.0 + 0.5 * np.cos(angle), 0.5 * np.sin(angle)), axis=-1)
     R = np.full(10, 0.17)
@@ -63,8 +63,8 @@ def test_paths_are_free_and_lead_from_start_to_goal(d: int) -> None:
                 assert segment_gap(a, c, s.centers[b].numpy(), s.inflated_radii[b].numpy(), 201) > -1e-9
 
 
-def test_further_paths_are_others() -> None:
-    """Around a disc on the other side; the first is the same however many follow, and lengths grow."""
+def test_further_paths_differ() -> None:
+    """The second path passes the disc on its other side and is longer; the first does not depend on their number."""
     s = scene([[[0.0, 0.1]]], [[0.4]])
     paths, _ = Roadmap().paths(s, 2)
     assert torch.equal(paths[:, :1], Roadmap().paths(s)[0])
@@ -72,14 +72,14 @@ def test_further_paths_are_others() -> None:
     assert path_length(paths[0, 0].numpy()) < path_length(paths[0, 1].numpy())
 
 
-def test_where_there_is_one_path_only_it_comes_again() -> None:
+def test_a_single_path_is_returned_again() -> None:
     paths, found = Roadmap().paths(ring(open_at=3), 2)
     middle = torch.tensor([1.0 + 0.5 * np.cos(0.6 * np.pi), 0.5 * np.sin(0.6 * np.pi)])
     path = points_along(paths[:, 1], torch.linspace(0, 3, 400, dtype=torch.float64)[None])
     assert bool(found) and float((path[0] - middle).square().sum(-1).sqrt().min()) < 0.17
 
 
-def test_the_path_around_one_disc_is_a_taut_string() -> None:
+def test_the_path_around_one_disc_is_nearly_shortest() -> None:
     R = 0.4
     paths, found = Roadmap().paths(scene([[[0.0, 0.0]]], [[R]]))
     tangents, arc = 2 * np.sqrt(1 - R**2), R * (np.pi - 2 * np.arccos(R))
@@ -102,7 +102,7 @@ def test_no_path_into_a_closed_ring_and_one_through_its_gap() -> None:
         assert float((path[0] - middle).square().sum(-1).sqrt().min()) < 0.17
 
 
-def test_a_gap_that_is_closed_by_little_is_open_with_max_overlap() -> None:
+def test_a_narrowly_closed_gap_is_open_with_max_overlap() -> None:
     """Ten discs around the goal that overlap by 10 % of their radius."""
     closed = ring()
     assert not bool(Roadmap(max_overlap=0.02).paths(closed)[1].any())
@@ -122,7 +122,7 @@ def test_a_path_goes_where_a_metre_is_cheap() -> None:
 
 @pytest.mark.parametrize("native", [True, False])
 def test_no_path_on_the_graph_is_cheaper(native: bool) -> None:
-    """Relaxing all edges at once finds what Dijkstra finds, on the very same graph."""
+    """The search finds a path of the same cost as Dijkstra on the same graph."""
     s, margin = random_scene(2, B=3, seed=4), 0.15
     rng = np.random.default_rng(1)
     points = torch.cat((s.start[:, None], s.goal[:, None], torch.as_tensor(rng.uniform(-1, 1, (3, 50, 2)))), dim=1)
@@ -222,7 +222,7 @@ def test_as_many_halton_points_as_a_point_has_edges_to_are_enough() -> None:
 
 
 def test_the_default_roadmap_finds_the_holes_of_the_walls() -> None:
-    """Around a wall of 12 m by 6 m it is over 26 m from start to goal, through the holes at most 25."""
+    """Paths through the holes are shorter than 25 m, those around a wall of 12 m by 6 m longer than 26 m."""
     setup = compose(["scenario=walls", "seed=5"])
     problem = setup.task(setup.layouts(8)).problem
     found = scene_of(problem, problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m)))

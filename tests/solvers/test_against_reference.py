@@ -43,7 +43,7 @@ def _reference(problem, U0, b: int, tolerance: float, limit: int, guided: bool):
         return reference_solve(twin, U0[b].numpy(), schedule)
 
     def noise(outer: int) -> np.ndarray:
-        # The reference counts guided updates from 0; the key holds how many inner solves have ended.
+        # The reference counts guided updates from 0; the key counts finished inner solves.
         key = DrawKey(0, torch.tensor([b]), torch.tensor([outer + 1]))
         z = standard_normal(key, problem.N * problem.m, range(SAMPLES), torch.float64)
         return z.unflatten(0, (problem.N, problem.m))[:, :, 0].permute(2, 0, 1).numpy()
@@ -77,7 +77,7 @@ def test_iterates_follow_the_nested_loops(case: str, guided: bool, native: bool)
         np.testing.assert_array_equal(mine.alpha, [r.alpha for _, r in theirs])
         np.testing.assert_array_equal(mine.regularisation, [r.mu_r for _, r in theirs])
         for o, outer in enumerate(reference.records):
-            if o < OUTER - 1:  # the running state doesn't outlive the last one
+            if o < OUTER - 1:  # a problem leaves the running state with its last one
                 present = ~problem.constraints[0].absent[b].numpy()
                 spheres, bounds = snapshots.lam[b, o]
                 np.testing.assert_allclose(spheres[:, present], outer.lam.spheres, rtol=1e-6, atol=1e-6)
@@ -85,6 +85,6 @@ def test_iterates_follow_the_nested_loops(case: str, guided: bool, native: bool)
                 assert snapshots.mu[b, o] == pytest.approx(outer.mu)
         guided_outer = set(mine.outer[mine.guided])
         assert guided_outer == {o for o, outer in enumerate(reference.records) if outer.guide is not None}
-    assert len(lengths) > 1, "every problem took as long as the others: the batch isn't mixed"
+    assert len(lengths) > 1, "all problems took equally many iterations: the batch is not mixed"
     if guided:
         assert trace.guided.any()

@@ -1,4 +1,4 @@
-"""The augmented Lagrangian: exact answers, the best iterate, warm starts, its ends, and replaced iterates."""
+"""The augmented Lagrangian: exact optima, the best iterate, warm starts, stopping, and replaced iterates."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def test_equality_at_the_end_is_met(as_printed: bool) -> None:
     assert solution.statuses == [Status.CONVERGED] * 2
 
 
-def test_the_initial_guess_is_no_answer_and_the_best_feasible_iterate_is() -> None:
-    """Feasible from the start, the solution still moves; the best end of an outer iteration is returned."""
+def test_the_best_feasible_iterate_is_returned_not_the_initial_guess() -> None:
+    """The best result of an outer iteration is returned, even where the initial guess is feasible."""
     problem, U0 = planar_batch(B=4, N=30, obstacles=5, seed=3)
     inner = ILQR(as_printed=True, tolerance=1e-4)
     solver = AugmentedLagrangian(inner, max_outer_iterations=8, record=True, violation_tolerance=1e-2)
@@ -71,7 +71,7 @@ def test_the_initial_guess_is_no_answer_and_the_best_feasible_iterate_is() -> No
     assert not torch.equal(solution.U, U0)
 
 
-def test_a_warm_start_is_at_once_where_the_cold_one_ended() -> None:
+def test_a_warm_start_reaches_the_same_cost_in_fewer_iterations() -> None:
     problem, U0 = quadrotor_batch(B=2, N=20, obstacles=4, seed=2)
     solver = AugmentedLagrangian(inner=ILQR(tolerance=1e-6), max_outer_iterations=15, violation_tolerance=1e-4)
     cold = solver.solve(problem, U0)
@@ -84,14 +84,14 @@ def test_a_warm_start_is_at_once_where_the_cold_one_ended() -> None:
         solver.solve(other, U1, warm=cold.multipliers)
 
 
-def test_it_ends_early_and_rests_its_penalty_but_not_as_printed() -> None:
+def test_it_ends_early_with_a_lower_penalty_unless_as_printed() -> None:
     problem, U0 = quadrotor_batch(B=2, N=15, obstacles=3, seed=2)
     early = AugmentedLagrangian(max_outer_iterations=12, violation_tolerance=0.05).solve(problem, U0)
     assert bool((early.outer_iterations < 12).all()) and early.statuses == [Status.CONVERGED] * 2
     assert bool((early.multipliers.mu < 20.0 * 2.2**early.outer_iterations * problem.cost_unit).all())
     printed = AugmentedLagrangian(ILQR(as_printed=True), max_outer_iterations=12).solve(problem, U0)
     assert printed.outer_iterations.tolist() == [12, 12]
-    rises = (printed.multipliers.mu / 20.0).log() / torch.tensor(2.2).log()  # of the best iterate's penalty
+    rises = (printed.multipliers.mu / 20.0).log() / torch.tensor(2.2).log()  # of the best iterate's mu
     torch.testing.assert_close(rises, rises.round().clamp(min=1.0), rtol=1e-6, atol=0)
 
 
@@ -113,7 +113,7 @@ class OnePlan:
 
 @pytest.mark.parametrize("hold", [1.0, 100.0])
 def test_the_penalty_keeps_the_solver_from_an_abandoned_trajectory(hold: float, monkeypatch) -> None:
-    """It costs `HOLD` times the extra cost of the new one, whose multipliers start again at zero."""
+    """Its penalty is `HOLD` times the extra cost of the new one, whose multipliers start at zero."""
     monkeypatch.setattr(augmented_lagrangian, "HOLD", hold)
     problem, U0 = planar_batch(B=2, N=25, obstacles=8, seed=4)
     plan = torch.full_like(U0[:1], 1.0)
@@ -137,7 +137,7 @@ def test_the_penalty_keeps_the_solver_from_an_abandoned_trajectory(hold: float, 
     torch.testing.assert_close(mu, (hold * gain).clamp(min=44.0), rtol=1e-6, atol=0)
 
 
-def test_a_penalty_without_a_first_one_is_named() -> None:
+def test_a_later_penalty_without_an_initial_one_is_named() -> None:
     class Late(OnePlan):
         def start(self, problem, X):
             return None

@@ -1,4 +1,4 @@
-"""A problem's result is the same bits alone, in any batch, in any order; a broken problem disturbs no other."""
+"""A problem's result has the same bits alone, in any batch and in any order; a broken problem disturbs no other."""
 
 import pytest
 import torch
@@ -58,9 +58,9 @@ BATCHES = {
 
 @pytest.mark.parametrize("solver", ["gco", "restarts"])
 @pytest.mark.parametrize("batch", BATCHES)
-def test_freed_slots_are_taken_by_those_that_wait(batch: str, solver: str) -> None:
+def test_freed_slots_are_taken_by_waiting_problems(batch: str, solver: str) -> None:
     problem, U0 = BATCHES[batch]()
-    problem.x0[4, 0] = torch.nan  # one that waits and can't begin
+    problem.x0[4, 0] = torch.nan  # a waiting problem that cannot start
     seen = []
     few = SOLVERS[solver].in_slots(2).solve(problem, U0, seed=3, callback=lambda p: seen.append(p))
     assert max(p.state.rows.numel() for p in seen) == 2 and seen[-1].finished == 7
@@ -123,8 +123,8 @@ def test_large_batch_equals_small_ones() -> None:
         assert torch.equal(getattr(large, name), getattr(small, name)[rows]), name
 
 
-def test_parts_per_element_follow_their_element() -> None:
-    """Goals per problem and knot, weights, drag, bounds, moving obstacles: taken apart they solve to the same bits."""
+def test_parts_per_problem_follow_their_problem() -> None:
+    """Goals, weights, drag, bounds and moving obstacles per problem: parts of the batch solve to the same bits."""
     B, N = 4, 20
     random = torch.Generator().manual_seed(0)
 
@@ -152,7 +152,7 @@ def test_parts_per_element_follow_their_element() -> None:
         assert_same_bits(solve_rows(solver, problem, U0, rows), together.take(torch.tensor(rows)))
 
 
-def test_a_broken_element_disturbs_nobody() -> None:
+def test_a_broken_problem_disturbs_no_other() -> None:
     problem, U0 = BATCHES["planar"]()
     healthy = SOLVERS["gco"].solve(problem, U0, seed=3)
     x0 = problem.x0.clone()
@@ -168,7 +168,7 @@ def test_a_broken_element_disturbs_nobody() -> None:
     assert_same_bits(solution.take(rest), healthy.take(rest))
 
 
-def test_first_step_consistency_holds_per_element() -> None:
+def test_first_step_consistency_holds_per_problem() -> None:
     """The rates after one period are what each vehicle's own thrusts allow (section 5.2.1)."""
     problem, U0 = quadrotor_batch(B=3, N=15)
     thrusts = torch.tensor([[3.9, 3.9, 3.9, 3.9], [3.8, 4.0, 4.0, 3.8], [3.9, 3.9, 4.1, 4.1]], dtype=torch.float64)

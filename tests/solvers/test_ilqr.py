@@ -1,4 +1,4 @@
-"""iLQR: exact answers, statuses, regularisation, and the line search."""
+"""iLQR: exact optima, statuses, regularisation, and the line search."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchgco.solvers.riccati import backward
 
 
 def test_lqr_is_solved_in_one_step() -> None:
-    """Linear dynamics and quadratic cost: the answer of one dense least-squares solve."""
+    """Linear dynamics and quadratic cost: the optimum of one dense least-squares problem."""
     problem = linear_problem()
     solution = ILQR(tolerance=1e-12).solve(problem, zeros(problem))
     A, b = np.array([[1, 0.2], [0, 1]]), np.array([[0], [0.2]])
@@ -33,8 +33,8 @@ def test_lqr_is_solved_in_one_step() -> None:
         U = -np.linalg.solve(forced.T @ W @ forced + np.kron(np.eye(8), R), forced.T @ W @ free @ problem.x0[i].numpy())
         np.testing.assert_allclose(solution.U[i, :, 0], U, rtol=1e-10, atol=1e-12)
     assert solution.statuses == [Status.CONVERGED] * 2
-    assert solution.iterations.tolist() == [2, 2]  # one step, and one that finds nothing to gain
-    # The gains returned are those of the optimum: no feed-forward is left.
+    assert solution.iterations.tolist() == [2, 2]  # one step, and one iteration that finds no decrease
+    # The returned gains belong to the optimum, where the feed-forward is zero.
     torch.testing.assert_close(solution.d, torch.zeros_like(solution.d), rtol=0, atol=1e-10)
 
 
@@ -61,7 +61,7 @@ def test_backward_pass_satisfies_the_general_recursion() -> None:
 
 @dataclass(frozen=True)
 class Saddle(Cost):
-    """Concave in u to the degree given: the backward pass needs regularisation, or fails."""
+    """A cost that is concave in u: the backward pass needs regularisation, or fails."""
 
     concavity: float
 
@@ -116,7 +116,7 @@ def steep_run(monkeypatch, as_printed: bool = False, smallest: float = 1e-4, bac
     return AugmentedLagrangian(inner=inner, max_outer_iterations=3, record=True).solve(steep(), zeros(steep()))
 
 
-def test_the_ladder_ends_with_a_step_that_is_accepted_as_printed_and_refused_otherwise(monkeypatch) -> None:
+def test_the_smallest_step_is_accepted_as_printed_and_refused_otherwise(monkeypatch) -> None:
     short, printed = steep_run(monkeypatch, smallest=0.4), steep_run(monkeypatch, True, smallest=0.4)
     assert set(short.trace.alpha) <= {1.0, 0.5, 0.0} and (short.trace.alpha == 0).any()
     assert set(printed.trace.alpha) <= {1.0, 0.5, 0.25} and (printed.trace.alpha == 0.25).any()
@@ -129,7 +129,7 @@ def test_a_failed_search_raises_the_regularisation_and_L_M_never_rises(monkeypat
     assert (damped.trace.groupby(["element", "outer"]).merit.diff().dropna() <= 1e-12).all()
 
 
-def test_a_search_begins_a_little_above_the_last_accepted_rung(monkeypatch) -> None:
+def test_a_search_starts_a_little_above_the_last_accepted_rung(monkeypatch) -> None:
     plain, kept = steep_run(monkeypatch), steep_run(monkeypatch, back=1)
     grown = {}
     for name, run in (("plain", plain), ("kept", kept)):
@@ -140,7 +140,7 @@ def test_a_search_begins_a_little_above_the_last_accepted_rung(monkeypatch) -> N
 
 
 @pytest.mark.parametrize("native", ["eager"], indirect=True)
-def test_rungs_tried_together_are_the_same_rungs(native: bool, monkeypatch) -> None:
+def test_parallel_and_sequential_line_searches_agree(native: bool, monkeypatch) -> None:
     many = steep_run(monkeypatch)
     monkeypatch.setattr(line_search, "PARALLEL", 1)
     monkeypatch.setattr(line_search, "SIDE_BY_SIDE", 1)

@@ -1,4 +1,4 @@
-"""What `Solution.iterations` counts: every iteration that was made for a problem, however deep the solve is nested."""
+"""`Solution.iterations` counts every iteration made for a problem, in nested solves too."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ BATCHES = {
 
 
 def guided(problem: Problem, record: bool = False) -> Restarts:
-    """`gco` with few candidates, which are nonetheless tracked, relaxed and refined, and few samples."""
+    """`gco` with few samples and few candidates, which are tracked, relaxed and refined."""
     solver = quick_gco(problem)
     local = replace(solver.local, max_outer_iterations=4, record=record)
     paths = replace(solver.paths, relax_iterations=3, track_iterations=4, max_penetration=9.0)
@@ -32,7 +32,7 @@ SOLVERS = {
 
 @pytest.fixture
 def made(monkeypatch) -> list[int]:
-    """Iterations and Newton steps as they are made, in whatever solve."""
+    """Numbers of iterations and Newton steps, noted in every solve."""
     made: list[int] = []
 
     def advance(inner, state, lagrangian, limit, real=ilqr.advance):
@@ -68,7 +68,7 @@ def test_every_iteration_is_counted_once(batch: str, name: str, made: list[int])
         assert int(alone.iterations) == int(together.iterations[b]) == sum(made)
 
 
-def test_candidates_are_most_of_it_and_no_part_of_the_trace() -> None:
+def test_candidates_take_most_iterations_and_are_not_in_the_trace() -> None:
     problem, U0 = BATCHES["planar"]()
     solution = guided(problem, record=True).solve(problem, U0, seed=3)
     rows = solution.trace.groupby("element").size()
@@ -79,7 +79,7 @@ def test_candidates_are_most_of_it_and_no_part_of_the_trace() -> None:
         assert history["iteration"].tolist() == list(range(len(history)))
 
 
-def test_steps_of_a_polish_are_counted_where_nothing_is_improved_too(made: list[int], monkeypatch) -> None:
+def test_steps_of_a_polish_count_without_an_improvement_too(made: list[int], monkeypatch) -> None:
     problem, U0 = BATCHES["planar"]()
     before = AugmentedLagrangian(inner=ILQR(max_iterations=20), max_outer_iterations=6).solve(problem, U0)
     monkeypatch.setattr(Polish, "_is_better", lambda self, new, old, first: False)

@@ -1,4 +1,4 @@
-"""The estimated memory of a batch, against the memory that it takes."""
+"""The estimated memory of a batch against the memory measured."""
 
 import subprocess
 import sys
@@ -24,7 +24,7 @@ print((peak(402) - small) / 400)
 """
 
 
-def test_an_element_takes_what_is_said() -> None:
+def test_a_problem_takes_the_estimated_memory() -> None:
     problem, _ = quadrotor_batch(B=3, N=40, obstacles=20)
     done = subprocess.run([sys.executable, "-c", PEAK], capture_output=True, text=True, check=True)
     assert 0.5 < element_bytes(problem) / float(done.stdout) < 2.0

@@ -1,4 +1,4 @@
-"""What CONVERGED is worth: stationary and feasible, on any scale of the cost."""
+"""CONVERGED means stationary and feasible, on any scale of the cost."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CAREFUL = ILQR(max_iterations=300)
 
 
 def pendulum(scale: float = 1.0, constraints: tuple = ()) -> Problem:
-    """Swing up from hanging, u bounded by its price alone."""
+    """Swing up from hanging; only the cost limits u."""
 
     def field(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
         return torch.stack((x[..., 1], 9.81 * torch.sin(x[..., 0]) - 0.1 * x[..., 1] + u[..., 0]), dim=-1)
@@ -68,7 +68,7 @@ def test_the_scale_of_the_cost_changes_no_iterate(factor: float) -> None:
 
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
 @pytest.mark.parametrize("batch", [planar_batch, quadrotor_batch])
-def test_nor_does_it_where_there_are_obstacles_and_guidance(batch, factor: float) -> None:
+def test_the_scale_of_the_cost_changes_no_iterate_with_guidance(batch, factor: float) -> None:
     problem = batch(B=2, N=25, obstacles=6, seed=4)[0]
     one, other = (solve(p, solver=quick_gco(p)) for p in (problem, scaled(problem, factor)))
     assert torch.equal(one.iterations, other.iterations) and one.statuses == other.statuses
@@ -115,7 +115,7 @@ def test_a_swing_up_that_converged_is_at_its_optimum(scale: float) -> None:
 
 
 def test_the_status_is_one_of_four_by_stationarity_and_violation() -> None:
-    """Controls that nothing refined are feasible at best; a violated bound is seen by a solver that leaves it out."""
+    """Unrefined controls are FEASIBLE at best; a solver that ignores constraints still reports their violation."""
     tight = (ControlBounds([-3.0], [3.0]),)
     problem = pendulum(constraints=tight)
     assert Hold().solve(problem, rest(problem)).statuses == [Status.FEASIBLE] * 2
@@ -143,7 +143,7 @@ def test_a_polished_trajectory_has_its_own_status() -> None:
 
 
 def test_unstable_dynamics_are_solved_from_rest() -> None:
-    """Euler steps of 0.5 s make the drag unstable: every rollout diverges until the gains hold all of the states."""
+    """Euler steps of 0.5 s make the drag unstable: every rollout diverges until the gains stabilise all states."""
     problem = Problem(
         dynamics=Planar(dt=0.5),
         cost=QuadraticCost(Q=[5, 5, 0, 1, 1, 0], R=[0.1, 0.1], Qf=[50, 50, 0, 1, 1, 0], x_ref=[1, 0.4, 0, 0, 0, 0]),
@@ -165,7 +165,7 @@ def test_gains_are_finite_where_the_plain_backward_pass_fails() -> None:
     assert bool(torch.isfinite(solution.K).all()) and bool(torch.isfinite(solution.d).all())
 
 
-def test_the_kkt_residual_knows_no_scale() -> None:
+def test_the_kkt_residual_is_independent_of_the_scale_of_the_cost() -> None:
     problem, U0 = planar_batch(B=2, N=20, obstacles=3)
     X = Hold().solve(problem, U0).X
     residuals = [certify(scaled(problem, factor), X, U0).kkt_residual for factor in (1e-8, 1.0, 1e8)]
@@ -182,14 +182,14 @@ def test_solve_is_the_configuration_gco(scenario: str, model: str) -> None:
 
 
 def test_solve_hands_the_problem_to_that_solver(monkeypatch) -> None:
-    asked = []
-    notice = lambda self, problem, U0, **words: asked.append((self, U0, words))
-    monkeypatch.setattr(Restarts, "solve", notice)
+    calls = []
+    note_call = lambda self, problem, U0, **options: calls.append((self, U0, options))
+    monkeypatch.setattr(Restarts, "solve", note_call)
     problem, U0 = planar_batch(B=2, N=25)
     solve(problem, seed=3)
-    ((solver, begun, words),) = asked
+    ((solver, guess, options),) = calls
     assert solver == compose(["scenario=planar_trap", "model=planar"]).solver
-    assert torch.equal(begun, U0) and words == {"seed": 3, "ids": None, "warm": None}
+    assert torch.equal(guess, U0) and options == {"seed": 3, "ids": None, "warm": None}
 
 
 def test_offsets_are_for_two_controls() -> None:

@@ -18,7 +18,7 @@ BASE = AugmentedLagrangian(
     violation_tolerance=0.05,
     record=True,
 )
-# Another value for every option, and with it the rest that the option needs to show.
+# Another value for every option, with the settings that it needs to have an effect.
 CHANGES = {
     AugmentedLagrangian: dict(
         inner=ILQR(max_iterations=2), guidance=None, initial_penalty=50.0, penalty_growth=5.0,
@@ -34,7 +34,7 @@ CHANGES = {
         noise_knots=3, decay=0.3, elite=4, dwell_cost=10.0, dtype="float32",
     ),
 }  # fmt: skip
-# `slots` decides no result (test_batch_contract), line searches show in test_ilqr, replaced iterates in test_restarts.
+# `slots` changes no result (test_batch_contract); test_ilqr tests the line search, test_restarts replaced iterates.
 ELSEWHERE = {(AugmentedLagrangian, "slots"), (ILQR, "line_search"), (GCO, "start_from_sample")}
 PLACES = {
     AugmentedLagrangian: lambda s, c: replace(s, **c),

@@ -1,4 +1,4 @@
-"""The last stage: what it promises of violation, cost and stationarity, and the pieces it is made of."""
+"""Polish: its effect on violation, cost and stationarity, and its parts."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def solved(batch: str) -> tuple[Problem, Solution]:
 
 @cache
 def solved_nearly(batch: str) -> tuple[Problem, Solution, torch.Tensor]:
-    """Those whose violation is within reach, and their rows in the batch: at least three."""
+    """The problems whose violation is within reach, their solutions and their rows in the batch: at least three."""
     problem, solution = solved(batch)
     rows = (solution.violation <= 1e-2).nonzero().flatten()
     assert rows.numel() >= 3
@@ -76,7 +76,7 @@ def assert_same_bits(a: Solution, b: Solution) -> None:
 def test_violation_and_residual_fall_and_the_cost_stays(batch: str) -> None:
     problem, before, rows = solved_nearly(batch)
     after = polished(batch).take(rows)
-    assert bool((before.violation > 1e-6).any())  # or there would be nothing to do
+    assert bool((before.violation > 1e-6).any())  # else there is nothing to reduce
     goal = problem.cost.goal(problem.x0)[:, problem.dynamics.position]
     assert bool((judge(problem, after.U, goal, 1.0).violation < 1e-8).all())
     assert bool((after.cost <= 1.001 * before.cost).all())
@@ -87,7 +87,7 @@ def test_violation_and_residual_fall_and_the_cost_stays(batch: str) -> None:
 
 
 @pytest.mark.parametrize("batch", BATCHES)
-def test_the_multipliers_and_gains_are_those_of_the_new_path(batch: str) -> None:
+def test_the_multipliers_and_gains_are_those_of_the_new_trajectory(batch: str) -> None:
     problem, _, rows = solved_nearly(batch)
     after = polished(batch).take(rows)
     U = after.U.clone().requires_grad_()
@@ -111,7 +111,7 @@ def test_alone_in_any_batch_and_in_any_order(batch: str) -> None:
         assert_same_bits(part, polished(batch).take(index))
 
 
-def test_what_is_out_of_reach_is_left_alone() -> None:
+def test_a_solution_out_of_reach_is_left_alone() -> None:
     problem, before = solved("planar")
     assert float(before.violation[2]) > 1e-2
     broken = replace(before, U=before.U.clone(), X=before.X.clone(), cost=before.cost.clone())
@@ -125,7 +125,7 @@ def test_what_is_out_of_reach_is_left_alone() -> None:
 
 
 def test_a_shortcut_through_an_obstacle_between_two_knots_is_refused(monkeypatch) -> None:
-    """The optimum of the problem as posed leaps over the edge of a disc, between knots that are clear."""
+    """The optimum with constraints at knots alone crosses the edge of a disc between two knots."""
     problem, U0 = planar_batch(B=4, N=30, obstacles=5, seed=10)
     before = SOLVER.solve(problem, U0, seed=1)
     after, spheres = Polish().refine(problem, before), problem.constraints[0]
@@ -141,7 +141,7 @@ def test_every_option_is_read() -> None:
     assert_same_bits(Polish(reach=1e-12).refine(problem, before), before)
     first = torch.tensor([0])
     one, start = problem.take(first), before.take(first)
-    assert_same_bits(Polish(tolerance=1e-3, stationarity=1e6).refine(one, start), start)  # met already
+    assert_same_bits(Polish(tolerance=1e-3, stationarity=1e6).refine(one, start), start)  # already met
     assert not torch.equal(Polish(stationarity=1e6).refine(one, start).U, start.U)
     assert not torch.equal(Polish(tolerance=1e-3).refine(one, start).U, start.U)
     flat = Polish(iterations=2, curvature=False).refine(problem, before)
@@ -167,7 +167,7 @@ def test_bad_options_and_calls_are_named() -> None:
 
 
 def test_equalities_and_functions_are_polished() -> None:
-    """A curved equality at the last knot, and a wall that is a function: met to rounding."""
+    """A curved equality at the last knot and a wall given as a function are met to rounding."""
     problem, U0 = planar_batch(B=2, N=25, obstacles=1, seed=1)
     ring = FunctionConstraint(lambda x: (x[..., :2] ** 2).sum(-1, keepdim=True) - 0.7, sense="equality", knots=[-1])
     wall = FunctionConstraint(lambda x: x[..., 1:2] - 0.25 - 0.1 * x[..., :1].square(), knots=slice(1, None))
@@ -180,7 +180,7 @@ def test_equalities_and_functions_are_polished() -> None:
 
 
 def test_a_linear_program_ends_at_its_corner() -> None:
-    """Nothing is curved at all: no convex model is found, and what was there is returned."""
+    """Without curvature there is no strictly convex model, and the given solution is returned."""
     dynamics = FunctionDynamics(lambda x, u: u, 1, 1, 1.0)
     x0 = torch.zeros(1, 1, dtype=torch.float64)
     cost = QuadraticCost([0.0], [0.0], [0.0], qf=[1.0])

@@ -1,4 +1,4 @@
-"""What CasADi computes from a traced function is what PyTorch computes."""
+"""CasADi computes the same from a traced function as PyTorch from the function."""
 
 from collections.abc import Iterable
 
@@ -40,7 +40,7 @@ def symbols(name: str, shape: tuple[int, ...]) -> tuple[ca.SX, np.ndarray]:
 
 
 def by_casadi(function, bs: Iterable[int], *values: Tensor) -> Tensor:
-    """function(index, *values) for the problems bs of a batch, by a CasADi function that was made of symbols."""
+    """function(index, *values) for the problems bs of a batch, by a CasADi function of symbols."""
     shapes = [(1, *v.shape[1:]) for v in values]
     traced = Traced("field", function, *(v.new_zeros(shape) for v, shape in zip(values, shapes, strict=True)))
     parameters, arrays = symbols("p", (traced.count,)), [symbols(f"z{i}", shape) for i, shape in enumerate(shapes)]
@@ -51,13 +51,13 @@ def by_casadi(function, bs: Iterable[int], *values: Tensor) -> Tensor:
 
 
 def check(part, method: str, *values: Tensor) -> None:
-    """`method` of a part at every problem of the batch."""
+    """Compare `method` of a part, traced and in PyTorch, for every problem of the batch."""
     made = by_casadi(lambda i, *z: getattr(part.take(i), method)(*z), range(len(values[0])), *values)
     torch.testing.assert_close(made, getattr(part, method)(*values), rtol=1e-12, atol=1e-12)
 
 
 def in_place(x: Tensor, u: Tensor) -> Tensor:
-    """A field that writes into what it made, branches element by element and looks things up."""
+    """A field with in-place writes, elementwise branches and indexing."""
     rate = torch.zeros(3, 3, **DOUBLE)
     rate[0, 1] = 2.0
     out = x.new_zeros(x.shape)
@@ -97,7 +97,7 @@ def test_steps(name: str) -> None:
 
 
 def flown(**parts) -> tuple[Problem, Tensor, Tensor]:
-    """Three planar problems of 7 stages with some parts replaced, and a trajectory of nowhere."""
+    """Three planar problems of 7 stages with some parts replaced, and a random trajectory."""
     plain, _ = planar_batch(B=3, N=7)
     known = dict(dynamics=Planar(dt=0.1), cost=plain.cost, constraints=plain.constraints, x0=plain.x0, N=7)
     problem = Problem(**{**known, **parts})
@@ -207,7 +207,7 @@ def test_a_clamped_nan_stays_one() -> None:
 
 
 def test_constants_may_be_replaced() -> None:
-    """But for those that pick elements."""
+    """All constants but index tensors."""
     weights, picked = torch.tensor([2.0, 3.0], **DOUBLE), torch.tensor([1, 0])
     traced = Traced("field", lambda i, x: weights * x[:, picked] + (weights > 2.5), torch.zeros(1, 2, **DOUBLE))
     assert sorted(traced.constants) == [0.0, 1.0, 2.0, 3.0]
@@ -231,8 +231,8 @@ def test_writing_in_place() -> None:
     torch.testing.assert_close(by_casadi(function, [0], x), function(torch.zeros(1), x))
 
 
-def test_a_constant_may_be_looked_at() -> None:
-    """Only values that depend on the arguments are out of reach."""
+def test_a_constant_may_be_read() -> None:
+    """Only values that depend on the arguments cannot be converted to Python numbers."""
     size = torch.tensor(2.0)
     x = torch.rand(1, 4, **DOUBLE)
     made = by_casadi(lambda i, x: x[:, : int(size)] * float(size + 1.0), [0], x)
@@ -249,7 +249,7 @@ def test_a_constant_may_be_looked_at() -> None:
         (lambda x: x if float(x.sum()) > 0 else -x, "traced"),
     ],
 )
-def test_what_has_no_counterpart_is_named(function, named: str) -> None:
+def test_unsupported_operations_are_named(function, named: str) -> None:
     with pytest.raises(InputError, match=named) as caught:
         by_casadi(lambda i, x: function(x), [0], torch.rand(1, 4, **DOUBLE))
     assert caught.value.field == "field"
