@@ -38,10 +38,10 @@ def _measure(bench: Bench, case: str, batch: int, limited: bool) -> float:
         return 0.0
     measured = json.loads(done.stdout.splitlines()[-1])
     seconds = measured["seconds"]
-    bench.row(SECTION, case, SOLVER, "per element", 1000 * seconds, "ms")
-    bench.row(SECTION, case, SOLVER, "per element and iteration", 1000 * seconds / measured["iterations"], "ms")
+    bench.row(SECTION, case, SOLVER, "per problem", 1000 * seconds, "ms")
+    bench.row(SECTION, case, SOLVER, "per problem and iteration", 1000 * seconds / measured["iterations"], "ms")
     bench.row(SECTION, case, SOLVER, "problems per second", 1 / seconds, "1/s")
     if measured["bytes"] is not None:
         bench.row(SECTION, case, SOLVER, "peak memory", measured["bytes"] / 2**20, "MiB")
-        bench.row(SECTION, case, SOLVER, "memory per element", measured["bytes"] / 2**20 / batch, "MiB")
+        bench.row(SECTION, case, SOLVER, "memory per problem", measured["bytes"] / 2**20 / batch, "MiB")
     return seconds

@@ -35,4 +35,4 @@ def _measure(bench: Bench, case: str, *overrides: str) -> None:
     solution, took = min(flights, key=lambda flight: flight[1].seconds)
     # Problems that end before the limit count with their own number of iterations.
     count = max(1, int(solution.iterations.sum()))
-    bench.row(SECTION, case, "al_ilqr", "per element and iteration", 1000 * took.seconds / count, "ms")
+    bench.row(SECTION, case, "al_ilqr", "per problem and iteration", 1000 * took.seconds / count, "ms")

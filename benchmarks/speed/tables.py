@@ -13,27 +13,27 @@ NO_GPU = "No GPU was at hand: `make benchmark-gpu` measures `families`, `batch` 
 
 # The text above each section's table, in the order of the page. The published pages repeat it.
 WORDS = {
-    "targets": "Processor time per problem, set-up apart. Under a peer's name: how many times as fast the solver is,\n"
+    "targets": "Processor time per problem without set-up. Under a peer's name: how many times as fast the solver is,\n"
     "per problem and, after the comma, per layout reached, as a peer that stops short of the goal may be fast.",
     "families": "Drawn layouts (seed 1000). The peers fly the first of the same layouts, before and after `gco`;\n"
     "spread is the difference of the two times, wall the elapsed time. `fatrop_guided` and `acados_guided` start\n"
-    "from a plan along the roadmap's best path, whose making counts, all others from the vehicle at rest. Ratios are\n"
+    "from a trajectory along the roadmap's best path, whose search counts, all others from the vehicle at rest. Ratios are\n"
     "peer / `gco`: of seconds per problem and per layout reached, and of costs, the median where both arrive.",
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
-    "plan that is left, `gco` from its multipliers as well. Set-up is apart: `gco` traces the model and finds its\n"
-    "kernels, FATROP's program is written down.",
+    "rest of the solution, `gco` from its multipliers as well. Set-up does not count: `gco` traces the model and\n"
+    "finds its kernels, FATROP's program is built.",
     "own_model": "A user's unicycle (4 states, 2 controls, a Python function, RK4), 100 stages, five discs,\n"
     "`torchgco.solve` without options.",
-    "paper": "The paper's planar problem by the paper's method: a thousand stages, three circles, own random draws.",
-    "mppi": "One round of white noise around the hover, 30 spheres, float32, B = 1; medians of rounds in turns.",
+    "paper": "The paper's planar problem by the paper's method: a thousand stages, three circles; the problems differ in their random draws.",
+    "mppi": "One round of white noise around hovering, 30 spheres, float32, B = 1; medians of alternating rounds.",
     "first_use": "A first solve in a new process: the model traced, differentiated, written out as C and compiled,\n"
     "and what the first solve takes more than the second, in processor seconds, the compiler's included.",
     "share": "Processor time of one solve, in percent: a line per phase of the method, a column per function of the\n"
     "native library that it calls. The problems are new to a process that has solved others.",
-    "batch": "Forests of 30 spheres. `2 outer` ends every element after two outer iterations. Memory is the peak of a\n"
-    "process of its own above what it held before the problems were made.",
-    "growth": "`al_ilqr`, line search included. Quadrotor (n = 14), 100 stages, 30 spheres but for what is named;\n"
-    "more stages cut the same 5 s finer, more spheres fill the same region. The planar vehicle has n = 6.",
+    "batch": "Forests of 30 spheres. `2 outer` ends every problem after two outer iterations. Memory is the peak of\n"
+    "a separate process above its memory before the problems were made.",
+    "growth": "`al_ilqr`, line search included. Quadrotor (n = 14), 100 stages, 30 spheres unless the row says\n"
+    "otherwise; more stages divide the same 5 s, more spheres fill the same region. The planar vehicle has n = 6.",
 }
 
 
