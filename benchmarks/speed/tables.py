@@ -17,14 +17,15 @@ WORDS = {
     "per problem and, after the comma, per layout reached, as a peer that stops short of the goal may be fast.",
     "families": "Drawn layouts (seed 1000). The peers fly the first of the same layouts, before and after `gco`;\n"
     "spread is the difference of the two times, wall the elapsed time. `fatrop_guided` and `acados_guided` start\n"
-    "from a trajectory along the roadmap's best path, whose search counts, all others from the vehicle at rest. Ratios are\n"
-    "peer / `gco`: of seconds per problem and per layout reached, and of costs, the median where both arrive.",
+    "from a trajectory along the roadmap's best path, whose search counts, all others from the vehicle at rest.\n"
+    "Ratios are peer / `gco`: of seconds per problem and per layout reached, and of costs, the median where both arrive.",
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
     "rest of the solution, `gco` from its multipliers as well. Set-up does not count: `gco` traces the model and\n"
     "finds its kernels, FATROP's program is built.",
     "own_model": "A user's unicycle (4 states, 2 controls, a Python function, RK4), 100 stages, five discs,\n"
     "`torchgco.solve` without options.",
-    "paper": "The paper's planar problem by the paper's method: a thousand stages, three circles; the problems differ in their random draws.",
+    "paper": "The paper's planar problem by the paper's method: a thousand stages, three circles;\n"
+    "the problems differ in their random draws.",
     "mppi": "One round of white noise around hovering, 30 spheres, float32, B = 1; medians of alternating rounds.",
     "first_use": "A first solve in a new process: the model traced, differentiated, written out as C and compiled,\n"
     "and what the first solve takes more than the second, in processor seconds, the compiler's included.",

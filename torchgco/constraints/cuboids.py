@@ -69,7 +69,7 @@ class Cuboids(NamedTuple):
         return _square(excess(_at(begin, along, nearest(begin, along, half)), half))
 
     def reach(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Lower and upper corner (B, d) of a region around points (B, V, d) and the inflated boxes, enlarged by half."""
+        """Lower and upper corner (B, d) around points (B, V, d) and the inflated boxes, made larger by half."""
         half = (self.axes.abs() * self.half_sizes.unsqueeze(-1)).sum(-2)
         wide, here = 1.5 * (half + self.radius.unsqueeze(-1)), self.here.unsqueeze(-1)
         low = torch.where(here, self.centers - wide, torch.inf)
