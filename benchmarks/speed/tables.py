@@ -18,7 +18,7 @@ WORDS = {
     "families": "Drawn layouts (seed 1000). The peers fly the first of the same layouts, before and after `gco`;\n"
     "spread is the difference of the two times, wall the elapsed time. `fatrop_guided` and `acados_guided` start\n"
     "from a trajectory along the roadmap's best path, whose search counts, all others from the vehicle at rest.\n"
-    "Ratios are peer / `gco`: of seconds per problem and per layout reached, and of costs, the median where both arrive.",
+    "Ratios are peer / `gco`: of seconds per problem and per layout reached, and of costs (median where both arrive).",
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
     "rest of the solution, `gco` from its multipliers as well. Set-up does not count: `gco` traces the model and\n"
     "finds its kernels, FATROP's program is built.",
