@@ -27,11 +27,8 @@ typedef struct {
 static inline void draw(const Samples *q, int64_t k, V *eps, V *u) {
     const Sampling *o = q->of;
     for (int j = 0; j < NU; j++) {
-        V z = q->z[k * NU + j];
-        if (o->knots > 0) {
-            const V *left = q->z + o->left[k] * NU + j;
-            z = left[0] + SET(o->share[k]) * (left[NU] - left[0]);
-        }
+        const V *left = q->z + (o->knots > 0 ? o->left[k] : k) * NU + j;
+        V z = o->knots > 0 ? left[0] + SET(o->share[k]) * (left[NU] - left[0]) : left[0];
         eps[j] = z * q->deviation[j];
         V v = q->mean[k * NU + j] + eps[j];
         u[j] = tgco_fmin(tgco_fmax(v, q->lower[j]), q->upper[j]);
