@@ -39,6 +39,7 @@ def _frame(ax: Axes, example: Example) -> None:
     room = 0.12 * float((high - low).max())
     ax.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
     ax.set_aspect("equal")
+    ax.set(xlabel="x [m]", ylabel="y [m]")
 
 
 def picture(examples: dict[str, Example], file: Path) -> Path:
@@ -55,7 +56,7 @@ def picture(examples: dict[str, Example], file: Path) -> Path:
         _frame(ax, example)
         tidy(ax, f"{cause}: {example.family}, {example.layout}", grid=None)
     handles = [
-        Line2D([], [], color=PATH, label="path returned"),
+        Line2D([], [], color=PATH, label="trajectory returned"),
         Line2D([], [], color=PLAN, label="last sampled plan"),
         Line2D([], [], color=INK, marker="*", linestyle="", label="goal"),
     ]

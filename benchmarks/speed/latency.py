@@ -7,14 +7,11 @@ from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from statistics import mean
 
-import torch
-from torch import Tensor
-
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.peers import CasADiPeer
 from torchgco.experiments.build import Setup
 from torchgco.judge import Verdict, judge
-from torchgco.lagrangian import Multipliers
+from torchgco.lagrangian import Multipliers, shifted
 from torchgco.native.dispatch import engine_of
 from torchgco.scenarios import Task
 from torchgco.solution import Solution
@@ -57,7 +54,7 @@ def run(bench: Bench) -> None:
             break
         began = time.monotonic()
         solution = _fly(bench, setup, task, "cold", None, flights)
-        _fly(bench, setup, _next(task, solution), "warm", _shifted(solution.multipliers), flights)
+        _fly(bench, setup, _next(task, solution), "warm", solution.multipliers.shifted(), flights)
         known = time.monotonic() - began
     _say(bench, flights)
 
@@ -92,13 +89,4 @@ def _say(bench: Bench, flights: AllFlights) -> None:
 
 def _next(task: Task, solution: Solution) -> Task:
     """The problem one stage later, with the remaining controls and the last control repeated."""
-    return replace(task, problem=replace(task.problem, x0=solution.X[:, 1]), U0=_shift(solution.U))
-
-
-def _shifted(multipliers: Multipliers) -> Multipliers:
-    return Multipliers(tuple(_shift(lam) for lam in multipliers.lam), multipliers.mu)
-
-
-def _shift(values: Tensor) -> Tensor:
-    """Knot k takes the values of knot k + 1; the last knot keeps its own."""
-    return torch.cat((values[:, 1:], values[:, -1:]), dim=1)
+    return replace(task, problem=replace(task.problem, x0=solution.X[:, 1]), U0=shifted(solution.U))
