@@ -19,6 +19,7 @@ def solve(
     seed: int = 0,
     ids: Tensor | None = None,
     warm: Solution | None = None,
+    max_seconds: float | None = None,
 ) -> Solution:
     """Solve every problem of the batch.
 
@@ -29,6 +30,7 @@ def solve(
         seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
         warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
             its controls.
+        max_seconds: time after which the best trajectories so far are returned; see `Solver.solve`.
 
     Raises:
         InputError: U0, ids or warm don't fit the problem.
@@ -38,7 +40,7 @@ def solve(
     if solver is None:
         solver = gco(problem)
     multipliers = None if warm is None else warm.multipliers
-    return solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers)
+    return solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds)
 
 
 def _at_rest(problem: Problem) -> Tensor:

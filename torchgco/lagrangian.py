@@ -35,12 +35,21 @@ class Multipliers:
         """The multipliers and penalties of the same problems with their costs times `factor` (B,)."""
         return Multipliers(tuple(factor.view(-1, 1, 1) * lam for lam in self.lam), factor * self.mu)
 
+    def shifted(self) -> Multipliers:
+        """Those of the same problems one stage later: every knot takes the values of the next one."""
+        return Multipliers(tuple(shifted(lam) for lam in self.lam), self.mu)
+
     def check(self, problem: Problem) -> None:
         """Raise InputError unless these multipliers belong to a problem of this form (a warm start)."""
         want = Multipliers.zero(problem, 0.0)
         got, expected = [tuple(t.shape) for t in self.lam], [tuple(t.shape) for t in want.lam]
         if got != expected:
             raise InputError("warm", f"multipliers of shapes {expected}", got)
+
+
+def shifted(values: Tensor) -> Tensor:
+    """Values (B, K, ...) of knots one stage later; the last knot keeps its own."""
+    return torch.cat((values[:, 1:], values[:, -1:]), dim=1)
 
 
 def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> Tensor:

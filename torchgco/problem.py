@@ -51,10 +51,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         self._check_border()
-        dims = Dimensions(
-            self.B, self.N, self.n, self.m,
-            getattr(self.dynamics, "dt", None), self.dynamics.position, self.x0,
-        )  # fmt: skip
+        dims = self._dimensions(self.x0)
         self._check_dynamics()
         object.__setattr__(self, "cost", self.cost.bind(dims))
         object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
@@ -62,6 +59,10 @@ class Problem:
         goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
         object.__setattr__(self, "goal", goal)
         object.__setattr__(self, "form", {})
+
+    def _dimensions(self, x0: Tensor) -> Dimensions:
+        dt = getattr(self.dynamics, "dt", None)
+        return Dimensions(x0.shape[0], self.N, self.n, self.m, dt, self.dynamics.position, x0)
 
     @property
     def B(self) -> int:
@@ -147,6 +148,25 @@ class Problem:
     def grown(self, by: Tensor) -> Self:
         """The same problems with their obstacles grown by `by` (B,), m."""
         return self._with({"constraints": tuple(c.grown(by) for c in self.constraints)}, form=self.form)
+
+    def started_at(self, x0: Tensor, constraints: Sequence[Constraint], cost: Cost | None = None) -> Self:
+        """The same problems from other states x0 (B, n): for receding horizons.
+
+        Constraints are of the same kinds and knots in the same order, the cost of the same kind; None: as it is. What
+        is known of the problems' form (native kernels) is kept.
+
+        Raises:
+            InputError: x0 of another shape, dtype or device, constraints of other kinds.
+        """
+        if x0.shape != self.x0.shape or x0.dtype != self.x0.dtype or x0.device != self.x0.device:
+            raise InputError("x0", f"{self.x0.dtype} of shape {tuple(self.x0.shape)}", _describe(x0))
+        dims = self._dimensions(x0)
+        bound = tuple(constraint.bind(dims) for constraint in constraints)
+        if [type(part) for part in bound] != [type(part) for part in self.constraints]:
+            kinds = ", ".join(type(part).__name__ for part in self.constraints)
+            raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in bound))
+        cost = self.cost if cost is None else cost.bind(dims)
+        return self._with({"x0": x0, "constraints": bound, "cost": cost}, form=self.form)
 
     def cast(self, dtype: torch.dtype) -> Self:
         """The same problems in another precision."""

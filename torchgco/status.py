@@ -17,6 +17,7 @@ class Status(IntEnum):
     INFEASIBLE = 6
     INVALID_START = 7
     FEASIBLE = 8
+    TIME_LIMIT = 9
 
     @property
     def sentence(self) -> str:
@@ -35,5 +36,6 @@ _SENTENCES = {
     Status.NOT_POSITIVE_DEFINITE: "The regularised control Hessian stayed indefinite up to the largest regularisation.",
     Status.NON_FINITE: "A state, cost or derivative became NaN or infinite.",
     Status.INFEASIBLE: "No iterate met the constraints; the least violated trajectory is returned.",
+    Status.TIME_LIMIT: "The time limit ended the solve before the trajectory was stationary or feasible.",
     Status.INVALID_START: "The start lies inside an obstacle; nothing was solved.",
 }

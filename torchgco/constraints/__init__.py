@@ -8,4 +8,5 @@ from torchgco.constraints.bounds import ControlBounds as ControlBounds
 from torchgco.constraints.bounds import StateBounds as StateBounds
 from torchgco.constraints.boxes import Boxes as Boxes
 from torchgco.constraints.equalities import FirstStepRates as FirstStepRates
+from torchgco.constraints.equalities import ThrustSum as ThrustSum
 from torchgco.constraints.obstacles import Spheres as Spheres

@@ -66,6 +66,10 @@ class Constraint(PerElement):
         """The same constraint with more distance from its obstacles by `by` (B,), m; itself where it keeps none."""
         return self
 
+    def later(self, t: float) -> Self:
+        """The same constraint for a problem that starts t seconds later: moving obstacles have moved."""
+        return self
+
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """Whether the constraint admits a start at x0 (B, n), (B,) bool."""
         return torch.ones(x0.shape[0], dtype=torch.bool, device=x0.device)

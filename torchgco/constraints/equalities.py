@@ -24,6 +24,8 @@ class FirstStepRates(Constraint):
         thrusts: F(t0), (4,) or (B, 4), N.
         period: T_s, s.
         airframe: the quadrotor's parameters.
+        reachable: lowest and highest w(t1) of the planning model, (B, 3) each, rad/s; where the rotors lead outside,
+            the nearest reachable rates are asked for. None: as printed, which no plan may be able to meet.
 
     Raises:
         InputError: on `Problem(...)`: wrong shapes, dynamics without the planning model's 14 states.
@@ -32,11 +34,12 @@ class FirstStepRates(Constraint):
     thrusts: Any
     period: float = 0.05
     airframe: Airframe = Airframe()
+    reachable: tuple[Tensor, Tensor] | None = None
     target: Tensor | None = None  # (B, 3): w(t1), once bound
 
     knots: ClassVar[slice] = slice(1, 2)
     sense: ClassVar[Sense] = "equality"
-    batched: ClassVar[tuple[str, ...]] = ("thrusts", "target")
+    batched: ClassVar[tuple[str, ...]] = ("thrusts", "reachable", "target")
     rates: ClassVar[slice] = slice(10, 13)
 
     def bind(self, dims: Dimensions) -> Self:
@@ -47,6 +50,11 @@ class FirstStepRates(Constraint):
         check_shape(thrusts, (dims.B, 4), "first_step.thrusts")
         w0 = dims.like[:, self.rates]
         target = w0 + self.period * self.airframe.angular_acceleration(w0, thrusts)
+        if self.reachable is not None:
+            lower, upper = self.reachable
+            check_shape(lower, (dims.B, 3), "first_step.reachable")
+            check_shape(upper, (dims.B, 3), "first_step.reachable")
+            target = torch.minimum(torch.maximum(target, lower), upper)
         return replace(self, thrusts=thrusts.contiguous(), target=target)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
@@ -58,3 +66,38 @@ class FirstStepRates(Constraint):
         H[:, 1, self.rates, n] += g[:, 0]
         H[:, 1, n, self.rates] += g[:, 0]
         H[:, 1, self.rates, self.rates] += torch.diag_embed(h[:, 0])
+
+
+@dataclass(frozen=True)
+class ThrustSum(Constraint):
+    """The rotors' joint thrust follows the plan (section 5.2.1): 0 = sum_i F_i - m a_ref at knots 1..N.
+
+    Args:
+        acceleration: a_ref (B, N), m/s^2, at knots 1..N.
+        mass: m, kg.
+
+    Raises:
+        InputError: on `Problem(...)`: wrong shape, dynamics without the tracking model's 7 states.
+    """
+
+    acceleration: Tensor
+    mass: float
+
+    knots: Any = None
+    sense: ClassVar[Sense] = "equality"
+    batched: ClassVar[tuple[str, ...]] = ("acceleration",)
+
+    def bind(self, dims: Dimensions) -> Self:
+        if dims.n != 7:
+            raise InputError("thrust_sum.dynamics", "the tracking model with 7 states", f"{dims.n} states")
+        check_shape(self.acceleration, (dims.B, dims.N), "thrust_sum.acceleration")
+        return replace(self, knots=slice(1, dims.N + 1))
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return (X[:, self.knots, 3:].sum(-1) - self.mass * self.acceleration).unsqueeze(-1)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        n = X.shape[-1]
+        H[:, self.knots, 3:n, n] += g
+        H[:, self.knots, n, 3:n] += g
+        H[:, self.knots, 3:n, 3:n] += h.unsqueeze(-1)

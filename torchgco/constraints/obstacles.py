@@ -73,16 +73,16 @@ class Spheres(Constraint):
             velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
         if velocities is not None and dims.dt is None:
             raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
+        knots = slice(1, dims.N + 1) if self.knots is None else self.knots
         return BoundSpheres.prepare(
             torch.where(absent.unsqueeze(-1), 0.0, centers),
             torch.where(absent, 0.0, radii + vehicle),
             velocities,
             absent,
             vehicle.expand(dims.B, 1)[:, 0].contiguous(),
-            resolve_knots(
-                slice(1, dims.N + 1) if self.knots is None else self.knots, dims.N, "obstacles.knots", radii.device
-            ),
-            dims,
+            resolve_knots(knots, dims.N, "obstacles.knots", radii.device),
+            dims.position,
+            dims.dt or 0.0,
         )
 
 
@@ -115,9 +115,9 @@ class BoundSpheres(Obstacles):
         absent: Tensor,
         vehicle_radius: Tensor,
         knots: Any,
-        dims: Dimensions,
+        position: slice,
+        dt: float,
     ) -> BoundSpheres:
-        assert dims.position is not None
         o, one = centers, (~absent).to(centers.dtype).unsqueeze(-1)  # absent: left out of sums
         rows = [2 * o, -one, (inflated_radii.square() - o.square().sum(-1)).unsqueeze(-1)]
         first, second = [one, o], [_outer(o, o)]
@@ -132,7 +132,7 @@ class BoundSpheres(Obstacles):
         constant[..., o.shape[-1] + 1] = -1.0
         weights = torch.where(absent.unsqueeze(-1), constant, weights).mT.contiguous()
         return cls(
-            centers, inflated_radii, velocities, absent, vehicle_radius, knots, dims.position, dims.dt or 0.0,
+            centers, inflated_radii, velocities, absent, vehicle_radius, knots, position, dt,
             weights, torch.cat(first, dim=-1), torch.cat(second, dim=-1),
         )  # fmt: skip
 
@@ -191,6 +191,14 @@ class BoundSpheres(Obstacles):
         weights = self.weights.clone()
         weights[:, self.centers.shape[-1] + 1] += radii.square() - self.inflated_radii.square()
         return replace(self, inflated_radii=radii, vehicle_radius=self.vehicle_radius + by, weights=weights)
+
+    def later(self, t: float) -> BoundSpheres:
+        if self.velocities is None:
+            return self
+        return self.prepare(
+            self.centers + t * self.velocities, self.inflated_radii, self.velocities, self.absent, self.vehicle_radius,
+            self.knots, self.position, self.dt,
+        )  # fmt: skip
 
     def inflated(self) -> Inflated | None:
         if self.moving:

@@ -89,6 +89,10 @@ class BoundQuadratic(Cost):
     def bind(self, dims: Dimensions) -> BoundQuadratic:
         return self
 
+    def toward(self, x_ref: Tensor) -> BoundQuadratic:
+        """The same cost with other references of the states, (B, N+1, n), unchecked: for receding horizons."""
+        return replace(self, x_ref=x_ref[:, :-1].contiguous(), xf_ref=x_ref[:, -1].contiguous())
+
     def scaled(self, factor: Tensor) -> BoundQuadratic:
         weights = {name: getattr(self, name) for name in ("Q", "R", "Qf", "q", "r", "qf", "H")}
         return replace(self, **{name: lead(factor, W) * W for name, W in weights.items() if W is not None})

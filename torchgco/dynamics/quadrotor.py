@@ -76,7 +76,7 @@ def _apply(A: Tensor, x: Tensor) -> Tensor:
     return (A * x.unsqueeze(-2)).sum(-1)
 
 
-def _pose_rates(v: Components, q: Components, w: Components, a: Tensor, gravity: float) -> Components:
+def pose_rates(v: Components, q: Components, w: Components, a: Tensor, gravity: float) -> Components:
     """p' = v (3), v' = a R(q) e3 - g e3 (3) and q' = 1/2 Qx(w) q (4) under a thrust acceleration a, m/s^2."""
     (q0, q1, q2, q3), (w1, w2, w3) = q, w
     axis = 2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3
@@ -124,7 +124,7 @@ class QuadrotorPlanning(Dynamics):
         v, q, w, a = states[3:6], states[6:10], states[10:13], states[13]
         T_w, T_a = (lead(T, a) for T in (self.rate_time_constant, self.thrust_time_constant))
         turning = ((w_c - w_i) / T_w for w_c, w_i in zip(controls[:3], w, strict=True))
-        return vectors(*_pose_rates(v, q, w, a, self.gravity), *turning, (controls[3] - a) / T_a)
+        return vectors(*pose_rates(v, q, w, a, self.gravity), *turning, (controls[3] - a) / T_a)
 
 
 @dataclass(frozen=True)
@@ -154,16 +154,20 @@ class QuadrotorPlant(Dynamics):
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
         lift = F.sum(-1) / self.airframe.mass
-        pose = _pose_rates(components(v), components(q), components(w), lift, self.gravity)
+        pose = pose_rates(components(v), components(q), components(w), lift, self.gravity)
         rates = self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, u)
         return torch.cat((vectors(*pose), *rates), dim=-1)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
-        x = super().step(x, u)
-        q = x[..., 6:10]
-        q = q / q.square().sum(-1, keepdim=True).sqrt()
-        F = x[..., 13:].clamp(self.airframe.thrust_min, self.airframe.thrust_max)
-        return torch.cat((x[..., :6], q, x[..., 10:13], F), dim=-1)
+        return within_limits(super().step(x, u), self.airframe)
+
+
+def within_limits(x: Tensor, airframe: Airframe) -> Tensor:
+    """States (..., 17) with thrusts limited to [f_min, f_max] and a renormalised quaternion."""
+    q = x[..., 6:10]
+    q = q / q.square().sum(-1, keepdim=True).sqrt()
+    F = x[..., 13:].clamp(airframe.thrust_min, airframe.thrust_max)
+    return torch.cat((x[..., :6], q, x[..., 10:13], F), dim=-1)
 
 
 @dataclass(frozen=True)

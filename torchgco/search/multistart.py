@@ -65,7 +65,7 @@ class MultiStart(Solver):
         left = call.problem.start_is_clear & torch.isfinite(call.problem.x0).all(-1)  # no guess helps an invalid start
         for start in range(1, self.starts):
             rows = (left if self.budget is None else left & (best.end.iterations < self.budget)).nonzero().flatten()
-            if rows.numel() == 0:
+            if rows.numel() == 0 or call.late:
                 break
             part = scaled.take(rows)
             noise = self._noise(DrawKey(call.seed, part.ids, torch.full_like(rows, start)), call.problem.N, sigma)

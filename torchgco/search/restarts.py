@@ -88,7 +88,8 @@ class Restarts(Solver):
             after = None if self.sampling is None else self.sampling.single_contact_after
             caught = solver.iterate(scaled, StopWhenCaught(after), recorder=recorder, by_arrival=True)
             best = self._restarted(scaled, caught, paths, sampling, recorder)
-        clear_chords(best, self.attempts + 3)
+        if not call.late:
+            clear_chords(best, self.attempts + 3)
         phr = not solver.inner.as_printed
         return finished(call, scaled, unit, best.end, phr, solver.violation_tolerance, solver.slots, recorder)
 
@@ -114,6 +115,8 @@ class Restarts(Solver):
         best = Best(call, caught, self.local, recorder)
         stopped = caught.status == STOPPED
         for attempt in range(1, self.attempts + 1):
+            if call.late:
+                return best
             if recorder is not None:
                 recorder.attempt = attempt + 1  # a problem gets the same number in any batch
             wanted = (stopped if self.all_attempts else stopped & ~best.arrived()).nonzero().flatten()

@@ -19,9 +19,10 @@ FALLEN_BACK = 0.25  # share of the distance from start to goal; candidates that 
 def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     """Start, goal and obstacles, and the cost of being at a point under the controls `rest` (B, N, m).
 
-    None without a goal or obstacles, with obstacles that the roadmap can't take, or if space is neither 2-D nor 3-D.
+    Obstacles that don't hold at the last knot are left out: only those that stay bar a path. None without a goal or
+    obstacles, with obstacles that the roadmap can't take, or if space is neither 2-D nor 3-D.
     """
-    forms = [c.inflated() if isinstance(c, Obstacles) else None for c in problem.geometric]
+    forms = [c.inflated() if isinstance(c, Obstacles) else None for c in problem.geometric if c.holds_at(problem.N)]
     spheres = [form for form in forms if form is not None]
     boxes = join([form.boxes for form in spheres if form.boxes is not None and form.boxes.radius.shape[1] > 0])
     count = sum(c.inflated_radii.shape[1] for c in spheres)

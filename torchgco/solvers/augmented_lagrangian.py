@@ -131,7 +131,7 @@ class OuterLoop:
 
     def begin(self, rows: Tensor) -> tuple[State, Tensor]:
         """Rollouts of the initial controls of the problems `rows`, and the statuses of invalid starts."""
-        problem, U = self.call.problem.take(rows), self.call.U0[rows]
+        problem, U = self._part(rows), self.call.U0[rows]
         X = open_loop(problem, U)
         if self.call.warm is None:
             multipliers = Multipliers.zero(problem, self.solver.initial_penalty)
@@ -157,8 +157,12 @@ class OuterLoop:
 
     def regroup(self, rows: Tensor) -> None:
         """Continue with these problems as the running ones."""
+        self.problem = self._part(rows)
+
+    def _part(self, rows: Tensor) -> Problem:
+        """The problems `rows`, in their order; all of them are the whole, of which native kernels know more."""
         whole = self.call.problem
-        self.problem = whole if rows.numel() == whole.B else whole.take(rows)
+        return whole if rows.numel() == whole.B else whole.take(rows)
 
     def advance(self, s: State) -> Tensor:
         """One inner solve of every running problem (one iteration by PyTorch or if recorded), then the outer update."""
@@ -169,6 +173,8 @@ class OuterLoop:
         rows = end.ended.nonzero().flatten()
         if rows.numel() > 0:
             self._outer_iteration(s, rows, end)
+        if self.call.late:
+            end.status[end.status == Status.RUNNING] = Status.TIME_LIMIT
         return end.status
 
     def _outer_iteration(self, s: State, rows: Tensor, end: PassEnd) -> None:

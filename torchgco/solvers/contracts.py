@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, Self
@@ -45,6 +46,7 @@ class Call:
     outer: Tensor  # (B,) int64: outer iterations that this call continues; draws are keyed by their number
     warm: Multipliers | None
     callback: Callback | None
+    deadline: float | None = None  # of `time.monotonic`, s; after it the solve ends with the best trajectory so far
 
     @classmethod
     def checked(
@@ -55,12 +57,16 @@ class Call:
         ids: Tensor | None = None,
         warm: Multipliers | None = None,
         callback: Callback | None = None,
+        max_seconds: float | None = None,
     ) -> Call:
         """The call of `Solver.solve`.
 
         Raises:
-            InputError: U0, ids or warm don't fit the problem.
+            InputError: U0, ids or warm don't fit the problem, or max_seconds isn't above 0.
         """
+        if max_seconds is not None and not max_seconds > 0:
+            raise InputError("max_seconds", "a time above 0 s, or None", max_seconds)
+        deadline = None if max_seconds is None else time.monotonic() + max_seconds
         problem.check_controls(U0)
         rows = torch.arange(problem.B, device=problem.x0.device)
         if ids is None:
@@ -69,13 +75,19 @@ class Call:
             raise InputError("ids", f"an int64 tensor ({problem.B},)", getattr(ids, "shape", type(ids).__name__))
         if warm is not None:
             warm.check(problem)
-        return cls(problem, U0, seed, ids, rows, torch.zeros_like(rows), warm, callback)
+        return cls(problem, U0, seed, ids, rows, torch.zeros_like(rows), warm, callback, deadline)
+
+    @property
+    def late(self) -> bool:
+        """Whether the time limit has passed."""
+        return self.deadline is not None and time.monotonic() >= self.deadline
 
     def take(self, index: Rows) -> Self:
         """The same call for the problems in `index`."""
         warm = None if self.warm is None else take(self.warm, index)
         U0, ids, rows, outer = take((self.U0, self.ids, self.rows, self.outer), index)
-        return type(self)(self.problem.take(index), U0, self.seed, ids, rows, outer, warm, self.callback)
+        part = self.problem.take(index)
+        return type(self)(part, U0, self.seed, ids, rows, outer, warm, self.callback, self.deadline)
 
     def in_cost_units(self) -> tuple[Self, Tensor]:
         """The same call with costs and multipliers in units of `Problem.cost_unit`, and these units (B,)."""
@@ -95,6 +107,7 @@ class Solver:
         ids: Tensor | None = None,
         warm: Multipliers | None = None,
         callback: Callback | None = None,
+        max_seconds: float | None = None,
     ) -> Solution:
         """Solve every problem of the batch.
 
@@ -105,11 +118,13 @@ class Solver:
                 not on its place in the batch. ids is int64 (B,), by default 0..B-1.
             warm: multipliers and penalties of an earlier solution, for solvers that use them.
             callback: called with the progress after every pass.
+            max_seconds: the batched solvers check the time after every pass; once it is over, they return the best
+                trajectories so far. Results then depend on the speed of the machine. The baselines ignore it.
 
         Raises:
             InputError: U0, ids or warm don't fit the problem, or an option of the solver doesn't.
         """
-        return self.run(Call.checked(problem, U0, seed, ids, warm, callback))
+        return self.run(Call.checked(problem, U0, seed, ids, warm, callback, max_seconds))
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""

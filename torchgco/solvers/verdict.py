@@ -52,10 +52,12 @@ def finished(
     X, U = best.X.clone(), best.U.clone()
     K, d, left = U.new_zeros(*U.shape, problem.n), torch.zeros_like(U), torch.zeros_like(best.cost)
     for rows in torch.arange(problem.B, device=U.device).split(slots or max(1, problem.B)):
-        lagrangian = Lagrangian(problem.take(rows), take(best.multipliers, rows), None, phr)
+        part = problem if rows.numel() == problem.B else problem.take(rows)
+        lagrangian = Lagrangian(part, take(best.multipliers, rows), None, phr)
         K[rows], d[rows], left[rows] = optimality(lagrangian, X[rows], U[rows])
         X[rows], U[rows] = reproducible(lagrangian.problem, X[rows], U[rows], K[rows])
-    ended = torch.where(end.status == STOPPED, int(Status.MAX_ITERATIONS), end.status)
+    limit = Status.TIME_LIMIT if call.late else Status.MAX_ITERATIONS
+    ended = torch.where(end.status == STOPPED, int(limit), end.status)
     status = final_status(ended, left, best.violation, tolerance, bool(problem.constraints))
     return Solution(
         X, U, K, d, best.multipliers.scaled(unit), call.problem.cost.total(X, U), best.violation, status,

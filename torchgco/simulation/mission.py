@@ -1,0 +1,177 @@
+"""The mission: planner, tracker and plant in closed loop, for a batch of vehicles in lockstep (section 5.2.2).
+
+Every control period the planner solves from the measured state; every step of the plant the tracker commands the rotors
+along the plan. A vehicle that reaches its goal, touches an obstacle or diverges leaves the batch.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.bodies import CONTACT_FACTOR
+from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.errors import InputError
+from torchgco.outcome import FARTHEST
+from torchgco.problem import Problem
+from torchgco.simulation.disturbance import Disturbance, measured
+from torchgco.simulation.log import MissionLog
+from torchgco.simulation.planner import Plan, Planner
+from torchgco.simulation.plant import Plant, RotorPlant, hovering
+from torchgco.simulation.tracker import Reference, Tracker, Tracking
+from torchgco.tree import take
+
+SEED_STEP = 7_919  # between the seeds of two control steps
+Report = Callable[[int, int], None]  # of a control step and the number of vehicles that still fly
+
+
+@dataclass(frozen=True)
+class Mission:
+    """The closed loop.
+
+    Args:
+        planner: makes a plan in every control period, which is a time step of the planning problems.
+        tracker: its time step divides the control period, and is the plant's.
+        plant: the vehicle; parameters that differ between missions are (B,).
+        disturbance: wind and noise.
+        duration: s, after which a mission ends with TIMEOUT.
+        goal_radius: m, within which the goal counts as reached; None: the problems' own.
+        latency: control periods between a measurement and the first use of the plan made from it, 0 or 1.
+
+    Raises:
+        InputError: a field out of its range, or periods that don't fit each other.
+    """
+
+    planner: Planner
+    tracker: Tracker = field(default_factory=Tracker)
+    plant: Plant = field(default_factory=RotorPlant)
+    disturbance: Disturbance = field(default_factory=Disturbance)
+    duration: float = 15.0
+    goal_radius: float | None = 0.5
+    latency: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.duration > 0:
+            raise InputError("mission.duration", "above 0 s", self.duration)
+        if self.goal_radius is not None and not self.goal_radius > 0:
+            raise InputError("mission.goal_radius", "above 0 m, or null", self.goal_radius)
+        if self.latency not in (0, 1):
+            raise InputError("mission.latency", "0 or 1 control periods", self.latency)
+        if self.plant.dt != self.tracker.dt:
+            raise InputError("tracker.dt", f"the plant's {self.plant.dt} s", self.tracker.dt)
+
+    def fly(
+        self, problem: Problem, seed: int = 0, ids: Tensor | None = None, report: Report | None = None
+    ) -> MissionLog:
+        """Fly B missions from rest at the starts of planning problems to their goals.
+
+        Args:
+            problem: the planning problems, float64, on the quadrotor's planning model.
+            seed, ids: the key of all random draws; ids (B,) int64, by default 0..B-1.
+
+        Raises:
+            InputError: another model, no goal, obstacles other than spheres, or a control period that isn't a multiple
+                of the plant's time step.
+        """
+        ids = torch.arange(problem.B) if ids is None else ids
+        return _Flight(self, problem, seed, ids).run(report or (lambda step, flying: None))
+
+
+class _Flight:
+    """One call of `Mission.fly`: the state of all vehicles that still fly."""
+
+    def __init__(self, mission: Mission, problem: Problem, seed: int, ids: Tensor) -> None:
+        self.mission, self.seed = mission, seed
+        if problem.goal is None:
+            raise InputError("goal", "a Goal in the problem", None)
+        self.period = float(problem.dynamics.dt)
+        self.substeps = round(self.period / mission.plant.dt)
+        if self.substeps < 1 or not math.isclose(self.substeps * mission.plant.dt, self.period, rel_tol=1e-9):
+            raise InputError("scenario.dt", f"a multiple of the plant's {mission.plant.dt} s", self.period)
+        self.steps = math.ceil(mission.duration / self.period - 1e-9)
+        self.spheres = _spheres(problem)
+        self.goal = problem.goal.position
+        radius = mission.goal_radius
+        self.radius = problem.goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
+        x = hovering(mission.planner.airframe, problem.x0[:, :3])
+        self.problem, self.planned = problem, mission.planner.problem(problem, x)
+        self.force, self.noise = mission.disturbance.draw(seed, ids.tolist(), self.steps, self.period)
+        self.log = MissionLog.blank(x, self.steps, self.substeps, self.period)
+        self.plant, self.x, self.rows, self.ids = mission.plant, x, torch.arange(problem.B), ids
+
+    def run(self, report: Report) -> MissionLog:
+        """Fly until all missions have ended."""
+        plan: Plan | None = None
+        active: Plan | None = None
+        tracking: Tracking | None = None
+        self._leave(~self.problem.start_is_clear)
+        for step in range(self.steps):
+            if self.rows.numel() == 0:
+                break
+            seen = measured(self.x, self.noise[self.rows, step])
+            before = plan
+            plan, self.planned, seconds = self.mission.planner.plan(
+                self.problem, self.planned, seen, step, before, self.seed + SEED_STEP * step, self.ids
+            )
+            active = plan if self.mission.latency == 0 or before is None else before
+            self.log.add_plan(self.rows, step, self.x, plan, seconds / self.rows.numel())
+            tracking, left = self._fly_period(step, active, tracking)
+            if bool(left.any()):
+                stay = (~left).nonzero().flatten()
+                plan, tracking = plan.take(stay), tracking.take(stay)
+                self._leave(left)
+            report(step, self.rows.numel())
+        return self.log
+
+    def _fly_period(self, step: int, plan: Plan, tracking: Tracking | None) -> tuple[Tracking, Tensor]:
+        """One control period along a plan; and which vehicles have ended in it, (B,) bool."""
+        reference = Reference(plan.X, self.period)
+        ended = torch.zeros_like(self.rows, dtype=torch.bool)
+        late = (step - plan.step) * self.period
+        for j in range(self.substeps):
+            seen = measured(self.x, self.noise[self.rows, step])
+            began = time.perf_counter()
+            tracking = self.mission.tracker.track(seen, reference, late + j * self.plant.dt, tracking)
+            seconds = (time.perf_counter() - began) / self.rows.numel()
+            x = self.plant.advance(self.x, tracking.commands, self.force[self.rows, step])
+            self.x = torch.where(ended.unsqueeze(-1), self.x, x)
+            ended |= self._ends((step * self.substeps + j + 1) * self.plant.dt)
+            self.log.add_sample(self.rows, step, j, self.x, tracking, seconds)
+        assert tracking is not None
+        return tracking, ended
+
+    def _ends(self, t: float) -> Tensor:
+        """Whether a vehicle is at its goal, in contact, or lost, (B,)."""
+        p = self.x[:, :3]
+        finite = torch.isfinite(self.x).all(-1) & (p.abs().amax(-1) < FARTHEST)
+        there = (p - self.goal[self.rows]).norm(dim=-1) < self.radius[self.rows]
+        hit = torch.zeros_like(there)
+        for centers, velocities, contact in self.spheres:
+            o = centers[self.rows] if velocities is None else centers[self.rows] + t * velocities[self.rows]
+            hit |= ((p.unsqueeze(1) - o).norm(dim=-1) < contact[self.rows]).any(-1)
+        return ~finite | there | hit
+
+    def _leave(self, left: Tensor) -> None:
+        """Drop the vehicles where `left` (B,)."""
+        stay = (~left).nonzero().flatten()
+        if stay.numel() == left.numel():
+            return
+        self.problem, self.planned = self.problem.take(stay), self.planned.take(stay)
+        self.plant = self.plant.take(stay)
+        self.x, self.rows, self.ids = take((self.x, self.rows, self.ids), stay)
+
+
+def _spheres(problem: Problem) -> list[tuple[Tensor, Tensor | None, Tensor]]:
+    """Centres (B, M, 3), velocities and distances of contact (B, M), m, of the problems' spheres."""
+    found = []
+    for part in problem.geometric:
+        if not isinstance(part, BoundSpheres):
+            raise InputError("constraints", "spheres as the obstacles of a mission", type(part).__name__)
+        contact = torch.where(part.absent, -torch.inf, CONTACT_FACTOR * part.inflated_radii)
+        found.append((part.centers, part.velocities, contact))
+    return found
