@@ -4,7 +4,8 @@
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
-# make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md
+# make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
+#              make paper: the paper's figures and Table A4 by our solvers, in docs/paper and docs/paper.md
 # make test    the tests; test-all: also the tests that kill processes or fly whole studies; lint, types: the static checks;
 #              clean: remove environments, caches and builds
 
@@ -23,7 +24,7 @@ ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all lint types clean quality oracle benchmark benchmark-gpu ladder docs figures
+.PHONY: study test test-all lint types clean quality oracle benchmark benchmark-gpu ladder docs figures paper
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -56,6 +57,9 @@ docs: $(DEV)
 
 figures: $(RUNTIME)
 	$(BIN)/python docs/figures.py
+
+paper: $(RUNTIME)
+	$(BIN)/python docs/paper_figures.py --outputs docs/paper $(ARGS)
 
 lint: $(DEV)
 	$(BIN)/ruff check .

@@ -131,10 +131,13 @@ def _scene(layouts: Layouts, title: str) -> tuple[Figure, Axes]:
     figure = Figure(figsize=SIZE, layout="constrained")
     ax = figure.subplots()
     centers, radii = layouts.centers[0], layouts.radii[0]
-    for extra, look in (
+    assert layouts.start is not None and layouts.goal is not None
+    assert layouts.vehicle_radius is not None and layouts.goal_radius is not None
+    looks: list[tuple[float, dict[str, Any]]] = [
         (0.0, {"facecolor": STONE}),
         (layouts.vehicle_radius, {"facecolor": "none", "edgecolor": EDGE}),
-    ):
+    ]
+    for extra, look in looks:
         circles = [Circle(tuple(at), r + extra) for at, r in zip(centers, radii, strict=True)]
         ax.add_collection(PatchCollection(circles, **look))
     start, goal = (np.broadcast_to(x, (1, x.shape[-1]))[0, :2] for x in (layouts.start, layouts.goal))

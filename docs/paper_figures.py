@@ -1,0 +1,91 @@
+"""python docs/paper_figures.py: the paper's figures on optimisation, from runs of our solvers, and Table A4.
+
+The figures go to `--outputs`, the table there and into the page, docs/paper.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import paper_planar
+import paper_quadrotor
+from matplotlib.figure import Figure
+from paper_runs import Solve, planar, quadrotor
+from PIL import Image
+
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.tables import put_between
+from torchgco.plotting.style import save
+
+ROOT = Path(__file__).resolve().parents[1]
+DPI = 110
+ROUNDING = 5  # of the 255 shades of a colour
+DRAWS = (0, 112)  # of the two trials: 112 is the only one of 0 to 191 that passes below the circles
+SOLVERS = ("al_ilqr", "gco_paper", "gco")  # of Figures 6 and 7
+MARKS = "<!-- table-A4 -->", "<!-- end table-A4 -->"
+PARTS = ("planar", "quadrotor")
+
+
+def planar_figures(trials: Sequence[Solve], alone: Solve) -> dict[str, Callable[[], Figure]]:
+    """What to draw of the planar problem, by the names of the files."""
+    return {
+        "figure-03": lambda: paper_planar.caught(alone, trials[0]),
+        "figure-04": lambda: paper_planar.result(trials[0]),
+        "figure-05": lambda: paper_planar.evolution(trials[0]),
+        "figure-A1": lambda: paper_planar.distinct(trials),
+        "figure-A2": lambda: paper_planar.histories(trials),
+        "figure-A3": lambda: paper_planar.evolution(trials[1]),
+    }
+
+
+def quadrotor_figures(solves: Sequence[Solve]) -> dict[str, Callable[[], Figure]]:
+    """What to draw of the quadrotor's first plans, by the names of the files."""
+    return {
+        "figure-06": lambda: paper_quadrotor.plans(solves),
+        "figure-07": lambda: paper_quadrotor.costs(solves),
+    }
+
+
+def write_table(trials: Sequence[Solve], outputs: Path, page: Path) -> None:
+    """Table A4 as a file, and between its marks in the page."""
+    rows = paper_planar.table(trials, DRAWS)
+    outputs.mkdir(parents=True, exist_ok=True)
+    rows.to_csv(outputs / "table-A4.csv", index=False)
+    origin = provenance("cpu")
+    head = f"Measured on {origin['date']} at commit {origin['commit']}, {origin['processor']}."
+    put_between(page, *MARKS, f"{head}\n\n{paper_planar.markdown(rows)}")
+
+
+def write_picture(figure: Figure, path: Path) -> None:
+    """A PNG in colours rounded to multiples of `ROUNDING`: invisible, and two thirds as large."""
+    save(figure, path, DPI)
+    with Image.open(path) as picture:
+        values = np.asarray(picture.convert("RGB"))
+    Image.fromarray((np.round(values / ROUNDING) * ROUNDING).astype(np.uint8)).save(path, optimize=True)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python docs/paper_figures.py", description="Draw the figures of paper.md.")
+    parser.add_argument("--outputs", type=Path, default=ROOT / "docs" / "paper")
+    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "paper.md", help="where Table A4 is written")
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS, help="by default all")
+    parser.add_argument("--stages", type=int, default=1000, help="of the planar problem; the paper has 1000")
+    asked = parser.parse_args(words)
+    drawings: dict[str, Callable[[], Figure]] = {}
+    if "planar" in asked.parts:
+        trials = [planar("gco_paper", number, asked.stages) for number in DRAWS]
+        drawings |= planar_figures(trials, planar("al_ilqr", 0, asked.stages))
+        write_table(trials, asked.outputs, asked.page)
+    if "quadrotor" in asked.parts:
+        drawings |= quadrotor_figures([quadrotor(name) for name in SOLVERS])
+    for name, make in drawings.items():
+        write_picture(make(), asked.outputs / f"{name}.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,88 @@
+"""The script of docs/paper.md draws its figures, and shows the samples that the solver drew."""
+
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pandas as pd
+import pytest
+import torch
+from matplotlib.image import imread
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+STAGES = 80
+
+
+@pytest.fixture(scope="module")
+def script() -> Iterator[ModuleType]:
+    sys.path.insert(0, str(DOCS))
+    yield importlib.import_module("paper_figures")
+    sys.path.remove(str(DOCS))
+
+
+def test_the_planar_figures_and_the_table_are_written(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(script, "DPI", 40)
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- table-A4 -->\nold\n<!-- end table-A4 -->\nafter\n")
+    words = ["--parts", "planar", "--stages", str(STAGES), "--page", str(page), "--outputs", str(tmp_path / "out")]
+    assert script.main(words) == 0
+    pictures = sorted((tmp_path / "out").glob("*.png"))
+    assert [path.stem for path in pictures] == [f"figure-{n}" for n in ("03", "04", "05", "A1", "A2", "A3")]
+    shown = (DOCS / "paper.md").read_text()
+    for path in pictures:
+        assert f"](paper/{path.name})" in shown
+        assert (DOCS / "paper" / path.name).stat().st_size < 200_000
+        assert imread(path).std() > 0.01
+    table, text = pd.read_csv(tmp_path / "out" / "table-A4.csv"), page.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert list(table.cost_paper) == [1364.08, 1655.35]
+    assert all(f"{cost:.2f}" in text for cost in table.cost)
+    # The table's costs are those of the solver without a witness.
+    runs = importlib.import_module("paper_runs")
+    assert table.cost[0] == pytest.approx(_cost(runs, draws=0), rel=1e-12)
+
+
+def _cost(runs: ModuleType, draws: int) -> float:
+    size = [f"scenario.stages={STAGES}", f"scenario.dt={runs.HORIZON / STAGES}"]
+    setup = runs.compose(["experiment=planar_trap_paper", *size, "device.threads=1"])
+    task = setup.task(setup.layouts(1))
+    return float(setup.solver.solve(task.problem, task.U0, seed=0, ids=torch.tensor([draws])).cost[0])
+
+
+def test_the_samples_shown_are_those_that_the_solver_averaged(script: ModuleType) -> None:
+    runs = importlib.import_module("paper_runs")
+    solve = runs.planar("gco_paper", 0, STAGES)
+    call = next(step.sampling for step in solve.steps if step.sampling is not None)
+    sampler, problem = call.sampler, call.problem
+    V = call.controls(sampler.samples)
+    X = problem.x0.expand(sampler.samples, -1)
+    S, spheres = torch.zeros(sampler.samples, dtype=X.dtype), problem.geometric[0]
+    noise = call.sampler._noise(problem, call.key, sampler._sigma(problem).sqrt(), 0, range(sampler.samples)).eps
+    states = [X]
+    for k in range(problem.N):
+        S = S + problem.cost.stage(X, V[:, k], k) + (call.U[:, k] / 100.0 * noise[k, 0]).sum(-1)
+        X = problem.dynamics.step(X, V[:, k])
+        states.append(X)
+        S = S + 1e8 * ((X[:, None, :2] - spheres.centers[0]).norm(dim=-1) <= spheres.inflated_radii[0]).sum(-1)
+    S = S + problem.cost.terminal(X)
+    mean = (torch.softmax(S.min() - S, 0)[:, None, None] * V).sum(0)
+    plan = problem.x0
+    for k in range(problem.N):
+        plan = problem.dynamics.step(plan, mean[None, k])
+    torch.testing.assert_close(plan[0], call.plan[-1], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        torch.from_numpy(call.samples(5)), torch.stack(states, 1)[:5, :, :2], rtol=1e-9, atol=1e-9
+    )
+
+
+def test_a_cross_marks_knots_inside_an_inflated_obstacle_alone(script: ModuleType) -> None:
+    solve = importlib.import_module("paper_runs").planar("al_ilqr", 0, STAGES)
+    marked = solve.infeasible(solve.positions)
+    reach = 0.153 + 0.06
+    for point, mark in zip(solve.positions, marked, strict=True):
+        assert mark == any(((point - center) ** 2).sum() ** 0.5 < reach - 1e-3 for center in solve.centers)
+    assert marked.any()
