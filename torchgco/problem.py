@@ -149,11 +149,17 @@ class Problem:
         """The same problems with their obstacles grown by `by` (B,), m."""
         return self._with({"constraints": tuple(c.grown(by) for c in self.constraints)}, form=self.form)
 
-    def started_at(self, x0: Tensor, constraints: Sequence[Constraint], cost: Cost | None = None) -> Self:
+    def started_at(
+        self,
+        x0: Tensor,
+        constraints: Sequence[Constraint],
+        cost: Cost | None = None,
+        dynamics: Dynamics | None = None,
+    ) -> Self:
         """The same problems from other states x0 (B, n): for receding horizons.
 
-        Constraints are of the same kinds and knots in the same order, the cost of the same kind; None: as it is. What
-        is known of the problems' form (native kernels) is kept.
+        Constraints are of the same kinds and knots in the same order, cost and dynamics of the same kinds; None: as
+        they are. What is known of the problems' form (native kernels) is kept.
 
         Raises:
             InputError: x0 of another shape, dtype or device, constraints of other kinds.
@@ -166,7 +172,8 @@ class Problem:
             kinds = ", ".join(type(part).__name__ for part in self.constraints)
             raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in bound))
         cost = self.cost if cost is None else cost.bind(dims)
-        return self._with({"x0": x0, "constraints": bound, "cost": cost}, form=self.form)
+        parts = {"x0": x0, "constraints": bound, "cost": cost, "dynamics": dynamics or self.dynamics}
+        return self._with(parts, form=self.form)
 
     def cast(self, dtype: torch.dtype) -> Self:
         """The same problems in another precision."""

@@ -33,6 +33,8 @@ class _Bounds(Constraint):
     of: ClassVar[Literal["x", "u"]]
 
     def bind(self, dims: Dimensions) -> Self:
+        if self.above is not None:  # bound already: infinite bounds are large numbers by now
+            return self
         name, size = ("control_bounds", dims.m) if self.of == "u" else ("state_bounds", dims.n)
         last = dims.N - 1 if self.of == "u" else dims.N
         lower = self._checked(self.lower, f"{name}.lower", size, dims)

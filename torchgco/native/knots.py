@@ -80,7 +80,7 @@ class KnotSource:
         """
         if self.shared is not None:
             return self.shared
-        traced = self.span.traced.rebound(self.span.own, own)
+        traced = self.span.traced.rebound(self.span.own, own, B)
         if traced is None:
             traced = again().traced
             if traced.fingerprint() != self.span.traced.fingerprint():

@@ -58,7 +58,7 @@ class DynamicsSource:
         """
         if of is None or self.count == 0:
             return self.traced.parameters_of(index)
-        traced = self.traced.rebound(self.own, own_tensors(of))
+        traced = self.traced.rebound(self.own, own_tensors(of), len(index))
         return (traced or trace_dynamics(of, self.n, self.m, device=index.device).traced).parameters_of(index)
 
 

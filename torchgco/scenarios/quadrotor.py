@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchgco.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import Family, uniform_clear
 from torchgco.scenarios.layouts import Layouts
@@ -80,19 +81,23 @@ class Forest(Quadrotor):
 class ForestMoving(Forest):
     """A forest whose spheres move, each in a random horizontal direction at a constant velocity.
 
-    Speeds are uniform in [0, speed] m/s. At the first instant it is the Forest of the same seed and number.
+    Speeds are uniform in [slowest, speed] m/s. At the first instant it is the Forest of the same seed and number.
     """
 
     name: str = "forest_moving"
     speed: float = 1.0
+    slowest: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("speed", checks.number, at_least=0)
+        for name in ("speed", "slowest"):
+            self._set(name, checks.number, at_least=0)
+        if self.slowest > self.speed:
+            raise InputError("scenario.slowest", f"at most scenario.speed, {self.speed} m/s", self.slowest)
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
         centers = self._centers(rng)
-        speed = rng.uniform(0.0, self.speed, len(centers))
+        speed = rng.uniform(self.slowest, self.speed, len(centers))
         heading = rng.uniform(-np.pi, np.pi, len(centers))
         direction = np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(centers))])
         return self._layout(centers, velocities=(speed[:, None] * direction)[None])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,7 +29,7 @@ class MissionLog:
     tracker_seconds: Tensor  # (B, K): of the J solves, divided likewise
 
     @classmethod
-    def blank(cls, x: Tensor, steps: int, substeps: int, period: float, knots: int = 101) -> MissionLog:
+    def blank(cls, x: Tensor, steps: int, substeps: int, period: float, knots: int) -> MissionLog:
         """To be filled, for plants that begin at x (B, 17)."""
         B = x.shape[0]
 
@@ -64,3 +65,12 @@ class MissionLog:
         x = torch.cat((self.x[:, :1, 0], self.x[:, :, 1:].reshape(B, K * J, 17)), dim=1)
         t = torch.arange(K * J + 1, dtype=x.dtype) * (self.period / J)
         return t, x
+
+    def steps(self) -> np.ndarray:
+        """Control steps that each mission made, (B,)."""
+        return (~torch.isnan(self.cost)).sum(1).numpy()
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What a study keeps of every mission: by name (B, ...)."""
+        names = ("x", "commands", "tracking_violation", "cost", "violation", "shifted", "guided")
+        return {name: getattr(self, name).numpy() for name in (*names, "planner_seconds", "tracker_seconds")}

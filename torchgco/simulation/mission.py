@@ -101,7 +101,7 @@ class _Flight:
         x = hovering(mission.planner.airframe, problem.x0[:, :3])
         self.problem, self.planned = problem, mission.planner.problem(problem, x)
         self.force, self.noise = mission.disturbance.draw(seed, ids.tolist(), self.steps, self.period)
-        self.log = MissionLog.blank(x, self.steps, self.substeps, self.period)
+        self.log = MissionLog.blank(x, self.steps, self.substeps, self.period, problem.N + 1)
         self.plant, self.x, self.rows, self.ids = mission.plant, x, torch.arange(problem.B), ids
 
     def run(self, report: Report) -> MissionLog:

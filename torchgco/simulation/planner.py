@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgco.constraints import ControlBounds, FirstStepRates
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bodies import CONTACT_FACTOR, Obstacles
-from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
+from torchgco.dynamics.quadrotor import GRAVITY, Airframe, QuadrotorPlanning, pose_rates
 from torchgco.errors import InputError
 from torchgco.evaluation import violation
 from torchgco.lagrangian import Multipliers, shifted
@@ -28,6 +28,20 @@ EARLY = 10  # knots in which a vehicle may leave a margin that it has entered
 
 
 @dataclass(frozen=True)
+class BiasedPlanning(QuadrotorPlanning):
+    """The planning model with an acceleration that is added to v'."""
+
+    bias: Tensor = torch.zeros(1, 3)  # (B, 3), m/s^2
+
+    batched: ClassVar[tuple[str, ...]] = ("bias",)
+    reads_fields_alone: ClassVar[bool] = True
+
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        rates, bias = super().field(x, u), self.bias.view(-1, *([1] * (x.dim() - 2)), 3)
+        return torch.cat((rates[..., :3], rates[..., 3:6] + bias.to(x.dtype), rates[..., 6:]), dim=-1)
+
+
+@dataclass(frozen=True)
 class Plan:
     """Trajectories from the states that were measured at the control step `step`, (B, ...)."""
 
@@ -38,12 +52,16 @@ class Plan:
     violation: Tensor
     shifted: Tensor  # bool: the former plan one stage later, as the new one was infeasible
     guided: Tensor  # int64: outer iterations with guidance on
+    measured: Tensor  # (B, 17): the plants' states
+    bias: Tensor  # (B, 3): estimated acceleration that the model lacks, m/s^2
     step: int
 
     def take(self, index: Rows) -> Plan:
         """The plans in `index`."""
-        tensors = take((self.X, self.U, self.multipliers, self.cost, self.violation, self.shifted, self.guided), index)
-        return Plan(*tensors, self.step)
+        return Plan(*take(tuple(getattr(self, name) for name in TENSORS), index), self.step)
+
+
+TENSORS = ("X", "U", "multipliers", "cost", "violation", "shifted", "guided", "measured", "bias")
 
 
 @dataclass(frozen=True)
@@ -58,6 +76,8 @@ class Planner:
         margin: by which obstacles are grown, m; margin_growth: by how much more per second of the horizon, m/s, in
             four steps.
         first_step: the body rates of the second knot are the ones that the rotors lead to (`FirstStepRates`).
+        estimation: gain per control period of an estimated constant acceleration that the planning model lacks, for
+            wind and errors of the mass, at most 1; 0: none, as the paper.
 
     Raises:
         InputError: a field out of its range.
@@ -70,6 +90,7 @@ class Planner:
     margin: float = 0.0
     margin_growth: float = 0.0
     first_step: bool = True
+    estimation: float = 0.2
 
     def __post_init__(self) -> None:
         if self.multipliers not in ("shifted", "reset"):
@@ -79,6 +100,8 @@ class Planner:
         for name in ("margin", "margin_growth"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"planner.{name}", "at least 0", getattr(self, name))
+        if not 0 <= self.estimation <= 1:
+            raise InputError("planner.estimation", "between 0 and 1", self.estimation)
 
     def problem(self, problem: Problem, x: Tensor) -> Problem:
         """The planning problems of a mission at its start, from those of an open-loop study and plants x (B, 17).
@@ -88,8 +111,9 @@ class Planner:
         """
         if not isinstance(problem.dynamics, QuadrotorPlanning):
             raise InputError("model", "quadrotor: a mission flies its planning model", type(problem.dynamics).__name__)
-        x0 = _planning_state(x, self.airframe)
-        return replace(problem, x0=x0, constraints=self._constraints(problem, 0.0, x, x0, torch.zeros_like(x0[:, 0])))
+        x0, model = _planning_state(x, self.airframe), self._model(problem, torch.zeros_like(x[:, :3]))
+        constraints = self._constraints(problem, 0.0, x, x0, torch.zeros_like(x0[:, 0]))
+        return replace(problem, dynamics=model, x0=x0, constraints=constraints)
 
     def plan(
         self, whole: Problem, now: Problem, x: Tensor, step: int, before: Plan | None, seed: int, ids: Tensor
@@ -105,16 +129,34 @@ class Planner:
         if before is not None:
             U0 = shifted(before.U)
             warm = before.multipliers.shifted() if self.multipliers == "shifted" else None
+        bias = self._estimated(x, before, float(whole.dynamics.dt))
         depth = self._unavoidable_depth(whole, t, x0, U0)
-        now = now.started_at(x0, self._constraints(whole, t, x, x0, depth))
+        now = now.started_at(x0, self._constraints(whole, t, x, x0, depth), dynamics=self._model(whole, bias))
         solution = self.solver.solve(now, U0, seed=seed, ids=ids, warm=warm, max_seconds=self.max_seconds)
         none = torch.zeros_like(solution.cost, dtype=torch.bool)
         plan = Plan(
-            solution.X, solution.U, solution.multipliers, solution.cost, solution.violation, none, solution.guided, step
-        )
+            solution.X, solution.U, solution.multipliers, solution.cost, solution.violation, none, solution.guided,
+            x, bias, step,
+        )  # fmt: skip
         if before is not None:
             self._keep_former(plan, now, U0, before)
         return plan, now, time.perf_counter() - began
+
+    def _model(self, whole: Problem, bias: Tensor) -> QuadrotorPlanning:
+        """The planning model with the estimated bias (B, 3)."""
+        assert isinstance(whole.dynamics, QuadrotorPlanning)
+        if self.estimation == 0:
+            return whole.dynamics
+        given = {f.name: getattr(whole.dynamics, f.name) for f in fields(whole.dynamics)}
+        return BiasedPlanning(**given, bias=bias)
+
+    def _estimated(self, x: Tensor, before: Plan | None, dt: float) -> Tensor:
+        """The acceleration (B, 3) that the planning model lacks: a low-pass of what the last period has shown."""
+        if before is None or self.estimation == 0:
+            return torch.zeros_like(x[:, :3])
+        shown = (x[:, 3:6] - before.measured[:, 3:6]) / dt
+        expected = 0.5 * (_acceleration(x, self.airframe) + _acceleration(before.measured, self.airframe))
+        return before.bias + self.estimation * (shown - expected - before.bias)
 
     def _constraints(self, whole: Problem, t: float, x: Tensor, x0: Tensor, depth: Tensor) -> list[Constraint]:
         """The constraints of plans that start at time t from plants x (B, 17), depth (B,) m within the margin."""
@@ -162,12 +204,12 @@ class Planner:
         better = worst < plan.violation[rows].nan_to_num(nan=torch.inf)
         chosen, place = better.nonzero().flatten(), rows[better]
         cost = part.cost.total(X, U[rows])
-        former = Plan(
-            X, U[rows], take(before.multipliers.shifted(), rows), cost, worst,
-            torch.ones_like(better), torch.zeros_like(rows), plan.step,
-        )  # fmt: skip
-        for name in ("X", "U", "multipliers", "cost", "violation", "shifted", "guided"):
-            put(getattr(plan, name), place, take(getattr(former, name), chosen))
+        former = {
+            "X": X, "U": U[rows], "multipliers": take(before.multipliers.shifted(), rows), "cost": cost,
+            "violation": worst, "shifted": torch.ones_like(better), "guided": torch.zeros_like(rows),
+        }  # fmt: skip
+        for name, values in former.items():
+            put(getattr(plan, name), place, take(values, chosen))
 
     def _first_step(self, problem: Problem, x: Tensor, x0: Tensor) -> list[Constraint]:
         if not self.first_step:
@@ -181,6 +223,12 @@ class Planner:
             share = model.dt / torch.as_tensor(model.rate_time_constant, dtype=x.dtype).reshape(-1, 1)
             reachable = tuple(w + share * (bound[:, :3] - w) for bound in (bounds[0].lower, bounds[0].upper))
         return [FirstStepRates(x[:, 13:], model.dt, self.airframe, reachable)]  # type: ignore[arg-type]
+
+
+def _acceleration(x: Tensor, airframe: Airframe) -> Tensor:
+    """v' (B, 3) of the planning model for plants x (B, 17), m/s^2."""
+    _, v, q, w, F = (part.unbind(-1) for part in x.split((3, 3, 4, 3, 4), dim=-1))
+    return torch.stack(pose_rates(v, q, w, sum(F) / airframe.mass, GRAVITY)[3:6], dim=-1)
 
 
 def _planning_state(x: Tensor, airframe: Airframe) -> Tensor:

@@ -65,6 +65,7 @@ class Traced:
         self._constants = {slot: _array(computed[slot]) for slot in border if slot not in varying}
         indices = {slot for call in self._symbolic if name_of(call.operation) in INDEXING for slot in call.inputs[1:]}
         self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
+        self._indexed = {slot for call in self._plain if self._index in call.inputs for slot in call.inputs}
         self._shapes = [tuple(example.shape) for example in examples]
 
     @property
@@ -101,14 +102,20 @@ class Traced:
         except RuntimeError:  # an operation that vmap can't batch
             return torch.stack([one(i) for i in index])
 
-    def rebound(self, own: Sequence[Tensor], others: Sequence[Tensor]) -> Traced | None:
-        """The same function with `others` in the place of its `own` tensors; None where it must be traced again.
+    def rebound(self, own: Sequence[Tensor], others: Sequence[Tensor], B: int) -> Traced | None:
+        """The same function of B problems with `others` in the place of its `own` tensors; None: trace it again.
 
         A new trace is needed where a row that all problems share, and that isn't indexed, becomes a row per problem.
         """
-        if len(own) != len(others) or any(a.shape[:1] == (1,) != b.shape[:1] for a, b in zip(own, others, strict=True)):
+        if len(own) != len(others):
             return None
-        tensors = {id(old): new for old, new in zip(own, others, strict=True)}
+        tensors = {}
+        indexed = {id(self._captured[slot]) for slot in self._indexed if slot in self._captured}
+        for old, new in zip(own, others, strict=True):
+            if _one_row(old) and not _one_row(new) and id(old) not in indexed:
+                return None
+            # The row of a single problem stands for all of its repetitions.
+            tensors[id(old)] = new.expand(B, *new.shape[1:]) if _one_row(new) and not _one_row(old) else new
         copy = object.__new__(type(self))
         copy.__dict__.update(self.__dict__)
         copy._captured = {slot: tensors.get(id(tensor), tensor) for slot, tensor in self._captured.items()}
@@ -154,6 +161,10 @@ class Traced:
             for call in self._plain:
                 call.replay(call.operation, known)
         return known
+
+
+def _one_row(value: Tensor) -> bool:
+    return value.shape[:1] == (1,)
 
 
 def own_tensors(part: PerElement) -> list[Tensor]:
