@@ -7,11 +7,64 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
+import torch
 
+from torchgco.constraints.bodies import CONTACT_FACTOR
+from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.outcome import Ending, judge_flight
+from torchgco.problem import Problem
 
 Arrays = Mapping[str, np.ndarray]
+Spheres = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # centres, distances of contact, velocities
+SCALARS = (
+    "cost", "violation", "shifted", "guided", "iterations", "planner_seconds", "tracker_seconds", "tracking_violation",
+)  # fmt: skip
+STATES, ROTORS = 17, 4
+
+
+def packed(arrays: Arrays) -> np.ndarray:
+    """The arrays of B missions as one (B, K, W), a row per control step."""
+    B, K = arrays["cost"].shape
+    parts = [arrays["x"].reshape(B, K, -1), arrays["commands"].reshape(B, K, -1)]
+    return np.concatenate([*parts, *(arrays[name][..., None] for name in SCALARS)], axis=-1)
+
+
+def unpacked(rows: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays that `packed` made."""
+    B, K, W = rows.shape
+    J = (W - len(SCALARS) - STATES) // (STATES + ROTORS)
+    ends = np.cumsum([(J + 1) * STATES, J * ROTORS])
+    arrays = {
+        "x": rows[..., : ends[0]].reshape(B, K, J + 1, STATES),
+        "commands": rows[..., ends[0] : ends[1]].reshape(B, K, J, ROTORS),
+    }
+    return arrays | {name: rows[..., ends[1] + i] for i, name in enumerate(SCALARS)}
+
+
+def spheres_of(problem: Problem) -> list[Spheres]:
+    """The spheres of each problem at t = 0, with the distances at which bodies touch; NaN where absent."""
+    parts = [part for part in problem.geometric if isinstance(part, BoundSpheres)]
+    found = []
+    for b in range(problem.B):
+        radii = [torch.where(part.absent, torch.nan, CONTACT_FACTOR * part.inflated_radii)[b] for part in parts]
+        moves = [torch.zeros_like(part.centers[b]) if part.velocities is None else part.velocities[b] for part in parts]
+        centers = torch.cat([part.centers[b] for part in parts]) if parts else torch.zeros(0, 3)
+        contact = torch.cat(radii) if parts else torch.zeros(0)
+        found.append((centers.numpy(), contact.numpy(), torch.cat(moves).numpy() if parts else None))
+    return found
+
+
+def clearances(arrays: Arrays, b: int, period: float, spheres: Spheres) -> np.ndarray:
+    """Distances (K,) of mission b to the nearest contact at the starts of its control steps, m."""
+    centers, contact, velocities = spheres
+    K = _steps(arrays, b)
+    here = ~np.isnan(contact)
+    if not here.any():
+        return np.full(K, np.inf)
+    t = period * np.arange(K)[:, None, None]
+    at = centers[here] + (0.0 if velocities is None else t * velocities[here])
+    return (np.linalg.norm(arrays["x"][b, :K, 0, None, :3] - at, axis=-1) - contact[here]).min(-1)
 
 
 def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances: Sequence[np.ndarray]) -> pd.DataFrame:
@@ -43,8 +96,6 @@ def samples(arrays: Arrays, b: int, period: float) -> tuple[np.ndarray, np.ndarr
     """Times (T,), s, and states (T, 17) of the plant at all time steps of mission b; at least one."""
     K, J = _steps(arrays, b), arrays["commands"].shape[2]
     x = arrays["x"][b]
-    if K == 0:
-        return np.zeros(1), np.full((1, x.shape[-1]), np.nan)
     states = np.concatenate((x[0, :1], x[:K, 1:].reshape(K * J, -1)))
     return np.arange(K * J + 1) * (period / J), states
 
@@ -79,7 +130,7 @@ def ending(
     arrays: Arrays,
     b: int,
     period: float,
-    spheres: tuple[np.ndarray, np.ndarray, np.ndarray | None],
+    spheres: Spheres,
     goal: np.ndarray,
     goal_radius: float,
 ) -> Ending:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from torchgco.errors import InputError
 from torchgco.experiments.preset_nodes import register
 from torchgco.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
+from torchgco.simulation import Mission
 
 DEFAULT_LAYOUTS = 64
 register()
@@ -47,6 +48,7 @@ class Setup:
     seed: int
     device: torch.device
     dtype: torch.dtype
+    mission: Mission | None = None  # with the solver under study as its planner's
 
     def layouts(self, count: int | None = None) -> Layouts:
         """Layouts 0..count-1 under the seed; by default all of a file, or 64.
@@ -108,6 +110,7 @@ def build(config: DictConfig) -> Setup:
         device=device,
         dtype=dtype,
     )
+    setup = replace(setup, mission=_mission(setup))
     if config.model.dimension != setup.vehicle.dimension:
         raise InputError("model.dimension", f"{setup.vehicle.dimension}, as its dynamics say", config.model.dimension)
     if setup.scenario.dimension != setup.vehicle.dimension:
@@ -115,6 +118,34 @@ def build(config: DictConfig) -> Setup:
         wanted = f"model={other}, as {setup.scenario.name} is {setup.scenario.dimension}-D"
         raise InputError("model", wanted, f"model={setup.vehicle.name}")
     return setup
+
+
+def _mission(setup: Setup) -> Mission | None:
+    """The closed loop of a configuration; None where it has none.
+
+    Raises:
+        InputError: a value that a part refuses, a model other than the quadrotor, or a device other than the CPU.
+    """
+    node = setup.config.get("mission")
+    if node is None:
+        if setup.config.get("plant") is not None:
+            raise InputError("plant", "a mission: experiment=mission or mission=default", "a plant alone")
+        return None
+    if setup.config.get("plant") is None:
+        raise InputError("plant", "the vehicle that flies the mission: plant=rotors", "none")
+    if setup.device.type != "cpu" or setup.dtype != torch.float64:
+        raise InputError("device", "device=cpu in float64 for missions", f"{setup.device.type}, {setup.dtype}")
+    parts = {name: _instantiate(node[name], f"mission.{name}") for name in ("planner", "tracker", "disturbance")}
+    held = OmegaConf.to_container(node, resolve=True)
+    assert isinstance(held, dict)
+    others: dict[str, Any] = {str(key): value for key, value in held.items() if key not in parts}
+    planner = parts.pop("planner")(solver=setup.solver)
+    try:
+        mission = Mission(planner=planner, plant=_instantiate(setup.config.plant, "plant"), **parts, **others)
+    except TypeError as error:
+        raise InputError("mission", "keys that the configuration knows", error) from None
+    mission.check(setup.vehicle.dynamics)
+    return mission
 
 
 def solver_of(config: DictConfig) -> Any:

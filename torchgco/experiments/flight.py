@@ -182,6 +182,14 @@ def prepare(threads: int, in_c: bool) -> None:
     use_native(in_c)
 
 
-def fly(flight: Flight) -> Flown:
+class AnyFlight(Protocol):
+    """A batch of layouts that one solver flies."""
+
+    name: str
+
+    def fly(self) -> tuple[pd.DataFrame, np.ndarray]: ...
+
+
+def fly(flight: AnyFlight) -> Flown:
     """The flight's rows and controls, under its solver's name."""
     return flight.name, flight.fly()

@@ -50,6 +50,7 @@ def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> di
         "device": {name: configuration["device"].get(name) for name in ARITHMETIC},
         "study": {"solvers": list(solvers)},
         "solvers": dict(solvers),
+        **{name: configuration[name] for name in ("mission", "plant") if configuration.get(name) is not None},
     }
 
 

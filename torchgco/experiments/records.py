@@ -34,7 +34,7 @@ COLUMNS = (
 )  # fmt: skip
 JUDGED = ("success", "best_cost", "best_from")  # columns that compare rows: not in shards
 MANIFEST, TRIALS, SOLUTIONS, LAYOUTS, DONE = "study.json", "trials.parquet", "solutions.npz", "layouts.npz", "done"
-FILES = (TRIALS, SOLUTIONS, LAYOUTS)  # of a finished study, kept under their checksums
+MISSION = "mission.parquet"  # in place of solutions, where missions are flown
 Flown = tuple[pd.DataFrame, np.ndarray]  # rows without the judged columns, controls (rows, N, m)
 Save = Callable[[IO[bytes]], Any]
 
@@ -46,6 +46,12 @@ class Records:
     folder: Path
     manifest: Manifest
     repair: bool = False
+
+    @property
+    def files(self) -> tuple[str, str, str]:
+        """The files of the finished study, which are kept under their checksums."""
+        missions = self.manifest.configuration.get("mission") is not None
+        return TRIALS, MISSION if missions else SOLUTIONS, LAYOUTS
 
     def claim(self) -> None:
         """Make the folder this study's, or raise and leave it as it is.
@@ -138,11 +144,14 @@ class Records:
         order = rows["layout"].map(place).drop_duplicates().sort_values().index
         return rows.loc[order].reset_index(drop=True), np.concatenate([U for _, U in held])[order.to_numpy()]
 
-    def finish(self, trials: pd.DataFrame, U: np.ndarray, layouts: Layouts) -> None:
-        """Write trials.parquet, solutions.npz and layouts.npz."""
+    def finish(self, trials: pd.DataFrame, flown: np.ndarray | pd.DataFrame, layouts: Layouts) -> None:
+        """Write trials.parquet, layouts.npz, and solutions.npz from controls or mission.parquet from a table."""
         solvers = np.array(list(self.manifest.solvers))
         write(self.folder / TRIALS, _table(trials))
-        write(self.folder / SOLUTIONS, _arrays({"U": U, "solver": solvers, "layout": layouts.ids}))
+        if isinstance(flown, pd.DataFrame):
+            write(self.folder / MISSION, _table(flown))
+        else:
+            write(self.folder / SOLUTIONS, _arrays({"U": flown, "solver": solvers, "layout": layouts.ids}))
         write(self.folder / LAYOUTS, _arrays(layouts.arrays()))
 
     def replace(self, trials: pd.DataFrame, layouts: Layouts) -> None:
@@ -157,7 +166,7 @@ class Records:
 
     def close(self) -> None:
         """Mark the study as done, with the checksums of its files, and drop its shards."""
-        write(self.folder / DONE, _json({name: [checksum(self.folder / name)] for name in FILES}))
+        write(self.folder / DONE, _json({name: [checksum(self.folder / name)] for name in self.files}))
         shutil.rmtree(self.folder / "shards", ignore_errors=True)
         for part in self.folder.glob(f"*{PART}"):  # of a start that was killed while it wrote
             part.unlink(missing_ok=True)
@@ -184,7 +193,7 @@ class Records:
         """The valid checksums of each file; with `repair`, an empty dict if they can't be read."""
         try:
             sums = read_checksums(self.folder / DONE)
-            if sums.keys() != set(FILES):
+            if sums.keys() != set(self.files):
                 raise damaged(self.folder / DONE, "is damaged (it doesn't name all files)")
         except InputError:
             if not self.repair:

@@ -130,7 +130,7 @@ def _rates(task: pd.DataFrame, swept: Sequence[str]) -> str:
     rows = [
         [*_cells(row, swept), row["solver"], *(_rate(row, name) for name in OUTCOMES)] for _, row in task.iterrows()
     ]
-    return _align([[*_headers(swept), "solver", *OUTCOMES], *rows], len(swept) + 1)
+    return aligned([[*_headers(swept), "solver", *OUTCOMES], *rows], len(swept) + 1)
 
 
 def _rate(row: pd.Series, name: str) -> str:
@@ -160,7 +160,7 @@ def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
     for _, row in task.iterrows():
         cells = ["-" if isnan(row[name]) else f"{row[name]:{form}}" for _, name, form in EFFORT]
         rows.append([*_cells(row, swept), row["solver"], *cells])
-    return _align(rows, len(swept) + 1)
+    return aligned(rows, len(swept) + 1)
 
 
 COUNTS = {"n": "n", "both": "both", "only_a": "first", "only_b": "second", "neither": "neither"}
@@ -175,10 +175,10 @@ def _paired(rows: pd.DataFrame, swept: Sequence[str]) -> str:
         pair, left_out = f"{row.solver_a} - {row.solver_b}", row.undefined + row.unmatched
         counts = [str(row[name]) for name in COUNTS]
         lines.append([*_cells(row, swept), pair, row.outcome, *counts, difference, p_value, str(left_out)])
-    return _align(lines, len(swept) + 1)
+    return aligned(lines, len(swept) + 1)
 
 
-def _align(rows: Sequence[Sequence[str]], left: int) -> str:
+def aligned(rows: Sequence[Sequence[str]], left: int) -> str:
     """Rows as lines of columns: the first `left` flush left, the others flush right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []

@@ -19,6 +19,8 @@ from torchgco.errors import InputError
 from torchgco.experiments.build import Setup, build, solver_of
 from torchgco.experiments.flight import Bar, Flight, Flown, NoBar, Plan, fly, plan_of, prepare
 from torchgco.experiments.identity import Manifest, layout_digests, plain, settings_of
+from torchgco.experiments.mission_flight import MissionFlight
+from torchgco.experiments.mission_report import mission_table, write_mission_report
 from torchgco.experiments.records import COLUMNS, JUDGED, TRIALS, Records
 from torchgco.experiments.report import write_report
 from torchgco.experiments.success import judged, sound
@@ -59,9 +61,14 @@ def run_study(
         show(f"Already done in {folder}: nothing was flown again.\n")
         _update_success(study, records, show)
     else:
-        rows, U = _fly_all(study, records)
-        records.finish(with_success(rows, study.layouts, len(study.solvers)), U, study.layouts)
-    show(write_report(folder, lambda held, flown: _trajectories(study, flown)))
+        rows, flown = _fly_all(study, records)
+        rivals = len(study.solvers) if study.setup.mission is None else 1  # missions have no cost to compare
+        held = flown if study.setup.mission is None else mission_table(study.setup, study.layouts, study.solvers, flown)
+        records.finish(with_success(rows, study.layouts, rivals), held, study.layouts)
+    if study.setup.mission is None:
+        show(write_report(folder, lambda held, flown: _trajectories(study, flown)))
+    else:
+        show(write_mission_report(folder, study.setup))
     records.close()
     show(f"\nTable, arrays and figures: {folder}")
     trials = pd.read_parquet(folder / TRIALS)
@@ -82,7 +89,9 @@ class _Study:
 def _study(config: DictConfig, recompose: Recompose) -> _Study:
     setup = build(config)
     layouts = setup.layouts()
-    setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
+    task = setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
+    if setup.mission is not None:
+        setup.mission.check(task.problem.dynamics)
     configs = {setup.solver_name: config}
     solvers = {setup.solver_name: setup.solver}
     for name in _baselines(config):
@@ -132,9 +141,10 @@ def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
     return batches
 
 
-def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight:
+def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight | MissionFlight:
     # A study's ids are positions, 0..L-1 (`Setup.layouts`).
-    return Flight(study.setup, study.layouts.take(ids), name, study.solvers[name], bar)
+    kind = Flight if study.setup.mission is None else MissionFlight
+    return kind(study.setup, study.layouts.take(ids), name, study.solvers[name], bar)
 
 
 def _fly_side_by_side(
@@ -167,7 +177,8 @@ def with_success(rows: pd.DataFrame, layouts: Layouts, solvers: int) -> pd.DataF
     if layouts.best_cost is not None:
         best = rows["layout"].map(dict(zip(layouts.ids.tolist(), layouts.best_cost, strict=True))).astype(float)
     rivals = pd.Series(solvers > 1, index=rows.index)
-    return judged(rows, best, rivals, ["layout"]).reindex(columns=list(COLUMNS))
+    more = [name for name in rows.columns if name not in COLUMNS and name != "sound"]
+    return judged(rows, best, rivals, ["layout"]).reindex(columns=[*COLUMNS, *more])
 
 
 def _update_success(study: _Study, records: Records, show: Callable[[str], None]) -> None:

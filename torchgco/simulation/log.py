@@ -25,6 +25,7 @@ class MissionLog:
     violation: Tensor  # (B, K): of the plan
     shifted: Tensor  # (B, K): 1 where the former plan was kept, else 0
     guided: Tensor  # (B, K): outer iterations with guidance on
+    iterations: Tensor  # (B, K): of the planner's solve
     planner_seconds: Tensor  # (B, K): of the batch's solve, divided by its missions
     tracker_seconds: Tensor  # (B, K): of the J solves, divided likewise
 
@@ -36,16 +37,18 @@ class MissionLog:
         def empty(*shape: int) -> Tensor:
             return x.new_full((B, steps, *shape), torch.nan)
 
+        states = empty(substeps + 1, 17)
+        states[:, 0, 0] = x
         return cls(
-            period, empty(substeps + 1, 17), empty(substeps, 4), empty(), empty(knots, 3),
-            *(empty() for _ in range(6)),
+            period, states, empty(substeps, 4), empty(), empty(knots, 3),
+            *(empty() for _ in range(7)),
         )  # fmt: skip
 
     def add_plan(self, rows: Tensor, step: int, x: Tensor, plan: Plan, seconds: float) -> None:
         """The start of a control period: states x (b, 17) of the missions `rows`, and their plans."""
         self.x[rows, step, 0] = x
         self.plan[rows, step] = plan.X[..., :3]
-        for name in ("cost", "violation", "shifted", "guided"):
+        for name in ("cost", "violation", "shifted", "guided", "iterations"):
             getattr(self, name)[rows, step] = getattr(plan, name).to(x.dtype)
         self.planner_seconds[rows, step] = seconds
         self.tracker_seconds[rows, step] = 0.0
@@ -72,5 +75,5 @@ class MissionLog:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What a study keeps of every mission: by name (B, ...)."""
-        names = ("x", "commands", "tracking_violation", "cost", "violation", "shifted", "guided")
+        names = ("x", "commands", "tracking_violation", "cost", "violation", "shifted", "guided", "iterations")
         return {name: getattr(self, name).numpy() for name in (*names, "planner_seconds", "tracker_seconds")}

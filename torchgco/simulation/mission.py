@@ -16,12 +16,13 @@ from torch import Tensor
 
 from torchgco.constraints.bodies import CONTACT_FACTOR
 from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.dynamics.base import Dynamics
 from torchgco.errors import InputError
 from torchgco.outcome import FARTHEST
 from torchgco.problem import Problem
 from torchgco.simulation.disturbance import Disturbance, measured
 from torchgco.simulation.log import MissionLog
-from torchgco.simulation.planner import Plan, Planner
+from torchgco.simulation.planner import Plan, Planner, check_model
 from torchgco.simulation.plant import Plant, RotorPlant, hovering
 from torchgco.simulation.tracker import Reference, Tracker, Tracking
 from torchgco.tree import take
@@ -65,6 +66,17 @@ class Mission:
         if self.plant.dt != self.tracker.dt:
             raise InputError("tracker.dt", f"the plant's {self.plant.dt} s", self.tracker.dt)
 
+    def check(self, dynamics: Dynamics) -> None:
+        """Raise InputError unless these dynamics of a planning problem can be flown."""
+        check_model(dynamics)
+        if self.substeps(float(dynamics.dt)) is None:
+            raise InputError("scenario.dt", f"a multiple of the plant's {self.plant.dt} s", dynamics.dt)
+
+    def substeps(self, period: float) -> int | None:
+        """Time steps of the plant in a control period, s; None where they don't fit."""
+        count = round(period / self.plant.dt)
+        return count if count >= 1 and math.isclose(count * self.plant.dt, period, rel_tol=1e-9) else None
+
     def fly(
         self, problem: Problem, seed: int = 0, ids: Tensor | None = None, report: Report | None = None
     ) -> MissionLog:
@@ -89,10 +101,9 @@ class _Flight:
         self.mission, self.seed = mission, seed
         if problem.goal is None:
             raise InputError("goal", "a Goal in the problem", None)
+        mission.check(problem.dynamics)
         self.period = float(problem.dynamics.dt)
-        self.substeps = round(self.period / mission.plant.dt)
-        if self.substeps < 1 or not math.isclose(self.substeps * mission.plant.dt, self.period, rel_tol=1e-9):
-            raise InputError("scenario.dt", f"a multiple of the plant's {mission.plant.dt} s", self.period)
+        self.substeps = mission.substeps(self.period) or 1
         self.steps = math.ceil(mission.duration / self.period - 1e-9)
         self.spheres = _spheres(problem)
         self.goal = problem.goal.position

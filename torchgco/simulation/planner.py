@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch import Tensor
 from torchgco.constraints import ControlBounds, FirstStepRates
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bodies import CONTACT_FACTOR, Obstacles
+from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import GRAVITY, Airframe, QuadrotorPlanning, pose_rates
 from torchgco.errors import InputError
 from torchgco.evaluation import violation
@@ -21,7 +22,6 @@ from torchgco.problem import Problem
 from torchgco.solvers.contracts import Solver
 from torchgco.tree import Rows, put, take
 
-FEASIBLE = 1e-2  # violation up to which a plan is flown without a look at the former one
 PARTS = 4  # of the horizon, with a margin each, where margins grow
 BLIND = 3  # knots whose positions the controls of a plan can't change, or hardly
 EARLY = 10  # knots in which a vehicle may leave a margin that it has entered
@@ -52,6 +52,7 @@ class Plan:
     violation: Tensor
     shifted: Tensor  # bool: the former plan one stage later, as the new one was infeasible
     guided: Tensor  # int64: outer iterations with guidance on
+    iterations: Tensor  # int64: of the solve
     measured: Tensor  # (B, 17): the plants' states
     bias: Tensor  # (B, 3): estimated acceleration that the model lacks, m/s^2
     step: int
@@ -61,7 +62,7 @@ class Plan:
         return Plan(*take(tuple(getattr(self, name) for name in TENSORS), index), self.step)
 
 
-TENSORS = ("X", "U", "multipliers", "cost", "violation", "shifted", "guided", "measured", "bias")
+TENSORS = ("X", "U", "multipliers", "cost", "violation", "shifted", "guided", "iterations", "measured", "bias")
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class Planner:
         airframe: as the planner knows it.
         multipliers: "shifted" starts from those of the former plan one stage later, "reset" from zero, as the paper.
         max_seconds: time limit of a solve, s; None: none. With a limit, results depend on the machine.
+        tolerance: violation (m for lengths) up to which a plan counts as feasible; replaces the solver's own.
         margin: by which obstacles are grown, m; margin_growth: by how much more per second of the horizon, m/s, in
             four steps.
         first_step: the body rates of the second knot are the ones that the rotors lead to (`FirstStepRates`).
@@ -87,6 +89,7 @@ class Planner:
     airframe: Airframe = Airframe()
     multipliers: Literal["shifted", "reset"] = "shifted"
     max_seconds: float | None = None
+    tolerance: float = 0.01
     margin: float = 0.0
     margin_growth: float = 0.0
     first_step: bool = True
@@ -97,6 +100,8 @@ class Planner:
             raise InputError("planner.multipliers", "shifted or reset", repr(self.multipliers))
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise InputError("planner.max_seconds", "above 0 s, or null", self.max_seconds)
+        if not self.tolerance > 0:
+            raise InputError("planner.tolerance", "above 0", self.tolerance)
         for name in ("margin", "margin_growth"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"planner.{name}", "at least 0", getattr(self, name))
@@ -109,8 +114,7 @@ class Planner:
         Raises:
             InputError: another model than the quadrotor's planning model.
         """
-        if not isinstance(problem.dynamics, QuadrotorPlanning):
-            raise InputError("model", "quadrotor: a mission flies its planning model", type(problem.dynamics).__name__)
+        check_model(problem.dynamics)
         x0, model = _planning_state(x, self.airframe), self._model(problem, torch.zeros_like(x[:, :3]))
         constraints = self._constraints(problem, 0.0, x, x0, torch.zeros_like(x0[:, 0]))
         return replace(problem, dynamics=model, x0=x0, constraints=constraints)
@@ -132,11 +136,12 @@ class Planner:
         bias = self._estimated(x, before, float(whole.dynamics.dt))
         depth = self._unavoidable_depth(whole, t, x0, U0)
         now = now.started_at(x0, self._constraints(whole, t, x, x0, depth), dynamics=self._model(whole, bias))
-        solution = self.solver.solve(now, U0, seed=seed, ids=ids, warm=warm, max_seconds=self.max_seconds)
+        solver = tolerant(self.solver, self.tolerance)
+        solution = solver.solve(now, U0, seed=seed, ids=ids, warm=warm, max_seconds=self.max_seconds)
         none = torch.zeros_like(solution.cost, dtype=torch.bool)
         plan = Plan(
             solution.X, solution.U, solution.multipliers, solution.cost, solution.violation, none, solution.guided,
-            x, bias, step,
+            solution.iterations, x, bias, step,
         )  # fmt: skip
         if before is not None:
             self._keep_former(plan, now, U0, before)
@@ -195,7 +200,7 @@ class Planner:
 
     def _keep_former(self, plan: Plan, problem: Problem, U: Tensor, before: Plan) -> None:
         """Put the former plan in the place of new ones that are infeasible and worse than it is."""
-        rows = (~(plan.violation <= FEASIBLE)).nonzero().flatten()
+        rows = (~(plan.violation <= self.tolerance)).nonzero().flatten()
         if rows.numel() == 0:
             return
         part = problem.take(rows)
@@ -223,6 +228,21 @@ class Planner:
             share = model.dt / torch.as_tensor(model.rate_time_constant, dtype=x.dtype).reshape(-1, 1)
             reachable = tuple(w + share * (bound[:, :3] - w) for bound in (bounds[0].lower, bounds[0].upper))
         return [FirstStepRates(x[:, 13:], model.dt, self.airframe, reachable)]  # type: ignore[arg-type]
+
+
+def check_model(dynamics: Dynamics) -> None:
+    """Raise InputError unless a mission can fly on these dynamics."""
+    if not isinstance(dynamics, QuadrotorPlanning):
+        raise InputError("model", "quadrotor: a mission flies its planning model", type(dynamics).__name__)
+
+
+def tolerant(solver: Solver, tolerance: float) -> Solver:
+    """The solver with another violation tolerance, where it has one."""
+    local: Any = getattr(solver, "local", None)
+    options: Any = solver
+    if local is not None:
+        return replace(options, local=replace(local, violation_tolerance=tolerance))
+    return replace(options, violation_tolerance=tolerance) if hasattr(solver, "violation_tolerance") else solver
 
 
 def _acceleration(x: Tensor, airframe: Airframe) -> Tensor:

@@ -1,0 +1,85 @@
+"""A solver flies a batch of layouts as the planner of closed-loop missions, and every mission becomes a row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+import torchgco
+from torchgco.experiments.build import Setup
+from torchgco.experiments.flight import Bar
+from torchgco.flights import clearances, ending, mission_row, packed, spheres_of
+from torchgco.outcome import Outcome
+from torchgco.scenarios import Layouts
+
+LOST = (Outcome.COLLISION, Outcome.DIVERGED)
+# Columns of a study that a mission leaves empty: they belong to a single trajectory.
+SINGLE = ("cost", "dynamics_residual", "clearance_full", "bound_violation", "kkt_residual")
+
+
+@dataclass
+class MissionFlight:
+    """A batch of missions in lockstep, planned by one solver."""
+
+    setup: Setup
+    layouts: Layouts
+    name: str
+    solver: Any
+    bar: Bar
+    shown: int = 0
+
+    def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
+        """Rows (without success), and logs (L, K, W) as `flights.packed` has them, NaN after a mission's end."""
+        setup, layouts = self.setup, self.layouts
+        assert setup.mission is not None
+        mission = replace(setup.mission, planner=replace(setup.mission.planner, solver=self.solver))
+        problem = setup.vehicle.task(layouts).problem
+        ids = torch.as_tensor(layouts.ids)
+        log = mission.fly(problem, seed=setup.seed, ids=ids, report=self._progress)
+        self.bar.update(layouts.count - self.shown)
+        arrays, spheres = log.arrays(), spheres_of(problem)
+        goal, radius = problem.goal.position.numpy(), problem.goal.radius.numpy()  # type: ignore[union-attr]
+        rows = []
+        for b in range(layouts.count):
+            near = float(radius[b]) if mission.goal_radius is None else mission.goal_radius
+            end = ending(arrays, b, log.period, spheres[b], goal[b], near)
+            rows.append({**self._row(b, end.outcome), **_judged(arrays, b, log.period, spheres[b], end)})
+            rows[-1] |= mission_row(arrays, b, log.period, end, mission.planner.airframe)
+        return pd.DataFrame(rows), packed(arrays)
+
+    def _row(self, b: int, outcome: Outcome) -> dict[str, Any]:
+        setup = self.setup
+        return {
+            "scenario": self.layouts.name, "layout": int(self.layouts.ids[b]), "seed": setup.seed,
+            "model": setup.vehicle.name, "solver": self.name, "status": outcome.name,
+            "feasible": outcome not in LOST, "reached": outcome == Outcome.REACHED, "sound": False,
+            **dict.fromkeys(SINGLE, np.nan),
+            "batch_size": self.layouts.count, "threads": torch.get_num_threads(), "device": setup.device.type,
+            "dtype": str(setup.dtype).removeprefix("torch."), "version": torchgco.__version__,
+        }  # fmt: skip
+
+    def _progress(self, step: int, flying: int) -> None:
+        ended = self.layouts.count - flying
+        self.bar.update(max(0, ended - self.shown))
+        self.bar.set_postfix({"step": step, "flying": flying}, refresh=False)
+        self.shown = max(self.shown, ended)
+
+
+def _judged(arrays: Any, b: int, period: float, spheres: Any, end: Any) -> dict[str, Any]:
+    """The study's columns that the log of mission b decides."""
+    knots = clearances(arrays, b, period, spheres)
+    flown = ~np.isnan(arrays["cost"][b])
+    return {
+        "violation": float(arrays["violation"][b][flown].max(initial=0.0)),
+        "clearance": end.clearance,
+        "clearance_knots": float(knots.min(initial=np.inf)),
+        "goal_distance": end.goal_distance,
+        "iterations": int(arrays["iterations"][b][flown].sum()),
+        "outer_iterations": int(flown.sum()),
+        "guided": int((arrays["guided"][b][flown] > 0).sum()),
+        "seconds": float((arrays["planner_seconds"] + arrays["tracker_seconds"])[b][flown].sum()),
+    }

@@ -1,0 +1,101 @@
+"""Reports on finished studies of missions: mission.parquet, a table of outcomes, figures and an animation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from torchgco.experiments.build import Setup
+from torchgco.experiments.files import write
+from torchgco.experiments.records import MISSION, TRIALS
+from torchgco.experiments.report import aligned, compare, format_table
+from torchgco.experiments.runs import read_trials
+from torchgco.experiments.statistics import summarise, wilson
+from torchgco.flights import clearances, mission_frame, spheres_of, unpacked
+from torchgco.outcome import Outcome
+from torchgco.scenarios import Layouts
+
+FEW = 4  # missions of which each gets a line
+
+
+def mission_table(setup: Setup, layouts: Layouts, solvers: Iterable[str], logs: np.ndarray) -> pd.DataFrame:
+    """The rows of mission.parquet from packed logs (solver, L, K, W)."""
+    problem = setup.vehicle.task(layouts).problem
+    period, spheres, frames = float(problem.dynamics.dt), spheres_of(problem), []
+    for name, rows in zip(solvers, logs, strict=True):
+        arrays = unpacked(rows)
+        distances = [clearances(arrays, b, period, spheres[b]) for b in range(layouts.count)]
+        frame = mission_frame(arrays, layouts.ids.tolist(), period, distances)
+        frame.insert(0, "solver", name)
+        frames.append(frame)
+    return pd.concat(frames, ignore_index=True)
+
+
+def write_mission_report(folder: Path, setup: Setup) -> str:
+    """Write summary.csv and figures next to the mission.parquet in a folder, and return the report as text."""
+    trials = read_trials(folder / TRIALS)
+    summary = summarise(trials)
+    write(folder / "summary.csv", lambda file: summary.to_csv(file, index=False))
+    blocks = [outcome_table(trials), effort_table(trials)]
+    paired = compare(trials)
+    if len(paired):
+        blocks.append(format_table(summary, paired).split("\n\n")[-1])
+    if len(trials) <= FEW:
+        blocks = [mission_lines(trials), *blocks[2:]]
+    write_figures(folder, trials, pd.read_parquet(folder / MISSION), setup)
+    return "\n\n".join(blocks)
+
+
+def mission_lines(trials: pd.DataFrame) -> str:
+    """A line per mission."""
+    lines = []
+    for row in trials.itertuples():
+        lines.append(
+            f"{row.scenario} {row.layout}, {row.solver}: {row.outcome} after {row.flight_time:.2f} s, clearance "
+            f"{row.clearance:.3f} m, planner {1000 * row.planner_seconds_median:.0f} ms (99 %: "
+            f"{1000 * row.planner_seconds_p99:.0f} ms), {row.missed_deadlines} missed deadlines. "
+            f"{Outcome[row.outcome].sentence}"
+        )
+    return "\n".join(lines)
+
+
+def outcome_table(trials: pd.DataFrame) -> str:
+    """Shares of the four outcomes by solver, which are disjoint, with 95 % Wilson intervals in percent."""
+    rows = [["solver", "n", *(outcome.name for outcome in Outcome)]]
+    for name, group in trials.groupby("solver", sort=False):
+        n, cells = len(group), []
+        for outcome in Outcome:
+            count = int((group["outcome"] == outcome.name).sum())
+            low, high = wilson(count, n)
+            cells.append(f"{count} [{100 * low:.0f}, {100 * high:.0f}]")
+        rows.append([str(name), str(n), *cells])
+    return aligned(rows, 1)
+
+
+COUNTS = ("missed_deadlines", "shifted_plans")
+EFFORT = (
+    ("flight time", "flight_time", "{:.2f} s"), ("clearance", "clearance", "{:.3f} m"),
+    ("energy", "energy", "{:.0f} J"),
+    ("planner", "planner_seconds_median", "{:.4f} s"), ("99 %", "planner_seconds_p99", "{:.4f} s"),
+    ("missed", "missed_deadlines", "{:.1f}"), ("kept plans", "shifted_plans", "{:.1f}"),
+)  # fmt: skip
+
+
+def effort_table(trials: pd.DataFrame) -> str:
+    """Medians by solver: over the missions that reached the goal, deadlines and kept plans as means over all."""
+    rows = [["solver", *(head for head, _, _ in EFFORT)]]
+    for name, group in trials.groupby("solver", sort=False):
+        reached = group[group["reached"].astype(bool)]
+        cells = []
+        for _, column, form in EFFORT:
+            value = group[column].mean() if column in COUNTS else reached[column].median()
+            cells.append("-" if pd.isna(value) else form.format(value))
+        rows.append([str(name), *cells])
+    return aligned(rows, 1)
+
+
+def write_figures(folder: Path, trials: pd.DataFrame, missions: pd.DataFrame, setup: Setup) -> None:
+    """figures/*.png."""
