@@ -24,22 +24,20 @@ STATES, ROTORS = 17, 4
 
 
 def packed(arrays: Arrays) -> np.ndarray:
-    """The arrays of B missions as one (B, K, W), a row per control step."""
+    """The arrays of B missions as one (B, K, W), a row per control step; planned positions come last, if they do."""
     B, K = arrays["cost"].shape
-    parts = [arrays["x"].reshape(B, K, -1), arrays["commands"].reshape(B, K, -1)]
-    return np.concatenate([*parts, *(arrays[name][..., None] for name in SCALARS)], axis=-1)
+    names = ("x", "commands", *SCALARS, *(["plan"] if "plan" in arrays else []))
+    return np.concatenate([arrays[name].reshape(B, K, -1) for name in names], axis=-1)
 
 
-def unpacked(rows: np.ndarray) -> dict[str, np.ndarray]:
-    """The arrays that `packed` made."""
-    B, K, W = rows.shape
-    J = (W - len(SCALARS) - STATES) // (STATES + ROTORS)
-    ends = np.cumsum([(J + 1) * STATES, J * ROTORS])
-    arrays = {
-        "x": rows[..., : ends[0]].reshape(B, K, J + 1, STATES),
-        "commands": rows[..., ends[0] : ends[1]].reshape(B, K, J, ROTORS),
-    }
-    return arrays | {name: rows[..., ends[1] + i] for i, name in enumerate(SCALARS)}
+def unpacked(rows: np.ndarray, substeps: int) -> dict[str, np.ndarray]:
+    """The arrays that `packed` made of logs with so many time steps per control step."""
+    B, K, J = *rows.shape[:2], substeps
+    widths = [(J + 1) * STATES, J * ROTORS, *[1] * len(SCALARS)]
+    x, commands, *scalars, plan = np.split(rows, np.cumsum(widths), axis=-1)
+    arrays = {name: part[..., 0] for name, part in zip(SCALARS, scalars, strict=True)}
+    arrays |= {"x": x.reshape(B, K, J + 1, STATES), "commands": commands.reshape(B, K, J, ROTORS)}
+    return arrays | ({"plan": plan.reshape(B, K, -1, 3)} if plan.shape[-1] else {})
 
 
 def spheres_of(problem: Problem) -> list[Spheres]:

@@ -16,6 +16,7 @@ from torchgco.flights import clearances, ending, mission_row, packed, spheres_of
 from torchgco.outcome import Outcome
 from torchgco.scenarios import Layouts
 
+FEW = 4  # missions in a study, up to which plans are kept and each mission gets figures
 LOST = (Outcome.COLLISION, Outcome.DIVERGED)
 # Columns of a study that a mission leaves empty: they belong to a single trajectory.
 SINGLE = ("cost", "dynamics_residual", "clearance_full", "bound_violation", "kkt_residual")
@@ -30,6 +31,7 @@ class MissionFlight:
     name: str
     solver: Any
     bar: Bar
+    plans: bool = False  # keep the planned positions, for figures
     shown: int = 0
 
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
@@ -41,7 +43,7 @@ class MissionFlight:
         ids = torch.as_tensor(layouts.ids)
         log = mission.fly(problem, seed=setup.seed, ids=ids, report=self._progress)
         self.bar.update(layouts.count - self.shown)
-        arrays, spheres = log.arrays(), spheres_of(problem)
+        arrays, spheres = log.arrays(self.plans), spheres_of(problem)
         goal, radius = problem.goal.position.numpy(), problem.goal.radius.numpy()  # type: ignore[union-attr]
         rows = []
         for b in range(layouts.count):

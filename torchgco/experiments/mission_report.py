@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import pandas as pd
 
 from torchgco.experiments.build import Setup
 from torchgco.experiments.files import write
+from torchgco.experiments.mission_flight import FEW
 from torchgco.experiments.records import MISSION, TRIALS
 from torchgco.experiments.report import aligned, compare, format_table
 from torchgco.experiments.runs import read_trials
@@ -18,19 +19,26 @@ from torchgco.flights import clearances, mission_frame, spheres_of, unpacked
 from torchgco.outcome import Outcome
 from torchgco.scenarios import Layouts
 
-FEW = 4  # missions of which each gets a line
+PLANS = "plans.npz"  # planned positions (solver, L, K, N+1, 3), where few missions fly
 
 
-def mission_table(setup: Setup, layouts: Layouts, solvers: Iterable[str], logs: np.ndarray) -> pd.DataFrame:
-    """The rows of mission.parquet from packed logs (solver, L, K, W)."""
+def mission_table(
+    folder: Path, setup: Setup, layouts: Layouts, solvers: Sequence[str], logs: np.ndarray
+) -> pd.DataFrame:
+    """The rows of mission.parquet from packed logs (solver, L, K, W); where they hold plans, plans.npz is written."""
+    assert setup.mission is not None
     problem = setup.vehicle.task(layouts).problem
-    period, spheres, frames = float(problem.dynamics.dt), spheres_of(problem), []
+    period, spheres, frames, plans = float(problem.dynamics.dt), spheres_of(problem), [], []
     for name, rows in zip(solvers, logs, strict=True):
-        arrays = unpacked(rows)
+        arrays = unpacked(rows, setup.mission.substeps(period) or 1)
         distances = [clearances(arrays, b, period, spheres[b]) for b in range(layouts.count)]
         frame = mission_frame(arrays, layouts.ids.tolist(), period, distances)
         frame.insert(0, "solver", name)
         frames.append(frame)
+        plans.append(arrays.get("plan"))
+    if plans[0] is not None:
+        held = {"plan": np.stack(plans), "solver": np.array(solvers), "layout": layouts.ids}
+        write(folder / PLANS, lambda file: np.savez_compressed(file, **held))
     return pd.concat(frames, ignore_index=True)
 
 
@@ -43,7 +51,7 @@ def write_mission_report(folder: Path, setup: Setup) -> str:
     paired = compare(trials)
     if len(paired):
         blocks.append(format_table(summary, paired).split("\n\n")[-1])
-    if len(trials) <= FEW:
+    if trials["layout"].nunique() <= FEW:
         blocks = [mission_lines(trials), *blocks[2:]]
     write_figures(folder, trials, pd.read_parquet(folder / MISSION), setup)
     return "\n\n".join(blocks)

@@ -19,7 +19,7 @@ from torchgco.errors import InputError
 from torchgco.experiments.build import Setup, build, solver_of
 from torchgco.experiments.flight import Bar, Flight, Flown, NoBar, Plan, fly, plan_of, prepare
 from torchgco.experiments.identity import Manifest, layout_digests, plain, settings_of
-from torchgco.experiments.mission_flight import MissionFlight
+from torchgco.experiments.mission_flight import FEW, MissionFlight
 from torchgco.experiments.mission_report import mission_table, write_mission_report
 from torchgco.experiments.records import COLUMNS, JUDGED, TRIALS, Records
 from torchgco.experiments.report import write_report
@@ -61,14 +61,8 @@ def run_study(
         show(f"Already done in {folder}: nothing was flown again.\n")
         _update_success(study, records, show)
     else:
-        rows, flown = _fly_all(study, records)
-        rivals = len(study.solvers) if study.setup.mission is None else 1  # missions have no cost to compare
-        held = flown if study.setup.mission is None else mission_table(study.setup, study.layouts, study.solvers, flown)
-        records.finish(with_success(rows, study.layouts, rivals), held, study.layouts)
-    if study.setup.mission is None:
-        show(write_report(folder, lambda held, flown: _trajectories(study, flown)))
-    else:
-        show(write_mission_report(folder, study.setup))
+        _finish(study, records, *_fly_all(study, records))
+    show(_report(study, folder))
     records.close()
     show(f"\nTable, arrays and figures: {folder}")
     trials = pd.read_parquet(folder / TRIALS)
@@ -84,6 +78,26 @@ class _Study:
     layouts: Layouts
     solvers: dict[str, Any]  # by name, the one under study first
     manifest: Manifest
+
+    @property
+    def rivals(self) -> int:
+        """How many solvers have costs to compare: none in missions."""
+        return len(self.solvers) if self.setup.mission is None else 1
+
+
+def _finish(study: _Study, records: Records, rows: pd.DataFrame, flown: np.ndarray) -> None:
+    """Write the files of a study from its rows and what was flown, (solver, L, ...)."""
+    held: np.ndarray | pd.DataFrame = flown
+    if study.setup.mission is not None:
+        held = mission_table(records.folder, study.setup, study.layouts, list(study.solvers), flown)
+    records.finish(with_success(rows, study.layouts, study.rivals), held, study.layouts)
+
+
+def _report(study: _Study, folder: Path) -> str:
+    """Write the report of a finished study, and return it as text."""
+    if study.setup.mission is not None:
+        return write_mission_report(folder, study.setup)
+    return write_report(folder, lambda held, flown: _trajectories(study, flown))
 
 
 def _study(config: DictConfig, recompose: Recompose) -> _Study:
@@ -143,8 +157,10 @@ def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
 
 def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight | MissionFlight:
     # A study's ids are positions, 0..L-1 (`Setup.layouts`).
-    kind = Flight if study.setup.mission is None else MissionFlight
-    return kind(study.setup, study.layouts.take(ids), name, study.solvers[name], bar)
+    layouts, solver = study.layouts.take(ids), study.solvers[name]
+    if study.setup.mission is None:
+        return Flight(study.setup, layouts, name, solver, bar)
+    return MissionFlight(study.setup, layouts, name, solver, bar, plans=study.layouts.count <= FEW)
 
 
 def _fly_side_by_side(
@@ -184,7 +200,7 @@ def with_success(rows: pd.DataFrame, layouts: Layouts, solvers: int) -> pd.DataF
 def _update_success(study: _Study, records: Records, show: Callable[[str], None]) -> None:
     """Judge the rows of a finished study again where the best costs of its layouts have changed since."""
     trials = pd.read_parquet(records.folder / TRIALS)
-    new = with_success(trials.assign(sound=sound(trials)), study.layouts, len(study.solvers))
+    new = with_success(trials.assign(sound=sound(trials)), study.layouts, study.rivals)
     if not new[list(JUDGED)].astype(object).equals(trials[list(JUDGED)].astype(object)):
         records.replace(new, study.layouts)
         show("The best costs of the layouts have changed: best_cost and success were computed again.\n")

@@ -73,7 +73,8 @@ class MissionLog:
         """Control steps that each mission made, (B,)."""
         return (~torch.isnan(self.cost)).sum(1).numpy()
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What a study keeps of every mission: by name (B, ...)."""
+    def arrays(self, plans: bool = False) -> dict[str, np.ndarray]:
+        """What a study keeps of every mission, by name (B, ...); with the planned positions where asked for."""
         names = ("x", "commands", "tracking_violation", "cost", "violation", "shifted", "guided", "iterations")
-        return {name: getattr(self, name).numpy() for name in (*names, "planner_seconds", "tracker_seconds")}
+        names = (*names, "planner_seconds", "tracker_seconds", *(["plan"] if plans else []))
+        return {name: getattr(self, name).numpy() for name in names}
