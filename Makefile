@@ -80,11 +80,11 @@ $(RUNTIME): pyproject.toml constraints.txt | $(BIN)/python
 	touch $@
 
 $(DEV): pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) -e '.[dev]'
+	$(INSTALL) -e '.[dev,plants]'
 	touch $@ $(RUNTIME)
 
 $(PEERS): pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) -e '.[dev,peers]'
+	$(INSTALL) -e '.[dev,plants,peers]'
 	touch $@ $(RUNTIME) $(DEV)
 
 $(ACADOS)/.ready: constraints.txt

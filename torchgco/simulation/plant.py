@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, Self
 
@@ -17,7 +18,10 @@ from torchgco.tree import PerElement, Rows
 class Plant(Protocol):
     """A simulated vehicle, B of them side by side: states x (B, 17) = [p (m), v (m/s), q, w (rad/s), F (N)]."""
 
-    dt: float  # s
+    @property
+    def dt(self) -> float:
+        """Time step, s."""
+        ...
 
     def take(self, index: Rows) -> Self:
         """The vehicles in `index`."""
@@ -38,7 +42,8 @@ class RotorPlant(PerElement):
         drag: force against the velocity, N s/m, a number or (B,).
 
     Raises:
-        InputError: non-positive dt, a mass or thrust coefficient that isn't above 0, a negative drag.
+        InputError: non-positive dt, a mass or thrust coefficient that isn't above 0, a negative drag, a parameter that
+            is neither a finite number nor (B,).
     """
 
     airframe: Airframe = Airframe()
@@ -50,13 +55,7 @@ class RotorPlant(PerElement):
     per_element: ClassVar[tuple[str, ...]] = ("mass_error", "thrust_error", "drag")
 
     def __post_init__(self) -> None:
-        if not self.dt > 0:
-            raise InputError("plant.dt", "a positive time step in seconds", self.dt)
-        for name, least in (("mass_error", -1.0), ("thrust_error", -1.0)):
-            if not bool((torch.as_tensor(getattr(self, name)) > least).all()):
-                raise InputError(f"plant.{name}", "a share above -1", getattr(self, name))
-        if not bool((torch.as_tensor(self.drag) >= 0).all()):
-            raise InputError("plant.drag", "at least 0 N s/m", self.drag)
+        check_vehicle(self.dt, self.mass_error, self.thrust_error, self.drag)
 
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """See `Plant`."""
@@ -71,6 +70,26 @@ class RotorPlant(PerElement):
         pose = torch.cat((pose[..., :3], pose[..., 3:6] + pushed, pose[..., 6:]), dim=-1)
         speed = (1.0 + _column(self.thrust_error)) ** 0.5 * u
         return torch.cat((pose, self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, speed)), dim=-1)
+
+
+def check_vehicle(dt: float, mass_error: float | Tensor, thrust_error: float | Tensor, drag: float | Tensor) -> None:
+    """Check the fields that plants have in common; see `RotorPlant`.
+
+    Raises:
+        InputError: non-positive dt, a mass or thrust coefficient that isn't above 0, a negative drag, a parameter that
+            is neither a finite number nor (B,).
+    """
+    if not 0 < dt < math.inf:
+        raise InputError("plant.dt", "a positive time step in seconds", dt)
+    shares = {"mass_error": mass_error, "thrust_error": thrust_error}
+    for name, value in {**shares, "drag": drag}.items():
+        values = torch.as_tensor(value)
+        if values.dim() > 1 or not bool(torch.isfinite(values).all()):
+            raise InputError(f"plant.{name}", "a finite number or a tensor (B,) of such", value)
+        if name in shares and not bool((values > -1.0).all()):
+            raise InputError(f"plant.{name}", "a share above -1", value)
+    if not bool((torch.as_tensor(drag) >= 0).all()):
+        raise InputError("plant.drag", "at least 0 N s/m", drag)
 
 
 def _column(value: float | Tensor) -> float | Tensor:
