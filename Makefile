@@ -5,7 +5,7 @@
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
-#              make paper: the paper's figures and Table A4 by our solvers, in docs/paper and docs/paper.md
+#              make paper: the paper's figures, tables and missions by our solvers, in docs/paper and docs/paper.md
 # make test    the tests; test-all: also the tests that kill processes or fly whole studies; lint, types: the static checks;
 #              clean: remove environments, caches and builds
 

@@ -1,6 +1,6 @@
-"""python docs/paper_figures.py: the paper's figures on optimisation, from runs of our solvers, and Table A4.
+"""python docs/paper_figures.py: the paper's figures from runs of our solvers, Table A4, and a table of missions.
 
-The figures go to `--outputs`, the table there and into the page, docs/paper.md.
+Figures and animations go to `--outputs`, the tables there and into the page, docs/paper.md.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import paper_mission
 import paper_planar
 import paper_quadrotor
 from matplotlib.figure import Figure
@@ -27,7 +28,8 @@ ROUNDING = 5  # of the 255 shades of a colour
 DRAWS = (0, 112)  # of the two trials: 112 is the only one of 0 to 191 that passes below the circles
 SOLVERS = ("al_ilqr", "gco_paper", "gco")  # of Figures 6 and 7
 MARKS = "<!-- table-A4 -->", "<!-- end table-A4 -->"
-PARTS = ("planar", "quadrotor")
+MISSION_MARKS = "<!-- missions -->", "<!-- end missions -->"
+PARTS = ("planar", "quadrotor", "mission")
 
 
 def planar_figures(trials: Sequence[Solve], alone: Solve) -> dict[str, Callable[[], Figure]]:
@@ -55,9 +57,23 @@ def write_table(trials: Sequence[Solve], outputs: Path, page: Path) -> None:
     rows = paper_planar.table(trials, DRAWS)
     outputs.mkdir(parents=True, exist_ok=True)
     rows.to_csv(outputs / "table-A4.csv", index=False)
+    put_between(page, *MARKS, f"{_head()}\n\n{paper_planar.markdown(rows)}")
+
+
+def fly(outputs: Path, page: Path, duration: float) -> dict[str, Callable[[], Figure]]:
+    """Fly the missions, write their table and the animations; what to draw of them."""
+    flights = [paper_mission.fly(name, duration) for name in paper_mission.SOLVERS]
+    rows = paper_mission.table(flights)
+    outputs.mkdir(parents=True, exist_ok=True)
+    rows.to_csv(outputs / "missions.csv", index_label="quantity")
+    put_between(page, *MISSION_MARKS, f"{_head()}\n\n{paper_mission.markdown(rows)}")
+    paper_mission.animate(flights, outputs)
+    return paper_mission.figures(flights)
+
+
+def _head() -> str:
     origin = provenance("cpu")
-    head = f"Measured on {origin['date']} at commit {origin['commit']}, {origin['processor']}."
-    put_between(page, *MARKS, f"{head}\n\n{paper_planar.markdown(rows)}")
+    return f"Measured on {origin['date']} at commit {origin['commit']}, {origin['processor']}."
 
 
 def write_picture(figure: Figure, path: Path) -> None:
@@ -71,9 +87,10 @@ def write_picture(figure: Figure, path: Path) -> None:
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python docs/paper_figures.py", description="Draw the figures of paper.md.")
     parser.add_argument("--outputs", type=Path, default=ROOT / "docs" / "paper")
-    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "paper.md", help="where Table A4 is written")
+    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "paper.md", help="where the tables go")
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS, help="by default all")
     parser.add_argument("--stages", type=int, default=1000, help="of the planar problem; the paper has 1000")
+    parser.add_argument("--duration", type=float, default=15.0, help="of the missions at most, s")
     asked = parser.parse_args(words)
     drawings: dict[str, Callable[[], Figure]] = {}
     if "planar" in asked.parts:
@@ -82,6 +99,8 @@ def main(words: Sequence[str] | None = None) -> int:
         write_table(trials, asked.outputs, asked.page)
     if "quadrotor" in asked.parts:
         drawings |= quadrotor_figures([quadrotor(name) for name in SOLVERS])
+    if "mission" in asked.parts:
+        drawings |= fly(asked.outputs, asked.page, asked.duration)
     for name, make in drawings.items():
         write_picture(make(), asked.outputs / f"{name}.png")
     return 0

@@ -11,6 +11,8 @@ import pytest
 import torch
 from matplotlib.image import imread
 
+from torchgco.plotting import animation
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 STAGES = 80
 
@@ -44,6 +46,28 @@ def test_the_planar_figures_and_the_table_are_written(
     # The table's costs are those of the solver without a witness.
     runs = importlib.import_module("paper_runs")
     assert table.cost[0] == pytest.approx(_cost(runs, draws=0), rel=1e-12)
+
+
+def test_missions_and_animations_are_written(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(script, "DPI", 40)
+    monkeypatch.setattr(animation, "DPI", 30)
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- missions -->\nold\n<!-- end missions -->\nafter\n")
+    words = ["--parts", "mission", "--duration", "0.2", "--page", str(page), "--outputs", str(tmp_path / "out")]
+    assert script.main(words) == 0
+    shown = (DOCS / "paper.md").read_text()
+    limits = {"mission.gif": 1_500_000, "freeing.gif": 700_000}
+    names = [f"figure-{n}.png" for n in ("08", "09", "10", "11", "12", "A4", "A5")]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted([*names, *limits, "missions.csv"])
+    for name in (*names, *limits):
+        assert f"](paper/{name})" in shown
+        assert (DOCS / "paper" / name).stat().st_size < limits.get(name, 200_000)
+        assert imread(tmp_path / "out" / name).std() > 0.01
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert "| control steps | 4 | 4 | 4 |" in text and "| outcome | TIMEOUT | TIMEOUT | TIMEOUT |" in text
 
 
 def _cost(runs: ModuleType, draws: int) -> float:

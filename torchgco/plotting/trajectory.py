@@ -31,9 +31,9 @@ CROSS, PLAN, SAMPLE, REGION = "#D00000", PALETTE[2], "#8CC8EA", "#BFE5D3"
 
 
 def inside(positions: np.ndarray, centers: np.ndarray, radii: np.ndarray, tolerance: float = 1e-3) -> np.ndarray:
-    """Which knots (N+1,) lie deeper than `tolerance`, m, in a sphere at rest; absent spheres have a nan or zero radius.
+    """Which knots (N+1,) lie deeper than `tolerance`, m, in a sphere; absent spheres have a nan or zero radius.
 
-    centers (M, d) and radii (M,), the vehicle's radius included.
+    centers (M, d), or (N+1, M, d) where they move, and radii (M,), the vehicle's radius included.
     """
     depth = radii - np.linalg.norm(positions[:, None] - centers, axis=-1)
     return ((depth > tolerance) & (radii > 0)).any(axis=-1)

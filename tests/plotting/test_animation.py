@@ -1,0 +1,88 @@
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from torchgco.errors import InputError
+from torchgco.plotting import animation
+from torchgco.plotting.animation import Picture, mission_animation, planar_animation
+from torchgco.plotting.course import Course
+
+PERIOD = 0.05
+
+
+def course(speed: float) -> Course:
+    goal, velocities = np.array([6.0, 0.0, 0.0]), np.array([[0.0, speed, 0.0]])
+    return Course(np.array([[3.0, 1.5, 0.0]]), np.array([0.6]), goal, 0.5, velocities)
+
+
+def flown(steps: int) -> tuple[pd.DataFrame, np.ndarray]:
+    x = np.linspace(0.0, 6.0, steps)
+    frame = pd.DataFrame({"t": PERIOD * np.arange(steps), "x0": x, "x1": 0.0 * x, "x2": 0.0 * x})
+    ahead = np.minimum(x[:, None] + 0.5 * np.arange(5), 6.0)
+    return frame, np.stack((ahead, 0.0 * ahead, 0.0 * ahead), axis=-1)
+
+
+def pictures(path: Path) -> tuple[list[np.ndarray], int]:
+    """The pictures of a GIF, (height, width, 3), and how long it runs, ms."""
+    with Image.open(path) as gif:
+        found, duration = [], 0
+        for i in range(getattr(gif, "n_frames", 1)):
+            gif.seek(i)
+            duration += gif.info["duration"]
+            found.append(np.asarray(gif.convert("RGB")))
+    return found, duration
+
+
+def changed(a: np.ndarray, b: np.ndarray) -> int:
+    return int((a != b).any(axis=-1).sum())
+
+
+def test_a_mission_plays_in_real_time_and_stands_at_its_end(tmp_path: Path) -> None:
+    frame, plans = flown(21)
+    found, duration = pictures(mission_animation(frame, plans, course(0.0), PERIOD, tmp_path / "new" / "a.gif"))
+    assert len(found) == 11 and duration == 1100 + 1000
+    assert all(changed(a, b) > 20 for a, b in pairwise(found))
+
+
+@pytest.mark.parametrize("steps", [20, 30, 31, 100])
+def test_a_long_mission_has_few_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    assert animation.MOST == 100
+    monkeypatch.setattr(animation, "MOST", 10)
+    frame, plans = flown(steps)
+    found, duration = pictures(mission_animation(frame, plans, course(0.0), PERIOD, tmp_path / "a.gif"))
+    assert 5 < len(found) <= 10 and duration <= 1000
+
+
+def test_obstacles_that_move_are_seen_to_move(tmp_path: Path) -> None:
+    frame, plans = flown(5)
+    for name in ("x0", "x1", "x2"):
+        frame[name] = 0.0
+    plans = np.zeros_like(plans)
+    rest, _ = pictures(mission_animation(frame, plans, course(0.0), PERIOD, tmp_path / "a.gif"))
+    moving, _ = pictures(mission_animation(frame, plans, course(-5.0), PERIOD, tmp_path / "b.gif"))
+    assert changed(moving[0], moving[-1]) > 2 * changed(rest[0], rest[-1])
+
+
+def test_colours_stay_those_of_the_drawing(tmp_path: Path) -> None:
+    frame, plans = flown(3)
+    (first, *_), _ = pictures(mission_animation(frame, plans, course(0.0), PERIOD, tmp_path / "a.gif"))
+    colours = {tuple(colour) for colour in first.reshape(-1, 3).tolist()}
+    assert {(255, 255, 255), (0x56, 0xB4, 0xE9)} <= colours  # paper, vehicle
+
+
+def test_pictures_of_a_planar_solve_stay_as_long_as_asked(tmp_path: Path) -> None:
+    path = np.stack((np.linspace(-1.0, 1.0, 20), np.zeros(20)), axis=-1)
+    many = np.stack([path + np.array([0.0, 0.1 * i]) for i in range(4)])
+    shown = [Picture("caught", path[None], seconds=0.3), Picture("candidates", many, path[None], 0.5)]
+    ends = path[0], path[-1]
+    target = planar_animation(shown, np.zeros((1, 2)), np.array([0.3]), ends, tmp_path / "a.gif", 0.1, 0.2)
+    found, duration = pictures(target)
+    assert duration == 800 and len(found) == 2 and changed(*found) > 100
+    red = (np.abs(found[0].astype(int) - [0xD0, 0, 0]).sum(axis=-1) < 60).sum()
+    assert red > 10  # crosses inside the circle
+    with pytest.raises(InputError, match="iterates"):
+        planar_animation([], np.zeros((1, 2)), np.array([0.3]), ends, tmp_path / "b.gif")

@@ -1,0 +1,172 @@
+"""Animations as GIFs: a mission as it is flown, and how a solver frees a caught trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.animation import PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
+
+from torchgco.errors import InputError
+from torchgco.plotting import trajectory as draw
+from torchgco.plotting.course import VEHICLE, VIEWS, Course, draw_instant, flight, positions
+from torchgco.plotting.missions import check_plans
+from torchgco.plotting.style import INK, PALETTE, tidy
+
+FPS = 10
+MOST = 100  # frames of a mission
+DPI = 80
+PALE = "#C8C8C8"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture of `planar_animation`: trajectories in the plane, m.
+
+    Args:
+        title: what is shown.
+        trajectories: (P, N+1, 2); a single one has dots from near to far future and crosses, several are thin lines.
+        behind: (Q, N+1, 2), pale.
+        seconds: how long it is shown.
+    """
+
+    title: str
+    trajectories: np.ndarray
+    behind: np.ndarray | None = None
+    seconds: float = 1.0
+
+
+def mission_animation(
+    frame: pd.DataFrame, plans: np.ndarray, course: Course, period: float, path: Path, title: str = ""
+) -> Path:
+    """Write a GIF of a mission from above and from the side, 10 pictures per second, in real time where 100 suffice.
+
+    frame   with columns t and x0 to x2, a row per control step
+    plans   planned positions (K, N+1, 3), m, K at least the frame's rows
+    period  of control steps and of the plan's knots, s
+    title   before the time
+
+    Raises InputError as `snapshots_figure`.
+    """
+    t, track = flight(frame, "t")["t"], positions(frame)
+    check_plans(plans, len(t))
+    every = max(1, round(1.0 / (FPS * period)), ceil((len(t) - 1) / (MOST - 2)))
+    steps = sorted({*range(0, len(t), every), len(t) - 1})
+    low, high = course.limits(track)
+    spans = (high - low)[1:] / (high - low)[0]
+    figure = Figure(figsize=(7.0, 6.2 * float(spans.sum()) + 1.1), layout="constrained")
+    axes = list(figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": spans.tolist()}))
+
+    def show(step: int) -> None:
+        for ax, plane in zip(axes, VIEWS, strict=True):
+            ax.clear()
+            draw_instant(ax, course, t[step], track[: step + 1], plans[step], period, plane)
+            draw.frame(ax, low.tolist(), high.tolist(), plane)
+            tidy(ax, f"{title}  {t[step]:.1f} s".strip() if plane == draw.ABOVE else "", grid=None)
+        axes[0].set_xlabel("")
+
+    last = steps[-1:] * min(FPS, MOST - len(steps))  # the end stays for a second
+    return _write(figure, show, [*steps, *last], path)
+
+
+def planar_animation(
+    iterates: Sequence[Picture],
+    centers: np.ndarray,
+    inflated_radii: np.ndarray,
+    ends: tuple[np.ndarray, np.ndarray],
+    path: Path,
+    vehicle_radius: float = 0.0,
+    goal_radius: float = np.nan,
+) -> Path:
+    """Write a GIF of trajectories in the plane, one picture after the other.
+
+    centers, inflated_radii       of circles, (M, 2) and (M,), m
+    ends                          start and goal, (2,) each, m
+    vehicle_radius, goal_radius   m
+
+    Raises InputError without a picture.
+    """
+    if not iterates:
+        raise InputError("iterates", "at least one picture", 0)
+    shown = np.concatenate([np.reshape(ends, (2, 2)), *(p.trajectories.reshape(-1, 2) for p in iterates)])
+    here = np.isfinite(inflated_radii)
+    o, r = centers[here], inflated_radii[here, None]
+    reach = np.nan_to_num(goal_radius)
+    shown = np.concatenate((shown, o - r, o + r, ends[1] + reach * np.array([[-1.0], [1.0]])))
+    low, high = shown.min(axis=0) - 0.05, shown.max(axis=0) + 0.05
+    figure = Figure(figsize=(5.0, 4.4 * float((high - low)[1] / (high - low)[0]) + 0.8), layout="constrained")
+    ax = figure.subplots()
+
+    def show(i: int) -> None:
+        ax.clear()
+        draw.draw_obstacles(ax, centers, inflated_radii - vehicle_radius, vehicle_radius)
+        draw.draw_ends(ax, *ends, goal_radius)
+        _trajectories(ax, iterates[i], centers, inflated_radii)
+        draw.frame(ax, low.tolist(), high.tolist())
+        tidy(ax, iterates[i].title, grid=None)
+
+    frames = [i for i, picture in enumerate(iterates) for _ in range(max(1, round(picture.seconds * FPS)))]
+    return _write(figure, show, frames, path)
+
+
+def _trajectories(ax: Axes, picture: Picture, centers: np.ndarray, radii: np.ndarray) -> None:
+    if picture.behind is not None:
+        for path in picture.behind:
+            ax.plot(*path.T, color=PALE, linewidth=1.0, zorder=1)
+    if len(picture.trajectories) == 1:
+        path = picture.trajectories[0]
+        infeasible = draw.inside(path, centers, radii)
+        draw.draw_trajectory(ax, path, infeasible, every=max(1, len(path) // 100))
+        return
+    for i, path in enumerate(picture.trajectories):
+        ax.plot(*path.T, color=PALETTE[i % len(PALETTE)], linewidth=0.7, zorder=3)
+
+
+def _write(figure: Figure, show: Callable[[int], None], frames: Sequence[int], path: Path) -> Path:
+    """Write a GIF of `show(i)` for i in frames; equal neighbours are drawn once."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = PillowWriter(fps=FPS)
+    show(frames[0])
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # the axes stay where they are
+    with writer.saving(figure, str(path), DPI):
+        shown = frames[0]
+        for i in frames:
+            if i != shown:
+                show(i)
+                shown = i
+            writer.grab_frame(facecolor="white")
+    _reduce(path)
+    return path
+
+
+def _reduce(path: Path) -> None:
+    """Give all pictures of a GIF one palette without dithering: neighbours then differ only where something moved."""
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(_palette())
+    with Image.open(path) as gif:
+        pictures, durations = [], []
+        for i in range(getattr(gif, "n_frames", 1)):
+            gif.seek(i)
+            pictures.append(gif.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE))
+            durations.append(gif.info["duration"])
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True)
+
+
+def _palette() -> list[int]:
+    """The colours of the drawings, full and paler, as bytes of red, green and blue; the rest is white."""
+    times = [draw.NEAR_TO_FAR(share)[:3] for share in np.linspace(0.0, 1.0, 16)]
+    full = np.array([to_rgb(colour) for colour in (INK, VEHICLE, draw.CROSS, draw.EDGE, draw.STONE, PALE, *PALETTE)])
+    full = np.concatenate((full, times))
+    shades = [1.0 - share * (1.0 - full) for share in (1.0, 0.6, 0.3)]
+    colours = np.round(255 * np.concatenate((np.ones((1, 3)), *shades))).astype(int)
+    return colours.ravel().tolist() + [255] * (3 * (256 - len(colours)))
