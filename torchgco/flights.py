@@ -94,7 +94,7 @@ def samples(arrays: Arrays, b: int, period: float) -> tuple[np.ndarray, np.ndarr
     """Times (T,), s, and states (T, 17) of the plant at all time steps of mission b; at least one."""
     K, J = _steps(arrays, b), arrays["commands"].shape[2]
     x = arrays["x"][b]
-    states = np.concatenate((x[0, :1], x[:K, 1:].reshape(K * J, -1)))
+    states = np.concatenate((x[0, :1], x[:K, 1:].reshape(K * J, x.shape[-1])))
     return np.arange(K * J + 1) * (period / J), states
 
 

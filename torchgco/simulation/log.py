@@ -37,12 +37,12 @@ class MissionLog:
         def empty(*shape: int) -> Tensor:
             return x.new_full((B, steps, *shape), torch.nan)
 
-        states = empty(substeps + 1, 17)
-        states[:, 0, 0] = x
-        return cls(
-            period, states, empty(substeps, 4), empty(), empty(knots, 3),
+        log = cls(
+            period, empty(substeps + 1, 17), empty(substeps, 4), empty(), empty(knots, 3),
             *(empty() for _ in range(7)),
         )  # fmt: skip
+        log.x[:, 0, 0] = x  # of missions, too, that end at their start
+        return log
 
     def add_plan(self, rows: Tensor, step: int, x: Tensor, plan: Plan, seconds: float) -> None:
         """The start of a control period: states x (b, 17) of the missions `rows`, and their plans."""

@@ -87,8 +87,8 @@ class Mission:
             seed, ids: the key of all random draws; ids (B,) int64, by default 0..B-1.
 
         Raises:
-            InputError: another model, no goal, obstacles other than spheres, or a control period that isn't a multiple
-                of the plant's time step.
+            InputError: another model, no goal, another precision, obstacles other than spheres, or a control period
+                that isn't a multiple of the plant's time step.
         """
         ids = torch.arange(problem.B) if ids is None else ids
         return _Flight(self, problem, seed, ids).run(report or (lambda step, flying: None))
@@ -102,6 +102,8 @@ class _Flight:
         if problem.goal is None:
             raise InputError("goal", "a Goal in the problem", None)
         mission.check(problem.dynamics)
+        if problem.x0.dtype != torch.float64:
+            raise InputError("x0", "torch.float64 for a mission", problem.x0.dtype)
         self.period = float(problem.dynamics.dt)
         self.substeps = mission.substeps(self.period) or 1
         self.steps = math.ceil(mission.duration / self.period - 1e-9)
@@ -110,6 +112,7 @@ class _Flight:
         radius = mission.goal_radius
         self.radius = problem.goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
         x = hovering(mission.planner.airframe, problem.x0[:, :3])
+        self.start = x[:, :3]
         self.problem, self.planned = problem, mission.planner.problem(problem, x)
         self.force, self.noise = mission.disturbance.draw(seed, ids.tolist(), self.steps, self.period)
         self.log = MissionLog.blank(x, self.steps, self.substeps, self.period, problem.N + 1)
@@ -159,7 +162,7 @@ class _Flight:
     def _ends(self, t: float) -> Tensor:
         """Whether a vehicle is at its goal, in contact, or lost, (B,)."""
         p = self.x[:, :3]
-        finite = torch.isfinite(self.x).all(-1) & (p.abs().amax(-1) < FARTHEST)
+        finite = torch.isfinite(self.x).all(-1) & ((p - self.start[self.rows]).norm(dim=-1) <= FARTHEST)
         there = (p - self.goal[self.rows]).norm(dim=-1) < self.radius[self.rows]
         hit = torch.zeros_like(there)
         for centers, velocities, contact in self.spheres:

@@ -173,8 +173,11 @@ class Planner:
 
     def _with_margin(self, obstacles: Obstacles, whole: Problem, depth: Tensor) -> list[Constraint]:
         """Obstacles with the planner's margin: less by `depth` at the early knots, more at late ones where it grows."""
-        late = torch.arange(EARLY + 1, whole.N + 1).chunk(PARTS if self.margin_growth > 0 else 1)
-        parts: list[Constraint] = [replace(obstacles.grown(self.margin - depth), knots=slice(1, EARLY + 1))]
+        early = min(EARLY, whole.N)
+        parts: list[Constraint] = [replace(obstacles.grown(self.margin - depth), knots=slice(1, early + 1))]
+        if early == whole.N:
+            return parts
+        late = torch.arange(early + 1, whole.N + 1).chunk(PARTS if self.margin_growth > 0 else 1)
         for knots in late:
             first, last = int(knots[0]), int(knots[-1]) + 1
             by = self.margin + self.margin_growth * 0.5 * (first + last - 1) * float(whole.dynamics.dt)
@@ -188,7 +191,7 @@ class Planner:
         """
         X, depth = whole.started_at(x0, whole.constraints), torch.zeros_like(x0[:, 0])
         p = open_loop(X, U)[:, : BLIND + 1, X.position]
-        times = torch.arange(BLIND + 1, dtype=p.dtype) * float(whole.dynamics.dt)
+        times = torch.arange(p.shape[1], dtype=p.dtype) * float(whole.dynamics.dt)
         for part in whole.constraints:
             if isinstance(part, Obstacles):
                 distance = part.later(t).signed_distance(p, times).amin(1) - self.margin  # (B, M)

@@ -1,0 +1,260 @@
+"""The planner: what it solves, from which guess, with which margins, and when it keeps the former plan."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.reference import models
+from tests.simulation.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
+from torchgco import Airframe, ControlBounds, FirstStepRates, InputError, Planar, Problem, QuadraticCost, kernels
+from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.rollout import open_loop
+from torchgco.simulation.disturbance import Disturbance
+from torchgco.simulation.planner import Plan, Planner
+from torchgco.simulation.plant import RotorPlant, hovering
+from torchgco.solution import Solution
+from torchgco.solvers.contracts import Solver
+
+FRAME = Airframe()
+FIRM = replace(SOLVER, max_outer_iterations=30, violation_tolerance=1e-3)
+RADIUS = 0.5  # m, of sphere and vehicle together in `scene`
+
+
+def first_plan(planner: Planner, problem: Problem, x: Tensor | None = None) -> tuple[Plan, Problem]:
+    """The plan of control step 0 from plants x (B, 17), by default hovering at the start; and its problem."""
+    x = hovering(FRAME, problem.x0[:, :3]) if x is None else x
+    plan, now, seconds = planner.plan(
+        problem, planner.problem(problem, x), x, 0, None, 0, torch.arange(problem.B)
+    )  # fmt: skip
+    assert seconds > 0
+    return plan, now
+
+
+def next_plan(planner: Planner, problem: Problem, now: Problem, before: Plan, x: Tensor) -> tuple[Plan, Problem]:
+    """The plan of the control step after `before`."""
+    plan, now, _ = planner.plan(problem, now, x, before.step + 1, before, 1, torch.arange(problem.B))
+    return plan, now
+
+
+def spheres_of(problem: Problem) -> list[tuple[list[int], Tensor]]:
+    """Knots and radii (B, M) of every group of spheres."""
+    parts = [part for part in problem.constraints if isinstance(part, BoundSpheres)]
+    return [(torch.arange(problem.N + 1)[part.knots].tolist(), part.inflated_radii) for part in parts]
+
+
+def test_the_first_plan_is_the_solvers_own_solution() -> None:
+    problem = varied()
+    x = hovering(FRAME, problem.x0[:, :3])
+    plan, _ = first_plan(Planner(SOLVER, estimation=0.0), problem)
+    bounds = problem.constraints[1]
+    assert isinstance(bounds, ControlBounds)
+    lower, upper = bounds.lower, bounds.upper
+    w = x[:, 10:13]
+    reachable = (w + DT / 1.5 * (lower[:, :3] - w), w + DT / 1.5 * (upper[:, :3] - w))
+    first = FirstStepRates(x[:, 13:], DT, FRAME, reachable)
+    x0 = torch.cat((x[:, :13], x[:, 13:].sum(-1, keepdim=True) / FRAME.mass), dim=-1)
+    alone = Problem(problem.dynamics, problem.cost, [*problem.constraints, first], x0, problem.N, problem.goal)
+    U0 = torch.tensor([0, 0, 0, 9.81], **DOUBLE).repeat(4, problem.N, 1)
+    solution = SOLVER.solve(alone, U0)
+    for name in ("X", "U", "cost", "violation"):
+        torch.testing.assert_close(getattr(plan, name), getattr(solution, name), rtol=1e-7, atol=1e-9)
+    assert plan.step == 0 and not bool(plan.shifted.any()) and torch.equal(plan.measured, x)
+    biased, _ = first_plan(Planner(SOLVER), problem)  # an estimate of zero changes nothing
+    torch.testing.assert_close(biased.X, plan.X, rtol=1e-7, atol=1e-9)
+    assert not bool(biased.bias.any())
+
+
+def test_rates_that_the_rotors_lead_to_are_planned() -> None:
+    problem, x = far(), hovering(FRAME, torch.zeros(1, 3, **DOUBLE))
+    x[0, 13:] = torch.tensor([3.8, 4.0, 4.05, 3.9], **DOUBLE)
+    plan, _ = first_plan(Planner(FIRM), problem, x)
+    expected = models.angular_acceleration(np.zeros(3), x[0, 13:].numpy(), models.QuadrotorParameters()) * DT
+    assert 0.02 < np.abs(expected).max() < 5.0 * DT / 1.5  # within reach
+    np.testing.assert_allclose(plan.X[0, 1, 10:13].numpy(), expected, rtol=0, atol=2e-3)
+    free, _ = first_plan(Planner(FIRM, first_step=False), problem, x)
+    assert np.abs(free.X[0, 1, 10:13].numpy() - expected).max() > 2e-2
+
+
+def test_rates_beyond_the_planning_models_reach_lead_to_the_nearest() -> None:
+    problem, x = far(), hovering(FRAME, torch.zeros(1, 3, **DOUBLE))
+    x[0, 10:13] = torch.tensor([0.3, -0.2, 0.0], **DOUBLE)
+    x[0, 13:] = torch.tensor([5.5, 2.4, 2.4, 5.5], **DOUBLE)  # about 50 rad/s^2 of roll
+    plan, now = first_plan(Planner(FIRM), problem, x)
+    w = x[0, 10:13].numpy()
+    wanted = w + DT * models.angular_acceleration(w, x[0, 13:].numpy(), models.QuadrotorParameters())
+    nearest = np.clip(wanted, w + DT / 1.5 * (-5 - w), w + DT / 1.5 * (5 - w))
+    assert wanted[0] > nearest[0] + 1.0
+    first = now.constraints[-1]
+    assert isinstance(first, FirstStepRates) and first.target is not None
+    np.testing.assert_allclose(first.target[0].numpy(), nearest, rtol=0, atol=1e-12)
+    assert float(plan.violation) <= 1e-3
+    np.testing.assert_allclose(plan.X[0, 1, 10:13].numpy(), nearest, rtol=0, atol=2e-3)
+
+
+def at_start(planner: Planner, problem: Problem) -> Problem:
+    """The planning problem of a mission's start, which has nothing compiled yet."""
+    return planner.problem(problem, hovering(FRAME, problem.x0[:, :3]))
+
+
+def test_obstacles_are_grown_more_at_later_knots() -> None:
+    problem = far(N=27)
+    now = at_start(Planner(SOLVER, margin=0.1, margin_growth=0.2), problem)
+    groups = spheres_of(now)
+    knots = [list(range(1, 11)), [11, 12, 13, 14, 15], [16, 17, 18, 19, 20], [21, 22, 23, 24, 25], [26, 27]]
+    assert [group for group, _ in groups] == knots
+    for group, radii in groups:
+        by = 0.1 if group[0] == 1 else 0.1 + 0.2 * float(np.mean(group)) * DT
+        torch.testing.assert_close(radii, torch.full((1, 1), RADIUS + by, **DOUBLE), rtol=0, atol=1e-12)
+    plain = at_start(Planner(SOLVER, margin=0.1), problem)
+    assert [group for group, _ in spheres_of(plain)] == [knots[0], list(range(11, 28))]
+    assert all(float(radii) == pytest.approx(RADIUS + 0.1, abs=1e-12) for _, radii in spheres_of(plain))
+
+
+@pytest.mark.parametrize("N", [2, 10, 11])
+def test_short_horizons_have_margins_too(N: int) -> None:
+    planner = Planner(SOLVER, margin=0.1, margin_growth=0.2)
+    problem = far(N=N, velocities=torch.ones(1, 1, 3, **DOUBLE))
+    now = at_start(planner, problem)
+    assert [k for knots, _ in spheres_of(now) for k in knots] == list(range(1, N + 1))
+    if N == 2:
+        kernels.use_native(False)  # nothing to compile
+        try:
+            plan, _ = first_plan(planner, problem)
+        finally:
+            kernels.use_native(True)
+        assert bool(torch.isfinite(plan.X).all())
+
+
+def test_a_margin_that_was_entered_shrinks_at_the_early_knots() -> None:
+    """Outside it, 0.04 m within, 0.01 m beneath the full surface, and almost in contact at 0.95 of the radius."""
+    distance = torch.tensor([1.0, 0.56, 0.49, 0.476], **DOUBLE)
+    centers = torch.zeros(4, 1, 3, **DOUBLE)
+    centers[:, 0, 1] = distance
+    problem = scene(centers)
+    _, now = first_plan(Planner(SOLVER, margin=0.1), problem)
+    (early, radii), (late, full) = spheres_of(now)
+    assert (early[0], early[-1], late[0]) == (1, 10, 11)
+    # A vehicle at rest stays where it is; a quarter of the way from contact to the full surface is kept in any case.
+    least = 0.95 * RADIUS + 0.25 * 0.05 * RADIUS
+    expected = torch.minimum(torch.full_like(distance, 0.6), distance).clamp(min=least)
+    torch.testing.assert_close(radii[:, 0], expected, rtol=0, atol=1e-6)
+    assert float(radii[3]) == pytest.approx(least, abs=1e-12) and least > 0.95 * RADIUS
+    torch.testing.assert_close(full[:, 0], torch.full_like(distance, 0.6), rtol=0, atol=1e-12)
+
+
+def test_moving_spheres_are_planned_where_they_will_be() -> None:
+    velocities = torch.tensor([[[0.0, -1.0, 0.0]]], **DOUBLE)
+    problem = scene(torch.tensor([[[1.0, 2.0, 0.0]]], **DOUBLE), velocities=velocities)
+    planner = Planner(SOLVER)
+    plan, now = first_plan(planner, problem)
+    for _ in range(3):
+        plan, now = next_plan(planner, problem, now, plan, plan.measured)
+    part = now.constraints[0]
+    assert isinstance(part, BoundSpheres)
+    torch.testing.assert_close(part.centers[0, 0], torch.tensor([1.0, 2.0 - 3 * DT, 0.0], **DOUBLE))
+    moved = scene(part.centers, velocities=velocities).constraints[0]
+    torch.testing.assert_close(part.value(plan.X, plan.U), moved.value(plan.X, plan.U)[:, :10], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("multipliers", ["shifted", "reset"])
+def test_the_next_plan_starts_from_the_former_one(multipliers: Any) -> None:
+    solver, problem = Recording(), varied()
+    planner = Planner(solver, multipliers=multipliers, max_seconds=100.0)
+    plan, now = first_plan(planner, problem)
+    next_plan(planner, problem, now, plan, plan.measured)
+    first, second = solver.calls
+    rest = torch.tensor([0, 0, 0, 9.81], **DOUBLE).expand(4, problem.N, 4)
+    assert first["warm"] is None and torch.equal(first["U0"], rest)
+    assert torch.equal(second["U0"], torch.cat((plan.U[:, 1:], plan.U[:, -1:]), dim=1))
+    assert first["max_seconds"] == second["max_seconds"] == 100.0
+    if multipliers == "reset":
+        assert second["warm"] is None
+    else:
+        for mine, old in zip(second["warm"].lam, plan.multipliers.lam, strict=True):
+            assert torch.equal(mine[:, :-1], old[:, 1:]) and torch.equal(mine[:, -1], old[:, -1])
+        assert torch.equal(second["warm"].mu, plan.multipliers.mu)
+
+
+class Failing(Solver):
+    """The first answer is right. In the second, problem 0 is right, 1 far off, 2 is NaN, 3 off by less than before."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def solve(self, problem: Problem, U0: Tensor, *arguments: Any, **options: Any) -> Solution:
+        self.calls += 1
+        solution = SOLVER.solve(problem, U0, *arguments, **options)
+        if self.calls == 1:
+            return solution
+        X, U, violation = solution.X.clone(), solution.U.clone(), solution.violation.clone()
+        U[1:], X[1:], violation[1] = 77.0, 77.0, 9.0
+        X[2], violation[2] = torch.nan, torch.nan
+        violation[3] = 0.02
+        return replace(solution, X=X, U=U, violation=violation)
+
+
+def test_the_former_plan_is_kept_where_the_new_one_is_infeasible_and_worse() -> None:
+    problem, planner = far(4), Planner(Failing())
+    plan, now = first_plan(planner, problem)
+    x = plan.measured.clone()
+    x[3, 13:] = torch.tensor([4.1, 3.7, 3.7, 4.1], **DOUBLE)  # its former plan is far off, too
+    kept, now = next_plan(planner, problem, now, plan, x)
+    assert kept.shifted.tolist() == [False, True, True, False] and kept.guided.tolist() == [0] * 4
+    later = torch.cat((plan.U[:, 1:], plan.U[:, -1:]), dim=1)
+    assert torch.equal(kept.U[1:3], later[1:3]) and bool((kept.U[3] == 77.0).all())
+    X = open_loop(now.dynamics, now.x0, later)
+    torch.testing.assert_close(kept.X[1:3], X[1:3], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(kept.cost[1:3], now.cost.total(X, later)[1:3])
+    worst = torch.stack([part.worst(X, later) for part in now.constraints]).amax(0)
+    torch.testing.assert_close(kept.violation[1:3], worst[1:3], rtol=1e-7, atol=1e-9)
+    assert float(worst[3]) > 0.02
+    for mine, old in zip(kept.multipliers.lam, plan.multipliers.lam, strict=True):
+        assert torch.equal(mine[1:3, :-1], old[1:3, 1:])
+
+
+def test_the_estimated_bias_is_the_acceleration_that_the_model_lacks() -> None:
+    solver, heavier = Recording(), torch.tensor([0.1, -0.1, 0.0], **DOUBLE)
+    wind = Disturbance(wind=1.0)
+    plant = RotorPlant(mass_error=heavier)
+    flown = mission(solver, 1.0, {"estimation": 0.4}, plant=plant, disturbance=wind, goal_radius=0.01)
+    log = flown.fly(far(3, goal=0.5), seed=2)
+    force, _ = wind.draw(2, [0, 1, 2], 20, DT)
+    x = log.x[:, -1, 0]
+    mass, q = FRAME.mass * (1.0 + heavier).unsqueeze(-1), x[:, 6:10].T
+    axis = torch.stack(
+        (
+            2 * (q[1] * q[3] + q[0] * q[2]),
+            2 * (q[2] * q[3] - q[0] * q[1]),
+            q[0] ** 2 - q[1] ** 2 - q[2] ** 2 + q[3] ** 2,
+        )
+    ).T
+    lift = x[:, 13:].sum(-1, keepdim=True) * axis
+    lacking = lift / mass - lift / FRAME.mass + force[:, -1] / mass
+    assert float(lacking.norm(dim=-1).min()) > 0.3
+    bias = solver.calls[-1]["problem"].dynamics.bias
+    torch.testing.assert_close(bias, lacking, rtol=0, atol=0.05)
+    assert not bool(solver.calls[0]["problem"].dynamics.bias.any())
+
+
+BAD = {
+    "multipliers": "kept", "max_seconds": 0.0, "margin": -0.1, "margin_growth": -1.0, "estimation": 1.5,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_fields_are_named(name: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Planner(SOLVER, **{name: BAD[name]})
+    assert caught.value.field == f"planner.{name}"
+
+
+def test_another_model_is_refused() -> None:
+    cost = QuadraticCost([1] * 6, [1, 1], [1] * 6)
+    planar = Problem(Planar(dt=DT), cost, [], torch.zeros(1, 6, **DOUBLE), 5)
+    with pytest.raises(InputError) as caught:
+        Planner(SOLVER).problem(planar, torch.zeros(1, 17, **DOUBLE))
+    assert caught.value.field == "model"

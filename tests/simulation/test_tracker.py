@@ -1,0 +1,144 @@
+"""The tracker: its equality and limits, its rates, and a dense solution of the same problem by SciPy."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.reference import models, tracking
+from tests.simulation.missions import DOUBLE
+from torchgco import Airframe, InputError
+from torchgco.simulation.plant import RotorPlant, hovering
+from torchgco.simulation.tracker import Reference, Tracker, Tracking
+
+FRAME = Airframe()
+PERIOD = 0.05
+
+
+def plan(rates: list[list[float]], acceleration: list[float], B: int = 1) -> Reference:
+    """A plan with these rates and thrust accelerations at its knots, the same for B vehicles."""
+    X = torch.zeros(B, len(rates), 14, **DOUBLE)
+    X[..., 10:13], X[..., 13] = torch.tensor(rates, **DOUBLE), torch.tensor(acceleration, **DOUBLE)
+    return Reference(X, PERIOD)
+
+
+def turning(B: int = 1, size: float = 0.4) -> Reference:
+    """A second of gentle turns and climbs, different for each vehicle."""
+    t = PERIOD * torch.arange(21, **DOUBLE)
+    X = torch.zeros(B, 21, 14, **DOUBLE)
+    for b in range(B):
+        for i in range(3):
+            X[b, :, 10 + i] = size * torch.sin((2.0 + i + b) * t) * (0.2 if i == 2 else 1.0)
+        X[b, :, 13] = 9.81 + 2.0 * torch.sin((3.0 + b) * t)
+    return Reference(X, PERIOD)
+
+
+def fly(reference: Reference, x: Tensor, steps: int, tracker: Tracker) -> tuple[list[Tensor], list[Tracking]]:
+    """States of the plant and answers of the tracker for some time steps."""
+    plant, states, answers = RotorPlant(), [x], []
+    for k in range(steps):
+        answers.append(tracker.track(states[-1], reference, k * tracker.dt, answers[-1] if answers else None))
+        states.append(plant.advance(states[-1], answers[-1].commands, x.new_zeros(len(x), 3)))
+    return states, answers
+
+
+def planned(x: Tensor, answer: Tracking, b: int = 0) -> np.ndarray:
+    """The states (N+1, 7) that the tracker plans for vehicle b, by NumPy."""
+    return tracking.rollout(x[b, 10:].numpy(), answer.U[b].numpy(), 0.01, models.QuadrotorParameters())
+
+
+def test_a_reference_is_interpolated_and_its_last_value_held() -> None:
+    reference = plan([[0, 0, 0], [1, 2, 3], [5, 2, -3]], [9.0, 10.0, 12.0])
+    times = torch.tensor([0.0, 0.025, 0.05, 0.08, 0.1, 0.4], **DOUBLE)
+    rates, acceleration = reference.at(times)
+    expected = [[0, 0, 0], [0.5, 1, 1.5], [1, 2, 3], [3.4, 2, -0.6], [5, 2, -3], [5, 2, -3]]
+    torch.testing.assert_close(rates[0], torch.tensor(expected, **DOUBLE), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        acceleration[0], torch.tensor([9.0, 9.5, 10, 11.2, 12, 12], **DOUBLE), rtol=0, atol=1e-12
+    )
+
+
+def test_thrusts_sum_up_to_the_plan_and_rates_follow_it() -> None:
+    reference, tracker = turning(), Tracker()
+    states, answers = fly(reference, hovering(FRAME, torch.zeros(1, 3, **DOUBLE)), 60, tracker)
+    for k in range(10, 60):
+        X = planned(states[k], answers[k])
+        rates, acceleration = reference.at(0.01 * (k + torch.arange(7, **DOUBLE)))
+        np.testing.assert_allclose(X[1:, 3:].sum(-1), FRAME.mass * acceleration[0, 1:].numpy(), rtol=0, atol=1e-6)
+        assert float(answers[k].violation) <= 1e-6
+        np.testing.assert_allclose(X[3:, :3], rates[0, 3:].numpy(), rtol=0, atol=2e-3)  # Euler reaches rates in 2 steps
+        now, _ = reference.at(torch.tensor([0.01 * k], **DOUBLE))
+        np.testing.assert_allclose(states[k][0, 10:13].numpy(), now[0, 0].numpy(), rtol=0, atol=0.03)
+
+
+def test_limits_of_the_thrusts_are_kept() -> None:
+    """A steep climb with a turn that takes more torque than the rotors have left: some are at the limit."""
+    reference, tracker = plan([[0.1, 0.0, 0.0]] * 6, [14.3] * 6), Tracker(stages=4)
+    x = hovering(FRAME, torch.zeros(1, 3, **DOUBLE))
+    x[0, 13:] = 5.5
+    answer = tracker.track(x, reference, 0.0)
+    F = planned(x, answer)[1:, 3:]
+    assert FRAME.thrust_max - 1e-3 <= F.max() <= FRAME.thrust_max + 1e-6 and F.min() >= FRAME.thrust_min - 1e-6
+    np.testing.assert_allclose(F.sum(-1), FRAME.mass * 14.3, rtol=0, atol=1e-6)
+
+
+def test_a_jump_of_the_rates_is_caught_up() -> None:
+    """No rotor can turn the vehicle as fast as asked for; the tracker recovers and follows."""
+    wanted = [1.0, -0.5, 0.2]
+    states, answers = fly(plan([wanted] * 6, [9.81] * 6), hovering(FRAME, torch.zeros(1, 3, **DOUBLE)), 30, Tracker())
+    assert max(float(answer.violation) for answer in answers) > 1e-2  # the jump is beyond reach
+    np.testing.assert_allclose(states[-1][0, 10:13].numpy(), wanted, rtol=0, atol=5e-3)
+    assert float(answers[-1].violation) <= 1e-6
+    for x in states:
+        assert bool((x[:, 13:] <= FRAME.thrust_max).all()) and bool((x[:, 13:] >= FRAME.thrust_min).all())
+
+
+CASES = {
+    "hover": ([0.0, 0.0, 0.0], [3.944, 3.944, 3.944, 3.944], [0.05, -0.02, 0.01], 9.9),
+    "turning": ([0.3, -0.2, 0.1], [3.6, 4.2, 4.1, 3.7], [0.25, -0.1, 0.12], 9.6),
+    "climbing": ([0.0, 0.1, 0.0], [4.6, 4.7, 4.65, 4.6], [0.0, 0.15, -0.02], 11.7),
+    "at the limit": ([0.0, 0.0, 0.0], [5.85, 5.85, 5.85, 5.85], [0.05, 0.0, 0.0], 14.7),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_commands_have_the_effect_of_a_dense_solution(name: str) -> None:
+    w, F, wanted, acceleration = CASES[name]
+    x = hovering(FRAME, torch.zeros(1, 3, **DOUBLE))
+    x[0, 10:] = torch.tensor(w + F, **DOUBLE)
+    reference = plan([w, wanted, wanted], [acceleration] * 3)
+    answer = Tracker().track(x, reference, 0.01)
+    rates, a = reference.at(0.01 + 0.01 * torch.arange(7, **DOUBLE))
+    X, U = tracking.solve(x[0, 10:].numpy(), rates[0].numpy(), a[0, 1:].numpy(), 0.01)
+    mine, parameters = planned(x, answer), models.QuadrotorParameters()
+    np.testing.assert_allclose(mine[1], X[1], rtol=0, atol=1e-3)  # what the first command leads to
+    np.testing.assert_allclose(mine[:, :3], X[:, :3], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(X[1:, 3:].sum(-1), FRAME.mass * a[0, 1:].numpy(), rtol=0, atol=1e-9)
+    costs = [tracking.cost(*flown, rates[0].numpy(), parameters) for flown in ((mine, answer.U[0].numpy()), (X, U))]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-2, abs=1e-7)
+
+
+def test_a_batch_equals_its_parts() -> None:
+    tracker, reference = Tracker(), turning(4)
+    x = hovering(FRAME, torch.zeros(4, 3, **DOUBLE))
+    x[:, 10:13] = 0.3 * torch.randn(4, 3, generator=torch.Generator().manual_seed(1), **DOUBLE)
+    states, answers = fly(reference, x, 4, tracker)
+    for rows in ([2], [3, 1], [3, 2, 1, 0]):
+        part, own = fly(Reference(reference.X[rows], PERIOD), x[rows], 4, tracker)
+        for k in range(4):
+            assert torch.equal(own[k].U, answers[k].U[rows]) and torch.equal(
+                own[k].violation, answers[k].violation[rows]
+            )
+            assert torch.equal(part[k + 1], states[k + 1][rows])
+    index = torch.tensor([3, 1])
+    later = tracker.track(states[-1][index], Reference(reference.X[index], PERIOD), 0.04, answers[-1].take(index))
+    assert torch.equal(later.U, tracker.track(states[-1], reference, 0.04, answers[-1]).U[index])
+
+
+@pytest.mark.parametrize(("name", "value"), [("penalty", 0.0), ("dt", -0.01), ("stages", 0)])
+def test_bad_fields_are_named(name: str, value: Any) -> None:
+    with pytest.raises(InputError) as caught:
+        Tracker(**{name: value})
+    assert caught.value.field == f"tracker.{name}"
