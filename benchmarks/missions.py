@@ -92,11 +92,12 @@ def timing(outputs: Path, alone: int, together: int) -> str:
     ]  # fmt: skip
     lines = ["| milliseconds | median | 90 % | 99 % | longest |", "|---|---|---|---|---|"]
     lines += [f"| {name} | " + " | ".join(f"{value:.1f}" for value in values) + " |" for name, *values in rows]
-    return "\n".join(lines) + (
-        f"\n\n{alone} missions alone on one core, {len(log)} control periods of 50 ms, of which {missed} missed their\n"
-        f"deadline. Planner and tracker take {np.mean(totals):.2f} s for a mission alone and {batch:.2f} s per mission\n"
-        f"in a batch of {together}."
-    )
+    text = [
+        f"{alone} missions alone on one core, {len(log)} control periods of 50 ms, {missed} missed deadlines.",
+        f"Planner and tracker take {np.mean(totals):.2f} s for a mission alone, {batch:.2f} s per mission in a batch",
+        f"of {together}.",
+    ]
+    return "\n".join([*lines, "", *text])
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -71,11 +71,11 @@ def test_the_first_plan_is_the_solvers_own_solution() -> None:
 def test_rates_that_the_rotors_lead_to_are_planned() -> None:
     problem, x = far(), hovering(FRAME, torch.zeros(1, 3, **DOUBLE))
     x[0, 13:] = torch.tensor([3.8, 4.0, 4.05, 3.9], **DOUBLE)
-    plan, _ = first_plan(Planner(FIRM), problem, x)
+    plan, _ = first_plan(Planner(FIRM, tolerance=1e-3), problem, x)
     expected = models.angular_acceleration(np.zeros(3), x[0, 13:].numpy(), models.QuadrotorParameters()) * DT
     assert 0.02 < np.abs(expected).max() < 5.0 * DT / 1.5  # within reach
     np.testing.assert_allclose(plan.X[0, 1, 10:13].numpy(), expected, rtol=0, atol=2e-3)
-    free, _ = first_plan(Planner(FIRM, first_step=False), problem, x)
+    free, _ = first_plan(Planner(FIRM, tolerance=1e-3, first_step=False), problem, x)
     assert np.abs(free.X[0, 1, 10:13].numpy() - expected).max() > 2e-2
 
 
@@ -83,7 +83,7 @@ def test_rates_beyond_the_planning_models_reach_lead_to_the_nearest() -> None:
     problem, x = far(), hovering(FRAME, torch.zeros(1, 3, **DOUBLE))
     x[0, 10:13] = torch.tensor([0.3, -0.2, 0.0], **DOUBLE)
     x[0, 13:] = torch.tensor([5.5, 2.4, 2.4, 5.5], **DOUBLE)  # about 50 rad/s^2 of roll
-    plan, now = first_plan(Planner(FIRM), problem, x)
+    plan, now = first_plan(Planner(FIRM, tolerance=1e-3), problem, x)
     w = x[0, 10:13].numpy()
     wanted = w + DT * models.angular_acceleration(w, x[0, 13:].numpy(), models.QuadrotorParameters())
     nearest = np.clip(wanted, w + DT / 1.5 * (-5 - w), w + DT / 1.5 * (5 - w))
@@ -170,7 +170,7 @@ def test_the_next_plan_starts_from_the_former_one(multipliers: Any) -> None:
     rest = torch.tensor([0, 0, 0, 9.81], **DOUBLE).expand(4, problem.N, 4)
     assert first["warm"] is None and torch.equal(first["U0"], rest)
     assert torch.equal(second["U0"], torch.cat((plan.U[:, 1:], plan.U[:, -1:]), dim=1))
-    assert first["max_seconds"] == second["max_seconds"] == 100.0
+    assert all(99.0 < call["max_seconds"] <= 100.0 for call in (first, second))
     if multipliers == "reset":
         assert second["warm"] is None
     else:

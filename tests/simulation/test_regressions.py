@@ -25,7 +25,7 @@ from torchgco.constraints import Constraint, ControlBounds
 from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import cost_unit, engine_of, open_loop
 from torchgco.rollout import open_loop as eager_rollout
-from torchgco.simulation.planner import BiasedPlanning
+from torchgco.simulation.horizon import BiasedPlanning
 
 SOLVER = AugmentedLagrangian(ILQR(max_iterations=6), initial_penalty=0.1, max_outer_iterations=4)
 INF = torch.inf

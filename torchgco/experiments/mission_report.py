@@ -7,18 +7,25 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
+from torchgco.constraints.bodies import CONTACT_FACTOR
 from torchgco.experiments.build import Setup
 from torchgco.experiments.files import write
 from torchgco.experiments.mission_flight import FEW
-from torchgco.experiments.records import MISSION, TRIALS
+from torchgco.experiments.records import LAYOUTS, MISSION, TRIALS
 from torchgco.experiments.report import aligned, compare, format_table
 from torchgco.experiments.runs import read_trials
 from torchgco.experiments.statistics import summarise, wilson
 from torchgco.flights import clearances, mission_frame, spheres_of, unpacked
 from torchgco.outcome import Outcome
+from torchgco.plotting import missions as draw
+from torchgco.plotting.animation import mission_animation
+from torchgco.plotting.course import Course
+from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts
 
+SNAPSHOTS = 4  # instants of a mission in one figure
 PLANS = "plans.npz"  # planned positions (solver, L, K, N+1, 3), where few missions fly
 
 
@@ -106,4 +113,44 @@ def effort_table(trials: pd.DataFrame) -> str:
 
 
 def write_figures(folder: Path, trials: pd.DataFrame, missions: pd.DataFrame, setup: Setup) -> None:
-    """figures/*.png."""
+    """figures/outcomes.png; where few missions fly, for each of them those of the paper, and an animation."""
+    held: dict[str, Figure] = {"outcomes": draw.outcomes_figure(trials)}
+    plans = _plans(folder)
+    layouts = Layouts.load(folder / LAYOUTS)
+    for i, number in enumerate(layouts.ids.tolist() if plans else []):
+        course, period = _course(setup, layouts.take([i]))
+        flown = {
+            str(name): rows for name, rows in missions[missions["mission"] == number].groupby("solver", sort=False)
+        }
+        held[f"{number}-compute"] = draw.compute_figure(flown, period)
+        held[f"{number}-distance"] = draw.distance_figure(flown, course)
+        for name, rows in flown.items():
+            plan = plans[name][i][: len(rows)]
+            steps = np.linspace(0, 0.8 * (len(rows) - 1), SNAPSHOTS).round().astype(int).tolist()
+            label = f"{number}-{name}"
+            held[f"{label}-snapshots"] = draw.snapshots_figure(rows, plan, course, steps, period)
+            held[f"{label}-commands"] = draw.commands_figure(rows)
+            held[f"{label}-states"] = draw.states_figure(rows, course.goal)
+            held[f"{label}-tracking"] = draw.tracking_figure(rows)
+            mission_animation(rows, plan, course, period, folder / "figures" / f"{label}.gif", name)
+    for name, figure in held.items():
+        write(folder / "figures" / f"{name}.png", lambda file, figure=figure: save(figure, file))
+
+
+def _plans(folder: Path) -> dict[str, np.ndarray]:
+    """Planned positions (L, K, N+1, 3) by solver; empty where none were kept."""
+    if not (folder / PLANS).is_file():
+        return {}
+    with np.load(folder / PLANS, allow_pickle=False) as held:
+        return dict(zip(held["solver"].tolist(), held["plan"], strict=True))
+
+
+def _course(setup: Setup, layouts: Layouts) -> tuple[Course, float]:
+    """The obstacles and the goal of one layout, and its control period, s."""
+    task = setup.vehicle.task(layouts)
+    centers, contact, velocities = spheres_of(task.problem)[0]
+    assert setup.mission is not None
+    near = setup.mission.goal_radius
+    radius = float(task.goal_radius) if near is None else near
+    course = Course(centers, contact / CONTACT_FACTOR, task.goal[0].numpy(), radius, velocities)
+    return course, float(task.problem.dynamics.dt)

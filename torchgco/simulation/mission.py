@@ -21,8 +21,9 @@ from torchgco.errors import InputError
 from torchgco.outcome import FARTHEST
 from torchgco.problem import Problem
 from torchgco.simulation.disturbance import Disturbance, measured
+from torchgco.simulation.horizon import check_model
 from torchgco.simulation.log import MissionLog
-from torchgco.simulation.planner import Plan, Planner, check_model
+from torchgco.simulation.planner import Plan, Planner
 from torchgco.simulation.plant import Plant, RotorPlant, hovering
 from torchgco.simulation.tracker import Reference, Tracker, Tracking
 from torchgco.tree import take

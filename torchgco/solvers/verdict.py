@@ -134,5 +134,6 @@ def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: floa
     status = torch.where(fits & constrained, int(Status.FEASIBLE), reason)
     status = torch.where(stationary, torch.where(fits, int(Status.CONVERGED), int(Status.INFEASIBLE)), status)
     status = torch.where(torch.isinf(left), int(Status.NOT_POSITIVE_DEFINITE), status)
+    status = torch.where((ended == Status.TIME_LIMIT) & ~fits, ended, status)  # more time might find more
     failed = (ended == Status.NON_FINITE) | (ended == Status.NOT_POSITIVE_DEFINITE) | (ended == Status.INVALID_START)
     return torch.where(failed, ended, status)
