@@ -134,7 +134,7 @@ def write_figures(folder: Path, trials: pd.DataFrame, missions: pd.DataFrame, se
             held[f"{label}-tracking"] = draw.tracking_figure(rows)
             mission_animation(rows, plan, course, period, folder / "figures" / f"{label}.gif", name)
     for name, figure in held.items():
-        write(folder / "figures" / f"{name}.png", lambda file, figure=figure: save(figure, file))
+        write(folder / "figures" / f"{name}.png", lambda file, figure=figure: save(figure, file, dpi=110))
 
 
 def _plans(folder: Path) -> dict[str, np.ndarray]:

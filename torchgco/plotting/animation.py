@@ -21,7 +21,7 @@ from torchgco.plotting.course import VEHICLE, VIEWS, Course, draw_instant, fligh
 from torchgco.plotting.missions import check_plans
 from torchgco.plotting.style import INK, PALETTE, tidy
 
-FPS = 10
+FPS = 5
 MOST = 100  # frames of a mission
 DPI = 80
 PALE = "#C8C8C8"
@@ -47,7 +47,7 @@ class Picture:
 def mission_animation(
     frame: pd.DataFrame, plans: np.ndarray, course: Course, period: float, path: Path, title: str = ""
 ) -> Path:
-    """Write a GIF of a mission from above and from the side, 10 pictures per second, in real time where 100 suffice.
+    """Write a GIF of a mission from above and from the side, 5 pictures per second, in real time where 100 suffice.
 
     frame   with columns t and x0 to x2, a row per control step
     plans   planned positions (K, N+1, 3), m, K at least the frame's rows
