@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -43,7 +43,8 @@ class Mission:
         disturbance: wind and noise.
         duration: s, after which a mission ends with TIMEOUT.
         goal_radius: m, within which the goal counts as reached; None: the problems' own.
-        latency: control periods between a measurement and the first use of the plan made from it, 0 or 1.
+        latency: control periods between a measurement and the first use of the plan made from it, 0 or 1. With 1, a
+            plan starts where the former plan leads within the period, and without `first_step`.
 
     Raises:
         InputError: a field out of its range, or periods that don't fit each other.
@@ -100,6 +101,8 @@ class _Flight:
 
     def __init__(self, mission: Mission, problem: Problem, seed: int, ids: Tensor) -> None:
         self.mission, self.seed = mission, seed
+        # The thrusts at a plan's start are not known one period ahead.
+        self.planner = mission.planner if mission.latency == 0 else replace(mission.planner, first_step=False)
         if problem.goal is None:
             raise InputError("goal", "a Goal in the problem", None)
         mission.check(problem.dynamics)
@@ -114,7 +117,7 @@ class _Flight:
         self.radius = problem.goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
         x = hovering(mission.planner.airframe, problem.x0[:, :3])
         self.start = x[:, :3]
-        self.problem, self.planned = problem, mission.planner.problem(problem, x)
+        self.problem, self.planned = problem, self.planner.problem(problem, x)
         self.force, self.noise = mission.disturbance.draw(seed, ids.tolist(), self.steps, self.period)
         self.log = MissionLog.blank(x, self.steps, self.substeps, self.period, problem.N + 1)
         self.plant, self.x, self.rows, self.ids = mission.plant, x, torch.arange(problem.B), ids
@@ -122,20 +125,20 @@ class _Flight:
     def run(self, report: Report) -> MissionLog:
         """Fly until all missions have ended."""
         plan: Plan | None = None
-        active: Plan | None = None
         tracking: Tracking | None = None
         self._leave(~self.problem.start_is_clear)
         for step in range(self.steps):
             if self.rows.numel() == 0:
                 break
-            seen = measured(self.x, self.noise[self.rows, step])
-            before = plan
-            plan, self.planned, seconds = self.mission.planner.plan(
-                self.problem, self.planned, seen, step, before, self.seed + SEED_STEP * step, self.ids
-            )
-            active = plan if self.mission.latency == 0 or before is None else before
-            self.log.add_plan(self.rows, step, self.x, plan, seconds / self.rows.numel())
-            tracking, left = self._fly_period(step, active, tracking)
+            seen, seconds = measured(self.x, self.noise[self.rows, step]), 0.0
+            if plan is None or self.mission.latency == 0:
+                plan, seconds = self._planned(step, seen, seen, plan)
+            flown = plan
+            if self.mission.latency == 1:
+                plan, more = self._planned(step + 1, self.planner.predicted(seen, flown), seen, flown)
+                seconds += more
+            self.log.add_plan(self.rows, step, self.x, flown, seconds / self.rows.numel())
+            tracking, left = self._fly_period(step, flown, tracking)
             if bool(left.any()):
                 stay = (~left).nonzero().flatten()
                 plan, tracking = plan.take(stay), tracking.take(stay)
@@ -143,15 +146,22 @@ class _Flight:
             report(step, self.rows.numel())
         return self.log
 
+    def _planned(self, step: int, x: Tensor, seen: Tensor, before: Plan | None) -> tuple[Plan, float]:
+        """Plans from states x (B, 17) at a control step, when `seen` is measured; and the seconds they took."""
+        seed = self.seed + SEED_STEP * step
+        plan, self.planned, seconds = self.planner.plan(
+            self.problem, self.planned, x, step, before, seed, self.ids, seen
+        )
+        return plan, seconds
+
     def _fly_period(self, step: int, plan: Plan, tracking: Tracking | None) -> tuple[Tracking, Tensor]:
         """One control period along a plan; and which vehicles have ended in it, (B,) bool."""
         reference = Reference(plan.X, self.period)
         ended = torch.zeros_like(self.rows, dtype=torch.bool)
-        late = (step - plan.step) * self.period
         for j in range(self.substeps):
             seen = measured(self.x, self.noise[self.rows, step])
             began = time.perf_counter()
-            tracking = self.mission.tracker.track(seen, reference, late + j * self.plant.dt, tracking)
+            tracking = self.mission.tracker.track(seen, reference, j * self.plant.dt, tracking)
             seconds = (time.perf_counter() - began) / self.rows.numel()
             x = self.plant.advance(self.x, tracking.commands, self.force[self.rows, step])
             self.x = torch.where(ended.unsqueeze(-1), self.x, x)

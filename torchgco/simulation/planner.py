@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bodies import Obstacles
+from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.errors import InputError
 from torchgco.evaluation import violation
@@ -37,12 +38,13 @@ class Plan:
     iterations: Tensor  # int64: of all solves for this plan
     measured: Tensor  # (B, 17): the plants' states
     bias: Tensor  # (B, 3): estimated acceleration that the model lacks, m/s^2
+    model: Dynamics  # that was planned with
     step: int
 
     def take(self, index: Rows) -> Plan:
         """The plans in `index`."""
         parts = {name: take(getattr(self, name), index) for name in (*TRAJECTORY, *OTHERS)}
-        return replace(self, **parts)
+        return replace(self, **parts, model=self.model.take(index))
 
 
 TRAJECTORY = ("X", "U", "multipliers", "cost", "violation", "shifted")
@@ -111,23 +113,42 @@ class Planner:
         return replace(problem, dynamics=dynamics, x0=x0, constraints=constraints)
 
     def plan(
-        self, whole: Problem, now: Problem, x: Tensor, step: int, before: Plan | None, seed: int, ids: Tensor
+        self,
+        whole: Problem,
+        now: Problem,
+        x: Tensor,
+        step: int,
+        before: Plan | None,
+        seed: int,
+        ids: Tensor,
+        measured: Tensor | None = None,
     ) -> tuple[Plan, Problem, float]:
         """Plans from plants x (B, 17) at a control step, their problems, and the seconds that the planning took.
 
         Args:
             whole: the problems of the open-loop study; now: those of the plan before, at first of `problem`.
+            measured: the states that were measured last, (B, 17), where x is predicted from them; None: x.
         """
+        measured = x if measured is None else measured
         began = time.perf_counter()
         t, x0 = step * float(whole.dynamics.dt), planning_state(x, self.airframe)
         U0 = now.cost.rest_controls(x0.new_zeros(now.B, now.N, now.m)) if before is None else shifted(before.U)
-        bias = self._estimated(x, before, float(whole.dynamics.dt))
+        bias = self._estimated(measured, before, float(whole.dynamics.dt))
         dynamics = whole.dynamics if self.estimation == 0 else biased(whole.dynamics, bias)
         depth = self._margin.unavoidable_depth(whole.started_at(x0, whole.constraints), t, U0)
         now = now.started_at(x0, self._constraints(whole, t, x, depth), dynamics=dynamics)
         solve = _Solve(self, now, seed, ids, began)
         plan = solve.first(U0) if before is None else solve.next(U0, before)
-        return replace(plan, measured=x, bias=bias, step=step), now, time.perf_counter() - began
+        return replace(plan, measured=measured, bias=bias, step=step), now, time.perf_counter() - began
+
+    def predicted(self, x: Tensor, plan: Plan) -> Tensor:
+        """The plants (B, 17) one period later, from x (B, 17) at the plan's first knot: as the plan's model leads."""
+        now = planning_state(x, self.airframe)
+        later = plan.model.step(now, plan.U[:, 0])
+        q = later[:, 6:10] / later[:, 6:10].square().sum(-1, keepdim=True).sqrt()
+        more = (later[:, 13:] - now[:, 13:]) * self.airframe.mass / 4.0
+        F = (x[:, 13:] + more).clamp(self.airframe.thrust_min, self.airframe.thrust_max)
+        return torch.cat((later[:, :6], q, later[:, 10:13], F), dim=-1)
 
     @property
     def _margin(self) -> Margin:
@@ -211,10 +232,9 @@ class _Solve:
         for name in TRAJECTORY:
             put(getattr(plan, name), rows[chosen], take(getattr(other, name), chosen))
 
-    @staticmethod
-    def _plan(solution: Solution) -> Plan:
+    def _plan(self, solution: Solution) -> Plan:
         none = torch.zeros_like(solution.cost, dtype=torch.bool)
         return Plan(
             solution.X, solution.U, solution.multipliers, solution.cost, solution.violation, none, solution.guided,
-            solution.iterations, solution.X[:, 0], solution.X[:, 0, :3], 0,
+            solution.iterations, solution.X[:, 0], solution.X[:, 0, :3], self.problem.dynamics, 0,
         )  # fmt: skip
