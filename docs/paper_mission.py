@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from torchgco.simulation.mission import Mission
 from torchgco.simulation.planner import Planner
 
 GOAL_RADIUS = 0.5  # m
-TOLERANCE = MARGIN = 0.01  # m, of the planner with gco
+MARGIN = 0.01  # m, of the planner with gco
 SOLVERS = ("al_ilqr", "gco_paper", "gco")
 SHOWN = "gco_paper"  # the solver of Figures 10 to 12, A4 and A5
 SNAPSHOTS = 4
@@ -50,9 +50,7 @@ def planner(name: str) -> Planner:
     """The paper's planner with al_ilqr or gco_paper; the library's with gco."""
     if name != "gco":
         return Planner(getattr(presets, name)(3), multipliers="reset", margin=0.0, estimation=0.0)
-    solver = presets.gco(3)
-    solver = replace(solver, local=replace(solver.local, violation_tolerance=TOLERANCE))
-    return Planner(solver, margin=MARGIN)
+    return Planner(presets.gco(3), margin=MARGIN)
 
 
 def fly(name: str, duration: float = 15.0) -> Flight:
