@@ -29,7 +29,10 @@ CASES = {
         "scenario=forest_moving", START, "scenario.num_obstacles=8", "scenario.slowest=1", "scenario.speed=3",
     ],
     "forest, mass +10 %, wind 0.5 N": ["plant.mass_error=0.1", "mission.disturbance.wind=0.5"],
-    "the same in drone-models with drag": [
+    "the same with drag 0.1 N s/m": [
+        "plant.drag=0.1", "plant.mass_error=0.1", "mission.disturbance.wind=0.5",
+    ],
+    "the same in drone-models": [
         "plant=drone_models", "plant.drag=0.1", "plant.mass_error=0.1", "mission.disturbance.wind=0.5",
     ],
     "forest, gusts 0.5 N, noise, one period of latency": [
