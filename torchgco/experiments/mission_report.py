@@ -122,6 +122,8 @@ def write_figures(folder: Path, trials: pd.DataFrame, missions: pd.DataFrame, se
         flown = {
             str(name): rows for name, rows in missions[missions["mission"] == number].groupby("solver", sort=False)
         }
+        if not flown:  # a start in contact
+            continue
         held[f"{number}-compute"] = draw.compute_figure(flown, period)
         held[f"{number}-distance"] = draw.distance_figure(flown, course)
         for name, rows in flown.items():
