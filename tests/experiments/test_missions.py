@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from tests.experiments.commands import problem_line
+from torchgco.experiments import report
 
 SHORT = ["mission.duration=0.2", "scenario.num_obstacles=3", "study.workers=1", "hydra.run.dir=out"]
 OWN = [
@@ -81,3 +82,16 @@ def test_bad_missions_are_refused_in_one_line(run, tmp_path, words: list[str], f
 def test_a_plant_needs_a_mission(run) -> None:
     code, _, err = run("plant=rotors", "hydra.run.dir=out")
     assert code == 2 and "experiment=mission" in problem_line(err)
+
+
+def test_a_sweep_over_missions_becomes_columns_of_one_report(run, tmp_path, capsys) -> None:
+    words = ["experiment=mission_study", *SHORT[:3], "study.layouts=2", "study.baselines=[]"]
+    for wind in (0.0, 1.0):
+        assert run(*words, f"mission.disturbance.wind={wind}", f"hydra.run.dir=all/{wind}")[0] == 0
+    assert run(*words, "plant.drag=0.5", "hydra.run.dir=all/drag")[0] == 0
+    assert report.main([str(tmp_path / "all"), "--output", str(tmp_path / "report")]) == 0
+    merged = pd.read_parquet(tmp_path / "report" / "trials.parquet")
+    assert merged.groupby(["mission.disturbance.wind", "plant.drag"]).size().to_dict() == {
+        (0.0, 0.0): 2, (0.0, 0.5): 2, (1.0, 0.0): 2,
+    }  # fmt: skip
+    assert merged["layout_digest"].nunique() == 6 and "wind" in capsys.readouterr().out

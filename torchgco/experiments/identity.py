@@ -25,6 +25,7 @@ OVERRULED = {
     "start": "start", "goal": "goal", "radius": "vehicle_radius", "goal_radius": "goal_radius", "stages": "stages",
     "control_lower": "control_lower", "control_upper": "control_upper",
 }  # fmt: skip
+CLOSED_LOOP = ("mission", "plant")  # nodes of missions
 DIGITS = 16  # hexadecimal, of a digest: 64 bits
 EXACT = 2**53  # above it neighbouring integers, such as seeds, become the same float
 LONGEST = 40  # letters of a value in a message
@@ -50,8 +51,13 @@ def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> di
         "device": {name: configuration["device"].get(name) for name in ARITHMETIC},
         "study": {"solvers": list(solvers)},
         "solvers": dict(solvers),
-        **{name: configuration[name] for name in ("mission", "plant") if configuration.get(name) is not None},
+        **closed_loop(configuration),
     }
+
+
+def closed_loop(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a configuration that missions add; empty without them."""
+    return {name: configuration[name] for name in CLOSED_LOOP if configuration.get(name) is not None}
 
 
 @dataclass(frozen=True)
@@ -115,16 +121,19 @@ def digest(value: Any) -> str:
     return sha256(json.dumps(_normal(value), sort_keys=True, default=str).encode()).hexdigest()[:DIGITS]
 
 
-def layout_digests(layouts: Layouts, vehicle: Mapping[str, Any]) -> dict[int, str]:
+def layout_digests(
+    layouts: Layouts, vehicle: Mapping[str, Any], loop: Mapping[str, Any] | None = None
+) -> dict[int, str]:
     """Digest of each layout by its id: the obstacles, and all else that a flight depends on except the solver.
 
     vehicle  `model.vehicle` of the resolved configuration; layouts override it where they hold values. The best
              known cost doesn't count.
+    loop     of missions, see `closed_loop`
     """
     model = {key: value for key, value in vehicle.items() if key not in (*OVERRULED, "name")}
     if layouts.dt is not None:
         model["dynamics"] = {key: value for key, value in dict(model["dynamics"]).items() if key != "dt"}
-    shared = {"model": model, "dt": layouts.dt}
+    shared = {"model": model, "dt": layouts.dt, **(loop or {})}
     for key, field in OVERRULED.items():
         given = getattr(layouts, field)
         shared[key] = vehicle.get(key) if given is None else given

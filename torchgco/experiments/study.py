@@ -18,7 +18,7 @@ import torchgco
 from torchgco.errors import InputError
 from torchgco.experiments.build import Setup, build, solver_of
 from torchgco.experiments.flight import Bar, Flight, Flown, NoBar, Plan, fly, plan_of, prepare
-from torchgco.experiments.identity import Manifest, layout_digests, plain, settings_of
+from torchgco.experiments.identity import Manifest, closed_loop, layout_digests, plain, settings_of
 from torchgco.experiments.mission_flight import FEW, MissionFlight
 from torchgco.experiments.mission_report import mission_table, write_mission_report
 from torchgco.experiments.records import COLUMNS, JUDGED, TRIALS, Records
@@ -116,7 +116,7 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
     manifest = Manifest(
         configuration=configuration,
         solvers={name: settings_of(held) for name, held in configs.items()},
-        layouts=layout_digests(layouts, configuration["model"]["vehicle"]),
+        layouts=layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(configuration)),
     )
     return _Study(setup, plan_of(setup), layouts, solvers, manifest)
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import pandas as pd
 
-from torchgco.experiments.identity import flat
+from torchgco.experiments.identity import CLOSED_LOOP, flat
 from torchgco.experiments.runs import Run
 from torchgco.experiments.statistics import TASK
 
 UNKNOWN = ""  # variant of a solver in a run of an older version
-SWEPT = ("scenario.", "model.vehicle.")  # prefixes of keys that define the problems; `model` has keys for solvers, too
+# Prefixes of keys that define the problems and missions; `model` has keys for solvers, too.
+SWEPT = ("scenario.", "model.vehicle.", "mission.", "plant.")
 NAMES = ("scenario.name", "scenario._target_", "model.vehicle.name", "model.vehicle._target_")  # have columns
 FILE = "scenario.path"
 RUN = "hydra.run.dir"
@@ -64,7 +65,7 @@ def _swept(runs: Sequence[Run], task: tuple[Any, ...]) -> list[dict[str, Any]]:
 
 
 def _keys(run: Run) -> dict[str, Any]:
-    parts = {name: run.configuration.get(name) for name in ("scenario", "model")}
+    parts = {name: run.configuration.get(name) for name in ("scenario", "model", *CLOSED_LOOP)}
     keys = flat({name: part for name, part in parts.items() if isinstance(part, Mapping)})
     return {key: value for key, value in keys.items() if key.startswith(SWEPT) and key not in NAMES}
 
