@@ -118,7 +118,7 @@ def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
 
 
 def _headers(swept: Sequence[str]) -> list[str]:
-    """Swept variables as they head a column of the terminal: without the group of the key, of missions the last word."""
+    """Swept variables as column heads: without the group of the key; of missions the last part alone."""
     short = (name.removeprefix("scenario.").removeprefix("model.vehicle.") for name in swept)
     return [name.split(".")[-1] if name.startswith(("mission.", "plant.")) else name for name in short]
 
