@@ -9,7 +9,9 @@ import pandas as pd
 import pytest
 
 from tests.experiments.commands import problem_line
+from torchgco import compose, presets
 from torchgco.experiments import report
+from torchgco.simulation import Mission, Planner
 
 SHORT = ["mission.duration=0.2", "scenario.num_obstacles=3", "study.workers=1", "hydra.run.dir=out"]
 OWN = [
@@ -95,3 +97,7 @@ def test_a_sweep_over_missions_becomes_columns_of_one_report(run, tmp_path, caps
         (0.0, 0.0): 2, (0.0, 0.5): 2, (1.0, 0.0): 2,
     }  # fmt: skip
     assert merged["layout_digest"].nunique() == 6 and "wind" in capsys.readouterr().out
+
+
+def test_the_configuration_has_the_defaults_of_the_classes() -> None:
+    assert compose(["experiment=mission"]).mission == Mission(Planner(presets.gco(3)))

@@ -49,7 +49,7 @@ def spheres_of(problem: Problem) -> list[tuple[list[int], Tensor]]:
 def test_the_first_plan_is_the_solvers_own_solution() -> None:
     problem = varied()
     x = hovering(FRAME, problem.x0[:, :3])
-    plan, _ = first_plan(Planner(SOLVER, estimation=0.0), problem)
+    plan, _ = first_plan(Planner(SOLVER, estimation=0.0, margin=0.0), problem)
     bounds = problem.constraints[1]
     assert isinstance(bounds, ControlBounds)
     lower, upper = bounds.lower, bounds.upper
@@ -63,7 +63,7 @@ def test_the_first_plan_is_the_solvers_own_solution() -> None:
     for name in ("X", "U", "cost", "violation"):
         torch.testing.assert_close(getattr(plan, name), getattr(solution, name), rtol=1e-7, atol=1e-9)
     assert plan.step == 0 and not bool(plan.shifted.any()) and torch.equal(plan.measured, x)
-    biased, _ = first_plan(Planner(SOLVER), problem)  # an estimate of zero changes nothing
+    biased, _ = first_plan(Planner(SOLVER, margin=0.0), problem)  # an estimate of zero changes nothing
     torch.testing.assert_close(biased.X, plan.X, rtol=1e-7, atol=1e-9)
     assert not bool(biased.bias.any())
 
@@ -149,7 +149,7 @@ def test_a_margin_that_was_entered_shrinks_at_the_early_knots() -> None:
 def test_moving_spheres_are_planned_where_they_will_be() -> None:
     velocities = torch.tensor([[[0.0, -1.0, 0.0]]], **DOUBLE)
     problem = scene(torch.tensor([[[1.0, 2.0, 0.0]]], **DOUBLE), velocities=velocities)
-    planner = Planner(SOLVER)
+    planner = Planner(SOLVER, margin=0.0)
     plan, now = first_plan(planner, problem)
     for _ in range(3):
         plan, now = next_plan(planner, problem, now, plan, plan.measured)

@@ -82,7 +82,7 @@ class Planner:
     multipliers: Literal["shifted", "reset"] = "shifted"
     max_seconds: float | None = None
     tolerance: float = 0.01
-    margin: float = 0.0
+    margin: float = 0.01
     margin_growth: float = 0.0
     first_step: bool = True
     estimation: float = 0.2
