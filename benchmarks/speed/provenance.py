@@ -9,7 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-WRITTEN = (":!benchmarks/README.md", ":!benchmarks/results")  # files that a benchmark itself changes
+# Files that a benchmark, or `make paper`, itself changes.
+WRITTEN = (":!benchmarks/README.md", ":!benchmarks/results", ":!docs/paper.md", ":!docs/paper")
 
 
 def provenance(device: str) -> dict[str, str]:
