@@ -14,9 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
+from torchgco import compose
 from torchgco.experiments.statistics import wilson
 from torchgco.outcome import Outcome
 
@@ -35,11 +37,6 @@ CASES = {
     "the same in drone-models": [
         "plant=drone_models", "plant.drag=0.1", "plant.mass_error=0.1", "mission.disturbance.wind=0.5",
     ],
-    "forest, gusts 0.5 N, noise, one period of latency": [
-        "mission.disturbance.gust=0.5", "mission.disturbance.position_noise=0.01",
-        "mission.disturbance.velocity_noise=0.02", "mission.disturbance.attitude_noise=0.002",
-        "mission.disturbance.rate_noise=0.01", "mission.latency=1",
-    ],
 }  # fmt: skip
 # Planners and how many missions they fly: the peers plan one problem after the other, and are built anew at every step.
 PLANNERS = {"gco": 128, "gco_paper": 32, "al_ilqr": 32, "fatrop": 4}
@@ -48,13 +45,13 @@ SLOW = ("fatrop",)  # planners that fly the first case alone
 HEAD = ("missions", "planner", "n", *(outcome.name for outcome in Outcome), "flight time", "clearance", "kept plans")
 
 
-def fly(case: str, solver: str, count: int, outputs: Path, first: int = 0, more: Sequence[str] = ()) -> pd.DataFrame:
+def fly(case: str, solver: str, count: int, outputs: Path) -> pd.DataFrame:
     """The trials of one case, flown now or read."""
-    name = "".join(letter if letter.isalnum() else "-" for letter in f"{case}-{solver}-{count}-{first}")
+    name = "".join(letter if letter.isalnum() else "-" for letter in f"{case}-{solver}-{count}-0")
     folder = outputs / name
     command = [
-        sys.executable, "-m", "torchgco", "experiment=mission_study", *CASES[case], f"solver={solver}", f"seed={first}",
-        f"study.layouts={count}", "study.baselines=[]", "study.workers=1", f"hydra.run.dir={folder}", *more,
+        sys.executable, "-m", "torchgco", "experiment=mission_study", *CASES[case], f"solver={solver}",
+        f"study.layouts={count}", "study.baselines=[]", "study.workers=1", f"hydra.run.dir={folder}",
     ]  # fmt: skip
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     return pd.read_parquet(folder / "trials.parquet").assign(case=case)
@@ -78,26 +75,24 @@ def table(trials: pd.DataFrame) -> str:
 
 def timing(outputs: Path, alone: int, together: int) -> str:
     """Markdown: planner and tracker of missions that fly alone, and seconds per mission of a batch against those."""
-    case, steps, totals = next(iter(CASES)), [], []
+    periods, totals = [], []
     for seed in range(alone):
-        trials = fly(case, "gco", 1, outputs, first=seed, more=["device.threads=1"])
-        folder = outputs / "".join(c if c.isalnum() else "-" for c in f"{case}-gco-1-{seed}")
-        steps.append(pd.read_parquet(folder / "mission.parquet"))
-        totals.append(float(trials["seconds"].iloc[0]))
-    batch = float(fly(case, "gco", together, outputs)["seconds"].mean())
-    log = pd.concat(steps)
-    planner, tracker = 1000 * log["planner_seconds"].to_numpy(), 1000 * log["tracker_seconds"].to_numpy() / 5
-    missed = int((log["planner_seconds"] + log["tracker_seconds"] > 0.05).sum())
-    rows = [
-        ("planner, one mission alone", *np.quantile(planner, [0.5, 0.9, 0.99]), planner.max()),
-        ("planner, after the first step", *np.quantile(planner[log["step"] > 0], [0.5, 0.9, 0.99]),
-         planner[log["step"] > 0].max()),
-        ("tracker, one call", *np.quantile(tracker, [0.5, 0.9, 0.99]), tracker.max()),
-    ]  # fmt: skip
+        setup = compose(["experiment=mission", f"seed={seed}", "device.threads=1"])
+        assert setup.mission is not None
+        log = setup.mission.fly(setup.task(setup.layouts(1)).problem, seed=seed)
+        took = torch.stack((log.planner_seconds[0], log.tracker_seconds[0]), dim=-1)[: int(log.steps()[0])]
+        periods.append(1000 * took.numpy())
+        totals.append(float(took.sum()))
+    batch = float(fly(next(iter(CASES)), "gco", together, outputs)["seconds"].mean())
+    every, later = np.concatenate(periods), np.concatenate([part[1:] for part in periods])
+    parts = {
+        "planner": every[:, 0], "planner, after the first period": later[:, 0], "tracker, one call": every[:, 1] / 5
+    }  # fmt: skip
     lines = ["| milliseconds | median | 90 % | 99 % | longest |", "|---|---|---|---|---|"]
-    lines += [f"| {name} | " + " | ".join(f"{value:.1f}" for value in values) + " |" for name, *values in rows]
+    for name, values in parts.items():
+        lines.append(f"| {name} | " + " | ".join(f"{np.quantile(values, q):.1f}" for q in (0.5, 0.9, 0.99, 1.0)) + " |")
     text = [
-        f"{alone} missions alone on one core, {len(log)} control periods of 50 ms, {missed} missed deadlines.",
+        f"{alone} missions alone on one core, {len(every)} periods of 50 ms, {(every.sum(1) > 50).sum()} missed.",
         f"Planner and tracker take {np.mean(totals):.2f} s for a mission alone, {batch:.2f} s per mission in a batch",
         f"of {together}.",
     ]
