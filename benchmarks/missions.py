@@ -38,7 +38,7 @@ CASES = {
         "plant=drone_models", "plant.drag=0.1", "plant.mass_error=0.1", "mission.disturbance.wind=0.5",
     ],
 }  # fmt: skip
-# Planners and how many missions they fly: the peers plan one problem after the other, and are built anew at every step.
+# Planners and how many missions they fly: FATROP plans one problem after the other, and is built again in every period.
 PLANNERS = {"gco": 128, "gco_paper": 32, "al_ilqr": 32, "fatrop": 4}
 WITH_PEERS = list(CASES)[:3]
 SLOW = ("fatrop",)  # planners that fly the first case alone
