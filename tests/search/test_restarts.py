@@ -146,7 +146,7 @@ def test_a_problem_that_is_never_caught_has_the_bits_of_the_local_solve() -> Non
 
 def test_counts_are_those_of_all_attempts_and_candidates(solves: list[Solve], monkeypatch) -> None:
     made, propose = [], PathProposals.propose
-    monkeypatch.setattr(PathProposals, "propose", lambda self, part: made.append(propose(self, part)) or made[-1])
+    monkeypatch.setattr(PathProposals, "propose", lambda self, *given: made.append(propose(self, *given)) or made[-1])
     problem, U0 = gates()
     solution = SOLVER.solve(problem, U0)
     expected = torch.zeros(3, 4, dtype=torch.int64)

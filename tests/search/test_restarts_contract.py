@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -25,6 +26,8 @@ from torchgco import (
     Solution,
     Status,
 )
+from torchgco.search.candidates import Candidates
+from torchgco.solvers import contracts
 from torchgco.solvers.contracts import Progress
 
 
@@ -58,8 +61,33 @@ def test_slots_change_no_bits(slots: int, whole: Solution) -> None:
     few = SOLVER.in_slots(slots)
     seen = []
     solution = few.solve(*gates(), seed=3, callback=seen.append)
-    assert max(now.rows.numel() for now in seen) == slots
+    assert max(now.rows.numel() for now in seen if now.candidates is None) == slots
     assert_same_bits(solution, whole)
+
+
+def test_progress_names_the_candidates_that_are_solved() -> None:
+    seen = [now for now in reports(SOLVER, *gates()) if now.candidates is not None]
+    counts = [now.candidates for now in seen]
+    assert counts and all(0 < done <= total for done, total in counts) and counts[0][0] == counts[0][1]
+    assert all(FREE not in now.rows.tolist() and now.finished >= 1 and now.state is None for now in seen)
+
+
+def test_the_search_for_paths_ends_with_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock passes the limit while the first candidates are solved: no later step begins."""
+    now = 0.0
+    monkeypatch.setattr(contracts, "time", SimpleNamespace(monotonic=lambda: now))
+    solved, steps = Candidates.solved, []
+
+    def slow(self: Candidates, *args, **options) -> Candidates:
+        nonlocal now
+        now = 10.0
+        steps.append(1)
+        return solved(self, *args, **options)
+
+    monkeypatch.setattr(Candidates, "solved", slow)
+    solution = SOLVER.solve(*gates(), max_seconds=5.0)
+    assert len(steps) == 1 and Status.TIME_LIMIT in solution.statuses
+    assert bool(torch.isfinite(solution.X).all()) and Status.RUNNING not in solution.statuses
 
 
 def test_a_problem_that_cannot_start_is_not_attempted_and_disturbs_no_other(

@@ -29,6 +29,7 @@ from torchgco.solvers.memory import is_out_of_memory, plan_batch
 from torchgco.status import Status
 
 Flown = tuple[str, tuple[pd.DataFrame, np.ndarray]]  # a solver's name, its rows and controls
+REDRAW = 0.5  # s between two drawings of the bar
 NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
 
 
@@ -101,6 +102,7 @@ class Flight:
     solver: Any
     bar: Bar
     shown: int = 0
+    drawn: float = 0.0  # s, when the bar was drawn last
 
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
         """Rows (without success) and controls (L, N, m), NaN where nothing was flown."""
@@ -161,10 +163,17 @@ class Flight:
 
     def _progress(self, together: Tensor, progress: Progress) -> None:
         """Show a pass, and note in `together` how many problems ran together in it."""
-        together[progress.rows] = together[progress.rows].clamp(min=progress.rows.numel())
+        if progress.candidates is None:
+            together[progress.rows] = together[progress.rows].clamp(min=progress.rows.numel())
+            state = {"pass": progress.passes}
+        else:
+            state = {"candidates": "{}/{}".format(*progress.candidates)}
         self.bar.update(max(0, progress.finished - self.shown))
-        self.bar.set_postfix({"pass": progress.passes}, refresh=False)
         self.shown = max(self.shown, progress.finished)
+        now = time.monotonic()
+        # A bar draws itself only where its count changes, and candidates may be solved for a minute.
+        self.bar.set_postfix(state, refresh=now - self.drawn > REDRAW)
+        self.drawn = now if now - self.drawn > REDRAW else self.drawn
 
 
 def _now(device: torch.device) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,6 +18,11 @@ from torchgco.tree import take
 
 AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
 PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4
+Watch = Callable[[int, int], None]  # is called with the candidates solved so far, and of how many
+
+
+def unwatched(done: int, total: int) -> None:
+    """The watch of candidates that nobody watches."""
 
 
 @dataclass(frozen=True)
@@ -35,21 +40,24 @@ class Candidates:
     live: Tensor  # bool: the others are never solved, and come last
     count: int  # candidates of each problem
     iterations: Tensor  # (B,) int64: of all solves so far, those of dropped candidates included
+    watch: Watch
 
     @classmethod
-    def begin(cls, problem: Problem, U: Tensor, R: Tensor, unit: Tensor, live: Tensor) -> Candidates:
+    def begin(
+        cls, problem: Problem, U: Tensor, R: Tensor, unit: Tensor, live: Tensor, watch: Watch = unwatched
+    ) -> Candidates:
         """Candidates with controls U (B, count, N, m) where `live` (B, count); R and unit (B,)."""
         count = U.shape[1]
         R, unit = (t.repeat_interleave(count) for t in (R, unit))
         X = U.new_zeros(U.shape[0] * count, problem.N + 1, problem.n)
         none = torch.zeros(problem.B, dtype=torch.int64, device=U.device)
-        return cls(problem, X, U.flatten(0, 1), R, unit, live.flatten(), count, none)
+        return cls(problem, X, U.flatten(0, 1), R, unit, live.flatten(), count, none, watch)
 
     def pick(self, order: Tensor) -> Candidates:
         """The candidates at the places `order` (B, c) among those of their problem."""
         rows = self.rows(order).flatten()
         X, U, R, unit, live = (t[rows] for t in (self.X, self.U, self.R, self.unit, self.live))
-        return Candidates(self.problem, X, U, R, unit, live, order.shape[1], self.iterations)
+        return Candidates(self.problem, X, U, R, unit, live, order.shape[1], self.iterations, self.watch)
 
     def rows(self, order: Tensor) -> Tensor:
         """Rows (B, c) of the candidates at the places `order` (B, c)."""
@@ -86,12 +94,15 @@ class Candidates:
         `place` says which row of `attraction` belongs to each candidate.
         """
         X, U, iterations = self.X.clone(), self.U.clone(), self.iterations
+        done, total = 0, int(self.live.sum())
         for rows in self.parts():
             part = take(attraction, rows if place is None else place[rows])
             lagrangian = Lagrangian(self.of(rows), self.multipliers(rows, penalty), part, True)
             end, _ = descend(inner, lagrangian, U[rows])
             X[rows], U[rows] = end.X, end.U
             iterations = iterations.index_add(0, rows // self.count, end.iterations)
+            done += rows.numel()
+            self.watch(done, total)
         return replace(self, X=X, U=U, iterations=iterations)
 
     def order(self, first: Tensor, alike: float | None = None) -> Tensor:

@@ -25,7 +25,7 @@ from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import cost_unit
 from torchgco.problem import Problem
 from torchgco.search import scene as seen
-from torchgco.search.candidates import PENALTY, Candidates
+from torchgco.search.candidates import PENALTY, Candidates, Watch, unwatched
 from torchgco.search.homotopy import one_per_class
 from torchgco.search.roadmap import Roadmap
 from torchgco.search.tracking import attraction, travel
@@ -130,8 +130,11 @@ class PathProposals:
         """The values of `arrive`, as a tuple."""
         return tuple(self.arrive) if isinstance(self.arrive, Sequence) else (self.arrive,)
 
-    def propose(self, problem: Problem) -> Proposal:
+    def propose(self, problem: Problem, watch: Watch = unwatched) -> Proposal:
         """A proposal for every problem, from the vehicle at rest.
+
+        `watch` is called with how many candidates of the current step are solved, and of how many; an exception that
+        it raises ends the search.
 
         Raises:
             InputError: initial offsets that don't fit the controls.
@@ -141,12 +144,12 @@ class PathProposals:
         whole = Proposal(rest, none.bool(), Multipliers.zero(problem, torch.nan), none)
         unit, scaled = cost_unit(problem), problem.in_cost_units()
         for rows in torch.arange(problem.B, device=none.device).split(max(1, MOST // self.num_paths)):
-            part = self._propose(scaled.take(rows), rest[rows])
+            part = self._propose(scaled.take(rows), rest[rows], watch)
             if part is not None:
                 put(whole, rows, part)
         return whole._replace(multipliers=whole.multipliers.scaled(unit))
 
-    def _propose(self, problem: Problem, rest: Tensor) -> Proposal | None:
+    def _propose(self, problem: Problem, rest: Tensor, watch: Watch) -> Proposal | None:
         scene = seen.scene_of(problem, rest)
         if scene is None:
             return None
@@ -156,7 +159,7 @@ class PathProposals:
         starts = self.starts(problem, rest).repeat_interleave(len(self.paces), dim=1)
         live = (one_per_class(paths, scene) & found.unsqueeze(-1)).repeat_interleave(starts.shape[1], dim=1)
         candidates = Candidates.begin(
-            problem, starts.repeat(1, self.num_paths, 1, 1), R, torch.where(found, unit, 1.0), live
+            problem, starts.repeat(1, self.num_paths, 1, 1), R, torch.where(found, unit, 1.0), live, watch
         )
         candidates = self.track(candidates, paths)
         candidates = candidates.pick(candidates.order(candidates.arrive())[:, : self.relax_top])
@@ -220,7 +223,10 @@ class PathProposals:
         part = candidates.of(rows)
         inner = replace(_inner(self.track_iterations), tolerance=0.1 * TOLERANCE)
         solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=20)
-        end = solver.solve(part, candidates.U[rows], warm=take(multipliers, rows))
+        end = solver.solve(
+            part, candidates.U[rows], warm=take(multipliers, rows),
+            callback=lambda progress: candidates.watch(progress.finished, progress.total),
+        )  # fmt: skip
         good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.X)
         good &= seen.chord_penetration(part, end.X, CHORD_PENETRATION) <= 0
         won = rows[good]

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -31,7 +32,7 @@ from torchgco.search.paths import PathProposals
 from torchgco.search.suitability import suited_paths
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
-from torchgco.solvers.contracts import Advice, Call, Solver
+from torchgco.solvers.contracts import Advice, Call, Progress, Solver
 from torchgco.solvers.state import STOPPED, Iterate, SolveEnd
 from torchgco.solvers.trace import Recorder
 from torchgco.solvers.verdict import finished
@@ -137,7 +138,10 @@ class Restarts(Solver):
         """
         if rows.numel() == 0:
             return rows, start
-        proposal = paths.propose(best.call.problem.take(rows))
+        try:
+            proposal = paths.propose(best.call.problem.take(rows), partial(_watched, best.call, rows))
+        except _Late:
+            return rows[:0], take(start, rows[:0])
         best.end.iterations[rows] += proposal.iterations
         mu = torch.fmax(start.multipliers.mu, proposal.multipliers.mu)
         found, others = proposal.found.nonzero().flatten(), (~proposal.found).nonzero().flatten()
@@ -165,6 +169,19 @@ class Restarts(Solver):
             start = take(best.end.best, rows)
             call = replace(best.call.take(rows), U0=start.U, warm=start.multipliers)
             best.improve(rows, call, penalty=_goal_region(call.problem))
+
+
+class _Late(Exception):
+    """The time limit has passed during the search for paths."""
+
+
+def _watched(call: Call, rows: Tensor, done: int, total: int) -> None:
+    """Report that `done` of `total` candidates for the problems `rows` are solved; raises _Late after the deadline."""
+    if call.late:
+        raise _Late
+    if call.callback is not None:
+        finished = call.problem.B - rows.numel()
+        call.callback(Progress(0, call.rows[rows], finished, call.problem.B, candidates=(done, total)))
 
 
 class StopWhenCaught:

@@ -22,13 +22,17 @@ from torchgco.tree import Rows, take
 
 @dataclass(frozen=True)
 class Progress:
-    """The argument of a callback: after every pass, or after every problem where a solver takes one at a time."""
+    """The argument of a callback: after every pass, or after every problem where a solver takes one at a time.
+
+    While candidates along paths are solved, it is called too, with `candidates` instead of a state.
+    """
 
     passes: int
     rows: Tensor  # (b,) int64: places in the batch of the problems in this pass
     finished: int
     total: int
     state: Any = None  # the running state of a batched solver, after the pass
+    candidates: tuple[int, int] | None = None  # how many are solved, and of how many
 
 
 Callback = Callable[[Progress], None]
