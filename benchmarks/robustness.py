@@ -1,0 +1,97 @@
+"""python -m benchmarks.robustness: what was tried against the library, and how often.
+
+Runs the tests of wrong input, damaged files, killed processes, batches and known answers, the slow ones too, and counts
+the cases and the random examples in them (some minutes on two cores). With --write the tables go into
+benchmarks/results/robustness.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.tables import put_between
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "benchmarks" / "results" / "robustness.md"
+# Kinds of trials, and the tests that make them: files, folders, or parts of a test's name after "::".
+KINDS: dict[str, tuple[str, ...]] = {
+    "wrong options and arguments from Python": ("tests/test_wrong_input.py", "tests/test_wrong_options.py"),
+    "wrong words on the command line": ("tests/experiments/test_wrong_commands.py",),
+    "wrong layout files": ("tests/scenarios/test_wrong_files.py",),
+    "damaged and missing files of studies, full disks": ("tests/experiments/test_damage.py",),
+    "signals: Ctrl-C, SIGTERM, SIGKILL of a study or of its workers": (
+        "tests/experiments/test_signals.py", "tests/experiments/test_workers.py",
+    ),
+    "studies stopped and resumed in other pieces": ("tests/experiments/test_resume.py",),
+    "batch contract: order, slots, neighbours, broken problems": ("tests/solvers/test_batch_contract.py",),
+    "known answers: dense KKT systems, convex problems, ALTRO's problems": ("tests/golden",),
+    "random inputs, files, calls and batches": ("tests/fuzz",),
+}  # fmt: skip
+
+
+def run_tests(folder: Path, arguments: Sequence[str]) -> tuple[Counter[tuple[str, str]], Counter[tuple[str, str]]]:
+    """Cases by (file, outcome), and random examples by (kind, outcome)."""
+    paths = [path for paths in KINDS.values() for path in paths]
+    report, tally = folder / "report.xml", folder / "tally"
+    words = ["-m", "pytest", "-q", "-m", "slow or not slow", f"--junitxml={report}", *arguments, *paths]
+    environment = {**os.environ, "TORCHGCO_TALLY": str(tally)}
+    subprocess.run([sys.executable, *words], cwd=ROOT, env=environment, check=False)
+    cases: Counter[tuple[str, str]] = Counter()
+    for case in ElementTree.parse(report).getroot().iter("testcase"):
+        ends = {child.tag for child in case} & {"failure", "error", "skipped"}
+        name = case.get("classname", "").replace(".", "/")
+        cases[name, min(ends, default="passed")] += 1
+    examples: Counter[tuple[str, str]] = Counter()
+    for path in sorted(folder.glob("tally.*.json")):
+        for kind, outcome, count in json.loads(path.read_text()):
+            examples[kind, outcome] += count
+    return cases, examples
+
+
+def case_table(cases: Mapping[tuple[str, str], int]) -> list[str]:
+    """A row per kind of trial."""
+    lines = ["| tried | cases | passed | failed | skipped |", "| --- | --- | --- | --- | --- |"]
+    for kind, paths in KINDS.items():
+        starts = tuple(path.removesuffix(".py") for path in paths)
+        ends: Counter[str] = Counter()
+        for (name, end), count in cases.items():
+            if name.startswith(starts):
+                ends[end] += count
+        failed = ends["failure"] + ends["error"]
+        lines.append(f"| {kind} | {ends.total()} | {ends['passed']} | {failed} | {ends['skipped']} |")
+    return lines
+
+
+def example_table(examples: Mapping[tuple[str, str], int]) -> list[str]:
+    """A row per kind of random example and outcome."""
+    rows = [f"| {kind} | {outcome} | {count:,} |" for (kind, outcome), count in sorted(examples.items())]
+    return ["| random examples | outcome | count |", "| --- | --- | --- |", *rows]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.robustness", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--write", action="store_true", help="put the tables into results/robustness.md")
+    options, more = parser.parse_known_args(arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        cases, examples = run_tests(Path(folder), more)
+    text = "\n".join(
+        [provenance(), "", *case_table(cases), "", *example_table(examples), "", f"{sum(examples.values()):,} examples."]
+    )
+    print(text)
+    if options.write:
+        put_between(PAGE, "robustness", text)
+    return 0 if all(end in ("passed", "skipped") for _, end in cases) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
