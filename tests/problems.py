@@ -71,8 +71,13 @@ def quadrotor_batch(B: int = 3, N: int = 40, obstacles: int = 6, seed: int = 0) 
     return problem, torch.tensor(HOVER, dtype=torch.float64).repeat(B, N, 1)
 
 
-def boxed_batch(d: int = 2, B: int = 4, N: int = 30, boxes: int = 4, seed: int = 0) -> tuple[Problem, Tensor]:
-    """Planar (d = 2) or quadrotor problems with rotated boxes too; in every other problem one box is absent."""
+def boxed_batch(
+    d: int = 2, B: int = 4, N: int = 30, boxes: int = 4, seed: int = 0, rounded: bool = False
+) -> tuple[Problem, Tensor]:
+    """Planar (d = 2) or quadrotor problems with rotated boxes too; in every other problem one box is absent.
+
+    rounded  the boxes have radii: one is a sphere, one a capsule, one a plate, the others are boxes
+    """
     plain, U = planar_batch(B, N, 3, seed) if d == 2 else quadrotor_batch(B, N, 3, seed)
     rng = np.random.default_rng(seed + 1)
     scale, start = (1.0, plain.x0[0, :2].numpy()) if d == 2 else (4.0, plain.x0[0, :3].numpy())
@@ -81,9 +86,13 @@ def boxed_batch(d: int = 2, B: int = 4, N: int = 30, boxes: int = 4, seed: int =
     half = scale * rng.uniform(0.03, 0.15, (B, boxes, d))
     turns = rng.normal(size=(B, boxes, 4))
     rotations = turns[..., 0] if d == 2 else turns / np.linalg.norm(turns, axis=-1, keepdims=True)
+    radii = None
+    if rounded:
+        radii = scale * rng.uniform(0.03, 0.1, (B, boxes))
+        half[:, 0], half[:, 1, 1:], half[:, 2, 0], radii[1::2, -1] = 0, 0, 0, np.nan
     centers[1::2, -1], half[1::2, -1], rotations[1::2, -1] = np.nan, np.nan, np.nan
     radius = float(plain.constraints[0].vehicle_radius[0])
-    parts = [*plain.constraints, Boxes(centers, half, radius, rotations)]
+    parts = [*plain.constraints, Boxes(centers, half, radius, rotations, radii)]
     return Problem(plain.dynamics, plain.cost, parts, plain.x0, N), U
 
 

@@ -18,6 +18,7 @@ from torchgco.baselines import IteratedMPPI as IteratedMPPI
 from torchgco.certificate import Certificate as Certificate
 from torchgco.certificate import certify as certify
 from torchgco.constraints import Boxes as Boxes
+from torchgco.constraints import Capsules as Capsules
 from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
 from torchgco.constraints import FirstStepRates as FirstStepRates

@@ -39,9 +39,9 @@ class Certificate:
     # Largest |x_{k+1} - step(x_k, u_k)| and |X_0 - x_0| over all states, in their units. A residual of rounding size
     # (1e-12 in float64) proves that X is the planning model's rollout of U; it says nothing about the model's quality.
     dynamics_residual: Tensor
-    # Smallest distance to the surface of the full r_obs + r_veh (of a box: grown by r_veh) from the first knot to the
-    # last, or a lower bound of it, m; infinite without obstacles. At 0 or more, no obstacle is touched between the
-    # knots either, under the conditions that `certify` states.
+    # Smallest distance to the surface of the full r_obs + r_veh (of a box: grown by r + r_veh, where r rounds it) from
+    # the first knot to the last, or a lower bound of it, m; infinite without obstacles. At 0 or more, no obstacle is
+    # touched between the knots either, under the conditions that `certify` states.
     clearance: Tensor
     # Largest excess over control and state bounds, in their units; 0 proves that they hold at every knot.
     bound_violation: Tensor
@@ -134,7 +134,7 @@ def _sphere_chords(spheres: BoundSpheres, X: Tensor) -> Tensor:
 
 
 def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
-    return box_segment_distance(boxes, X[None, :, boxes.position])[0] - boxes.vehicle_radius[0]
+    return box_segment_distance(boxes, X[None, :, boxes.position])[0] - boxes.inflated_radii[0]
 
 
 # By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, or lower

@@ -31,8 +31,9 @@ class Verdict:
 
     cost: Tensor  # J_var
     violation: Tensor  # largest violation of the planning problem, full radii; lengths in metres
-    # Smallest distance, m, to a surface of 0.95 (r_obs + r_veh), of a box grown by 0.95 r_veh, at the knots; infinite
-    # without obstacles. A constraint given as a function has no distance: its rows count only as violations.
+    # Smallest distance, m, to a surface of 0.95 (r_obs + r_veh), of a box grown by 0.95 (r + r_veh), where r rounds it,
+    # at the knots; infinite without obstacles. A constraint given as a function has no distance: its rows count only as
+    # violations.
     clearance_knots: Tensor
     clearance: Tensor  # the same along the straight segments between the knots
     goal_distance: Tensor  # m, last knot to goal, positions only
@@ -131,7 +132,7 @@ def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def box_clearance(boxes: BoundBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
-    """Smallest distance (B,) to a surface grown by 0.95 r_veh, at the knots and along the segments between, m.
+    """Smallest distance (B,) to a surface grown by 0.95 (r + r_veh), at the knots and along the segments between, m.
 
     As for spheres: all knots count, and it is infinite where there is no obstacle.
     """
@@ -139,7 +140,7 @@ def box_clearance(boxes: BoundBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
     if boxes.centers.shape[1] == 0:
         far = torch.full_like(p[:, 0, 0], torch.inf)
         return far, far
-    contact = torch.where(boxes.absent, -torch.inf, CONTACT_FACTOR * boxes.vehicle_radius.unsqueeze(-1)).unsqueeze(1)
+    contact = torch.where(boxes.absent, -torch.inf, CONTACT_FACTOR * boxes.inflated_radii).unsqueeze(1)
     at_knots = (box_distance(boxes, p) - contact).flatten(1).amin(-1)
     between = (box_segment_distance(boxes, p) - contact).flatten(1).amin(-1)
     return at_knots, torch.minimum(between, at_knots)

@@ -11,7 +11,7 @@ ROUNDS = 70  # each shrinks a segment by a third
 
 
 def box_distance(boxes: BoundBoxes, p: Tensor) -> Tensor:
-    """Signed distances (B, K, M) of points p (B, K, d) from the boxes' own surfaces, m; absent boxes count too."""
+    """Signed distances (B, K, M) of points p (B, K, d) from the boxes before rounding, m; absent ones count too."""
     return _distance(boxes, p.unsqueeze(2))
 
 

@@ -295,6 +295,8 @@ def test_boxes_make_another_layout_unless_absent() -> None:
     turned = boxes | {"box_rotations": np.ones((2, 1))}
     plain, none, some, other = (layout_digests(scene(**more), PLANE) for more in ({}, absent, boxes, turned))
     assert plain == none and len({plain[0], some[0], other[0]}) == 3
+    sharp, rounded = (layout_digests(scene(**boxes, box_radii=np.array([[r], [0.0]])), PLANE) for r in (0.0, 0.1))
+    assert sharp == some and rounded[0] != some[0] and rounded[1] == some[1]
 
 
 @pytest.mark.parametrize("field", OTHERS)

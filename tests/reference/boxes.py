@@ -22,18 +22,32 @@ def directions(rotation: Array | float | None, d: int) -> Array:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross  # Rodrigues
 
 
-def distance(p: Array, center: Array, half: Array, rotation: Array | float | None = None) -> float:
-    """Distance of a point from the surface of a box, negative inside."""
+def distance(
+    p: Array, center: Array, half: Array, rotation: Array | float | None = None, radius: float = 0.0
+) -> float:
+    """Distance of a point from the surface of a box, rounded by a radius; negative inside."""
     axes = directions(rotation, len(p))
     local = axes.T @ (p - center)
     if np.all(np.abs(local) < half):
-        return -min(min(h - x, h + x) for x, h in zip(local, half, strict=True))
+        return -min(min(h - x, h + x) for x, h in zip(local, half, strict=True)) - radius
     nearest = center + axes @ np.clip(local, -half, half)
-    return float(np.linalg.norm(p - nearest))
+    return float(np.linalg.norm(p - nearest)) - radius
+
+
+def distance_from_capsule(p: Array, start: Array, end: Array, radius: float) -> float:
+    """Distance of a point from the surface around a segment, negative inside: the segment is cut into small pieces."""
+    middles = start + np.linspace(0, 1, 20001)[:, None] * (end - start)
+    return float(np.linalg.norm(p - middles, axis=1).min()) - radius
 
 
 def segment_distance(
-    a: Array, b: Array, center: Array, half: Array, rotation: Array | float | None = None, samples: int = 2001
+    a: Array,
+    b: Array,
+    center: Array,
+    half: Array,
+    rotation: Array | float | None = None,
+    radius: float = 0.0,
+    samples: int = 2001,
 ) -> float:
     """Smallest distance over samples of a segment: an upper bound of the true one."""
-    return min(distance(a + s * (b - a), center, half, rotation) for s in np.linspace(0, 1, samples))
+    return min(distance(a + s * (b - a), center, half, rotation, radius) for s in np.linspace(0, 1, samples))

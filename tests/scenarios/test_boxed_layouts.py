@@ -16,7 +16,7 @@ from torchgco import InputError, Planar
 from torchgco.constraints.boxes import BoundBoxes
 from torchgco.plotting.boxes import outlines
 from torchgco.plotting.layouts import layout_grid
-from torchgco.scenarios.layouts import Layouts, concatenate
+from torchgco.scenarios.layouts import BOXES, Layouts, concatenate
 from torchgco.scenarios.vehicle import Vehicle
 
 NAN = np.nan
@@ -38,6 +38,15 @@ def example(**changes) -> Layouts:
     return Layouts(**(given | changes))
 
 
+def with_capsule(**changes) -> Layouts:
+    """As `example`, with a capsule and a rounded box in the first layout."""
+    given = {
+        "box_half_sizes": np.array([[[0.2, 0.0], [0.3, 0.1]], [[0.1, 0.1], [NAN, NAN]]]),
+        "box_radii": np.array([[0.1, 0.05], [0.0, 7.0]]),
+    }
+    return example(**(given | changes))
+
+
 def in_space(**changes) -> Layouts:
     half = np.sqrt(0.5)
     given = {
@@ -51,9 +60,11 @@ def in_space(**changes) -> Layouts:
 
 
 def test_a_round_trip_keeps_the_boxes(tmp_path: Path) -> None:
-    for layouts in (example(name="boxes"), in_space(name="boxes"), example(name="boxes", box_rotations=None)):
+    parts = example(name="boxes"), in_space(name="boxes"), example(name="boxes", box_rotations=None)
+    for layouts in (*parts, with_capsule(name="boxes")):
         layouts.save(tmp_path / "boxes.npz")
         assert Layouts.load(tmp_path / "boxes.npz") == layouts
+    assert np.isnan(with_capsule().box_radii[1, 1]) and example() != with_capsule()
     assert np.isnan(example().box_rotations[1, 1])
     assert example().take([1]).box_centers.shape == (1, 2, 2)
 
@@ -65,7 +76,10 @@ def test_parts_with_and_without_boxes_are_joined() -> None:
     assert joined.box_centers.shape == (5, 2, 2) and np.isnan(joined.box_centers[0]).all()
     assert joined.box_rotations[1].tolist() == [0.3, -0.2] and joined.box_rotations[3, 0] == 0.0
     assert concatenate([discs, discs]).box_centers is None
-    assert concatenate([plain, plain]).box_rotations is None
+    assert concatenate([plain, plain]).box_rotations is None and joined.box_radii is None
+    mixed = concatenate([discs, plain, with_capsule(box_rotations=None)])
+    assert mixed.box_rotations is None and mixed.box_radii[1:4].tolist()[0][0] == 0.0
+    assert mixed.box_radii[3].tolist() == [0.1, 0.05] and np.isnan(mixed.box_radii[:3, 1]).all()
     assert concatenate([in_space(), in_space(box_rotations=None)]).box_rotations[1, 0].tolist() == [1, 0, 0, 0]
 
 
@@ -79,6 +93,14 @@ def test_a_task_has_boxes_as_obstacles() -> None:
     expected = slow.distance(np.array([0.2, 0.1]), np.array([0.5, 0.5]), np.array([0.3, 0.1]), -0.2) - 0.06
     assert float(found[0, 0, 1]) == pytest.approx(expected)
     assert task.problem.goal is not None and task.problem.goal.radius.tolist() == [0.3, 0.3]
+
+
+def test_a_task_has_rounded_boxes_as_obstacles() -> None:
+    (boxes,) = (c for c in CAR.task(with_capsule()).problem.constraints if isinstance(c, BoundBoxes))
+    p = torch.tensor([[[0.2, 0.1]]] * 2, dtype=torch.float64)
+    found = boxes.signed_distance(p, torch.zeros(1, dtype=torch.float64))
+    centers, half, turns, radii = (part[0, 0] for part in (getattr(with_capsule(), name) for name in BOXES))
+    assert float(found[0, 0, 0]) == pytest.approx(slow.distance(p[0, 0].numpy(), centers, half, turns, radii) - 0.06)
 
 
 ERRORS = {
@@ -96,6 +118,13 @@ ERRORS = {
         dict(box_half_sizes=np.ones((2, 2, 2))),
         "layouts.box_half_sizes: expected NaN where",
     ),
+    "flat and sharp": (
+        dict(box_half_sizes=with_capsule().box_half_sizes, box_radii=np.zeros((2, 2))),
+        "layouts.box_half_sizes: expected finite half sides above 0 where the centre is finite; 0 too where",
+    ),
+    "number of radii": (dict(box_radii=np.zeros((2, 1))), "layouts.box_radii: expected shape (2, 2), got (2, 1)"),
+    "negative radius": (dict(box_radii=np.full((2, 2), -0.1)), "layouts.box_radii: expected finite radii >= 0"),
+    "missing radius": (dict(box_radii=np.full((2, 2), NAN)), "layouts.box_radii: expected finite radii >= 0"),
     "turns": (dict(box_rotations=np.zeros((2, 2, 4))), "layouts.box_rotations: expected shape (2, 2): angles"),
     "no angle": (dict(box_rotations=np.full((2, 2), NAN)), "layouts.box_rotations: expected finite angles"),
     "text": (dict(box_centers="here"), "layouts.box_centers: expected an array of real numbers"),
@@ -108,6 +137,11 @@ def test_malformed_boxes_are_named(changes: dict, message: str) -> None:
         example(**changes)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_radii_need_boxes() -> None:
+    with pytest.raises(InputError, match=r"layouts.box_radii: expected none without box_centers, got some"):
+        Layouts(np.zeros((1, 0, 2)), np.zeros((1, 0)), box_radii=np.zeros((1, 1)))
 
 
 def test_a_quaternion_of_another_length_is_named() -> None:
@@ -127,7 +161,20 @@ def test_an_outline_from_above() -> None:
     assert outlines({"radii": np.zeros((1, 0))}, 0) == ()
 
 
-@pytest.mark.parametrize("layouts", [example(), in_space()], ids=["plane", "space"])
+def test_outlines_of_rounded_boxes_and_of_a_trunk() -> None:
+    first, second = outlines(with_capsule().arrays(), 0)
+    for box, half, turn, radius in ((first, [0.2, 0.0], 0.3, 0.1), (second, [0.3, 0.1], -0.2, 0.05)):
+        center = np.zeros(2) if box is first else np.array([0.5, 0.5])
+        for by in (0.0, 0.07):
+            ring = box.grown(by) if by > 0 else box.corners
+            away = [slow.distance(p, center, np.array(half), turn, radius) for p in ring]
+            assert away == pytest.approx([by] * len(ring), abs=1e-12)
+    trunk = in_space(box_half_sizes=np.array([[[0.0, 0.0, 2.0]]]), box_radii=np.array([[0.3]]), box_rotations=None)
+    (disc,) = outlines(trunk.arrays(), 0)
+    assert np.linalg.norm(disc.corners, axis=1) == pytest.approx(np.full(len(disc.corners), 0.3)) and disc.height == 1.0
+
+
+@pytest.mark.parametrize("layouts", [example(), in_space(), with_capsule()], ids=["plane", "space", "rounded"])
 def test_maps_show_boxes(layouts: Layouts) -> None:
     d, count = layouts.dimension, layouts.count
     ends = pd.DataFrame({"layout": range(count), "solver": "gco", "feasible": True, "reached": True})

@@ -7,6 +7,7 @@ from torchgco.constraints.bodies import Obstacles as Obstacles
 from torchgco.constraints.bounds import ControlBounds as ControlBounds
 from torchgco.constraints.bounds import StateBounds as StateBounds
 from torchgco.constraints.boxes import Boxes as Boxes
+from torchgco.constraints.capsules import Capsules as Capsules
 from torchgco.constraints.equalities import FirstStepRates as FirstStepRates
 from torchgco.constraints.equalities import ThrustSum as ThrustSum
 from torchgco.constraints.obstacles import Spheres as Spheres

@@ -1,4 +1,4 @@
-"""Boxes as static obstacles, aligned with the axes or turned, in the plane and in space."""
+"""Boxes as static obstacles, aligned with the axes or turned, sharp or rounded, in the plane and in space."""
 
 from __future__ import annotations
 
@@ -20,93 +20,115 @@ UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
 
 @dataclass(frozen=True)
 class Boxes(Constraint):
-    """2 s (r_veh - distance of p_k from box i) <= 0 for every box i.
+    """2 s (r + r_veh - distance of p_k from box i) <= 0 for every box i, rounded by a radius r.
 
-    Distances count from the surface, negative inside. The factor 2 s, with s = r_veh + the smallest half side, makes c
-    a squared length with the slope of a sphere of radius s: penalties then mean the same for both kinds. Rows hold at
-    the knots; between two knots a trajectory may cut a corner, which is rounded by r_veh, by up to the square of its
-    step over 8 r_veh. `gco` solves such trajectories again with grown boxes.
+    Distances count from the surface of the box before it is rounded, negative inside. The factor 2 s, with s = r +
+    r_veh + the smallest half side, makes c a squared length with the slope of a sphere of radius s: penalties then mean
+    the same for both kinds. Rows hold at the knots; between two knots a trajectory may cut a corner, which is rounded
+    by r + r_veh, by up to the square of its step over 8 (r + r_veh). `gco` solves such trajectories again with grown
+    boxes.
 
     Args:
         centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent boxes (padding); M may be 0, and an
             empty list stands for (0, d).
-        half_sizes: as centers: half the lengths of the sides, m, above 0; NaN where the centre is.
-        vehicle_radius: number or (B,), m. Bodies touch at CONTACT_FACTOR of it from the surface.
+        half_sizes: as centers: half the lengths of the sides before rounding, m; NaN where the centre is. Above 0, or
+            at least 0 where the box has a radius above 0: a box with a single side above 0 is then a capsule.
+        vehicle_radius: number or (B,), m.
         rotations: those that turn the axes of space into the box's sides. In the plane angles (M,) or (B, M), rad; in
             space unit quaternions [w, x, y, z], (M, 4) or (B, M, 4). None: sides along the axes.
+        radii: (M,) or (B, M), m, at least 0; NaN where the centre is. The surface of a rounded box lies so far outside
+            its sides. Bodies touch at CONTACT_FACTOR (r + r_veh) from the sides. None: sharp boxes.
         knots: default 1..N.
 
     Raises:
-        InputError: on `Problem(...)`: wrong shapes, NaN centre with finite sides, sides that aren't above 0, negative
-            vehicle radius, quaternions of another length than 1, dynamics without a position in 2-D or 3-D.
+        InputError: on `Problem(...)`: wrong shapes, NaN centre with finite sides or radius, sides that aren't above 0
+            in a sharp box or are negative in a rounded one, negative radii, quaternions of another length than 1,
+            dynamics without a position in 2-D or 3-D.
     """
 
     centers: Any
     half_sizes: Any
     vehicle_radius: Any = 0.0
     rotations: Any = None
+    radii: Any = None
     knots: Any = None
 
     sense: ClassVar[Sense] = "inequality"
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
-        at = dims.position
-        if at is None or at.stop - at.start not in (2, 3):
-            got = "dynamics without one" if at is None else f"{at.stop - at.start}-D"
-            raise InputError("boxes.centers", "dynamics with a position in 2-D or 3-D", got)
+        d = dimension(dims, "boxes.centers")
         centers = tensor(self.centers, "boxes.centers", dims.like)
         half = tensor(self.half_sizes, "boxes.half_sizes", dims.like)
-        d = at.stop - at.start
         centers, half = (z.reshape(0, d) if tuple(z.shape) == (0,) else z for z in (centers, half))
         centers = per_problem(centers, "boxes.centers", 3, dims)
         check_shape(centers, (dims.B, "M", d), "boxes.centers")
-        M = centers.shape[1]
         half = per_problem(half, "boxes.half_sizes", 3, dims)
-        check_shape(half, (dims.B, M, d), "boxes.half_sizes")
+        check_shape(half, (dims.B, centers.shape[1], d), "boxes.half_sizes")
         absent = torch.isnan(centers).all(-1)
         if bool((absent.unsqueeze(-1) != torch.isnan(half)).any()) or not _finite(centers[~absent]):
             raise InputError("boxes.half_sizes", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
-        if not bool((half[~absent] > 0).all()) or not _finite(half[~absent]):
-            raise InputError("boxes.half_sizes", "finite half sides above 0 m", float(half[~absent].min()))
-        vehicle = tensor(self.vehicle_radius, "boxes.vehicle_radius", dims.like).reshape(-1, 1)
-        if vehicle.shape[0] not in (1, dims.B) or not bool((vehicle >= 0).all()):
-            raise InputError(
-                "boxes.vehicle_radius", f"a number of at least 0 m, or {dims.B}", vehicle.flatten().tolist()
-            )
+        radii = torch.where(absent, torch.nan, 0.0)
+        if self.radii is not None:
+            radii = own_radii(self.radii, "boxes.radii", absent, dims)
+        sized = torch.where(radii.unsqueeze(-1) > 0, half >= 0, half > 0) & torch.isfinite(half)
+        wrong = ~sized.all(-1) & ~absent
+        if bool(wrong.any()):
+            expected = "finite half sides above 0 m; 0 m too where the box is rounded"
+            raise InputError("boxes.half_sizes", expected, half[wrong][0].tolist())
         axes = _axes(self.rotations, absent, d, dims)
-        half = torch.where(absent.unsqueeze(-1), 1.0, half)
-        radius = vehicle.expand(dims.B, 1)
+        vehicle = vehicle_radii(self.vehicle_radius, "boxes.vehicle_radius", dims)
         knots = slice(1, dims.N + 1) if self.knots is None else self.knots
-        return BoundBoxes(
-            torch.where(absent.unsqueeze(-1), 0.0, centers), half, axes, absent, radius[:, 0].contiguous(),
-            torch.where(absent, 0.0, radius + half.amin(-1)), resolve_knots(knots, dims.N, "boxes.knots", half.device),
-            at, dims.dt or 0.0,
-        )  # fmt: skip
+        knots = resolve_knots(knots, dims.N, "boxes.knots", half.device)
+        return BoundBoxes.prepare(centers, half, axes, absent, radii, vehicle, knots, dims)
 
 
 @dataclass(frozen=True)
 class BoundBoxes(Obstacles):
-    """Boxes shaped for their problem."""
+    """Boxes, sharp or rounded, shaped for their problem."""
 
     centers: Tensor  # (B, M, d)
-    half_sizes: Tensor  # (B, M, d)
+    half_sizes: Tensor  # (B, M, d), before rounding
     axes: Tensor  # (B, M, d, d): row i is the direction of side i
     absent: Tensor  # (B, M) bool
     vehicle_radius: Tensor  # (B,)
-    depths: Tensor  # (B, M): r_veh + the smallest half side; 0 where absent
+    inflated_radii: Tensor  # (B, M): r + r_veh; 0 where absent
+    depths: Tensor  # (B, M): r + r_veh + the smallest half side; 0 where absent
     knots: Any
     position: slice
     dt: float
 
-    batched: ClassVar[tuple[str, ...]] = ("centers", "half_sizes", "axes", "absent", "vehicle_radius", "depths")
+    batched: ClassVar[tuple[str, ...]] = (
+        "centers", "half_sizes", "axes", "absent", "vehicle_radius", "inflated_radii", "depths",
+    )  # fmt: skip
+
+    @classmethod
+    def prepare(
+        cls,
+        centers: Tensor,
+        half_sizes: Tensor,
+        axes: Tensor,
+        absent: Tensor,
+        radii: Tensor,
+        vehicle_radius: Tensor,
+        knots: Any,
+        dims: Dimensions,
+    ) -> BoundBoxes:
+        """Boxes of checked numbers (B, ...), whatever those of absent boxes are."""
+        assert dims.position is not None
+        half = torch.where(absent.unsqueeze(-1), 1.0, half_sizes)
+        inflated = torch.where(absent, 0.0, radii + vehicle_radius.unsqueeze(-1))
+        return cls(
+            torch.where(absent.unsqueeze(-1), 0.0, centers), half, axes, absent, vehicle_radius, inflated,
+            torch.where(absent, 0.0, inflated + half.amin(-1)), knots, dims.position, dims.dt or 0.0,
+        )  # fmt: skip
 
     def bind(self, dims: Dimensions) -> Self:
         return self
 
     @property
     def margins(self) -> Tensor:
-        return torch.where(self.absent, 0.0, self.vehicle_radius.unsqueeze(-1))
+        return self.inflated_radii
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self._rows(X[:, self.knots, self.position])
@@ -133,31 +155,35 @@ class BoundBoxes(Obstacles):
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
         boxes = self._cuboids()
         along = boxes.local([(b - a)[..., None, j] for j in range(a.shape[-1])])
-        distance = segment_distance(boxes.seen_from(a), along, boxes.halves()) - self.vehicle_radius.view(-1, 1, 1)
+        distance = segment_distance(boxes.seen_from(a), along, boxes.halves()) - self.inflated_radii.unsqueeze(1)
         return torch.where(self.absent.unsqueeze(1), torch.inf, distance)
 
     def grown(self, by: Tensor) -> Self:
-        depths = torch.where(self.absent, 0.0, self.depths + by.unsqueeze(-1))
-        return replace(self, vehicle_radius=self.vehicle_radius + by, depths=depths)
+        more = torch.where(self.absent, 0.0, by.unsqueeze(-1))
+        inflated, depths = self.inflated_radii + more, self.depths + more
+        return replace(self, vehicle_radius=self.vehicle_radius + by, inflated_radii=inflated, depths=depths)
 
     def inflated(self) -> Inflated:
         return Inflated(self.centers[:, :0], self.depths[:, :0], self._cuboids())
 
     def _cuboids(self) -> Cuboids:
-        radius = torch.where(self.absent, FAR, self.vehicle_radius.unsqueeze(-1))
+        radius = torch.where(self.absent, FAR, self.inflated_radii)
         return Cuboids(self.centers, self.axes, self.half_sizes, radius)
 
     def _outside(self, p: Tensor) -> Tensor:
         """Distances (B, K, M) of points p (B, K, d) from the full surfaces, as if none were absent."""
         boxes = self._cuboids()
-        return signed_distance(boxes.seen_from(p), boxes.halves()) - self.vehicle_radius.view(-1, 1, 1)
+        return signed_distance(boxes.seen_from(p), boxes.halves()) - self.inflated_radii.unsqueeze(1)
 
     def _rows(self, p: Tensor) -> Tensor:
         """c (B, K, M) at points (B, K, d); an absent box is c = -1 everywhere."""
         return torch.where(self.absent.unsqueeze(1), -1.0, -2.0 * self.depths.unsqueeze(1) * self._outside(p))
 
     def _normals(self, p: Tensor) -> Tensor:
-        """Unit vectors (B, K, M, d) along which the distance grows: away from the box, inside to the nearest side."""
+        """Unit vectors (B, K, M, d) along which the distance grows: away from the box, inside to the nearest side.
+
+        On a box with sides of length 0, such as the axis of a capsule, to a side across which its length is 0.
+        """
         boxes = self._cuboids()
         local, half = boxes.seen_from(p), boxes.halves()
         away = torch.stack(excess(local, half), dim=-1)
@@ -170,6 +196,47 @@ class BoundBoxes(Obstacles):
         inside = torch.where(place < 0, -side, side)
         normal = torch.where(square > 0, outside, inside)
         return (self.axes.unsqueeze(1) * normal.unsqueeze(-1)).sum(-2)
+
+
+def dimension(dims: Dimensions, name: str) -> int:
+    """d of the space that the vehicle moves in.
+
+    Raises:
+        InputError: dynamics without a position in 2-D or 3-D.
+    """
+    at = dims.position
+    if at is None or at.stop - at.start not in (2, 3):
+        got = "dynamics without one" if at is None else f"{at.stop - at.start}-D"
+        raise InputError(name, "dynamics with a position in 2-D or 3-D", got)
+    return at.stop - at.start
+
+
+def vehicle_radii(value: Any, name: str, dims: Dimensions) -> Tensor:
+    """The vehicle's radius in every problem, (B,).
+
+    Raises:
+        InputError: neither a number nor (B,), or negative.
+    """
+    vehicle = tensor(value, name, dims.like).reshape(-1)
+    if vehicle.shape[0] not in (1, dims.B) or not bool((vehicle >= 0).all()):
+        raise InputError(name, f"a number of at least 0 m, or {dims.B}", vehicle.tolist())
+    return vehicle.expand(dims.B).contiguous()
+
+
+def own_radii(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor:
+    """The obstacles' own radii (B, M), NaN where absent.
+
+    Raises:
+        InputError: another shape, NaN elsewhere or not there, infinite or negative radii.
+    """
+    radii = per_problem(value, name, 2, dims)
+    check_shape(radii, tuple(absent.shape), name)
+    if bool((torch.isnan(radii) != absent).any()):
+        raise InputError(name, "NaN exactly where the obstacle is absent", "NaN and numbers mixed")
+    wrong = ~absent & ~((radii >= 0) & torch.isfinite(radii))
+    if bool(wrong.any()):
+        raise InputError(name, "finite radii of at least 0 m", float(radii[wrong][0]))
+    return radii
 
 
 def _finite(values: Tensor) -> bool:
@@ -193,14 +260,14 @@ def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
         wrong = ((length - 1.0).abs() > UNIT_WITHIN).squeeze(-1) & ~absent
         if bool(wrong.any()):
             raise InputError("boxes.rotations", "unit quaternions [w, x, y, z]", turns[wrong][0].tolist())
-        axes = _from_quaternions(turns / length)
+        axes = from_quaternions(turns / length)
     axes = torch.where(absent[..., None, None], straight, axes)
     if not _finite(axes):
         raise InputError("boxes.rotations", "finite numbers for every box that is there", "NaN or infinity")
     return axes.contiguous()
 
 
-def _from_quaternions(turns: Tensor) -> Tensor:
+def from_quaternions(turns: Tensor) -> Tensor:
     """The images (..., 3, 3), as rows, of the three axes under turns [w, x, y, z] (..., 4)."""
     w, x, y, z = turns.unbind(-1)
     first = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))

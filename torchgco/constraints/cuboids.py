@@ -1,5 +1,7 @@
 """Geometry of boxes that may be turned, grown by a radius: distances of points and of straight segments from them.
 
+Sides of length 0 make the box a rectangle, a segment or a point, and the grown box a capsule, for example.
+
 Everything is computed coordinate by coordinate, in one order and with no operation but sums, products, quotients and
 comparisons, apart from the last square root: native/roadmap_boxes.h does the same operations, and gets the same bits.
 A point is given as its coordinates, a sequence of d tensors of one shape.
@@ -19,7 +21,7 @@ Coordinates = Sequence[Tensor]
 
 
 class Cuboids(NamedTuple):
-    """K boxes of each of B problems, grown by the vehicle's radius."""
+    """K boxes of each of B problems, grown by their own radius and the vehicle's."""
 
     centers: Tensor  # (B, K, d), m
     axes: Tensor  # (B, K, d, d): row i is the direction of side i
@@ -139,11 +141,7 @@ def beside(boxes: Cuboids, start: Tensor, goal: Tensor, shells: Sequence[float])
 
     Along edges and sides a point lies where the straight line from start to goal (B, d) comes nearest.
     """
-    ends = start.unsqueeze(1), goal.unsqueeze(1)
-    begin, half = boxes.seen_from(ends[0]), boxes.halves()
-    along = boxes.local([(ends[1] - ends[0])[..., None, j] for j in range(start.shape[1])])
-    pass_by = _at(begin, along, nearest(begin, along, half))
-    level = [torch.minimum(torch.maximum(x, -h), h) for x, h in zip(pass_by, half, strict=True)]
+    half, level = boxes.halves(), _level(boxes, start, goal)
     points = []
     for shell in shells:
         off = (boxes.radius + (shell - 1.0) * boxes.sizes).unsqueeze(1)
@@ -158,36 +156,75 @@ def beside(boxes: Cuboids, start: Tensor, goal: Tensor, shells: Sequence[float])
     return torch.cat(points, dim=1), boxes.here.repeat(1, len(points))
 
 
-def between(boxes: Cuboids, centers: Tensor, radii: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def between(
+    boxes: Cuboids, start: Tensor, goal: Tensor, centers: Tensor, radii: Tensor, count: int
+) -> tuple[Tensor, Tensor]:
     """Middles (B, C, d) of each box's gaps to the `count` nearest boxes and spheres each; whether each exists (B, C).
 
     Args:
+        start, goal: (B, d), m.
         centers, radii: of spheres, (B, M, d) and (B, M), m; negative where absent.
     """
-    K = boxes.centers.shape[1]
-    other = boxes.centers.unsqueeze(1).expand(-1, K, -1, -1)  # (B, i, j, d): of box j, as seen by box i
-    for _ in range(ROUNDS):
-        own = _projected(boxes, other)
-        other = _projected(boxes, own.transpose(1, 2)).transpose(1, 2)
-    pairs = boxes.here.unsqueeze(1) & boxes.here.unsqueeze(2)
-    pairs = pairs & ~torch.eye(K, dtype=torch.bool, device=centers.device)
-    found = [_middles(own, other, boxes.radius.unsqueeze(2), boxes.radius.unsqueeze(1), pairs, count)]
-    there = centers.unsqueeze(1).expand(-1, K, -1, -1)
-    here = boxes.here.unsqueeze(2) & (radii > 0).unsqueeze(1)
-    found.append(_middles(_projected(boxes, there), there, boxes.radius.unsqueeze(2), radii.unsqueeze(1), here, count))
-    return torch.cat([p for p, _ in found], dim=1), torch.cat([e for _, e in found], dim=1)
+    (B, K), M = boxes.radius.shape, radii.shape[1]
+    most = max(1, PAIRS // max(K * K, K * M, 1))
+    parts = []
+    for first in range(0, max(B, 1), most):
+        rows = slice(first, first + most)
+        parts.append(_gaps(boxes.rows(rows), start[rows], goal[rows], centers[rows], radii[rows], count))
+    return torch.cat([points for points, _ in parts]), torch.cat([exists for _, exists in parts])
 
 
 ROUNDS = 8  # projections from one box to the other and back; the two points converge to the nearest of both
+PAIRS = 32768  # of boxes that are projected onto each other at once: their coordinates fit into the processor's cache
 
 
-def _projected(boxes: Cuboids, points: Tensor) -> Tensor:
-    """The nearest points (B, K, V, d) of box k to points (B, K, V, d)."""
-    away = points - boxes.centers.unsqueeze(2)
-    local = (boxes.axes.unsqueeze(2) * away.unsqueeze(-2)).sum(-1)
-    half = boxes.half_sizes.unsqueeze(2)
-    held = torch.minimum(torch.maximum(local, -half), half)
-    return boxes.centers.unsqueeze(2) + (boxes.axes.unsqueeze(2) * held.unsqueeze(-1)).sum(-2)
+def _level(boxes: Cuboids, start: Tensor, goal: Tensor) -> list[Tensor]:
+    """The point of each box that is nearest to the straight line from start to goal, (B, 1, K) along each side."""
+    ends = start.unsqueeze(1), goal.unsqueeze(1)
+    begin, half = boxes.seen_from(ends[0]), boxes.halves()
+    along = boxes.local([(ends[1] - ends[0])[..., None, j] for j in range(start.shape[1])])
+    pass_by = _at(begin, along, nearest(begin, along, half))
+    return [torch.minimum(torch.maximum(x, -h), h) for x, h in zip(pass_by, half, strict=True)]
+
+
+def _gaps(
+    boxes: Cuboids, start: Tensor, goal: Tensor, centers: Tensor, radii: Tensor, count: int
+) -> tuple[Tensor, Tensor]:
+    """As `between`, for a few problems."""
+    K = boxes.radius.shape[1]
+    # Two trunks are equally near to each other all along: their gap is flown through where the straight line passes.
+    thin = (boxes.half_sizes == 0).any(-1, keepdim=True)
+    first = torch.where(thin, _world(boxes, _level(boxes, start, goal)), boxes.centers)
+    other: Coordinates = [x.unsqueeze(2).expand(-1, -1, K) for x in first.unbind(-1)]  # (B, j, i): of box j, for box i
+    own = other
+    for _ in range(ROUNDS):
+        before, own = own, _projected(boxes, other)  # of box i, for box j
+        other = _swapped(_projected(boxes, _swapped(own)))
+        if all(torch.equal(x, y) for x, y in zip(before, own, strict=True)):
+            break  # further rounds would change nothing
+    pairs = boxes.here.unsqueeze(1) & boxes.here.unsqueeze(2)
+    pairs = pairs & ~torch.eye(K, dtype=torch.bool, device=centers.device)
+    p, q = torch.stack(_swapped(own), dim=-1), torch.stack(_swapped(other), dim=-1)
+    found = [_middles(p, q, boxes.radius.unsqueeze(2), boxes.radius.unsqueeze(1), pairs, count)]
+    there = centers.unsqueeze(1).expand(-1, K, -1, -1)
+    p = torch.stack(_swapped(_projected(boxes, centers.unsqueeze(2).unbind(-1))), dim=-1)
+    here = boxes.here.unsqueeze(2) & (radii > 0).unsqueeze(1)
+    found.append(_middles(p, there, boxes.radius.unsqueeze(2), radii.unsqueeze(1), here, count))
+    return torch.cat([p for p, _ in found], dim=1), torch.cat([e for _, e in found], dim=1)
+
+
+def _projected(boxes: Cuboids, points: Coordinates) -> list[Tensor]:
+    """The nearest points of each box to points, coordinates (B, V, K) each."""
+    o, axes = boxes.centers.unsqueeze(1), boxes.axes.unsqueeze(1)
+    local = boxes.local([x - o[..., j] for j, x in enumerate(points)])
+    held = [torch.minimum(torch.maximum(x, -h), h) for x, h in zip(local, boxes.halves(), strict=True)]
+    d = len(held)
+    return [o[..., j] + reduce(torch.add, (axes[..., i, j] * held[i] for i in range(d))) for j in range(d)]
+
+
+def _swapped(points: Coordinates) -> list[Tensor]:
+    """The same points (B, W, V) of pairs (B, V, W)."""
+    return [x.mT for x in points]
 
 
 def _middles(

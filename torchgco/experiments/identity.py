@@ -147,6 +147,8 @@ def layout_digests(
         if layouts.box_centers is not None:
             here = ~np.isnan(layouts.box_centers[i]).all(axis=-1)
             held = {name: getattr(layouts, name) for name in BOXES}
+            if held["box_radii"] is not None and not held["box_radii"][i][here].any():
+                del held["box_radii"]  # sharp boxes, as without the array
             if here.any():
                 own |= {name: value[i][here] for name, value in held.items() if value is not None}
         for name in ("start", "goal"):

@@ -1,7 +1,7 @@
 /* Boxes that may be turned, as obstacles: the rows of a knot, for problems with boxes (constraints/boxes.py). */
 
-/* Numbers of a box: its centre (DIM), the directions of its sides (DIM, DIM), half their lengths (DIM), r_veh, and the
-   factor that turns a distance into a squared length, 0 where the box is absent. */
+/* Numbers of a box: its centre (DIM), the directions of its sides (DIM, DIM), half their lengths (DIM), its own
+   radius plus r_veh, and the factor that turns a distance into a squared length, 0 where the box is absent. */
 #define BOX_NUMBERS (DIM * DIM + 2 * DIM + 2)
 
 /* Row j at a knot, and its derivatives by position (DIM) unless `slopes` is NULL; an absent box is c = -1. */

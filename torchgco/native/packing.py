@@ -103,8 +103,7 @@ def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: 
 
 def _box_numbers(boxes: BoundBoxes) -> Tensor:
     """The numbers that boxes.c reads per box, (B, M, ...)."""
-    radius = boxes.vehicle_radius.view(-1, 1, 1).expand(-1, boxes.centers.shape[1], 1)
-    factor = 2.0 * boxes.depths.unsqueeze(-1)
+    radius, factor = boxes.inflated_radii.unsqueeze(-1), 2.0 * boxes.depths.unsqueeze(-1)
     return torch.cat((boxes.centers, boxes.axes.flatten(2), boxes.half_sizes, radius, factor), dim=-1)
 
 

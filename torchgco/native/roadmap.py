@@ -137,7 +137,8 @@ def around_boxes(boxes: Cuboids, o: Tensor, R: Tensor, start: Tensor, goal: Tens
     Args:
         o, R: centres (B, M, d) and radii (B, M) of the spheres.
     """
-    (first, here), (second, there) = beside(boxes, start, goal, SHELLS[start.shape[1]]), between(boxes, o, R, MIDWAY)
+    first, here = beside(boxes, start, goal, SHELLS[start.shape[1]])
+    second, there = between(boxes, start, goal, o, R, MIDWAY)
     return torch.cat((first, second), dim=1), torch.cat((here, there), dim=1)
 
 

@@ -66,3 +66,32 @@ static inline double square_of_segment(const double *box, const double *start, c
     part = part < 0.0 ? 0.0 : part > 1.0 ? 1.0 : part;
     return square_at(half, begin, along, falls < 0.0 ? low + (high - low) * part : low, &found);
 }
+
+/* Lowers `gap`, the distances of segments from a to a + along from the surface, and `open`, a measure with the same
+   sign. Distances above `margin` don't count: the segments whose extent shows that they are so far are left out. */
+static inline void measure_box(
+    const double *box, int count, double a[DIM][count], double along[DIM][count], double margin, double *gap,
+    double *open
+) {
+    const double *axes = box + DIM, *half = BOX_HALF(box), radius = BOX_RADIUS(box);
+    double low[DIM], high[DIM];
+    for (int i = 0; i < DIM; i++) {
+        double reach = radius + margin;
+        for (int j = 0; j < DIM; j++) reach += fabs(axes[j * DIM + i]) * half[j];
+        reach += 1e-9 * (fabs(reach) + fabs(box[i])); /* more than rounding */
+        low[i] = box[i] - reach, high[i] = box[i] + reach;
+    }
+    for (int e = 0; e < count; e++) {
+        double start[DIM], step[DIM];
+        int near = 1;
+        for (int i = 0; i < DIM; i++) {
+            double end = a[i][e] + along[i][e];
+            start[i] = a[i][e], step[i] = along[i][e];
+            near &= (start[i] <= high[i] || end <= high[i]) && (start[i] >= low[i] || end >= low[i]);
+        }
+        if (!near) continue;
+        double away = square_of_segment(box, start, step), left = sqrt(away) - radius, more = away - radius * fabs(radius);
+        gap[e] = left < gap[e] ? left : gap[e];
+        open[e] = more < open[e] ? more : open[e];
+    }
+}

@@ -262,16 +262,7 @@ static void measure(
                 open[e] = more < open[e] ? more : open[e];
             }
 #if BOXES
-        for (int64_t m = 0; m < o->boxes; m++)
-            for (int e = 0; e < BLOCK; e++) {
-                double begin[DIM], step[DIM];
-                const double *box = o->box + m * BOX_NUMBERS;
-                for (int i = 0; i < DIM; i++) begin[i] = a[i][e], step[i] = along[i][e];
-                double away = square_of_segment(box, begin, step);
-                double left = sqrt(away) - BOX_RADIUS(box), more = away - SIGNED_SQUARE(BOX_RADIUS(box));
-                gap[e] = left < gap[e] ? left : gap[e];
-                open[e] = more < open[e] ? more : open[e];
-            }
+        for (int64_t m = 0; m < o->boxes; m++) measure_box(o->box + m * BOX_NUMBERS, BLOCK, a, along, margin, gap, open);
 #endif
         for (int e = 0; e < BLOCK && first + e < n * k; e++) {
             double close = 1.0 + CLAMP((margin - gap[e]) / margin, 0.0, 1.0);

@@ -121,16 +121,16 @@ def velocities(value: Any, centers: np.ndarray) -> np.ndarray | None:
     return moving
 
 
-def boxes(centers: Any, halves: Any, turns: Any, like: np.ndarray) -> tuple[np.ndarray | None, ...]:
-    """Centres and half sides (L, K, d), and turns (L, K) or (L, K, 4), that are present or absent together; or None.
+def boxes(centers: Any, halves: Any, turns: Any, radii: Any, like: np.ndarray) -> tuple[np.ndarray | None, ...]:
+    """Centres and half sides (L, K, d), turns (L, K) or (L, K, 4), radii (L, K): present or absent together; or None.
 
     `like` are the spheres' centres (L, M, d).
     """
     if centers is None:
-        for name, value in (("half_sizes", halves), ("rotations", turns)):
+        for name, value in (("half_sizes", halves), ("rotations", turns), ("radii", radii)):
             if value is not None:
                 raise InputError(f"layouts.box_{name}", "none without box_centers", "some")
-        return None, None, None
+        return None, None, None, None
     middle = array(centers, "layouts.box_centers")
     count, _, d = like.shape
     if middle.ndim != 3 or middle.shape[0] != count or middle.shape[2] != d:
@@ -142,10 +142,26 @@ def boxes(centers: Any, halves: Any, turns: Any, like: np.ndarray) -> tuple[np.n
     half = array(halves, "layouts.box_half_sizes")
     if half.shape != middle.shape:
         raise InputError("layouts.box_half_sizes", f"the shape {middle.shape} of box_centers", half.shape)
-    good = np.isfinite(half).all(axis=2) & (half > 0).all(axis=2)
-    _none_of(~absent & ~good, "layouts.box_half_sizes", "finite half sides above 0 where the centre is finite", half)
+    rounding = _rounding(radii, absent)
+    rounded = np.zeros_like(absent) if rounding is None else rounding > 0
+    good = np.isfinite(half).all(axis=2) & ((half > 0).all(axis=2) | rounded & (half >= 0).all(axis=2))
+    expected = "finite half sides above 0 where the centre is finite; 0 too where the radius is above 0"
+    _none_of(~absent & ~good, "layouts.box_half_sizes", expected, half)
     _none_of(absent & ~np.isnan(half).all(axis=2), "layouts.box_half_sizes", "NaN where the centre is NaN", half)
-    return middle, half, _turns(turns, absent, d)
+    return middle, half, _turns(turns, absent, d), rounding
+
+
+def _rounding(value: Any, absent: np.ndarray) -> np.ndarray | None:
+    """Radii (L, K) of the boxes' edges, NaN where there is no box."""
+    if value is None:
+        return None
+    radii = array(value, "layouts.box_radii")
+    if radii.shape != absent.shape:
+        raise InputError("layouts.box_radii", f"shape {absent.shape}", radii.shape)
+    wrong = ~absent & ~(np.isfinite(radii) & (radii >= 0))
+    _none_of(wrong, "layouts.box_radii", "finite radii >= 0 where the centre is finite", radii)
+    radii[absent] = np.nan
+    return radii
 
 
 def _turns(value: Any, absent: np.ndarray, dimension: int) -> np.ndarray | None:

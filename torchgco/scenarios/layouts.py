@@ -24,7 +24,7 @@ from torchgco.scenarios import checks
 REQUIRED = ("centers", "radii")
 SCALARS = ("vehicle_radius", "goal_radius", "dt", "stages")
 CONTROLS = ("control_lower", "control_upper")
-BOXES = ("box_centers", "box_half_sizes", "box_rotations")
+BOXES = ("box_centers", "box_half_sizes", "box_rotations", "box_radii")
 NAMED = (*REQUIRED, "velocities", *BOXES, "start", "goal", *SCALARS, *CONTROLS, "best_cost")
 IDS = "layout"
 
@@ -48,6 +48,8 @@ class Layouts:
                     (L, K, d) m, rows of NaN where a box is absent, or None if there are none; half the sides' lengths
     box_rotations   (L, K) rad in the plane, (L, K, 4) unit quaternions [w, x, y, z] in space: from the sides to the
                     axes of space, NaN where absent; None: sides along the axes
+    box_radii       (L, K) m by which boxes are rounded outwards, NaN where absent; None: sharp boxes. Where above 0,
+                    half sides may be 0: a capsule has one side above 0
     name            of the family, or the stem of the file
     ids             (L,) int64, index of each layout in its file or generator; 0..L-1 unless given
 
@@ -69,6 +71,7 @@ class Layouts:
     box_centers: np.ndarray | None = None
     box_half_sizes: np.ndarray | None = None
     box_rotations: np.ndarray | None = None
+    box_radii: np.ndarray | None = None
     name: str = "layouts"
     ids: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  # empty stands for 0..L-1
 
@@ -80,7 +83,7 @@ class Layouts:
         put("centers", centers)
         put("radii", radii)
         put("velocities", checks.velocities(self.velocities, centers))
-        boxes = checks.boxes(self.box_centers, self.box_half_sizes, self.box_rotations, centers)
+        boxes = checks.boxes(self.box_centers, self.box_half_sizes, self.box_rotations, self.box_radii, centers)
         for name, value in zip(BOXES, boxes, strict=True):
             put(name, value)
         for name in ("start", "goal"):
@@ -219,19 +222,20 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
 def _joined_boxes(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
     """The boxes of all parts, padded to the same number; None where no part has any."""
     width = max(0 if part.box_centers is None else part.box_centers.shape[1] for part in parts)
-    turned = any(part.box_rotations is not None for part in parts)
+    optional = [name for name in BOXES[2:] if any(getattr(part, name) is not None for part in parts)]
     columns: dict[str, list[Any]] = {name: [] for name in BOXES}
     for part in parts:
         none = np.empty((part.count, 0, part.dimension))
         centers = none if part.box_centers is None else part.box_centers
         halves = none if part.box_half_sizes is None else part.box_half_sizes
-        count, turns = centers.shape[1], part.box_rotations
+        count, turns, radii = centers.shape[1], part.box_rotations, part.box_radii
         if turns is None:  # no turn: an angle of 0, or its quaternion
             turns = np.zeros((part.count, count))
             turns = turns if part.dimension == 2 else np.tile((1.0, 0.0, 0.0, 0.0), (part.count, count, 1))
-        for name, value in zip(BOXES, (centers, halves, turns), strict=True):
+        radii = np.zeros((part.count, count)) if radii is None else radii
+        for name, value in zip(BOXES, (centers, halves, turns, radii), strict=True):
             columns[name].append(np.pad(value, _behind(value, width - count), constant_values=np.nan))
-    kept = BOXES[: 0 if width == 0 else 3 if turned else 2]
+    kept = () if width == 0 else (*BOXES[:2], *optional)
     return {name: column if name in kept else [None] for name, column in columns.items()}
 
 

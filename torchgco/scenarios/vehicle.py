@@ -95,9 +95,11 @@ class Vehicle:
             ),
         ]
         if layouts.box_centers is not None:
-            turns = None if layouts.box_rotations is None else tensor(layouts.box_rotations)
+            turns, radii = (
+                None if value is None else tensor(value) for value in (layouts.box_rotations, layouts.box_radii)
+            )
             radius = _given(layouts.vehicle_radius, self.radius)
-            constraints.append(Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns))
+            constraints.append(Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns, radii))
         cost = QuadraticCost(
             Q=tensor(list(self.state_weight)), R=tensor(list(self.control_weight)),
             Qf=tensor(list(self.terminal_weight)), x_ref=tensor(goal).unsqueeze(1),
