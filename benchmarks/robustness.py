@@ -84,12 +84,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options, more = parser.parse_known_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         cases, examples = run_tests(Path(folder), more)
-    text = "\n".join(
-        [provenance(), "", *case_table(cases), "", *example_table(examples), "", f"{sum(examples.values()):,} examples."]
-    )
+    origin = provenance("cpu")
+    head = f"Run on {origin['date']} at commit {origin['commit']}, torch {origin['torch']}: {sum(cases.values()):,} cases"
+    head += f", {sum(examples.values()):,} random examples."
+    text = "\n".join([head, "", *case_table(cases), "", *example_table(examples)])
     print(text)
     if options.write:
-        put_between(PAGE, "robustness", text)
+        put_between(PAGE, "<!-- robustness -->", "<!-- end robustness -->", text)
     return 0 if all(end in ("passed", "skipped") for _, end in cases) else 1
 
 
