@@ -102,6 +102,14 @@ def test_no_path_into_a_closed_ring_and_one_through_its_gap() -> None:
         assert float((path[0] - middle).square().sum(-1).sqrt().min()) < 0.17
 
 
+def test_the_way_past_a_long_row_of_discs_is_found() -> None:
+    """A wall of more discs than the graph has points around obstacles; one end is near, the other far."""
+    centers = np.stack((np.zeros(170), np.linspace(-20.0, 4.0, 170)), axis=-1)
+    paths, found = Roadmap().paths(scene(centers[None], np.full((1, 170), 0.5)))
+    assert bool(found)
+    assert 2.0 * np.hypot(1.0, 4.5) < path_length(paths[0, 0].numpy()) < 11.0
+
+
 def test_a_narrowly_closed_gap_is_open_with_max_overlap() -> None:
     """Ten discs around the goal that overlap by 10 % of their radius."""
     closed = ring()

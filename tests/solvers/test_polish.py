@@ -29,7 +29,7 @@ from torchgco import (
 from torchgco.baselines import Hold
 from torchgco.judge import judge, sphere_clearance
 from torchgco.rollout import open_loop
-from torchgco.solvers.active_set import multipliers
+from torchgco.solvers.active_set import multipliers, projected
 from torchgco.solvers.condensed import Condensed
 
 SOLVER = AugmentedLagrangian(
@@ -207,6 +207,23 @@ def test_programs_agree_with_trying_every_set(seed: int) -> None:
         found = multipliers(*(torch.from_numpy(z) for z in (S, b, equality, start)))
         np.testing.assert_allclose(found.numpy(), lam, rtol=1e-8, atol=1e-9)
         np.testing.assert_allclose(-np.linalg.solve(H, g + A.T @ found.numpy()), d, rtol=1e-8, atol=1e-9)
+    V = np.linalg.solve(np.linalg.cholesky(H), A.T)
+    found = projected(*(torch.from_numpy(z) for z in (V, b, equality)))
+    np.testing.assert_allclose(found.numpy(), lam, rtol=1e-8, atol=1e-9)
+
+
+def test_rows_that_depend_on_each_other_have_a_program() -> None:
+    """Twice the bound x <= -1 on min |x|^2 / 2, and a row in between: the multipliers add up to 1."""
+    V = torch.tensor([[1.0, 1.0, 2.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    b = torch.tensor([1.0, 1.0, 2.0], dtype=torch.float64)
+    lam = projected(V, b, torch.zeros(3, dtype=torch.bool))
+    assert lam is not None and float(lam.min()) >= 0
+    torch.testing.assert_close(V @ lam, torch.tensor([1.0, 0.0], dtype=torch.float64))
+
+
+def test_no_projection_onto_rows_that_contradict_each_other() -> None:
+    V = torch.tensor([[1.0, -1.0]], dtype=torch.float64)
+    assert projected(V, torch.tensor([1.0, 1.0], dtype=torch.float64), torch.zeros(2, dtype=torch.bool)) is None
 
 
 def test_rows_that_contradict_each_other_end() -> None:

@@ -16,12 +16,15 @@ from torch import Tensor
 
 from torchgco.errors import InputError
 from torchgco.native import roadmap
-from torchgco.native.roadmap import NativeSearch
+from torchgco.native.roadmap import Graph, NativeSearch
 from torchgco.search.geometry import Scene
 from torchgco.search.graph import Search
 
 AT_ONCE = 4  # problems that PyTorch searches together: memory holds the distances of all edges from all obstacles
 NODES = 128  # points around obstacles: those of the shortest detours
+# Points of a second search, where there is no path between more than NODES obstacles: a wall that is given as a row of
+# discs takes all places of the first search, before its ends get any.
+MANY_NODES = 2048
 NEIGHBOURS, HALTON_NEIGHBOURS = 12, 6  # edges of a point to its nearest of all points and of the Halton points
 MARGIN = 0.15  # distance from an obstacle, in largest inflated radii, below which an edge costs up to double
 DIVERSITY = 1.0  # extra cost of later paths, as a share, within the largest inflated radius of an earlier path
@@ -69,9 +72,24 @@ class Roadmap:
         boxes = None if scene.boxes is None else scene.boxes.rows(rows).cut(self.max_overlap)
         search = Search(o, R, MARGIN, boxes) if library is None else NativeSearch(library, o, R, MARGIN, boxes)
         cube = halton(self.num_halton, o.shape[-1]).to(o)
-        graph = search.graph(start, goal, cube, NODES, NEIGHBOURS, HALTON_NEIGHBOURS)
+
+        def cheapest(nodes: int) -> tuple[Tensor, Tensor]:
+            graph = search.graph(start, goal, cube, nodes, NEIGHBOURS, HALTON_NEIGHBOURS)
+            return self._cheapest(search, graph, scene, rows, count)
+
+        paths, found = cheapest(NODES)
+        again = ~found & ((R > 0).sum(-1) > NODES)
+        if bool(again.any()):
+            more, arrives = cheapest(MANY_NODES)
+            paths, found = torch.where(again.view(-1, 1, 1, 1), more, paths), torch.where(again, arrives, found)
+        return paths, found
+
+    def _cheapest(
+        self, search: Search | NativeSearch, graph: Graph, scene: Scene, rows: slice, count: int
+    ) -> tuple[Tensor, Tensor]:
+        """Paths (B', count, HOPS+1, d) over a graph of the problems in `rows`, and where there are any (B',)."""
         price = scene.traversal_cost(graph.points, rows)
-        paths, found = [], torch.ones_like(start[:, 0], dtype=torch.bool)
+        paths, found = [], torch.ones(graph.points.shape[0], dtype=torch.bool, device=graph.points.device)
         for _ in range(count):
             path, string, arrives = search.cheapest(graph, price)
             found = found & arrives

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
 BLOCK_TRIES = 10  # exchanges of whole blocks without progress before rows are exchanged one at a time
@@ -46,6 +48,28 @@ def multipliers(S: Tensor, b: Tensor, free: Tensor, start: Tensor) -> Tensor | N
             wrong = _last(wrong)
         working = working ^ wrong
     return None
+
+
+def projected(V: Tensor, b: Tensor, free: Tensor) -> Tensor | None:
+    """`multipliers` for S = V'V, by the least-distance program min |y| with b + V'y <= 0 (Lawson and Hanson, 1974).
+
+    Slower, but reliable where rows depend on each other, as those of a bound that holds at many knots in succession.
+    """
+    length = V.norm(dim=0).clamp(min=torch.finfo(V.dtype).tiny)
+    E = (torch.cat((-V, b.unsqueeze(0))) / length).cpu().numpy()
+    E = np.concatenate((E, -E[:, free.cpu().numpy()]), axis=1)  # a free row's multiplier may have either sign
+    target = np.zeros(len(E))
+    target[-1] = 1.0
+    try:
+        pushes = nnls(E, target, maxiter=10 * E.shape[1])[0]
+    except RuntimeError:
+        return None
+    distance = 1.0 - float(E[-1] @ pushes)
+    if not distance > SLACK:
+        return None  # the rows contradict each other
+    lam = b.new_tensor(pushes[: b.numel()]) / distance
+    lam[free] -= b.new_tensor(pushes[b.numel() :]) / distance
+    return lam / length
 
 
 def _on(S: Tensor, b: Tensor, working: Tensor) -> Tensor:

@@ -17,23 +17,22 @@ from torchgco.errors import InputError
 from torchgco.evaluation import chord_clearance, violation
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.problem import Problem
-from torchgco.rollout import open_loop
 from torchgco.solution import Solution
-from torchgco.solvers.active_set import multipliers
+from torchgco.solvers.active_set import multipliers, projected
 from torchgco.solvers.condensed import Condensed
+from torchgco.solvers.merit import NOISE, descend
 from torchgco.solvers.verdict import final_status, optimality
 from torchgco.status import Status
 from torchgco.tree import copied, put
 
 VIOLATION_TOLERANCE = 1e-3  # metres for lengths, for the status
 STIFFNESS = 1e4  # curvature added across the active rows, times the Hessian's mean diagonal; no solution changes
-SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)  # shares of the same mean added to the diagonal until the model is convex
+# Shares of the mean of `_mean_along`, added to the diagonal until the model is convex.
+SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)
 NEAR = 1e-2  # rows with c above minus this share of their slope's length are in the program from the start
-PIVOT = 1e-3  # the smallest pivot that is convex enough, as a share of the same mean
-ACTIVE = 1e-3  # in the same measure: rows that count as active in the KKT residual
+PIVOT = 1e-3  # the smallest pivot that is convex enough, as a share of the mean of `_mean_along`
+ACTIVE = 1e-3  # as NEAR: rows that count as active in the KKT residual
 ROUNDS = 10  # rounds of adding the rows that a step would violate to a program
-SMALLEST = 1e-3  # step length at which the line search gives up
-NOISE = 1e-12  # rounding of a merit, as a share of it
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ class Polish:
                 continue
             step, lam = found
             heavier = max(weight, 2.0 * float(lam.abs().max())) if lam.numel() else weight
-            moved = _search(point, step, heavier)
+            moved = descend(point.model, step, lam, heavier)
             if moved is not None:
                 return _Point.at(point.model.problem, *moved, lam), heavier
         return None
@@ -177,15 +176,6 @@ class _Point:
         rest = model.gradient + pushes @ A
         return min(self.residual, float(rest.abs().max()) / (1.0 + float(model.gradient.abs().max())))
 
-    def merit(self, X: Tensor, U: Tensor, weight: float) -> float:
-        """J_var + weight |violated rows|_1: exact where the weight is above every multiplier."""
-        problem = self.model.problem
-        total = problem.cost.total(X, U)
-        for constraint in problem.constraints:
-            c = constraint.value(X, U)
-            total = total + weight * (c.abs() if constraint.sense == "equality" else c.clamp(min=0.0)).sum()
-        return float(total)
-
     def put_into(self, solution: Solution) -> Solution:
         """The solution with its trajectory replaced by this one, and gains along it."""
         problem, X, U = self.model.problem, self.model.X, self.model.U
@@ -211,8 +201,8 @@ def _convex(point: _Point, exact: bool) -> tuple[Tensor, Tensor] | None:
     """
     model, lam = point.model, point.lam
     H = model.hessian(lam if exact else None)
-    mean = H.diagonal().abs().mean()
-    if _holds(factor := torch.linalg.cholesky_ex(H), mean):
+    mean, along = H.diagonal().abs().mean(), _mean_along(model, H)
+    if _holds(factor := torch.linalg.cholesky_ex(H), along):
         return factor[0], model.gradient
     pushing = ((lam > 0) | model.equality) & (model.slopes.abs().amax(-1) > 0)
     rows = pushing.nonzero().flatten()
@@ -221,9 +211,22 @@ def _convex(point: _Point, exact: bool) -> tuple[Tensor, Tensor] | None:
     A, c = A / length.unsqueeze(-1), model.c[rows] / length
     H = H + STIFFNESS * mean * (A.mT @ A)
     for shift in SHIFTS:
-        if _holds(factor := torch.linalg.cholesky_ex(H + torch.diag((shift * mean).expand(H.shape[0]))), mean):
+        if _holds(factor := torch.linalg.cholesky_ex(H + torch.diag((shift * along).expand(H.shape[0]))), along):
             return factor[0], model.gradient + STIFFNESS * mean * (c @ A)
     return None
+
+
+def _mean_along(model: Condensed, H: Tensor) -> Tensor:
+    """Mean magnitude of the diagonal of H (v, v), reduced to the directions in which the equalities let a step go.
+
+    A terminal weight may be a thousand times as stiff as the rest of H, and a shift in proportion to it would stop all
+    steps, even where a terminal equality fixes the components that the weight is about.
+    """
+    if not bool(model.equality.any()):
+        return H.diagonal().abs().mean()
+    across, _ = torch.linalg.qr(model.dense(model.equality.nonzero().flatten()).mT)
+    H = H - across @ (across.mT @ H)
+    return (H - (H @ across) @ across.mT).diagonal().abs().mean()
 
 
 def _holds(factor: tuple[Tensor, Tensor], mean: Tensor) -> bool:
@@ -250,23 +253,12 @@ def _program(point: _Point, L: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor
         V = torch.linalg.solve_triangular(L, A.mT.contiguous(), upper=False)
         pushes = multipliers(V.mT @ V, model.c[rows] - V.mT @ g, model.equality[rows], lam[rows] > 0)
         if pushes is None:
+            pushes = projected(V, model.c[rows] - V.mT @ g, model.equality[rows])
+        if pushes is None:
             return None
         step = -torch.linalg.solve_triangular(L.mT, (g + V @ pushes).unsqueeze(-1), upper=True).squeeze(-1)
         broken = (model.c + model.change(step) > NOISE * size) & ~member & (size > 0)
         if not bool(broken.any()):
             return step, torch.zeros_like(lam).index_put((rows,), pushes)
         member = member | broken
-    return None
-
-
-def _search(point: _Point, step: Tensor, weight: float) -> tuple[Tensor, Tensor] | None:
-    """States and controls (1, ...) along the step that lower the merit; None where no step length does."""
-    problem, X, U = point.model.problem, point.model.X, point.model.U
-    before, alpha = point.merit(X, U, weight), 1.0
-    while alpha >= SMALLEST:
-        trial = U + alpha * step.view_as(U)
-        states = open_loop(problem.dynamics, problem.x0, trial)
-        if point.merit(states, trial, weight) <= before + NOISE * (1.0 + abs(before)):
-            return states, trial
-        alpha *= 0.5
     return None
