@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.constraints.bodies import Inflated, Obstacles
 from torchgco.constraints.cuboids import Cuboids, excess, segment_distance, signed_distance
-from torchgco.constraints.obstacles import FAR, per_problem
+from torchgco.constraints.obstacles import FAR, per_problem, vehicle_radius
 from torchgco.errors import InputError
 from torchgco.shapes import Dimensions, check_shape, tensor
 
@@ -69,11 +69,9 @@ class Boxes(Constraint):
             raise InputError("boxes.half_sizes", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
         if not bool((half[~absent] > 0).all()) or not _finite(half[~absent]):
             raise InputError("boxes.half_sizes", "finite half sides above 0 m", float(half[~absent].min()))
-        vehicle = tensor(self.vehicle_radius, "boxes.vehicle_radius", dims.like).reshape(-1, 1)
-        if vehicle.shape[0] not in (1, dims.B) or not bool((vehicle >= 0).all()):
-            raise InputError(
-                "boxes.vehicle_radius", f"a number of at least 0 m, or {dims.B}", vehicle.flatten().tolist()
-            )
+        vehicle = vehicle_radius(self.vehicle_radius, "boxes.vehicle_radius", dims)
+        if not bool((vehicle >= 0).all()):
+            raise InputError("boxes.vehicle_radius", "a number of at least 0 m", float(vehicle.min()))
         axes = _axes(self.rotations, absent, d, dims)
         half = torch.where(absent.unsqueeze(-1), 1.0, half)
         radius = vehicle.expand(dims.B, 1)
