@@ -10,6 +10,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "torchgco"
 LAYERS = [
     ["errors", "tree", "status", "autodiff", "draws", "kernels"],
+    ["options", "archive"],
     ["shapes"],
     ["dynamics", "costs", "constraints", "penalties", "goal"],
     ["problem", "measure"],

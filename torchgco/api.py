@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
+from torchgco.errors import InputError
 from torchgco.presets import gco
-from torchgco.problem import Problem
+from torchgco.problem import Problem, check_problem
 from torchgco.solution import Solution
+from torchgco.solvers.contracts import Solver
 
 
 def solve(
     problem: Problem,
     U0: Tensor | None = None,
-    solver: Any = None,
+    solver: Solver | None = None,
     seed: int = 0,
     ids: Tensor | None = None,
     warm: Solution | None = None,
@@ -33,8 +33,13 @@ def solve(
         max_seconds: time after which the best trajectories so far are returned; see `Solver.solve`.
 
     Raises:
-        InputError: U0, ids or warm don't fit the problem.
+        InputError: U0, ids or warm don't fit the problem, or an argument is of another kind or out of its range.
     """
+    check_problem(problem)
+    if warm is not None and not isinstance(warm, Solution):
+        raise InputError("warm", "a Solution, or None", type(warm).__name__)
+    if solver is not None and (isinstance(solver, type) or not callable(getattr(solver, "solve", None))):
+        raise InputError("solver", "a solver, such as presets.gco(problem), or None", repr(solver))
     if U0 is None:
         U0 = warm.U if warm is not None else _at_rest(problem)
     if solver is None:

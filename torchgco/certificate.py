@@ -25,8 +25,8 @@ from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.errors import InputError
 from torchgco.judge import by_kind, segment_distance
 from torchgco.measure import box_segment_distance
-from torchgco.problem import Problem
-from torchgco.shapes import check_shape
+from torchgco.problem import Problem, check_problem
+from torchgco.shapes import check_shape, check_tensor
 
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
@@ -73,12 +73,16 @@ def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None)
     Raises:
         InputError: X, U or asked don't fit the problem, or the problem isn't float64.
     """
+    check_problem(problem)
     problem.check_controls(U, "U")
     check_shape(X, (problem.B, problem.N + 1, problem.n), "X")
     if problem.x0.dtype != torch.float64 or X.dtype != torch.float64:
         raise InputError("X", "torch.float64 for the certificate", X.dtype)
+    check_tensor(X, "X", problem.x0)
     asked = torch.ones(problem.B, dtype=torch.bool, device=U.device) if asked is None else asked
     check_shape(asked, (problem.B,), "asked")
+    if asked.dtype != torch.bool:
+        raise InputError("asked", "a tensor of bool", asked.dtype)
     columns = torch.full((4, problem.B), torch.nan, dtype=X.dtype, device=X.device)
     finite = torch.isfinite(X).flatten(1).all(-1) & torch.isfinite(U).flatten(1).all(-1)
     for b in (asked & finite).nonzero().flatten():

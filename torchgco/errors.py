@@ -14,5 +14,11 @@ class InputError(ValueError):
         return type(self), (self.field, self.expected, str(self.got))  # so that a worker process can return it
 
 
+def shown(value: object) -> str:
+    """A value as an error shows it: its repr where that fits on a line, else its type."""
+    text = repr(value)
+    return text if len(text) <= 80 and "\n" not in text else type(value).__name__
+
+
 class GuidanceWarning(UserWarning):
     """Guidance, or a part of it, can't be used for a problem, which is solved without it."""

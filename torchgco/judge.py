@@ -17,8 +17,10 @@ from torchgco.constraints.bodies import Obstacles
 from torchgco.constraints.boxes import BoundBoxes
 from torchgco.constraints.obstacles import CONTACT_FACTOR, BoundSpheres
 from torchgco.errors import InputError
+from torchgco.goal import Goal
 from torchgco.measure import box_distance, box_segment_distance
-from torchgco.problem import Problem
+from torchgco.problem import Problem, check_problem
+from torchgco.shapes import check_shape, tensor
 
 OTHERS_WITHIN = 1e-3  # how far all constraints but the obstacles may be violated by a feasible trajectory
 SUCCESS_VIOLATION = 1e-3  # full radii, in metres
@@ -55,12 +57,13 @@ def judge(
         problem: the planning problems, float64.
         U: controls; NaN where a solver returned none: such a problem is neither feasible nor reached.
         goal: positions (B, d) or (d,), m. None: the problem's goal.
-        goal_radius: number or (B,), m. None: that of the problem's goal.
+        goal_radius: number or (B,), m, above 0. None: that of the problem's goal.
 
     Raises:
-        InputError: U doesn't fit the problem, the problem isn't float64, the dynamics have no position, no goal is
-            given and the problem has none, or obstacles are of a kind that can't be judged.
+        InputError: U, goal or radius don't fit the problem, the problem isn't float64, the dynamics have no position,
+            no goal is given and the problem has none, or obstacles are of a kind that can't be judged.
     """
+    check_problem(problem)
     problem.check_controls(U, "U")
     if problem.x0.dtype != torch.float64:
         raise InputError("x0", "torch.float64 for the judge", problem.x0.dtype)
@@ -76,16 +79,30 @@ def judge(
     return _verdict(problem, torch.stack(X, dim=1), U, cost, center, radius)
 
 
-def _goal(problem: Problem, center: Tensor | None, radius: Tensor | float | None) -> tuple[Tensor, Tensor | float]:
-    """Position and radius of the goal: those given, else the problem's."""
-    if center is not None and radius is not None:
-        return center, radius
+def _goal(problem: Problem, center: Any, radius: Any) -> tuple[Tensor, Tensor]:
+    """Position (B, d) or (d,) and radius, () or (B,), of the goal: those given, else the problem's."""
+    if center is None:
+        center = _own_goal(problem).position
+    else:
+        center = tensor(center, "goal", problem.x0)
+        d = problem.position.stop - problem.position.start
+        check_shape(center, (d,) if center.dim() == 1 else (problem.B, d), "goal")
+        if not bool(torch.isfinite(center).all()):
+            raise InputError("goal", "finite numbers", "NaN or infinity")
+    if radius is None:
+        radius = _own_goal(problem).radius
+    else:
+        radius = tensor(radius, "goal_radius", problem.x0)
+        check_shape(radius, () if radius.dim() == 0 else (problem.B,), "goal_radius")
+        if not bool((radius > 0).all()):
+            raise InputError("goal_radius", "above 0 m", float(radius.min()))
+    return center, radius
+
+
+def _own_goal(problem: Problem) -> Goal:
     if problem.goal is None:
         raise InputError("goal", "a Goal in the problem, or position and radius here", "neither")
-    return (
-        problem.goal.position if center is None else center,
-        problem.goal.radius if radius is None else radius,
-    )
+    return problem.goal
 
 
 def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor, radius: Tensor | float) -> Verdict:

@@ -12,6 +12,7 @@ from torchgco.errors import InputError
 from torchgco.expansion import quadratise
 from torchgco.penalties import Penalty
 from torchgco.problem import Problem
+from torchgco.shapes import check_tensor
 from torchgco.tree import Rows, take
 
 
@@ -41,10 +42,15 @@ class Multipliers:
 
     def check(self, problem: Problem) -> None:
         """Raise InputError unless these multipliers belong to a problem of this form (a warm start)."""
+        if not isinstance(self.lam, tuple) or not all(isinstance(part, Tensor) for part in (*self.lam, self.mu)):
+            raise InputError("warm", "multipliers that are tensors", type(self.lam).__name__)
         want = Multipliers.zero(problem, 0.0)
-        got, expected = [tuple(t.shape) for t in self.lam], [tuple(t.shape) for t in want.lam]
-        if got != expected:
-            raise InputError("warm", f"multipliers of shapes {expected}", got)
+        for mine, theirs in ((self.lam, want.lam), ((self.mu,), (want.mu,))):
+            got, expected = ([tuple(t.shape) for t in tensors] for tensors in (mine, theirs))
+            if got != expected:
+                raise InputError("warm", f"multipliers of shapes {expected}", got)
+        for part in (*self.lam, self.mu):
+            check_tensor(part, "warm", problem.x0)
 
 
 def shifted(values: Tensor) -> Tensor:

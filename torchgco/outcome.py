@@ -8,8 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
+
+from torchgco.errors import InputError
+from torchgco.options import Meters, check_value
 
 FARTHEST = 1e3  # m from the start: a vehicle beyond has diverged
 
@@ -60,8 +64,19 @@ def judge_flight(
         t, position: samples (T,), s, and (T, 3), m, of the plant; after the flight's end NaN.
         centers, contact, velocities: spheres at t = 0, (M, 3), m, with the distances (M,) at which bodies touch, m, and
             (M, 3), m/s, or None where they are at rest; NaN rows are absent.
-        goal, goal_radius: (3,) and a number, m.
+        goal, goal_radius: (3,) and a number above 0, m.
+
+    Raises:
+        InputError: arrays of other shapes, without a sample, or of anything but numbers; a radius that isn't above 0.
     """
+    t = _numbers(t, "t", (None,))
+    position, goal = _numbers(position, "position", (len(t), 3)), _numbers(goal, "goal", (3,))
+    contact = _numbers(contact, "contact", (None,))
+    centers = _numbers(centers, "centers", (len(contact), 3))
+    velocities = None if velocities is None else _numbers(velocities, "velocities", (len(contact), 3))
+    check_value(goal_radius, Meters, "goal_radius")
+    if len(t) == 0:
+        raise InputError("t", "at least one sample", "none")
     here = ~np.isnan(contact)
     centers, contact = centers[here], contact[here]
     moves = np.zeros_like(centers) if velocities is None else velocities[here]
@@ -81,6 +96,19 @@ def judge_flight(
         if distance < goal_radius:
             return Ending(Outcome.REACHED, float(t[k]), clearance, distance)
     return Ending(Outcome.TIMEOUT, float(t[-1]), clearance, distance)
+
+
+def _numbers(value: Any, field: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """`value` as an array of numbers of this shape; None stands for any length."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError):
+        array = np.empty((), object)
+    fits = len(shape) == array.ndim and all(want in (None, got) for want, got in zip(shape, array.shape, strict=True))
+    if not fits or array.dtype.kind not in "iuf":
+        wanted = ", ".join("any" if length is None else str(length) for length in shape)
+        raise InputError(field, f"numbers of shape ({wanted})", f"{array.dtype} of shape {array.shape}")
+    return array
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from torchgco.baselines import CasADiSolver, GuidedCasADi, Hold, IteratedMPPI
+from torchgco.errors import InputError
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.mppi import MPPI
 from torchgco.problem import Problem
@@ -176,6 +177,8 @@ def _printed_sampler(space: Space) -> MPPI:
 
 def _in_the_plane(space: Space) -> bool:
     """Whether the settings for the plane apply: in all but 3-D problems."""
+    if not isinstance(space, Problem) and space not in (2, 3):
+        raise InputError("space", "a Problem, or the dimension 2 or 3", repr(space))
     if isinstance(space, Problem):
         at = space.dynamics.position
         space = 0 if at is None else at.stop - at.start

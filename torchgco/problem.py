@@ -12,10 +12,13 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.costs.base import Cost
+from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.integrators import Integrator
 from torchgco.errors import InputError
 from torchgco.goal import Goal
-from torchgco.shapes import Dimensions
+from torchgco.options import Count, Seconds, check_value
+from torchgco.shapes import MISTAKES, Dimensions, check_tensor, describe
 from torchgco.tree import Rows, cast
 
 LEAST_UNIT = 1e-3  # share of the controls' curvature in the unit of cost
@@ -27,7 +30,7 @@ class Problem:
 
     Args:
         dynamics, cost, constraints: the parts; values given per problem have the batch of x0.
-        x0: (B, n), fixes batch, device and dtype.
+        x0: (B, n), fixes batch, device and dtype: float64 or float32, without gradients.
         N: number of stages.
         goal: where the last knot should lie. None: derived from the cost, around the position in `Cost.goal` (the
             terminal reference of a quadratic cost) with 0.09 of the distance from the start as radius; no goal where
@@ -55,6 +58,7 @@ class Problem:
         self._check_dynamics()
         object.__setattr__(self, "cost", self.cost.bind(dims))
         object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
+        self._check_cost()
         given = self.goal if self.goal is not None and not self.goal.assumed else None
         goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
         object.__setattr__(self, "goal", goal)
@@ -164,8 +168,12 @@ class Problem:
         Raises:
             InputError: x0 of another shape, dtype or device, constraints of other kinds.
         """
+        check_tensor(x0, "x0")
         if x0.shape != self.x0.shape or x0.dtype != self.x0.dtype or x0.device != self.x0.device:
-            raise InputError("x0", f"{self.x0.dtype} of shape {tuple(self.x0.shape)}", _describe(x0))
+            raise InputError("x0", f"{self.x0.dtype} of shape {tuple(self.x0.shape)}", describe(x0))
+        _check_constraints(constraints)
+        if cost is not None and not isinstance(cost, Cost):
+            raise InputError("cost", "a Cost", _named(cost))
         dims = self._dimensions(x0)
         bound = tuple(constraint.bind(dims) for constraint in constraints)
         if [type(part) for part in bound] != [type(part) for part in self.constraints]:
@@ -193,48 +201,83 @@ class Problem:
         if not isinstance(U, Tensor) or tuple(U.shape) != (self.B, self.N, self.m):
             got = tuple(U.shape) if isinstance(U, Tensor) else type(U).__name__
             raise InputError(field, f"a tensor ({self.B}, {self.N}, {self.m})", got)
-        if U.dtype != self.x0.dtype or U.device != self.x0.device:
-            raise InputError(field, f"{self.x0.dtype} on {self.x0.device} as x0", f"{U.dtype} on {U.device}")
+        check_tensor(U, field, self.x0)
 
     def _check_border(self) -> None:
-        if not isinstance(self.x0, Tensor) or self.x0.dim() != 2 or not self.x0.is_floating_point():
-            raise InputError("x0", f"a floating tensor (B, {self.dynamics.n})", _describe(self.x0))
-        if self.x0.shape[1] != self.dynamics.n or self.x0.shape[0] < 1:
-            raise InputError("x0", f"shape (B, {self.dynamics.n})", tuple(self.x0.shape))
-        if isinstance(self.N, bool) or not isinstance(self.N, int) or self.N < 1:
-            raise InputError("N", "at least one stage", repr(self.N))
         for name, part, kind in (("dynamics", self.dynamics, Dynamics), ("cost", self.cost, Cost)):
             if not isinstance(part, kind):
-                raise InputError(name, f"a {kind.__name__}", type(part).__name__)
+                raise InputError(name, f"a {kind.__name__}", _named(part))
+        for name in ("n", "m"):
+            check_value(getattr(self.dynamics, name, None), Count, f"dynamics.{name}")
+        if not isinstance(self.x0, Tensor) or self.x0.dim() != 2 or not self.x0.is_floating_point():
+            raise InputError("x0", f"a floating tensor (B, {self.dynamics.n})", describe(self.x0))
+        if self.x0.shape[1] != self.dynamics.n or self.x0.shape[0] < 1:
+            raise InputError("x0", f"shape (B, {self.dynamics.n})", tuple(self.x0.shape))
+        check_tensor(self.x0, "x0")
+        if isinstance(self.N, bool) or not isinstance(self.N, int) or self.N < 1:
+            raise InputError("N", "at least one stage, an int", repr(self.N))
         if not callable(self.cost.goal):
             raise InputError("cost.goal", "a method, which no field may hide", type(self.cost.goal).__name__)
         if self.goal is not None and not isinstance(self.goal, Goal):
             raise InputError("goal", "a Goal, or None", type(self.goal).__name__)
-        for constraint in self.constraints:
-            if not isinstance(constraint, Constraint):
-                raise InputError("constraints", "a sequence of Constraint", type(constraint).__name__)
+        _check_constraints(self.constraints)
 
     def _check_dynamics(self) -> None:
+        check_value(getattr(self.dynamics, "dt", None), Seconds | None, "dynamics.dt")
+        if type(self.dynamics).step is Dynamics.step:
+            check_value(self.dynamics.integrator, Integrator, "dynamics.integrator")
+        where = self.dynamics.position
+        if where is not None and where not in [slice(i, j) for j in range(1, self.n + 1) for i in range(j)]:
+            raise InputError("dynamics.position", f"a slice of states within 0..{self.n}, or None", repr(where))
         for name in self.dynamics.per_element:
             value = getattr(self.dynamics, name)
-            if not isinstance(value, Tensor) or value.dim() == 0:
-                continue
-            if tuple(value.shape) not in ((self.B,), (1,)):
-                raise InputError(f"dynamics.{name}", f"a number or a tensor ({self.B},)", tuple(value.shape))
-            if value.dtype != self.x0.dtype or value.device != self.x0.device:
-                raise InputError(
-                    f"dynamics.{name}", f"{self.x0.dtype} on {self.x0.device} as x0", f"{value.dtype} on {value.device}"
-                )
+            if not isinstance(value, Tensor):
+                check_value(value, float, f"dynamics.{name}")
+            elif value.dim() > 0:
+                if tuple(value.shape) not in ((self.B,), (1,)):
+                    raise InputError(f"dynamics.{name}", f"a number or a tensor ({self.B},)", tuple(value.shape))
+                if value.dtype != self.x0.dtype or value.device != self.x0.device:
+                    wanted = f"{self.x0.dtype} on {self.x0.device} as x0"
+                    raise InputError(f"dynamics.{name}", wanted, f"{value.dtype} on {value.device}")
+                check_tensor(value, f"dynamics.{name}")
         try:
             after = self.dynamics.step(self.x0, self.x0.new_zeros(self.B, self.m))
-        except RuntimeError as error:
-            message = str(error).splitlines()[0]
+        except MISTAKES as error:
+            message = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError("dynamics.step", f"a step for states {tuple(self.x0.shape)}", message) from error
-        if after.shape != self.x0.shape or after.dtype != self.x0.dtype:
-            raise InputError(
-                "dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", f"{after.dtype} {tuple(after.shape)}"
-            )
+        if not isinstance(after, Tensor) or after.shape != self.x0.shape or after.dtype != self.x0.dtype:
+            raise InputError("dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", describe(after))
 
 
-def _describe(value: object) -> str:
-    return f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+    def _check_cost(self) -> None:
+        """Evaluate a user's cost for the first problem, which stays at its start."""
+        if isinstance(self.cost, BoundQuadratic):
+            return
+        X, U = self.x0[:1].unsqueeze(1).repeat(1, self.N + 1, 1), self.x0.new_zeros(1, self.N, self.m)
+        try:
+            total = self.cost.take(slice(0, 1)).total(X, U)
+        except MISTAKES as error:
+            message = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError("cost", "a stage cost and a terminal cost of states and controls", message) from error
+        if not isinstance(total, Tensor) or total.shape != (1,) or total.dtype != self.x0.dtype:
+            got = f"for one problem {describe(total)}"
+            raise InputError("cost", f"one number in {self.x0.dtype} per state and control", got)
+
+
+def check_problem(problem: Any) -> None:
+    """Raise InputError unless the argument is a Problem."""
+    if not isinstance(problem, Problem):
+        raise InputError("problem", "a Problem", _named(problem))
+
+
+def _check_constraints(constraints: Any) -> None:
+    # A generator is refused, too: this first look would use it up.
+    if not isinstance(constraints, Sequence) or isinstance(constraints, str):
+        raise InputError("constraints", "a list of Constraint", _named(constraints))
+    for constraint in constraints:
+        if not isinstance(constraint, Constraint):
+            raise InputError("constraints", "a list of Constraint", _named(constraint))
+
+
+def _named(part: object) -> str:
+    return f"the class {part.__name__}" if isinstance(part, type) else type(part).__name__

@@ -15,31 +15,68 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.errors import InputError
+from torchgco.errors import InputError, shown
+
+# What a user's function raises where it doesn't fit the problem.
+MISTAKES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError)
 
 
-def tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
+def tensor(value: Any, field: str, like: Tensor) -> Tensor:
     """`value` (tensor, array, nested sequence or number) as a floating tensor of the dtype and device of `like`.
 
-    Raises InputError where it isn't numeric, and where a tensor comes with another dtype or device than `like`:
-    converting it silently would hide a mistake.
+    Raises InputError where it isn't numeric, and where a tensor is refused by `check_tensor`.
     """
     if isinstance(value, Tensor):
-        if like is not None and value.dtype != like.dtype:
-            raise InputError(field, f"dtype {like.dtype} as in x0", value.dtype)
-        if like is not None and value.device != like.device:
-            raise InputError(field, f"device {like.device} as in x0", value.device)
-        return value
-    dtype = like.dtype if like is not None else torch.float64
-    device = like.device if like is not None else None
+        return check_tensor(value, field, like)
     try:
-        plain = list(value) if isinstance(value, Sequence) else value
-        return torch.as_tensor(plain, dtype=dtype, device=device)
-    except (TypeError, ValueError, RuntimeError):
-        raise InputError(field, "numbers", repr(value)) from None
+        plain = np.array(value) if isinstance(value, np.ndarray) else value  # a copy: it may be read-only or reversed
+        plain = list(plain) if isinstance(plain, Sequence) else plain
+        if isinstance(plain, (bool, complex)) or (isinstance(plain, np.ndarray) and plain.dtype.kind not in "iuf"):
+            raise TypeError
+        return torch.as_tensor(plain, dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise InputError(field, "numbers", shown(value)) from None
+
+
+def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
+    """`value`, a dense tensor of float64 or float32 without gradients, of the dtype and device of `like`.
+
+    Raises InputError for all else. Converting another dtype or device silently would hide a mistake; and gradients with
+    respect to the input of a solve don't exist, so a tensor that asks for them is refused as well.
+    """
+    if not isinstance(value, Tensor):
+        raise InputError(field, "a tensor", type(value).__name__)
+    if value.dtype not in (torch.float64, torch.float32):
+        raise InputError(field, f"a {'float64 or float32' if like is None else like.dtype} tensor", describe(value))
+    if value.layout != torch.strided:
+        raise InputError(field, "a dense tensor", value.layout)
+    if value.requires_grad:
+        expected = "a tensor without gradients, `.detach()`, as solves aren't differentiable"
+        raise InputError(field, expected, describe(value))
+    if like is not None and value.dtype != like.dtype:
+        raise InputError(field, f"dtype {like.dtype} as in x0", value.dtype)
+    if like is not None and value.device != like.device:
+        raise InputError(field, f"device {like.device} as in x0", value.device)
+    return value
+
+
+def check_device(device: Any) -> torch.device:
+    """The device by its name; InputError where there is none, or PyTorch can't use it."""
+    try:
+        return torch.empty(0, device=device).device
+    except (RuntimeError, AssertionError, TypeError, ValueError):
+        raise InputError("device", "a device that is there, such as cpu", repr(device)) from None
+
+
+def describe(value: object) -> str:
+    """The kind of a value: dtype and shape of a tensor, else its type."""
+    if not isinstance(value, Tensor):
+        return type(value).__name__
+    return f"{value.dtype} {tuple(value.shape)}" + (" with requires_grad" if value.requires_grad else "")
 
 
 @dataclass(frozen=True)
@@ -56,7 +93,9 @@ class Dimensions:
 
 
 def check_shape(value: Tensor, shape: tuple[int | str, ...], field: str) -> None:
-    """Raise InputError unless `value` has `shape`; a letter stands for any length and names the dimension."""
+    """Raise InputError unless `value` is a tensor of `shape`; a letter stands for any length, named by it."""
+    if not isinstance(value, Tensor):
+        raise InputError(field, f"a tensor ({', '.join(map(str, shape))})", type(value).__name__)
     fits = value.dim() == len(shape) and all(
         isinstance(want, str) or want == got for want, got in zip(shape, value.shape, strict=True)
     )

@@ -12,8 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.archive import read_arrays
 from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
+from torchgco.shapes import check_device
 from torchgco.status import Status
 from torchgco.tree import take
 
@@ -77,16 +79,20 @@ class Solution:
         """Read what `save` wrote.
 
         Raises:
-            InputError: no such file, or one that isn't a solution.
+            InputError: no such file, one that isn't a solution, or a device that isn't there.
         """
-        if not Path(path).is_file():
-            raise InputError("path", "a solution file", f"{path}, which isn't there")
-        with np.load(path, allow_pickle=False) as file:
-            missing = {*_TENSORS, "mu"} - set(file.files)
-            if missing:
-                raise InputError("path", "a solution file", f"{path} without {sorted(missing)}")
-            tensors = {name: torch.from_numpy(file[name]).to(device) for name in file.files}
-        lam = tuple(tensors[f"lam{i}"] for i in range(sum(name.startswith("lam") for name in tensors)))
+        where = check_device(device)
+        arrays = read_arrays(path, "path", "a solution file", {*_TENSORS, "mu"})
+        count = next(i for i in range(len(arrays)) if f"lam{i}" not in arrays)
+        names = (*_TENSORS, "mu", *(f"lam{i}" for i in range(count)))
+        strange = [name for name in names if arrays[name].dtype.kind not in "iuf"]
+        if strange:
+            raise InputError("path", "a solution file", f"{path}, where {strange[0]} holds no numbers")
+        ranks = {"X": 3, "U": 3, "K": 4, "d": 3}
+        if any(arrays[name].ndim != ranks.get(name, 3 if name.startswith("lam") else 1) for name in names):
+            raise InputError("path", "a solution file", f"{path}, whose arrays have other shapes")
+        tensors = {name: torch.from_numpy(arrays[name]).to(where) for name in names}
+        lam = tuple(tensors[f"lam{i}"] for i in range(count))
         return cls(multipliers=Multipliers(lam, tensors["mu"]), **{name: tensors[name] for name in _TENSORS})
 
 

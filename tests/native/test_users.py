@@ -217,11 +217,6 @@ class Sums(Smooth):
         return super().stage(x, u, k).cumsum(-1)
 
 
-class Column(Smooth):
-    def terminal(self, x: Tensor) -> Tensor:
-        return super().terminal(x).unsqueeze(-1)
-
-
 @dataclass(frozen=True)
 class Jerk(Constraint):
     """Rows that join two knots."""
@@ -247,7 +242,6 @@ def with_rows(row: Constraint) -> Problem:
         (lambda: with_cost(Jerky()), r"cost.total \(Jerky\)"),
         (lambda: with_cost(FirstIsFree()), r"cost.stage \(FirstIsFree\): expected the same operations at every knot"),
         (lambda: with_cost(Sums()), r"cost.stage \(Sums\): expected rows that read their own knot alone"),
-        (lambda: with_cost(Column()), r"cost.terminal \(Column\): expected costs \(1,\) of states"),
         (lambda: with_rows(Jerk()), r"constraints\[0\] \(Jerk\): expected rows that read their own knot alone"),
         (lambda: with_rows(Tube(torch.zeros(13, 2), torch.ones(5), slice(1, 1))), "at least one knot"),
     ],

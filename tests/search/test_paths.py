@@ -225,6 +225,7 @@ def test_lists_of_a_configuration_equal_tuples() -> None:
         (dict(num_paths=0), "paths.num_paths"), (dict(track_iterations=0), "paths.track_iterations"),
         (dict(relax_iterations=-1), "paths.relax_iterations"), (dict(relax_top=0), "paths.relax_top"),
         (dict(refine_top=0), "paths.refine_top"), (dict(initial_offsets=7), "paths.initial_offsets"),
+        (dict(initial_offsets=[["left", "right"]]), "paths.initial_offsets"), (dict(arrive="late"), "paths.arrive"),
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_named(change: dict, field: str) -> None:

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from torchgco.baselines.hold import rolled_out
 from torchgco.errors import InputError
-from torchgco.problem import Problem
+from torchgco.options import Count, Positive, check_options
+from torchgco.problem import Problem, check_problem
 from torchgco.rollout import open_loop
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
@@ -45,19 +46,13 @@ class CasADiSolver(Solver):
     """
 
     plugin: Literal["ipopt", "fatrop"] = "ipopt"
-    max_iterations: int = 1000
-    tolerance: float = 1e-8
-    violation_tolerance: float = 1e-3
+    max_iterations: Count = 1000
+    tolerance: Positive = 1e-8
+    violation_tolerance: Positive = 1e-3
     options: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        if self.plugin not in ("ipopt", "fatrop"):
-            raise InputError("solver.plugin", "ipopt or fatrop", repr(self.plugin))
-        if self.max_iterations < 1:
-            raise InputError("solver.max_iterations", "at least 1", self.max_iterations)
-        for name in ("tolerance", "violation_tolerance"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"solver.{name}", "above 0", getattr(self, name))
+        check_options(self, "solver")
         if find_spec("casadi") is None:
             raise InputError("solver", "CasADi (`pip install casadi`)", "no such module")
 
@@ -72,6 +67,7 @@ class CasADiSolver(Solver):
 
         from torchgco.baselines.nlp import transcribe
 
+        check_problem(problem)
         program = transcribe(problem)
         nlp = {"x": program.variables, "p": program.parameters, "f": program.objective, "g": program.rows}
         try:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgco.baselines.casadi import CasADiSolver
 from torchgco.native.dispatch import engine_of
+from torchgco.options import check_options
 from torchgco.problem import Problem
 from torchgco.search.paths import PathProposals
 from torchgco.solution import Solution
@@ -33,10 +34,16 @@ class GuidedCasADi(Solver):
     Args:
         solver: solves each problem from that guess.
         paths: makes the proposals, for all problems at once.
+
+    Raises:
+        InputError: a field of another kind.
     """
 
     solver: CasADiSolver = CasADiSolver("fatrop")
     paths: PathProposals = PathProposals(num_paths=4, relax_iterations=0, max_penetration=1.0)
+
+    def __post_init__(self) -> None:
+        check_options(self, "solver")
 
     def prepare(self, problem: Problem) -> Solver:
         """As `CasADiSolver.prepare`; the guess is part of the solve.

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchgco.evaluation import violation
 from torchgco.lagrangian import Multipliers
+from torchgco.options import Positive, check_options
 from torchgco.problem import Problem
 from torchgco.rollout import open_loop
 from torchgco.solution import Solution
@@ -22,9 +23,15 @@ class Hold(Solver):
 
     Args:
         violation_tolerance: violation (metres for lengths) up to which a trajectory counts as feasible.
+
+    Raises:
+        InputError: a field out of its range.
     """
 
-    violation_tolerance: float = 1e-3
+    violation_tolerance: Positive = 1e-3
+
+    def __post_init__(self) -> None:
+        check_options(self, "solver")
 
     def run(self, call: Call) -> Solution:
         """U0 rolled out."""

@@ -13,6 +13,7 @@ from torchgco.errors import GuidanceWarning, InputError
 from torchgco.evaluation import is_better, violation
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_sampler
+from torchgco.options import Count, Positive, check_options
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 
@@ -34,14 +35,11 @@ class IteratedMPPI(Solver):
     """
 
     sampler: MPPI = MPPI()
-    iterations: int = 20
-    violation_tolerance: float = 1e-3
+    iterations: Count = 20
+    violation_tolerance: Positive = 1e-3
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise InputError("solver.iterations", "at least 1", self.iterations)
-        if not self.violation_tolerance > 0:
-            raise InputError("solver.violation_tolerance", "above 0", self.violation_tolerance)
+        check_options(self, "solver")
 
     def run(self, call: Call) -> Solution:
         """Sample around U0; draws are keyed by (seed, id, iteration).

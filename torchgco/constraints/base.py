@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
@@ -11,8 +12,9 @@ from torch import Tensor
 
 from torchgco.autodiff import jacobian
 from torchgco.costs.base import add_blocks
-from torchgco.errors import InputError
-from torchgco.shapes import Dimensions
+from torchgco.errors import InputError, shown
+from torchgco.options import check_options
+from torchgco.shapes import MISTAKES, Dimensions, check_shape
 from torchgco.tree import PerElement
 
 Sense = Literal["inequality", "equality"]
@@ -79,12 +81,13 @@ def resolve_knots(knots: Knots, last: int, field: str, device: torch.device) -> 
     """Knots as a slice where they are contiguous, else as indices; negative ones count from the end.
 
     Raises:
-        InputError: no knot, a repeated knot, or a knot outside 0..last.
+        InputError: no knot, a repeated knot, a knot that is no whole number or outside 0..last.
     """
-    if isinstance(knots, slice):
-        chosen = list(range(last + 1)[knots])
-    else:
-        chosen = [int(k) for k in knots]
+    try:
+        chosen = list(range(last + 1)[knots]) if isinstance(knots, slice) else [_whole(k) for k in knots]
+    except (TypeError, ValueError):
+        raise InputError(field, "a slice, or a list of whole numbers", shown(knots)) from None
+    if not isinstance(knots, slice):
         if any(not -last - 1 <= k <= last for k in chosen):
             raise InputError(field, f"knots within 0..{last}", chosen)
         chosen = [k % (last + 1) for k in chosen]
@@ -95,9 +98,11 @@ def resolve_knots(knots: Knots, last: int, field: str, device: torch.device) -> 
     return torch.tensor(chosen, device=device)
 
 
-def check_sense(sense: str, field: str) -> None:
-    if sense not in ("inequality", "equality"):
-        raise InputError(field, "inequality or equality", repr(sense))
+def _whole(k: Any) -> int:
+    """An int, or an integer of NumPy or PyTorch; TypeError for all else, a mask's True among it."""
+    if isinstance(k, bool) or (isinstance(k, Tensor) and k.dtype == torch.bool):
+        raise TypeError
+    return operator.index(k)
 
 
 @dataclass(frozen=True)
@@ -119,9 +124,7 @@ class FunctionConstraint(Constraint):
     name: str = "constraint"
 
     def bind(self, dims: Dimensions) -> Self:
-        check_sense(self.sense, f"{self.name}.sense")
-        if self.of not in ("x", "u", "xu"):
-            raise InputError(f"{self.name}.of", "x, u or xu", repr(self.of))
+        check_options(self, self.name if isinstance(self.name, str) else "constraint")
         if self.geometric and self.of != "x":
             raise InputError(f"{self.name}.geometric", "a function of x alone", f"of={self.of!r}")
         last = dims.N if self.of == "x" else dims.N - 1
@@ -129,9 +132,15 @@ class FunctionConstraint(Constraint):
         knots = resolve_knots(
             default if self.knots is None else self.knots, last, f"{self.name}.knots", dims.like.device
         )
-        rows = self.function(*(dims.like.new_zeros(dims.B, 1, dims.n if a == "x" else dims.m) for a in self.of))
-        if rows.dim() != 3 or rows.shape[:2] != (dims.B, 1):
-            raise InputError(f"{self.name}.function", f"rows ({dims.B}, 1, p)", tuple(rows.shape))
+        where, arguments = f"{self.name}.function", [dims.n if a == "x" else dims.m for a in self.of]
+        try:
+            rows = self.function(*(dims.like.new_zeros(dims.B, 1, size) for size in arguments))
+        except MISTAKES as error:
+            message = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(where, f"a function of {' and '.join(self.of)}", message) from error
+        check_shape(rows, (dims.B, 1, "p"), where)
+        if rows.dtype != dims.like.dtype:
+            raise InputError(where, f"rows of {dims.like.dtype} as x0", rows.dtype)
         return replace(self, knots=knots)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:

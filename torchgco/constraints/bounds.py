@@ -17,10 +17,11 @@ from torchgco.shapes import Dimensions, check_shape, tensor
 class _Bounds(Constraint):
     """lower <= z <= upper, as rows [z - upper, lower - z] of the bounded components.
 
-    Bounds are (size,) or, per problem, (B, size); infinity means unbounded.
+    Bounds are (size,) or, per problem, (B, size), or one number for all components; infinity means unbounded.
 
     Raises:
-        InputError: on `Problem(...)`: wrong shape, NaN, bounds crossed, nothing bounded.
+        InputError: on `Problem(...)`: wrong shape, NaN, bounds crossed, nothing bounded, a lower bound of infinity or
+            an upper bound of minus infinity.
     """
 
     lower: Any
@@ -37,8 +38,8 @@ class _Bounds(Constraint):
             return self
         name, size = ("control_bounds", dims.m) if self.of == "u" else ("state_bounds", dims.n)
         last = dims.N - 1 if self.of == "u" else dims.N
-        lower = self._checked(self.lower, f"{name}.lower", size, dims)
-        upper = self._checked(self.upper, f"{name}.upper", size, dims)
+        lower = self._checked(self.lower, f"{name}.lower", size, dims, torch.inf)
+        upper = self._checked(self.upper, f"{name}.upper", size, dims, -torch.inf)
         if bool((lower > upper).any()):
             raise InputError(f"{name}.lower", "at most the upper bound", f"{lower.tolist()} over {upper.tolist()}")
         default = slice(0, dims.N) if self.of == "u" else slice(1, dims.N + 1)
@@ -50,12 +51,14 @@ class _Bounds(Constraint):
         knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", lower.device)
         return replace(self, lower=lower, upper=upper, knots=knots, above=_range(above), below=_range(below))
 
-    def _checked(self, value: Any, name: str, size: int, dims: Dimensions) -> Tensor:
+    def _checked(self, value: Any, name: str, size: int, dims: Dimensions, refused: float) -> Tensor:
         bound = tensor(value, name, dims.like)
+        bound = bound.repeat(size) if bound.dim() == 0 else bound
         bound = bound.unsqueeze(0) if bound.dim() == 1 else bound
         check_shape(bound, (1 if bound.shape[0] == 1 else dims.B, size), name)
-        if bool(torch.isnan(bound).any()):
-            raise InputError(name, "numbers or infinity", "NaN")
+        bad = torch.isnan(bound) | (bound == refused)
+        if bool(bad.any()):
+            raise InputError(name, f"numbers or {-refused}", float(bound[bad][0]))
         return bound
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.constraints.bodies import Inflated, Obstacles
 from torchgco.constraints.cuboids import Cuboids, excess, segment_distance, signed_distance
-from torchgco.constraints.obstacles import FAR, per_problem
+from torchgco.constraints.obstacles import FAR, per_problem, vehicle_radius
 from torchgco.errors import InputError
 from torchgco.shapes import Dimensions, check_shape, tensor
 
@@ -217,9 +217,9 @@ def vehicle_radii(value: Any, name: str, dims: Dimensions) -> Tensor:
     Raises:
         InputError: neither a number nor (B,), or negative.
     """
-    vehicle = tensor(value, name, dims.like).reshape(-1)
-    if vehicle.shape[0] not in (1, dims.B) or not bool((vehicle >= 0).all()):
-        raise InputError(name, f"a number of at least 0 m, or {dims.B}", vehicle.tolist())
+    vehicle = vehicle_radius(value, name, dims)[:, 0]
+    if not bool((vehicle >= 0).all()):
+        raise InputError(name, "a number of at least 0 m", float(vehicle.min()))
     return vehicle.expand(dims.B).contiguous()
 
 

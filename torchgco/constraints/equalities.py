@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -11,7 +11,8 @@ from torch import Tensor
 from torchgco.constraints.base import Constraint, Sense
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.errors import InputError
-from torchgco.shapes import Dimensions, check_shape, tensor
+from torchgco.options import Above, Seconds, check_options
+from torchgco.shapes import Dimensions, check_shape, check_tensor, tensor
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class FirstStepRates(Constraint):
     """
 
     thrusts: Any
-    period: float = 0.05
+    period: Seconds = 0.05
     airframe: Airframe = Airframe()
     reachable: tuple[Tensor, Tensor] | None = None
     target: Tensor | None = None  # (B, 3): w(t1), once bound
@@ -43,6 +44,7 @@ class FirstStepRates(Constraint):
     rates: ClassVar[slice] = slice(10, 13)
 
     def bind(self, dims: Dimensions) -> Self:
+        check_options(self, "first_step")
         if dims.n != 14:
             raise InputError("first_step.dynamics", "the planning model with 14 states", f"{dims.n} states")
         thrusts = tensor(self.thrusts, "first_step.thrusts", dims.like)
@@ -52,8 +54,9 @@ class FirstStepRates(Constraint):
         target = w0 + self.period * self.airframe.angular_acceleration(w0, thrusts)
         if self.reachable is not None:
             lower, upper = self.reachable
-            check_shape(lower, (dims.B, 3), "first_step.reachable")
-            check_shape(upper, (dims.B, 3), "first_step.reachable")
+            for bound in self.reachable:
+                check_shape(bound, (dims.B, 3), "first_step.reachable")
+                check_tensor(bound, "first_step.reachable", dims.like)
             target = torch.minimum(torch.maximum(target, lower), upper)
         return replace(self, thrusts=thrusts.contiguous(), target=target)
 
@@ -81,16 +84,18 @@ class ThrustSum(Constraint):
     """
 
     acceleration: Tensor
-    mass: float
+    mass: Annotated[float, Above(0, "kg")]
 
     knots: Any = None
     sense: ClassVar[Sense] = "equality"
     batched: ClassVar[tuple[str, ...]] = ("acceleration",)
 
     def bind(self, dims: Dimensions) -> Self:
+        check_options(self, "thrust_sum")
         if dims.n != 7:
             raise InputError("thrust_sum.dynamics", "the tracking model with 7 states", f"{dims.n} states")
         check_shape(self.acceleration, (dims.B, dims.N), "thrust_sum.acceleration")
+        check_tensor(self.acceleration, "thrust_sum.acceleration", dims.like)
         return replace(self, knots=slice(1, dims.N + 1))
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:

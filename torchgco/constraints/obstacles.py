@@ -59,10 +59,12 @@ class Spheres(Constraint):
         M = centers.shape[1]
         radii = per_problem(self.radii, "obstacles.radii", 2, dims)
         check_shape(radii, (dims.B, M), "obstacles.radii")
-        vehicle = tensor(self.vehicle_radius, "obstacles.vehicle_radius", dims.like).reshape(-1, 1)
+        vehicle = vehicle_radius(self.vehicle_radius, "obstacles.vehicle_radius", dims)
         absent = torch.isnan(centers).all(-1)
         if bool((absent != torch.isnan(radii)).any()) or bool(torch.isnan(centers[~absent]).any()):
             raise InputError("obstacles.radii", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
+        if bool(torch.isinf(centers).any()) or bool(torch.isinf(radii).any()):
+            raise InputError("obstacles.centers", "finite centres and radii, or NaN where absent", "infinity")
         if bool((radii < 0).any()) or bool((vehicle < 0).any()):
             lowest = min(float(sizes.nan_to_num(0.0).min()) for sizes in (radii, vehicle) if sizes.numel() > 0)
             raise InputError("obstacles.radii", "radii of at least 0 m", lowest)
@@ -71,6 +73,8 @@ class Spheres(Constraint):
             velocities = per_problem(self.velocities, "obstacles.velocities", 3, dims)
             check_shape(velocities, (dims.B, M, d), "obstacles.velocities")
             velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
+            if not bool(torch.isfinite(velocities).all()):
+                raise InputError("obstacles.velocities", "finite velocities of every sphere", "NaN or infinity")
         if velocities is not None and dims.dt is None:
             raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
         knots = slice(1, dims.N + 1) if self.knots is None else self.knots
@@ -263,6 +267,19 @@ def _from_origin(a: Tensor, along: Tensor) -> Tensor:
 def _outer(a: Tensor, b: Tensor) -> Tensor:
     """a b' of the last axis, flattened: (..., d * d)."""
     return (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2)
+
+
+def vehicle_radius(value: Any, name: str, dims: Dimensions) -> Tensor:
+    """The vehicle's radius as (B, 1), or (1, 1) where all problems share it.
+
+    Raises:
+        InputError: neither a finite number nor one per problem.
+    """
+    radius = tensor(value, name, dims.like)
+    if radius.dim() > 1 or radius.numel() not in (1, dims.B) or not bool(torch.isfinite(radius).all()):
+        got = f"shape {tuple(radius.shape)}" if bool(torch.isfinite(radius).all()) else "NaN or infinity"
+        raise InputError(name, f"a number, or {dims.B} of them", got)
+    return radius.reshape(-1, 1)
 
 
 def per_problem(value: Any, name: str, dim: int, dims: Dimensions) -> Tensor:

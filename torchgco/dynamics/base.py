@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, Literal
 
 from torch import Tensor
 
 from torchgco.autodiff import jacobian
 from torchgco.dynamics.integrators import INTEGRATORS
-from torchgco.errors import InputError
+from torchgco.options import Count, Seconds, check_options
 from torchgco.tree import PerElement
 
 
@@ -54,32 +54,23 @@ class Dynamics(PerElement):
         return fx, fu
 
 
-def check_model(dynamics: Any, name: str) -> None:
-    """Raise InputError unless a model's time step is positive and its integrator known."""
-    if not dynamics.dt > 0:
-        raise InputError(f"{name}.dt", "a positive time step in seconds", dynamics.dt)
-    if dynamics.integrator not in INTEGRATORS:
-        raise InputError(f"{name}.integrator", f"one of {sorted(INTEGRATORS)}", dynamics.integrator)
-
-
 @dataclass(frozen=True)
 class FunctionDynamics(Dynamics):
     """Dynamics from function(x, u) on (..., n), (..., m): the derivative x', or with integrator="none" the next state.
 
     Raises:
-        InputError: non-positive dt, unknown integrator.
+        InputError: a field out of its range or of another kind.
     """
 
     function: Callable[[Tensor, Tensor], Tensor]
-    n: int
-    m: int
-    dt: float
-    integrator: str = "euler"
+    n: Count
+    m: Count
+    dt: Seconds
+    integrator: Literal["euler", "midpoint", "rk4", "none"] = "euler"
     position: slice | None = None
 
     def __post_init__(self) -> None:
-        if self.integrator != "none":
-            check_model(self, "dynamics")
+        check_options(self, "dynamics")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         return self.function(x, u)

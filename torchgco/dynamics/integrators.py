@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 Rates = Callable[[Tensor], Tensor]
+Integrator = Literal["euler", "midpoint", "rk4"]
 
 
 def euler(rates: Rates, x: Tensor, dt: float) -> Tensor:

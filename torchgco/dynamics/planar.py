@@ -8,7 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.dynamics.base import Dynamics, check_model
+from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.integrators import Integrator
+from torchgco.options import Seconds, check_options
 from torchgco.shapes import components, lead, vectors
 
 
@@ -22,11 +24,11 @@ class Planar(Dynamics):
     The coefficients may be tensors (B,), one value per problem.
 
     Raises:
-        InputError: non-positive dt, unknown integrator.
+        InputError: a field out of its range or of another kind.
     """
 
-    dt: float = 0.05
-    integrator: str = "euler"
+    dt: Seconds = 0.05
+    integrator: Integrator = "euler"
     drag: float | Tensor = 10.0  # k1, 1/s
     thrust_gain: float | Tensor = 1.0  # k2
     turn_drag: float | Tensor = 0.001  # k3, 1/s
@@ -39,7 +41,7 @@ class Planar(Dynamics):
     per_element: ClassVar[tuple[str, ...]] = ("drag", "thrust_gain", "turn_drag", "turn_gain")
 
     def __post_init__(self) -> None:
-        check_model(self, "planar")
+        check_options(self, "planar")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, _, theta, vx, vy, turning = components(x)

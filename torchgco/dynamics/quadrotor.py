@@ -7,17 +7,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchgco.dynamics.base import Dynamics, check_model
+from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.integrators import Integrator
 from torchgco.errors import InputError
+from torchgco.options import Above, Meters, NonNegative, Positive, Seconds, check_options
 from torchgco.shapes import components, lead, vectors
 
 GRAVITY = 9.81  # m/s^2
 Components = tuple[Tensor, ...]
+Row = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -25,26 +28,27 @@ class Airframe:
     """The quadrotor's parameters (Table 2), shared by plant, tracking model and `FirstStepRates`.
 
     Raises:
-        InputError: non-positive mass, or thrust limits crossed.
+        InputError: a field out of its range or of another kind, thrust limits crossed, an inertia that can't be.
     """
 
-    mass: float = 1.608  # kg
-    inertia: tuple[tuple[float, float, float], ...] = (
+    mass: Annotated[float, Above(0, "kg")] = 1.608
+    inertia: tuple[Row, Row, Row] = (
         (0.0366, 0.0, 0.0065),
         (0.0, 0.0327, 0.0046),
         (0.0065, 0.0046, 0.0187),
     )  # J, kg m^2
-    arm: float = 0.216  # l, m
-    rotor_torque: float = 1.6e-2  # k_r, m: yaw torque per newton of thrust
-    rotational_drag: float = 1.0e-2  # k_a, N m s/rad, on the yaw rate
-    rotor_time_constant: float = 0.10  # T_r, s
-    thrust_min: float = 0.1046  # N per rotor
-    thrust_max: float = 6.0  # N per rotor
-    hover_speed: float = 5000.0  # rpm at which the rotors carry the weight
+    arm: Meters = 0.216  # l
+    rotor_torque: Positive = 1.6e-2  # k_r, m: yaw torque per newton of thrust
+    rotational_drag: NonNegative = 1.0e-2  # k_a, N m s/rad, on the yaw rate
+    rotor_time_constant: Seconds = 0.10  # T_r
+    thrust_min: NonNegative = 0.1046  # N per rotor
+    thrust_max: Positive = 6.0  # N per rotor
+    hover_speed: Positive = 5000.0  # rpm at which the rotors carry the weight
 
     def __post_init__(self) -> None:
-        if not self.mass > 0:
-            raise InputError("airframe.mass", "a positive mass in kg", self.mass)
+        check_options(self, "airframe")
+        if not _is_inertia(*self.inertia):
+            raise InputError("airframe.inertia", "a symmetric, positive definite matrix in kg m^2", self.inertia)
         if not self.thrust_min < self.thrust_max:
             raise InputError("airframe.thrust_min", f"less than thrust_max {self.thrust_max}", self.thrust_min)
 
@@ -69,6 +73,14 @@ class Airframe:
         """F' = 2/T_r sqrt(F) (sqrt(b) u - sqrt(F)) for commanded rotor speeds u in rpm, (..., 4)."""
         root = F.clamp(min=torch.finfo(F.dtype).tiny).sqrt()  # the root of 0 has no derivative
         return 2.0 / self.rotor_time_constant * root * (math.sqrt(self.thrust_coefficient) * speed - root)
+
+
+def _is_inertia(a: Row, b: Row, c: Row) -> bool:
+    """Whether the matrix with these rows is symmetric and positive definite: its leading minors are above 0."""
+    minor = a[0] * b[1] - a[1] * b[0]
+    # By hand: a first use of PyTorch's linear algebra here would come before `import torchgco` has set it up.
+    whole = c[0] * (a[1] * b[2] - a[2] * b[1]) - c[1] * (a[0] * b[2] - a[2] * b[0]) + c[2] * minor
+    return (a[1], a[2], b[2]) == (b[0], c[0], c[1]) and min(a[0], minor, whole) > 0
 
 
 def _apply(A: Tensor, x: Tensor) -> Tensor:
@@ -101,13 +113,13 @@ class QuadrotorPlanning(Dynamics):
     q isn't renormalised, as in the paper's planner. The time constants may be tensors (B,).
 
     Raises:
-        InputError: non-positive dt, unknown integrator.
+        InputError: a field out of its range or of another kind.
     """
 
-    dt: float = 0.05
-    integrator: str = "euler"
-    rate_time_constant: float | Tensor = 1.5  # T_w, s
-    thrust_time_constant: float | Tensor = 1.5  # T_a, s
+    dt: Seconds = 0.05
+    integrator: Integrator = "euler"
+    rate_time_constant: Seconds | Tensor = 1.5  # T_w, s
+    thrust_time_constant: Seconds | Tensor = 1.5  # T_a, s
     gravity: float = GRAVITY
 
     n: ClassVar[int] = 14
@@ -117,7 +129,7 @@ class QuadrotorPlanning(Dynamics):
     per_element: ClassVar[tuple[str, ...]] = ("rate_time_constant", "thrust_time_constant")
 
     def __post_init__(self) -> None:
-        check_model(self, "quadrotor")
+        check_options(self, "quadrotor")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         states, controls = components(x), components(u)
@@ -135,11 +147,11 @@ class QuadrotorPlant(Dynamics):
     beyond a limit, the derivative of that thrust is zero.
 
     Raises:
-        InputError: non-positive dt, unknown integrator.
+        InputError: a field out of its range or of another kind.
     """
 
-    dt: float = 0.01
-    integrator: str = "rk4"
+    dt: Seconds = 0.01
+    integrator: Integrator = "rk4"
     airframe: Airframe = Airframe()
     gravity: float = GRAVITY
 
@@ -149,7 +161,7 @@ class QuadrotorPlant(Dynamics):
     position: ClassVar[slice] = slice(0, 3)
 
     def __post_init__(self) -> None:
-        check_model(self, "plant")
+        check_options(self, "plant")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
@@ -175,11 +187,11 @@ class RotorTracking(Dynamics):
     """Tracking model: x = [w (rad/s), F (N)], u = rotor speeds (rpm), n = 7, m = 4 (section 5.2, Table 5).
 
     Raises:
-        InputError: non-positive dt, unknown integrator.
+        InputError: a field out of its range or of another kind.
     """
 
-    dt: float = 0.01
-    integrator: str = "euler"
+    dt: Seconds = 0.01
+    integrator: Integrator = "euler"
     airframe: Airframe = Airframe()
 
     n: ClassVar[int] = 7
@@ -187,7 +199,7 @@ class RotorTracking(Dynamics):
     reads_fields_alone: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        check_model(self, "rotors")
+        check_options(self, "rotors")
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         w, F = x[..., :3], x[..., 3:]

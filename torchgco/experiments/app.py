@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
 from torchgco.errors import InputError
-from torchgco.experiments.build import as_input_error, compose_config, config_dir
+from torchgco.experiments.build import as_input_error, compose_config, config_dir, group_error
 from torchgco.experiments.files import write
 from torchgco.experiments.identity import decisive, digest, plain, settings_of
 
@@ -91,6 +91,12 @@ def main() -> int:
         _run()
     except (HydraException, OmegaConfBaseException) as error:
         print(f"torchgco: {as_input_error(error)}", file=sys.stderr)
+        return 2
+    except ValueError as error:
+        refused = group_error(error)
+        if refused is None:
+            raise
+        print(f"torchgco: {refused}", file=sys.stderr)
         return 2
     except OSError as error:  # Hydra can't make the study's folder; the study's own files raise InputError
         print(f"torchgco: {InputError('hydra.run.dir', 'a folder that can be made', error)}", file=sys.stderr)

@@ -20,6 +20,7 @@ import torchgco
 from torchgco.errors import InputError
 from torchgco.experiments.preset_nodes import register
 from torchgco.kernels import use_native
+from torchgco.options import check_value
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 from torchgco.simulation import Mission
 
@@ -71,8 +72,9 @@ def compose(overrides: Sequence[str] = ()) -> Setup:
     """The objects that `torchgco` would use with these command-line overrides.
 
     Raises:
-        InputError: unknown key or group, or a value that a part refuses.
+        InputError: unknown key or group, or a value that a part refuses; overrides that aren't a list of texts.
     """
+    check_value(overrides, Sequence[str], "overrides")
     return build(compose_config(overrides))
 
 
@@ -86,6 +88,8 @@ def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> 
             return hydra.compose("config", [*overrides, *extra])
     except (HydraException, OmegaConfBaseException) as error:
         raise as_input_error(error) from None
+    except ValueError as error:
+        raise group_error(error) or error from None
     finally:
         Singleton.set_state(running)
 
@@ -154,6 +158,8 @@ def solver_of(config: DictConfig) -> Any:
 
 
 def _instantiate(node: DictConfig, field: str, leave_out: str | None = None) -> Any:
+    if not isinstance(node, DictConfig):
+        raise InputError(field, "a part with its options", repr(node))
     try:
         # Containers become lists here: no part of the library knows OmegaConf.
         plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
@@ -162,6 +168,14 @@ def _instantiate(node: DictConfig, field: str, leave_out: str | None = None) -> 
         return hydra.utils.instantiate(parts, _convert_="all")
     except (InstantiationException, OmegaConfBaseException) as error:
         raise as_input_error(error, field) from None
+
+
+def group_error(error: ValueError) -> InputError | None:
+    """The InputError for a group of configs set to a number or null, which Hydra refuses by a ValueError; else None."""
+    message = str(error)
+    named = message.startswith("Config group override")
+    expected = "the name of a config for each group, such as model=planar"
+    return InputError("configuration", expected, message) if named else None
 
 
 def as_input_error(error: BaseException, field: str = "configuration") -> InputError:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from torchgco.constraints.bodies import Obstacles
 from torchgco.draws import DrawKey
-from torchgco.errors import InputError
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.native.dispatch import cost_unit
+from torchgco.options import AtLeast, Count, Positive, check_options
 from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem
 from torchgco.solvers.contracts import Advice
@@ -47,17 +48,14 @@ class GCO:
     """
 
     sampler: MPPI = MPPI()
-    initial_penalty: float = 20.0
-    penalty_growth: float = 4.84
+    initial_penalty: Positive = 20.0
+    penalty_growth: Annotated[float, AtLeast(1)] = 4.84
     start_from_sample: bool = False
     sample_from_rest: bool = False
-    single_contact_after: int | None = None
+    single_contact_after: Count | None = None
 
     def __post_init__(self) -> None:
-        if not self.initial_penalty > 0:
-            raise InputError("gco.initial_penalty", "above 0", self.initial_penalty)
-        if not self.penalty_growth >= 1:
-            raise InputError("gco.penalty_growth", "at least 1", self.penalty_growth)
+        check_options(self, "gco")
 
     def suited(self, problem: Problem) -> GCO | None:
         """This guidance where it can serve a problem; None where it can't, which a GuidanceWarning explains.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from torchgco.errors import InputError
 from torchgco.guidance.samples import Flight, Noise, average, draw, fly
 from torchgco.native.dispatch import open_loop, sampler_of
 from torchgco.native.sampler import Rounds
+from torchgco.options import Above, AtMost, Count, Natural, NonNegative, Positive, check_options
 from torchgco.problem import Problem
 from torchgco.shapes import check_shape, tensor
 
@@ -54,38 +55,24 @@ class MPPI:
         InputError: a field out of its range; on `check` and `improve`, a covariance that doesn't fit the controls.
     """
 
-    samples: int = 100
+    samples: Count = 100
     covariance: Any = 1.0
-    spread: float = 0.25
-    temperature: float = 1.0
+    spread: Positive = 0.25
+    temperature: Positive = 1.0
     saturation: Literal["bounds", "symmetric"] | None = "bounds"
-    rounds: int = 1
-    noise_knots: int = 0
-    decay: float = 1.0
-    dwell_cost: float = 0.0
-    elite: int = 0
+    rounds: Count = 1
+    noise_knots: Natural = 0
+    decay: Annotated[float, Above(0), AtMost(1)] = 1.0
+    dwell_cost: NonNegative = 0.0
+    elite: Natural = 0
     dtype: Literal["float32", "float64"] | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("samples", 1), ("rounds", 1), ("noise_knots", 0), ("elite", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"mppi.{name}", f"at least {least}", getattr(self, name))
+        check_options(self, "mppi")
         if self.elite > self.samples:
             raise InputError("mppi.elite", f"at most the {self.samples} samples", self.elite)
         if self.noise_knots == 1:
             raise InputError("mppi.noise_knots", "0, or at least 2", self.noise_knots)
-        if not 0 < self.decay <= 1:
-            raise InputError("mppi.decay", "above 0, at most 1", self.decay)
-        if not self.spread > 0:
-            raise InputError("mppi.spread", "above 0", self.spread)
-        if not self.temperature > 0:
-            raise InputError("mppi.temperature", "above 0", self.temperature)
-        if not self.dwell_cost >= 0:
-            raise InputError("mppi.dwell_cost", "at least 0 horizons", self.dwell_cost)
-        if self.dtype not in ("float32", "float64", None):
-            raise InputError("mppi.dtype", "float32, float64 or null", repr(self.dtype))
-        if self.saturation not in ("bounds", "symmetric", None):
-            raise InputError("mppi.saturation", "bounds, symmetric or null", repr(self.saturation))
 
     def check(self, problem: Problem) -> None:
         """Raise InputError where the covariance doesn't fit the controls."""
@@ -187,8 +174,8 @@ class MPPI:
         sigma = tensor(self.covariance, "mppi.covariance", problem.x0)
         sigma = sigma.expand(problem.m) if sigma.dim() == 0 else sigma
         check_shape(sigma, (problem.m,), "mppi.covariance")
-        if not bool((sigma > 0).all()):
-            raise InputError("mppi.covariance", "variances above 0", sigma.tolist())
+        if not bool(((sigma > 0) & torch.isfinite(sigma)).all()):
+            raise InputError("mppi.covariance", "finite variances above 0", sigma.tolist())
         return sigma.view(1, 1, -1)
 
     def _from_bounds(self, problem: Problem) -> Tensor:

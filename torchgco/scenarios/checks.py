@@ -19,10 +19,7 @@ from torchgco.errors import InputError
 
 def number(value: Any, field: str, above: float = -math.inf, at_least: float = -math.inf) -> float:
     """`value` as a finite float that is > `above` and >= `at_least`."""
-    try:
-        plain = float(value)
-    except (TypeError, ValueError):
-        plain = math.nan
+    plain = _plain(value)
     if not (math.isfinite(plain) and plain > above and plain >= at_least):
         limit = f" > {above:g}" if above > -math.inf else f" >= {at_least:g}" if at_least > -math.inf else ""
         raise InputError(field, f"a finite number{limit}", repr(value))
@@ -36,13 +33,18 @@ def optional_number(value: Any, field: str, **limits: float) -> float | None:
 
 def integer(value: Any, field: str, at_least: int) -> int:
     """`value` as an int >= `at_least`; 5.0 is one, 5.5 is not."""
-    try:
-        plain = float(value)
-    except (TypeError, ValueError):
-        plain = math.nan
+    plain = _plain(value)
     if not (plain >= at_least and plain.is_integer()):
         raise InputError(field, f"an integer >= {at_least}", repr(value))
     return int(value)
+
+
+def _plain(value: Any) -> float:
+    """A number, also in an array without axes, as a float; NaN for all else, such as text and booleans."""
+    try:
+        return float(value) if np.asarray(value).dtype.kind in "iuf" else math.nan
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return math.nan
 
 
 def vector(value: Any, field: str, length: int | None = None) -> tuple[float, ...]:
@@ -86,7 +88,7 @@ def array(value: Any, field: str) -> np.ndarray:
         if np.asarray(value).dtype.kind not in "iuf":
             raise TypeError
         return np.array(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RuntimeError):
         got = f"dtype {value.dtype}" if isinstance(value, np.ndarray) else repr(value)
         raise InputError(field, "an array of real numbers", got) from None
 
@@ -227,11 +229,15 @@ def best_cost(value: Any, count: int) -> np.ndarray | None:
 
 def ids(value: Any, count: int) -> np.ndarray:
     """Ids (L,) >= 0 as int64; None or an empty array stands for 0..L-1."""
-    given = np.asarray(() if value is None else value)
+    try:
+        given = np.asarray(() if value is None else value)
+    except ValueError:  # rows of unequal lengths
+        given = np.asarray(None)
     if given.size == 0:
         return np.arange(count)
     if given.shape != (count,) or not np.issubdtype(given.dtype, np.integer) or given.min() < 0:
-        got = f"{given.dtype} of shape {given.shape}, from {given.min()}"
+        numeric = given.dtype.kind in "iuf"
+        got = f"{given.dtype} of shape {given.shape}" + (f", from {given.min()}" if numeric else "")
         raise InputError("layouts.ids", f"integers >= 0 of shape ({count},)", got)
     return given.astype(np.int64)
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import os
 import uuid
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from torchgco.archive import read_arrays
 from torchgco.errors import InputError
+from torchgco.options import check_value
 from torchgco.scenarios import checks
 
 # Arrays of a file, in the order of the fields of Layouts. `layout` holds the ids, if they are not 0..L-1.
@@ -27,9 +27,6 @@ CONTROLS = ("control_lower", "control_upper")
 BOXES = ("box_centers", "box_half_sizes", "box_rotations", "box_radii")
 NAMED = (*REQUIRED, "velocities", *BOXES, "start", "goal", *SCALARS, *CONTROLS, "best_cost")
 IDS = "layout"
-
-# Raised by np.load for a file that is no npz, holds pickles or is damaged; an .npy file fails as a context manager.
-UNREADABLE = (OSError, EOFError, AttributeError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +95,7 @@ class Layouts:
         put("control_upper", upper)
         put("best_cost", checks.best_cost(self.best_cost, len(centers)))
         put("ids", checks.ids(self.ids, len(centers)))
+        check_value(self.name, str, "layouts.name")
 
     @property
     def count(self) -> int:
@@ -171,8 +169,8 @@ class Layouts:
         Raises InputError: `scenario.path` if there is no readable npz file, `layouts.<array>` if an array is
         missing, unknown or malformed.
         """
+        held = read_arrays(path, "scenario.path", "a layout file")
         path = Path(path)
-        held = _read(path)
         for name in REQUIRED:
             if name not in held:
                 raise InputError(f"layouts.{name}", f"this array in {path}", f"only {sorted(held)}")
@@ -190,6 +188,8 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
     Spheres rest in parts without velocities, and best_cost is NaN in parts without one. Raises InputError
     where the parts differ in what a batch shares: dimension, lengths of states, scalars, control bounds.
     """
+    if not isinstance(parts, Sequence) or not all(isinstance(part, Layouts) for part in parts):
+        raise InputError("layouts", "a list of Layouts", repr(parts))
     if not parts:
         raise InputError("layouts", "at least one part to concatenate", "none")
     _same("dimension", [part.dimension for part in parts])
@@ -251,15 +251,3 @@ def _same(name: str, values: list[Any]) -> Any:
         if (value is None) != (first is None) or not np.array_equal(value, first):
             raise InputError(f"layouts.{name}", "the same in all parts", f"{first} and {value}")
     return first
-
-
-def _read(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz file."""
-    try:
-        with np.load(path, allow_pickle=False) as held:
-            return {name: held[name] for name in held.files}
-    except FileNotFoundError:
-        raise InputError("scenario.path", "a layout file (.npz)", f"{path}, which isn't there") from None
-    except UNREADABLE as error:
-        got = f"{path} ({error})"
-        raise InputError("scenario.path", "a readable npz file without pickles", got) from None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -16,8 +17,13 @@ from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.base import Dynamics
 from torchgco.errors import InputError
 from torchgco.goal import Goal
+from torchgco.options import AtLeast, Count, Extended, Meters, check_options
 from torchgco.problem import Problem
 from torchgco.scenarios.layouts import Layouts
+from torchgco.shapes import check_device
+
+STATES = ("state_weight", "terminal_weight", "start", "goal")  # fields with one number per state
+CONTROLS = ("control_weight", "control_reference", "control_lower", "control_upper")
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,8 @@ class Vehicle:
         stages: N.
 
     Raises:
-        InputError: on `task`: layouts of another dimension or with states of another length.
+        InputError: a field of another kind, length or out of its range; on `task`: layouts of another dimension or with
+            states of another length.
     """
 
     name: str
@@ -56,13 +63,21 @@ class Vehicle:
     control_weight: Sequence[float]
     terminal_weight: Sequence[float]
     control_reference: Sequence[float]
-    control_lower: Sequence[float]
-    control_upper: Sequence[float]
+    control_lower: Sequence[Extended]
+    control_upper: Sequence[Extended]
     start: Sequence[float]
     goal: Sequence[float]
-    radius: float
-    goal_radius: float
-    stages: int
+    radius: Annotated[float, AtLeast(0, "m")]
+    goal_radius: Meters
+    stages: Count
+
+    def __post_init__(self) -> None:
+        check_options(self, "vehicle")
+        n, m = self.dynamics.n, self.dynamics.m
+        for names, length in ((STATES, n), (CONTROLS, m)):
+            for name in names:
+                if len(getattr(self, name)) != length:
+                    raise InputError(f"vehicle.{name}", f"{length} numbers", repr(getattr(self, name)))
 
     @property
     def dimension(self) -> int:
@@ -71,7 +86,17 @@ class Vehicle:
         return 0 if position is None else position.stop - position.start
 
     def task(self, layouts: Layouts, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float64) -> Task:
-        """The planning problems of these layouts: quadratic cost to the goal, obstacles, control bounds (section 5)."""
+        """The planning problems of these layouts: quadratic cost to the goal, obstacles, control bounds (section 5).
+
+        Raises:
+            InputError: layouts that don't fit the vehicle, a device that isn't there, or another dtype than float64 and
+                float32.
+        """
+        if not isinstance(layouts, Layouts):
+            raise InputError("layouts", "Layouts", type(layouts).__name__)
+        if dtype not in (torch.float64, torch.float32):
+            raise InputError("dtype", "torch.float64 or torch.float32", repr(dtype))
+        device = check_device(device)
         if layouts.dimension != self.dimension:
             other = "quadrotor" if layouts.dimension == 3 else "planar"
             raise InputError("model", f"model={other} for the {layouts.dimension}-D {layouts.name}", self.name)

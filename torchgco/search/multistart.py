@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from torchgco.draws import DrawKey, standard_normal
 from torchgco.errors import InputError
+from torchgco.options import AtLeast, Count, check_options
 from torchgco.problem import Problem
 from torchgco.search.best import Best
 from torchgco.shapes import check_shape, tensor
@@ -40,17 +41,13 @@ class MultiStart(Solver):
     """
 
     local: AugmentedLagrangian = AugmentedLagrangian()
-    starts: int = 8
-    budget: int | None = None
+    starts: Count = 8
+    budget: Count | None = None
     covariance: Any = 1.0
-    noise_knots: int = 10
+    noise_knots: Annotated[int, AtLeast(2)] = 10
 
     def __post_init__(self) -> None:
-        for name, least in (("starts", 1), ("noise_knots", 2)):
-            if getattr(self, name) < least:
-                raise InputError(f"multistart.{name}", f"at least {least}", getattr(self, name))
-        if self.budget is not None and self.budget < 1:
-            raise InputError("multistart.budget", "at least 1, or null", self.budget)
+        check_options(self, "multistart")
 
     def in_slots(self, slots: int) -> MultiStart:
         """The same solver with at most `slots` problems at a time."""
@@ -86,6 +83,6 @@ class MultiStart(Solver):
         sigma = tensor(self.covariance, "multistart.covariance", problem.x0)
         sigma = sigma.expand(problem.m) if sigma.dim() == 0 else sigma
         check_shape(sigma, (problem.m,), "multistart.covariance")
-        if not bool((sigma > 0).all()):
-            raise InputError("multistart.covariance", "variances above 0", sigma.tolist())
+        if not bool(((sigma > 0) & torch.isfinite(sigma)).all()):
+            raise InputError("multistart.covariance", "finite variances above 0", sigma.tolist())
         return sigma

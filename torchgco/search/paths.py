@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +23,7 @@ from torch import Tensor
 from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import cost_unit
+from torchgco.options import AtLeast, Below, Count, Natural, Positive, check_options
 from torchgco.problem import Problem
 from torchgco.search import scene as seen
 from torchgco.search.candidates import PENALTY, Candidates, Watch, unwatched
@@ -86,44 +87,29 @@ class PathProposals:
     """
 
     roadmap: Roadmap = Roadmap()
-    num_paths: int = 1
+    num_paths: Count = 1
     initial_offsets: tuple[tuple[float, ...], ...] = ()
     depart: float = 0.0
     arrive: float | tuple[float, ...] = 0.9
-    smoothing: float = 0.08
-    tube: float | None = 0.05
-    stiffness: tuple[float, ...] = (20.0, 200.0)
-    track_iterations: int = 20
-    relax_iterations: int = 20
-    relax_top: int | None = None
-    refine_top: int = 1
-    max_penetration: float = 0.1
+    smoothing: Annotated[float, AtLeast(0), Below(1)] = 0.08
+    tube: Positive | None = 0.05
+    stiffness: tuple[Positive, ...] = (20.0, 200.0)
+    track_iterations: Count = 20
+    relax_iterations: Natural = 20
+    relax_top: Count | None = None
+    refine_top: Count = 1
+    max_penetration: Positive = 0.1
 
     def __post_init__(self) -> None:
+        check_options(self, "paths")
         for name in ("arrive", "stiffness", "initial_offsets"):  # lists of a configuration file equal tuples
-            if isinstance(value := getattr(self, name), Sequence) and not isinstance(value, str):
+            if isinstance(value := getattr(self, name), Sequence):
                 rows = (tuple(row) if isinstance(row, list) else row for row in value)
                 object.__setattr__(self, name, tuple(rows))
-        if not isinstance(self.roadmap, Roadmap):
-            raise InputError("paths.roadmap", "a Roadmap", self.roadmap)
         if not self.paces or not all(0 <= self.depart < arrive <= 1 for arrive in self.paces):
             raise InputError("paths.depart", f"at least 0 and below arrive, {self.arrive}", self.depart)
-        if not isinstance(self.initial_offsets, Sequence) or not all(
-            hasattr(o, "__len__") for o in self.initial_offsets
-        ):
-            raise InputError("paths.initial_offsets", "a list of offsets of the controls", self.initial_offsets)
-        if not 0 <= self.smoothing < 1:
-            raise InputError("paths.smoothing", "at least 0 and below 1", self.smoothing)
-        if self.tube is not None and not self.tube > 0:
-            raise InputError("paths.tube", "above 0, or null", self.tube)
-        if not self.max_penetration > 0:
-            raise InputError("paths.max_penetration", "above 0", self.max_penetration)
-        if not self.stiffness or not all(value > 0 for value in self.stiffness):
+        if not self.stiffness:
             raise InputError("paths.stiffness", "one or more numbers above 0", self.stiffness)
-        least = {"num_paths": 1, "relax_top": 1, "track_iterations": 1, "relax_iterations": 0, "refine_top": 1}
-        for name, lowest in least.items():
-            if getattr(self, name) is not None and getattr(self, name) < lowest:
-                raise InputError(f"paths.{name}", f"at least {lowest}", getattr(self, name))
 
     @property
     def paces(self) -> tuple[float, ...]:

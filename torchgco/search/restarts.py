@@ -24,6 +24,7 @@ from torchgco.guidance.detection import caught_knots
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.native.dispatch import cost_unit
+from torchgco.options import Count, check_options
 from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem
 from torchgco.search.best import Best
@@ -64,12 +65,11 @@ class Restarts(Solver):
     local: AugmentedLagrangian = AugmentedLagrangian()
     paths: PathProposals | None = PathProposals()
     sampling: GCO | None = GCO()
-    attempts: int = 4
+    attempts: Count = 4
     all_attempts: bool = False
 
     def __post_init__(self) -> None:
-        if self.attempts < 1:
-            raise InputError("solver.attempts", "at least 1", self.attempts)
+        check_options(self, "solver")
         if self.local.guidance is not None:
             raise InputError("solver.local.guidance", "null: attempts are guided by `sampling`", self.local.guidance)
 

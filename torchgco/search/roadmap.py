@@ -10,13 +10,14 @@ from __future__ import annotations
 from ctypes import CDLL
 from dataclasses import dataclass
 from functools import cache
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from torchgco.errors import InputError
 from torchgco.native import roadmap
 from torchgco.native.roadmap import Graph, NativeSearch
+from torchgco.options import AtLeast, Below, check_options
 from torchgco.search.geometry import Scene
 from torchgco.search.graph import Search
 
@@ -44,14 +45,11 @@ class Roadmap:
         InputError: a field out of its range.
     """
 
-    num_halton: int = 64
-    max_overlap: float = 0.0
+    num_halton: Annotated[int, AtLeast(HALTON_NEIGHBOURS)] = 64
+    max_overlap: Annotated[float, AtLeast(0), Below(1)] = 0.0
 
     def __post_init__(self) -> None:
-        if self.num_halton < HALTON_NEIGHBOURS:
-            raise InputError("roadmap.num_halton", f"at least {HALTON_NEIGHBOURS}", self.num_halton)
-        if not 0 <= self.max_overlap < 1:
-            raise InputError("roadmap.max_overlap", "at least 0 and below 1", self.max_overlap)
+        check_options(self, "roadmap")
 
     def paths(self, scene: Scene, count: int = 1) -> tuple[Tensor, Tensor]:
         """Different paths, the cheapest first; each further one avoids those before it unless that costs too much.

@@ -36,7 +36,6 @@ def suited_paths(paths: PathProposals | None, problem: Problem) -> tuple[PathPro
     rest = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))
     if scene_of(one, rest) is None:
         return paths, None
-    paths.starts(one, rest)  # raises for malformed offsets
     why = None if engine_of(problem) is not None else failure(_expand, problem, problem.x0.dtype)
     return (paths, None) if why is None else (None, f"no path can be followed ({why})")
 

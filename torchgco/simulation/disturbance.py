@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.errors import InputError
+from torchgco.options import NonNegative, Seconds, check_options
 
 NOISY = slice(0, 13)  # position, velocity, quaternion and body rates are measured with noise, thrusts without
 
@@ -29,20 +29,16 @@ class Disturbance:
         InputError: a field out of its range.
     """
 
-    wind: float = 0.0
-    gust: float = 0.0
-    gust_time: float = 1.0
-    position_noise: float = 0.0
-    velocity_noise: float = 0.0
-    attitude_noise: float = 0.0
-    rate_noise: float = 0.0
+    wind: NonNegative = 0.0
+    gust: NonNegative = 0.0
+    gust_time: Seconds = 1.0
+    position_noise: NonNegative = 0.0
+    velocity_noise: NonNegative = 0.0
+    attitude_noise: NonNegative = 0.0
+    rate_noise: NonNegative = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("wind", "gust", "position_noise", "velocity_noise", "attitude_noise", "rate_noise"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"disturbance.{name}", "at least 0", getattr(self, name))
-        if not self.gust_time > 0:
-            raise InputError("disturbance.gust_time", "above 0 s", self.gust_time)
+        check_options(self, "disturbance")
 
     def draw(self, seed: int, ids: Sequence[int], steps: int, period: float) -> tuple[Tensor, Tensor]:
         """Forces (B, steps, 3), N, and noise (B, steps, 13) of every control step."""

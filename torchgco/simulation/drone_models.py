@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchgco.dynamics.quadrotor import GRAVITY, Airframe
 from torchgco.errors import InputError
+from torchgco.options import Seconds, check_options
 from torchgco.simulation.plant import check_vehicle
 from torchgco.tree import PerElement
 
@@ -44,7 +45,7 @@ class DroneModelsPlant(PerElement):
     """
 
     airframe: Airframe = Airframe()
-    dt: float = 0.01
+    dt: Seconds = 0.01
     mass_error: float | Tensor = 0.0
     thrust_error: float | Tensor = 0.0
     drag: float | Tensor = 0.0
@@ -52,7 +53,8 @@ class DroneModelsPlant(PerElement):
     per_element: ClassVar[tuple[str, ...]] = ("mass_error", "thrust_error", "drag")
 
     def __post_init__(self) -> None:
-        check_vehicle(self.dt, self.mass_error, self.thrust_error, self.drag)
+        check_options(self, "plant")
+        check_vehicle(self.mass_error, self.thrust_error, self.drag)
         _dynamics()
 
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:

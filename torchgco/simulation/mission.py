@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -18,14 +19,16 @@ from torchgco.constraints.bodies import CONTACT_FACTOR
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.dynamics.base import Dynamics
 from torchgco.errors import InputError
+from torchgco.options import Meters, Seconds, Seed, Within, check_options, check_value
 from torchgco.outcome import FARTHEST
-from torchgco.problem import Problem
+from torchgco.problem import Problem, check_problem
 from torchgco.simulation.disturbance import Disturbance, measured
 from torchgco.simulation.horizon import check_model
 from torchgco.simulation.log import MissionLog
 from torchgco.simulation.planner import Plan, Planner
 from torchgco.simulation.plant import Plant, RotorPlant, hovering
 from torchgco.simulation.tracker import Reference, Tracker, Tracking
+from torchgco.solvers.contracts import check_ids
 from torchgco.tree import take
 
 SEED_STEP = 7_919  # between the seeds of two control steps
@@ -54,17 +57,12 @@ class Mission:
     tracker: Tracker = field(default_factory=Tracker)
     plant: Plant = field(default_factory=RotorPlant)
     disturbance: Disturbance = field(default_factory=Disturbance)
-    duration: float = 15.0
-    goal_radius: float | None = 0.5
-    latency: int = 0
+    duration: Seconds = 15.0
+    goal_radius: Meters | None = 0.5
+    latency: Annotated[int, Within(0, 1, "control periods")] = 0
 
     def __post_init__(self) -> None:
-        if not self.duration > 0:
-            raise InputError("mission.duration", "above 0 s", self.duration)
-        if self.goal_radius is not None and not self.goal_radius > 0:
-            raise InputError("mission.goal_radius", "above 0 m, or null", self.goal_radius)
-        if self.latency not in (0, 1):
-            raise InputError("mission.latency", "0 or 1 control periods", self.latency)
+        check_options(self, "mission")
         if self.plant.dt != self.tracker.dt:
             raise InputError("tracker.dt", f"the plant's {self.plant.dt} s", self.tracker.dt)
 
@@ -89,9 +87,14 @@ class Mission:
             seed, ids: the key of all random draws; ids (B,) int64, by default 0..B-1.
 
         Raises:
-            InputError: another model, no goal, another precision, obstacles other than spheres, or a control period
-                that isn't a multiple of the plant's time step.
+            InputError: another model, no goal, another precision, obstacles other than spheres, a control period that
+                isn't a multiple of the plant's time step, or an argument of another kind.
         """
+        check_problem(problem)
+        seed = check_value(seed, Seed, "seed")
+        check_value(report, Callable | None, "report")
+        if ids is not None:
+            check_ids(ids, problem)
         ids = torch.arange(problem.B) if ids is None else ids
         return _Flight(self, problem, seed, ids).run(report or (lambda step, flying: None))
 

@@ -13,10 +13,10 @@ from torchgco.constraints.base import Constraint
 from torchgco.constraints.bodies import Obstacles
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.errors import InputError
 from torchgco.evaluation import violation
 from torchgco.lagrangian import Multipliers, shifted
 from torchgco.native.dispatch import open_loop
+from torchgco.options import NonNegative, Positive, Seconds, Share, check_options
 from torchgco.problem import Problem
 from torchgco.simulation.horizon import Margin, acceleration, biased, check_model, first_step, planning_state
 from torchgco.solution import Solution
@@ -80,25 +80,15 @@ class Planner:
     solver: Solver
     airframe: Airframe = Airframe()
     multipliers: Literal["shifted", "reset"] = "shifted"
-    max_seconds: float | None = None
-    tolerance: float = 0.01
-    margin: float = 0.01
-    margin_growth: float = 0.0
+    max_seconds: Seconds | None = None
+    tolerance: Positive = 0.01
+    margin: NonNegative = 0.01
+    margin_growth: NonNegative = 0.0
     first_step: bool = True
-    estimation: float = 0.2
+    estimation: Share = 0.2
 
     def __post_init__(self) -> None:
-        if self.multipliers not in ("shifted", "reset"):
-            raise InputError("planner.multipliers", "shifted or reset", repr(self.multipliers))
-        if self.max_seconds is not None and not self.max_seconds > 0:
-            raise InputError("planner.max_seconds", "above 0 s, or null", self.max_seconds)
-        if not self.tolerance > 0:
-            raise InputError("planner.tolerance", "above 0", self.tolerance)
-        for name in ("margin", "margin_growth"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"planner.{name}", "at least 0", getattr(self, name))
-        if not 0 <= self.estimation <= 1:
-            raise InputError("planner.estimation", "between 0 and 1", self.estimation)
+        check_options(self, "planner")
 
     def problem(self, problem: Problem, x: Tensor) -> Problem:
         """The planning problems of a mission at its start, from those of an open-loop study and plants x (B, 17).

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, Self
+from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -12,9 +11,11 @@ from torch import Tensor
 from torchgco.dynamics.integrators import rk4
 from torchgco.dynamics.quadrotor import GRAVITY, Airframe, pose_rates, within_limits
 from torchgco.errors import InputError
+from torchgco.options import Seconds, check_options
 from torchgco.tree import PerElement, Rows
 
 
+@runtime_checkable
 class Plant(Protocol):
     """A simulated vehicle, B of them side by side: states x (B, 17) = [p (m), v (m/s), q, w (rad/s), F (N)]."""
 
@@ -47,7 +48,7 @@ class RotorPlant(PerElement):
     """
 
     airframe: Airframe = Airframe()
-    dt: float = 0.01
+    dt: Seconds = 0.01
     mass_error: float | Tensor = 0.0
     thrust_error: float | Tensor = 0.0
     drag: float | Tensor = 0.0
@@ -55,7 +56,8 @@ class RotorPlant(PerElement):
     per_element: ClassVar[tuple[str, ...]] = ("mass_error", "thrust_error", "drag")
 
     def __post_init__(self) -> None:
-        check_vehicle(self.dt, self.mass_error, self.thrust_error, self.drag)
+        check_options(self, "plant")
+        check_vehicle(self.mass_error, self.thrust_error, self.drag)
 
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """See `Plant`."""
@@ -72,19 +74,17 @@ class RotorPlant(PerElement):
         return torch.cat((pose, self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, speed)), dim=-1)
 
 
-def check_vehicle(dt: float, mass_error: float | Tensor, thrust_error: float | Tensor, drag: float | Tensor) -> None:
-    """Check the fields that plants have in common; see `RotorPlant`.
+def check_vehicle(mass_error: float | Tensor, thrust_error: float | Tensor, drag: float | Tensor) -> None:
+    """Check the ranges of the fields that plants have in common; see `RotorPlant`.
 
     Raises:
-        InputError: non-positive dt, a mass or thrust coefficient that isn't above 0, a negative drag, a parameter that
-            is neither a finite number nor (B,).
+        InputError: a mass or thrust coefficient that isn't above 0, a negative drag, a parameter that is neither a
+            finite number nor (B,).
     """
-    if not 0 < dt < math.inf:
-        raise InputError("plant.dt", "a positive time step in seconds", dt)
     shares = {"mass_error": mass_error, "thrust_error": thrust_error}
     for name, value in {**shares, "drag": drag}.items():
         values = torch.as_tensor(value)
-        if values.dim() > 1 or not bool(torch.isfinite(values).all()):
+        if values.is_complex() or values.dim() > 1 or not bool(torch.isfinite(values).all()):
             raise InputError(f"plant.{name}", "a finite number or a tensor (B,) of such", value)
         if name in shares and not bool((values > -1.0).all()):
             raise InputError(f"plant.{name}", "a share above -1", value)

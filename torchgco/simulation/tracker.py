@@ -12,9 +12,9 @@ from torchgco.constraints import StateBounds, ThrustSum
 from torchgco.costs import QuadraticCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.quadrotor import GRAVITY, Airframe, RotorTracking
-from torchgco.errors import InputError
 from torchgco.evaluation import violation
 from torchgco.lagrangian import Lagrangian, Multipliers, shifted, update
+from torchgco.options import Count, Positive, Seconds, check_options
 from torchgco.problem import Problem
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
 from torchgco.solvers.ilqr import ILQR, descend
@@ -78,16 +78,12 @@ class Tracker:
 
     airframe: Airframe = Airframe()
     inner: ILQR = ILQR(tolerance=1e-4, max_iterations=10)
-    penalty: float = 1e3
-    dt: float = 0.01
-    stages: int = 6
+    penalty: Positive = 1e3
+    dt: Seconds = 0.01
+    stages: Count = 6
 
     def __post_init__(self) -> None:
-        for name in ("penalty", "dt"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"tracker.{name}", "above 0", getattr(self, name))
-        if self.stages < 1:
-            raise InputError("tracker.stages", "at least 1", self.stages)
+        check_options(self, "tracker")
 
     def track(self, x: Tensor, reference: Reference, offset: float, before: Tracking | None = None) -> Tracking:
         """Commands for plants x (B, 17), `offset` s after the plan's first knot; `before` is the last result."""

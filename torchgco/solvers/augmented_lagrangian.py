@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from torchgco.errors import InputError
 from torchgco.evaluation import is_preferred, violation
 from torchgco.lagrangian import Lagrangian, Multipliers, update
 from torchgco.native.dispatch import open_loop, value
+from torchgco.options import Above, AtLeast, AtMost, Count, Positive, check_options
 from torchgco.penalties import Penalty
 from torchgco.problem import Problem
 from torchgco.solution import Solution
@@ -55,24 +57,15 @@ class AugmentedLagrangian(Solver):
 
     inner: ILQR = ILQR()
     guidance: Guidance | None = None
-    initial_penalty: float = 20.0
-    penalty_growth: float = 2.2
-    max_outer_iterations: int = 10
-    violation_tolerance: float = 1e-3
-    slots: int | None = None
+    initial_penalty: Annotated[float, Above(0), AtMost(PENALTY_MAX)] = 20.0
+    penalty_growth: Annotated[float, AtLeast(1)] = 2.2
+    max_outer_iterations: Count = 10
+    violation_tolerance: Positive = 1e-3
+    slots: Count | None = None
     record: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 < self.initial_penalty <= PENALTY_MAX:
-            raise InputError("solver.initial_penalty", f"above 0, at most {PENALTY_MAX:g}", self.initial_penalty)
-        if not self.penalty_growth >= 1:
-            raise InputError("solver.penalty_growth", "at least 1", self.penalty_growth)
-        if self.max_outer_iterations < 1:
-            raise InputError("solver.max_outer_iterations", "at least 1", self.max_outer_iterations)
-        if not self.violation_tolerance > 0:
-            raise InputError("solver.violation_tolerance", "above 0", self.violation_tolerance)
-        if self.slots is not None and self.slots < 1:
-            raise InputError("solver.slots", "at least 1, or null", self.slots)
+        check_options(self, "solver")
 
     def in_slots(self, slots: int) -> AugmentedLagrangian:
         """The same solver with at most `slots` problems at a time."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -14,8 +14,10 @@ from torchgco.draws import DrawKey
 from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import cost_unit
+from torchgco.options import Seconds, Seed, check_value
 from torchgco.penalties import GuideRegion
-from torchgco.problem import Problem
+from torchgco.problem import Problem, check_problem
+from torchgco.shapes import describe
 from torchgco.solution import Solution
 from torchgco.tree import Rows, take
 
@@ -66,18 +68,22 @@ class Call:
         """The call of `Solver.solve`.
 
         Raises:
-            InputError: U0, ids or warm don't fit the problem, or max_seconds isn't above 0.
+            InputError: U0, ids or warm don't fit the problem, or an argument is of another kind or out of its range.
         """
-        if max_seconds is not None and not max_seconds > 0:
-            raise InputError("max_seconds", "a time above 0 s, or None", max_seconds)
+        check_problem(problem)
+        seed = check_value(seed, Seed, "seed")
+        max_seconds = check_value(max_seconds, Seconds | None, "max_seconds")
+        check_value(callback, Callable | None, "callback")
         deadline = None if max_seconds is None else time.monotonic() + max_seconds
         problem.check_controls(U0)
         rows = torch.arange(problem.B, device=problem.x0.device)
         if ids is None:
             ids = rows
-        elif not isinstance(ids, Tensor) or tuple(ids.shape) != (problem.B,) or ids.dtype != torch.int64:
-            raise InputError("ids", f"an int64 tensor ({problem.B},)", getattr(ids, "shape", type(ids).__name__))
+        else:
+            check_ids(ids, problem)
         if warm is not None:
+            if not isinstance(warm, Multipliers):
+                raise InputError("warm", "Multipliers, such as those of a solution", type(warm).__name__)
             warm.check(problem)
         return cls(problem, U0, seed, ids, rows, torch.zeros_like(rows), warm, callback, deadline)
 
@@ -100,6 +106,13 @@ class Call:
         return replace(self, problem=self.problem.in_cost_units(), warm=warm), unit
 
 
+def check_ids(ids: Any, problem: Problem) -> None:
+    """Raise InputError unless ids is int64 (B,) on the problem's device."""
+    device = problem.x0.device
+    if not isinstance(ids, Tensor) or (ids.shape, ids.dtype, ids.device) != ((problem.B,), torch.int64, device):
+        raise InputError("ids", f"an int64 tensor ({problem.B},) on {device}", describe(ids))
+
+
 class Solver:
     """A solver for batches of problems. Its fields are its options; it keeps no state between calls."""
 
@@ -119,7 +132,7 @@ class Solver:
             problem: B problems.
             U0: initial controls (B, N, m).
             seed, ids: key the random draws, where a solver makes any: the result of a problem depends on (seed, id),
-                not on its place in the batch. ids is int64 (B,), by default 0..B-1.
+                not on its place in the batch. seed is at least 0; ids is int64 (B,), by default 0..B-1.
             warm: multipliers and penalties of an earlier solution, for solvers that use them.
             callback: called with the progress after every pass.
             max_seconds: the batched solvers check the time after every pass; once it is over, they return the best
@@ -153,6 +166,7 @@ class Advice:
     stop: Tensor | None = None  # (B',) bool: where the solve is to end, for another attempt
 
 
+@runtime_checkable
 class Guidance(Protocol):
     """Plug-in of the outer loop (Algorithm 4), called after every inner solve."""
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.errors import InputError
 from torchgco.evaluation import violation
 from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import engine_of, open_loop, terms_of, value
 from torchgco.native.engine import Options
+from torchgco.options import Count, NonNegative, check_options
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.lifted import LOST, diverges, lifted_search, native_lifted_search
@@ -53,15 +53,12 @@ class ILQR(Solver):
     """
 
     as_printed: bool = False
-    tolerance: float = 1e-6
-    max_iterations: int = 50
+    tolerance: NonNegative = 1e-6
+    max_iterations: Count = 50
     line_search: LineSearch = LineSearch()
 
     def __post_init__(self) -> None:
-        if not self.tolerance >= 0:
-            raise InputError("ilqr.tolerance", "at least 0", self.tolerance)
-        if self.max_iterations < 1:
-            raise InputError("ilqr.max_iterations", "at least 1", self.max_iterations)
+        check_options(self, "ilqr")
 
     def in_units(self, call: Call) -> tuple[Call, Tensor]:
         """The call in the units of cost that the solver works in, and these units (B,)."""

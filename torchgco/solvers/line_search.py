@@ -12,8 +12,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.errors import InputError
 from torchgco.lagrangian import Lagrangian
+from torchgco.options import Natural, check_options
 from torchgco.rollout import closed_loop
 from torchgco.solvers.riccati import BackwardPass
 
@@ -45,7 +45,7 @@ class LineSearch:
         InputError: a field out of its range.
     """
 
-    back: int | None = None
+    back: Natural | None = None
 
     shrink: ClassVar[float] = 0.5  # phi, factor from one step length to the next
     ratio_min: ClassVar[float] = 1e-4  # accepted range of the ratio
@@ -53,8 +53,7 @@ class LineSearch:
     smallest: ClassVar[float] = 1e-4  # no shorter step is tried, but for one as printed: the first below this
 
     def __post_init__(self) -> None:
-        if self.back is not None and self.back < 0:
-            raise InputError("line_search.back", "at least 0, or null", self.back)
+        check_options(self, "line_search")
 
     def ladder(self, accept_last: bool) -> list[float]:
         """1, phi, phi^2, ... down to `smallest`, and with `accept_last` the first one below."""

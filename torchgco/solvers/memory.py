@@ -6,10 +6,11 @@ import os
 
 import torch
 
-from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import engine_of
-from torchgco.problem import Problem
+from torchgco.options import Count, check_value
+from torchgco.problem import Problem, check_problem
+from torchgco.shapes import check_device
 
 CPU_LIMIT = 256  # a larger batch is no faster on a core: the overhead that problems share is negligible by then
 SHARE = 0.5  # of the free memory; the rest is the system's and other processes'
@@ -38,11 +39,11 @@ def plan_batch(problem: Problem, device: str | torch.device | None = None, proce
         processes: number of processes that share the device's memory.
 
     Raises:
-        InputError: fewer than one process.
+        InputError: fewer than one process, or a device that isn't there.
     """
-    if processes < 1:
-        raise InputError("processes", "at least 1", processes)
-    where = torch.device(device) if device is not None else problem.x0.device
+    check_problem(problem)
+    check_value(processes, Count, "processes")
+    where = problem.x0.device if device is None else check_device(device)
     free = torch.cuda.mem_get_info(where)[0] if where.type == "cuda" else _free_memory()
     fits = max(1, int(SHARE * free / processes) // element_bytes(problem))
     return fits if where.type == "cuda" else min(fits, CPU_LIMIT)

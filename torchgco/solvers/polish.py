@@ -16,7 +16,8 @@ from torch import Tensor
 from torchgco.errors import InputError
 from torchgco.evaluation import chord_clearance, violation
 from torchgco.lagrangian import Lagrangian, Multipliers
-from torchgco.problem import Problem
+from torchgco.options import Count, NonNegative, Positive, check_options
+from torchgco.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.active_set import multipliers, projected
 from torchgco.solvers.condensed import Condensed
@@ -56,21 +57,15 @@ class Polish:
         InputError: a field out of its range.
     """
 
-    iterations: int = 15
-    tolerance: float = 1e-8
-    stationarity: float = 1e-8
-    reach: float = 1e-2
-    cost_rise: float = 1e-2
+    iterations: Count = 15
+    tolerance: Positive = 1e-8
+    stationarity: Positive = 1e-8
+    reach: Positive = 1e-2
+    cost_rise: NonNegative = 1e-2
     curvature: bool = True
 
     def __post_init__(self) -> None:
-        if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
-            raise InputError("polish.iterations", "at least 1", repr(self.iterations))
-        for name in ("tolerance", "stationarity", "reach"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"polish.{name}", "above 0", getattr(self, name))
-        if not self.cost_rise >= 0:
-            raise InputError("polish.cost_rise", "at least 0", self.cost_rise)
+        check_options(self, "polish")
 
     def refine(self, problem: Problem, solution: Solution) -> Solution:
         """The solution with the problems that could be improved replaced: X, U, gains, multipliers, cost, violation.
@@ -84,6 +79,8 @@ class Polish:
             InputError: a problem that isn't float64, or a solution of other problems.
         """
         self.check(problem)
+        if not isinstance(solution, Solution):
+            raise InputError("solution", "a Solution", type(solution).__name__)
         problem.check_controls(solution.U, "solution.U")
         solution.multipliers.check(problem)
         result = copied(replace(solution, trace=None))
@@ -99,6 +96,7 @@ class Polish:
 
     def check(self, problem: Problem) -> None:
         """Raise InputError for a problem that isn't float64: its rounding exceeds any useful tolerance."""
+        check_problem(problem)
         if problem.x0.dtype != torch.float64:
             raise InputError("polish", "a problem in torch.float64", problem.x0.dtype)
 
