@@ -85,8 +85,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         cases, examples = run_tests(Path(folder), more)
     origin = provenance("cpu")
-    head = f"Run on {origin['date']} at commit {origin['commit']}, torch {origin['torch']}: {sum(cases.values()):,} cases"
-    head += f", {sum(examples.values()):,} random examples."
+    counts = f"{sum(cases.values()):,} cases, {sum(examples.values()):,} random examples"
+    head = f"Run on {origin['date']} at commit {origin['commit']}, torch {origin['torch']}: {counts}."
     text = "\n".join([head, "", *case_table(cases), "", *example_table(examples)])
     print(text)
     if options.write:

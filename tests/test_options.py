@@ -77,7 +77,8 @@ BAD = [
     ("count", 0, "a whole number of at least 1"), ("count", 1.0, "a whole number"), ("count", True, "a whole number"),
     ("count", "1", "a whole number"), ("count", None, "a whole number"), ("natural", -1, "of at least 0, or null"),
     ("rate", 0, "a number above 0"), ("rate", nan, "a number above 0"), ("rate", inf, "a number above 0"),
-    ("rate", True, "a number"), ("rate", torch.tensor(1.0), "a number"), ("rate", 1j, "a number"),
+    ("rate", True, "a number"), ("count", 10**30, "of 64 bits"), ("rate", 10**400, "of 64 bits"),
+    ("rate", torch.tensor(1.0), "a number"), ("rate", 1j, "a number"),
     ("share", 1.1, "between 0 and 1"), ("time", 0.0, "a number above 0 s"), ("open", 1, "of at least 0 m and below 1"),
     ("factor", 0, "above 0 and at most 2"), ("factor", 2.1, "at most 2"), ("bound", nan, "a number or infinity"),
     ("flag", 1, "true or false"), ("word", "c", "a or b, or null"), ("word", ["a"], "a or b"), ("text", 5, "text"),
@@ -87,7 +88,7 @@ BAD = [
     ("function", 5, "a function, or null"), ("table", 5, "of class Mapping, or null"),
 ]  # fmt: skip
 GOOD = [
-    ("count", 10**30), ("natural", 0), ("rate", 1), ("bound", -inf), ("word", None), ("row", [1, 2.5]), ("row", ()),
+    ("count", 2**62), ("natural", 0), ("rate", 1), ("bound", -inf), ("word", None), ("row", [1, 2.5]), ("row", ()),
     ("rows", [(1, 2), [3.0, 4.0]]), ("row", np.array([1.0, 2.0])), ("per_problem", torch.zeros(2)),
     ("function", len), ("table", {}), ("anything", object()), ("hidden", 5),
 ]  # fmt: skip
@@ -113,6 +114,11 @@ def test_a_value_that_fits_is_kept(name: str, value: object) -> None:
 def test_numbers_of_numpy_become_those_of_python(name: str, value: np.generic) -> None:
     held = getattr(Options(**{name: value}), name)
     assert held == value and type(held) is type(value.item())
+
+
+def test_a_long_integer_becomes_a_float_where_one_will_do() -> None:
+    held = Options(rate=10**24).rate
+    assert isinstance(held, float) and held == 1e24
 
 
 def test_numbers_of_numpy_keep_their_kind() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchgco.errors import InputError
+from torchgco.errors import InputError, shown
 from torchgco.presets import gco
 from torchgco.problem import Problem, check_problem
 from torchgco.solution import Solution
@@ -38,8 +38,8 @@ def solve(
     check_problem(problem)
     if warm is not None and not isinstance(warm, Solution):
         raise InputError("warm", "a Solution, or None", type(warm).__name__)
-    if solver is not None and (isinstance(solver, type) or not callable(getattr(solver, "solve", None))):
-        raise InputError("solver", "a solver, such as presets.gco(problem), or None", repr(solver))
+    if solver is not None and not isinstance(solver, Solver):
+        raise InputError("solver", "a solver, such as presets.gco(problem), or None", shown(solver))
     if U0 is None:
         U0 = warm.U if warm is not None else _at_rest(problem)
     if solver is None:

@@ -15,6 +15,7 @@ that can't be checked (`Any`, a name that isn't known at run time) admit everyth
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, reduce
@@ -61,6 +62,7 @@ def Within(low: float, high: float, unit: str = "") -> Limit:
     return Limit(f"between {low:g} and {high:g} {unit}".rstrip(), low=low, high=high)
 
 
+LONG = 2**63  # integers from here on don't fit into 64 bits
 UNBOUNDED = Limit("or infinity")  # admits infinity, but not NaN
 
 Natural = Annotated[int, AtLeast(0)]
@@ -103,10 +105,13 @@ def check_value(value: Any, kind: Any, field: str) -> Any:
 
 
 def _plain(value: Any, rule: Rule, field: str) -> Any:
-    """The Python value of a NumPy number; InputError for all else."""
+    """The Python value of a NumPy number, the float of a long integer where one will do; InputError for all else."""
     if isinstance(value, np.generic) and rule.fits(value.item()):
         return value.item()
-    raise InputError(field, rule.one, shown(value))
+    long = isinstance(value, int) and abs(value) >= LONG
+    if long and abs(value) < sys.float_info.max and rule.fits(float(value)):
+        return float(value)
+    raise InputError(field, f"{rule.one} of 64 bits" if long else rule.one, shown(value))
 
 
 @cache
@@ -201,16 +206,16 @@ def _row(kinds: Sequence[Any]) -> Rule | None:
 
 
 def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, int) and not isinstance(value, bool) and -LONG < value < LONG
 
 
 def _is_number(value: Any) -> bool:
     """Infinity included, NaN left out."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and value == value
+    return (isinstance(value, float) and value == value) or _is_whole(value)
 
 
 def _is_finite(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and -math.inf < value < math.inf
+    return (isinstance(value, float) and -math.inf < value < math.inf) or _is_whole(value)
 
 
 PLAIN: dict[Any, Rule] = {

@@ -224,7 +224,7 @@ BAD = {
     "negative post": (POST | dict(radii=[-1.0]), "capsules.radii: expected finite radii of at least 0 m, got -1.0"),
     "absent radius": (POST | dict(radii=[NAN]), "capsules.radii: expected NaN exactly where the obstacle is absent"),
     "vehicle": (POST | dict(vehicle_radius=-1.0), "capsules.vehicle_radius: expected a number of at least 0 m"),
-    "vehicles": (POST | dict(vehicle_radius=[0.1] * 3), "capsules.vehicle_radius: expected a number of at least 0 m"),
+    "vehicles": (POST | dict(vehicle_radius=[0.1] * 3), "capsules.vehicle_radius: expected a number, or 2 of them"),
     "knots": (POST | dict(knots=[99]), "capsules.knots: "),
 }
 

@@ -41,8 +41,10 @@ NUMBERS = st.one_of(
     st.integers(-3, 8), st.floats(-3, 3), st.sampled_from([0.0, np.nan, np.inf, -np.inf, 1e200, 1e-320, 10**24, -1])
 )
 OBJECTS = st.sampled_from(
-    [None, True, "abc", "", b"x", {}, {"a": 1}, (), [], [[]], [None], ["a"], [[1, 2], [3]], object(), int, len, Path("x"),
-     1j, slice(1, 3), range(3), {1, 2}, np.datetime64("2020-01-01"), WHOLE, Planar(dt=0.1)]
+    [
+        None, True, "abc", "", b"x", {}, {"a": 1}, (), [], [[]], [None], ["a"], [[1, 2], [3]], object(), int, len, 1j,
+        slice(1, 3), range(3), {1, 2}, np.datetime64("2020-01-01"), Path("x"), WHOLE, Planar(dt=0.1),
+    ]
 )  # fmt: skip
 SHAPES = arrays.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=6)
 DTYPES = st.sampled_from(
@@ -59,7 +61,8 @@ def tensors(draw: Any) -> torch.Tensor:
     return made
 
 
-ANY = st.one_of(NUMBERS, OBJECTS, tensors(), arrays.arrays(float, SHAPES, elements=st.floats(-3, 3)), st.lists(NUMBERS, max_size=6))
+ARRAYS = arrays.arrays(float, SHAPES, elements=st.floats(-3, 3))
+ANY = st.one_of(NUMBERS, OBJECTS, tensors(), ARRAYS, st.lists(NUMBERS, max_size=6))
 
 
 def problem(**given: Any) -> Any:
@@ -103,7 +106,8 @@ PARTS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "ControlBounds": (with_constraint(ControlBounds), {"lower": [-1.0, -1.0], "upper": [1.0, 1.0]}),
     "StateBounds": (with_constraint(StateBounds), {"lower": [-9.0] * 6, "upper": [9.0] * 6}),
     "FunctionConstraint": (
-        with_constraint(FunctionConstraint), {"function": first_state, "sense": "equality", "knots": [6], "of": "x", "geometric": False},
+        with_constraint(FunctionConstraint),
+        {"function": first_state, "sense": "equality", "knots": [6], "of": "x", "geometric": False},
     ),
     "QuadraticCost": (
         with_cost, {"Q": [1.0] * 6, "R": [0.1] * 2, "Qf": [5.0] * 6, "x_ref": [0.5] * 6, "u_ref": [0.0, 0.0]},
@@ -119,7 +123,10 @@ PARTS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         lambda **given: judge(**{"problem": WHOLE, "U": REST, "goal": [[0.5, 0.4]] * 2, "goal_radius": 0.1, **given}),
         {"U": REST, "goal": [[0.5, 0.4]] * 2, "goal_radius": 0.1},
     ),
-    "solve": (solve, {"U0": REST, "seed": 0, "ids": torch.arange(2), "warm": None, "callback": None, "max_seconds": 9.0}),
+    "solve": (
+        solve,
+        {"U0": REST, "seed": 0, "ids": torch.arange(2), "warm": None, "callback": None, "max_seconds": 9.0},
+    ),
     "torchgco.solve": (
         lambda **given: torchgco.solve(WHOLE, **{"solver": QUICK, **given}),
         {"U0": REST, "solver": QUICK, "ids": None, "seed": 0, "max_seconds": 9.0, "warm": None},
