@@ -20,7 +20,7 @@ from benchmarks.families import FAMILIES, Family
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
 from torchgco.experiments.statistics import summarise
-from torchgco.experiments.study import with_success
+from torchgco.experiments.success import with_success
 from torchgco.judge import SUCCESS_VIOLATION
 from torchgco.scenarios import Layouts
 
@@ -31,8 +31,8 @@ PAGES = {
     "drawn": "results/drawn.md",
 }  # below benchmarks/; a table is between the marks of its name
 HEAD = (
-    "family", "solver", "n", "feasible", "reached", "success", "violation <= 1e-3", "median cost", "iterations",
-    "seconds",
+    "family", "solver", "n", "feasible", "reached", "success", "violation <= 1e-3", "median cost", "median iterations",
+    "median seconds",
 )  # fmt: skip
 
 
@@ -104,7 +104,7 @@ def table(trials: pd.DataFrame) -> str:
         cells = [
             row["scenario"], f"`{row['solver']}`", row["n"], *rates,
             round(row["violation_ok"] * row["n"]), _number(row["cost_median_reached"], ",.0f"),
-            _number(row["iterations_mean"], ".0f"), _number(row["seconds_mean"], ".2f"),
+            _number(row["iterations_median"], ".0f"), _number(row["seconds_median"], ".2f"),
         ]  # fmt: skip
         lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
     return "\n".join(lines)

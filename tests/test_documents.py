@@ -23,6 +23,7 @@ from benchmarks.speed import __main__ as speed
 from torchgco import Problem
 from torchgco.certificate import CHORDS
 from torchgco.constraints import Constraint
+from torchgco.experiments import report
 from torchgco.experiments.build import compose_config
 from torchgco.judge import CLEARANCES
 from torchgco.native.compiler import find_compiler
@@ -85,7 +86,8 @@ def accept(command: str) -> None:
     if program == "torchgco":
         accept_overrides(words)
     elif program == "torchgco-report":
-        assert words and not words[0].startswith("-")
+        options = report._parser().parse_args(words)
+        assert options.folders or options.power
     elif program == "make":
         accept_make(words)
     elif program == "python":
@@ -221,6 +223,7 @@ def test_the_figures_of_the_algorithm_are_drawn(tmp_path: Path) -> None:
 
 
 def test_a_wrong_command_is_not_accepted() -> None:
-    for command in ("make quantity", "torchgco solver=none", "pip install torchgco", 'make quality ARGS="--solver"'):
+    wrong = ("make quantity", "torchgco solver=none", "pip install torchgco", 'make quality ARGS="--solver"')
+    for command in (*wrong, "torchgco-report --power 1", "torchgco-report --verify"):
         with pytest.raises((AssertionError, SystemExit, ValueError)):
             accept(command)

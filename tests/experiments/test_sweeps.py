@@ -14,9 +14,11 @@ from tests.experiments.commands import TINY
 from tests.trials import PLAIN, trials
 from torchgco.experiments.identity import Manifest, digest, layout_digests
 from torchgco.experiments.merge import merge
+from torchgco.experiments.paired import compare
 from torchgco.experiments.records import read_manifest
-from torchgco.experiments.report import compare, format_table, main
+from torchgco.experiments.report import main
 from torchgco.experiments.statistics import summarise
+from torchgco.experiments.tables import format_table
 from torchgco.scenarios import Layouts
 
 HIT, MISS = True, False

@@ -29,7 +29,8 @@ def colour(patch: Rectangle) -> str:
 
 
 def test_figures_need_no_pyplot() -> None:
-    modules = ("rates", "layouts", "distributions", "convergence", "style", "trajectory", "missions", "animation")
+    modules = ("rates", "sweeps", "layouts", "distributions", "convergence", "style", "trajectory", "missions")
+    modules += ("animation",)
     code = "import sys\n" + "".join(f"import torchgco.plotting.{name}\n" for name in modules)
     code += "sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -155,6 +155,11 @@ def _mission(setup: Setup) -> Mission | None:
 def solver_of(config: DictConfig) -> Any:
     """The solver alone."""
     return _instantiate(config.solver, "solver", leave_out="name")
+
+
+def vehicle_of(configuration: Mapping[str, Any]) -> Vehicle:
+    """The planning model of a study, from its resolved configuration in plain dicts."""
+    return _instantiate(OmegaConf.create(dict(configuration["model"]["vehicle"])), "model.vehicle")
 
 
 def _instantiate(node: DictConfig, field: str, leave_out: str | None = None) -> Any:

@@ -185,7 +185,8 @@ def _branches(tree: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
 def _normal(value: Any) -> Any:
     """Plain data in which equal numbers are equal in text: floats alone, no negative zero."""
     if isinstance(value, Mapping):
-        return {str(key): _normal(held) for key, held in value.items()}
+        # No call for text: a manifest has a digest per layout, thousands of them.
+        return {str(key): held if type(held) is str else _normal(held) for key, held in value.items()}
     if isinstance(value, np.ndarray):
         return _normal(value.tolist())
     if isinstance(value, list | tuple):

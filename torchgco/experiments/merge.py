@@ -8,26 +8,29 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from torchgco.errors import InputError
 from torchgco.experiments.identity import ARITHMETIC, digest, flat
 from torchgco.experiments.runs import MERGED, ROW, Run, find_runs
-from torchgco.experiments.statistics import PAIR, TASK, task_columns
+from torchgco.experiments.statistics import PAIR, TASK, grouped, task_columns
 from torchgco.experiments.success import judged, sound
-from torchgco.experiments.variants import UNKNOWN, labels, task_of_runs
+from torchgco.experiments.variants import labels, task_of_runs
 
 REPEATED = "repeated"  # in the attributes of a merged table: rows left out because another run has the same flight
 OLDER = "older"  # likewise: the folders of runs without digests
+UNFINISHED = "unfinished"  # likewise: for each study that isn't finished, "96 of 128 trials in FOLDER"
 DIGESTS = ("layout_digest", "settings_digest")
 # Columns in which runs of one flight may differ: they depend on timing, batching and the other solvers that flew.
 INCIDENTAL = {"seconds", "batch_size", "threads", "best_cost", "best_from", "success"}
-FOLDER, VARIANT, CONFIGURATION = "_folder", "_variant", "_configuration"
-OWN = [FOLDER, VARIANT, CONFIGURATION]
+# Columns of numbers while runs are merged: of the run, the solver's variant (-1: unknown), the layout.
+RUN, VARIANT, LAYOUT = "_run", "_variant", "_layout"
+OWN = [RUN, VARIANT]
 
 
 def merge(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
@@ -41,104 +44,135 @@ def merge(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
     - A flight that several runs hold counts once, as the first run has it.
     - Best costs are those of the merged table: success is judged again where layouts have no best cost in their file.
 
-    The table's `attrs` hold `merged_from`, the folders read, `repeated`, how many rows were left out, and `older`, the
-    folders of runs without digests. Of those, different results for one trial get the run's folder as label.
+    The table's `attrs` hold `merged_from`, the folders read, `repeated`, how many rows were left out, `older`, the
+    folders of runs without digests, and `unfinished`. Of older runs, different results for one trial get the run's
+    folder as label.
 
     Raises:
         InputError: a missing folder, folders without trials, a damaged file, and rows with different content for one
             flight.
     """
-    runs = find_runs(folders)
-    settings = {digest(held): held for run in runs for held in run.solvers.values()}
-    rows = pd.concat([_tagged(run, swept, settings) for run, swept in zip(runs, task_of_runs(runs), strict=True)])
-    rows = _named(_without_repetitions(rows.reset_index(drop=True)))
+    found = find_runs(folders)
+    unfinished = [run for run in found if run.planned is not None]
+    runs = [run for run in found if len(run.trials)]
+    if not runs:
+        raise InputError("folders", "studies with trials", f"{', '.join(map(_folder, found))}, which have none yet")
+    rows, variants = _tagged(runs)
+    rows = _named(_without_repetitions(rows, runs), runs, variants)
     merged = _sorted(_judged_together(rows)).drop(columns=OWN)
-    older = [run.folder.as_posix() for run in runs if _is_older(run.trials)]
-    found = [run.folder.as_posix() for run in runs]
-    merged.attrs = {MERGED: found, REPEATED: sum(len(run.trials) for run in runs) - len(merged), OLDER: older}
+    merged.attrs = {
+        MERGED: [_folder(run) for run in runs],
+        REPEATED: sum(len(run.trials) for run in runs) - len(merged),
+        OLDER: [_folder(run) for run in runs if _is_older(run.trials)],
+        UNFINISHED: [f"{len(run.trials)} of {run.planned} trials in {_folder(run)}" for run in unfinished],
+    }
     return merged
+
+
+def _folder(run: Run) -> str:
+    return run.folder.as_posix()
 
 
 def _is_older(trials: pd.DataFrame) -> bool:
     return not set(DIGESTS) <= set(trials.columns)
 
 
-def _tagged(run: Run, swept: pd.DataFrame, settings: Mapping[str, dict[str, Any]]) -> pd.DataFrame:
-    """The rows of a run with its swept variables, its folder, and the variants of its solvers.
+def _tagged(runs: Sequence[Run]) -> tuple[pd.DataFrame, list[str]]:
+    """The rows of all runs with swept variables and the columns OWN, and the variants that these number."""
+    swept = task_of_runs(runs)
+    tables = [
+        run.trials.assign(**{name: more[name].array for name in more.columns}, **{RUN: i})
+        for i, (run, more) in enumerate(zip(runs, swept, strict=True))
+    ]
+    rows = pd.concat(tables, ignore_index=True)
+    settings = {digest(held): held for run in runs for held in run.solvers.values()}
+    numbers: dict[str, int] = {}
+    code = np.full(len(rows), -1)
+    names = [RUN, "settings_digest", "device", "dtype", "version"]
+    if not all(_is_older(run.trials) for run in runs):
+        for place in grouped(rows, names):
+            number, *key = rows[names].iloc[place[0]].tolist()
+            if not _is_older(runs[number].trials):
+                code[place] = numbers.setdefault(_variant(runs[number], settings, *key), len(numbers))
+    return rows.assign(**{VARIANT: code}), list(numbers)
+
+
+def _variant(run: Run, settings: Mapping[str, dict[str, Any]], code: str, device: str, dtype: str, version: str) -> str:
+    """All that distinguishes a solver's results from those of its other variants, as JSON for `labels`.
 
     settings  of all solvers whose manifest was found, by digest
     """
-    rows = run.trials.assign(**{name: swept[name].array for name in swept.columns})
-    configuration = json.dumps(run.configuration, sort_keys=True, default=str) if run.configuration else ""
-    rows[FOLDER], rows[CONFIGURATION] = run.folder.as_posix(), configuration
-    if _is_older(rows):
-        return rows.assign(**{VARIANT: UNKNOWN})
     kernels = run.configuration.get("device", {}).get("kernels", "native")
-    names = ["settings_digest", "device", "dtype", "version"]
-    made = {}
-    for key in rows[names].drop_duplicates().itertuples(index=False, name=None):
-        code, device, dtype, version = key
-        arithmetic = zip(ARITHMETIC, (device, dtype, kernels), strict=True)
-        held = flat(settings.get(code, {"settings": code}))
-        held |= {f"device.{name}": value for name, value in arithmetic} | {"version": version}
-        made[key] = json.dumps(held, sort_keys=True, default=str)
-    return rows.assign(**{VARIANT: [made[key] for key in rows[names].itertuples(index=False, name=None)]})
+    held = flat(settings.get(code, {"settings": code}))
+    held |= {f"device.{name}": value for name, value in zip(ARITHMETIC, (device, dtype, kernels), strict=True)}
+    return json.dumps(held | {"version": version}, sort_keys=True, default=str)
 
 
-def _without_repetitions(rows: pd.DataFrame) -> pd.DataFrame:
+def _without_repetitions(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
     """Each flight once: as the first run has it, but one whose success is known before one whose isn't.
 
     Raises:
         InputError: two runs give one flight different content.
     """
-    if "success" in rows.columns:
-        rows = rows.loc[rows["success"].isna().sort_values(kind="stable").index]
-    content = [name for name in rows.columns if name not in INCIDENTAL | {FOLDER, CONFIGURATION}]
-    known = rows[rows[VARIANT] != UNKNOWN].drop_duplicates(content)
-    flight = [*dict.fromkeys([*task_columns(rows), *ROW]), VARIANT, *(n for n in DIGESTS if n in rows.columns)]
-    twice = known.duplicated(flight, keep=False)
-    if twice.any():
-        raise _dispute(known[twice], content)
-    older = rows[rows[VARIANT] == UNKNOWN].groupby([*task_columns(rows), "solver"], sort=False, dropna=False)
-    return pd.concat([known, *(_of_older_runs(group, content) for _, group in older)]).sort_index()
+    content = [name for name in rows.columns if name not in INCIDENTAL | {RUN}]
+    flight = [*dict.fromkeys([*task_columns(rows), *ROW]), VARIANT, *(n for n in DIGESTS[:1] if n in rows.columns)]
+    known = rows[VARIANT] >= 0
+    repeated = known & rows.duplicated(flight, keep=False)
+    twins = rows[repeated]
+    if len(twins):
+        twins = twins.loc[twins["success"].isna().sort_values(kind="stable").index].drop_duplicates(content)
+        disputed = twins.duplicated(flight, keep=False)
+        if disputed.any():
+            raise _dispute(twins[disputed], content, runs)
+    if known.all() and not len(twins):
+        return rows
+    older = rows[~known]
+    groups = [older.iloc[place] for place in grouped(older, [*task_columns(rows), "solver"])] if len(older) else []
+    once = [_of_older_runs(held, content, runs) for held in groups]
+    return pd.concat([rows[known & ~repeated], twins, *once]).sort_index()
 
 
-def _of_older_runs(group: pd.DataFrame, content: list[str]) -> pd.DataFrame:
+def _of_older_runs(group: pd.DataFrame, content: list[str], runs: Sequence[Run]) -> pd.DataFrame:
     """The rows of one solver on one task without repetitions; labelled by their folders where results differ."""
     rows = group.drop_duplicates(content)
     disputed = rows[rows.duplicated(ROW, keep=False)]
     if disputed.empty:
         return rows
+    texts = {i: json.dumps(runs[i].configuration, sort_keys=True, default=str) for i in group[RUN].unique()}
+    configuration = group[RUN].map(texts)
     # All rows get a label: under the bare name, a run's undisputed rows would look like the whole run.
-    rows = group.drop_duplicates([*content, CONFIGURATION])
-    same = rows[rows.duplicated([*ROW, CONFIGURATION], keep=False)]
-    if len(same) or (disputed[CONFIGURATION] == "").any():
-        raise _dispute(disputed if same.empty else same, content)
-    first = rows.groupby(CONFIGURATION)[FOLDER].transform("first")
-    return rows.assign(solver=rows["solver"] + " [" + first.map(_short(first.unique())) + "]")
+    rows = group.assign(_text=configuration).drop_duplicates([*content, "_text"])
+    same = rows[rows.duplicated([*ROW, "_text"], keep=False)]
+    if len(same) or not all(runs[i].configuration for i in disputed[RUN].unique()):
+        raise _dispute(disputed if same.empty else same, content, runs)
+    first = rows.groupby("_text")[RUN].transform("first")
+    return rows.drop(columns="_text").assign(solver=rows["solver"] + " [" + first.map(_short(first, runs)) + "]")
 
 
-def _named(rows: pd.DataFrame) -> pd.DataFrame:
+def _named(rows: pd.DataFrame, runs: Sequence[Run], variants: list[str]) -> pd.DataFrame:
     """The rows with a label after the name of each solver that flew in several variants."""
     names = rows["solver"].copy()
-    for _, group in rows.groupby(["model", "solver"], sort=False, dropna=False):
-        known, older = group[group[VARIANT] != UNKNOWN], group[group[VARIANT] == UNKNOWN]
-        found = labels(known[VARIANT].unique().tolist())
-        if len(found) > 1:
-            names[known.index] = known["solver"] + " [" + known[VARIANT].map(found) + "]"
-        if len(known) and len(older):
-            names[older.index] = older["solver"] + " [" + older[FOLDER].map(_short(rows[FOLDER].unique())) + "]"
+    for place in grouped(rows, ["model", "solver"]):
+        code = rows[VARIANT].iloc[place]
+        numbers = [number for number in code.unique() if number >= 0]
+        if len(numbers) > 1:
+            found = labels([variants[number] for number in numbers])
+            label = code[code >= 0].map({number: found[variants[number]] for number in numbers})
+            names[label.index] = names[label.index] + " [" + label + "]"
+        if numbers and (code < 0).any():
+            run = rows.loc[code.index[code < 0], RUN]
+            names[run.index] = names[run.index] + " [" + run.map(_short(rows[RUN], runs)) + "]"
     return rows.assign(solver=names)
 
 
-def _short(folders: Iterable[str]) -> dict[str, str]:
-    """A short name for each folder, without their common part."""
-    names = list(folders)
-    common = os.path.commonpath(names)
-    return {name: Path(name).name if name == common else os.path.relpath(name, common) for name in names}
+def _short(numbers: pd.Series, runs: Sequence[Run]) -> dict[int, str]:
+    """A short name for the folder of each run, without their common part."""
+    folders = {number: _folder(runs[number]) for number in numbers.unique()}
+    common = os.path.commonpath(list(folders.values()))
+    return {i: Path(name).name if name == common else os.path.relpath(name, common) for i, name in folders.items()}
 
 
-def _dispute(rows: pd.DataFrame, content: list[str]) -> InputError:
+def _dispute(rows: pd.DataFrame, content: list[str], runs: Sequence[Run]) -> InputError:
     """The error for rows of one name and different content, naming the first."""
     first = rows.iloc[0]
     twins = rows[(rows[ROW] == first[ROW]).all(axis=1)]
@@ -147,7 +181,8 @@ def _dispute(rows: pd.DataFrame, content: list[str]) -> InputError:
     return InputError(
         "folders",
         "one result per trial, or runs whose configurations are known to differ",
-        f"two that differ in {', '.join(columns)} for {where}: {' and '.join(twins[FOLDER].iloc[:2])}",
+        f"two that differ in {', '.join(columns)} for {where}: "
+        f"{' and '.join(_folder(runs[number]) for number in twins[RUN].iloc[:2])}",
     )
 
 
@@ -155,26 +190,34 @@ def _judged_together(rows: pd.DataFrame) -> pd.DataFrame:
     """The rows with success against one best cost per layout: its file's, else the best of all solvers that flew it."""
     if "best_from" not in rows.columns:
         return rows
-    new = rows[rows["layout_digest"].notna() & rows["settings_digest"].notna()]
+    new = rows[rows[VARIANT] >= 0]
     layout = [*task_columns(rows), *PAIR[len(TASK) :], "layout_digest"]
-    best = new["best_cost"].where(new["best_from"] == "file").astype(float)
-    groups = new.assign(_best=best).groupby(layout, sort=False, dropna=False)
-    rivals = groups["solver"].transform("nunique") > 1
-    again = judged(new.assign(sound=sound(new)), groups["_best"].transform("min"), rivals, layout)
-    old = rows[~rows.index.isin(new.index)]
-    return pd.concat([again[rows.columns], old]).sort_index() if len(old) else again[rows.columns]
+    groups = pd.DataFrame(
+        {
+            LAYOUT: new.groupby(layout, sort=False, dropna=False).ngroup(),
+            "best": new["best_cost"].where(new["best_from"] == "file").astype(float),
+            "solver": pd.factorize(new["solver"])[0],
+        }
+    ).groupby(LAYOUT)
+    rivals = groups["solver"].transform("min") < groups["solver"].transform("max")
+    narrow = new[["cost"]].assign(sound=sound(new), **{LAYOUT: groups.obj[LAYOUT]})
+    again = judged(narrow, groups["best"].transform("min"), rivals, [LAYOUT])
+    names = ["best_cost", "success", "best_from"]
+    if len(new) < len(rows):
+        again = pd.concat([again[names], rows.loc[rows[VARIANT] < 0, names]]).sort_index()
+    return rows.assign(**{name: again[name] for name in names})
 
 
 def _sorted(rows: pd.DataFrame) -> pd.DataFrame:
     """By task and swept variables; solvers that are no baseline first, as a study has its own solver first."""
-    firsts = rows.groupby(FOLDER, sort=False)["solver"].transform("first")
-    baselines = set(rows.loc[rows["solver"] != firsts, "solver"])
-    rank = {name: i for i, name in enumerate(rows["solver"].unique())}
+    solver = pd.factorize(rows["solver"])[0]
+    firsts = pd.Series(solver, index=rows.index).groupby(rows[RUN], sort=False).transform("first")
+    baselines = np.unique(solver[solver != firsts])
     keys = pd.DataFrame(index=rows.index)
     for name in TASK:
         keys[name] = pd.factorize(rows[name])[0]
     for name in task_columns(rows)[len(TASK) :]:
         keys[name] = rows[name].rank(method="dense", na_option="bottom")
-    keys["baseline"] = rows["solver"].isin(baselines)
-    keys["solver"] = rows["solver"].map(rank)
+    keys["baseline"] = np.isin(solver, baselines)
+    keys["solver"] = solver
     return rows.loc[keys.sort_values(list(keys.columns), kind="stable").index].reset_index(drop=True)

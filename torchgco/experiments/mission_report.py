@@ -13,10 +13,11 @@ from torchgco.constraints.bodies import CONTACT_FACTOR
 from torchgco.experiments.build import Setup
 from torchgco.experiments.files import write
 from torchgco.experiments.mission_flight import FEW
+from torchgco.experiments.paired import compare
 from torchgco.experiments.records import LAYOUTS, MISSION, TRIALS
-from torchgco.experiments.report import aligned, compare, format_table
 from torchgco.experiments.runs import read_trials
 from torchgco.experiments.statistics import summarise, wilson
+from torchgco.experiments.tables import aligned, paired_lines
 from torchgco.flights import clearances, mission_frame, spheres_of, unpacked
 from torchgco.outcome import Outcome
 from torchgco.plotting import missions as draw
@@ -57,7 +58,7 @@ def write_mission_report(folder: Path, setup: Setup) -> str:
     blocks = [outcome_table(trials), effort_table(trials)]
     paired = compare(trials)
     if len(paired):
-        blocks.append(format_table(summary, paired).split("\n\n")[-1])
+        blocks.append(paired_lines(paired))
     if trials["layout"].nunique() <= FEW:
         blocks = [mission_lines(trials), *blocks[2:]]
     write_figures(folder, trials, pd.read_parquet(folder / MISSION), setup)

@@ -139,6 +139,8 @@ class Records:
             InputError: a shard is damaged or isn't of this study.
         """
         held = [self._read(path, solver) for path in self._shards(solver)]
+        if not held:
+            return pd.DataFrame(columns=[name for name in COLUMNS if name not in JUDGED]), np.empty((0, 0, 0))
         rows = pd.concat([rows for rows, _ in held], ignore_index=True)
         place = {number: i for i, number in enumerate(self.manifest.layouts)}
         order = rows["layout"].map(place).drop_duplicates().sort_values().index

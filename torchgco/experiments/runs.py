@@ -1,4 +1,4 @@
-"""The finished runs below some folders, as `torchgco-report` finds them."""
+"""The runs below some folders, finished or not, as `torchgco-report` finds them."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ from yaml import YAMLError
 
 from torchgco.errors import InputError
 from torchgco.experiments.files import checksum, damaged
-from torchgco.experiments.records import DONE, MANIFEST, TRIALS, read_checksums, read_manifest
+from torchgco.experiments.identity import Manifest
+from torchgco.experiments.records import COLUMNS, DONE, MANIFEST, TRIALS, Records, read_checksums, read_manifest
 from torchgco.experiments.statistics import PAIR
+from torchgco.experiments.success import with_success
+from torchgco.scenarios import Layouts
 
 MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
 ROW = [*PAIR, "solver"]
@@ -29,27 +32,31 @@ class Run:
 
     configuration  of the study, from its study.json, else from `.hydra/`; empty where there is neither
     solvers        resolved settings by name; empty for a run of an older version
+    planned        trials of the whole study where it isn't finished; None where it is
     """
 
     folder: Path
     trials: pd.DataFrame
     configuration: dict[str, Any]
     solvers: dict[str, Any]
+    planned: int | None = None
 
 
 def find_runs(folders: Iterable[str | os.PathLike[str]]) -> list[Run]:
     """The runs in and below `folders`, each once, in the order of the folders and by name below each.
 
-    Tables that a merge wrote are passed over below a folder, and read where the folder itself is given.
+    Tables that a merge wrote are passed over below a folder, and read where the folder itself is given. The trials of
+    an unfinished study come from its shards; their success is provisional.
 
     Raises:
         InputError: a missing folder, folders without trials, a damaged file.
     """
     given = [Path(folder) for folder in folders]
-    tables = {path.resolve(): (path.parent, trials) for path, trials in _tables(given)}
-    if not tables:
+    places = {place.resolve(): (place, place in given) for place in _places(given)}
+    runs = [run for place, is_given in places.values() if (run := _run(place, is_given)) is not None]
+    if not runs:
         raise InputError("folders", f"a {TRIALS} in or below them", ", ".join(map(str, given)) or "no folder")
-    return [Run(folder, trials, *_origin(folder)) for folder, trials in tables.values()]
+    return runs
 
 
 def read_trials(path: str | os.PathLike[str]) -> pd.DataFrame:
@@ -63,7 +70,7 @@ def read_trials(path: str | os.PathLike[str]) -> pd.DataFrame:
     if sums and Path(path).is_file() and checksum(Path(path)) not in sums:
         raise damaged(Path(path), "isn't as the study wrote it")
     try:
-        trials = pd.read_parquet(path)
+        trials = pd.read_parquet(path, use_threads=False)  # most tables are small: threads cost more than they save
     except Exception as error:  # damaged bytes make the reader raise nearly anything
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError("trials", "a readable parquet file", f"{path} ({reason})") from None
@@ -78,14 +85,35 @@ def is_merged(trials: pd.DataFrame) -> bool:
     return MERGED in trials.attrs
 
 
-def _tables(folders: list[Path]) -> Iterator[tuple[Path, pd.DataFrame]]:
+def _places(folders: list[Path]) -> Iterator[Path]:
     for folder in folders:
         if not folder.is_dir():
             raise InputError("folders", "an existing folder", folder)
-        for path in sorted(folder.rglob(TRIALS)):
-            trials = read_trials(path)
-            if path.parent == folder or not is_merged(trials):
-                yield path, trials
+        yield from sorted({path.parent for name in (TRIALS, MANIFEST) for path in folder.rglob(name)})
+
+
+def _run(folder: Path, given: bool) -> Run | None:
+    """The run in a folder; None for a table that a merge wrote, unless the folder itself was given."""
+    if (folder / TRIALS).is_file():
+        trials = read_trials(folder / TRIALS)
+        return Run(folder, trials, *_origin(folder)) if given or not is_merged(trials) else None
+    manifest = read_manifest(folder / MANIFEST)
+    if manifest is None or (folder / DONE).is_file():
+        raise damaged(folder / TRIALS, "is missing")
+    records = Records(folder, manifest)
+    parts = [rows for name in manifest.solvers if len(rows := records.flown(name)[0])]
+    trials = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(COLUMNS))
+    if parts:
+        rivals = 1 if manifest.configuration.get("mission") is not None else len(parts)
+        trials = with_success(trials, _layouts(manifest), rivals)
+    planned = len(manifest.layouts) * len(manifest.solvers)
+    return Run(folder, trials, manifest.configuration, manifest.solvers, planned)
+
+
+def _layouts(manifest: Manifest) -> Layouts | None:
+    """The layouts of a study's file, for their best costs; None where they were drawn, or the file has moved."""
+    path = manifest.configuration["scenario"].get("path")
+    return Layouts.load(path) if path and Path(path).is_file() else None
 
 
 def _origin(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:

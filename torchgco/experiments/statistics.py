@@ -1,4 +1,4 @@
-"""Rates with their intervals, and paired comparisons, counted from a table of trials.
+"""Rates with their intervals, costs and effort, counted from a table of trials.
 
 A trial is one solver on one layout, a row of `trials.parquet`. Nothing is left out of a count silently: a trial
 whose start was invalid is a failure, an outcome that isn't defined is subtracted from a denominator that
@@ -7,8 +7,8 @@ is given with the rate, and a violation that isn't a number counts as infinite.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import nan
 
 import numpy as np
@@ -24,35 +24,9 @@ PAIR = [*TASK, "layout", "seed"]
 EFFORT = ["iterations", "outer_iterations", "guided", "seconds"]
 COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, "violation", "cost", *EFFORT]
 INVALID = Status.INVALID_START.name
+STATUS = "status_"  # prefix of the columns that count statuses
 VIOLATION_TOLERANCE = 1e-3  # metres for lengths, inputs in their units
 CONFIDENCE = 0.95
-
-
-@dataclass(frozen=True)
-class PairedResult:
-    """Two solvers on the same trials, counted by which of them attained the outcome.
-
-    n              trials in which both solvers flew and the outcome is defined for both
-    both, only_a, only_b, neither
-                   how many of the n trials were attained by both, by one only, by neither
-    difference     rate of a minus rate of b over the n trials, nan where n is 0
-    p_value        exact McNemar, two-sided: a fair coin for the trials that only one of the two attained
-    undefined      trials that both flew, left out because the outcome isn't defined
-    unmatched      trials that only one of the two flew
-    """
-
-    solver_a: str
-    solver_b: str
-    outcome: str
-    n: int
-    both: int
-    only_a: int
-    only_b: int
-    neither: int
-    difference: float
-    p_value: float
-    undefined: int
-    unmatched: int
 
 
 def task_columns(table: pd.DataFrame) -> list[str]:
@@ -61,6 +35,17 @@ def task_columns(table: pd.DataFrame) -> list[str]:
     The latter are named by their keys in the configuration, with a dot, which no column of a study has.
     """
     return [*TASK, *(str(name) for name in table.columns if "." in str(name))]
+
+
+def grouped(table: pd.DataFrame, names: Sequence[str]) -> list[np.ndarray]:
+    """Positions of the rows with the same values in some columns, NA being a value, in order of appearance.
+
+    Positions and not tables: on large tables the many small copies would take most of a report's time.
+    """
+    groups = table.groupby(list(names), sort=False, dropna=False, observed=True)
+    code = groups.ngroup().to_numpy()
+    order = np.argsort(code, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(code[order])) + 1)
 
 
 def summarise(trials: pd.DataFrame) -> pd.DataFrame:
@@ -73,54 +58,90 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
     violation_median    over all n, one that isn't a number counting as infinite
     cost_median_reached over the trials that reached the goal
     cost_median         over the cost_n trials whose cost is finite
-    iterations_mean, outer_iterations_median, guided_mean, seconds_mean
-                        over the trials with a valid start; nan if one of them lacks the number
+    cost_ratio_median, _p90
+                        cost divided by the best known cost, over the cost_ratio_n trials that reached the goal and
+                        have a positive best cost
+    <effort>_median, _p90
+                        iterations, outer_iterations, guided and seconds over the trials with a valid start; nan if
+                        one of them lacks the number
+    status_<NAME>       trials that ended with this status; missions: with this outcome
 
-    Raises InputError if `trials` is empty or lacks a column.
+    _p90 is the 90 % quantile, interpolated linearly. Raises InputError if `trials` is empty or lacks a column.
     """
-    _check(trials)
+    check(trials)
     names = [*task_columns(trials), "solver"]
-    groups = trials.groupby(names, sort=False, dropna=False)
-    return pd.DataFrame([_summary(group, names) for _, group in groups])
+    groups = grouped(trials, names)
+    values = _Values.of(trials, groups)
+    keys = trials[names].iloc[[rows[0] for rows in groups]].reset_index(drop=True)
+    return pd.concat([keys, pd.DataFrame([values.summary(rows) for rows in groups])], axis=1)
 
 
-def _summary(group: pd.DataFrame, names: list[str]) -> dict[str, object]:
-    valid = group[group["status"] != INVALID]
-    violation = np.nan_to_num(_numbers(group["violation"]), nan=np.inf, posinf=np.inf)
-    cost = _numbers(group["cost"])
-    reached = outcome_of(group, "reached").to_numpy(dtype=bool, na_value=False)
-    row: dict[str, object] = {name: group[name].iloc[0] for name in names}
-    row |= {
-        "n": len(group),
-        "seed": " ".join(str(seed) for seed in group["seed"].unique()),
-        "invalid": len(group) - len(valid),
-    }
-    for name in OUTCOMES:
-        row |= _rate(name, outcome_of(group, name))
-    return row | {
-        "violation_ok": float(np.mean(violation <= VIOLATION_TOLERANCE)),
-        "violation_median": float(np.median(violation)),
-        "cost_median_reached": _median(cost[reached]),
-        "cost_median": _median(cost[np.isfinite(cost)]),
-        "cost_n": int(np.isfinite(cost).sum()),
-        "iterations_mean": _mean(_numbers(valid["iterations"])),
-        "outer_iterations_median": _median(_numbers(valid["outer_iterations"])),
-        "guided_mean": _mean(_numbers(valid["guided"])),
-        "seconds_mean": _mean(_numbers(valid["seconds"])),
-    }
+@dataclass(frozen=True)
+class _Values:
+    """The columns of a table as arrays of numbers."""
+
+    seed: np.ndarray
+    invalid: np.ndarray
+    hits: dict[str, np.ndarray]
+    numbers: dict[str, np.ndarray]
+    status: np.ndarray  # index into `statuses`
+    statuses: list[str]
+
+    @classmethod
+    def of(cls, trials: pd.DataFrame, groups: Sequence[np.ndarray]) -> _Values:
+        numbers = {name: numbers_of(trials[name]) for name in ("violation", "cost", *EFFORT)}
+        numbers["violation"] = np.nan_to_num(numbers["violation"], nan=np.inf, posinf=np.inf)
+        best = numbers_of(trials["best_cost"]) if "best_cost" in trials.columns else np.full(len(trials), nan)
+        numbers["cost_ratio"] = numbers["cost"] / np.where(best > 0, best, nan)
+        status, statuses = pd.factorize(trials["status"])
+        hits = attained(trials, groups)
+        invalid = (trials["status"] == INVALID).to_numpy(dtype=bool)
+        return cls(trials["seed"].to_numpy(), invalid, hits, numbers, status, [str(name) for name in statuses])
+
+    def summary(self, rows: np.ndarray) -> dict[str, object]:
+        held = {name: values[rows] for name, values in self.numbers.items()}
+        valid, reached, cost = ~self.invalid[rows], self.hits["reached"][rows] == 1, held["cost"]
+        ratio = held["cost_ratio"][reached & np.isfinite(held["cost_ratio"])]
+        row: dict[str, object] = {
+            "n": len(rows),
+            "seed": " ".join(str(seed) for seed in pd.unique(self.seed[rows])),
+            "invalid": len(rows) - int(valid.sum()),
+        }
+        for name in OUTCOMES:
+            row |= _rate(name, self.hits[name][rows])
+        row |= {
+            "violation_ok": float(np.mean(held["violation"] <= VIOLATION_TOLERANCE)),
+            "violation_median": float(np.median(held["violation"])),
+            "cost_median_reached": _quantiles("", cost[reached])["_median"],
+            "cost_median": _quantiles("", cost[np.isfinite(cost)])["_median"],
+            "cost_n": int(np.isfinite(cost).sum()),
+            "cost_ratio_n": len(ratio),
+            **_quantiles("cost_ratio", ratio),
+        }
+        for name in EFFORT:
+            row |= _quantiles(name, held[name][valid])
+        counts = np.bincount(self.status[rows], minlength=len(self.statuses)).tolist()
+        return row | {f"{STATUS}{name}": count for name, count in zip(self.statuses, counts, strict=True)}
 
 
-def outcome_of(group: pd.DataFrame, name: str) -> pd.Series:
-    """Outcome `name` of one solver's trials as nullable booleans; an invalid start counts as a failure.
+def attained(trials: pd.DataFrame, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """Each outcome (rows,): 1 attained, 0 not, NaN where undefined; an invalid start counts as a failure.
 
-    Where no valid trial of the group defines the outcome (a success without any best cost), it stays
-    undefined for the invalid ones too: a rate of 0 would be read as a measurement.
+    groups  positions of the rows of each solver on each task, see `grouped`
+
+    Where no valid trial of a group defines success (there is no best cost), it stays undefined for the invalid ones
+    too: a rate of 0 would be read as a measurement.
     """
-    values = group[name].astype("boolean")
-    invalid = group["status"] == INVALID
-    if name == "success" and values[~invalid].isna().all():
-        return values.mask(invalid)
-    return values.mask(invalid, False)
+    invalid = (trials["status"] == INVALID).to_numpy(dtype=bool)
+    hits = {}
+    for name in OUTCOMES:
+        values = trials[name].astype("boolean").to_numpy(dtype=float, na_value=nan)
+        hits[name] = np.where(invalid, 0.0, values)
+    if invalid.any():
+        for rows in groups:
+            if np.isnan(hits["success"][rows][~invalid[rows]]).all():
+                hits["success"][rows] = nan
+    return hits
 
 
 def wilson(count: int, n: int) -> tuple[float, float]:
@@ -131,85 +152,8 @@ def wilson(count: int, n: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def paired(trials: pd.DataFrame, solver_a: str, solver_b: str, outcome: str = "reached") -> PairedResult:
-    """Compare two solvers on the trials both flew, matched by scenario, model, swept variables, layout and seed.
-
-    A layout is the same where its digest is, too, if the table has a column `layout_digest`.
-
-    Raises InputError for a column that is missing, a solver that isn't in `trials`, an unknown outcome, and a
-    solver that has two rows for one trial.
-    """
-    _check(trials)
-    if outcome not in OUTCOMES:
-        raise InputError("outcome", f"one of {', '.join(OUTCOMES)}", outcome)
-    a, b = (_by_trial(trials, solver, outcome) for solver in (solver_a, solver_b))
-    rows = a.merge(b, on=_pair(trials), how="outer", suffixes=("_a", "_b"), indicator="flown_by")
-    shared = rows[rows["flown_by"] == "both"]
-    defined = shared.dropna(subset=["hit_a", "hit_b"])
-    hit_a, hit_b = (defined[name].to_numpy(dtype=bool) for name in ("hit_a", "hit_b"))
-    only_a, only_b = int((hit_a & ~hit_b).sum()), int((hit_b & ~hit_a).sum())
-    n, discordant = len(defined), only_a + only_b
-    return PairedResult(
-        solver_a=solver_a,
-        solver_b=solver_b,
-        outcome=outcome,
-        n=n,
-        both=int((hit_a & hit_b).sum()),
-        only_a=only_a,
-        only_b=only_b,
-        neither=int((~hit_a & ~hit_b).sum()),
-        difference=(only_a - only_b) / n if n else nan,
-        p_value=float(binomtest(only_a, discordant).pvalue) if discordant else 1.0,
-        undefined=len(shared) - n,
-        unmatched=len(rows) - len(shared),
-    )
-
-
-def paired_table(trials: pd.DataFrame, solver: str) -> pd.DataFrame:
-    """`solver` against every other solver: a row per task (scenario, model, swept variables), other solver and outcome.
-
-    Columns: those of the task and the fields of PairedResult, `solver` being a. Tasks that `solver` didn't fly
-    and tasks that nobody else flew give no row. Raises InputError as `paired` does.
-    """
-    _check(trials)
-    if solver not in set(trials["solver"]):
-        raise InputError("solver", f"one of {', '.join(trials['solver'].unique())}", solver)
-    rows = list(_pairs(trials, solver))
-    names = [*task_columns(trials), *PairedResult.__dataclass_fields__]
-    return pd.DataFrame(rows, columns=names)
-
-
-def _pairs(trials: pd.DataFrame, solver: str) -> Iterator[dict[str, object]]:
-    names = task_columns(trials)
-    for values, task in trials.groupby(names, sort=False, dropna=False):
-        solvers = list(task["solver"].unique())
-        others = [other for other in solvers if other != solver] if solver in solvers else []
-        for other in others:
-            for name in OUTCOMES:
-                yield dict(zip(names, values, strict=True)) | asdict(paired(task, solver, other, name))
-
-
-def _pair(trials: pd.DataFrame) -> list[str]:
-    """Columns that identify a trial for any solver."""
-    digest = ["layout_digest"] if "layout_digest" in trials.columns else []
-    return [*task_columns(trials), *PAIR[len(TASK) :], *digest]
-
-
-def _by_trial(trials: pd.DataFrame, solver: str, outcome: str) -> pd.DataFrame:
-    """The columns that identify a trial, and `hit`, one solver's outcome there."""
-    group = trials[trials["solver"] == solver]
-    if group.empty:
-        raise InputError("solver", f"one of {', '.join(trials['solver'].unique())}", solver)
-    pair = _pair(trials)
-    repeated = group.loc[group.duplicated(pair), PAIR]
-    if len(repeated):
-        first = ", ".join(f"{name} {value}" for name, value in repeated.iloc[0].items())
-        raise InputError("trials", f"one row of {solver} for {first}", "two")
-    tasks = group.groupby(task_columns(trials), sort=False, dropna=False)
-    return group[pair].assign(hit=pd.concat([outcome_of(task, outcome) for _, task in tasks]))
-
-
-def _check(trials: pd.DataFrame) -> None:
+def check(trials: pd.DataFrame) -> None:
+    """Raise InputError where a table has no rows, or lacks a column of a study."""
     missing = [name for name in COLUMNS if name not in trials.columns]
     if missing:
         raise InputError("trials", "the columns of a study", f"a table without {', '.join(missing)}")
@@ -217,20 +161,18 @@ def _check(trials: pd.DataFrame) -> None:
         raise InputError("trials", "at least one row", "none")
 
 
-def _rate(name: str, values: pd.Series) -> dict[str, object]:
-    n, count = int(values.notna().sum()), int(values.sum())
+def numbers_of(column: pd.Series) -> np.ndarray:
+    """A column as floats, NaN where it has no value."""
+    return column.to_numpy(dtype=float, na_value=nan)
+
+
+def _rate(name: str, hits: np.ndarray) -> dict[str, object]:
+    n, count = int((~np.isnan(hits)).sum()), int(np.nansum(hits))
     low, high = wilson(count, n)
     parts = {"count": count, "n": n, "rate": count / n if n else nan, "low": low, "high": high}
     return {f"{name}_{part}": value for part, value in parts.items()}
 
 
-def _numbers(column: pd.Series) -> np.ndarray:
-    return column.to_numpy(dtype=float, na_value=nan)
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if values.size else nan
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(np.mean(values)) if values.size else nan
+def _quantiles(name: str, values: np.ndarray) -> dict[str, float]:
+    median, p90 = np.quantile(values, [0.5, 0.9]).tolist() if values.size else (nan, nan)
+    return {f"{name}_median": median, f"{name}_p90": p90}

@@ -21,9 +21,9 @@ from torchgco.experiments.flight import Bar, Flight, Flown, NoBar, Plan, fly, pl
 from torchgco.experiments.identity import Manifest, closed_loop, layout_digests, plain, settings_of
 from torchgco.experiments.mission_flight import FEW, MissionFlight
 from torchgco.experiments.mission_report import mission_table, write_mission_report
-from torchgco.experiments.records import COLUMNS, JUDGED, TRIALS, Records
+from torchgco.experiments.records import JUDGED, TRIALS, Records
 from torchgco.experiments.report import write_report
-from torchgco.experiments.success import judged, sound
+from torchgco.experiments.success import sound, with_success
 from torchgco.experiments.workers import run_all
 from torchgco.kernels import native
 from torchgco.rollout import open_loop
@@ -182,19 +182,6 @@ def _fly_side_by_side(
         keep=keep,
         say=lambda line: bar.write(line, sys.stderr),
     )
-
-
-def with_success(rows: pd.DataFrame, layouts: Layouts, solvers: int) -> pd.DataFrame:
-    """The rows of a study in its columns, with `best_cost` and `success`.
-
-    The best cost is the file's, else the best of the study where at least two solvers flew.
-    """
-    best = pd.Series(np.nan, index=rows.index)
-    if layouts.best_cost is not None:
-        best = rows["layout"].map(dict(zip(layouts.ids.tolist(), layouts.best_cost, strict=True))).astype(float)
-    rivals = pd.Series(solvers > 1, index=rows.index)
-    more = [name for name in rows.columns if name not in COLUMNS and name != "sound"]
-    return judged(rows, best, rivals, ["layout"]).reindex(columns=[*COLUMNS, *more])
 
 
 def _update_success(study: _Study, records: Records, show: Callable[[str], None]) -> None:

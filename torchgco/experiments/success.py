@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import pandas as pd
 
+from torchgco.experiments.records import COLUMNS
 from torchgco.judge import SUCCESS_COST, SUCCESS_VIOLATION
+from torchgco.scenarios import Layouts
 
 
 def sound(trials: pd.DataFrame) -> pd.Series:
@@ -32,3 +35,16 @@ def judged(rows: pd.DataFrame, best: pd.Series, rivals: pd.Series, layout: Seque
     source = pd.Series(None, index=rows.index, dtype=object).mask(rivals, "study").mask(best.notna(), "file")
     success = (is_sound & (rows["cost"] <= SUCCESS_COST * filled)).astype("boolean")
     return rows.assign(best_cost=filled, success=success.where(source.notna(), pd.NA), best_from=source)
+
+
+def with_success(rows: pd.DataFrame, layouts: Layouts | None, solvers: int) -> pd.DataFrame:
+    """The rows of a study in its columns, with `best_cost` and `success`.
+
+    The best cost is that of the layouts' file, else the best of the study where at least two solvers flew.
+    """
+    best = pd.Series(np.nan, index=rows.index)
+    if layouts is not None and layouts.best_cost is not None:
+        best = rows["layout"].map(dict(zip(layouts.ids.tolist(), layouts.best_cost, strict=True))).astype(float)
+    rivals = pd.Series(solvers > 1, index=rows.index)
+    more = [name for name in rows.columns if name not in COLUMNS and name != "sound"]
+    return judged(rows, best, rivals, ["layout"]).reindex(columns=[*COLUMNS, *more])

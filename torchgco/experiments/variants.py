@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from torchgco.experiments.identity import CLOSED_LOOP, flat
 from torchgco.experiments.runs import Run
 from torchgco.experiments.statistics import TASK
 
-UNKNOWN = ""  # variant of a solver in a run of an older version
 # Prefixes of keys that define the problems and missions; `model` has keys for solvers, too.
 SWEPT = ("scenario.", "model.vehicle.", "mission.", "plant.")
 NAMES = ("scenario.name", "scenario._target_", "model.vehicle.name", "model.vehicle._target_")  # have columns
@@ -32,33 +32,45 @@ def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
     chosen: dict[tuple[int, Any], dict[str, Any]] = {}
     for task in dict.fromkeys(task for found in tasks for task in found):
         members = [i for i, found in enumerate(tasks) if task in found]
-        cells = _swept([runs[i] for i in members], task)
+        tables = [_rows_of(runs[i].trials, task, len(tasks[i])) for i in members]
+        cells = _swept([runs[i] for i in members], tables)
         chosen |= {(i, task): held for i, held in zip(members, cells, strict=True)}
     columns = list(dict.fromkeys(key for held in chosen.values() for key in held))
     kinds = {key: _kind([held[key] for held in chosen.values() if key in held]) for key in columns}
     frames = []
-    for i, run in enumerate(runs):
-        of_row = [chosen[i, task] for task in run.trials[TASK].itertuples(index=False, name=None)]
+    for i, (run, found) in enumerate(zip(runs, tasks, strict=True)):
+        cells = [chosen[i, task] for task in found]
+        of_row = np.zeros(len(run.trials), dtype=int)
+        if len(found) > 1:
+            of_row = run.trials.groupby(TASK, sort=False, dropna=False).ngroup()  # numbers `found`
         held = {
-            key: pd.array([_cell(row.get(key), key in row, kinds[key]) for row in of_row], dtype=kinds[key])
+            key: pd.array([_cell(cell.get(key), key in cell, kinds[key]) for cell in cells], dtype=kinds[key])
             for key in columns
         }
-        frames.append(pd.DataFrame(held, index=run.trials.index))
+        frames.append(pd.DataFrame(held, index=range(len(cells))).take(of_row).set_axis(run.trials.index))
     return frames
 
 
-def _swept(runs: Sequence[Run], task: tuple[Any, ...]) -> list[dict[str, Any]]:
-    """The swept variables of each run that flew a task; none for a run whose configuration isn't known."""
+def _rows_of(trials: pd.DataFrame, task: tuple[Any, ...], tasks: int) -> pd.DataFrame:
+    """The rows of one of the tasks that a run flew; nearly always there is only one."""
+    return trials if tasks == 1 else trials[(trials[TASK] == list(task)).all(axis=1)]
+
+
+def _swept(runs: Sequence[Run], tables: Sequence[pd.DataFrame]) -> list[dict[str, Any]]:
+    """The swept variables of each run that flew a task; none for a run whose configuration isn't known.
+
+    tables  the trials of each run in that task
+    """
     given = [_keys(run) for run in runs]
     known = [keys for keys in given if keys]
     shared = [key for key in (known[0] if known else {}) if all(key in keys for keys in known)]
     swept = [key for key in shared if key != FILE and len({_text(keys[key]) for keys in known}) > 1]
     cells = [{key: keys[key] for key in swept if keys} for keys in given]
-    clusters = _clusters(runs, cells, task)
+    clusters = _clusters(runs, cells, tables)
     if FILE in shared and any(clusters):
         for cell, keys in zip(cells, given, strict=True):
             cell |= {FILE: keys[FILE]} if keys else {}
-        clusters = _clusters(runs, cells, task)
+        clusters = _clusters(runs, cells, tables)
     for cell, cluster in zip(cells, clusters, strict=True):
         cell |= {RUN: cluster} if cluster else {}
     return cells
@@ -70,15 +82,22 @@ def _keys(run: Run) -> dict[str, Any]:
     return {key: value for key, value in keys.items() if key.startswith(SWEPT) and key not in NAMES}
 
 
-def _clusters(runs: Sequence[Run], cells: Sequence[Mapping[str, Any]], task: tuple[Any, ...]) -> list[str | None]:
+def _clusters(
+    runs: Sequence[Run], cells: Sequence[Mapping[str, Any]], tables: Sequence[pd.DataFrame]
+) -> list[str | None]:
     """For each run the folder of the first run that flew the same layouts; None where all did.
 
     Runs whose swept values (`cells`) differ are not compared.
     """
     held: list[tuple[str, dict[Any, str], str]] = []  # folder, digest by (layout, seed), swept values
     place = []
-    for run, cell in zip(runs, cells, strict=True):
-        digests, values = _digests(run, task), _text(cell)
+    values_of = pd.factorize(np.array([_text(cell) for cell in cells], dtype=object))[0]
+    of_run = [_digests(table).assign(cell=code) for table, code in zip(tables, values_of, strict=True)]
+    layouts = [rows for rows in of_run if len(rows)]
+    if not layouts or not pd.concat(layouts).drop_duplicates().duplicated(["layout", "seed", "cell"]).any():
+        return [None] * len(runs)  # nearly always: nothing to distinguish
+    for run, rows, cell in zip(runs, of_run, cells, strict=True):
+        digests, values = rows.set_index(["layout", "seed"])["layout_digest"].to_dict(), _text(cell)
         for number, (_, known, theirs) in enumerate(held):
             if values == theirs and all(known.get(key, code) == code for key, code in digests.items()):
                 known.update(digests)
@@ -91,12 +110,12 @@ def _clusters(runs: Sequence[Run], cells: Sequence[Mapping[str, Any]], task: tup
     return [held[number][0] if split[number] else None for number in place]
 
 
-def _digests(run: Run, task: tuple[Any, ...]) -> dict[Any, str]:
-    if "layout_digest" not in run.trials.columns:
-        return {}
-    rows = run.trials[(run.trials[TASK] == list(task)).all(axis=1)]
-    columns = rows[["layout", "seed", "layout_digest"]].dropna()
-    return {(layout, seed): code for layout, seed, code in columns.itertuples(index=False, name=None)}
+def _digests(trials: pd.DataFrame) -> pd.DataFrame:
+    """The known layouts of some trials: columns layout, seed and layout_digest."""
+    names = ["layout", "seed", "layout_digest"]
+    if "layout_digest" not in trials.columns:
+        return pd.DataFrame(columns=names)
+    return trials.loc[trials["layout_digest"].notna(), names]
 
 
 def _kind(values: Sequence[Any]) -> str:

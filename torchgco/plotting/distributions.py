@@ -91,6 +91,6 @@ def _bars(ax: Axes, values: dict[str, np.ndarray], edges: Sequence[float], label
 
 
 def _legend(figure: Figure, trials: pd.DataFrame, mark: str) -> None:
-    colours = solver_colours(trials["solver"])
+    colours = solver_colours(trials["solver"].unique())
     handles: list = [Patch(color=colour, label=solver) for solver, colour in colours.items()]
     legend(figure, [*handles, Line2D([], [], color=INK, linestyle="--", linewidth=1.2, label=mark)])

@@ -1,0 +1,133 @@
+"""How rates and costs depend on a variable that a sweep has changed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter, NullLocator, PercentFormatter
+
+from torchgco.plotting.rates import OUTCOMES
+from torchgco.plotting.style import INK, SMALL, legend, panels, solver_colours, tasks_of, tidy
+
+SIZE = (3.4, 2.8)  # of a panel, inches
+DECADES = 50.0  # ratio of the largest to the smallest value from which the axis is logarithmic
+TICKS = 8  # values that are all marked on the axis
+LETTERS = 18  # of the name of a bar group
+
+
+def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
+    """Rates with 95 % Wilson intervals and costs against one swept variable: a panel per outcome, a line per solver.
+
+    summary   as `experiments.statistics.summarise` returns it, with a column `variable`
+    variable  a column of numbers gives lines with bands, any other column groups of bars
+
+    Every task, which are the values of the other swept variables too, has its row of panels. An outcome that is
+    defined nowhere has no panel. The cost is the median ratio to the best known cost, with a whisker or band up to the
+    90 % quantile; where no best cost is known, the median cost, both over the trials that reached the goal.
+    """
+    rows = summary[summary[variable].notna()]
+    tasks = list(tasks_of(rows.rename(columns={variable: "value"})))
+    shown = [name for name in OUTCOMES if rows[f"{name}_n"].sum() > 0]
+    figure, axes = panels(len(tasks) * (len(shown) + 1), len(shown) + 1, SIZE)
+    numeric = pd.api.types.is_numeric_dtype(rows[variable])
+    draw, place = (_line, _numbers) if numeric else (_bars, _categories)
+    colours = solver_colours(rows["solver"])
+    for i, (title, task) in enumerate(tasks):
+        row = axes[i * (len(shown) + 1) : (i + 1) * (len(shown) + 1)]
+        values = place(row, task["value"])
+        for j, (solver, held) in enumerate(task.groupby("solver", sort=False)):
+            x = held["value"].map(values).to_numpy(dtype=float)
+            order = np.argsort(x)
+            held, x = held.iloc[order], x[order]
+            side = (j, task["solver"].nunique())
+            for ax, name in zip(row, shown, strict=False):
+                low, rate, high = (held[f"{name}_{part}"].to_numpy() for part in ("low", "rate", "high"))
+                # Rounding can put an end of the interval slightly inside the rate at 0 and at 1.
+                draw(ax, x, np.minimum(low, rate), rate, np.maximum(high, rate), colours[solver], side)
+            _cost(row[-1], _line if numeric else _points, x, held, colours[solver], side)
+        for ax, name in zip(row, shown, strict=False):
+            _as_rate(ax, name)
+        for ax in row:
+            ax.set_xlabel(variable)
+            tidy(ax, title if ax is row[0] else "")
+    kind = (lambda colour, name: Line2D([], [], color=colour, marker="o", label=name)) if numeric else _patch
+    handles: list[Artist] = [kind(colour, solver) for solver, colour in colours.items()]
+    legend(figure, handles)
+    return figure
+
+
+def _patch(colour: str, name: str) -> Patch:
+    return Patch(color=colour, label=name)
+
+
+def _as_rate(ax: Axes, name: str) -> None:
+    ax.set_ylim(-0.02, 1.02)
+    ax.set_yticks([0, 0.25, 0.5, 0.75, 1])
+    ax.yaxis.set_major_formatter(PercentFormatter(1, symbol=" %"))
+    ax.set_ylabel(f"{name}, 95 % interval")
+
+
+def _cost(ax: Axes, draw, x: np.ndarray, held: pd.DataFrame, colour: str, side: tuple[int, int]) -> None:
+    names = ("cost_ratio_median", "cost_ratio_p90")
+    label = "cost / best, median to 90 %"
+    if held[names[0]].isna().all():
+        names, label = ("cost_median_reached",) * 2, "median cost, reached"
+    median, high = (held[name].to_numpy(dtype=float) for name in names)
+    draw(ax, x, median, median, high, colour, side)
+    ax.set_ylabel(label)
+
+
+def _numbers(row: list[Axes], values: pd.Series) -> dict[object, float]:
+    """Set the axes for the numbers of a column; returns the place of each."""
+    found = sorted(float(value) for value in values.unique())
+    for ax in row:
+        if found[0] > 0 and found[-1] / found[0] >= DECADES:
+            ax.set_xscale("log")
+        if len(found) <= TICKS:
+            ax.set_xticks(found, [f"{value:g}" for value in found])
+            ax.xaxis.set_minor_locator(NullLocator())
+            ax.xaxis.set_minor_formatter(NullFormatter())
+    return {value: float(value) for value in values.unique()}
+
+
+def _categories(row: list[Axes], values: pd.Series) -> dict[object, float]:
+    """Name the groups of bars on the axes; returns the middle of each group."""
+    found = [str(value) for value in values.unique()]
+    names = [name if len(name) <= LETTERS else f"...{name[-LETTERS:]}" for name in found]
+    turned = {"rotation": 20, "ha": "right"} if sum(map(len, names)) > 30 else {}
+    for ax in row:
+        ax.set_xticks(range(len(found)), names, fontsize=SMALL, **turned)
+        ax.set_xlim(-0.5, len(found) - 0.5)
+    return {value: float(i) for i, value in enumerate(values.unique())}
+
+
+def _line(ax: Axes, x, low, middle, high, colour: str, side: tuple[int, int]) -> None:
+    ax.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
+    ax.vlines(x, low, high, color=colour, alpha=0.5, linewidth=1)  # a band needs two values
+    ax.plot(x, middle, color=colour, marker="o", markersize=4, linewidth=1.6)
+
+
+def _bars(ax: Axes, x, low, middle, high, colour: str, side: tuple[int, int]) -> None:
+    x, width = _beside(x, side)
+    known = np.isfinite(middle)
+    x, low, middle, high = x[known], low[known], middle[known], high[known]
+    ax.bar(x, middle, 0.9 * width, color=colour, alpha=0.85)
+    ax.errorbar(x, middle, [middle - low, high - middle], fmt="none", color=INK, capsize=3, linewidth=1.2)
+
+
+def _points(ax: Axes, x, low, middle, high, colour: str, side: tuple[int, int]) -> None:
+    """In place of bars where 0 isn't on the axis."""
+    x, _ = _beside(x, side)
+    ax.errorbar(x, middle, [middle - low, high - middle], fmt="o", color=colour, capsize=3, linewidth=1.2)
+
+
+def _beside(x: np.ndarray, side: tuple[int, int]) -> tuple[np.ndarray, float]:
+    """Places of one of several solvers side by side in their groups, and the width of each."""
+    i, count = side
+    width = 0.8 / count
+    return x + (i - (count - 1) / 2) * width, width
