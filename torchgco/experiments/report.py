@@ -12,16 +12,18 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from math import isnan
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pandas as pd
 
 from torchgco.errors import InputError
-from torchgco.experiments.files import write
+from torchgco.experiments.files import say, write
 from torchgco.experiments.merge import OLDER, REPEATED, merge
 from torchgco.experiments.records import TRIALS
 from torchgco.experiments.runs import is_merged, read_trials
 from torchgco.experiments.statistics import OUTCOMES, TASK, paired_table, summarise, task_columns
+from torchgco.interrupts import farewell, raised
 from torchgco.plotting.distributions import clearance_histogram, violation_histogram
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.rates import rates_figure
@@ -192,19 +194,36 @@ def aligned(rows: Sequence[Sequence[str]], left: int) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """`torchgco-report`: merge, print and write. Returns the exit code, 2 for malformed input."""
-    parser = argparse.ArgumentParser(prog="torchgco-report", description="One report on many studies.")
+    parser = _Parser(prog="torchgco-report", description="One report on many studies.")
     parser.add_argument("folders", nargs="+", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     options = parser.parse_args(arguments)
     output = options.output or options.folders[0] / "report"
     try:
-        merged = merge(options.folders)
-        if (output / TRIALS).exists() and not is_merged(read_trials(output / TRIALS)):
-            raise InputError("--output", "a folder without the results of a study, which are kept", output)
-        write(output / TRIALS, lambda file: merged.to_parquet(file, index=False))
-        print(write_report(output))
-        print(f"\nwritten to {output}")
+        with raised():
+            _report(options.folders, output)
     except InputError as error:
         print(f"torchgco-report: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt as error:
+        return farewell(error, "torchgco-report")
     return 0
+
+
+def _report(folders: Sequence[Path], output: Path) -> None:
+    merged = merge(folders)
+    if output.exists() and not output.is_dir():
+        raise InputError("--output", "a folder", f"{output}, which is a file")
+    if (output / TRIALS).exists() and not is_merged(read_trials(output / TRIALS)):
+        raise InputError("--output", "a folder without the results of a study, which are kept", output)
+    write(output / TRIALS, lambda file: merged.to_parquet(file, index=False))
+    say(write_report(output))
+    say(f"\nwritten to {output}")
+
+
+class _Parser(argparse.ArgumentParser):
+    """Without the usage before an error: one line for every mistake."""
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: {message} (--help lists the options)", file=sys.stderr)
+        sys.exit(2)

@@ -17,7 +17,7 @@ from yaml import YAMLError
 from torchgco.errors import InputError
 from torchgco.experiments.files import checksum, damaged
 from torchgco.experiments.records import DONE, MANIFEST, TRIALS, read_checksums, read_manifest
-from torchgco.experiments.statistics import PAIR
+from torchgco.experiments.statistics import PAIR, check_trials
 
 MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
 ROW = [*PAIR, "solver"]
@@ -43,7 +43,7 @@ def find_runs(folders: Iterable[str | os.PathLike[str]]) -> list[Run]:
     Tables that a merge wrote are passed over below a folder, and read where the folder itself is given.
 
     Raises:
-        InputError: a missing folder, folders without trials, a damaged file.
+        InputError: a missing folder, folders without trials, a damaged file, a table that is no study's.
     """
     given = [Path(folder) for folder in folders]
     tables = {path.resolve(): (path.parent, trials) for path, trials in _tables(given)}
@@ -84,6 +84,7 @@ def _tables(folders: list[Path]) -> Iterator[tuple[Path, pd.DataFrame]]:
             raise InputError("folders", "an existing folder", folder)
         for path in sorted(folder.rglob(TRIALS)):
             trials = read_trials(path)
+            check_trials(trials, path)
             if path.parent == folder or not is_merged(trials):
                 yield path, trials
 

@@ -23,6 +23,7 @@ TASK = ["scenario", "model"]
 PAIR = [*TASK, "layout", "seed"]
 EFFORT = ["iterations", "outer_iterations", "guided", "seconds"]
 COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, "violation", "cost", *EFFORT]
+NUMBERS = [*EFFORT, "violation", "cost", "best_cost", "clearance", "clearance_knots", "goal_distance"]
 INVALID = Status.INVALID_START.name
 VIOLATION_TOLERANCE = 1e-3  # metres for lengths, inputs in their units
 CONFIDENCE = 0.95
@@ -78,7 +79,7 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
 
     Raises InputError if `trials` is empty or lacks a column.
     """
-    _check(trials)
+    check_trials(trials)
     names = [*task_columns(trials), "solver"]
     groups = trials.groupby(names, sort=False, dropna=False)
     return pd.DataFrame([_summary(group, names) for _, group in groups])
@@ -116,7 +117,7 @@ def outcome_of(group: pd.DataFrame, name: str) -> pd.Series:
     Where no valid trial of the group defines the outcome (a success without any best cost), it stays
     undefined for the invalid ones too: a rate of 0 would be read as a measurement.
     """
-    values = group[name].astype("boolean")
+    values = _truth(group[name])
     invalid = group["status"] == INVALID
     if name == "success" and values[~invalid].isna().all():
         return values.mask(invalid)
@@ -139,7 +140,7 @@ def paired(trials: pd.DataFrame, solver_a: str, solver_b: str, outcome: str = "r
     Raises InputError for a column that is missing, a solver that isn't in `trials`, an unknown outcome, and a
     solver that has two rows for one trial.
     """
-    _check(trials)
+    check_trials(trials)
     if outcome not in OUTCOMES:
         raise InputError("outcome", f"one of {', '.join(OUTCOMES)}", outcome)
     a, b = (_by_trial(trials, solver, outcome) for solver in (solver_a, solver_b))
@@ -171,7 +172,7 @@ def paired_table(trials: pd.DataFrame, solver: str) -> pd.DataFrame:
     Columns: those of the task and the fields of PairedResult, `solver` being a. Tasks that `solver` didn't fly
     and tasks that nobody else flew give no row. Raises InputError as `paired` does.
     """
-    _check(trials)
+    check_trials(trials)
     if solver not in set(trials["solver"]):
         raise InputError("solver", f"one of {', '.join(trials['solver'].unique())}", solver)
     rows = list(_pairs(trials, solver))
@@ -209,12 +210,19 @@ def _by_trial(trials: pd.DataFrame, solver: str, outcome: str) -> pd.DataFrame:
     return group[pair].assign(hit=pd.concat([outcome_of(task, outcome) for _, task in tasks]))
 
 
-def _check(trials: pd.DataFrame) -> None:
+def check_trials(trials: pd.DataFrame, place: object = "a table") -> None:
+    """Raise InputError if a table, read from `place`, is empty, lacks a column or has text for numbers."""
     missing = [name for name in COLUMNS if name not in trials.columns]
     if missing:
-        raise InputError("trials", "the columns of a study", f"a table without {', '.join(missing)}")
+        raise InputError("trials", "the columns of a study", f"{place} without {', '.join(missing)}")
     if trials.empty:
-        raise InputError("trials", "at least one row", "none")
+        raise InputError("trials", "at least one row", f"{place} with none")
+    for names, convert, kind in ((NUMBERS, _numbers, "numbers"), (OUTCOMES, _truth, "true or false")):
+        for name in trials.columns.intersection(list(names)):
+            try:
+                convert(trials[name])
+            except (TypeError, ValueError):
+                raise InputError("trials", f"{kind} in column {name}", f"{place} with others") from None
 
 
 def _rate(name: str, values: pd.Series) -> dict[str, object]:
@@ -226,6 +234,10 @@ def _rate(name: str, values: pd.Series) -> dict[str, object]:
 
 def _numbers(column: pd.Series) -> np.ndarray:
     return column.to_numpy(dtype=float, na_value=nan)
+
+
+def _truth(column: pd.Series) -> pd.Series:
+    return column.astype("boolean")
 
 
 def _median(values: np.ndarray) -> float:

@@ -16,17 +16,28 @@ import numpy as np
 from torchgco.constraints.boxes import UNIT_WITHIN
 from torchgco.errors import InputError
 
+LARGEST = 1e6  # m, m/s or s: beyond it, squares and sums lose the digits that obstacles are checked to
+MOST_OBSTACLES = 100_000  # in a layout that is drawn
+MOST_STAGES = 10**9  # beyond any memory, and few enough for arithmetic on bytes
+
 
 def number(value: Any, field: str, above: float = -math.inf, at_least: float = -math.inf) -> float:
-    """`value` as a finite float that is > `above` and >= `at_least`."""
-    try:
-        plain = float(value)
-    except (TypeError, ValueError):
-        plain = math.nan
+    """`value` as a finite float that is > `above`, >= `at_least`, and at most LARGEST in size."""
+    plain = _plain(value)
     if not (math.isfinite(plain) and plain > above and plain >= at_least):
         limit = f" > {above:g}" if above > -math.inf else f" >= {at_least:g}" if at_least > -math.inf else ""
         raise InputError(field, f"a finite number{limit}", repr(value))
+    if abs(plain) > LARGEST:
+        raise InputError(field, f"a number of at most {LARGEST:g} in size", repr(value))
     return plain
+
+
+def _plain(value: Any) -> float:
+    """`value` as a float, NaN if it isn't a number."""
+    try:
+        return float(value) if np.asarray(value).dtype.kind in "iufO" and value is not None else math.nan
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def optional_number(value: Any, field: str, **limits: float) -> float | None:
@@ -34,14 +45,13 @@ def optional_number(value: Any, field: str, **limits: float) -> float | None:
     return None if value is None else number(value, field, **limits)
 
 
-def integer(value: Any, field: str, at_least: int) -> int:
-    """`value` as an int >= `at_least`; 5.0 is one, 5.5 is not."""
-    try:
-        plain = float(value)
-    except (TypeError, ValueError):
-        plain = math.nan
+def integer(value: Any, field: str, at_least: int, at_most: int | None = None) -> int:
+    """`value` as an int >= `at_least` and <= `at_most`; 5.0 is one, 5.5 is not."""
+    plain = _plain(value)
     if not (plain >= at_least and plain.is_integer()):
         raise InputError(field, f"an integer >= {at_least}", repr(value))
+    if at_most is not None and plain > at_most:
+        raise InputError(field, f"an integer <= {at_most}", repr(value))
     return int(value)
 
 
@@ -101,9 +111,11 @@ def obstacles(centers: Any, radii: Any) -> tuple[np.ndarray, np.ndarray]:
     absent = np.isnan(centers).all(axis=2)
     partial = ~absent & ~np.isfinite(centers).all(axis=2)
     _none_of(partial, "layouts.centers", "finite rows or rows of NaN", centers)
+    _bounded(centers, "layouts.centers")
     _none_of(np.isinf(radii) | (radii < 0), "layouts.radii", "finite radii >= 0", radii)
     _none_of(absent & ~np.isnan(radii), "layouts.radii", "NaN where the centre is NaN", radii)
     _none_of(~absent & np.isnan(radii), "layouts.radii", "a radius where the centre is finite", radii)
+    _bounded(radii, "layouts.radii")
     return centers, radii
 
 
@@ -118,6 +130,7 @@ def velocities(value: Any, centers: np.ndarray) -> np.ndarray | None:
     bad = ~absent & ~np.isfinite(moving).all(axis=2)
     _none_of(bad, "layouts.velocities", "finite velocities where the centre is finite", moving)
     moving[absent] = np.nan
+    _bounded(moving, "layouts.velocities")
     return moving
 
 
@@ -137,6 +150,7 @@ def boxes(centers: Any, halves: Any, turns: Any, like: np.ndarray) -> tuple[np.n
         raise InputError("layouts.box_centers", f"shape ({count}, K, {d})", f"shape {middle.shape}")
     absent = np.asarray(np.isnan(middle).all(axis=2))
     _none_of(~absent & ~np.isfinite(middle).all(axis=2), "layouts.box_centers", "finite rows or rows of NaN", middle)
+    _bounded(middle, "layouts.box_centers")
     if halves is None:
         raise InputError("layouts.box_half_sizes", "this array with box_centers", "none")
     half = array(halves, "layouts.box_half_sizes")
@@ -145,6 +159,7 @@ def boxes(centers: Any, halves: Any, turns: Any, like: np.ndarray) -> tuple[np.n
     good = np.isfinite(half).all(axis=2) & (half > 0).all(axis=2)
     _none_of(~absent & ~good, "layouts.box_half_sizes", "finite half sides above 0 where the centre is finite", half)
     _none_of(absent & ~np.isnan(half).all(axis=2), "layouts.box_half_sizes", "NaN where the centre is NaN", half)
+    _bounded(half, "layouts.box_half_sizes")
     return middle, half, _turns(turns, absent, d)
 
 
@@ -178,6 +193,7 @@ def states(value: Any, field: str, centers: np.ndarray) -> np.ndarray | None:
         raise InputError(field, expected, f"shape {given.shape}")
     given = np.tile(given, (count, 1)) if given.ndim == 1 else given
     _none_of(~np.isfinite(given).all(axis=1), field, "finite states", given)
+    _bounded(given, field)
     return given
 
 
@@ -218,6 +234,11 @@ def ids(value: Any, count: int) -> np.ndarray:
         got = f"{given.dtype} of shape {given.shape}, from {given.min()}"
         raise InputError("layouts.ids", f"integers >= 0 of shape ({count},)", got)
     return given.astype(np.int64)
+
+
+def _bounded(values: np.ndarray, field: str) -> None:
+    """Raise InputError where a value exceeds LARGEST; NaN passes."""
+    _none_of(np.abs(values) > LARGEST, field, f"values of at most {LARGEST:g} in size", values)
 
 
 def _none_of(bad: Any, field: str, expected: str, values: np.ndarray) -> None:

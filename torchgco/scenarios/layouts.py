@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import uuid
 import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 
 from torchgco.errors import InputError
 from torchgco.scenarios import checks
+from torchgco.solvers.memory import free_memory
 
 # Arrays of a file, in the order of the fields of Layouts. `layout` holds the ids, if they are not 0..L-1.
 REQUIRED = ("centers", "radii")
@@ -27,9 +27,6 @@ CONTROLS = ("control_lower", "control_upper")
 BOXES = ("box_centers", "box_half_sizes", "box_rotations")
 NAMED = (*REQUIRED, "velocities", *BOXES, "start", "goal", *SCALARS, *CONTROLS, "best_cost")
 IDS = "layout"
-
-# Raised by np.load for a file that is no npz, holds pickles or is damaged; an .npy file fails as a context manager.
-UNREADABLE = (OSError, EOFError, AttributeError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +86,8 @@ class Layouts:
             raise InputError("layouts.goal", f"n = {self.start.shape[1]} as start has", self.goal.shape[1])
         for name, limit in (("vehicle_radius", "at_least"), ("goal_radius", "above"), ("dt", "above")):
             put(name, checks.optional_number(getattr(self, name), f"layouts.{name}", **{limit: 0.0}))
-        put("stages", None if self.stages is None else checks.integer(self.stages, "layouts.stages", 1))
+        if self.stages is not None:
+            put("stages", checks.integer(self.stages, "layouts.stages", 1, checks.MOST_STAGES))
         lower, upper = checks.control_bounds(self.control_lower, self.control_upper)
         put("control_lower", lower)
         put("control_upper", upper)
@@ -252,10 +250,14 @@ def _same(name: str, values: list[Any]) -> Any:
 def _read(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an npz file."""
     try:
+        with zipfile.ZipFile(path) as members:
+            size = sum(member.file_size for member in members.infolist())
+        if size > free_memory():
+            raise MemoryError(f"its arrays take {size / 1e9:.3g} GB")
         with np.load(path, allow_pickle=False) as held:
             return {name: held[name] for name in held.files}
     except FileNotFoundError:
         raise InputError("scenario.path", "a layout file (.npz)", f"{path}, which isn't there") from None
-    except UNREADABLE as error:
-        got = f"{path} ({error})"
-        raise InputError("scenario.path", "a readable npz file without pickles", got) from None
+    except Exception as error:  # damaged bytes make numpy, zipfile and zlib raise nearly anything
+        got = f"{path} ({(str(error).splitlines() or [type(error).__name__])[0]})"
+        raise InputError("scenario.path", "a readable npz file without pickles that fits into memory", got) from None
