@@ -11,6 +11,9 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
+from torchgco import interrupts as interrupts  # first: the imports below take seconds
+
+# isort: split
 from torchgco import presets as presets
 from torchgco.api import solve as solve
 from torchgco.baselines import Hold as Hold

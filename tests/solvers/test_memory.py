@@ -33,11 +33,11 @@ def test_a_problem_takes_the_estimated_memory() -> None:
 def test_a_plan_fits_the_memory_that_is_free(monkeypatch) -> None:
     problem, _ = planar_batch(B=2, N=30)
     need = element_bytes(problem)
-    monkeypatch.setattr("torchgco.solvers.memory._free_memory", lambda: 40 * need)
+    monkeypatch.setattr("torchgco.solvers.memory.free_memory", lambda: 40 * need)
     assert plan_batch(problem) == 20 and plan_batch(problem, "cpu", processes=4) == 5
-    monkeypatch.setattr("torchgco.solvers.memory._free_memory", lambda: 0)
+    monkeypatch.setattr("torchgco.solvers.memory.free_memory", lambda: 0)
     assert plan_batch(problem) == 1
-    monkeypatch.setattr("torchgco.solvers.memory._free_memory", lambda: 10**15)
+    monkeypatch.setattr("torchgco.solvers.memory.free_memory", lambda: 10**15)
     assert plan_batch(problem) == CPU_LIMIT
     with pytest.raises(InputError, match="processes"):
         plan_batch(problem, processes=0)

@@ -18,13 +18,17 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
 from torchgco.errors import InputError
+from torchgco.experiments.checks import as_input_error, check, check_words
+from torchgco.experiments.identity import plain
 from torchgco.experiments.preset_nodes import register
 from torchgco.kernels import use_native
 from torchgco.options import check_value
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 from torchgco.simulation import Mission
+from torchgco.solvers.memory import free_memory, least_bytes
 
 DEFAULT_LAYOUTS = 64
+MOST = 1024  # threads or processes: PyTorch ends with an error of the system long before the system's own limit
 register()
 
 
@@ -55,13 +59,29 @@ class Setup:
         """Layouts 0..count-1 under the seed; by default all of a file, or 64.
 
         Raises:
-            InputError: count below 1, or more than there are.
+            InputError: count below 1, more than there are, or more than fit into memory.
         """
         count = count if count is not None else self.config.study.layouts
         count = count if count is not None else self.scenario.available or DEFAULT_LAYOUTS
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise InputError("study.layouts", "at least 1", repr(count))
+        self._refuse_beyond_memory(self.scenario.draw(range(1), self.seed), count)
         return self.scenario.draw(range(count), self.seed)
+
+    def _refuse_beyond_memory(self, first: Layouts, count: int) -> None:
+        """Raise where one problem, or all layouts and controls, exceed the free memory: the system would kill us."""
+        dynamics, free = self.vehicle.dynamics, free_memory()
+        N = self.vehicle.stages if first.stages is None else first.stages
+        bodies = first.radii.shape[1] + (0 if first.box_centers is None else first.box_centers.shape[1])
+        problem = least_bytes(N, dynamics.n, dynamics.m, N * (bodies + 2 * dynamics.m))
+        if problem > free:
+            field = "model.vehicle.stages" if first.stages is None else "scenario.stages"
+            got = f"{N} stages with {bodies} obstacles, {_gigabytes(problem)} or more"
+            raise InputError(field, f"a problem that fits into the free memory, {_gigabytes(free)}", got)
+        flights = count * (sum(held.nbytes for held in first.arrays().values()) + 8 * N * dynamics.m)
+        if flights > free:
+            got = f"{count}, {_gigabytes(flights)} or more"
+            raise InputError("study.layouts", f"layouts that fit into the free memory, {_gigabytes(free)}", got)
 
     def task(self, layouts: Layouts | None = None) -> Task:
         """The planning problems of some layouts (default: `layouts()`) on the configured device."""
@@ -81,6 +101,7 @@ def compose(overrides: Sequence[str] = ()) -> Setup:
 def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> DictConfig:
     """The configuration alone; `searchpath` names further folders of configs."""
     extra = [f"hydra.searchpath=[{','.join(searchpath)}]"] if searchpath else []
+    check_words(overrides, config_dir())
     running = Singleton.get_state()  # a study composes its baselines while Hydra's own main runs
     GlobalHydra.instance().clear()
     try:
@@ -88,8 +109,6 @@ def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> 
             return hydra.compose("config", [*overrides, *extra])
     except (HydraException, OmegaConfBaseException) as error:
         raise as_input_error(error) from None
-    except ValueError as error:
-        raise group_error(error) or error from None
     finally:
         Singleton.set_state(running)
 
@@ -100,9 +119,7 @@ def build(config: DictConfig) -> Setup:
     Raises:
         InputError: a value that a part refuses, or parts that don't fit each other.
     """
-    seed = config.seed
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise InputError("seed", "a whole number of at least 0", repr(seed))
+    check(plain(config), config_dir())
     device, dtype = _device(config.device)
     setup = Setup(
         config=config,
@@ -110,7 +127,7 @@ def build(config: DictConfig) -> Setup:
         scenario=_instantiate(config.scenario, "scenario"),
         solver=solver_of(config),
         solver_name=config.solver.name,
-        seed=seed,
+        seed=config.seed,
         device=device,
         dtype=dtype,
     )
@@ -122,6 +139,10 @@ def build(config: DictConfig) -> Setup:
         wanted = f"model={other}, as {setup.scenario.name} is {setup.scenario.dimension}-D"
         raise InputError("model", wanted, f"model={setup.vehicle.name}")
     return setup
+
+
+def _gigabytes(count: float) -> str:
+    return f"{count / 1e9:.3g} GB"
 
 
 def _mission(setup: Setup) -> Mission | None:
@@ -143,11 +164,14 @@ def _mission(setup: Setup) -> Mission | None:
     held = OmegaConf.to_container(node, resolve=True)
     assert isinstance(held, dict)
     others: dict[str, Any] = {str(key): value for key, value in held.items() if key not in parts}
-    planner = parts.pop("planner")(solver=setup.solver)
+    plant = _instantiate(setup.config.plant, "plant")
+    field = "mission.planner"
     try:
-        mission = Mission(planner=planner, plant=_instantiate(setup.config.plant, "plant"), **parts, **others)
+        planner = parts.pop("planner")(solver=setup.solver)
+        field = "mission"
+        mission = Mission(planner=planner, plant=plant, **parts, **others)
     except TypeError as error:
-        raise InputError("mission", "keys that the configuration knows", error) from None
+        raise as_input_error(error, field) from None
     mission.check(setup.vehicle.dynamics)
     return mission
 
@@ -163,39 +187,16 @@ def vehicle_of(configuration: Mapping[str, Any]) -> Vehicle:
 
 
 def _instantiate(node: DictConfig, field: str, leave_out: str | None = None) -> Any:
-    if not isinstance(node, DictConfig):
-        raise InputError(field, "a part with its options", repr(node))
+    if not OmegaConf.is_dict(node):
+        raise InputError(field, "a group of keys", repr(node))
     try:
         # Containers become lists here: no part of the library knows OmegaConf.
         plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
         assert isinstance(plain, dict)
         parts = {key: value for key, value in plain.items() if key != leave_out}
         return hydra.utils.instantiate(parts, _convert_="all")
-    except (InstantiationException, OmegaConfBaseException) as error:
+    except (InstantiationException, OmegaConfBaseException, TypeError) as error:  # Hydra wraps those of parts
         raise as_input_error(error, field) from None
-
-
-def group_error(error: ValueError) -> InputError | None:
-    """The InputError for a group of configs set to a number or null, which Hydra refuses by a ValueError; else None."""
-    message = str(error)
-    named = message.startswith("Config group override")
-    expected = "the name of a config for each group, such as model=planar"
-    return InputError("configuration", expected, message) if named else None
-
-
-def as_input_error(error: BaseException, field: str = "configuration") -> InputError:
-    """An error of Hydra or OmegaConf as one line that names the key."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, InputError):
-            return cause
-        cause = cause.__cause__
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    key = getattr(error, "full_key", None) or next(
-        (line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), field
-    )
-    message = " ".join(line for line in lines if not line.startswith(("full_key:", "object_type=")))
-    return InputError(str(key) or field, "a value that the configuration knows", message)
 
 
 def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
@@ -221,6 +222,6 @@ def allotted_cores() -> int:
 def _threads(wanted: int | None) -> int:
     if wanted is None:
         return allotted_cores()
-    if isinstance(wanted, bool) or not isinstance(wanted, int) or wanted < 1:
-        raise InputError("device.threads", "at least 1, or null for all that are allotted", repr(wanted))
+    if isinstance(wanted, bool) or not isinstance(wanted, int) or not 1 <= wanted <= MOST:
+        raise InputError("device.threads", f"1 to {MOST}, or null for all that are allotted", repr(wanted))
     return wanted

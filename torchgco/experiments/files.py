@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from hashlib import sha256
@@ -33,12 +34,27 @@ def write(path: Path, save: Callable[[IO[bytes]], Any]) -> None:
         os.chmod(part, 0o644)
         os.replace(part, path)
     except OSError as error:
-        raise InputError(
-            "hydra.run.dir", "a folder with room that may be written to", f"{path} ({error.strerror or error})"
-        ) from None
+        expected = "a folder (hydra.run.dir, --output of a report) with room that may be written to"
+        raise InputError(str(path), expected, error.strerror or error) from None
     finally:
         if part is not None:
             Path(part).unlink(missing_ok=True)  # gone already after a move
+
+
+def say(text: str) -> None:
+    """Print a text; a reader that has read enough, as `head` does, isn't an error.
+
+    Raises:
+        InputError: the system refuses to write (disk full).
+    """
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # What is still buffered, and all that is printed later, goes nowhere: Python would complain when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise InputError("standard output", "room to write", error.strerror or error) from None
 
 
 def checksum(path: Path) -> str:

@@ -17,7 +17,7 @@ import torchgco
 from torchgco.certificate import certify
 from torchgco.certificate import frame_columns as certificate_columns
 from torchgco.errors import InputError
-from torchgco.experiments.build import Setup, allotted_cores
+from torchgco.experiments.build import MOST, Setup, allotted_cores
 from torchgco.judge import frame_columns, judge
 from torchgco.kernels import use_native
 from torchgco.native.dispatch import engine_of
@@ -59,14 +59,15 @@ def plan_of(setup: Setup) -> Plan:
     return Plan(
         batch_size=None if given.batch_size == "auto" else _count(given.batch_size, "batch_size", ", or auto"),
         shard_size=_count(given.shard_size, "shard_size"),
-        workers=processes if given.workers is None else _count(given.workers, "workers", ", or null for one per core"),
+        workers=processes if given.workers is None else _count(given.workers, "workers", ", or null: all cores", MOST),
         repair=given.repair,
     )
 
 
-def _count(value: object, name: str, otherwise: str = "") -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise InputError(f"study.{name}", f"at least 1{otherwise}", repr(value))
+def _count(value: object, name: str, otherwise: str = "", most: int | None = None) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1 or (most is not None and value > most):
+        limits = "at least 1" if most is None else f"1 to {most}"
+        raise InputError(f"study.{name}", f"{limits}{otherwise}", repr(value))
     return value
 
 

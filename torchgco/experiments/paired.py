@@ -19,7 +19,7 @@ from torchgco.experiments.statistics import (
     PAIR,
     TASK,
     attained,
-    check,
+    check_trials,
     grouped,
     numbers_of,
     task_columns,
@@ -72,7 +72,7 @@ def paired(trials: pd.DataFrame, solver_a: str, solver_b: str, outcome: str = "r
     Raises InputError for a column that is missing, a solver that isn't in `trials`, an unknown outcome, and a
     solver that has two rows for one trial.
     """
-    check(trials)
+    check_trials(trials)
     if outcome not in OUTCOMES:
         raise InputError("outcome", f"one of {', '.join(OUTCOMES)}", outcome)
     for solver in (solver_a, solver_b):
@@ -88,7 +88,7 @@ def paired_table(trials: pd.DataFrame, solver: str) -> pd.DataFrame:
     Columns: those of the task and the fields of PairedResult, `solver` being a. Tasks that `solver` didn't fly
     and tasks that nobody else flew give no row. Raises InputError as `paired` does.
     """
-    check(trials)
+    check_trials(trials)
     _check_flown(trials, solver)
     flights = _Flights(trials)
     return flights.table(
@@ -102,7 +102,7 @@ def compare(trials: pd.DataFrame) -> pd.DataFrame:
     Where it flew in several variants ("gco [...]"), each of them is compared with all that follow. Columns as
     `paired_table` has them; no rows for a task that one solver flew.
     """
-    check(trials)
+    check_trials(trials)
     flights = _Flights(trials)
     return flights.table(lambda names: [(a, b) for a, b in combinations(names, 2) if _bare(a) == _bare(names[0])])
 

@@ -11,13 +11,14 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from torchgco.errors import InputError
-from torchgco.experiments.files import write
+from torchgco.experiments.files import say, write
 from torchgco.experiments.merge import OLDER, REPEATED, UNFINISHED, merge
 from torchgco.experiments.paired import compare
 from torchgco.experiments.power import power_table
@@ -26,6 +27,7 @@ from torchgco.experiments.runs import is_merged, read_trials
 from torchgco.experiments.statistics import TASK, summarise, task_columns
 from torchgco.experiments.tables import FORMATS, aligned, format_frame, format_report
 from torchgco.experiments.verify import Verification, unconfirmed, verify
+from torchgco.interrupts import REPORT, farewell, raised
 from torchgco.plotting.distributions import clearance_histogram, violation_histogram
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.rates import rates_figure
@@ -108,8 +110,16 @@ def _notes(trials: pd.DataFrame) -> list[str]:
     return notes
 
 
+class _Parser(argparse.ArgumentParser):
+    """Without the usage before an error: one line for every mistake."""
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: {message} (--help lists the options)", file=sys.stderr)
+        sys.exit(2)
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="torchgco-report", description="One report on many studies.")
+    parser = _Parser(prog="torchgco-report", description="One report on many studies.")
     parser.add_argument("folders", nargs="*", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     parser.add_argument("--format", choices=FORMATS, default="table", help="of the tables on stdout; default: table")
@@ -127,27 +137,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """`torchgco-report`. Returns the exit code: 2 for malformed input, 1 where rows can't be confirmed."""
     options = _parser().parse_args(arguments)
     try:
-        if options.power is not None:
-            return _power(options)
-        if not options.folders:
+        if not options.folders and options.power is None:
             raise InputError("DIR", "a study, or a folder of studies", "none")
-        return _verify(options.folders) if options.verify else _report(options)
+        with raised():
+            if options.power is not None:
+                return _power(options)
+            return _verify(options.folders) if options.verify else _report(options)
     except InputError as error:
         print(f"torchgco-report: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt as error:
+        return farewell(error, REPORT)
 
 
 def _report(options: argparse.Namespace) -> int:
     output = options.output or options.folders[0] / "report"
     merged = merge(options.folders)
+    if output.exists() and not output.is_dir():
+        raise InputError("--output", "a folder", f"{output}, which is a file")
     is_study = (output / TRIALS).exists() and not is_merged(read_trials(output / TRIALS))
     if is_study or (output / MANIFEST).exists():
         raise InputError("--output", "a folder without the results of a study, which are kept", output)
     write(output / TRIALS, lambda file: merged.to_parquet(file, index=False))
-    print(_written(output, merged, None, options.format))
-    aside = sys.stdout if options.format == "table" else sys.stderr
+    say(_written(output, merged, None, options.format))
     for note in [*_notes(merged), f"written to {output}"]:
-        print(f"\n{note}", file=aside)
+        if options.format == "table":
+            say(f"\n{note}")
+        else:
+            print(note, file=sys.stderr)
     for note in merged.attrs[UNFINISHED]:
         print(f"unfinished: {note}", file=sys.stderr)
     return 0
@@ -162,7 +179,7 @@ def _power(options: argparse.Namespace) -> int:
             discordant=table["discordant"].map(lambda share: "-" if np.isnan(share) else f"{share:.1%}"),
             power=table["power"].map("{:.3f}".format),
         )
-    print(format_frame(table, options.format))
+    say(format_frame(table, options.format))
     return 0
 
 
@@ -173,15 +190,15 @@ def _verify(folders: Sequence[Path]) -> int:
         print(f"unfinished, not verified: {folder}", file=sys.stderr)
     differing = [study for study in studies if len(study.differences)]
     for study in differing:
-        print(_difference(study))
+        say(_difference(study))
     right = [study for study in studies if study.differences.empty]
     where = f" in {len(right)} studies" if len(right) > 1 else ""
-    print(f"{sum(study.rows for study in right)} rows confirmed{where}")
+    say(f"{sum(study.rows for study in right)} rows confirmed{where}")
     columns = dict.fromkeys((study.columns, tuple(unconfirmed(study).items())) for study in right)
     for confirmed, more in columns:
-        print(f"  columns: {', '.join(confirmed)}")
+        say(f"  columns: {', '.join(confirmed)}")
         for names, reason in more:
-            print(f"  not confirmed: {names} ({reason})")
+            say(f"  not confirmed: {names} ({reason})")
     return 1 if differing else 0
 
 

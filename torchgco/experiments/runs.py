@@ -18,7 +18,7 @@ from torchgco.errors import InputError
 from torchgco.experiments.files import checksum, damaged
 from torchgco.experiments.identity import Manifest
 from torchgco.experiments.records import COLUMNS, DONE, MANIFEST, TRIALS, Records, read_checksums, read_manifest
-from torchgco.experiments.statistics import PAIR
+from torchgco.experiments.statistics import PAIR, check_trials
 from torchgco.experiments.success import with_success
 from torchgco.scenarios import Layouts
 
@@ -49,7 +49,7 @@ def find_runs(folders: Iterable[str | os.PathLike[str]]) -> list[Run]:
     an unfinished study come from its shards; their success is provisional.
 
     Raises:
-        InputError: a missing folder, folders without trials, a damaged file.
+        InputError: a missing folder, folders without trials, a damaged file, a table that is no study's.
     """
     given = [Path(folder) for folder in folders]
     places = {place.resolve(): (place, place in given) for place in _places(given)}
@@ -96,6 +96,7 @@ def _run(folder: Path, given: bool) -> Run | None:
     """The run in a folder; None for a table that a merge wrote, unless the folder itself was given."""
     if (folder / TRIALS).is_file():
         trials = read_trials(folder / TRIALS)
+        check_trials(trials, folder / TRIALS)
         return Run(folder, trials, *_origin(folder)) if given or not is_merged(trials) else None
     manifest = read_manifest(folder / MANIFEST)
     if manifest is None or (folder / DONE).is_file():

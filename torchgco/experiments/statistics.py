@@ -23,6 +23,7 @@ TASK = ["scenario", "model"]
 PAIR = [*TASK, "layout", "seed"]
 EFFORT = ["iterations", "outer_iterations", "guided", "seconds"]
 COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, "violation", "cost", *EFFORT]
+NUMBERS = [*EFFORT, "violation", "cost", "best_cost", "clearance", "clearance_knots", "goal_distance"]
 INVALID = Status.INVALID_START.name
 STATUS = "status_"  # prefix of the columns that count statuses
 VIOLATION_TOLERANCE = 1e-3  # metres for lengths, inputs in their units
@@ -68,7 +69,7 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
 
     _p90 is the 90 % quantile, interpolated linearly. Raises InputError if `trials` is empty or lacks a column.
     """
-    check(trials)
+    check_trials(trials)
     names = [*task_columns(trials), "solver"]
     groups = grouped(trials, names)
     values = _Values.of(trials, groups)
@@ -135,7 +136,7 @@ def attained(trials: pd.DataFrame, groups: Sequence[np.ndarray]) -> dict[str, np
     invalid = (trials["status"] == INVALID).to_numpy(dtype=bool)
     hits = {}
     for name in OUTCOMES:
-        values = trials[name].astype("boolean").to_numpy(dtype=float, na_value=nan)
+        values = _truth(trials[name]).to_numpy(dtype=float, na_value=nan)
         hits[name] = np.where(invalid, 0.0, values)
     if invalid.any():
         for rows in groups:
@@ -152,13 +153,19 @@ def wilson(count: int, n: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def check(trials: pd.DataFrame) -> None:
-    """Raise InputError where a table has no rows, or lacks a column of a study."""
+def check_trials(trials: pd.DataFrame, place: object = "a table") -> None:
+    """Raise InputError if a table, read from `place`, is empty, lacks a column or has text for numbers."""
     missing = [name for name in COLUMNS if name not in trials.columns]
     if missing:
-        raise InputError("trials", "the columns of a study", f"a table without {', '.join(missing)}")
+        raise InputError("trials", "the columns of a study", f"{place} without {', '.join(missing)}")
     if trials.empty:
-        raise InputError("trials", "at least one row", "none")
+        raise InputError("trials", "at least one row", f"{place} with none")
+    for names, convert, kind in ((NUMBERS, numbers_of, "numbers"), (OUTCOMES, _truth, "true or false")):
+        for name in trials.columns.intersection(list(names)):
+            try:
+                convert(trials[name])
+            except (TypeError, ValueError):
+                raise InputError("trials", f"{kind} in column {name}", f"{place} with others") from None
 
 
 def numbers_of(column: pd.Series) -> np.ndarray:
@@ -171,6 +178,10 @@ def _rate(name: str, hits: np.ndarray) -> dict[str, object]:
     low, high = wilson(count, n)
     parts = {"count": count, "n": n, "rate": count / n if n else nan, "low": low, "high": high}
     return {f"{name}_{part}": value for part, value in parts.items()}
+
+
+def _truth(column: pd.Series) -> pd.Series:
+    return column.astype("boolean")
 
 
 def _quantiles(name: str, values: np.ndarray) -> dict[str, float]:

@@ -17,8 +17,9 @@ from tqdm import tqdm
 import torchgco
 from torchgco.errors import InputError
 from torchgco.experiments.build import Setup, build, solver_of
+from torchgco.experiments.files import say
 from torchgco.experiments.flight import Bar, Flight, Flown, NoBar, Plan, fly, plan_of, prepare
-from torchgco.experiments.identity import Manifest, closed_loop, layout_digests, plain, settings_of
+from torchgco.experiments.identity import Manifest, closed_loop, difference, digest, layout_digests, plain, settings_of
 from torchgco.experiments.mission_flight import FEW, MissionFlight
 from torchgco.experiments.mission_report import mission_table, write_mission_report
 from torchgco.experiments.records import JUDGED, TRIALS, Records
@@ -39,7 +40,7 @@ def run_study(
     folder: Path,
     recompose: Recompose,
     accepted: Callable[[], None] = lambda: None,
-    show: Callable[[str], None] = print,
+    show: Callable[[str], None] = say,
 ) -> int:
     """Fly, judge, write and report; returns how many trials could be flown at all.
 
@@ -106,12 +107,8 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
     task = setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
     if setup.mission is not None:
         setup.mission.check(task.problem.dynamics)
-    configs = {setup.solver_name: config}
-    solvers = {setup.solver_name: setup.solver}
-    for name in _baselines(config):
-        if name not in solvers:  # a baseline that is the solver itself is dropped
-            configs[name] = recompose(name)
-            solvers[name] = solver_of(configs[name])
+    configs = _rivals(config, recompose)
+    solvers = {name: setup.solver if held is config else solver_of(held) for name, held in configs.items()}
     configuration = {"version": torchgco.__version__, **plain(config)}
     manifest = Manifest(
         configuration=configuration,
@@ -121,11 +118,18 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
     return _Study(setup, plan_of(setup), layouts, solvers, manifest)
 
 
-def _baselines(config: DictConfig) -> Sequence[str]:
-    names = config.study.baselines
-    if isinstance(names, str) or not all(isinstance(name, str) for name in names or ()):
-        raise InputError("study.baselines", "a list of solver names, such as [al_ilqr]", repr(names))
-    return list(names or ())
+def _rivals(config: DictConfig, recompose: Recompose) -> dict[str, DictConfig]:
+    """The configurations of the solvers by name, the one under study first; a baseline that equals it is left out."""
+    own = config.solver.name
+    found = {own: config}
+    for name in config.study.baselines or ():
+        other = recompose(name)
+        here, there = settings_of(config), settings_of(other)
+        if name == own and digest(here) != digest(there):
+            expected = f"another name, as the baseline {own} has other settings: solver.name={own}_changed"
+            raise InputError("solver.name", expected, f"{own} ({difference(there, here)})")
+        found.setdefault(name, other)
+    return found
 
 
 def _fly_all(study: _Study, records: Records) -> tuple[pd.DataFrame, np.ndarray]:

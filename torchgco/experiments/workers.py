@@ -14,6 +14,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from torchgco.errors import InputError
+from torchgco.interrupts import raised, throw
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -69,13 +70,12 @@ def _run_pool(
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(processes, context, _begin_worker, (prepare, options))
     try:
-        with _interrupts_held():
-            futures = {pool.submit(work, job): number for number, job in left.items()}
         with _interrupts_noted() as noted:
+            with _interrupts_held(noted):
+                futures = {pool.submit(work, job): number for number, job in left.items()}
             while futures:
                 done, _ = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED)
-                if noted:
-                    raise KeyboardInterrupt
+                noted.raise_late()
                 for future in done:
                     number = futures.pop(future)  # and with it the memory of the result
                     try:
@@ -94,33 +94,46 @@ def _run_pool(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
+class _Noted:
+    """The signals of a pool: each is noted before it raises, because Python drops exceptions of destructors."""
+
+    def __init__(self) -> None:
+        self.held = False  # while true, a signal is noted only
+        self.numbers: list[int] = []
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        self.numbers.append(number)
+        if not self.held:
+            throw(number, frame)
+
+    def raise_late(self) -> None:
+        """Raise for a signal that was noted, but whose exception got lost."""
+        if self.numbers:
+            throw(self.numbers[0], None)
+
+
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Ctrl-C waits until the end of the block. Processes started in it never see it: the parent handles it."""
-    held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def _interrupts_held(noted: _Noted) -> Iterator[None]:
+    """Signals wait until the end of the block: a process that is half started would end with an error of its own.
+
+    Processes started in the block never see Ctrl-C: the parent handles it. SIGTERM ends them.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    noted.held = True
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, held)
+        noted.held = False
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    noted.raise_late()
 
 
 @contextmanager
-def _interrupts_noted() -> Iterator[list[int]]:
-    """A list that is empty until Ctrl-C: Python drops an exception raised within a destructor."""
-    noted: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
+def _interrupts_noted() -> Iterator[_Noted]:
+    """The signals that arrive in the block."""
+    noted = _Noted()
+    with raised(noted):
         yield noted
-        return
-
-    def note(number: int, frame: FrameType | None) -> None:
-        noted.append(number)
-        signal.default_int_handler(number, frame)
-
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield noted
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...]) -> None:

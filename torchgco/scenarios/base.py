@@ -84,7 +84,7 @@ class Family(Scenario):
             self._set(field, checks.number, above=0)
         for field in ("start", "goal"):
             self._set(field, checks.vector, length=self.dimension)
-        self._set("stages", checks.integer, at_least=1)
+        self._set("stages", checks.integer, at_least=1, at_most=checks.MOST_STAGES)
 
     def _set(self, field: str, check: Any, **limits: Any) -> None:
         """Replace a field by its checked, plain form."""

@@ -16,13 +16,19 @@ import numpy as np
 from torchgco.constraints.boxes import UNIT_WITHIN
 from torchgco.errors import InputError
 
+LARGEST = 1e6  # m, m/s or s: beyond it, squares and sums lose the digits that obstacles are checked to
+MOST_OBSTACLES = 100_000  # in a layout that is drawn
+MOST_STAGES = 10**9  # beyond any memory, and few enough for arithmetic on bytes
+
 
 def number(value: Any, field: str, above: float = -math.inf, at_least: float = -math.inf) -> float:
-    """`value` as a finite float that is > `above` and >= `at_least`."""
+    """`value` as a finite float that is > `above`, >= `at_least`, and at most LARGEST in size."""
     plain = _plain(value)
     if not (math.isfinite(plain) and plain > above and plain >= at_least):
         limit = f" > {above:g}" if above > -math.inf else f" >= {at_least:g}" if at_least > -math.inf else ""
         raise InputError(field, f"a finite number{limit}", repr(value))
+    if abs(plain) > LARGEST:
+        raise InputError(field, f"a number of at most {LARGEST:g} in size", repr(value))
     return plain
 
 
@@ -31,18 +37,20 @@ def optional_number(value: Any, field: str, **limits: float) -> float | None:
     return None if value is None else number(value, field, **limits)
 
 
-def integer(value: Any, field: str, at_least: int) -> int:
-    """`value` as an int >= `at_least`; 5.0 is one, 5.5 is not."""
+def integer(value: Any, field: str, at_least: int, at_most: int | None = None) -> int:
+    """`value` as an int >= `at_least` and <= `at_most`; 5.0 is one, 5.5 is not."""
     plain = _plain(value)
     if not (plain >= at_least and plain.is_integer()):
         raise InputError(field, f"an integer >= {at_least}", repr(value))
+    if at_most is not None and plain > at_most:
+        raise InputError(field, f"an integer <= {at_most}", repr(value))
     return int(value)
 
 
 def _plain(value: Any) -> float:
     """A number, also in an array without axes, as a float; NaN for all else, such as text and booleans."""
     try:
-        return float(value) if np.asarray(value).dtype.kind in "iuf" else math.nan
+        return float(value) if np.asarray(value).dtype.kind in "iufO" and value is not None else math.nan
     except (TypeError, ValueError, RuntimeError, OverflowError):
         return math.nan
 
@@ -103,9 +111,11 @@ def obstacles(centers: Any, radii: Any) -> tuple[np.ndarray, np.ndarray]:
     absent = np.isnan(centers).all(axis=2)
     partial = ~absent & ~np.isfinite(centers).all(axis=2)
     _none_of(partial, "layouts.centers", "finite rows or rows of NaN", centers)
+    _bounded(centers, "layouts.centers")
     _none_of(np.isinf(radii) | (radii < 0), "layouts.radii", "finite radii >= 0", radii)
     _none_of(absent & ~np.isnan(radii), "layouts.radii", "NaN where the centre is NaN", radii)
     _none_of(~absent & np.isnan(radii), "layouts.radii", "a radius where the centre is finite", radii)
+    _bounded(radii, "layouts.radii")
     return centers, radii
 
 
@@ -120,6 +130,7 @@ def velocities(value: Any, centers: np.ndarray) -> np.ndarray | None:
     bad = ~absent & ~np.isfinite(moving).all(axis=2)
     _none_of(bad, "layouts.velocities", "finite velocities where the centre is finite", moving)
     moving[absent] = np.nan
+    _bounded(moving, "layouts.velocities")
     return moving
 
 
@@ -139,6 +150,7 @@ def boxes(centers: Any, halves: Any, turns: Any, radii: Any, like: np.ndarray) -
         raise InputError("layouts.box_centers", f"shape ({count}, K, {d})", f"shape {middle.shape}")
     absent = np.asarray(np.isnan(middle).all(axis=2))
     _none_of(~absent & ~np.isfinite(middle).all(axis=2), "layouts.box_centers", "finite rows or rows of NaN", middle)
+    _bounded(middle, "layouts.box_centers")
     if halves is None:
         raise InputError("layouts.box_half_sizes", "this array with box_centers", "none")
     half = array(halves, "layouts.box_half_sizes")
@@ -150,6 +162,7 @@ def boxes(centers: Any, halves: Any, turns: Any, radii: Any, like: np.ndarray) -
     expected = "finite half sides above 0 where the centre is finite; 0 too where the radius is above 0"
     _none_of(~absent & ~good, "layouts.box_half_sizes", expected, half)
     _none_of(absent & ~np.isnan(half).all(axis=2), "layouts.box_half_sizes", "NaN where the centre is NaN", half)
+    _bounded(half, "layouts.box_half_sizes")
     return middle, half, _turns(turns, absent, d), rounding
 
 
@@ -162,6 +175,7 @@ def _rounding(value: Any, absent: np.ndarray) -> np.ndarray | None:
         raise InputError("layouts.box_radii", f"shape {absent.shape}", radii.shape)
     wrong = ~absent & ~(np.isfinite(radii) & (radii >= 0))
     _none_of(wrong, "layouts.box_radii", "finite radii >= 0 where the centre is finite", radii)
+    _bounded(radii, "layouts.box_radii")
     radii[absent] = np.nan
     return radii
 
@@ -196,6 +210,7 @@ def states(value: Any, field: str, centers: np.ndarray) -> np.ndarray | None:
         raise InputError(field, expected, f"shape {given.shape}")
     given = np.tile(given, (count, 1)) if given.ndim == 1 else given
     _none_of(~np.isfinite(given).all(axis=1), field, "finite states", given)
+    _bounded(given, field)
     return given
 
 
@@ -240,6 +255,11 @@ def ids(value: Any, count: int) -> np.ndarray:
         got = f"{given.dtype} of shape {given.shape}" + (f", from {given.min()}" if numeric else "")
         raise InputError("layouts.ids", f"integers >= 0 of shape ({count},)", got)
     return given.astype(np.int64)
+
+
+def _bounded(values: np.ndarray, field: str) -> None:
+    """Raise InputError where a value exceeds LARGEST; NaN passes."""
+    _none_of(np.abs(values) > LARGEST, field, f"values of at most {LARGEST:g} in size", values)
 
 
 def _none_of(bad: Any, field: str, expected: str, values: np.ndarray) -> None:

@@ -89,7 +89,8 @@ class Layouts:
             raise InputError("layouts.goal", f"n = {self.start.shape[1]} as start has", self.goal.shape[1])
         for name, limit in (("vehicle_radius", "at_least"), ("goal_radius", "above"), ("dt", "above")):
             put(name, checks.optional_number(getattr(self, name), f"layouts.{name}", **{limit: 0.0}))
-        put("stages", None if self.stages is None else checks.integer(self.stages, "layouts.stages", 1))
+        if self.stages is not None:
+            put("stages", checks.integer(self.stages, "layouts.stages", 1, checks.MOST_STAGES))
         lower, upper = checks.control_bounds(self.control_lower, self.control_upper)
         put("control_lower", lower)
         put("control_upper", upper)
@@ -169,7 +170,7 @@ class Layouts:
         Raises InputError: `scenario.path` if there is no readable npz file, `layouts.<array>` if an array is
         missing, unknown or malformed.
         """
-        held = read_arrays(path, "scenario.path", "a layout file")
+        held = read_arrays(path, "scenario.path", "a layout file", room=free_memory())
         path = Path(path)
         for name in REQUIRED:
             if name not in held:

@@ -94,7 +94,7 @@ class PlanarRandom(Planar):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("num_obstacles", checks.integer, at_least=0)
+        self._set("num_obstacles", checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
         self._set("region", checks.box, dimension=2)
         for field in ("start_clearance", "goal_clearance"):
             self._set(field, checks.number, at_least=0)

@@ -13,6 +13,7 @@ from torchgco.scenarios.base import Family, uniform_clear
 from torchgco.scenarios.layouts import Layouts
 
 HOVER = 9.81  # thrust acceleration that holds the vehicle, m/s^2
+MOST_HOLES = 1000  # in a wall
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +58,12 @@ class Forest(Quadrotor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("num_obstacles", checks.integer, at_least=0)
+        self._set("num_obstacles", checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
         self._set("density", checks.optional_number, at_least=0)
         self._set("region", checks.box, dimension=3)
+        if self.obstacle_count > checks.MOST_OBSTACLES:
+            expected = f"at most {checks.MOST_OBSTACLES} obstacles in scenario.region"
+            raise InputError("scenario.density", expected, f"{self.density}, which makes {self.obstacle_count}")
         self._set("clearance", checks.number, at_least=0)
 
     @property
@@ -132,8 +136,12 @@ class Walls(Quadrotor):
         for field in ("extent", "hole_region"):
             self._set(field, checks.box, dimension=2)
         self._set("pitch", checks.number, above=0)
-        self._set("holes", checks.integer, at_least=0)
+        self._set("holes", checks.integer, at_least=0, at_most=MOST_HOLES)
         self._set("hole_radius", checks.number, at_least=0)
+        steps = [(high - low) / self.pitch + 1 for low, high in self.extent]
+        if len(self.positions) * steps[0] * steps[1] > checks.MOST_OBSTACLES:
+            expected = f"grids of at most {checks.MOST_OBSTACLES} spheres in scenario.extent"
+            raise InputError("scenario.pitch", expected, self.pitch)
 
     def _grid(self) -> np.ndarray:
         """Centres in the plane of a wall, (G, 2): all z for each y."""

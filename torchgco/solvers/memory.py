@@ -17,17 +17,22 @@ SHARE = 0.5  # of the free memory; the rest is the system's and other processes'
 NUMBER = 8  # bytes of float64
 
 
+def least_bytes(N: int, n: int, m: int, rows: int) -> int:
+    """Bytes that a problem of this size takes at least in a solve; `rows` of its constraints at all knots together."""
+    gains = N * 2 * m * (n + 1)
+    trajectories = N * (n + m) * 16  # iterate, best, last, result, and those tried by a line search
+    return NUMBER * (gains + trajectories + 12 * rows)
+
+
 def element_bytes(problem: Problem) -> int:
     """Bytes that one problem of this form takes in a solve, measured to be within a factor of 2 (tests)."""
     N, n, m = problem.N, problem.n, problem.m
     z, s = n + 1, n + 1 + m
     one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
     rows = sum(lam.numel() for lam in Multipliers.zero(one, 0.0).lam)
-    gains = N * 2 * m * z
     # F, H and the derivatives they are built from; native kernels hold them for eight problems only.
     expansion = 0 if engine_of(problem) is not None else N * (2 * z * s + 2 * s * s)
-    trajectories = N * (n + m) * 16  # iterate, best, last, result, and those tried by a line search
-    return NUMBER * (gains + expansion + trajectories + 12 * rows)
+    return least_bytes(N, n, m, rows) + NUMBER * expansion
 
 
 def plan_batch(problem: Problem, device: str | torch.device | None = None, processes: int = 1) -> int:
@@ -44,7 +49,7 @@ def plan_batch(problem: Problem, device: str | torch.device | None = None, proce
     check_problem(problem)
     check_value(processes, Count, "processes")
     where = problem.x0.device if device is None else check_device(device)
-    free = torch.cuda.mem_get_info(where)[0] if where.type == "cuda" else _free_memory()
+    free = torch.cuda.mem_get_info(where)[0] if where.type == "cuda" else free_memory()
     fits = max(1, int(SHARE * free / processes) // element_bytes(problem))
     return fits if where.type == "cuda" else min(fits, CPU_LIMIT)
 
@@ -54,7 +59,7 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "can't allocate memory" in str(error)
 
 
-def _free_memory() -> int:
+def free_memory() -> int:
     """Bytes that can be allocated without swapping: the kernel's own estimate, else unused pages."""
     try:
         with open("/proc/meminfo") as lines:
