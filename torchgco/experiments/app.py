@@ -4,29 +4,35 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
-from functools import cache
+import warnings
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
 from torchgco.errors import InputError
-from torchgco.experiments.build import as_input_error, compose_config, config_dir
+from torchgco.experiments.build import as_input_error, config_dir, forget_composed, recomposer
 from torchgco.experiments.files import write
 from torchgco.experiments.identity import decisive, digest, plain, settings_of
+from torchgco.experiments.jobs import Report
+
+# conf/hydra/launcher extends the plugins' configurations of the same names. Hydra warns that it may stop to join them;
+# ours are whole.
+warnings.filterwarnings("ignore", r"\s*'hydra/launcher/\w+' is validated against ConfigStore schema", UserWarning)
+LAUNCHERS = ("joblib", "submitit", "ray")  # packages whose errors tell that a job was killed or timed out
 
 
 def study_folder(_root_: Any) -> str:
     """A folder name from the settings that decide results. It holds no time, so a second start resumes the first."""
     held = plain(OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"]))
     solvers = {held["solver"]["name"]: {key: value for key, value in held["solver"].items() if key != "name"}}
-    recompose = _recomposer(_root_.hydra)
+    recompose = recomposer(_root_.hydra.overrides.task, _root_.hydra.runtime.config_sources)
     baselines = held["study"]["baselines"]
     for name in baselines if isinstance(baselines, list) else ():
         try:
@@ -42,32 +48,42 @@ def study_folder(_root_: Any) -> str:
 OmegaConf.register_new_resolver("torchgco.folder", study_folder, replace=True)
 
 
-def _recomposer(job: Any) -> Callable[[str], DictConfig]:
-    """A function that composes the running job's configuration (its node `hydra`) with another solver."""
-    given = [o for o in job.overrides.task if not o.lstrip("+~").startswith(("solver=", "solver."))]
-    folders = [source.path for source in job.runtime.config_sources if source.schema == "file"]
-    others = [f"file://{path}" for path in folders if str(config_dir()) not in path]
-    return lambda solver: _composed((*given, f"solver={solver}"), tuple(others))
-
-
-@cache
-def _composed(overrides: tuple[str, ...], searchpath: tuple[str, ...]) -> DictConfig:
-    return compose_config(overrides, searchpath)  # needed several times by the folder's name
-
-
-@hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="config")
-def _run(config: DictConfig) -> None:
+def _task(config: DictConfig) -> Report:
     from torchgco.experiments.study import run_study  # here, as workers import this module and need no figures
 
     job = HydraConfig.get()
-    folder = Path(job.runtime.output_dir)
+    folder, overrides = Path(job.runtime.output_dir), list(job.overrides.task)
+    alone = job.mode == RunMode.RUN
     try:
-        if run_study(config, folder, _recomposer(job), lambda: _keep_configuration(config, folder)) == 0:
-            raise InputError("scenario", "a layout whose start is outside its obstacles", "none")
+        done = run_study(
+            config, folder, recomposer(overrides, job.runtime.config_sources),
+            lambda: _keep_configuration(config, folder), command=sys.argv[1:] if alone else ["-m", *overrides],
+        )  # fmt: skip
     except InputError as error:
+        if not alone:
+            return Report(str(folder), overrides, False, str(error))
         # An exit, because Hydra would print a line before an exception.
         print(f"torchgco: {error}", file=sys.stderr)
         sys.exit(2)
+    except Exception as error:
+        if _is_of_launcher(error):
+            return Report(str(folder), overrides, False, _stopped(error))
+        raise
+    return Report(str(folder), overrides, done)
+
+
+# Not as a decorator: launchers send the task to other processes by its name.
+_run = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="config")(_task)
+
+
+def _is_of_launcher(error: Exception) -> bool:
+    return type(error).__module__.split(".")[0] in LAUNCHERS
+
+
+def _stopped(error: Exception) -> str:
+    """A launcher's error as one line."""
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    return f"a job was stopped ({reason}); what jobs flew is kept, and the same command resumes"
 
 
 def _keep_configuration(config: DictConfig, folder: Path) -> None:
@@ -86,7 +102,7 @@ def main() -> int:
         return 0
     # Hydra would print and exit by itself; with this it raises its errors, and each is printed as one line.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    _composed.cache_clear()  # the files of conf/ may have changed since the last call
+    forget_composed()  # the files of conf/ may have changed since the last call
     try:
         _run()
     except (HydraException, OmegaConfBaseException) as error:
@@ -98,4 +114,9 @@ def main() -> int:
     except KeyboardInterrupt:
         print("\ntorchgco: interrupted; the same command resumes from here", file=sys.stderr)
         return 130
+    except Exception as error:
+        if not _is_of_launcher(error):
+            raise
+        print(f"torchgco: {_stopped(error)}", file=sys.stderr)
+        return 1
     return 0

@@ -96,8 +96,11 @@ def _run_pool(
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Ctrl-C waits until the end of the block. Processes started in it never see it: the parent handles it."""
-    held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    """Ctrl-C waits until the end of the block. Processes started in it never see it: the parent handles it.
+
+    The same holds for the signals of schedulers before a time limit, which reach all processes of a job.
+    """
+    held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2})
     try:
         yield
     finally:
