@@ -6,7 +6,8 @@
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
 #              make paper: the paper's figures, tables and missions by our solvers, in docs/paper and docs/paper.md
-# make test    the tests; test-all: also the tests that kill processes or fly whole studies; lint, types: the static checks;
+# make test    the tests; test-all: also the tests that kill processes or fly whole studies; test-slurm: those that start a
+#              SLURM on this machine (as root; needs Debian's slurm-wlm and munge); lint, types: the static checks;
 #              clean: remove environments, caches and builds
 
 PYTHON ?= python3
@@ -24,7 +25,7 @@ ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all lint types clean quality oracle benchmark benchmark-gpu ladder docs figures paper
+.PHONY: study test test-all test-slurm lint types clean quality oracle benchmark benchmark-gpu ladder docs figures paper
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -33,7 +34,10 @@ test: $(DEV)
 	$(BIN)/python -m pytest -n auto $(ARGS)
 
 test-all: $(DEV)
-	$(BIN)/python -m pytest -n auto -m "slow or not slow" $(ARGS)
+	$(BIN)/python -m pytest -n auto -m "not slurm" $(ARGS)
+
+test-slurm: $(DEV)
+	$(BIN)/python -m pytest -m slurm $(ARGS)
 
 ladder: $(RUNTIME)
 	$(BIN)/python -m benchmarks.quality --write \
@@ -80,11 +84,11 @@ $(RUNTIME): pyproject.toml constraints.txt | $(BIN)/python
 	touch $@
 
 $(DEV): pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) -e '.[dev,plants]'
+	$(INSTALL) -e '.[dev,plants,cluster]'
 	touch $@ $(RUNTIME)
 
 $(PEERS): pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) -e '.[dev,plants,peers]'
+	$(INSTALL) -e '.[dev,plants,cluster,peers]'
 	touch $@ $(RUNTIME) $(DEV)
 
 $(ACADOS)/.ready: constraints.txt

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import itertools
 import re
 import shlex
 import warnings
@@ -16,6 +15,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from torch import Tensor
 
 from benchmarks import oracle, quality
@@ -41,6 +42,7 @@ PAGES += [
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?<=\n\n)(?:    .*\n)+")
 PYTHON, SHELL = "python", "sh"
+INSTALLS = ("pip install -e .", "pip install 'torchgco[cluster]'", "pip install 'torchgco[ray]'")
 TARGETS = {"quality": quality, "ladder": quality, "oracle": oracle, "benchmark": speed, "benchmark-gpu": speed}
 
 
@@ -93,7 +95,7 @@ def accept(command: str) -> None:
     elif program == "python":
         accept_python(words)
     else:
-        assert command == "pip install -e ."
+        assert command.split(" #")[0].strip() in INSTALLS
 
 
 def accept_make(words: list[str]) -> None:
@@ -109,10 +111,11 @@ def accept_make(words: list[str]) -> None:
 
 def accept_overrides(words: list[str]) -> None:
     """Every combination of a sweep composes."""
-    sweep = "-m" in words
-    parts = [word.split("=", 1) for word in words if word != "-m"]
-    choices = [[f"{key}={choice}" for choice in (value.split(",") if sweep else [value])] for key, value in parts]
-    for overrides in itertools.product(*choices):
+    given = OverridesParser.create().parse_overrides([word for word in words if word != "-m"])
+    if "-m" not in words:
+        assert not any(override.is_sweep_override() for override in given)
+    (jobs,) = BasicSweeper.split_arguments(given, None)
+    for overrides in jobs:
         compose_config([word for word in overrides if not word.startswith("hydra.")])
 
 

@@ -108,10 +108,11 @@ def _plain(value: Any, rule: Rule, field: str) -> Any:
     """The Python value of a NumPy number, the float of a long integer where one will do; InputError for all else."""
     if isinstance(value, np.generic) and rule.fits(value.item()):
         return value.item()
-    long = type(value) is int and abs(value) >= LONG
-    if long and abs(value) < sys.float_info.max and rule.fits(float(value)):
-        return float(value)
-    raise InputError(field, f"{rule.one} of 64 bits" if long else rule.one, shown(value))
+    if type(value) is int and abs(value) >= LONG:
+        if abs(value) < sys.float_info.max and rule.fits(float(value)):
+            return float(value)
+        raise InputError(field, f"{rule.one} of 64 bits", shown(value))
+    raise InputError(field, rule.one, shown(value))
 
 
 @cache

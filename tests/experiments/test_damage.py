@@ -160,13 +160,17 @@ def test_a_full_disk_gets_one_line_and_leaves_no_parts(name: str, run, tmp_path,
     if name not in ("summary.csv", "rates.png"):
         request.getfixturevalue("without_report")
 
-    def replace(part, place, real=os.replace):
-        if Path(place).name == name:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        real(part, place)
+    def full(real):
+        def move(part, place):
+            if Path(place).name == name:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            real(part, place)
+
+        return move
 
     with monkeypatch.context() as patch:
-        patch.setattr(files.os, "replace", replace)
+        patch.setattr(files.os, "replace", full(os.replace))
+        patch.setattr(files.os, "link", full(os.link))
         code, _, err = run(*WORDS)
     line = problem_line(err)
     assert code == 2 and name in line and "No space left on device" in line

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Callable
-from functools import cache
+import warnings
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,11 +19,17 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
 from torchgco.errors import InputError
-from torchgco.experiments.build import compose_config, config_dir
+from torchgco.experiments.build import config_dir, forget_composed, recomposer
 from torchgco.experiments.checks import as_input_error, check, check_words
 from torchgco.experiments.files import write
 from torchgco.experiments.identity import decisive, digest, plain, settings_of
+from torchgco.experiments.jobs import Report
 from torchgco.interrupts import farewell, raised
+
+# conf/hydra/launcher extends the plugins' configurations of the same names. Hydra warns that it may stop to join them;
+# ours are whole.
+warnings.filterwarnings("ignore", r"\s*'hydra/launcher/\w+' is validated against ConfigStore schema", UserWarning)
+LAUNCHERS = ("joblib", "submitit", "ray")  # packages whose errors tell that a job was killed or timed out
 
 
 def study_folder(_root_: Any) -> str:
@@ -32,7 +37,7 @@ def study_folder(_root_: Any) -> str:
     held = plain(OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"]))
     check(held, config_dir())
     solvers = {held["solver"]["name"]: {key: value for key, value in held["solver"].items() if key != "name"}}
-    recompose = _recomposer(_root_.hydra)
+    recompose = recomposer(_root_.hydra.overrides.task, _root_.hydra.runtime.config_sources)
     for name in held["study"]["baselines"] or ():
         solvers.setdefault(name, settings_of(recompose(name)))
     path = held["scenario"].get("path")
@@ -44,47 +49,47 @@ def study_folder(_root_: Any) -> str:
 OmegaConf.register_new_resolver("torchgco.folder", study_folder, replace=True)
 
 
-def _recomposer(job: Any) -> Callable[[str], DictConfig]:
-    """A function that composes the running job's configuration (its node `hydra`) with another solver."""
-    given = [o for o in job.overrides.task if not o.lstrip("+~").startswith(("solver=", "solver."))]
-    folders = [source.path for source in job.runtime.config_sources if source.schema == "file"]
-    others = [f"file://{path}" for path in folders if str(config_dir()) not in path]
-
-    def recompose(solver: str) -> DictConfig:
-        try:
-            return _composed((*given, f"solver={solver}"), tuple(others))
-        except InputError as error:
-            if error.field != "solver":
-                raise
-            raise InputError("study.baselines", error.expected, solver) from None
-
-    return recompose
-
-
-@cache
-def _composed(overrides: tuple[str, ...], searchpath: tuple[str, ...]) -> DictConfig:
-    return compose_config(overrides, searchpath)  # needed several times by the folder's name
-
-
-@hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="config")
-def _run(config: DictConfig) -> None:
+def _task(config: DictConfig) -> Report:
     from torchgco.experiments.study import run_study  # here, as workers import this module and need no figures
 
     job = HydraConfig.get()
-    folder = Path(job.runtime.output_dir)
+    folder, overrides = Path(job.runtime.output_dir), list(job.overrides.task)
+    alone = job.mode == RunMode.RUN
     try:
-        kind, named = ("sweep", job.sweep.dir) if job.mode == RunMode.MULTIRUN else ("run", job.run.dir)
+        kind, named = ("run", job.run.dir) if alone else ("sweep", job.sweep.dir)
         if not named:
             raise InputError(f"hydra.{kind}.dir", "the name of a folder", "an empty one")
         with raised():  # modules are loaded, and files are about to be written
-            flown = run_study(config, folder, _recomposer(job), lambda: _keep_configuration(config, folder))
-        if flown == 0:
-            raise InputError("scenario", "a layout whose start is outside its obstacles", "none")
+            done = run_study(
+                config, folder, recomposer(overrides, job.runtime.config_sources),
+                lambda: _keep_configuration(config, folder), command=sys.argv[1:] if alone else ["-m", *overrides],
+            )  # fmt: skip
     except (InputError, HydraException, OmegaConfBaseException) as error:
         _remove_empty(folder)
+        if not alone:
+            return Report(str(folder), overrides, False, str(as_input_error(error)))
         # An exit, because Hydra would print a line before an exception.
         print(f"torchgco: {as_input_error(error)}", file=sys.stderr)
         sys.exit(2)
+    except Exception as error:
+        if _is_of_launcher(error):
+            return Report(str(folder), overrides, False, _stopped(error))
+        raise
+    return Report(str(folder), overrides, done)
+
+
+# Not as a decorator: launchers send the task to other processes by its name.
+_run = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="config")(_task)
+
+
+def _is_of_launcher(error: Exception) -> bool:
+    return type(error).__module__.split(".")[0] in LAUNCHERS
+
+
+def _stopped(error: Exception) -> str:
+    """A launcher's error as one line."""
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    return f"a job was stopped ({reason}); what jobs flew is kept, and the same command resumes"
 
 
 def _remove_empty(folder: Path) -> None:
@@ -114,7 +119,7 @@ def main() -> int:
         return 0
     # Hydra would print and exit by itself; with this it raises its errors, and each is printed as one line.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    _composed.cache_clear()  # the files of conf/ may have changed since the last call
+    forget_composed()  # the files of conf/ may have changed since the last call
     parser = get_args_parser()
     parser.error = _refuse_flags
     try:
@@ -126,8 +131,11 @@ def main() -> int:
         return _refuse(InputError("hydra.run.dir", "a folder that can be made", error))
     except KeyboardInterrupt as error:
         return farewell(error)
-    except ValueError as error:
-        if not _by_hydra(error):
+    except Exception as error:
+        if _is_of_launcher(error):
+            print(f"torchgco: {_stopped(error)}", file=sys.stderr)
+            return 1
+        if not isinstance(error, ValueError) or not _by_hydra(error):
             raise
         return _refuse(InputError("command line", "words that Hydra accepts", error))
     return 0

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import torchgco
 from torchgco.errors import InputError
 from torchgco.experiments.checks import as_input_error, check, check_words
 from torchgco.experiments.identity import plain
+from torchgco.experiments.launching import allotted_cores
 from torchgco.experiments.preset_nodes import register
 from torchgco.kernels import use_native
 from torchgco.options import check_value
@@ -111,6 +112,36 @@ def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> 
         raise as_input_error(error) from None
     finally:
         Singleton.set_state(running)
+
+
+def recomposer(overrides: Sequence[str], sources: Iterable[Any]) -> Callable[[str | None], DictConfig]:
+    """A function that composes the configuration of some overrides with another solver, with None as it is.
+
+    `sources` are Hydra's own `config_sources` of the command.
+    """
+    given = [o for o in overrides if not o.lstrip("+~").startswith(("solver=", "solver."))]
+    folders = [source.path for source in sources if source.schema == "file"]
+    others = tuple(f"file://{path}" for path in folders if str(config_dir()) not in path)
+
+    def recompose(solver: str | None) -> DictConfig:
+        try:
+            return _composed(tuple(overrides) if solver is None else (*given, f"solver={solver}"), others)
+        except InputError as error:
+            if solver is None or error.field != "solver":
+                raise
+            raise InputError("study.baselines", error.expected, solver) from None
+
+    return recompose
+
+
+@cache
+def _composed(overrides: tuple[str, ...], searchpath: tuple[str, ...]) -> DictConfig:
+    return compose_config(overrides, searchpath)  # needed several times by the folder's name
+
+
+def forget_composed() -> None:
+    """Compose anew what `recomposer` composes: the files of conf/ may have changed."""
+    _composed.cache_clear()
 
 
 def build(config: DictConfig) -> Setup:
@@ -212,11 +243,6 @@ def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
     torch.set_num_threads(_threads(node.threads))
     use_native(node.kernels == "native")
     return torch.device(node.name), getattr(torch, node.dtype)
-
-
-def allotted_cores() -> int:
-    """Cores that this process may use, according to Slurm or else the system."""
-    return int(os.environ.get("SLURM_CPUS_PER_TASK", 0)) or len(os.sched_getaffinity(0))
 
 
 def _threads(wanted: int | None) -> int:

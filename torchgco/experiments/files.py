@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import tempfile
@@ -13,6 +14,7 @@ from typing import IO, Any
 from torchgco.errors import InputError
 
 PART = ".part"  # ending of a file that is still being written
+NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)  # of file systems without hard links
 
 
 def write(path: Path, save: Callable[[IO[bytes]], Any]) -> None:
@@ -23,22 +25,54 @@ def write(path: Path, save: Callable[[IO[bytes]], Any]) -> None:
     Raises:
         InputError: the system refuses to write there (disk full, no permission).
     """
-    part: str | None = None
+    _place(path, save, os.replace)
+
+
+def create(path: Path, save: Callable[[IO[bytes]], Any]) -> bool:
+    """As `write`, but False, and the file left as it is, where `path` exists: of several processes one creates it.
+
+    Raises:
+        InputError: the system refuses to write there (disk full, no permission).
+    """
+
+    def move(part: str, place: Path) -> None:
+        try:
+            os.link(part, place)
+        except OSError as error:
+            if error.errno not in NO_LINKS:
+                raise
+            os.replace(part, place)
+
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, part = tempfile.mkstemp(dir=path.parent, suffix=PART)
-        with os.fdopen(handle, "wb") as file:
-            save(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(part, 0o644)
-        os.replace(part, path)
-    except OSError as error:
-        expected = "a folder (hydra.run.dir, --output of a report) with room that may be written to"
-        raise InputError(str(path), expected, error.strerror or error) from None
-    finally:
-        if part is not None:
-            Path(part).unlink(missing_ok=True)  # gone already after a move
+        _place(path, save, move)
+    except FileExistsError:
+        return False
+    return True
+
+
+def _place(path: Path, save: Callable[[IO[bytes]], Any], move: Callable[[str, Path], None]) -> None:
+    for last in (False, True):
+        part: str | None = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, part = tempfile.mkstemp(dir=path.parent, suffix=PART)
+            with os.fdopen(handle, "wb") as file:
+                save(file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(part, 0o644)
+            move(part, path)
+            return
+        except OSError as error:
+            if isinstance(error, FileNotFoundError) and not last:
+                continue  # another process that finished the study removed the part, or its folder, as left over
+            if isinstance(error, FileExistsError) and part is not None:
+                raise
+            expected = "a folder (hydra.run.dir, --output of a report) with room that may be written to"
+            raise InputError(str(path), expected, error.strerror or error) from None
+        finally:
+            if part is not None:
+                Path(part).unlink(missing_ok=True)  # gone already after a move
 
 
 def say(text: str) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import IO, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import pandas as pd
@@ -17,7 +18,9 @@ import torchgco
 from torchgco.certificate import certify
 from torchgco.certificate import frame_columns as certificate_columns
 from torchgco.errors import InputError
-from torchgco.experiments.build import MOST, Setup, allotted_cores
+from torchgco.experiments.build import MOST, Setup
+from torchgco.experiments.launching import allotted_cores, jobs_at_once
+from torchgco.experiments.progress import Bar
 from torchgco.judge import frame_columns, judge
 from torchgco.kernels import use_native
 from torchgco.native.dispatch import engine_of
@@ -41,12 +44,22 @@ class Plan:
     shard_size  layouts to a file
     workers     processes
     repair      damaged files are redone
+    job, jobs   this process flies share `job` (0..jobs-1) of the layouts; job is None where it flies all
     """
 
     batch_size: int | None
     shard_size: int
     workers: int
     repair: bool
+    job: int | None
+    jobs: int
+
+    def share(self, ids: Sequence[int], count: int) -> list[int]:
+        """The part of `ids` that this process flies, of a study's layouts 0..count-1.
+
+        A layout's share depends on nothing else: a job that is started again flies what it left.
+        """
+        return [number for number in ids if self.job is None or number * self.jobs // count == self.job]
 
 
 def plan_of(setup: Setup) -> Plan:
@@ -54,6 +67,13 @@ def plan_of(setup: Setup) -> Plan:
     given = setup.config.study
     if not isinstance(given.repair, bool):
         raise InputError("study.repair", "true or false", repr(given.repair))
+    jobs = 1 if given.jobs is None else _count(given.jobs, "jobs", ", or null for a study in one piece")
+    job = given.job
+    if (job is None) != (given.jobs is None) or (job is not None and not _is_one_of(job, jobs)):
+        raise InputError(
+            "study.job", "one of 0 to study.jobs - 1, as in -m study.jobs=4 'study.job=range(0,4)'",
+            f"study.job={job} study.jobs={given.jobs}",
+        )  # fmt: skip
     # On a GPU the batches of several processes would share one device.
     processes = 1 if setup.device.type == "cuda" else max(1, allotted_cores() // torch.get_num_threads())
     return Plan(
@@ -61,7 +81,13 @@ def plan_of(setup: Setup) -> Plan:
         shard_size=_count(given.shard_size, "shard_size"),
         workers=processes if given.workers is None else _count(given.workers, "workers", ", or null: all cores", MOST),
         repair=given.repair,
+        job=job,
+        jobs=jobs,
     )
+
+
+def _is_one_of(number: object, count: int) -> bool:
+    return isinstance(number, int) and not isinstance(number, bool) and 0 <= number < count
 
 
 def _count(value: object, name: str, otherwise: str = "", most: int | None = None) -> int:
@@ -69,28 +95,6 @@ def _count(value: object, name: str, otherwise: str = "", most: int | None = Non
         limits = "at least 1" if most is None else f"1 to {most}"
         raise InputError(f"study.{name}", f"{limits}{otherwise}", repr(value))
     return value
-
-
-class Bar(Protocol):
-    """The part of a tqdm bar that a flight uses."""
-
-    def update(self, n: float) -> Any: ...
-    def set_postfix(self, ordered_dict: Any, refresh: bool) -> Any: ...
-    def write(self, s: str, file: IO[str]) -> Any: ...
-
-
-class NoBar:
-    """Shows warnings only, in worker processes: even a disabled tqdm makes a semaphore, which leaks in a kill."""
-
-    def update(self, n: float) -> None:
-        """Nothing is shown."""
-
-    def set_postfix(self, ordered_dict: Any, refresh: bool) -> None:
-        """Nothing is shown."""
-
-    def write(self, s: str, file: IO[str]) -> None:
-        """The line as it is."""
-        print(s, file=file)
 
 
 @dataclass
@@ -142,7 +146,8 @@ class Flight:
         solver, at_once = self.solver.prepare(problem), problem.B
         if solver.in_slots(1) is not None:
             plan = plan_of(self.setup)
-            at_once = min(problem.B, plan.batch_size or plan_batch(problem, self.setup.device, plan.workers))
+            processes = plan.workers * jobs_at_once()
+            at_once = min(problem.B, plan.batch_size or plan_batch(problem, self.setup.device, processes))
             solver = solver.in_slots(at_once)
         while True:
             together = torch.zeros_like(ids)

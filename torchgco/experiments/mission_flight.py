@@ -11,7 +11,7 @@ import torch
 
 import torchgco
 from torchgco.experiments.build import Setup
-from torchgco.experiments.flight import Bar
+from torchgco.experiments.progress import Bar
 from torchgco.flights import clearances, ending, mission_row, packed, spheres_of
 from torchgco.outcome import Outcome
 from torchgco.scenarios import Layouts

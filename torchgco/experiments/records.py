@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 
 from torchgco.errors import InputError
-from torchgco.experiments.files import PART, checksum, damaged, write
+from torchgco.experiments.files import PART, checksum, create, damaged, write
 from torchgco.experiments.identity import Manifest, difference
 from torchgco.scenarios import Layouts
 
@@ -60,22 +60,31 @@ class Records:
             InputError: results of another study lie there, or the study's manifest is damaged or missing.
         """
         path = self.folder / MANIFEST
-        if path.is_file():
-            try:
-                held = read_manifest(path)
-            except InputError:
-                if not self.repair:
-                    raise
-            else:
-                if held is None:
-                    raise self._another("(written by an older version of torchgco)")
-                if held.identity() == self.manifest.identity():
-                    return
-                raise self._another(f"({difference(held.identity(), self.manifest.identity())})")
-        elif not self.repair and ((self.folder / TRIALS).is_file() or any(self.folder.glob("shards/*.npz"))):
+        orphaned = (self.folder / TRIALS).is_file() or any(self.folder.glob("shards/*.npz"))
+        there = path.is_file()  # looked at after the results, which another job of the study may be writing
+        if there and self._claimed(path):
+            return
+        if orphaned and not there and not self.repair:
             raise damaged(path, "is missing")
         self._refuse_foreign()
-        write(path, lambda file: file.write(self.manifest.to_json()))
+        if there:
+            write(path, lambda file: file.write(self.manifest.to_json()))
+        elif not create(path, lambda file: file.write(self.manifest.to_json())):
+            self._claimed(path)  # by another job meanwhile
+
+    def _claimed(self, path: Path) -> bool:
+        """Whether study.json is this study's; False where it is damaged and to be repaired."""
+        try:
+            held = read_manifest(path)
+        except InputError:
+            if not self.repair:
+                raise
+            return False
+        if held is None:
+            raise self._another("(written by an older version of torchgco)")
+        if held.identity() != self.manifest.identity():
+            raise self._another(f"({difference(held.identity(), self.manifest.identity())})")
+        return True
 
     def finished(self, layouts: Layouts) -> bool:
         """Whether all files of the study are present and undamaged.
@@ -94,7 +103,7 @@ class Records:
             if not self.repair:
                 raise damaged(place, "is damaged" if place.is_file() else "is missing")
             if name != LAYOUTS:
-                path.unlink()
+                path.unlink(missing_ok=True)  # another job may be repairing, too
                 return False
             write(place, _arrays(layouts.arrays()))
             self.close()
@@ -111,9 +120,11 @@ class Records:
             try:
                 rows, _ = self._read(path, solver)
             except InputError:
+                if not path.is_file():  # the study was finished, or the shard repaired, by another process
+                    continue
                 if not self.repair:
                     raise
-                path.unlink()
+                path.unlink(missing_ok=True)
             else:
                 for number in rows["layout"]:
                     left.pop(number, None)
@@ -169,9 +180,13 @@ class Records:
     def close(self) -> None:
         """Mark the study as done, with the checksums of its files, and drop its shards."""
         write(self.folder / DONE, _json({name: [checksum(self.folder / name)] for name in self.files}))
-        shutil.rmtree(self.folder / "shards", ignore_errors=True)
+        self.drop_shards()
         for part in self.folder.glob(f"*{PART}"):  # of a start that was killed while it wrote
             part.unlink(missing_ok=True)
+
+    def drop_shards(self) -> None:
+        """Remove the shards of a study that is done."""
+        shutil.rmtree(self.folder / "shards", ignore_errors=True)
 
     def _shards(self, solver: str) -> list[Path]:
         name = re.compile(rf"{re.escape(solver)}-\d+-\d+\.npz")

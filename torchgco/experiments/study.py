@@ -18,11 +18,14 @@ import torchgco
 from torchgco.errors import InputError
 from torchgco.experiments.build import Setup, build, solver_of
 from torchgco.experiments.files import say
-from torchgco.experiments.flight import Bar, Flight, Flown, NoBar, Plan, fly, plan_of, prepare
+from torchgco.experiments.flight import Flight, Flown, Plan, fly, plan_of, prepare
 from torchgco.experiments.identity import Manifest, closed_loop, difference, digest, layout_digests, plain, settings_of
+from torchgco.experiments.launching import side_by_side
 from torchgco.experiments.mission_flight import FEW, MissionFlight
 from torchgco.experiments.mission_report import mission_table, write_mission_report
-from torchgco.experiments.records import JUDGED, TRIALS, Records
+from torchgco.experiments.progress import Bar, Lines, NoBar
+from torchgco.experiments.provenance import recorded
+from torchgco.experiments.records import DONE, JUDGED, TRIALS, Records
 from torchgco.experiments.report import write_report
 from torchgco.experiments.success import sound, with_success
 from torchgco.experiments.workers import run_all
@@ -41,33 +44,72 @@ def run_study(
     recompose: Recompose,
     accepted: Callable[[], None] = lambda: None,
     show: Callable[[str], None] = say,
-) -> int:
-    """Fly, judge, write and report; returns how many trials could be flown at all.
+    command: Sequence[str] = (),
+    collect: bool = False,
+) -> bool:
+    """Fly, judge, write and report; returns False where a job flew its share of a study that others finish.
 
     Started again on the same folder it resumes where it was stopped; a finished study only shows its table.
 
     Args:
         recompose: makes the configuration of a baseline.
         accepted: called once the folder is known to be this study's; before that nothing is written.
+        command: the command line, for run.json.
+        collect: fly nothing, only judge, write and report what jobs flew.
 
     Raises:
         InputError: malformed configuration, a folder that holds another study, damaged files, worker processes that
-            die again and again.
+            die again and again, no layout that could be flown at all, missing trials where `collect` is set.
     """
     study = _study(config, recompose)
     records = Records(folder, study.manifest, study.plan.repair)
     records.claim()
     accepted()
+    with recorded(folder, study.setup, study.plan, command) as ending:
+        if study.plan.job is not None:
+            _fly_share(study, records, show)
+            ending.append("share flown")
+            return False
+        _fly_and_report(study, records, show, collect)
+        return True
+
+
+def _fly_share(study: _Study, records: Records, show: Callable[[str], None]) -> None:
+    """Fly the share of a job, and leave the tables to the process that finishes the study."""
+    name = f"Job {study.plan.job} of {study.plan.jobs}"
+    if records.finished(study.layouts):
+        show(f"{name}: already done in {records.folder}")
+        return
+    missing = {solver: study.plan.share(records.missing(solver), study.layouts.count) for solver in study.solvers}
+    _fly(study, records, missing, name)
+    if (records.folder / DONE).is_file():  # another process flew the rest, and this share, meanwhile
+        records.drop_shards()
+    show(f"{name}: {sum(map(len, missing.values()))} trials flown in {records.folder}")
+
+
+def _fly_and_report(study: _Study, records: Records, show: Callable[[str], None], collect: bool) -> None:
+    folder = records.folder
     if records.finished(study.layouts):
         show(f"Already done in {folder}: nothing was flown again.\n")
         _update_success(study, records, show)
     else:
-        _finish(study, records, *_fly_all(study, records))
+        missing = {name: records.missing(name) for name in study.solvers}
+        count, left = study.layouts.count * len(study.solvers), sum(map(len, missing.values()))
+        if collect and left:
+            told = f"{left} of {count} trials missing in {folder} (the same command flies them)"
+            raise InputError("study.jobs", "a share from every job", told)
+        if left < count and not collect:
+            show(f"Resumed in {folder}: {count - left} of {count} trials were flown before.\n")
+        _fly(study, records, missing, study.setup.solver_name)
+        flown = [records.flown(name) for name in study.solvers]
+        rows = pd.concat([rows for rows, _ in flown], ignore_index=True)
+        _finish(study, records, rows, np.stack([U for _, U in flown]))
     show(_report(study, folder))
     records.close()
     show(f"\nTable, arrays and figures: {folder}")
     trials = pd.read_parquet(folder / TRIALS)
-    return int((trials["status"] != Status.INVALID_START.name).sum())
+    if (trials["status"] == Status.INVALID_START.name).all():
+        raise InputError("scenario", "a layout whose start is outside its obstacles", "none")
 
 
 @dataclass(frozen=True)
@@ -132,12 +174,12 @@ def _rivals(config: DictConfig, recompose: Recompose) -> dict[str, DictConfig]:
     return found
 
 
-def _fly_all(study: _Study, records: Records) -> tuple[pd.DataFrame, np.ndarray]:
-    """Rows of every solver on every layout and controls (solver, L, N, m); flown here or read from the shards."""
-    missing = {name: records.missing(name) for name in study.solvers}
+def _fly(study: _Study, records: Records, missing: Mapping[str, Sequence[int]], name: str) -> None:
+    """Fly the missing layouts of every solver, and keep them as shards."""
     batches = [(name, ids) for name, left in missing.items() for ids in _cut(left, study.plan.shard_size)]
-    count = study.layouts.count * len(study.solvers)
-    with tqdm(total=count, initial=count - sum(map(len, missing.values())), unit="trial", dynamic_ncols=True) as bar:
+    if not batches:
+        return
+    with _bar(study, sum(map(len, missing.values())), name) as bar:
         workers = min(study.plan.workers, len(batches))
         if workers > 1:
             _fly_side_by_side(study, records, batches, workers, bar)
@@ -145,8 +187,15 @@ def _fly_all(study: _Study, records: Records) -> tuple[pd.DataFrame, np.ndarray]
             for name, ids in batches:
                 bar.set_description(name)
                 records.keep(name, _flight(study, name, ids, bar).fly())
-    flown = [records.flown(name) for name in study.solvers]
-    return pd.concat([rows for rows, _ in flown], ignore_index=True), np.stack([U for _, U in flown])
+
+
+def _bar(study: _Study, left: int, name: str) -> tqdm | Lines:
+    """Progress over the trials that this process flies, those flown before included."""
+    layouts = len(study.plan.share(range(study.layouts.count), study.layouts.count))
+    count = layouts * len(study.solvers)
+    if side_by_side():
+        return Lines(name, count, count - left)
+    return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True)
 
 
 def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
@@ -168,7 +217,7 @@ def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight | 
 
 
 def _fly_side_by_side(
-    study: _Study, records: Records, batches: Sequence[tuple[str, list[int]]], workers: int, bar: tqdm
+    study: _Study, records: Records, batches: Sequence[tuple[str, list[int]]], workers: int, bar: tqdm | Lines
 ) -> None:
     """Fly the batches by several processes; this one writes the shards."""
 

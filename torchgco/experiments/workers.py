@@ -116,9 +116,10 @@ class _Noted:
 def _interrupts_held(noted: _Noted) -> Iterator[None]:
     """Signals wait until the end of the block: a process that is half started would end with an error of its own.
 
-    Processes started in the block never see Ctrl-C: the parent handles it. SIGTERM ends them.
+    Processes started in the block never see Ctrl-C, nor the signals of schedulers before a time limit, which reach all
+    processes of a job: the parent handles them. SIGTERM ends them.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2})
     noted.held = True
     try:
         yield

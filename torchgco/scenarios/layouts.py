@@ -19,6 +19,7 @@ from torchgco.archive import read_arrays
 from torchgco.errors import InputError
 from torchgco.options import check_value
 from torchgco.scenarios import checks
+from torchgco.solvers.memory import free_memory
 
 # Arrays of a file, in the order of the fields of Layouts. `layout` holds the ids, if they are not 0..L-1.
 REQUIRED = ("centers", "radii")
