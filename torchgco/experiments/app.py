@@ -29,11 +29,22 @@ from torchgco.interrupts import farewell, raised
 # conf/hydra/launcher extends the plugins' configurations of the same names. Hydra warns that it may stop to join them;
 # ours are whole.
 warnings.filterwarnings("ignore", r"\s*'hydra/launcher/\w+' is validated against ConfigStore schema", UserWarning)
+REFUSED = "refused"  # folder that exists while a study is refused
 LAUNCHERS = ("joblib", "submitit", "ray")  # packages whose errors tell that a job was killed or timed out
 
 
 def study_folder(_root_: Any) -> str:
-    """A folder name from the settings that decide results. It holds no time, so a second start resumes the first."""
+    """A folder name from the settings that decide results. It holds no time, so a second start resumes the first.
+
+    A malformed configuration gets a name, too: the study refuses it, and the other jobs of a sweep go on.
+    """
+    try:
+        return _described(_root_)
+    except InputError:
+        return REFUSED
+
+
+def _described(_root_: Any) -> str:
     held = plain(OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"]))
     check(held, config_dir())
     solvers = {held["solver"]["name"]: {key: value for key, value in held["solver"].items() if key != "name"}}

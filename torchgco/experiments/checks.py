@@ -11,8 +11,8 @@ from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 
 from torchgco.errors import InputError
+from torchgco.options import Seed, check_value
 
-SEEDS = 2**63  # seeds are int64 in draws and tables
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")  # part of the names of files and folders
 MODEL = ("dimension", "vehicle")
 NO_CHOICES = ("null", "true", "false", "")  # values that Hydra reads as no name
@@ -51,9 +51,7 @@ def check(held: Mapping[str, Any], conf: Path) -> None:
     for name in ("scenario", "solver"):
         _keys(held[name], name, ["_target_"])
     _keys(held["model"]["vehicle"], "model.vehicle", ["_target_", "name"])
-    seed = held["seed"]
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < SEEDS:
-        raise InputError("seed", "a whole number from 0 to 2^63 - 1", repr(seed))
+    check_value(held["seed"], Seed, "seed")
     _name(held["solver"].get("name"), "solver.name")
     _name(held["model"]["vehicle"]["name"], "model.vehicle.name")
     if "path" not in held["scenario"]:
