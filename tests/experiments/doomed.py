@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchgco.baselines import Hold
+from torchgco.experiments.workers import Shared
 
 
 def prepare(*_: object) -> None:
@@ -16,6 +17,9 @@ def prepare(*_: object) -> None:
 def work(job: tuple[int, str]) -> int:
     """The job's number doubled. A job with a path kills its process unless the file exists; it makes the file first."""
     number, path = job
+    bar = Shared()
+    bar.update(1)
+    bar.set_postfix({}, False)
     if path == "always":
         time.sleep(1.0)  # the others are done by then
         os.kill(os.getpid(), signal.SIGKILL)

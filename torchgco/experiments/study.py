@@ -18,17 +18,17 @@ import torchgco
 from torchgco.errors import InputError
 from torchgco.experiments.build import Setup, build, solver_of
 from torchgco.experiments.files import say
-from torchgco.experiments.flight import Flight, Flown, Plan, fly, plan_of, prepare
+from torchgco.experiments.flight import Flight, Plan, fly, plan_of, prepare
 from torchgco.experiments.identity import Manifest, closed_loop, difference, digest, layout_digests, plain, settings_of
 from torchgco.experiments.launching import side_by_side
 from torchgco.experiments.mission_flight import FEW, MissionFlight
 from torchgco.experiments.mission_report import mission_table, write_mission_report
-from torchgco.experiments.progress import Bar, Lines, NoBar
+from torchgco.experiments.progress import Bar, Lines
 from torchgco.experiments.provenance import recorded
 from torchgco.experiments.records import DONE, JUDGED, TRIALS, Records
 from torchgco.experiments.report import write_report
 from torchgco.experiments.success import sound, with_success
-from torchgco.experiments.workers import run_all
+from torchgco.experiments.workers import Shared, run_all
 from torchgco.kernels import native
 from torchgco.rollout import open_loop
 from torchgco.scenarios import Layouts
@@ -221,18 +221,23 @@ def _fly_side_by_side(
 ) -> None:
     """Fly the batches by several processes; this one writes the shards."""
 
-    def keep(flown: Flown) -> None:
-        records.keep(*flown)
-        bar.update(len(flown[1][0]))
+    shown = 0.0
+
+    def watch(finished: float, passes: float) -> None:
+        nonlocal shown
+        bar.update(max(0.0, finished - shown))
+        bar.set_postfix({"pass": int(passes)}, refresh=True)
+        shown = max(shown, finished)
 
     bar.set_description(f"{workers} processes")
     run_all(
         fly,
-        [_flight(study, name, ids, NoBar()) for name, ids in batches],
+        [_flight(study, name, ids, Shared()) for name, ids in batches],
         workers,
         prepare=prepare,
         options=(torch.get_num_threads(), native()),
-        keep=keep,
+        keep=lambda flown: records.keep(*flown),
+        watch=watch,
         say=lambda line: bar.write(line, sys.stderr),
     )
 

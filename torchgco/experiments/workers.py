@@ -11,14 +11,16 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from torchgco.errors import InputError
+from torchgco.experiments.progress import NoBar
 from torchgco.interrupts import raised, throw
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-POLL = 1.0  # seconds until an interrupt that Python dropped is noticed
+CONTEXT = multiprocessing.get_context("spawn")
+POLL = 1.0  # seconds until progress is shown, and an interrupt noticed that Python dropped
 NEW_POOLS = 3  # replacements of broken pools before giving up
 
 
@@ -30,6 +32,7 @@ def run_all(
     options: tuple[Any, ...],
     keep: Callable[[Result], None],
     say: Callable[[str], None],
+    watch: Callable[[float, float], None],
 ) -> None:
     """`keep(work(job))` for every job, `work` in other processes, `keep` in this one, in any order.
 
@@ -39,13 +42,19 @@ def run_all(
     Args:
         prepare, options: `prepare(*options)` runs first in every process.
         say: receives a line for each broken pool.
+        watch: called every POLL seconds with the sums of what `Shared` bars counted in all jobs: trials and passes.
 
     Raises:
         InputError: the last pool broke, too.
     """
     left = dict(enumerate(jobs))
+    counts = CONTEXT.RawArray("d", 2 * len(left))  # of trials and passes, by job: each is written by one process
+
+    def look() -> None:
+        watch(sum(counts[::2]), sum(counts[1::2]))
+
     for number in range(NEW_POOLS + 1):
-        _run_pool(work, left, min(processes, len(left)), prepare, options, keep)
+        _run_pool(work, left, min(processes, len(left)), (prepare, options, counts), keep, look)
         if not left:
             return
         if number < NEW_POOLS:
@@ -61,18 +70,17 @@ def _run_pool(
     work: Callable[[Job], Result],
     left: dict[int, Job],
     processes: int,
-    prepare: Callable[..., None],
-    options: tuple[Any, ...],
+    begin: tuple[Any, ...],
     keep: Callable[[Result], None],
+    look: Callable[[], None],
 ) -> None:
     """Run the jobs that are left by one pool and remove those with a result; returns early where it broke."""
     others = set(multiprocessing.active_children())
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, _begin_worker, (prepare, options))
+    pool = ProcessPoolExecutor(processes, CONTEXT, _begin_worker, begin)
     try:
         with _interrupts_noted() as noted:
             with _interrupts_held(noted):
-                futures = {pool.submit(work, job): number for number, job in left.items()}
+                futures = {pool.submit(_work, work, job, number): number for number, job in left.items()}
             while futures:
                 done, _ = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED)
                 noted.raise_late()
@@ -84,6 +92,7 @@ def _run_pool(
                         continue
                     keep(result)
                     del left[number]
+                look()
     except BrokenProcessPool:  # while jobs were still being submitted
         pass
     except BaseException:
@@ -137,9 +146,33 @@ def _interrupts_noted() -> Iterator[_Noted]:
         yield noted
 
 
-def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...]) -> None:
+class Shared(NoBar):
+    """The bar of a worker process: counts trials and passes of its job where the parent sees them."""
+
+    counts: ClassVar[Any] = None  # of all jobs; None outside worker processes
+    job: ClassVar[int] = 0
+
+    def update(self, n: float) -> None:
+        """Count trials."""
+        if self.counts is not None:
+            self.counts[2 * self.job] += n
+
+    def set_postfix(self, ordered_dict: Any, refresh: bool) -> None:
+        """Count a pass."""
+        if self.counts is not None:
+            self.counts[2 * self.job + 1] += 1
+
+
+def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...], counts: Any) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    Shared.counts = counts
     prepare(*options)
+
+
+def _work(work: Callable[[Job], Result], job: Job, number: int) -> Result:
+    Shared.job = number
+    Shared.counts[2 * number] = 0.0  # a former pool may have died in this job
+    return work(job)
 
 
 def _end_with_parent() -> None:
