@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 
+MOST = 250  # letters of a value in an error
+
+
 class InputError(ValueError):
-    """Malformed input: the field at fault, the expected value, and the given one."""
+    """Malformed input: the field at fault, the expected value, and the given one, in one line."""
 
     def __init__(self, field: str, expected: str, got: object) -> None:
         self.field, self.expected, self.got = field, expected, got
-        super().__init__(f"{field}: expected {expected}, got {got}")
+        text = " ".join(str(got).split())
+        super().__init__(f"{field}: expected {expected}, got {text if len(text) <= MOST else f'{text[:MOST]}...'}")
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         return type(self), (self.field, self.expected, str(self.got))  # so that a worker process can return it

@@ -19,7 +19,7 @@ from torchgco.constraints.bodies import CONTACT_FACTOR
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.dynamics.base import Dynamics
 from torchgco.errors import InputError
-from torchgco.options import Meters, Seconds, Seed, Within, check_options, check_value
+from torchgco.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
 from torchgco.outcome import FARTHEST
 from torchgco.problem import Problem, check_problem
 from torchgco.simulation.disturbance import Disturbance, measured
@@ -31,6 +31,7 @@ from torchgco.simulation.tracker import Reference, Tracker, Tracking
 from torchgco.solvers.contracts import check_ids
 from torchgco.tree import take
 
+LONGEST = 3600.0  # s of a mission
 SEED_STEP = 7_919  # between the seeds of two control steps
 Report = Callable[[int, int], None]  # of a control step and the number of vehicles that still fly
 
@@ -57,7 +58,7 @@ class Mission:
     tracker: Tracker = field(default_factory=Tracker)
     plant: Plant = field(default_factory=RotorPlant)
     disturbance: Disturbance = field(default_factory=Disturbance)
-    duration: Seconds = 15.0
+    duration: Annotated[float, Above(0, "s"), AtMost(LONGEST, "s")] = 15.0
     goal_radius: Meters | None = 0.5
     latency: Annotated[int, Within(0, 1, "control periods")] = 0
 
