@@ -7,7 +7,8 @@
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
 #              make paper: the paper's figures, tables and missions by our solvers, in docs/paper and docs/paper.md
 # make test    the tests; test-all: also the tests that kill processes or fly whole studies; test-slurm: those that start a
-#              SLURM on this machine (as root; needs Debian's slurm-wlm and munge); lint, types: the static checks;
+#              SLURM on this machine (as root; needs Debian's slurm-wlm and munge); robustness: those of wrong input, kills
+#              and random examples, with a table of what was tried; lint, types: the static checks;
 #              clean: remove environments, caches and builds
 
 PYTHON ?= python3
@@ -25,7 +26,7 @@ ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all test-slurm lint types clean quality oracle benchmark benchmark-gpu ladder docs figures paper
+.PHONY: study test test-all test-slurm robustness lint types clean quality oracle benchmark benchmark-gpu ladder docs figures paper
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -38,6 +39,9 @@ test-all: $(DEV)
 
 test-slurm: $(DEV)
 	$(BIN)/python -m pytest -m slurm $(ARGS)
+
+robustness: $(DEV)
+	$(BIN)/python -m benchmarks.robustness --write -n auto $(ARGS)
 
 ladder: $(RUNTIME)
 	$(BIN)/python -m benchmarks.quality --write \

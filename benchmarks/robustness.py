@@ -25,17 +25,20 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "benchmarks" / "results" / "robustness.md"
 # Kinds of trials, and the tests that make them: files, folders, or parts of a test's name after "::".
 KINDS: dict[str, tuple[str, ...]] = {
-    "wrong options and arguments from Python": ("tests/test_wrong_input.py", "tests/test_wrong_options.py"),
-    "wrong words on the command line": ("tests/experiments/test_wrong_commands.py",),
-    "wrong layout files": ("tests/scenarios/test_wrong_files.py",),
-    "damaged and missing files of studies, full disks": ("tests/experiments/test_damage.py",),
-    "signals: Ctrl-C, SIGTERM, SIGKILL of a study or of its workers": (
-        "tests/experiments/test_signals.py", "tests/experiments/test_workers.py",
+    "wrong options and arguments from Python": (
+        "tests/test_wrong_input.py", "tests/test_wrong_options.py", "tests/test_options.py",
     ),
+    "wrong words and values on the command line": ("tests/experiments/test_wrong_commands.py",),
+    "wrong layouts and layout files": ("tests/scenarios/test_layouts.py", "tests/scenarios/test_boxed_layouts.py"),
+    "damaged and missing files of studies, full disks": ("tests/experiments/test_damage.py",),
+    "signals at any moment: Ctrl-C and SIGTERM": ("tests/experiments/test_interrupts.py",),
+    "killed studies and worker processes": ("tests/experiments/test_workers.py",),
     "studies stopped and resumed in other pieces": ("tests/experiments/test_resume.py",),
+    "studies cut over jobs, launchers": ("tests/experiments/test_jobs.py", "tests/cluster/test_launchers.py"),
+    "tampered tables, found by --verify": ("tests/experiments/test_verify.py",),
     "batch contract: order, slots, neighbours, broken problems": ("tests/solvers/test_batch_contract.py",),
     "known answers: dense KKT systems, convex problems, ALTRO's problems": ("tests/golden",),
-    "random inputs, files, calls and batches": ("tests/fuzz",),
+    "random values, files, calls and batches": ("tests/fuzz",),
 }  # fmt: skip
 
 
@@ -43,7 +46,7 @@ def run_tests(folder: Path, arguments: Sequence[str]) -> tuple[Counter[tuple[str
     """Cases by (file, outcome), and random examples by (kind, outcome)."""
     paths = [path for paths in KINDS.values() for path in paths]
     report, tally = folder / "report.xml", folder / "tally"
-    words = ["-m", "pytest", "-q", "-m", "slow or not slow", f"--junitxml={report}", *arguments, *paths]
+    words = ["-m", "pytest", "-q", "-m", "not slurm", f"--junitxml={report}", *arguments, *paths]
     environment = {**os.environ, "TORCHGCO_TALLY": str(tally)}
     subprocess.run([sys.executable, *words], cwd=ROOT, env=environment, check=False)
     cases: Counter[tuple[str, str]] = Counter()

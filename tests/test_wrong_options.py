@@ -45,7 +45,8 @@ def layouts(**change: Any) -> Layouts:
 
 CASES: dict[str, list[Callable[[], object]]] = {
     "overrides": [lambda o=o: compose(o) for o in (5, "solver=gco", [5], None, {"solver": "gco"})],
-    "configuration": [lambda: compose(["model=5"]), lambda: compose(["a=b=c"])],
+    "model": [lambda: compose(["model=5"])],
+    "'a=b=c'": [lambda: compose(["a=b=c"])],
     "model.vehicle": [lambda: compose(["model.vehicle=5"])],
     "solver.attempts": [lambda: compose(["solver.attempts=1.5"])],
     "solver.guidance": [
