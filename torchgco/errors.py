@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 MOST = 250  # letters of a value in an error
 
 
