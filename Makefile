@@ -7,7 +7,8 @@
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
 #              make paper: the paper's figures, tables and missions by our solvers, in docs/paper and docs/paper.md
 # make test    the tests; test-all: also the tests that kill processes or fly whole studies; lint, types: the static checks;
-#              clean: remove environments, caches and builds
+#              versions: the tests of the wheel with the oldest and the newest dependencies, in environments of their own
+#              (ARGS=oldest for one line); clean: remove environments, caches and builds
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -24,7 +25,7 @@ ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all lint types clean quality oracle benchmark benchmark-gpu ladder docs figures paper
+.PHONY: study test test-all versions lint types clean quality oracle benchmark benchmark-gpu ladder docs figures paper
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -34,6 +35,9 @@ test: $(DEV)
 
 test-all: $(DEV)
 	$(BIN)/python -m pytest -n auto -m "slow or not slow" $(ARGS)
+
+versions:
+	$(PYTHON) .ci/versions $(ARGS)
 
 ladder: $(RUNTIME)
 	$(BIN)/python -m benchmarks.quality --write \

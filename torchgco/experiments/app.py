@@ -19,6 +19,7 @@ import torchgco
 from torchgco.errors import InputError
 from torchgco.experiments.build import as_input_error, compose_config, config_dir
 from torchgco.experiments.files import write
+from torchgco.experiments.hydra_versions import ENTRY, register_resolver
 from torchgco.experiments.identity import decisive, digest, plain, settings_of
 
 
@@ -39,7 +40,7 @@ def study_folder(_root_: Any) -> str:
     return f"{scenario}-{held['model']['vehicle']['name']}-{held['solver']['name']}-{digest(described)[:8]}"
 
 
-OmegaConf.register_new_resolver("torchgco.folder", study_folder, replace=True)
+register_resolver("torchgco.folder", study_folder)
 
 
 def _recomposer(job: Any) -> Callable[[str], DictConfig]:
@@ -55,7 +56,7 @@ def _composed(overrides: tuple[str, ...], searchpath: tuple[str, ...]) -> DictCo
     return compose_config(overrides, searchpath)  # needed several times by the folder's name
 
 
-@hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="config")
+@hydra.main(config_path=str(config_dir()), config_name="config", **ENTRY)
 def _run(config: DictConfig) -> None:
     from torchgco.experiments.study import run_study  # here, as workers import this module and need no figures
 

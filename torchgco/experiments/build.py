@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
 from torchgco.errors import InputError
+from torchgco.experiments.hydra_versions import ANY_CLASS, ENTRY
 from torchgco.experiments.preset_nodes import register
 from torchgco.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
@@ -82,7 +83,7 @@ def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> 
     running = Singleton.get_state()  # a study composes its baselines while Hydra's own main runs
     GlobalHydra.instance().clear()
     try:
-        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        with hydra.initialize_config_dir(str(config_dir()), **ENTRY):
             return hydra.compose("config", [*overrides, *extra])
     except (HydraException, OmegaConfBaseException) as error:
         raise as_input_error(error) from None
@@ -159,8 +160,8 @@ def _instantiate(node: DictConfig, field: str, leave_out: str | None = None) -> 
         plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
         assert isinstance(plain, dict)
         parts = {key: value for key, value in plain.items() if key != leave_out}
-        return hydra.utils.instantiate(parts, _convert_="all")
-    except (InstantiationException, OmegaConfBaseException) as error:
+        return hydra.utils.instantiate(parts, _convert_="all", **ANY_CLASS)
+    except (InstantiationException, OmegaConfBaseException, TypeError) as error:  # Hydra 1.4 wraps no TypeError
         raise as_input_error(error, field) from None
 
 
@@ -171,7 +172,8 @@ def as_input_error(error: BaseException, field: str = "configuration") -> InputE
         if isinstance(cause, InputError):
             return cause
         cause = cause.__cause__
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    text = "\n".join((str(error), *getattr(error, "__notes__", ())))
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
     key = getattr(error, "full_key", None) or next(
         (line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), field
     )

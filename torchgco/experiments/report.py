@@ -47,7 +47,8 @@ def compare(trials: pd.DataFrame) -> pd.DataFrame:
         for i, name in enumerate(names):
             if _bare(name) == _bare(names[0]):
                 tables.append(paired_table(task[task["solver"].isin(names[i:])], name))
-    return pd.concat(tables, ignore_index=True)
+    # Empty tables would take part in the choice of the columns' types, of which pandas 2 warns.
+    return pd.concat([table for table in tables if len(table)] or tables, ignore_index=True)
 
 
 def _bare(solver: str) -> str:
