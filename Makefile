@@ -8,7 +8,8 @@
 #              make paper: the paper's figures, tables and missions by our solvers, in docs/paper and docs/paper.md
 # make test    the tests; test-all: also the tests that kill processes or fly whole studies; test-slurm: those that start a
 #              SLURM on this machine (as root; needs Debian's slurm-wlm and munge); robustness: those of wrong input, kills
-#              and random examples, with a table of what was tried; lint, types: the static checks;
+#              and random examples, with a table of what was tried; versions: the tests of the wheel with the oldest and the
+#              newest dependencies, in environments of their own (ARGS=oldest for one line); lint, types: the static checks;
 #              clean: remove environments, caches and builds
 
 PYTHON ?= python3
@@ -26,7 +27,8 @@ ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all test-slurm robustness lint types clean quality oracle benchmark benchmark-gpu ladder docs figures paper
+.PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle benchmark benchmark-gpu ladder docs \
+    figures paper
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -42,6 +44,9 @@ test-slurm: $(DEV)
 
 robustness: $(DEV)
 	$(BIN)/python -m benchmarks.robustness --write -n auto $(ARGS)
+
+versions:
+	$(PYTHON) .ci/versions $(ARGS)
 
 ladder: $(RUNTIME)
 	$(BIN)/python -m benchmarks.quality --write \

@@ -4,6 +4,7 @@ import math
 import os
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 from itertools import pairwise
 
 import numpy as np
@@ -22,7 +23,9 @@ from torchgco.simulation.mission import Mission
 from torchgco.simulation.planner import Planner
 from torchgco.simulation.plant import RotorPlant, hovering
 
+needs_drone_models = pytest.mark.skipif(find_spec("drone_models") is None, reason="drone-models isn't installed")
 PLANTS = [RotorPlant, DroneModelsPlant]
+each_plant = pytest.mark.parametrize("make", [RotorPlant, pytest.param(DroneModelsPlant, marks=needs_drone_models)])
 FRAME = Airframe()
 DOUBLE = torch.float64
 STEP = torch.tensor([[100.0, -50.0, -120.0, 90.0], [400.0, 300.0, 420.0, 380.0]], dtype=DOUBLE)  # rpm
@@ -62,7 +65,7 @@ def random_states(B: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     return x, FRAME.hover_speed + 300.0 * u, force
 
 
-@pytest.mark.parametrize("make", PLANTS)
+@each_plant
 def test_the_quaternion_keeps_its_length_and_thrusts_their_limits(make) -> None:
     x, _, _ = random_states(5)
     generator = torch.Generator().manual_seed(1)
@@ -73,7 +76,7 @@ def test_the_quaternion_keeps_its_length_and_thrusts_their_limits(make) -> None:
     assert F.min() == FRAME.thrust_min and F.max() == FRAME.thrust_max
 
 
-@pytest.mark.parametrize("make", PLANTS)
+@each_plant
 def test_energy_in_free_fall(make) -> None:
     """It changes by the work of the least thrusts and of the yaw drag, and by nothing else."""
     dt, m, J = 0.01, FRAME.mass, np.array(FRAME.inertia)
@@ -92,13 +95,13 @@ def test_energy_in_free_fall(make) -> None:
     assert abs(energy[-1] - energy[0] - sum(works)) < 1e-7
 
 
-@pytest.mark.parametrize("make", PLANTS)
+@each_plant
 def test_hover_holds(make) -> None:
     flown = fly(make(), at_hover(), hover_commands(1000))
     assert (flown - flown[0]).abs().max() < 1e-10
 
 
-@pytest.mark.parametrize("make", PLANTS)
+@each_plant
 def test_half_the_time_step_leaves_a_sixteenth_of_the_error(make) -> None:
     x, _, force = random_states(3)
     x[:, 13:] = at_hover(3)[:, 13:]
@@ -121,7 +124,7 @@ def test_without_errors_it_is_the_papers_plant() -> None:
     assert torch.equal(RotorPlant().advance(x, u, torch.zeros(20, 3, dtype=DOUBLE)), QuadrotorPlant().step(x, u))
 
 
-@pytest.mark.parametrize("make", PLANTS)
+@each_plant
 def test_a_heavier_vehicle_falls(make) -> None:
     errors, t = torch.tensor([0.1, -0.2], dtype=DOUBLE), 0.5
     flown = fly(make(mass_error=errors), at_hover(2), hover_commands(50))[-1]
@@ -130,7 +133,7 @@ def test_a_heavier_vehicle_falls(make) -> None:
     torch.testing.assert_close(flown[:, 2], acceleration * t * t / 2, rtol=1e-9, atol=0)
 
 
-@pytest.mark.parametrize("make", PLANTS)
+@each_plant
 def test_better_rotors_lift_more(make) -> None:
     errors = torch.tensor([0.1, -0.2], dtype=DOUBLE)
     flown = fly(make(thrust_error=errors), at_hover(2), hover_commands(300))
@@ -140,7 +143,7 @@ def test_better_rotors_lift_more(make) -> None:
     torch.testing.assert_close(gained, GRAVITY * errors, rtol=1e-9, atol=0)
 
 
-@pytest.mark.parametrize("make", PLANTS)
+@each_plant
 def test_drag_slows_the_vehicle_down(make) -> None:
     drag, x = torch.tensor([0.0, 0.3, 0.8], dtype=DOUBLE), at_hover(3)
     x[:, 3:5] = torch.tensor([4.0, -2.0])
@@ -149,7 +152,7 @@ def test_drag_slows_the_vehicle_down(make) -> None:
     torch.testing.assert_close(flown[:, 3:5], left[:, None] * x[:, 3:5], rtol=1e-9, atol=0)
 
 
-@pytest.mark.parametrize("make", PLANTS)
+@each_plant
 def test_a_force_accelerates_the_mass(make) -> None:
     force = torch.tensor([[0.5, -0.3, 0.2], [0.0, 0.0, -1.0]], dtype=DOUBLE)
     flown = fly(make(mass_error=0.25), at_hover(2), hover_commands(100), force)[-1]
@@ -158,6 +161,7 @@ def test_a_force_accelerates_the_mass(make) -> None:
     assert not flown[:, 10:13].any()
 
 
+@needs_drone_models
 def test_the_plants_agree_on_a_hover() -> None:
     """Measured 4e-16."""
     flown = [fly(make(), at_hover(), hover_commands(200)) for make in PLANTS]
@@ -165,6 +169,7 @@ def test_the_plants_agree_on_a_hover() -> None:
 
 
 @pytest.mark.parametrize(("dt", "tolerance"), [(0.01, 2e-6), (0.001, 2e-10)])
+@needs_drone_models
 def test_the_plants_agree_on_a_step_command(dt, tolerance) -> None:
     """Measured 1.8e-7 and 1.7e-11.
 
@@ -176,6 +181,7 @@ def test_the_plants_agree_on_a_step_command(dt, tolerance) -> None:
     torch.testing.assert_close(a, b, rtol=0, atol=tolerance)
 
 
+@needs_drone_models
 def test_the_plants_agree_with_errors_drag_and_wind() -> None:
     """Measured 1.1e-11."""
     x, _, force = random_states(2)
@@ -185,6 +191,7 @@ def test_the_plants_agree_with_errors_drag_and_wind() -> None:
     torch.testing.assert_close(a, b, rtol=0, atol=2e-10)
 
 
+@needs_drone_models
 @pytest.mark.parametrize("order", [PLANTS, PLANTS[::-1]])
 def test_the_plants_differ_where_one_has_drag(order) -> None:
     a, b = (make(drag=drag) for make, drag in zip(order, (0.3, 0.0), strict=True))
@@ -203,6 +210,7 @@ def mission_problem(free: bool) -> Problem:
     return replace(problem, dynamics=QuadrotorPlanning(dt=0.05), cost=cost, constraints=constraints, goal=goal)
 
 
+@needs_drone_models
 def test_the_plants_agree_on_a_short_mission() -> None:
     """In closed loop, without obstacles, measured 1.5e-6.
 
@@ -217,6 +225,7 @@ def test_the_plants_agree_on_a_short_mission() -> None:
     assert (a - dragged).abs().max() > 0.05
 
 
+@needs_drone_models
 def test_the_plants_agree_on_the_commands_of_a_mission_among_obstacles() -> None:
     """Measured 4e-6, and 3e-10 with a tenth of the time step."""
     problem = mission_problem(free=False)
@@ -228,7 +237,7 @@ def test_the_plants_agree_on_the_commands_of_a_mission_among_obstacles() -> None
         torch.testing.assert_close(a, b, rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("make", PLANTS)
+@each_plant
 def test_a_batch_equals_its_parts(make) -> None:
     """Bit by bit, in any order, and next to vehicles that have diverged."""
     B = 24
@@ -245,13 +254,13 @@ def test_a_batch_equals_its_parts(make) -> None:
         assert torch.equal(plant.take(rows).advance(x[rows], u[rows], force[rows]), whole[rows])
 
 
-def test_single_precision_stays_single() -> None:
+@each_plant
+def test_single_precision_stays_single(make) -> None:
     x, u, force = (part.float() for part in random_states(4))
-    for plant in (RotorPlant(), DroneModelsPlant()):
-        assert plant.advance(x, u, force).dtype == torch.float32
+    assert make().advance(x, u, force).dtype == torch.float32
 
 
-@pytest.mark.parametrize("make", PLANTS)
+@each_plant
 @pytest.mark.parametrize(
     ("field", "value"),
     [
@@ -288,6 +297,7 @@ def test_a_missing_package_is_named(fresh_import, monkeypatch) -> None:
         DroneModelsPlant()
 
 
+@needs_drone_models
 @pytest.mark.parametrize("before", [None, "0"])
 def test_the_environment_is_left_as_it_was(fresh_import, monkeypatch, before) -> None:
     for name in [name for name in sys.modules if name.split(".")[0] == "drone_models"]:

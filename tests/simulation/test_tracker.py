@@ -103,6 +103,7 @@ CASES = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:Values in x were outside bounds:RuntimeWarning")  # of SLSQP before SciPy 1.16
 @pytest.mark.parametrize("name", CASES)
 def test_commands_have_the_effect_of_a_dense_solution(name: str) -> None:
     w, F, wanted, acceleration = CASES[name]

@@ -179,6 +179,7 @@ def test_operations(name: str) -> None:
 KINKS = {
     "abs": lambda x: x.abs() * (1.0 + x),
     "clamp": lambda x: x.clamp(min=0.0).square() + x.clamp(max=0.0) + x.clamp_min(0.0),
+    "hardtanh": lambda x: F.hardtanh(x, 0.0, 1.0) + F.hardtanh(x, -1.0, 0.0) * (1.0 + x),
     "relu": lambda x: x.relu().square() + x.relu(),
     "norm": lambda x: x.norm(dim=-1),
     "where": lambda x: torch.where(x.abs() < 1.0, x.square(), x.abs()),

@@ -22,6 +22,7 @@ from torchgco.errors import InputError
 from torchgco.experiments.build import config_dir, forget_composed, recomposer
 from torchgco.experiments.checks import as_input_error, check, check_words
 from torchgco.experiments.files import write
+from torchgco.experiments.hydra_versions import ENTRY, register_resolver
 from torchgco.experiments.identity import decisive, digest, plain, settings_of
 from torchgco.experiments.jobs import Report
 from torchgco.interrupts import farewell, raised
@@ -57,7 +58,7 @@ def _described(_root_: Any) -> str:
     return f"{scenario}-{held['model']['vehicle']['name']}-{held['solver']['name']}-{digest(described)[:8]}"
 
 
-OmegaConf.register_new_resolver("torchgco.folder", study_folder, replace=True)
+register_resolver("torchgco.folder", study_folder)
 
 
 def _task(config: DictConfig) -> Report:
@@ -90,7 +91,7 @@ def _task(config: DictConfig) -> Report:
 
 
 # Not as a decorator: launchers send the task to other processes by its name.
-_run = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name="config")(_task)
+_run = hydra.main(config_path=str(config_dir()), config_name="config", **ENTRY)(_task)
 
 
 def _is_of_launcher(error: Exception) -> bool:

@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 import torchgco
 from torchgco.errors import InputError
 from torchgco.experiments.checks import as_input_error, check, check_words
+from torchgco.experiments.hydra_versions import ANY_CLASS, ENTRY
 from torchgco.experiments.identity import plain
 from torchgco.experiments.launching import allotted_cores
 from torchgco.experiments.preset_nodes import register
@@ -106,7 +107,7 @@ def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> 
     running = Singleton.get_state()  # a study composes its baselines while Hydra's own main runs
     GlobalHydra.instance().clear()
     try:
-        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        with hydra.initialize_config_dir(str(config_dir()), **ENTRY):
             return hydra.compose("config", [*overrides, *extra])
     except (HydraException, OmegaConfBaseException) as error:
         raise as_input_error(error) from None
@@ -225,8 +226,8 @@ def _instantiate(node: DictConfig, field: str, leave_out: str | None = None) -> 
         plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
         assert isinstance(plain, dict)
         parts = {key: value for key, value in plain.items() if key != leave_out}
-        return hydra.utils.instantiate(parts, _convert_="all")
-    except (InstantiationException, OmegaConfBaseException, TypeError) as error:  # Hydra wraps those of parts
+        return hydra.utils.instantiate(parts, _convert_="all", **ANY_CLASS)
+    except (InstantiationException, OmegaConfBaseException, TypeError) as error:  # Hydra 1.4 wraps no TypeError
         raise as_input_error(error, field) from None
 
 

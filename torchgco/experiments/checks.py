@@ -98,7 +98,8 @@ def as_input_error(error: BaseException, field: str = "configuration") -> InputE
     if isinstance(error, MissingConfigException) and options:
         group, _, option = str(error.missing_cfg_file).rpartition("/")
         return InputError(group, f"one of {', '.join(options)}", option)
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    text = "\n".join((str(error), *getattr(error, "__notes__", ())))
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
     if unknown := re.match(r"Could not override '(.+?)'", lines[0] if lines else ""):
         return InputError(unknown[1], "a key that the configuration has", unknown[1].split(".")[-1])
     if merged := re.match(r"Error merging override \+*([^=\s]+)=?(.*)", lines[0] if lines else ""):

@@ -118,7 +118,11 @@ class Manifest:
 
 def digest(value: Any) -> str:
     """A digest of plain data: 1 and 1.0 are the same, the order of keys doesn't matter."""
-    return sha256(json.dumps(_normal(value), sort_keys=True, default=str).encode()).hexdigest()[:DIGITS]
+    return _digest_of(_normal(value))
+
+
+def _digest_of(normal: Any) -> str:
+    return sha256(json.dumps(normal, sort_keys=True, default=str).encode()).hexdigest()[:DIGITS]
 
 
 def layout_digests(
@@ -137,6 +141,7 @@ def layout_digests(
     for key, field in OVERRULED.items():
         given = getattr(layouts, field)
         shared[key] = vehicle.get(key) if given is None else given
+    shared = _normal(shared)  # once for all layouts: a study may have thousands
     moves = layouts.velocities is not None and bool(np.nan_to_num(layouts.velocities).any())
     codes = {}
     for i, number in enumerate(layouts.ids.tolist()):
@@ -154,7 +159,7 @@ def layout_digests(
         for name in ("start", "goal"):
             if getattr(layouts, name) is not None:
                 own[name] = getattr(layouts, name)[i]
-        codes[number] = digest({**shared, **own})
+        codes[number] = _digest_of({**shared, **_normal(own)})
     return codes
 
 
@@ -188,7 +193,7 @@ def _normal(value: Any) -> Any:
         # No call for text: a manifest has a digest per layout, thousands of them.
         return {str(key): held if type(held) is str else _normal(held) for key, held in value.items()}
     if isinstance(value, np.ndarray):
-        return _normal(value.tolist())
+        return (value.astype(np.float64) + 0.0).tolist() if value.dtype.kind == "f" else _normal(value.tolist())
     if isinstance(value, list | tuple):
         return [_normal(held) for held in value]
     if isinstance(value, int | float) and not isinstance(value, bool) and not abs(value) > EXACT:

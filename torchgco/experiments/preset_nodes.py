@@ -11,8 +11,8 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import OmegaConf
 
+from torchgco.experiments.hydra_versions import register_resolver
 from torchgco.presets import PRESETS
 
 BY_DIMENSION = "torchgco.by_dimension"
@@ -20,7 +20,7 @@ BY_DIMENSION = "torchgco.by_dimension"
 
 def register() -> None:
     """Store all presets; to be called before Hydra composes anything."""
-    OmegaConf.register_new_resolver(BY_DIMENSION, _by_dimension, replace=True)
+    register_resolver(BY_DIMENSION, _by_dimension)
     for name, make in PRESETS.items():
         ConfigStore.instance().store(group="preset", name=name, node=_joined(_tree(make(2)), _tree(make(3))))
 

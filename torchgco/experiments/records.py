@@ -141,7 +141,8 @@ class Records:
         # JSON by way of Python floats keeps every bit, NaN and infinity included.
         columns = json.dumps(rows.to_dict(orient="list"), default=lambda value: value.item())
         path = self.folder / "shards" / f"{solver}-{numbers[0]:06d}-{numbers[-1]:06d}.npz"
-        write(path, _arrays({"U": U, "rows": np.array(columns)}))
+        # Not compressed: controls hardly shrink, and a shard is dropped when the study is done.
+        write(path, lambda file: np.savez(file, U=U, rows=np.array(columns)))
 
     def flown(self, solver: str) -> Flown:
         """All results of a solver that `keep` wrote, in the order of the layouts.

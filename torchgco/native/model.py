@@ -161,13 +161,13 @@ def elements(column: Any) -> np.ndarray:
 
 @cache
 def makers(*more: str) -> Sequence[str]:
-    """CasADi's version and the texts of the files that generate code: when they change, cached code isn't used."""
+    """Versions of CasADi and PyTorch and the texts of the files that generate code, which cached code depends on."""
     files = (operations.__file__, arrays.__file__, emit.__file__, __file__, *more)
     try:
         casadi = version("casadi")
     except PackageNotFoundError:
         casadi = ""
     try:
-        return (casadi, *(Path(str(name)).read_text() for name in files))
+        return (casadi, torch.__version__, *(Path(str(name)).read_text() for name in files))
     except OSError:  # in an archive, say; then the package's version stands for them
-        return (casadi, version("torchgco"))
+        return (casadi, torch.__version__, version("torchgco"))

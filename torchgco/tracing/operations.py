@@ -68,9 +68,26 @@ def _divide(a: Any, b: Any, rounding_mode: str | None = None) -> np.ndarray:
 
 
 def _clamp(a: Any, min: Any = None, max: Any = None) -> np.ndarray:
-    # Choices, not fmin and fmax: at a bound the derivative is 1, as PyTorch's, and NaN stays NaN.
-    a = a if min is None else _where(_binary(operator.lt)(a, min), min, a)
-    return a if max is None else _where(_binary(operator.gt)(a, max), max, a)
+    # Choices, not fmin and fmax: NaN stays NaN, and the derivative at a number is PyTorch's, at a tensor 1.
+    for bound, beyond, reached in ((min, operator.lt, operator.le), (max, operator.gt, operator.ge)):
+        if bound is not None:
+            flat = not isinstance(bound, np.ndarray) and _flat_at_numbers()
+            a = _where(_binary(reached if flat else beyond)(a, bound), bound, a)
+    return a
+
+
+@functools.cache
+@torch.inference_mode(False)
+@torch.enable_grad()
+def _flat_at_numbers() -> bool:
+    """Whether the derivative of PyTorch's clamp at a bound that is a number is 0, as since 2.14, instead of 1."""
+    x = torch.zeros((), requires_grad=True)
+    return torch.autograd.grad(x.clamp(min=0.0), x)[0].item() == 0.0
+
+
+def _hardtanh(a: np.ndarray, low: float = -1.0, high: float = 1.0) -> np.ndarray:
+    a = _where(_binary(operator.le)(a, low), low, a)  # the derivative is 0 at the bounds
+    return _where(_binary(operator.ge)(a, high), high, a)
 
 
 def _softplus(a: np.ndarray, beta: float = 1.0, threshold: float = 20.0) -> np.ndarray:
@@ -194,7 +211,7 @@ OPERATIONS: dict[str, Callable] = {
     "aten.clamp": _clamp,
     "aten.clamp_min": _clamp,
     "aten.clamp_max": lambda a, max: _clamp(a, max=max),
-    "aten.hardtanh": lambda a, low=-1.0, high=1.0: _clamp(a, low, high),
+    "aten.hardtanh": _hardtanh,
     "aten.maximum": _fmax,
     "aten.minimum": _fmin,
     **{f"aten.{name}": _binary(getattr(operator, name)) for name in ("lt", "le", "gt", "ge", "eq", "ne")},

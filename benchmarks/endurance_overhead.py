@@ -1,0 +1,131 @@
+"""python -m benchmarks.endurance_overhead FOLDER LAYOUTS SHARD_SIZE: what a study costs besides its solves.
+
+In one process with one thread, a study of one worker flies all layouts into FOLDER, and then direct calls fly the same
+layouts, a batch per shard, without files. Prints processor seconds by phase as JSON: {"study": {...}, "direct": {...}}.
+The time to import packages is in neither.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from functools import wraps
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
+
+import torch
+
+from torchgco import compose
+from torchgco.experiments import app, flight
+from torchgco.native.dispatch import engine_of
+from torchgco.solvers.memory import plan_batch
+
+COMMON = ["solver=gco", "device.threads=1"]
+# A phase lasts while one of its functions runs, except for phases inside it.
+PHASES = {
+    "solve": ["torchgco.solvers.contracts.Solver.solve"],
+    "judge": ["torchgco.experiments.flight.judge", "torchgco.experiments.flight.certify"],
+    "draw layouts": ["torchgco.scenarios.base.Scenario.draw"],
+    "make problems": ["torchgco.scenarios.vehicle.Vehicle.task"],
+    "progress": ["torchgco.experiments.flight.Flight._progress"],
+    "digests": ["torchgco.experiments.study.layout_digests"],
+    "write shards": ["torchgco.experiments.records.Records.keep"],
+    "read shards": ["torchgco.experiments.records.Records.flown", "torchgco.experiments.records.Records.missing"],
+    "tables": [
+        "torchgco.experiments.study.with_success", "torchgco.experiments.records.Records.finish",
+        "torchgco.experiments.records.Records.close",
+    ],
+    "report": ["torchgco.experiments.study.write_report"],
+}  # fmt: skip
+FLIGHT, REPORT, REST = ("solve", "judge"), "report", "rest"
+
+
+class Phases:
+    """Processor seconds by phase."""
+
+    def __init__(self) -> None:
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+        self.open = [REST]
+        self.since = 0.0
+
+    def book(self) -> None:
+        now = time.process_time()
+        self.seconds[self.open[-1]] += now - self.since
+        self.since = now
+
+    @contextlib.contextmanager
+    def running(self) -> Iterator[None]:
+        """Wrap all functions of PHASES in timers; restored at the end."""
+        originals = []
+        for phase, places in PHASES.items():
+            for holder, _, name in (place.rpartition(".") for place in places):
+                owner = resolve_name(holder)
+                originals.append((owner, name, getattr(owner, name)))
+                setattr(owner, name, self._around(originals[-1][-1], phase))
+        self.since = time.process_time()
+        try:
+            yield
+            self.book()
+        finally:
+            for owner, name, work in originals:
+                setattr(owner, name, work)
+
+    def _around(self, work: Callable[..., Any], phase: str) -> Callable[..., Any]:
+        @wraps(work)
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            self.book()
+            self.open.append(phase)
+            try:
+                return work(*args, **kwargs)
+            finally:
+                self.book()
+                self.open.pop()
+
+        return timed
+
+
+def direct(count: int, shard_size: int) -> None:
+    """Fly and judge the layouts, a batch per shard."""
+    setup = compose([*COMMON, f"study.layouts={count}"])
+    layouts = setup.layouts()
+    for begin in range(0, count, shard_size):
+        part = layouts.take(range(begin, min(count, begin + shard_size)))
+        task = setup.vehicle.task(part)
+        engine_of(task.problem)
+        solver = setup.solver.prepare(task.problem).in_slots(plan_batch(task.problem))
+        solution = solver.solve(task.problem, task.U0, seed=setup.seed, ids=torch.as_tensor(part.ids))
+        verdict = flight.judge(task.problem, solution.U, task.goal, task.goal_radius)
+        flight.certify(task.problem, solution.X, solution.U, verdict.feasible)
+
+
+def sharded(folder: Path, count: int, shard_size: int) -> None:
+    """Fly the same layouts as a study."""
+    words = [*COMMON, "study.baselines=[]", "study.workers=1", f"study.layouts={count}"]
+    sys.argv = ["torchgco", *words, f"study.shard_size={shard_size}", f"hydra.run.dir={folder}"]
+    with open(os.devnull, "w") as sink, contextlib.redirect_stdout(sink), contextlib.redirect_stderr(sink):
+        if app.main() != 0:
+            raise RuntimeError("the study failed")
+
+
+def main() -> int:
+    folder, count, shard_size = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    direct(2, 2)  # imports, and kernels compiled or loaded
+    timed = {}
+    works = {"study": lambda: sharded(folder, count, shard_size), "direct": lambda: direct(count, shard_size)}
+    for name, work in works.items():
+        phases = Phases()
+        with phases.running():
+            work()
+        timed[name] = dict(phases.seconds)
+    print(json.dumps(timed))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
