@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from torchgco.draws import DrawKey
 from torchgco.evaluation import violation
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.gco import GCO
+from torchgco.guidance.mppi import MPPI
 from torchgco.problem import Problem
 
 HERE = Path(__file__).resolve().parent
@@ -62,7 +63,7 @@ class Witness:
 
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: Any, key: DrawKey) -> Any:
         self.plan = None
-        advice = replace(self.guidance, sampler=_Noted(self.guidance.sampler, self)).update(problem, X, U, penalty, key)
+        advice = replace(self.guidance, sampler=_noted(self.guidance.sampler, self)).update(problem, X, U, penalty, key)
         self._note(problem, X, U, key)
         return advice
 
@@ -93,16 +94,19 @@ class Witness:
 
 
 @dataclass(frozen=True)
-class _Noted:
+class _Noted(MPPI):
     """A sampler that passes its plans on to the witness."""
 
-    sampler: Any
-    witness: Witness
+    witness: Any = None
 
     def improve(self, problem: Problem, U: Tensor, key: DrawKey) -> tuple[Tensor, Tensor]:
-        X, plan = self.sampler.improve(problem, U, key)
+        X, plan = super().improve(problem, U, key)
         self.witness.plan = (key.ids, X)
         return X, plan
+
+
+def _noted(sampler: MPPI, witness: Witness) -> _Noted:
+    return _Noted(**{option.name: getattr(sampler, option.name) for option in fields(sampler)}, witness=witness)
 
 
 def _crosses(problem: Problem, path: Tensor, plan: Tensor) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -79,7 +79,8 @@ class Witness:
 
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
         self.sampling = None
-        noted: Any = _Noted(self.guidance.sampler, self)
+        sampler = self.guidance.sampler
+        noted = _Noted(**{option.name: getattr(sampler, option.name) for option in fields(sampler)}, witness=self)
         advice = replace(self.guidance, sampler=noted).update(problem, X, U, penalty, key)
         assert advice.penalty is not None
         path, center, radius = (x[0].clone().numpy() for x in (X, advice.penalty.center, advice.penalty.radius))
@@ -88,15 +89,14 @@ class Witness:
 
 
 @dataclass(frozen=True)
-class _Noted:
+class _Noted(MPPI):
     """A sampler that tells the witness of its calls."""
 
-    sampler: MPPI
-    witness: Witness
+    witness: Any = None
 
     def improve(self, problem: Problem, U: Tensor, key: DrawKey) -> tuple[Tensor, Tensor]:
-        X, plan = self.sampler.improve(problem, U, key)
-        self.witness.sampling = Sampling(self.sampler, problem, U.clone(), key, X[0].clone())
+        X, plan = super().improve(problem, U, key)
+        self.witness.sampling = Sampling(self.witness.guidance.sampler, problem, U.clone(), key, X[0].clone())
         return X, plan
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-MOST = 250  # letters of a value in an error
+MOST = 300  # letters of a value in an error
 
 
 class InputError(ValueError):

@@ -9,7 +9,7 @@ from hypothesis import settings
 from torchgco import InputError
 
 COUNTS: Counter[tuple[str, str]] = Counter()
-LONGEST = 400  # letters of a clear line
+LONGEST = 500  # letters of a clear line
 
 
 def examples(count: int) -> int:
