@@ -10,7 +10,7 @@ from torchgco.errors import InputError
 from torchgco.experiments.merge import merge
 from torchgco.experiments.paired import compare
 from torchgco.experiments.report import main, write_report
-from torchgco.experiments.statistics import summarise
+from torchgco.experiments.statistics import plain, summarise
 from torchgco.experiments.tables import format_table
 from torchgco.scenarios.layouts import Layouts
 
@@ -202,3 +202,12 @@ def test_the_command_answers_wrong_input_with_one_line(tmp_path: Path, capsys) -
     assert main([str(tmp_path / "nowhere")]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and len(captured.err.splitlines()) == 1 and "nowhere" in captured.err
+
+
+def test_a_merged_table_is_written_with_text_and_can_be_merged_again(tmp_path: Path) -> None:
+    rows = [*flights("gco", [True] * 2), *flights("hold", [False] * 2, device=None)]
+    given = pd.read_parquet(study(tmp_path / "a", *rows) / "trials.parquet")
+    assert main([str(tmp_path / "a"), "--output", str(tmp_path / "out")]) == 0
+    written = pd.read_parquet(tmp_path / "out" / "trials.parquet")
+    pd.testing.assert_frame_equal(written, given)
+    pd.testing.assert_frame_equal(plain(merge([tmp_path / "out"])), given)

@@ -31,10 +31,12 @@ INCIDENTAL = {"seconds", "batch_size", "threads", "best_cost", "best_from", "suc
 # Columns of numbers while runs are merged: of the run, the solver's variant (-1: unknown), the layout.
 RUN, VARIANT, LAYOUT = "_run", "_variant", "_layout"
 OWN = [RUN, VARIANT]
+# Columns of text that become categories: comparing and copying text would take most of a large report's time.
+TEXT = (*TASK, "solver", "status", "device", "dtype", "version", "best_from", *DIGESTS)
 
 
 def merge(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
-    """All trials found in and below `folders`, as one table with the columns of a study.
+    """All trials found in and below `folders`, as one table with the columns of a study, those of TEXT as categories.
 
     - Keys of scenario and vehicle in which runs of one (scenario, model) differ become columns, named as on the
       command line: `scenario.num_obstacles`. Runs that flew other layouts without such a key get their folder in a
@@ -85,13 +87,15 @@ def _tagged(runs: Sequence[Run]) -> tuple[pd.DataFrame, list[str]]:
         for i, (run, more) in enumerate(zip(runs, swept, strict=True))
     ]
     rows = pd.concat(tables, ignore_index=True)
+    rows = rows.assign(**{name: pd.Categorical.from_codes(*pd.factorize(rows[name])) for name in TEXT if name in rows})
     settings = {digest(held): held for run in runs for held in run.solvers.values()}
     numbers: dict[str, int] = {}
     code = np.full(len(rows), -1)
     names = [RUN, "settings_digest", "device", "dtype", "version"]
     if not all(_is_older(run.trials) for run in runs):
-        for place in grouped(rows, names):
-            number, *key = rows[names].iloc[place[0]].tolist()
+        groups = grouped(rows, names)
+        firsts = rows[names].iloc[[place[0] for place in groups]].to_numpy(dtype=object)
+        for place, (number, *key) in zip(groups, firsts.tolist(), strict=True):
             if not _is_older(runs[number].trials):
                 code[place] = numbers.setdefault(_variant(runs[number], settings, *key), len(numbers))
     return rows.assign(**{VARIANT: code}), list(numbers)
@@ -146,12 +150,13 @@ def _of_older_runs(group: pd.DataFrame, content: list[str], runs: Sequence[Run])
     if len(same) or not all(runs[i].configuration for i in disputed[RUN].unique()):
         raise _dispute(disputed if same.empty else same, content, runs)
     first = rows.groupby("_text")[RUN].transform("first")
-    return rows.drop(columns="_text").assign(solver=rows["solver"] + " [" + first.map(_short(first, runs)) + "]")
+    label = " [" + first.map(_short(first, runs)) + "]"
+    return rows.drop(columns="_text").assign(solver=rows["solver"].astype(object) + label)
 
 
 def _named(rows: pd.DataFrame, runs: Sequence[Run], variants: list[str]) -> pd.DataFrame:
     """The rows with a label after the name of each solver that flew in several variants."""
-    names = rows["solver"].copy()
+    names = rows["solver"].astype(object)
     for place in grouped(rows, ["model", "solver"]):
         code = rows[VARIANT].iloc[place]
         numbers = [number for number in code.unique() if number >= 0]
@@ -162,7 +167,7 @@ def _named(rows: pd.DataFrame, runs: Sequence[Run], variants: list[str]) -> pd.D
         if numbers and (code < 0).any():
             run = rows.loc[code.index[code < 0], RUN]
             names[run.index] = names[run.index] + " [" + run.map(_short(rows[RUN], runs)) + "]"
-    return rows.assign(solver=names)
+    return rows.assign(solver=names.astype("category"))
 
 
 def _short(numbers: pd.Series, runs: Sequence[Run]) -> dict[int, str]:
@@ -194,7 +199,7 @@ def _judged_together(rows: pd.DataFrame) -> pd.DataFrame:
     layout = [*task_columns(rows), *PAIR[len(TASK) :], "layout_digest"]
     groups = pd.DataFrame(
         {
-            LAYOUT: new.groupby(layout, sort=False, dropna=False).ngroup(),
+            LAYOUT: new.groupby(layout, sort=False, dropna=False, observed=True).ngroup(),
             "best": new["best_cost"].where(new["best_from"] == "file").astype(float),
             "solver": pd.factorize(new["solver"])[0],
         }
@@ -210,14 +215,14 @@ def _judged_together(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _sorted(rows: pd.DataFrame) -> pd.DataFrame:
     """By task and swept variables; solvers that are no baseline first, as a study has its own solver first."""
-    solver = pd.factorize(rows["solver"])[0]
-    firsts = pd.Series(solver, index=rows.index).groupby(rows[RUN], sort=False).transform("first")
-    baselines = np.unique(solver[solver != firsts])
-    keys = pd.DataFrame(index=rows.index)
-    for name in TASK:
-        keys[name] = pd.factorize(rows[name])[0]
+    flown = rows[[RUN, "solver"]].drop_duplicates()
+    baselines = flown.loc[flown.duplicated(RUN), "solver"]  # not the first of their run
+    groups = grouped(rows, [*task_columns(rows), "solver"])
+    heads = rows.iloc[[place[0] for place in groups]].reset_index(drop=True)
+    keys = pd.DataFrame({name: pd.factorize(heads[name])[0] for name in TASK})
     for name in task_columns(rows)[len(TASK) :]:
-        keys[name] = rows[name].rank(method="dense", na_option="bottom")
-    keys["baseline"] = np.isin(solver, baselines)
-    keys["solver"] = solver
-    return rows.loc[keys.sort_values(list(keys.columns), kind="stable").index].reset_index(drop=True)
+        keys[name] = heads[name].rank(method="dense", na_option="bottom")
+    keys["baseline"] = heads["solver"].isin(baselines)
+    keys["solver"] = pd.factorize(heads["solver"])[0]
+    order = keys.sort_values(list(keys.columns), kind="stable").index
+    return rows.take(np.concatenate([groups[i] for i in order])).reset_index(drop=True)

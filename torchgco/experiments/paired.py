@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from math import nan
@@ -78,8 +78,7 @@ def paired(trials: pd.DataFrame, solver_a: str, solver_b: str, outcome: str = "r
     for solver in (solver_a, solver_b):
         _check_flown(trials, solver)
     flights = _Flights(trials)
-    matched = flights.match(np.arange(len(trials)), solver_a, solver_b)
-    return flights.compared(*matched, solver_a, solver_b, outcome)
+    return next(flights.compared(np.arange(len(trials)), solver_a, solver_b, [outcome]))
 
 
 def paired_table(trials: pd.DataFrame, solver: str) -> pd.DataFrame:
@@ -133,12 +132,12 @@ class _Flights:
 
     def _rows(self, chosen: Chosen) -> Iterator[dict[str, object]]:
         names = task_columns(self.trials)
+        keys = self.trials[names]
         for task in grouped(self.trials, names):
-            key = self.trials[names].iloc[task[0]].to_dict()
+            key = keys.iloc[task[0]].to_dict()
             for a, b in chosen([self.names[code] for code in pd.unique(self.solver[task])]):
-                matched = self.match(task, a, b)
-                for outcome in OUTCOMES:
-                    yield key | asdict(self.compared(*matched, a, b, outcome))
+                for result in self.compared(task, a, b, OUTCOMES):
+                    yield key | asdict(result)
 
     def match(self, rows: np.ndarray, a: str, b: str) -> tuple[np.ndarray, np.ndarray, int]:
         """Positions of two solvers' rows of the trials that both flew, among `rows`, and how many only one flew."""
@@ -156,30 +155,33 @@ class _Flights:
             first = ", ".join(f"{name} {value}" for name, value in row.items())
             raise InputError("trials", f"one row of {solver} for {first}", "two")
 
-    def compared(
-        self, rows_a: np.ndarray, rows_b: np.ndarray, unmatched: int, a: str, b: str, outcome: str
-    ) -> PairedResult:
-        hit_a, hit_b = (self.hits[outcome][rows] for rows in (rows_a, rows_b))
-        defined = ~np.isnan(hit_a) & ~np.isnan(hit_b)
-        hit_a, hit_b = hit_a[defined] == 1, hit_b[defined] == 1
-        only_a, only_b = int((hit_a & ~hit_b).sum()), int((hit_b & ~hit_a).sum())
-        n, discordant = len(hit_a), only_a + only_b
+    def compared(self, rows: np.ndarray, a: str, b: str, outcomes: Sequence[str]) -> Iterator[PairedResult]:
+        """Two solvers' rows among `rows`, compared by each outcome."""
+        rows_a, rows_b, unmatched = self.match(rows, a, b)
         arrived = (self.hits["reached"][rows_a] == 1) & (self.hits["reached"][rows_b] == 1)
-        return PairedResult(
-            solver_a=a,
-            solver_b=b,
-            outcome=outcome,
-            n=n,
-            both=int((hit_a & hit_b).sum()),
-            only_a=only_a,
-            only_b=only_b,
-            neither=int((~hit_a & ~hit_b).sum()),
-            difference=(only_a - only_b) / n if n else nan,
-            p_value=float(binomtest(only_a, discordant).pvalue) if discordant else 1.0,
-            undefined=len(rows_a) - n,
-            unmatched=unmatched,
-            **_ratio(self.cost[rows_a[arrived]], self.cost[rows_b[arrived]]),
-        )
+        costs = _ratio(self.cost[rows_a[arrived]], self.cost[rows_b[arrived]])
+        for outcome in outcomes:
+            counts = _counts(self.hits[outcome][rows_a], self.hits[outcome][rows_b])
+            yield PairedResult(a, b, outcome, **counts, unmatched=unmatched, **costs)
+
+
+def _counts(hit_a: np.ndarray, hit_b: np.ndarray) -> dict[str, Any]:
+    """The counts of PairedResult from the outcomes (rows,) of two solvers, NaN where undefined."""
+    total = len(hit_a)
+    defined = ~np.isnan(hit_a) & ~np.isnan(hit_b)
+    hit_a, hit_b = hit_a[defined] == 1, hit_b[defined] == 1
+    only_a, only_b = int((hit_a & ~hit_b).sum()), int((hit_b & ~hit_a).sum())
+    n, discordant = len(hit_a), only_a + only_b
+    return {
+        "n": n,
+        "both": int((hit_a & hit_b).sum()),
+        "only_a": only_a,
+        "only_b": only_b,
+        "neither": int((~hit_a & ~hit_b).sum()),
+        "difference": (only_a - only_b) / n if n else nan,
+        "p_value": float(binomtest(only_a, discordant).pvalue) if discordant else 1.0,
+        "undefined": total - n,
+    }
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:

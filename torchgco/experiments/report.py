@@ -24,7 +24,7 @@ from torchgco.experiments.paired import compare
 from torchgco.experiments.power import power_table
 from torchgco.experiments.records import MANIFEST, TRIALS
 from torchgco.experiments.runs import is_merged, read_trials
-from torchgco.experiments.statistics import TASK, summarise, task_columns
+from torchgco.experiments.statistics import TASK, plain, summarise, task_columns
 from torchgco.experiments.tables import FORMATS, aligned, format_frame, format_report
 from torchgco.experiments.verify import Verification, unconfirmed, verify
 from torchgco.interrupts import REPORT, farewell, raised
@@ -155,11 +155,15 @@ def _report(options: argparse.Namespace) -> int:
     merged = merge(options.folders)
     if output.exists() and not output.is_dir():
         raise InputError("--output", "a folder", f"{output}, which is a file")
-    is_study = (output / TRIALS).exists() and not is_merged(read_trials(output / TRIALS))
+    is_study = (output / TRIALS).exists() and not is_merged(output / TRIALS)
     if is_study or (output / MANIFEST).exists():
         raise InputError("--output", "a folder without the results of a study, which are kept", output)
-    write(output / TRIALS, lambda file: merged.to_parquet(file, index=False))
-    say(_written(output, merged, None, options.format))
+    text = [str(name) for name in merged.columns if isinstance(merged[name].dtype, pd.CategoricalDtype)]
+    # Numbers hardly repeat: a dictionary of them would be given up after the time it takes.
+    write(output / TRIALS, lambda file: plain(merged).to_parquet(file, index=False, use_dictionary=text))
+    trials = merged.copy(deep=False)
+    trials.attrs = {}  # pandas copies them for every table that it makes from this one
+    say(_written(output, trials, None, options.format))
     for note in [*_notes(merged), f"written to {output}"]:
         if options.format == "table":
             say(f"\n{note}")

@@ -69,20 +69,25 @@ def read_trials(path: str | os.PathLike[str]) -> pd.DataFrame:
     sums = read_checksums(mark).get(TRIALS, []) if mark.is_file() else []
     if sums and Path(path).is_file() and checksum(Path(path)) not in sums:
         raise damaged(Path(path), "isn't as the study wrote it")
-    try:
-        trials = pd.read_parquet(path, use_threads=False)  # most tables are small: threads cost more than they save
-    except Exception as error:  # damaged bytes make the reader raise nearly anything
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError("trials", "a readable parquet file", f"{path} ({reason})") from None
+    trials = _read(path)
     missing = [name for name in ROW if name not in trials.columns]
     if missing:
         raise InputError("trials", f"columns {', '.join(ROW)}", f"{path} without {', '.join(missing)}")
     return trials
 
 
-def is_merged(trials: pd.DataFrame) -> bool:
-    """Whether the table comes out of a merge rather than out of a study."""
-    return MERGED in trials.attrs
+def is_merged(path: Path) -> bool:
+    """Whether a table comes out of a merge rather than out of a study. Raises InputError if it can't be read."""
+    return MERGED in _read(path, columns=[]).attrs
+
+
+def _read(path: str | os.PathLike[str], **options: Any) -> pd.DataFrame:
+    try:
+        # Most tables are small: threads cost more than they save.
+        return pd.read_parquet(path, use_threads=False, **options)
+    except Exception as error:  # damaged bytes make the reader raise nearly anything
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError("trials", "a readable parquet file", f"{path} ({reason})") from None
 
 
 def _places(folders: list[Path]) -> Iterator[Path]:
@@ -97,7 +102,7 @@ def _run(folder: Path, given: bool) -> Run | None:
     if (folder / TRIALS).is_file():
         trials = read_trials(folder / TRIALS)
         check_trials(trials, folder / TRIALS)
-        return Run(folder, trials, *_origin(folder)) if given or not is_merged(trials) else None
+        return Run(folder, trials, *_origin(folder)) if given or MERGED not in trials.attrs else None
     manifest = read_manifest(folder / MANIFEST)
     if manifest is None or (folder / DONE).is_file():
         raise damaged(folder / TRIALS, "is missing")

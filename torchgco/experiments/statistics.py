@@ -49,6 +49,14 @@ def grouped(table: pd.DataFrame, names: Sequence[str]) -> list[np.ndarray]:
     return np.split(order, np.flatnonzero(np.diff(code[order])) + 1)
 
 
+def plain(table: pd.DataFrame) -> pd.DataFrame:
+    """The table with text in place of categories."""
+    coded = {str(name): column.cat for name, column in table.items() if isinstance(column.dtype, pd.CategoricalDtype)}
+    # `astype` takes twenty times as long.
+    text = {name: cat.categories.array.take(cat.codes.to_numpy(), allow_fill=True) for name, cat in coded.items()}
+    return table.assign(**text)
+
+
 def summarise(trials: pd.DataFrame) -> pd.DataFrame:
     """One row per (scenario, model, solver), in order of appearance; in a merged table also per swept variable.
 
@@ -74,7 +82,7 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
     groups = grouped(trials, names)
     values = _Values.of(trials, groups)
     keys = trials[names].iloc[[rows[0] for rows in groups]].reset_index(drop=True)
-    return pd.concat([keys, pd.DataFrame([values.summary(rows) for rows in groups])], axis=1)
+    return pd.concat([plain(keys), pd.DataFrame([values.summary(rows) for rows in groups])], axis=1)
 
 
 @dataclass(frozen=True)
@@ -160,10 +168,15 @@ def check_trials(trials: pd.DataFrame, place: object = "a table") -> None:
         raise InputError("trials", "the columns of a study", f"{place} without {', '.join(missing)}")
     if trials.empty:
         raise InputError("trials", "at least one row", f"{place} with none")
-    for names, convert, kind in ((NUMBERS, numbers_of, "numbers"), (OUTCOMES, _truth, "true or false")):
+    types = pd.api.types
+    for names, is_right, convert, kind in (
+        (NUMBERS, types.is_numeric_dtype, numbers_of, "numbers"),
+        (OUTCOMES, types.is_bool_dtype, _truth, "true or false"),
+    ):
         for name in trials.columns.intersection(list(names)):
             try:
-                convert(trials[name])
+                if not is_right(trials[name].dtype):
+                    convert(trials[name])
             except (TypeError, ValueError):
                 raise InputError("trials", f"{kind} in column {name}", f"{place} with others") from None
 

@@ -42,7 +42,7 @@ def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
         cells = [chosen[i, task] for task in found]
         of_row = np.zeros(len(run.trials), dtype=int)
         if len(found) > 1:
-            of_row = run.trials.groupby(TASK, sort=False, dropna=False).ngroup()  # numbers `found`
+            of_row = run.trials.groupby(TASK, sort=False, dropna=False, observed=True).ngroup()  # numbers `found`
         held = {
             key: pd.array([_cell(cell.get(key), key in cell, kinds[key]) for cell in cells], dtype=kinds[key])
             for key in columns
@@ -92,6 +92,9 @@ def _clusters(
     held: list[tuple[str, dict[Any, str], str]] = []  # folder, digest by (layout, seed), swept values
     place = []
     values_of = pd.factorize(np.array([_text(cell) for cell in cells], dtype=object))[0]
+    seeds = [(seed, code) for table, code in zip(tables, values_of, strict=True) for seed in table["seed"].unique()]
+    if len(set(seeds)) == len(seeds):
+        return [None] * len(runs)  # no two runs have layouts in common
     of_run = [_digests(table).assign(cell=code) for table, code in zip(tables, values_of, strict=True)]
     layouts = [rows for rows in of_run if len(rows)]
     if not layouts or not pd.concat(layouts).drop_duplicates().duplicated(["layout", "seed", "cell"]).any():

@@ -17,6 +17,7 @@ from torchgco.plotting.style import INK, legend, panels, solver_colours, tasks_o
 FLOOR = 1e-12
 TOLERANCE = 1e-3  # violations up to this count as none, metres for lengths
 SIZE = (5.2, 3.2)  # of a panel, inches
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")  # matplotlib's own formulas take long to load
 
 
 def clearance_histogram(trials: pd.DataFrame) -> Figure:
@@ -65,12 +66,12 @@ def violation_histogram(trials: pd.DataFrame) -> Figure:
 
 
 def _power(exponent: float, _: object) -> str:
-    text = f"$10^{{{exponent:.0f}}}$"
+    text = f"10{f'{exponent:.0f}'.translate(RAISED)}"
     return f"≤ {text}" if exponent <= np.log10(FLOOR) else text
 
 
 def _by_solver(task: pd.DataFrame, column: str) -> dict[str, np.ndarray]:
-    groups = task.groupby("solver", sort=False)[column]
+    groups = task.groupby("solver", sort=False, observed=True)[column]
     return {str(solver): values.to_numpy(dtype=float, na_value=np.nan) for solver, values in groups}
 
 

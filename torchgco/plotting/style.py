@@ -83,7 +83,8 @@ def tasks_of(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     A task is (scenario, model) and, in a merged table, the values of the swept variables: the columns with a dot.
     """
     swept = [name for name in table.columns if "." in str(name)]
-    for (scenario, model, *values), rows in table.groupby(["scenario", "model", *swept], sort=False, dropna=False):
+    groups = table.groupby(["scenario", "model", *swept], sort=False, dropna=False, observed=True)
+    for (scenario, model, *values), rows in groups:
         more = [f"{name.split('.')[-1]} {value}" for name, value in zip(swept, values, strict=True) if pd.notna(value)]
         yield ", ".join([f"{scenario} ({model})", *more]), rows
 
