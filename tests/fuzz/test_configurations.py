@@ -59,14 +59,14 @@ def flown_setup(words: tuple[str, ...]) -> Setup:
 
 
 @pytest.mark.parametrize("base", BASES)
-@settings(max_examples=examples(150))
+@settings(max_examples=examples(60))
 @given(data=st.data())
 def test_any_value_of_a_key(base: str, data: st.DataObject) -> None:
     words: Any = [f"{data.draw(st.sampled_from(keys(base)))}={data.draw(VALUES)}"]
     accepted_or_refused("values of configuration keys", lambda: flown_setup((*BASES[base], *words)))
 
 
-@settings(max_examples=examples(300))
+@settings(max_examples=examples(150))
 @given(data=st.data())
 def test_any_two_values(data: st.DataObject) -> None:
     base = data.draw(st.sampled_from(list(BASES)))
@@ -78,7 +78,7 @@ def test_any_two_values(data: st.DataObject) -> None:
 WORDS = st.text(st.sampled_from("aseln=.,+~-[]{}'\"\\:/ @!#$%01"), min_size=1, max_size=16)
 
 
-@settings(max_examples=examples(400))
+@settings(max_examples=examples(250))
 @given(st.lists(WORDS, min_size=1, max_size=3))
 def test_any_words(words: list[str]) -> None:
     """Words that are no overrides, groups that don't exist, half a list."""

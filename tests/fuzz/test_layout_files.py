@@ -74,7 +74,7 @@ def fly(path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*:RuntimeWarning")
-@settings(max_examples=examples(600), suppress_health_check=list(HealthCheck))
+@settings(max_examples=examples(500), suppress_health_check=list(HealthCheck))
 @given(held=files())
 def test_any_arrays(held: dict[str, np.ndarray], tmp_path: Path) -> None:
     path = tmp_path / "layouts.npz"
