@@ -1,6 +1,8 @@
 """Settings of all tests: one thread each, because parallel test workers share the cores."""
 
 import os
+import signal
+import threading
 from collections.abc import Iterator
 
 import pytest
@@ -11,6 +13,9 @@ from torchgco.native.compiler import find_compiler
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start
 torch.set_num_threads(1)
+# In the background of a shell Ctrl-C is ignored, also by all processes that tests start and interrupt.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN and threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(params=["native", "eager"])
