@@ -57,17 +57,17 @@ def generator(seed: int, number: int) -> np.random.Generator:
 
 @dataclass(frozen=True, kw_only=True)
 class Family(Scenario):
-    """Base of the built-in random families: equal spheres, one start at rest, one goal.
+    """Base of the built-in random families: one start at rest, one goal.
 
-    start, goal      positions (d,) m; the full states are at rest
-    obstacle_radius  m; vehicle_radius: m; goal_radius: m
-    stages           N; dt: s
+    start, goal  positions (d,) m; the full states are at rest
+    vehicle_radius, goal_radius
+                 m
+    stages       N; dt: s
 
     Raises InputError naming `scenario.<field>`.
     """
 
     name: str
-    obstacle_radius: float
     vehicle_radius: float
     start: Sequence[float]
     goal: Sequence[float]
@@ -78,8 +78,7 @@ class Family(Scenario):
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise InputError("scenario.name", "a name", repr(self.name))
-        for field in ("obstacle_radius", "vehicle_radius"):
-            self._set(field, checks.number, at_least=0)
+        self._set("vehicle_radius", checks.number, at_least=0)
         for field in ("goal_radius", "dt"):
             self._set(field, checks.number, above=0)
         for field in ("start", "goal"):
@@ -94,20 +93,23 @@ class Family(Scenario):
     def _at_rest(self, position: Sequence[float]) -> np.ndarray:
         """The vehicle's state (n,) at rest in `position` (d,)."""
 
-    def _layout(self, centers: np.ndarray, **more: Any) -> Layouts:
-        """One layout of spheres at `centers` (M, d), NaN where absent; `more` goes to Layouts as it is."""
-        radii = np.where(np.isnan(centers[:, 0]), np.nan, self.obstacle_radius)
+    def _layout(self, **obstacles: Any) -> Layouts:
+        """One layout with these fields of Layouts; without `centers` there are no spheres."""
+        none = {"centers": np.empty((1, 0, self.dimension)), "radii": np.empty((1, 0))}
         return Layouts(
-            centers=centers[None],
-            radii=radii[None],
             start=self._at_rest(self.start),
             goal=self._at_rest(self.goal),
             vehicle_radius=self.vehicle_radius,
             goal_radius=self.goal_radius,
             dt=self.dt,
             stages=self.stages,
-            **more,
+            **(none | obstacles),
         )
+
+
+def equal_spheres(centers: np.ndarray, radius: float) -> dict[str, np.ndarray]:
+    """The fields of Layouts for one layout of spheres at `centers` (M, d), NaN where absent, m."""
+    return {"centers": centers[None], "radii": np.where(np.isnan(centers[:, 0]), np.nan, radius)[None]}
 
 
 def uniform_clear(

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from torchgco.errors import InputError
 from torchgco.scenarios import checks
-from torchgco.scenarios.base import Family, uniform_clear
+from torchgco.scenarios.base import Family, equal_spheres, uniform_clear
 from torchgco.scenarios.layouts import Layouts
 
 # A cup that opens towards the start and stands on the straight line to the goal.
@@ -54,8 +55,8 @@ class Planar(Family):
     def _at_rest(self, position: Sequence[float]) -> np.ndarray:
         return np.array([*position, 0.0, 0.0, 0.0, 0.0])
 
-    def _planar_layout(self, centers: np.ndarray) -> Layouts:
-        return self._layout(centers, control_lower=self.control_lower, control_upper=self.control_upper)
+    def _layout(self, **obstacles: Any) -> Layouts:
+        return super()._layout(control_lower=self.control_lower, control_upper=self.control_upper, **obstacles)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,11 +71,13 @@ class PlanarTrap(Planar):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._set("centers", checks.vectors, length=2)
-        self._set("jitter", checks.number, at_least=0)
+        for field in ("obstacle_radius", "jitter"):
+            self._set(field, checks.number, at_least=0)
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
         centers = np.array(self.centers)
-        return self._planar_layout(centers + self.jitter * rng.standard_normal(centers.shape))
+        centers = centers + self.jitter * rng.standard_normal(centers.shape)
+        return self._layout(**equal_spheres(centers, self.obstacle_radius))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,9 +99,10 @@ class PlanarRandom(Planar):
         super().__post_init__()
         self._set("num_obstacles", checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
         self._set("region", checks.box, dimension=2)
-        for field in ("start_clearance", "goal_clearance"):
+        for field in ("obstacle_radius", "start_clearance", "goal_clearance"):
             self._set(field, checks.number, at_least=0)
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
         clear = ((self.start, self.start_clearance), (self.goal, self.goal_clearance))
-        return self._planar_layout(uniform_clear(rng, self.region, self.num_obstacles, clear))
+        centers = uniform_clear(rng, self.region, self.num_obstacles, clear)
+        return self._layout(**equal_spheres(centers, self.obstacle_radius))

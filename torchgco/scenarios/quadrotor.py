@@ -1,4 +1,4 @@
-"""Scenarios in space: sphere obstacles for the quadrotor's planning model."""
+"""Scenarios in space for the quadrotor's planning model: spheres, resting, moving and in walls."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from torchgco.errors import InputError
 from torchgco.scenarios import checks
-from torchgco.scenarios.base import Family, uniform_clear
+from torchgco.scenarios.base import Family, equal_spheres, uniform_clear
 from torchgco.scenarios.layouts import Layouts
 
 HOVER = 9.81  # thrust acceleration that holds the vehicle, m/s^2
@@ -23,7 +23,6 @@ class Quadrotor(Family):
     Control bounds are the model's.
     """
 
-    obstacle_radius: float = 0.60
     vehicle_radius: float = 0.36
     start: Sequence[float] = (-1.0, 1.0, 0.0)
     goal: Sequence[float] = (20.0, 1.0, 0.2)
@@ -51,6 +50,7 @@ class Forest(Quadrotor):
     """
 
     name: str = "forest"
+    obstacle_radius: float = 0.60
     num_obstacles: int = 30
     density: float | None = None
     region: Sequence[Sequence[float]] = ((2.0, 16.0), (-1.0, 3.0), (-1.0, 1.0))
@@ -59,12 +59,13 @@ class Forest(Quadrotor):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._set("num_obstacles", checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
+        for field in ("obstacle_radius", "clearance"):
+            self._set(field, checks.number, at_least=0)
         self._set("density", checks.optional_number, at_least=0)
         self._set("region", checks.box, dimension=3)
         if self.obstacle_count > checks.MOST_OBSTACLES:
             expected = f"at most {checks.MOST_OBSTACLES} obstacles in scenario.region"
             raise InputError("scenario.density", expected, f"{self.density}, which makes {self.obstacle_count}")
-        self._set("clearance", checks.number, at_least=0)
 
     @property
     def obstacle_count(self) -> int:
@@ -78,7 +79,7 @@ class Forest(Quadrotor):
         return uniform_clear(rng, self.region, self.obstacle_count, clear)
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
-        return self._layout(self._centers(rng))
+        return self._layout(**equal_spheres(self._centers(rng), self.obstacle_radius))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +105,8 @@ class ForestMoving(Forest):
         speed = rng.uniform(self.slowest, self.speed, len(centers))
         heading = rng.uniform(-np.pi, np.pi, len(centers))
         direction = np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(centers))])
-        return self._layout(centers, velocities=(speed[:, None] * direction)[None])
+        spheres = equal_spheres(centers, self.obstacle_radius)
+        return self._layout(**spheres, velocities=(speed[:, None] * direction)[None])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +124,7 @@ class Walls(Quadrotor):
     """
 
     name: str = "walls"
+    obstacle_radius: float = 0.60
     stages: int = 160
     positions: Sequence[float] = (7.0, 13.0)
     extent: Sequence[Sequence[float]] = ((-5.0, 7.0), (-3.0, 3.0))
@@ -137,7 +140,8 @@ class Walls(Quadrotor):
             self._set(field, checks.box, dimension=2)
         self._set("pitch", checks.number, above=0)
         self._set("holes", checks.integer, at_least=0, at_most=MOST_HOLES)
-        self._set("hole_radius", checks.number, at_least=0)
+        for field in ("obstacle_radius", "hole_radius"):
+            self._set(field, checks.number, at_least=0)
         steps = [(high - low) / self.pitch + 1 for low, high in self.extent]
         if len(self.positions) * steps[0] * steps[1] > checks.MOST_OBSTACLES:
             expected = f"grids of at most {checks.MOST_OBSTACLES} spheres in scenario.extent"
@@ -162,4 +166,4 @@ class Walls(Quadrotor):
         centers = np.full((len(self.positions) * len(grid), 3), np.nan)
         present = np.concatenate(standing)
         centers[: len(present)] = present
-        return self._layout(centers)
+        return self._layout(**equal_spheres(centers, self.obstacle_radius))
