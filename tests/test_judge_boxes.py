@@ -46,7 +46,12 @@ def test_clearances_against_sampled_segments(d: int, rounded: bool) -> None:
     X[:, 5, :d] = 2 * boxes.centers[:, 0] - X[:, 4, :d]  # and one right through a box
     at_knots, between = box_clearance(boxes, X)
     for b in range(2):
-        chords = CHORDS[BoundBoxes](boxes.take(torch.tensor([b])), X[b])
+        single = boxes.take(torch.tensor([b]))
+        chords = CHORDS[BoundBoxes](single, X[b], torch.tensor(torch.inf, dtype=torch.float64))
+        near = CHORDS[BoundBoxes](single, X[b], torch.tensor(0.05, dtype=torch.float64))
+        assert (near <= chords).all() and (near < chords).any()
+        is_near = near < near.amin() + 0.05
+        assert torch.equal(near[is_near], chords[is_near]) and torch.equal(near.amin(), chords.amin())
         p, knots, nearest = X[b, :, :d].numpy(), np.inf, np.inf
         for i in range(3):
             box = tuple(part[b, i] for part in parts)

@@ -24,7 +24,7 @@ from torchgco.constraints.boxes import BoundBoxes
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.errors import InputError
 from torchgco.judge import by_kind, segment_distance
-from torchgco.measure import box_segment_distance
+from torchgco.measure import box_distance, box_segment_distance
 from torchgco.problem import Problem, check_problem
 from torchgco.shapes import check_shape, check_tensor
 
@@ -124,12 +124,13 @@ def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     nearest = X.new_full((), torch.inf)
     for obstacles in problem.constraints:
         if isinstance(obstacles, Obstacles) and not bool(obstacles.absent.all()):
-            path = by_kind(CHORDS, obstacles)(obstacles, X[0]) - _bulge(problem, X, U).unsqueeze(-1)
+            bulge = _bulge(problem, X, U)
+            path = by_kind(CHORDS, obstacles)(obstacles, X[0], bulge.amax()) - bulge.unsqueeze(-1)
             nearest = torch.minimum(nearest, path[:, ~obstacles.absent[0]].amin())
     return nearest
 
 
-def _sphere_chords(spheres: BoundSpheres, X: Tensor) -> Tensor:
+def _sphere_chords(spheres: BoundSpheres, X: Tensor, slack: Tensor) -> Tensor:
     k = torch.arange(X.shape[0], dtype=X.dtype, device=X.device).view(-1, 1, 1)
     relative = X[:, None, spheres.position] - spheres.centers[0]  # (N+1, M, d)
     if spheres.velocities is not None:
@@ -137,13 +138,15 @@ def _sphere_chords(spheres: BoundSpheres, X: Tensor) -> Tensor:
     return segment_distance(relative[:-1], relative[1:]) - spheres.inflated_radii[0]
 
 
-def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
-    return box_segment_distance(boxes, X[None, :, boxes.position])[0] - boxes.inflated_radii[0]
+def _box_chords(boxes: BoundBoxes, X: Tensor, slack: Tensor) -> Tensor:
+    p, radii = X[None, :, boxes.position], torch.where(boxes.absent, -torch.inf, boxes.inflated_radii).unsqueeze(1)
+    nearest = (box_distance(boxes, p) - radii).amin()
+    return (box_segment_distance(boxes, p, nearest + slack + radii) - radii)[0]
 
 
 # By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, or lower
-# bounds of them.
-CHORDS: dict[type[Obstacles], Callable[[Any, Tensor], Tensor]] = {
+# bounds of them, close up to a slack (m) above the smallest distance.
+CHORDS: dict[type[Obstacles], Callable[[Any, Tensor, Tensor], Tensor]] = {
     BoundSpheres: _sphere_chords,
     BoundBoxes: _box_chords,
 }

@@ -159,7 +159,7 @@ def box_clearance(boxes: BoundBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
         return far, far
     contact = torch.where(boxes.absent, -torch.inf, CONTACT_FACTOR * boxes.inflated_radii).unsqueeze(1)
     at_knots = (box_distance(boxes, p) - contact).flatten(1).amin(-1)
-    between = (box_segment_distance(boxes, p) - contact).flatten(1).amin(-1)
+    between = (box_segment_distance(boxes, p, at_knots.view(-1, 1, 1) + contact) - contact).flatten(1).amin(-1)
     return at_knots, torch.minimum(between, at_knots)
 
 

@@ -1,22 +1,28 @@
 """Named sources of obstacle layouts: random families and files."""
 
 from torchgco.scenarios.base import Scenario
+from torchgco.scenarios.crossing import Crossing
 from torchgco.scenarios.files import LayoutFile
 from torchgco.scenarios.layouts import Layouts, concatenate
+from torchgco.scenarios.mazes import Mazes
 from torchgco.scenarios.planar import PlanarRandom, PlanarTrap
 from torchgco.scenarios.quadrotor import Forest, ForestMoving, Walls
 from torchgco.scenarios.vehicle import Task, Vehicle
+from torchgco.scenarios.woods import Woods
 
 __all__ = [
+    "Crossing",
     "Forest",
     "ForestMoving",
     "LayoutFile",
     "Layouts",
+    "Mazes",
     "PlanarRandom",
     "PlanarTrap",
     "Scenario",
     "Task",
     "Vehicle",
     "Walls",
+    "Woods",
     "concatenate",
 ]

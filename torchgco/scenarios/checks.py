@@ -79,6 +79,14 @@ def box(value: Any, field: str, dimension: int) -> tuple[tuple[float, float], ..
     return tuple((low, high) for low, high in pairs)
 
 
+def interval(value: Any, field: str, **limits: float) -> tuple[float, float]:
+    """A pair (least, largest) of numbers in order, within the limits of `number`."""
+    low, high = (number(item, field, **limits) for item in vector(value, field, length=2))
+    if low > high:
+        raise InputError(field, "[least, largest] in this order", repr(value))
+    return low, high
+
+
 def indices(value: Any, field: str) -> np.ndarray:
     """A sequence of at least one integer >= 0, as int64 (count,)."""
     try:
