@@ -19,7 +19,7 @@ from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
 from torchgco.native.dispatch import EagerWarning
 
 AT_ONCE = 64  # problems searched together
-HOPS = 32  # edges of a path, at most
+HOPS = 64  # edges of a path, at most
 CLEAR = 0.001  # smallest gap between a point and all obstacles, as a share of the largest r_obs + r_veh
 MIDWAY = 4  # nearest neighbours of an obstacle: each gap to one gets a point
 SHELLS = {2: (1.05, 1.3), 3: (1.15,)}  # radii of the circles of points around a sphere, by the number of coordinates

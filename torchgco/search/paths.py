@@ -27,9 +27,10 @@ from torchgco.options import AtLeast, Below, Count, Natural, Positive, check_opt
 from torchgco.problem import Problem
 from torchgco.search import scene as seen
 from torchgco.search.candidates import PENALTY, Candidates, Watch, unwatched
+from torchgco.search.geometry import Scene
 from torchgco.search.homotopy import one_per_class
 from torchgco.search.roadmap import Roadmap
-from torchgco.search.tracking import attraction, travel
+from torchgco.search.tracking import attraction, followed
 from torchgco.shapes import check_shape, tensor
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR
@@ -68,7 +69,7 @@ class PathProposals:
             don't fit the number of controls.
         depart, arrive: shares of the horizon at which the vehicle leaves the start and reaches the goal. Several
             values of `arrive`: every path is tracked at each pace.
-        smoothing: share of the horizon over which the corners of a path are averaged.
+        smoothing: share of the horizon over which the corners of a path are averaged, at most (`tracking.followed`).
         tube: radius of the tube that a candidate is kept in, as a share of the mean inflated radius; None: a spring to
             the path instead. A spring takes half the iterations; a vehicle that can't move sideways ends closer to the
             path in a tube.
@@ -147,7 +148,7 @@ class PathProposals:
         candidates = Candidates.begin(
             problem, starts.repeat(1, self.num_paths, 1, 1), R, torch.where(found, unit, 1.0), live, watch
         )
-        candidates = self.track(candidates, paths)
+        candidates = self.track(candidates, paths, scene)
         candidates = candidates.pick(candidates.order(candidates.arrive())[:, : self.relax_top])
         candidates, sound = self.relax(candidates)
         order = candidates.order(sound, ALIKE)[:, : self.refine_top]
@@ -168,12 +169,13 @@ class PathProposals:
             starts[:, 1:, : math.ceil(OFFSET_LASTS * N)] += (reach * offsets).unsqueeze(2)
         return starts
 
-    def track(self, candidates: Candidates, paths: Tensor) -> Candidates:
+    def track(self, candidates: Candidates, paths: Tensor, scene: Scene) -> Candidates:
         """The candidates, tracked along their paths (B, num_paths, P, d) from their initial controls at their paces."""
         paces, K = len(self.paces), paths.shape[1]
         path = paths.flatten(0, 1).repeat_interleave(paces, dim=0)
         arrive = path.new_tensor(self.paces).repeat(path.shape[0] // paces)
-        center = travel(path, self.depart, arrive, self.smoothing, candidates.problem.N)
+        room = candidates.R[:: candidates.count]
+        center = followed(path, self.depart, arrive, self.smoothing, candidates.problem.N, scene, room)
         problem = torch.arange(candidates.problem.B, device=path.device).repeat_interleave(K * paces) * candidates.count
         number = torch.arange(candidates.live.numel(), device=path.device)
         place = number // (candidates.count // K) * paces + number % paces  # of each candidate's path and pace

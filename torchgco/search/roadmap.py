@@ -23,9 +23,11 @@ from torchgco.search.graph import Search
 
 AT_ONCE = 4  # problems that PyTorch searches together: memory holds the distances of all edges from all obstacles
 NODES = 128  # points around obstacles: those of the shortest detours
-# Points of a second search, where there is no path between more than NODES obstacles: a wall that is given as a row of
-# discs takes all places of the first search, before its ends get any.
-MANY_NODES = 2048
+# A second search has more points, where the first had no places for all of them and found no path, or only a long one
+# (in distances from start to goal): the points next to the straight line take all places, before any lies in the gaps
+# that lead through a wood or at the ends of a wall.
+MANY_NODES = 1024
+LONG = 1.25
 NEIGHBOURS, HALTON_NEIGHBOURS = 12, 6  # edges of a point to its nearest of all points and of the Halton points
 MARGIN = 0.15  # distance from an obstacle, in largest inflated radii, below which an edge costs up to double
 DIVERSITY = 1.0  # extra cost of later paths, as a share, within the largest inflated radius of an earlier path
@@ -71,15 +73,17 @@ class Roadmap:
         search = Search(o, R, MARGIN, boxes) if library is None else NativeSearch(library, o, R, MARGIN, boxes)
         cube = halton(self.num_halton, o.shape[-1]).to(o)
 
-        def cheapest(nodes: int) -> tuple[Tensor, Tensor]:
-            graph = search.graph(start, goal, cube, nodes, NEIGHBOURS, HALTON_NEIGHBOURS)
-            return self._cheapest(search, graph, scene, rows, count)
+        def graph_of(nodes: int) -> Graph:
+            return search.graph(start, goal, cube, nodes, NEIGHBOURS, HALTON_NEIGHBOURS)
 
-        paths, found = cheapest(NODES)
-        again = ~found & ((R > 0).sum(-1) > NODES)
-        if bool(again.any()):
-            more, arrives = cheapest(MANY_NODES)
-            paths, found = torch.where(again.view(-1, 1, 1, 1), more, paths), torch.where(again, arrives, found)
+        graph = graph_of(NODES)
+        paths, found = self._cheapest(search, graph, scene, rows, count)
+        is_full = graph.points.shape[1] == 2 + len(cube) + NODES
+        again = ~found | (length(paths[:, 0]) > LONG * length(torch.stack((start, goal), dim=1)))
+        if is_full and bool(again.any()):
+            more, arrives = self._cheapest(search, graph_of(MANY_NODES), scene, rows, count)
+            again = again & arrives
+            paths, found = torch.where(again.view(-1, 1, 1, 1), more, paths), found | again
         return paths, found
 
     def _cheapest(
@@ -95,6 +99,11 @@ class Roadmap:
             paths.append(path)
             price = search.raised(price, graph.points, path, 1.0 + DIVERSITY)
         return torch.stack(paths, dim=1), found
+
+
+def length(path: Tensor) -> Tensor:
+    """Lengths (B,) of paths (B, P, d)."""
+    return path.diff(dim=1).square().sum(-1).sqrt().sum(-1)
 
 
 @cache

@@ -6,7 +6,11 @@ import torch
 from torch import Tensor
 
 from torchgco.penalties import GuidePath, GuideRegion, Penalty
-from torchgco.search.geometry import points_along
+from torchgco.search.geometry import Scene, points_along
+
+CUT = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
+HALVINGS = 3  # of the share of the horizon over which they are averaged
+SAMPLES = 64  # points of a path at which its depth is measured, about
 
 
 def travel(path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int) -> Tensor:
@@ -26,6 +30,29 @@ def travel(path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int
         return center
     padded = torch.cat((center[:, :1].expand(-1, reach, -1), center, center[:, -1:].expand(-1, reach, -1)), dim=1)
     return padded.unfold(1, 2 * reach + 1, 1).mean(-1)
+
+
+def followed(
+    path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int, scene: Scene, R: Tensor
+) -> Tensor:
+    """As `travel`, but corners are averaged less where the average would cut deep into an obstacle.
+
+    Between the trunks of a dense wood, a path that is averaged over seconds leads through the trunks.
+
+    Args:
+        path: those of B problems one after the other, (B K, P, d).
+        R: mean inflated radius (B,), m.
+    """
+    center, B = travel(path, depart, arrive, smoothing, N), R.shape[0]
+    for _ in range(HALVINGS if B > 0 else 0):
+        points = center[:, :: max(1, N // SAMPLES)]
+        depth = scene.depth(points.reshape(B, -1, points.shape[-1])).view(B, -1, points.shape[1]).amax(-1)
+        deep = depth > CUT * R.unsqueeze(-1)
+        if not bool(deep.any()):
+            break
+        smoothing *= 0.5
+        center = torch.where(deep.view(-1, 1, 1), travel(path, depart, arrive, smoothing, N), center)
+    return center
 
 
 def attraction(
