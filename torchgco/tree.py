@@ -38,7 +38,8 @@ def take(tree: Any, index: Rows) -> Any:
     if isinstance(tree, PerElement):
         return tree.take(index)
     if isinstance(tree, tuple):
-        return tuple(take(leaf, index) for leaf in tree)
+        rows = (take(leaf, index) for leaf in tree)
+        return type(tree)(*rows) if hasattr(tree, "_fields") else tuple(rows)
     if is_dataclass(tree) and not isinstance(tree, type):
         return replace(tree, **{f.name: take(getattr(tree, f.name), index) for f in fields(tree)})
     return tree

@@ -34,13 +34,13 @@ class Mazes(Quadrotor):
     name: str = "mazes"
     walls: int = 3
     region: Sequence[Sequence[float]] = ((2.0, 17.0), (-3.0, 5.0), (-2.0, 2.0))
-    extent: Sequence[Sequence[float]] = ((-9.0, 11.0), (-8.0, 8.0))
+    extent: Sequence[Sequence[float]] = ((-24.0, 26.0), (-8.0, 8.0))
     thickness: float = 0.4
     opening: Sequence[float] = (1.8, 1.8)
     opening_region: Sequence[Sequence[float]] = ((-3.0, 5.0), (-2.0, 2.0))
     loose: int = 6
     sizes: Sequence[float] = (0.3, 0.9)
-    stages: int = 200
+    stages: int = 280
 
     def __post_init__(self) -> None:
         super().__post_init__()

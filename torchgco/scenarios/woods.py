@@ -27,12 +27,12 @@ class Woods(Quadrotor):
     """
 
     name: str = "woods"
-    density: float = 0.2
-    region: Sequence[Sequence[float]] = ((2.0, 17.0), (-9.0, 11.0))
+    density: float = 0.4
+    region: Sequence[Sequence[float]] = ((2.0, 17.0), (-14.0, 16.0))
     radii: Sequence[float] = (0.25, 0.45)
     height: Sequence[float] = (-8.0, 8.0)
     clearance: float = 1.26
-    stages: int = 160
+    stages: int = 240
 
     def __post_init__(self) -> None:
         super().__post_init__()

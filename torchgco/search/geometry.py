@@ -9,8 +9,10 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bodies import Inflated
 from torchgco.constraints.cuboids import Cuboids, signed_distance
 from torchgco.constraints.obstacles import FAR as FAR
+from torchgco.tree import take
 
 AT_ONCE = 2**18  # distances between points and obstacles that are held at once
 
@@ -36,20 +38,28 @@ class Scene:
         """The centres of all obstacles, boxes last, (B, M', d)."""
         return self.centers if self.boxes is None else torch.cat((self.centers, self.boxes.centers), dim=1)
 
-    def depth(self, points: Tensor) -> Tensor:
-        """How deep points (B, V, d) lie beneath the surface of an obstacle, (B, V), m; negative outside of all."""
-        most = max(1, AT_ONCE // max(1, points.shape[1] * self.sizes.shape[1]))
-        rows = range(0, max(1, points.shape[0]), most)
-        return torch.cat([self._depth(points[i : i + most], slice(i, i + most)) for i in rows])
+    @property
+    def obstacles(self) -> Inflated:
+        """The obstacles alone."""
+        return Inflated(self.centers, self.inflated_radii, self.boxes)
 
-    def _depth(self, points: Tensor, rows: slice) -> Tensor:
-        apart = squares(points, self.centers[rows]).sqrt_()
-        depth = (self.inflated_radii[rows].unsqueeze(1) - apart).amax(-1)
-        if self.boxes is None:
-            return depth
-        boxes = self.boxes.rows(rows)
-        within = boxes.radius.unsqueeze(1) - signed_distance(boxes.seen_from(points), boxes.halves())
-        return torch.maximum(depth, within.masked_fill(~boxes.here.unsqueeze(1), -torch.inf).amax(-1))
+
+def depth(obstacles: Inflated, points: Tensor) -> Tensor:
+    """How deep points (B, V, d) lie beneath the surface of an obstacle, (B, V), m; negative outside of all."""
+    B, V, count = *points.shape[:2], obstacles.centers.shape[1]
+    count += 0 if obstacles.boxes is None else obstacles.boxes.radius.shape[1]
+    parts = torch.arange(B, device=points.device).split(max(1, AT_ONCE // max(1, V * count)))
+    return torch.cat([_depth(take(obstacles, rows), points[rows]) for rows in parts])
+
+
+def _depth(obstacles: Inflated, points: Tensor) -> Tensor:
+    apart = squares(points, obstacles.centers).sqrt_()
+    within = (obstacles.inflated_radii.unsqueeze(1) - apart).amax(-1)
+    boxes = obstacles.boxes
+    if boxes is None:
+        return within
+    inside = boxes.radius.unsqueeze(1) - signed_distance(boxes.seen_from(points), boxes.halves())
+    return torch.maximum(within, inside.masked_fill(~boxes.here.unsqueeze(1), -torch.inf).amax(-1))
 
 
 def points_along(path: Tensor, length: Tensor) -> Tensor:

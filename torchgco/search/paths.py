@@ -20,6 +20,7 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bodies import Inflated
 from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import cost_unit
@@ -27,7 +28,6 @@ from torchgco.options import AtLeast, Below, Count, Natural, Positive, check_opt
 from torchgco.problem import Problem
 from torchgco.search import scene as seen
 from torchgco.search.candidates import PENALTY, Candidates, Watch, unwatched
-from torchgco.search.geometry import Scene
 from torchgco.search.homotopy import one_per_class
 from torchgco.search.roadmap import Roadmap
 from torchgco.search.tracking import attraction, followed
@@ -44,6 +44,9 @@ ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a sh
 TOLERANCE = 5e-5  # of tracking and relaxing, as a share of L_M; refining takes a tenth of it
 SEARCH = LineSearch(back=2)
 TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
+# Where no candidate arrives, the paths are followed again: with corners averaged over a share of the horizon that is
+# smaller, and a spring or tube that is stiffer, by these factors. Doors and gaps of a few vehicle radii need it.
+CLOSER = (4.0, 10.0)
 CHORD_PENETRATION = 0.049  # share of an obstacle's margin, between two knots; the judge accepts 0.05
 
 
@@ -54,6 +57,17 @@ class Proposal(NamedTuple):
     found: Tensor  # (B,) bool: whether there is a proposal; elsewhere U is not to be used
     multipliers: Multipliers  # to continue with; mu keeps the solver from leaving the path, NaN where there is none
     iterations: Tensor  # (B,) int64: of all solves of all candidates, also where none is found
+
+
+@dataclass(frozen=True)
+class Ways:
+    """Paths of B problems, K each, and the units to follow them in."""
+
+    paths: Tensor  # (B, K, P, d), m
+    live: Tensor  # (B, K) bool: one per homotopy class
+    R: Tensor  # (B,): mean inflated radius, m
+    unit: Tensor  # (B,): q0 / R^4
+    obstacles: Inflated
 
 
 @dataclass(frozen=True)
@@ -143,18 +157,30 @@ class PathProposals:
         paths, found = self.roadmap.paths(scene, self.num_paths)
         R, unit = seen.scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
-        starts = self.starts(problem, rest).repeat_interleave(len(self.paces), dim=1)
-        live = (one_per_class(paths, scene) & found.unsqueeze(-1)).repeat_interleave(starts.shape[1], dim=1)
-        candidates = Candidates.begin(
-            problem, starts.repeat(1, self.num_paths, 1, 1), R, torch.where(found, unit, 1.0), live, watch
+        ways = Ways(
+            paths, one_per_class(paths, scene) & found.unsqueeze(-1), R, torch.where(found, unit, 1.0), scene.obstacles
         )
-        candidates = self.track(candidates, paths, scene)
+        proposal = self._along(problem, rest, ways, watch)
+        rows = (found & ~proposal.found).nonzero().flatten()
+        if rows.numel() > 0:
+            closer = replace(self, smoothing=self.smoothing / CLOSER[0], stiffness=(CLOSER[1] * self.stiffness[-1],))
+            more = closer._along(problem.take(rows), rest[rows], take(ways, rows), watch)
+            put(proposal, rows, more._replace(iterations=more.iterations + proposal.iterations[rows]))
+        return proposal
+
+    def _along(self, problem: Problem, rest: Tensor, ways: Ways, watch: Watch) -> Proposal:
+        """Proposals along paths that are known."""
+        paths = ways.paths
+        starts = self.starts(problem, rest).repeat_interleave(len(self.paces), dim=1)
+        live = ways.live.repeat_interleave(starts.shape[1], dim=1)
+        candidates = Candidates.begin(problem, starts.repeat(1, paths.shape[1], 1, 1), ways.R, ways.unit, live, watch)
+        candidates = self.track(candidates, ways)
         candidates = candidates.pick(candidates.order(candidates.arrive())[:, : self.relax_top])
         candidates, sound = self.relax(candidates)
         order = candidates.order(sound, ALIKE)[:, : self.refine_top]
         sound = sound[candidates.rows(order).flatten()]
         candidates, multipliers, best = self.refine(candidates.pick(order), sound)
-        multipliers = take(multipliers, best)
+        multipliers, found = take(multipliers, best), ways.live.any(-1)
         multipliers = replace(multipliers, mu=torch.where(found, multipliers.mu, torch.nan))
         return Proposal(candidates.U[best], found & sound[best], multipliers, candidates.iterations)
 
@@ -169,13 +195,12 @@ class PathProposals:
             starts[:, 1:, : math.ceil(OFFSET_LASTS * N)] += (reach * offsets).unsqueeze(2)
         return starts
 
-    def track(self, candidates: Candidates, paths: Tensor, scene: Scene) -> Candidates:
-        """The candidates, tracked along their paths (B, num_paths, P, d) from their initial controls at their paces."""
-        paces, K = len(self.paces), paths.shape[1]
-        path = paths.flatten(0, 1).repeat_interleave(paces, dim=0)
+    def track(self, candidates: Candidates, ways: Ways) -> Candidates:
+        """The candidates, tracked along their paths from their initial controls at their paces."""
+        paces, K = len(self.paces), ways.paths.shape[1]
+        path = ways.paths.flatten(0, 1).repeat_interleave(paces, dim=0)
         arrive = path.new_tensor(self.paces).repeat(path.shape[0] // paces)
-        room = candidates.R[:: candidates.count]
-        center = followed(path, self.depart, arrive, self.smoothing, candidates.problem.N, scene, room)
+        center = followed(path, self.depart, arrive, self.smoothing, candidates.problem.N, ways.obstacles, ways.R)
         problem = torch.arange(candidates.problem.B, device=path.device).repeat_interleave(K * paces) * candidates.count
         number = torch.arange(candidates.live.numel(), device=path.device)
         place = number // (candidates.count // K) * paces + number % paces  # of each candidate's path and pace

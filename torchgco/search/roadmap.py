@@ -28,6 +28,7 @@ NODES = 128  # points around obstacles: those of the shortest detours
 # that lead through a wood or at the ends of a wall.
 MANY_NODES = 1024
 LONG = 1.25
+MANY_NEIGHBOURS = 96  # in the second search: two doors of a maze lie farther apart than the points around each
 NEIGHBOURS, HALTON_NEIGHBOURS = 12, 6  # edges of a point to its nearest of all points and of the Halton points
 MARGIN = 0.15  # distance from an obstacle, in largest inflated radii, below which an edge costs up to double
 DIVERSITY = 1.0  # extra cost of later paths, as a share, within the largest inflated radius of an earlier path
@@ -73,15 +74,13 @@ class Roadmap:
         search = Search(o, R, MARGIN, boxes) if library is None else NativeSearch(library, o, R, MARGIN, boxes)
         cube = halton(self.num_halton, o.shape[-1]).to(o)
 
-        def graph_of(nodes: int) -> Graph:
-            return search.graph(start, goal, cube, nodes, NEIGHBOURS, HALTON_NEIGHBOURS)
-
-        graph = graph_of(NODES)
+        graph = search.graph(start, goal, cube, NODES, NEIGHBOURS, HALTON_NEIGHBOURS)
         paths, found = self._cheapest(search, graph, scene, rows, count)
         is_full = graph.points.shape[1] == 2 + len(cube) + NODES
         again = ~found | (length(paths[:, 0]) > LONG * length(torch.stack((start, goal), dim=1)))
         if is_full and bool(again.any()):
-            more, arrives = self._cheapest(search, graph_of(MANY_NODES), scene, rows, count)
+            graph = search.graph(start, goal, cube, MANY_NODES, MANY_NEIGHBOURS, HALTON_NEIGHBOURS)
+            more, arrives = self._cheapest(search, graph, scene, rows, count)
             again = again & arrives
             paths, found = torch.where(again.view(-1, 1, 1, 1), more, paths), found | again
         return paths, found

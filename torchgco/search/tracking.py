@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.constraints.bodies import Inflated
 from torchgco.penalties import GuidePath, GuideRegion, Penalty
-from torchgco.search.geometry import Scene, points_along
+from torchgco.search.geometry import depth, points_along
 
 CUT = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
 HALVINGS = 3  # of the share of the horizon over which they are averaged
@@ -33,7 +34,7 @@ def travel(path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int
 
 
 def followed(
-    path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int, scene: Scene, R: Tensor
+    path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int, obstacles: Inflated, R: Tensor
 ) -> Tensor:
     """As `travel`, but corners are averaged less where the average would cut deep into an obstacle.
 
@@ -46,8 +47,8 @@ def followed(
     center, B = travel(path, depart, arrive, smoothing, N), R.shape[0]
     for _ in range(HALVINGS if B > 0 else 0):
         points = center[:, :: max(1, N // SAMPLES)]
-        depth = scene.depth(points.reshape(B, -1, points.shape[-1])).view(B, -1, points.shape[1]).amax(-1)
-        deep = depth > CUT * R.unsqueeze(-1)
+        deepest = depth(obstacles, points.reshape(B, -1, points.shape[-1])).view(B, -1, points.shape[1]).amax(-1)
+        deep = deepest > CUT * R.unsqueeze(-1)
         if not bool(deep.any()):
             break
         smoothing *= 0.5
