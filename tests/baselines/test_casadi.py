@@ -100,6 +100,25 @@ def test_a_bad_start_affects_its_own_problem_alone(plugin: str) -> None:
     assert [(p.finished, p.total) for p in reports] == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_a_guess_of_states(plugin: str) -> None:
+    """Their own rollout as states changes nothing; states at the solution save iterations; bad shapes are named."""
+    problem, U0 = three_problems()
+    prepared = CasADiSolver(plugin).prepare(problem)
+    plain = prepared.solve(problem, U0)
+    same = prepared.run_from(open_loop(problem.dynamics, problem.x0, U0), U0)
+    assert torch.equal(same.U, plain.U) and torch.equal(same.iterations, plain.iterations)
+    near = prepared.run_from(plain.X, plain.U)
+    assert near.statuses == [Status.CONVERGED] * 3
+    assert bool((near.iterations < prepared.run_from(plain.X.flip(1), U0).iterations).all())
+    with pytest.raises(InputError, match="X0"):
+        prepared.run_from(plain.X[:, 1:], U0)
+    with pytest.raises(InputError, match="X0"):
+        prepared.run_from(plain.X.float(), U0)
+    with pytest.raises(InputError, match="U0"):
+        prepared.run_from(plain.X, U0[:, 1:])
+
+
 def test_every_kind_of_row_holds() -> None:
     """Equalities, bounds at some knots, a fixed control, a bound per problem, a row of x and u.
 

@@ -20,8 +20,9 @@ from torchgco.errors import InputError
 from torchgco.options import Count, Positive, check_options
 from torchgco.problem import Problem, check_problem
 from torchgco.rollout import open_loop
+from torchgco.shapes import check_shape, check_tensor
 from torchgco.solution import Solution
-from torchgco.solvers.contracts import Call, Progress, Solver
+from torchgco.solvers.contracts import Call, Callback, Progress, Solver
 from torchgco.status import Status
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class CasADiSolver(Solver):
         if find_spec("casadi") is None:
             raise InputError("solver", "CasADi (`pip install casadi`)", "no such module")
 
-    def prepare(self, problem: Problem) -> Solver:
+    def prepare(self, problem: Problem) -> PreparedCasADi:
         """The program and the solver built for one batch, so that a solve takes the plugin's time alone.
 
         Raises:
@@ -115,15 +116,31 @@ class PreparedCasADi(Solver):
         if problem is not self.problem:
             raise InputError("problem", "the one that was prepared", "another")
         X0 = open_loop(problem.dynamics, problem.x0, U0)
-        X0 = torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1))
+        return self._all(torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1)), U0, call.callback)
+
+    def run_from(self, X0: Tensor, U0: Tensor) -> Solution:
+        """Solve from states X0 (B, N+1, n) that the controls U0 (B, N, m) need not lead to, such as waypoints.
+
+        Raises:
+            InputError: X0 or U0 don't fit the problem.
+        """
+        problem = self.problem
+        problem.check_controls(U0, "U0")
+        check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
+        check_tensor(X0, "X0", problem.x0)
+        return self._all(X0, U0, None)
+
+    def _all(self, X0: Tensor, U0: Tensor, callback: Callback | None) -> Solution:
+        """Every problem of the batch in turn; problems with an invalid start are left out."""
+        problem = self.problem
         valid = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
         U, ends = U0.clone(), [(Status.CONVERGED, 0)] * problem.B
         for b in range(problem.B):
             if bool(valid[b]):
                 U[b], ends[b] = self._one(b, X0[b], U0[b])
-            if call.callback is not None:
+            if callback is not None:
                 rows = torch.arange(b, b + int(valid[b]), device=U.device)
-                call.callback(Progress(b + 1, rows, b + 1, problem.B))
+                callback(Progress(b + 1, rows, b + 1, problem.B))
         solution = rolled_out(problem, U, self.solver.violation_tolerance, iterations=0)
         return _with_ends(solution, ends)
 

@@ -1,0 +1,183 @@
+"""python -m benchmarks.maze: ALTRO's quadrotor maze, solved without waypoints, compared with IPOPT and FATROP.
+
+The peers start from the five published waypoints, `torchgco` from hovering. All are judged by `recount`, in NumPy, and
+run in one thread. With --write the table goes into benchmarks/results/maze.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import resource
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchgco
+from benchmarks.golden import IPOPT
+from benchmarks.maze_problem import maze, recount, starts, waypoint_guess
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.tables import put_between
+from torchgco import Problem, presets
+from torchgco.baselines import CasADiSolver
+from torchgco.experiments.statistics import wilson
+from torchgco.search.restarts import Restarts
+
+PAGE = Path(__file__).resolve().parent / "results" / "maze.md"
+STARTS, FATROP_STARTS = 64, 16
+TOLERANCE = 1e-6  # violation of a solved problem: m, m/s, rad/s, N
+FATROP = CasADiSolver("fatrop", tolerance=1e-10)
+FATROP_LIMIT = 20  # s of processor time per problem: on some FATROP does not return
+TRACKING = 40  # iterations of tracking a path; the default's 20 are too few for this vehicle
+HEAD = (
+    "solver", "initial guess", "n", "violation <= 1e-6", "violation <= 1e-3", "median cost",
+    "cost, share of IPOPT's: least, median, largest", "iterations, median", "seconds per problem",
+)  # fmt: skip
+
+
+def longer_tracking(problem: Problem) -> Restarts:
+    """The default solver with more iterations of tracking, to a violation of `TOLERANCE`."""
+    solver = presets.gco(problem)
+    assert solver.paths is not None
+    local = replace(solver.local, violation_tolerance=TOLERANCE)
+    return replace(solver, local=local, paths=replace(solver.paths, track_iterations=TRACKING))
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What one solver made of the starts, each (B,) and as `recount` counts; NaN where it did not return."""
+
+    name: str
+    guess: str
+    cost: np.ndarray
+    violation: np.ndarray
+    iterations: np.ndarray
+    seconds: np.ndarray  # of processor time; a batch's mean for every one of its problems
+
+    def cells(self, peer: Flight) -> list[str]:
+        """A row of the table; costs are compared where both this and `peer` are within 1e-3."""
+        n = len(self.cost)
+        close, ended = self.violation <= 1e-3, ~np.isnan(self.seconds)
+        both = close & (peer.violation[:n] <= 1e-3)
+        ratio = (self.cost / peer.cost[:n])[both]
+        return [
+            self.name, self.guess, str(n), _share(int((self.violation <= TOLERANCE).sum()), n), f"{close.sum()} of {n}",
+            f"{np.median(self.cost[close]):.4f}" if close.any() else "-",
+            ", ".join(f"{x:.4f}" for x in np.quantile(ratio, (0, 0.5, 1))) if both.any() else "-",
+            f"{np.median(self.iterations[ended]):.0f}" if ended.any() else "-",
+            f"{self.seconds[ended].mean():.3f}" if ended.any() else "-",
+        ]  # fmt: skip
+
+
+def ours(name: str, problem: Problem, solver: Restarts) -> Flight:
+    """All starts as one batch, from hovering."""
+    torchgco.solve(problem.take(slice(0, 1)), solver=solver, max_seconds=1e-3)  # compiles
+    began = process_time()
+    solution = torchgco.solve(problem, solver=solver)
+    seconds = (process_time() - began) / problem.B
+    return _flight(name, "hovering", problem, solution.U, solution.iterations, seconds)
+
+
+def ipopt(problem: Problem) -> Flight:
+    """IPOPT from the waypoints, one start after the other; building the program isn't timed."""
+    solver = IPOPT.prepare(problem)
+    began = process_time()
+    solution = solver.run_from(*waypoint_guess(problem.x0))
+    seconds = (process_time() - began) / problem.B
+    return _flight("IPOPT", "waypoints", problem, solution.U, solution.iterations, seconds)
+
+
+def fatrop(problem: Problem) -> Flight:
+    """FATROP from the waypoints, each start in a process of its own that ends after `FATROP_LIMIT` seconds."""
+    U = torch.full((problem.B, problem.N, problem.m), torch.nan, dtype=torch.float64)
+    iterations, seconds = U.new_full((problem.B,), torch.nan), np.full(problem.B, np.nan)
+    context = multiprocessing.get_context("fork")  # the child shares the program that was built here
+    for b in range(problem.B):
+        part = problem.take(slice(b, b + 1))
+        prepared, guess = FATROP.prepare(part), waypoint_guess(part.x0)
+        receiver, sender = context.Pipe(duplex=False)
+
+        def solve(prepared=prepared, guess=guess, sender=sender) -> None:
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            resource.setrlimit(resource.RLIMIT_CPU, (FATROP_LIMIT, FATROP_LIMIT + 1))
+            began = process_time()
+            solution = prepared.run_from(*guess)
+            sender.send((solution.U.numpy(), int(solution.iterations), process_time() - began))
+
+        child = context.Process(target=solve)
+        child.start()
+        sender.close()
+        try:
+            controls, iterations[b], seconds[b] = receiver.recv()
+            U[b : b + 1] = torch.from_numpy(controls)
+        except EOFError:  # ended by its limit
+            pass
+        child.join()
+    return _flight("FATROP", "waypoints", problem, U, iterations, seconds)
+
+
+def _flight(
+    name: str, guess: str, problem: Problem, U: Tensor, iterations: Tensor, seconds: float | np.ndarray
+) -> Flight:
+    cost, violation, _ = recount(problem.x0.numpy(), U.numpy())
+    return Flight(name, guess, cost, violation, iterations.double().numpy(), np.broadcast_to(seconds, cost.shape))
+
+
+def _share(hits: int, n: int) -> str:
+    low, high = (100 * bound for bound in wilson(hits, n))
+    return f"{hits} of {n} [{low:.0f}, {high:.0f}] %"
+
+
+def table(count: int, seed: int, fatrop_count: int) -> str:
+    """The results of all solvers, in Markdown."""
+    problem = maze(starts(count, seed))
+    default = ours("`torchgco.solve`, default options", problem, presets.gco(problem))
+    longer = ours(f"`torchgco`, {TRACKING} tracking iterations, tolerance 1e-6", problem, longer_tracking(problem))
+    peer = ipopt(problem)
+    flights = [default, longer, peer]
+    note = ""
+    if fatrop_count > 0:
+        last = fatrop(problem.take(slice(0, fatrop_count)))
+        flights.append(last)
+        lost = int(np.isnan(last.seconds).sum())
+        note = (
+            f" FATROP did not return within {FATROP_LIMIT} s on {lost} of {fatrop_count} starts; its iterations and "
+            "seconds leave these out."
+        )
+    known = (longer.violation <= TOLERANCE) & (peer.violation <= 1e-3)
+    dearer = int((longer.cost > (1 + 1e-4) * peer.cost)[known].sum())
+    rows = [list(HEAD), ["---"] * len(HEAD), *(flight.cells(peer) for flight in flights)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows) + (
+        f"\n\nOf {int(known.sum())} starts that `torchgco` with {TRACKING} tracking iterations and IPOPT both solve, "
+        f"`torchgco` is more than 1e-4 above IPOPT's cost on {dearer}.{note}"
+    )
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.maze", description="ALTRO's quadrotor maze.")
+    parser.add_argument("--starts", type=int, default=STARTS, help="the published start and others around it")
+    parser.add_argument("--fatrop", type=int, default=FATROP_STARTS, help="of these, starts that FATROP flies")
+    parser.add_argument("--seed", type=int, default=0, help="of the starts")
+    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/maze.md")
+    asked = parser.parse_args(words)
+    torch.set_num_threads(1)
+    text = table(asked.starts, asked.seed, asked.fatrop)
+    print(text)
+    if asked.write:
+        origin = provenance("cpu")
+        head = (
+            f"Measured on {origin['date']} at commit {origin['commit']}, {asked.starts} starts, seed {asked.seed}, "
+            f"processor time with one thread, {origin['processor']}, shared; CasADi {origin['casadi']}; set-up "
+            "excluded; 95 % Wilson intervals in percent."
+        )
+        put_between(PAGE, "<!-- maze -->", "<!-- end maze -->", f"{head}\n\n{text}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

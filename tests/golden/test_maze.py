@@ -1,0 +1,91 @@
+"""ALTRO's quadrotor maze: its form, and a few starts solved without waypoints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import torchgco
+from benchmarks.maze import TOLERANCE, Flight, longer_tracking, main
+from benchmarks.maze_problem import DT, GOAL, HOVER, START, THRUST, R, cylinders, maze, recount, starts, waypoint_guess
+from torchgco import ControlBounds, StateBounds
+from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.evaluation import violation
+from torchgco.rollout import open_loop
+
+
+def test_the_form_of_the_maze() -> None:
+    problem = maze(starts(3, 0))
+    assert (problem.n, problem.m, problem.N, problem.dynamics.dt) == (13, 4, 100, 0.05)
+    discs, controls, states, goal = problem.constraints
+    assert isinstance(discs, BoundSpheres) and discs.centers.shape == (3, 47, 2)
+    assert bool((discs.inflated_radii == 2.2).all())
+    assert isinstance(controls, ControlBounds) and isinstance(states, StateBounds)
+    assert controls.lower.unique().tolist() == [0.0] and controls.upper.unique().tolist() == [50.0]
+    assert states.upper[0, :3].tolist() == [25.0, 1e20, 20.0] and states.upper[0, 7:10].tolist() == [30.0] * 3
+    assert goal.sense == "equality" and goal.knots == slice(100, 101)
+    assert goal.value(problem.x0.new_zeros(3, 101, 13), problem.x0.new_zeros(3, 100, 4)).shape == (3, 1, 9)
+    assert problem.x0[0, :3].tolist() == list(START) and len(problem.x0.unique(dim=0)) == 3
+
+
+def test_the_walls_leave_doors_but_no_straight_way() -> None:
+    """At y = -10 and 10 m the doors are 1.6 m wide for the vehicle's centre; at y = 0 the middle wall bars 10.4 m."""
+
+    def clear(x: float, y: float) -> bool:
+        return bool((np.linalg.norm(cylinders() - (x, y), axis=-1) >= 2.2).all())
+
+    for side in (-1, 1):
+        assert clear(side * 0.79, -10.0) and clear(side * 0.79, 10.0) and clear(side * 5.21, 0.0)
+        assert clear(side * 7.9, 0.0)
+        assert not any(clear(side * x, y) for y in (-10.0, 10.0) for x in np.arange(0.81, 10, 0.01))
+        assert not any(clear(side * x, 0.0) for x in np.arange(0, 5.2, 0.01))
+    assert clear(*START[:2]) and clear(*GOAL[:2])
+
+
+def test_the_problem_is_the_one_that_is_judged() -> None:
+    problem = maze(starts(4, 1))
+    U = HOVER + 0.02 * torch.randn(4, 100, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    U[1] += THRUST  # beyond the bounds, and fast
+    X = open_loop(problem.dynamics, problem.x0, U)
+    cost, worst, states = recount(problem.x0.numpy(), U.numpy())
+    torch.testing.assert_close(torch.from_numpy(states), X, rtol=1e-9, atol=1e-9)
+    constant = 0.5 * R * DT * 4 * HOVER**2 * problem.N
+    torch.testing.assert_close(problem.cost.total(X, U) + constant, torch.from_numpy(cost), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(violation(problem, X, U), torch.from_numpy(worst), rtol=1e-9, atol=1e-9)
+    assert worst.min() > 1.0
+
+
+def test_the_guess_passes_the_waypoints() -> None:
+    X0, U0 = waypoint_guess(starts(2, 0))
+    assert X0.shape == (2, 101, 13) and U0.unique().tolist() == [HOVER]
+    assert X0[0, 50, :3].tolist() == [7.0, 0.0, 1.0]
+    assert X0[:, 0].equal(starts(2, 0)) and X0[1, -1, :3].tolist() == list(GOAL)
+
+
+def test_four_starts_are_solved_without_waypoints() -> None:
+    problem = maze(starts(4, 0))
+    solution = torchgco.solve(problem, solver=longer_tracking(problem))
+    cost, worst, _ = recount(problem.x0.numpy(), solution.U.numpy())
+    assert worst.max() <= TOLERANCE
+    assert cost[0] <= 0.6111  # IPOPT's from the waypoints
+
+
+def test_a_row_counts_starts_without_a_result_as_failures() -> None:
+    peer = Flight("IPOPT", "waypoints", np.full(5, 2.0), np.zeros(5), np.full(5, 9.0), np.ones(5))
+    nan = np.nan
+    lost = Flight(
+        "FATROP", "waypoints", np.array([2.2, 1.0, 2.0, nan]), np.array([1e-7, 0.5, 1e-4, nan]),
+        np.array([10, 20, 30, nan]), np.array([1.0, 2.0, 3.0, nan]),
+    )  # fmt: skip
+    cells = lost.cells(peer)
+    assert cells[2:6] == ["4", "1 of 4 [5, 70] %", "2 of 4", "2.1000"]
+    assert cells[6:] == ["1.0000, 1.0500, 1.1000", "20", "2.000"]
+
+
+@pytest.mark.slow
+def test_the_table(capsys) -> None:
+    assert main(["--starts", "2", "--fatrop", "1"]) == 0
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:6]]
+    assert [row[1] for row in rows] == ["hovering", "hovering", "waypoints", "waypoints"]
+    assert rows[1][3].startswith("2 of 2") and rows[2][3].startswith("2 of 2") and rows[3][2] == "1"
