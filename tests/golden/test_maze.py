@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import torchgco
-from benchmarks.maze import TOLERANCE, Flight, longer_tracking, main
+from benchmarks.maze import TOLERANCE, Flight, main, precise
 from benchmarks.maze_problem import DT, GOAL, HOVER, START, THRUST, R, cylinders, maze, recount, starts, waypoint_guess
 from torchgco import ControlBounds, StateBounds
 from torchgco.constraints.obstacles import BoundSpheres
@@ -65,7 +65,7 @@ def test_the_guess_passes_the_waypoints() -> None:
 
 def test_four_starts_are_solved_without_waypoints() -> None:
     problem = maze(starts(4, 0))
-    solution = torchgco.solve(problem, solver=longer_tracking(problem))
+    solution = torchgco.solve(problem, solver=precise(problem))
     cost, worst, _ = recount(problem.x0.numpy(), solution.U.numpy())
     assert worst.max() <= TOLERANCE
     assert cost[0] <= 0.6111  # IPOPT's from the waypoints

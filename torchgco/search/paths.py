@@ -44,9 +44,9 @@ ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a sh
 TOLERANCE = 5e-5  # of tracking and relaxing, as a share of L_M; refining takes a tenth of it
 SEARCH = LineSearch(back=2)
 TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
-# Where no candidate arrives, the paths are followed again: with corners averaged over a share of the horizon that is
-# smaller, and a spring or tube that is stiffer, by these factors. Doors and gaps of a few vehicle radii need it.
-CLOSER = (4.0, 10.0)
+# Where no candidate arrives, the paths are followed again, with corners averaged over a share of the horizon that is
+# smaller by a factor. A spring gives way to the cost, so it gets stiffer; in a tube more iterations help.
+SHARPER, STIFFER, LONGER = 4.0, 10.0, 2
 CHORD_PENETRATION = 0.049  # share of an obstacle's margin, between two knots; the judge accepts 0.05
 
 
@@ -167,7 +167,11 @@ class PathProposals:
         """The proposal; where it has none though there are paths, these are followed again, closer."""
         rows = (ways.live.any(-1) & ~proposal.found).nonzero().flatten()
         if rows.numel() > 0:
-            closer = replace(self, smoothing=self.smoothing / CLOSER[0], stiffness=(CLOSER[1] * self.stiffness[-1],))
+            closer = replace(self, smoothing=self.smoothing / SHARPER)
+            if self.tube is None:
+                closer = replace(closer, stiffness=(STIFFER * self.stiffness[-1],))
+            else:
+                closer = replace(closer, track_iterations=LONGER * self.track_iterations)
             more = closer._along(problem.take(rows), rest[rows], take(ways, rows), watch)
             put(proposal, rows, more._replace(iterations=more.iterations + proposal.iterations[rows]))
         return proposal
