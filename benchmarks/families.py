@@ -1,4 +1,4 @@
-"""The five families: the files of their layouts, and the overrides that draw new ones."""
+"""Families of layouts: their files, and the overrides that draw new ones."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ class Family:
     name: str
     model: str
     drawn: tuple[str, ...]  # overrides of the generator
+    folder: str = ""  # below data
 
     def file(self, fresh: int = 0, seed: int = 0) -> Path:
         """The file of the public layouts, or of the first layouts drawn under a seed, with the best known costs."""
-        return DATA / (f"drawn/{self.name}-seed{seed}.npz" if fresh else f"{self.name}.npz")
+        return DATA / (f"drawn/{self.name}-seed{seed}.npz" if fresh else f"{self.folder}/{self.name}.npz")
 
     def overrides(self, fresh: int = 0, seed: int = 0) -> list[str]:
         """Overrides for `torchgco`: the file's layouts, or `fresh` new layouts drawn under a seed."""
@@ -39,3 +40,20 @@ FAMILIES = {
         Family("planar_random", "planar", ("scenario=planar_random",)),
     )
 }
+
+# Worlds that can't be flown around: woods by trunks per 100 m^2, mazes by walls, crossing spheres by their number.
+WORLDS = {
+    family.name: family
+    for family in (
+        *(
+            Family(f"woods{d}", "quadrotor", ("scenario=woods", f"scenario.density={d / 100:g}"), "worlds")
+            for d in (20, 40, 60)
+        ),
+        *(Family(f"mazes{w}", "quadrotor", ("scenario=mazes", f"scenario.walls={w}"), "worlds") for w in (2, 3, 4)),
+        *(
+            Family(f"crossing{m}", "quadrotor", ("scenario=crossing", f"scenario.num_obstacles={m}"), "worlds")
+            for m in (10, 30)
+        ),
+    )
+}
+EVERY = FAMILIES | WORLDS

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from benchmarks.families import DATA, FAMILIES, Family
+from benchmarks.families import DATA, EVERY, FAMILIES, Family
 from torchgco import compose, judge
 from torchgco.errors import InputError
 from torchgco.judge import SUCCESS_COST
@@ -45,9 +45,9 @@ PEERS = ("fatrop", "ipopt")  # need the extra `peers`; reference.csv has their r
 def main(words: Sequence[str] | None = None) -> int:
     asked = _parser().parse_args(words)
     for name in asked.families:
-        family = FAMILIES[name]
+        family = EVERY[name]
         path = held(family, asked.fresh, asked.seed)
-        if not asked.fresh:
+        if not asked.fresh and name in FAMILIES:
             keep(path, reference(family), "reference.csv")
         for search in asked.search or [name for name in SEARCH if asked.fresh or name not in PEERS]:
             for draw in asked.draws:
@@ -58,7 +58,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.oracle", description="Seek the best known costs.")
-    parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(FAMILIES), metavar="NAME")
+    parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--search", nargs="+", choices=list(SEARCH), metavar="NAME", help="some of the searches only")
     parser.add_argument("--draws", type=int, nargs="+", default=[0], metavar="SEED", help="seeds of the solvers' draws")
     parser.add_argument("--fresh", type=int, default=0, metavar="N", help="N drawn layouts per family, not the 32")

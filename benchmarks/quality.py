@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from benchmarks.families import FAMILIES, Family
+from benchmarks.families import EVERY, FAMILIES, Family
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
 from torchgco.experiments.statistics import summarise
@@ -38,7 +38,7 @@ HEAD = (
 
 def main(words: Sequence[str] | None = None) -> int:
     asked = _parser().parse_args(words)
-    trials = pd.concat([fly(FAMILIES[name], asked) for name in asked.families], ignore_index=True)
+    trials = pd.concat([fly(EVERY[name], asked) for name in asked.families], ignore_index=True)
     text = table(trials)
     print(text)
     if set(asked.families) == set(FAMILIES) and asked.write:
@@ -57,7 +57,7 @@ def page(asked: argparse.Namespace) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.quality", description="Fly the families, and count.")
-    parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(FAMILIES), metavar="NAME")
+    parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--solvers", nargs="+", default=["gco"], metavar="NAME", help="configs; default: gco")
     parser.add_argument(
         "--fresh", type=int, default=0, metavar="N", help="N drawn layouts per family, not the public 32"
@@ -72,10 +72,11 @@ def _parser() -> argparse.ArgumentParser:
 
 def fly(family: Family, asked: argparse.Namespace) -> pd.DataFrame:
     """The trials of every solver, with the family's name as scenario."""
-    return pd.concat([_flown(family, solver, asked) for solver in asked.solvers], ignore_index=True)
+    return pd.concat([study(family, solver, asked) for solver in asked.solvers], ignore_index=True)
 
 
-def _flown(family: Family, solver: str, asked: argparse.Namespace) -> pd.DataFrame:
+def study(family: Family, solver: str, asked: argparse.Namespace) -> pd.DataFrame:
+    """The trials of one solver, with the family's name as scenario, and success by the best costs known now."""
     folder = asked.outputs / f"{family.name}-{asked.fresh}-{asked.seed}-{solver}"
     command = [
         sys.executable, "-m", "torchgco", *family.overrides(asked.fresh, asked.seed), f"solver={solver}",
