@@ -1,0 +1,116 @@
+"""python -m benchmarks.worlds: woods, mazes and crossing spheres that can't be flown around, by `gco` and its peers.
+
+Every world and solver is a separate study below outputs/worlds, so that a run that was stopped resumes where it was.
+The peers are slow among so many obstacles and get the first layouts only. With --write the table goes into
+benchmarks/results/worlds.md, with date and commit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from benchmarks.families import WORLDS
+from benchmarks.quality import study
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.tables import put_between
+from torchgco.experiments.statistics import summarise, wilson
+from torchgco.experiments.success import sound
+from torchgco.scenarios import Layouts
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "benchmarks" / "results" / "worlds.md"
+SOLVERS = ("gco", "al_ilqr")
+PEERS = ("fatrop", "fatrop_guided", "ipopt")
+HEAD = (
+    "world", "solver", "n", "reached", "reached, of solved layouts", "success", "cost / best known, median",
+    "seconds per problem, median",
+)  # fmt: skip
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    asked = _parser().parse_args(words)
+    rows = []
+    for name in asked.worlds:
+        tables = [_flown(name, solver, asked, None) for solver in SOLVERS]
+        if not asked.fresh and asked.peers > 0:
+            tables += [_flown(name, solver, asked, asked.peers) for solver in PEERS]
+        rows += table(pd.concat(tables, ignore_index=True), solved(name, tables, asked))
+        print("\n".join(rows[-len(tables) :]), flush=True)
+    if asked.write and set(asked.worlds) == set(WORLDS):
+        head = ["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|"]
+        mark = "drawn" if asked.fresh else "worlds"
+        put_between(PAGE, f"<!-- {mark} -->", f"<!-- end {mark} -->", "\n".join([_source(asked), "", *head, *rows]))
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.worlds", description="Fly the worlds, and count.")
+    parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
+    parser.add_argument("--peers", type=int, default=4, metavar="N", help="layouts that the peers fly; 0: none")
+    parser.add_argument("--fresh", type=int, default=0, metavar="N", help="N drawn layouts per world, not the 32")
+    parser.add_argument("--seed", type=int, default=0, help="of the drawn layouts")
+    parser.add_argument("--write", action="store_true", help=f"put the table into {PAGE.relative_to(ROOT)}")
+    parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "worlds")
+    return parser
+
+
+def _flown(name: str, solver: str, asked: argparse.Namespace, first: int | None) -> pd.DataFrame:
+    """The trials of one solver on a world's layouts, or on its first ones."""
+    overrides = [] if first is None else [f"study.layouts={first}"]
+    return study(WORLDS[name], solver, argparse.Namespace(**(vars(asked) | {"overrides": overrides})))
+
+
+def solved(name: str, tables: Sequence[pd.DataFrame], asked: argparse.Namespace) -> set[int]:
+    """The layouts that any solver is known to solve: here, or when the best costs were sought."""
+    trials = pd.concat(tables, ignore_index=True)
+    known = set(trials.loc[sound(trials), "layout"].tolist())
+    path = WORLDS[name].file(asked.fresh, asked.seed)
+    if path.is_file() and (best := Layouts.load(path).best_cost) is not None:
+        known |= {i for i, cost in enumerate(best) if cost == cost}
+    return known
+
+
+def table(trials: pd.DataFrame, known: set[int]) -> list[str]:
+    """A row in Markdown per solver, rates with 95 % Wilson intervals in percent.
+
+    known  layouts that somebody solves
+    """
+    lines = []
+    for row in summarise(trials).to_dict(orient="records"):
+        own = trials[(trials["solver"] == row["solver"]) & trials["layout"].isin(known)]
+        cells = [
+            row["scenario"], f"`{row['solver']}`", row["n"], _share(row["reached_count"], row["n"]),
+            _share(int(own["reached"].sum()), len(own)), _share(row["success_count"], row["success_n"]),
+            _number(row["cost_ratio_median"], ".3f"), _number(row["seconds_median"], ".2g"),
+        ]  # fmt: skip
+        lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
+    return lines
+
+
+def _share(count: int, n: int) -> str:
+    if n == 0:
+        return "-"
+    low, high = (100 * end for end in wilson(int(count), int(n)))
+    return f"{count} of {n} [{low:.0f}, {high:.0f}]"
+
+
+def _number(value: float, form: str) -> str:
+    return "-" if value != value else format(value, form)
+
+
+def _source(asked: argparse.Namespace) -> str:
+    origin = provenance("cpu")
+    layouts = f"{asked.fresh} drawn layouts per world" if asked.fresh else "the public layouts"
+    return (
+        f"Flown on {origin['date']} at commit {origin['commit']}, {layouts}, seed {asked.seed}, 95 % Wilson intervals "
+        f"in percent; one thread per process, two processes, {origin['processor']}, shared."
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
