@@ -2,6 +2,7 @@
 # make ladder   every solver on the public layouts (ten minutes on one core)
 # make quality   how often gco reaches the goal on the public layouts, and how well (ARGS="--solvers gco gco_max" for more
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
+# make worlds   woods, mazes, crossing spheres and the outside benchmarks, with pages in benchmarks/results (half an hour)
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
@@ -27,7 +28,7 @@ ACADOS := .venv-acados
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle benchmark benchmark-gpu ladder docs \
+.PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle worlds benchmark benchmark-gpu ladder docs \
     figures paper
 
 study: $(RUNTIME)
@@ -57,6 +58,12 @@ quality: $(RUNTIME)
 
 oracle: $(RUNTIME)
 	$(BIN)/python -m benchmarks.oracle $(ARGS)
+
+worlds: $(PEERS)
+	$(BIN)/python -m benchmarks.worlds --write $(ARGS)
+	$(BIN)/python -m benchmarks.barn --write
+	$(BIN)/python -m benchmarks.maze --write
+	$(BIN)/python -m benchmarks.navigation --write
 
 benchmark: $(PEERS)
 	$(MAKE) $(ACADOS)/.ready || echo "acados can't be installed here: the tables will say so."

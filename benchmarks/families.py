@@ -19,7 +19,7 @@ class Family:
 
     def file(self, fresh: int = 0, seed: int = 0) -> Path:
         """The file of the public layouts, or of the first layouts drawn under a seed, with the best known costs."""
-        return DATA / (f"drawn/{self.name}-seed{seed}.npz" if fresh else f"{self.folder}/{self.name}.npz")
+        return DATA / "drawn" / f"{self.name}-seed{seed}.npz" if fresh else DATA / self.folder / f"{self.name}.npz"
 
     def overrides(self, fresh: int = 0, seed: int = 0) -> list[str]:
         """Overrides for `torchgco`: the file's layouts, or `fresh` new layouts drawn under a seed."""

@@ -12,6 +12,7 @@ from torchgco import Boxes, Problem, certify, judge
 from torchgco.certificate import CHORDS
 from torchgco.constraints.boxes import BoundBoxes
 from torchgco.judge import box_clearance
+from torchgco.measure import box_segment_distance
 from torchgco.rollout import open_loop
 
 SAMPLES = 601
@@ -47,11 +48,13 @@ def test_clearances_against_sampled_segments(d: int, rounded: bool) -> None:
     at_knots, between = box_clearance(boxes, X)
     for b in range(2):
         single = boxes.take(torch.tensor([b]))
-        chords = CHORDS[BoundBoxes](single, X[b], torch.tensor(torch.inf, dtype=torch.float64))
-        near = CHORDS[BoundBoxes](single, X[b], torch.tensor(0.05, dtype=torch.float64))
-        assert (near <= chords).all() and (near < chords).any()
-        is_near = near < near.amin() + 0.05
-        assert torch.equal(near[is_near], chords[is_near]) and torch.equal(near.amin(), chords.amin())
+        at, radii = X[b : b + 1, :, :d], single.inflated_radii.unsqueeze(1)
+        chords = (box_segment_distance(single, at, torch.full_like(radii, torch.inf)) - radii)[0]
+        near = CHORDS[BoundBoxes](single, X[b])
+        assert (near <= chords).all() and torch.equal(near.amin(), chords.amin())
+        loose = box_segment_distance(single, at, near.amin() + 0.05 + radii)[0] - radii[0]
+        close = loose < near.amin() + 0.05
+        assert (loose <= chords).all() and (loose < chords).any() and torch.equal(loose[close], chords[close])
         p, knots, nearest = X[b, :, :d].numpy(), np.inf, np.inf
         for i in range(3):
             box = tuple(part[b, i] for part in parts)

@@ -124,13 +124,12 @@ def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     nearest = X.new_full((), torch.inf)
     for obstacles in problem.constraints:
         if isinstance(obstacles, Obstacles) and not bool(obstacles.absent.all()):
-            bulge = _bulge(problem, X, U)
-            path = by_kind(CHORDS, obstacles)(obstacles, X[0], bulge.amax()) - bulge.unsqueeze(-1)
+            path = by_kind(CHORDS, obstacles)(obstacles, X[0]) - _bulge(problem, X, U).unsqueeze(-1)
             nearest = torch.minimum(nearest, path[:, ~obstacles.absent[0]].amin())
     return nearest
 
 
-def _sphere_chords(spheres: BoundSpheres, X: Tensor, slack: Tensor) -> Tensor:
+def _sphere_chords(spheres: BoundSpheres, X: Tensor) -> Tensor:
     k = torch.arange(X.shape[0], dtype=X.dtype, device=X.device).view(-1, 1, 1)
     relative = X[:, None, spheres.position] - spheres.centers[0]  # (N+1, M, d)
     if spheres.velocities is not None:
@@ -138,15 +137,16 @@ def _sphere_chords(spheres: BoundSpheres, X: Tensor, slack: Tensor) -> Tensor:
     return segment_distance(relative[:-1], relative[1:]) - spheres.inflated_radii[0]
 
 
-def _box_chords(boxes: BoundBoxes, X: Tensor, slack: Tensor) -> Tensor:
+def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
     p, radii = X[None, :, boxes.position], torch.where(boxes.absent, -torch.inf, boxes.inflated_radii).unsqueeze(1)
-    nearest = (box_distance(boxes, p) - radii).amin()
-    return (box_segment_distance(boxes, p, nearest + slack + radii) - radii)[0]
+    # Bounds are close up to a step's length above the smallest distance: the path hardly leaves a chord by more.
+    close = (box_distance(boxes, p) - radii).amin() + p.diff(dim=1).norm(dim=-1).amax()
+    return (box_segment_distance(boxes, p, close + radii) - radii)[0]
 
 
 # By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, or lower
-# bounds of them, close up to a slack (m) above the smallest distance.
-CHORDS: dict[type[Obstacles], Callable[[Any, Tensor, Tensor], Tensor]] = {
+# bounds of them.
+CHORDS: dict[type[Obstacles], Callable[[Any, Tensor], Tensor]] = {
     BoundSpheres: _sphere_chords,
     BoundBoxes: _box_chords,
 }

@@ -248,7 +248,6 @@ class Problem:
         if not isinstance(after, Tensor) or after.shape != self.x0.shape or after.dtype != self.x0.dtype:
             raise InputError("dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", describe(after))
 
-
     def _check_cost(self) -> None:
         """Evaluate a user's cost for the first problem, which stays at its start."""
         if isinstance(self.cost, BoundQuadratic):

@@ -22,9 +22,7 @@ def directions(rotation: Array | float | None, d: int) -> Array:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross  # Rodrigues
 
 
-def distance(
-    p: Array, center: Array, half: Array, rotation: Array | float | None = None, radius: float = 0.0
-) -> float:
+def distance(p: Array, center: Array, half: Array, rotation: Array | float | None = None, radius: float = 0.0) -> float:
     """Distance of a point from the surface of a box, rounded by a radius; negative inside."""
     axes = directions(rotation, len(p))
     local = axes.T @ (p - center)

@@ -42,9 +42,7 @@ FACETS = 6  # most tasks that have panels of their own; more are pooled over the
 DIFFERENT = 10  # differing values that `--verify` prints per study
 
 
-def write_report(
-    folder: str | os.PathLike[str], trajectories: Trajectories | None = None, form: str = "table"
-) -> str:
+def write_report(folder: str | os.PathLike[str], trajectories: Trajectories | None = None, form: str = "table") -> str:
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
     trajectories  states for the picture of the layouts, which needs `layouts.npz` too: X (L, N+1, n) by

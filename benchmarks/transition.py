@@ -1,0 +1,115 @@
+"""python -m benchmarks.transition: how often the goal is reached in woods, by density and speed, as one figure.
+
+A Hydra sweep of density against horizon: the faster the vehicle must fly, the sparser the woods that it can cross.
+With --write the figure and the table go into benchmarks/results.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.tables import put_between
+from torchgco.experiments.merge import merge
+from torchgco.experiments.statistics import summarise
+from torchgco.plotting.style import INK, SMALL, legend, panels, save, solver_colours, tidy
+from torchgco.scenarios import Woods
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+DENSITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
+STAGES = (80, 120, 160, 240)
+SOLVERS = ("gco", "al_ilqr", "gco_paper")
+DENSITY, HORIZON = "scenario.density", "scenario.stages"
+# Discs of one radius r at random in the plane leave no way through, in the limit of a large region, from
+# density * pi r^2 = 1.128 on (Quintanilla and Ziff, Physical Review E 76, 051115, 2007).
+COVERED = 1.128
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    asked = _parser().parse_args(words)
+    command = [
+        sys.executable, "-m", "torchgco", "-m", "scenario=woods", f"{DENSITY}={','.join(map(str, DENSITIES))}",
+        f"{HORIZON}={','.join(map(str, STAGES))}", f"solver={','.join(asked.solvers)}", "study.baselines=[]",
+        f"study.layouts={asked.layouts}", f"seed={asked.seed}", f"hydra.sweep.dir={asked.outputs}",
+    ]  # fmt: skip
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    summary = summarise(merge([asked.outputs]))
+    print(table(summary))
+    if asked.write:
+        save(figure(summary), RESULTS / "transition.png")
+        origin = provenance("cpu")
+        head = (
+            f"Flown on {origin['date']} at commit {origin['commit']}, {asked.layouts} layouts per point, seed "
+            f"{asked.seed}; 95 % Wilson intervals; {origin['processor']}, shared."
+        )
+        marks = "<!-- transition -->", "<!-- end transition -->"
+        put_between(RESULTS / "transition.md", *marks, f"{head}\n\n![Rates](transition.png)\n\n{table(summary)}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.transition", description="Sweep density and speed.")
+    parser.add_argument("--layouts", type=int, default=32, metavar="N", help="per density and speed")
+    parser.add_argument("--solvers", nargs="+", default=list(SOLVERS), metavar="NAME", help="configs")
+    parser.add_argument("--seed", type=int, default=0, help="of the layouts")
+    parser.add_argument("--write", action="store_true", help="put table and figure into benchmarks/results")
+    parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "transition")
+    return parser
+
+
+def speed(stages: float) -> float:
+    """Mean speed on the straight line, from the start to the goal within the horizon, m/s."""
+    woods = Woods(stages=int(stages))
+    return math.dist(woods.start, woods.goal) / (woods.stages * woods.dt)
+
+
+def threshold() -> float:
+    """The density (per m^2) above which a large wood is closed for the vehicle, by the mean square of the radii."""
+    woods = Woods()
+    low, high = (radius + woods.vehicle_radius for radius in woods.radii)
+    return COVERED / (math.pi * (low * low + low * high + high * high) / 3)
+
+
+def figure(summary: pd.DataFrame) -> Figure:
+    """Rates of reached layouts against density: a panel per speed, a line with its interval per solver."""
+    held = sorted(summary[HORIZON].unique())
+    picture, axes = panels(len(held), len(held), (3.0, 2.8), share=True)
+    colours = solver_colours(summary["solver"])
+    for ax, stages in zip(axes, held, strict=True):
+        for name, rows in summary[summary[HORIZON] == stages].groupby("solver", sort=False):
+            rows = rows.sort_values(DENSITY)
+            x, rate = rows[DENSITY].to_numpy(dtype=float), rows["reached_rate"].to_numpy(dtype=float)
+            ax.fill_between(x, rows["reached_low"], rows["reached_high"], color=colours[name], alpha=0.15, linewidth=0)
+            ax.plot(x, rate, color=colours[name], marker="o", markersize=3)
+        ax.axvline(threshold(), color=INK, linestyle=":", linewidth=1)
+        ax.set_ylim(-0.02, 1.02)
+        ax.set_xlabel("trunks per m²")
+        tidy(ax, f"{speed(stages):.1f} m/s ({stages * Woods().dt:g} s)")
+    axes[0].set_ylabel("reached, 95 % interval")
+    axes[0].text(threshold(), 0.02, "closed ", ha="right", fontsize=SMALL, color=INK)
+    legend(picture, [Line2D([], [], color=colour, marker="o", label=name) for name, colour in colours.items()])
+    return picture
+
+
+def table(summary: pd.DataFrame) -> str:
+    """Markdown: reached, of n, by density; a row per speed and solver."""
+    lines = [f"| speed | solver | n | {' | '.join(f'{d:g}' for d in DENSITIES)} |", "|---" * (3 + len(DENSITIES)) + "|"]
+    for (stages, solver), rows in summary.groupby([HORIZON, "solver"], sort=False):
+        found = rows.set_index(DENSITY)["reached_count"]
+        cells = [str(found.get(density, "-")) for density in DENSITIES]
+        lines.append(f"| {speed(stages):.1f} m/s | `{solver}` | {rows['n'].iloc[0]} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
