@@ -6,6 +6,7 @@ from torchgco.scenarios.layouts import Layouts, concatenate
 from torchgco.scenarios.planar import PlanarRandom, PlanarTrap
 from torchgco.scenarios.quadrotor import Forest, ForestMoving, Walls
 from torchgco.scenarios.vehicle import Task, Vehicle
+from torchgco.scenarios.yard import Yard
 
 __all__ = [
     "Forest",
@@ -18,5 +19,6 @@ __all__ = [
     "Task",
     "Vehicle",
     "Walls",
+    "Yard",
     "concatenate",
 ]
