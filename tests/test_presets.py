@@ -12,7 +12,7 @@ from torchgco import InputError, Problem, QuadraticCost, presets, solve
 from torchgco.experiments.build import config_dir
 from torchgco.presets import PRESETS
 
-MODELS = {"planar": (2, "planar_trap"), "quadrotor": (3, "forest")}
+MODELS = {"planar": (2, "planar_trap"), "quadrotor": (3, "forest"), "unicycle": (2, "yard")}
 
 
 @pytest.mark.parametrize("name", PRESETS)

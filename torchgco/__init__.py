@@ -37,6 +37,7 @@ from torchgco.dynamics import Planar as Planar
 from torchgco.dynamics import QuadrotorPlanning as QuadrotorPlanning
 from torchgco.dynamics import QuadrotorPlant as QuadrotorPlant
 from torchgco.dynamics import RotorTracking as RotorTracking
+from torchgco.dynamics import Unicycle as Unicycle
 from torchgco.errors import GuidanceWarning as GuidanceWarning
 from torchgco.errors import InputError as InputError
 from torchgco.goal import Goal as Goal

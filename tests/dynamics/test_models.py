@@ -15,15 +15,17 @@ from torchgco import (
     QuadrotorPlanning,
     QuadrotorPlant,
     RotorTracking,
+    Unicycle,
 )
 from torchgco.expansion import linearise
 
-MODELS = [Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking]
+MODELS = [Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking, Unicycle]
 FIELDS = {
     Planar: reference.planar_field,
     QuadrotorPlanning: reference.quadrotor_planning_field,
     QuadrotorPlant: reference.plant_field,
     RotorTracking: reference.rotor_field,
+    Unicycle: reference.unicycle_field,
 }
 
 
@@ -128,6 +130,17 @@ def test_plant_keeps_the_quaternion_and_the_limits() -> None:
     assert bool(((x[:, 13:] >= 0.1046) & (x[:, 13:] <= 6.0)).all())
 
 
+def test_a_unicycle_at_constant_speed_and_turn_rate_drives_on_a_circle() -> None:
+    """Against the closed form: radius speed / turn rate, to the error of Runge and Kutta's steps."""
+    model, x = Unicycle(dt=0.02), torch.tensor([[0.5, -1.0, 0.3, 1.2]], dtype=torch.float64)
+    for _ in range(100):
+        x = model.step(x, torch.tensor([[0.0, 0.8]], dtype=torch.float64))
+    radius, heading = 1.2 / 0.8, 0.3 + 0.8 * 2.0
+    across, along = np.sin(heading) - np.sin(0.3), np.cos(0.3) - np.cos(heading)
+    expected = [0.5 + radius * across, -1.0 + radius * along, heading, 1.2]
+    np.testing.assert_allclose(x[0].numpy(), expected, rtol=0, atol=1e-9)
+
+
 def test_hover_is_an_equilibrium_of_plant_and_planner() -> None:
     frame = Airframe()
     rest = torch.zeros(1, 17, dtype=torch.float64)
@@ -179,6 +192,8 @@ def test_parameters_per_problem() -> None:
     [
         (lambda: Planar(dt=0.0), "planar.dt"),
         (lambda: QuadrotorPlanning(integrator="heun"), "quadrotor.integrator"),
+        (lambda: Unicycle(dt=-0.1), "unicycle.dt"),
+        (lambda: Unicycle(integrator="heun"), "unicycle.integrator"),
         (lambda: Airframe(mass=-1.0), "airframe.mass"),
         (lambda: Airframe(thrust_min=7.0), "airframe.thrust_min"),
     ],

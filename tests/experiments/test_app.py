@@ -20,6 +20,7 @@ DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
 SCENARIOS = sorted(p.stem for p in (ROOT / "conf" / "scenario").glob("*.yaml"))
 SOLVERS = sorted(p.stem for p in (ROOT / "conf" / "solver").glob("*.yaml"))
+FLOWN_IN = {"planar": "planar_random", "quadrotor": "walls", "unicycle": "yard"}  # every model in one scenario
 EXPERIMENTS = sorted(p.stem for p in (ROOT / "conf" / "experiment").glob("*.yaml"))
 
 
@@ -171,9 +172,9 @@ def test_version_and_help(run) -> None:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("model", ["planar", "quadrotor"])
-def test_every_solver_fits_both_models(model: str, solver: str) -> None:
-    scenario = "planar_random" if model == "planar" else "walls"
+@pytest.mark.parametrize("model", FLOWN_IN)
+def test_every_solver_fits_every_model(model: str, solver: str) -> None:
+    scenario = FLOWN_IN[model]
     setup = compose([f"model={model}", f"scenario={scenario}", f"solver={solver}"])
     task = setup.task(setup.layouts(1))
     assert setup.solver_name == solver and task.problem.B == 1
@@ -182,7 +183,7 @@ def test_every_solver_fits_both_models(model: str, solver: str) -> None:
 @pytest.mark.parametrize("scenario", [s for s in SCENARIOS if s != "layouts"])
 def test_scenario_configs_hold_the_defaults_of_the_code(scenario: str) -> None:
     """The numbers in YAML, which users read and override, are the defaults of the class."""
-    model = "planar" if scenario.startswith("planar") else "quadrotor"
+    model = {"planar_trap": "planar", "planar_random": "planar", "yard": "unicycle"}.get(scenario, "quadrotor")
     made = compose([f"model={model}", f"scenario={scenario}"]).scenario
     assert made == type(made)(name=scenario)
 

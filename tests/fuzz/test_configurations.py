@@ -20,6 +20,7 @@ BASES = {
     "space": ("solver=gco",),
     "plane": ("model=planar", "scenario=planar_random", "solver=gco"),
     "trap": ("model=planar", "scenario=planar_trap", "solver=multistart"),
+    "yard": ("model=unicycle", "scenario=yard", "solver=gco"),
     "walls": ("scenario=walls", "solver=gco_paper"),
     "moving": ("scenario=forest_moving", "solver=mppi"),
     "peers": ("solver=fatrop_guided",),
@@ -40,7 +41,7 @@ VALUES = st.one_of(
     ATOMS.map(lambda item: f"[[{item},{item}]]"),
 )
 # Large values of these are no mistakes: they are slow, and a user may wait.
-SLOW = ("scenario.num_obstacles", "study.layouts")
+SLOW = ("scenario.num_obstacles", "scenario.num_discs", "scenario.num_boxes", "study.layouts")
 
 
 @cache

@@ -18,6 +18,7 @@ from torchgco import (
     QuadrotorPlanning,
     QuadrotorPlant,
     RotorTracking,
+    Unicycle,
 )
 from torchgco.native import model as made_by
 from torchgco.native.compiler import find_compiler
@@ -51,6 +52,7 @@ TABLE = torch.tensor([[0.3, -1.0, 0.2], [0.0, 2.0, 1.0 / 3.0]], **DOUBLE)
 KINDS = ("euler", "midpoint", "rk4")
 MODELS: dict[str, Dynamics] = {
     **{f"planar {kind}": Planar(integrator=kind) for kind in KINDS},
+    **{f"unicycle {kind}": Unicycle(integrator=kind) for kind in KINDS},
     **{f"quadrotor {kind}": QuadrotorPlanning(integrator=kind) for kind in KINDS},
     **{f"plant {kind}": QuadrotorPlant(integrator=kind) for kind in KINDS},
     **{f"rotors {kind}": RotorTracking(integrator=kind) for kind in KINDS},

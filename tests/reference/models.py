@@ -1,4 +1,4 @@
-"""The paper's four vehicle models for one state and one control, and three integrators.
+"""The paper's four vehicle models and the unicycle for one state and one control, and three integrators.
 
 A `field(x, u)` returns dx/dt; `euler`, `midpoint` and `rk4` turn a field into `step(x, u)`. SI units,
 controls of the rotor models in rpm, quaternions scalar first. Every field also accepts complex arrays, so
@@ -59,6 +59,12 @@ def planar_field(x, u, k1=10.0, k2=1.0, k3=0.001, k4=0.10):
             -k3 * rate + k4 * (-left + right),
         ]
     )
+
+
+def unicycle_field(x, u):
+    """x (4) = [px, py, heading, speed], u (2) = [acceleration, turn rate]; returns (4)."""
+    _, _, heading, speed = x
+    return np.array([speed * np.cos(heading), speed * np.sin(heading), u[1], u[0]])
 
 
 def thrust_acceleration(q, a, gravity):

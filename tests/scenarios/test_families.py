@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from torchgco.errors import InputError
-from torchgco.scenarios import Forest, ForestMoving, Layouts, PlanarRandom, PlanarTrap, Scenario, Walls
+from torchgco.scenarios import Forest, ForestMoving, Layouts, PlanarRandom, PlanarTrap, Scenario, Walls, Yard
 from torchgco.scenarios.base import generator
 from torchgco.scenarios.planar import TRAP
 
 DATA = Path(__file__).parents[2] / "benchmarks" / "data"
-FAMILIES = [PlanarTrap(), PlanarRandom(), Forest(), ForestMoving(), Walls()]
+FAMILIES = [PlanarTrap(), PlanarRandom(), Forest(), ForestMoving(), Walls(), Yard()]
 PUBLIC = {
     "planar_trap": PlanarTrap(),
     "planar_random": PlanarRandom(),
@@ -191,10 +191,41 @@ def test_walls_by_other_parameters():
     assert np.linalg.norm(pinned[:, 1:] - [1.0, 0.0], axis=1).min() >= 1.5
 
 
+def test_a_yard_holds_discs_and_turned_boxes():
+    drawn = Yard().draw(range(200), seed=0)
+    assert drawn.centers.shape == (200, 8, 2) and drawn.start is not None and drawn.goal is not None
+    assert drawn.box_centers is not None and drawn.box_half_sizes is not None and drawn.box_rotations is not None
+    assert drawn.box_centers.shape == (200, 6, 2) and drawn.start.shape == (200, 4)
+    for values, low, high in (
+        (drawn.radii, 0.3, 0.6),
+        (drawn.box_half_sizes[..., 0], 0.5, 1.1),
+        (drawn.box_half_sizes[..., 1], 0.15, 0.3),
+        (drawn.box_rotations, 0.0, np.pi),
+        (drawn.box_centers[..., 0], -3.5, 3.5),
+        (drawn.centers[..., 1], -2.5, 2.5),
+    ):
+        assert low <= values.min() < low + 0.02 * (high - low) and high >= values.max() > high - 0.02 * (high - low)
+    middles = np.concatenate((drawn.centers, drawn.box_centers), axis=1)
+    for state in (drawn.start, drawn.goal):
+        assert 1.5 < np.linalg.norm(middles - state[:, None, :2], axis=-1).min() < 1.6
+
+
+def test_a_yard_may_lack_discs_or_boxes():
+    assert Yard(num_boxes=0).draw([0, 1], seed=0).box_centers is None
+    bare = Yard(num_discs=0).draw([0, 1], seed=0)
+    assert bare.centers.shape == (2, 0, 2) and bare.box_centers is not None
+
+
+@pytest.mark.parametrize("scenario", FAMILIES, ids=names)
+def test_a_family_knows_the_number_of_its_states(scenario):
+    start = scenario.draw([0], seed=0).start
+    assert start is not None and scenario.states == start.shape[1]
+
+
 ERRORS = {
     "no room": (
         lambda: Forest(clearance=50.0).draw([0], 0),
-        "scenario.region: expected room for scenario.num_obst",
+        "scenario.region: expected room for 30 centres more than 50 m from",
     ),
     "region": (lambda: Forest(region=[[0, 1], [0, 1]]), "scenario.region: expected 3 pairs [low, high]"),
     "crossed region": (lambda: PlanarRandom(region=[[1, 0], [0, 1]]), "scenario.region: expected 2 pairs"),
@@ -240,6 +271,10 @@ ERRORS = {
     "speed": (lambda: ForestMoving(speed=-1), "scenario.speed: expected a finite number >= 0, got -1"),
     "pitch": (lambda: Walls(pitch=0), "scenario.pitch: expected a finite number > 0, got 0"),
     "holes": (lambda: Walls(holes=1.5), "scenario.holes: expected an integer >= 0, got 1.5"),  # type: ignore
+    "discs": (lambda: Yard(num_discs=-1), "scenario.num_discs: expected an integer >= 0, got -1"),
+    "sides": (lambda: Yard(box_width=(0.5, 0.2)), "scenario.box_width: expected a pair [low, high] with 0 < low"),
+    "radii": (lambda: Yard(disc_radius=[0.3]), "scenario.disc_radius: expected a list of 2 numbers, got [0.3]"),
+    "yard": (lambda: Yard(region=[[0, 1]]), "scenario.region: expected 2 pairs [low, high]"),
     "walls": (
         lambda: Walls(positions=[]),
         "scenario.positions: expected a list of numbers, got []",

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from torchgco import InputError
-from torchgco.dynamics import Planar
+from torchgco.dynamics import Planar, Unicycle
 from torchgco.experiments.build import compose
-from torchgco.scenarios import Layouts, PlanarTrap
+from torchgco.scenarios import Layouts, PlanarTrap, Yard
+from torchgco.scenarios.vehicle import BUILT_IN, fitting
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def vehicle(name: str):
-    scenario = "forest" if name == "quadrotor" else "planar_trap"
+    scenario = {"quadrotor": "forest", "unicycle": "yard"}.get(name, "planar_trap")
     return compose([f"model={name}", f"scenario={scenario}"]).vehicle
 
 
@@ -53,6 +54,47 @@ def test_a_mismatch_names_the_model_to_give(name: str, other: str) -> None:
     wanted = "quadrotor" if name == "planar" else "planar"
     with pytest.raises(InputError, match=f"model: expected model={wanted}"):
         vehicle(name).task(layouts)
+
+
+def test_the_built_in_models_are_those_of_the_configurations() -> None:
+    assert set(BUILT_IN) == {path.stem for path in (ROOT / "conf" / "model").glob("*.yaml")}
+    for name, form in BUILT_IN.items():
+        assert form == (vehicle(name).dimension, vehicle(name).dynamics.n) and fitting(*form) == f"model={name}"
+    assert fitting(2, None) == "model=planar or model=unicycle" == fitting(2, 5)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ("model=planar scenario=yard", "expected model=unicycle, as yard is 2-D with 4 states, got model=planar"),
+        ("model=unicycle scenario=planar_trap", "model=planar, as planar_trap is 2-D with 6 states, got model=un"),
+        ("model=quadrotor scenario=yard", "expected model=unicycle, as yard is 2-D with 4 states, got model=quadrotor"),
+        ("model=unicycle scenario=forest", "expected model=quadrotor, as forest is 3-D with 14 states"),
+    ],
+)
+def test_of_two_models_in_the_plane_the_one_that_fits_is_named(words: str, line: str) -> None:
+    with pytest.raises(InputError) as caught:
+        compose(words.split())
+    assert caught.value.field == "model" and line in str(caught.value)
+
+
+def test_layouts_without_states_fit_both_models_in_the_plane(tmp_path) -> None:
+    Layouts(centers=[[[0.0, 0.0]]], radii=[[0.1]]).save(tmp_path / "bare.npz")
+    words = ["scenario=layouts", f"scenario.path={tmp_path / 'bare.npz'}"]
+    for name in ("planar", "unicycle"):
+        setup = compose([*words, f"model={name}"])
+        assert setup.task().problem.n == BUILT_IN[name][1]
+    with pytest.raises(InputError, match="expected model=planar or model=unicycle, as bare is 2-D, got model=quad"):
+        compose([*words, "model=quadrotor"])
+
+
+def test_a_yard_makes_the_unicycles_problem() -> None:
+    task = vehicle("unicycle").task(Yard().draw(range(3), 0))
+    spheres, bounds, boxes = task.problem.constraints
+    assert task.problem.dynamics == Unicycle(dt=0.1) and task.problem.N == 100
+    assert spheres.centers.shape == (3, 8, 2) and boxes.centers.shape == (3, 6, 2)
+    assert bounds.upper[0].tolist() == [2, 1.5]
+    assert task.problem.x0.tolist() == [[-5, 0, 0, 0]] * 3 and task.goal.tolist() == [[5, 0]] * 3
 
 
 def test_states_of_another_length_are_named() -> None:

@@ -24,6 +24,7 @@ from torchgco import (
     QuadrotorPlant,
     Spheres,
     StateBounds,
+    Unicycle,
 )
 from torchgco.autodiff import gradient_and_hessian
 from torchgco.tracing import Traced
@@ -77,6 +78,7 @@ def network(x: Tensor, u: Tensor) -> Tensor:
 MODELS: dict[str, Dynamics] = {
     "planar": Planar(),
     "planar, one drag each": Planar(drag=torch.tensor([1.0, 2.0, 3.0], **DOUBLE), integrator="midpoint"),
+    "unicycle": Unicycle(integrator="rk4"),
     "quadrotor": QuadrotorPlanning(rate_time_constant=torch.tensor([1.0, 1.5, 2.0], **DOUBLE)),
     "plant": QuadrotorPlant(integrator="rk4"),
     "in place": FunctionDynamics(in_place, n=3, m=2, dt=0.1),

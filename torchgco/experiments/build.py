@@ -26,6 +26,7 @@ from torchgco.experiments.preset_nodes import register
 from torchgco.kernels import use_native
 from torchgco.options import check_value
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
+from torchgco.scenarios.vehicle import BUILT_IN, fitting
 from torchgco.simulation import Mission
 from torchgco.solvers.memory import free_memory, least_bytes
 
@@ -166,9 +167,11 @@ def build(config: DictConfig) -> Setup:
     setup = replace(setup, mission=_mission(setup))
     if config.model.dimension != setup.vehicle.dimension:
         raise InputError("model.dimension", f"{setup.vehicle.dimension}, as its dynamics say", config.model.dimension)
-    if setup.scenario.dimension != setup.vehicle.dimension:
-        other = "quadrotor" if setup.scenario.dimension == 3 else "planar"
-        wanted = f"model={other}, as {setup.scenario.name} is {setup.scenario.dimension}-D"
+    d, n = setup.scenario.dimension, setup.scenario.states
+    another = n != setup.vehicle.dynamics.n and (d, n) in BUILT_IN.values()
+    if d != setup.vehicle.dimension or another:
+        form = f"{d}-D" if n is None else f"{d}-D with {n} states"
+        wanted = f"{fitting(d, n)}, as {setup.scenario.name} is {form}"
         raise InputError("model", wanted, f"model={setup.vehicle.name}")
     return setup
 

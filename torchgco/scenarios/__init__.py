@@ -9,6 +9,7 @@ from torchgco.scenarios.planar import PlanarRandom, PlanarTrap
 from torchgco.scenarios.quadrotor import Forest, ForestMoving, Walls
 from torchgco.scenarios.vehicle import Task, Vehicle
 from torchgco.scenarios.woods import Woods
+from torchgco.scenarios.yard import Yard
 
 __all__ = [
     "Crossing",
@@ -24,5 +25,6 @@ __all__ = [
     "Vehicle",
     "Walls",
     "Woods",
+    "Yard",
     "concatenate",
 ]

@@ -31,6 +31,11 @@ class Scenario(ABC):
         """Dimension d of space, 2 or 3."""
 
     @property
+    def states(self) -> int | None:
+        """Number n of states in start and goal; None where the vehicle gives both."""
+        return None
+
+    @property
     def available(self) -> int | None:
         """How many layouts there are; None where any number can be drawn."""
         return None
@@ -85,6 +90,11 @@ class Family(Scenario):
             self._set(field, checks.vector, length=self.dimension)
         self._set("stages", checks.integer, at_least=1, at_most=checks.MOST_STAGES)
 
+    @property
+    def states(self) -> int:
+        """n."""
+        return len(self._at_rest(self.start))
+
     def _set(self, field: str, check: Any, **limits: Any) -> None:
         """Replace a field by its checked, plain form."""
         object.__setattr__(self, field, check(getattr(self, field), f"scenario.{field}", **limits))
@@ -136,6 +146,6 @@ def uniform_clear(
     distances = " and ".join(f"{distance:g} m from {tuple(point)}" for point, distance in keep_clear)
     raise InputError(
         "scenario.region",
-        f"room for scenario.num_obstacles = {count} centres more than {distances}",
+        f"room for {count} centres more than {distances}",
         f"{[list(pair) for pair in region]}, where {MAX_DRAWS} draws found no room",
     )

@@ -37,6 +37,12 @@ class LayoutFile(Scenario):
         return self.layouts.dimension
 
     @property
+    def states(self) -> int | None:
+        """Number n of states in the file's start and goal; None where it has neither."""
+        given = self.layouts.start if self.layouts.start is not None else self.layouts.goal
+        return None if given is None else given.shape[1]
+
+    @property
     def available(self) -> int:
         """How many layouts the file holds."""
         return self.layouts.count

@@ -24,6 +24,8 @@ from torchgco.shapes import check_device
 
 STATES = ("state_weight", "terminal_weight", "start", "goal")  # fields with one number per state
 CONTROLS = ("control_weight", "control_reference", "control_lower", "control_upper")
+# The models of conf/model: dimension of space and number of states.
+BUILT_IN = {"planar": (2, 6), "unicycle": (2, 4), "quadrotor": (3, 14)}
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,9 @@ class Vehicle:
             raise InputError("dtype", "torch.float64 or torch.float32", repr(dtype))
         device = check_device(device)
         if layouts.dimension != self.dimension:
-            other = "quadrotor" if layouts.dimension == 3 else "planar"
-            raise InputError("model", f"model={other} for the {layouts.dimension}-D {layouts.name}", self.name)
+            given = layouts.start if layouts.start is not None else layouts.goal
+            wanted = fitting(layouts.dimension, None if given is None else given.shape[1])
+            raise InputError("model", f"{wanted} for the {layouts.dimension}-D {layouts.name}", self.name)
         start, goal = self._states(layouts, "start"), self._states(layouts, "goal")
 
         def tensor(value: object) -> Tensor:
@@ -144,6 +147,13 @@ class Vehicle:
         if states.shape[1] != self.dynamics.n:
             raise InputError(f"layouts.{name}", f"{self.dynamics.n} states of model={self.name}", states.shape[1])
         return states
+
+
+def fitting(dimension: int, states: int | None) -> str:
+    """The built-in models for layouts of this dimension and number of states (None: any), as words of a command."""
+    fits = {name: n for name, (d, n) in BUILT_IN.items() if d == dimension}
+    names = [name for name, n in fits.items() if n == states] or list(fits)
+    return " or ".join(f"model={name}" for name in names)
 
 
 def _given(value, default):

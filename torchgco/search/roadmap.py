@@ -90,11 +90,14 @@ class Roadmap:
     ) -> tuple[Tensor, Tensor]:
         """Paths (B', count, HOPS+1, d) over a graph of the problems in `rows`, and where there are any (B',)."""
         price = scene.traversal_cost(graph.points, rows)
-        paths, found = [], torch.ones(graph.points.shape[0], dtype=torch.bool, device=graph.points.device)
+        paths: list[Tensor] = []
         for _ in range(count):
             path, string, arrives = search.cheapest(graph, price)
-            found = found & arrives
             path = search.taut(path, string, scene.traversal_cost(string, rows))
+            if not paths:
+                found = arrives
+            else:  # a later path may have too many edges: the first stands in for it
+                path = torch.where(arrives.view(-1, 1, 1), path, paths[0])
             paths.append(path)
             price = search.raised(price, graph.points, path, 1.0 + DIVERSITY)
         return torch.stack(paths, dim=1), found

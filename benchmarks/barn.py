@@ -1,0 +1,184 @@
+"""python -m benchmarks.barn: the worlds of the BARN challenge, planned from a known map.
+
+A unicycle with the limits of the challenge's robot drives 10 m through walls and clusters of cylinders; the challenge's
+score rewards short times. `gco` plans the 50 test worlds as one batch, and then the 250 others, on which no option was
+chosen. The controls are driven again in steps of 1 ms, without code of the solvers. With --write the table goes into
+benchmarks/results/barn.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from benchmarks.barn_data import DATA, GOAL, GOAL_RADIUS, RADIUS, TEST
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.tables import put_between
+from torchgco import ControlBounds, Goal, Problem, QuadraticCost, Spheres, StateBounds, Unicycle, judge, presets, solve
+from torchgco.experiments.statistics import wilson
+from torchgco.scenarios import Layouts
+from torchgco.search import Restarts
+
+PAGE = Path(__file__).resolve().parent / "results" / "barn.md"
+STAGES, DT = 100, 0.1  # 10 s in every world; the challenge, too, looks every 0.1 s whether a run has arrived
+SPEED = 2.0  # m/s: the challenge's shortest time is the length of its path over this
+BACKWARDS = -0.5  # m/s: these limits are those of the challenge's planner (base_local_planner_params.yaml)
+ACCELERATION, TURN_RATE, TURN_CHANGE = 10.0, 1.57, 20.0  # m/s^2, rad/s, rad/s^2
+# The disc around the robot's wheels: 0.262 + 2 * 0.098 m long, 0.37559 + 0.040 m wide (jackal.urdf.xacro).
+BODY = float(np.hypot(0.458, 0.41559)) / 2  # m
+# Planned with 2 cm more: the path between two knots, 0.2 m apart, may cut a corner by 1.3 cm.
+VEHICLE = BODY + 0.02  # m
+# Far from the goal position costs most, so that the cost asks for speed. With less weight on the controls solves end
+# far from an optimum; the turn rate has more, because no constraint limits its change.
+POSITION, CONTROLS, LAST = 1.0, (1.0, 4.0), 10.0
+FINE = 100  # steps of 1 ms per stage: the simulator's own
+
+
+def worlds(test: bool = True, first: int | None = None) -> tuple[Layouts, pd.DataFrame]:
+    """The test worlds or all others, or the first of them, and their table.
+
+    Its column `optimal` is the challenge's shortest time, s.
+    """
+    table = pd.read_csv(DATA / "barn.csv")
+    table = table[table["world"].isin(TEST) == test].head(first)
+    layouts = Layouts.load(DATA / "barn.npz").take(table.index.to_numpy())
+    return layouts, table.assign(optimal=table["path_length"] / SPEED)
+
+
+def problems(layouts: Layouts) -> Problem:
+    """The planning problems: the whole map is known, and every cylinder is a disc of its own."""
+    assert layouts.start is not None
+    free = [torch.inf] * 3
+    return Problem(
+        Unicycle(dt=DT),
+        QuadraticCost(Q=[POSITION, POSITION, 0, 0], R=CONTROLS, Qf=[LAST, LAST, 0, 0], x_ref=[*GOAL, 0.0, 0.0]),
+        [
+            Spheres(layouts.centers, layouts.radii, VEHICLE),
+            ControlBounds([-ACCELERATION, -TURN_RATE], [ACCELERATION, TURN_RATE]),
+            StateBounds([-x for x in free] + [BACKWARDS], [*free, SPEED]),
+        ],
+        torch.from_numpy(layouts.start),
+        STAGES,
+        Goal(GOAL, GOAL_RADIUS),
+    )
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Controls driven in every world, arrays (B,)."""
+
+    seconds: np.ndarray  # to the first knot within 1 m of the goal; infinite without arrival
+    clearance: np.ndarray  # least distance of the body's disc from a cylinder on the way, m
+    turn_change: np.ndarray  # largest change of the turn rate from one stage to the next, rad/s^2
+    sound: np.ndarray  # bool: arrived without contact and within all limits
+
+    @classmethod
+    def of(cls, problem: Problem, layouts: Layouts, U: Tensor) -> Drives:
+        verdict = judge(problem, U)
+        driven = [drive(x0, u) for x0, u in zip(problem.x0.numpy(), U.numpy(), strict=True)]
+        near = [np.linalg.norm(path[::FINE] - GOAL, axis=1) <= GOAL_RADIUS for path in driven]
+        seconds = np.array([DT * inside.argmax() if inside.any() else np.inf for inside in near])
+        clearance = np.array([gap(path, rows) for path, rows in zip(driven, layouts.centers, strict=True)])
+        change = np.abs(np.diff(U[..., 1].numpy(), axis=1, prepend=0.0)).max(axis=1) / DT
+        sound = verdict.sound.numpy() & np.isfinite(seconds) & (clearance > 0) & (change <= TURN_CHANGE)
+        return cls(seconds, clearance, change, sound)
+
+    def score(self, optimal: np.ndarray) -> np.ndarray:
+        """The challenge's score of every world, 0 to 0.5, for its shortest times, s (run.py, March 2026)."""
+        return self.sound * optimal / np.clip(self.seconds, 2 * optimal, 8 * optimal)
+
+
+def drive(x0: np.ndarray, U: np.ndarray) -> np.ndarray:
+    """Positions (FINE N + 1, 2) under controls U (N, 2), in steps of 1 ms by the midpoint rule."""
+    step = DT / FINE
+    acceleration, turning = np.repeat(U, FINE, axis=0).T
+    heading = x0[2] + np.cumsum(turning) * step - 0.5 * step * turning
+    speed = x0[3] + np.cumsum(acceleration) * step - 0.5 * step * acceleration
+    moves = step * speed[:, None] * np.stack((np.cos(heading), np.sin(heading)), axis=-1)
+    return np.vstack((x0[:2], x0[:2] + np.cumsum(moves, axis=0)))
+
+
+def gap(path: np.ndarray, centers: np.ndarray) -> float:
+    """The least distance of the body's disc on a path (T, 2) from cylinders at `centers` (M, 2), m."""
+    apart = np.hypot(*(path[:, None, i] - centers[~np.isnan(centers[:, 0])][:, i] for i in range(2)))
+    return float(apart.min()) - RADIUS - BODY
+
+
+def solvers(problem: Problem) -> dict[str, Restarts]:
+    """The default solver, and the same with the shortest path alone."""
+    gco = presets.gco(problem)
+    assert gco.paths is not None
+    return {"`gco`": gco, "`gco`, one path": replace(gco, paths=replace(gco.paths, num_paths=1))}
+
+
+def cells(drives: Drives, optimal: np.ndarray) -> list[str]:
+    """The cells of a row that tell how good the drives are; all but the first two are of successes."""
+    hits, count, score = int(drives.sound.sum()), len(optimal), f"{drives.score(optimal).mean():.3f}"
+    low, high = (100 * bound for bound in wilson(hits, count))
+    success = f"{hits} of {count} [{low:.0f}, {high:.0f}] %"
+    if hits == 0:
+        return [success, score, *["-"] * 4]
+    seconds, clearance, change = (z[drives.sound] for z in (drives.seconds, drives.clearance, drives.turn_change))
+    ratio = seconds / optimal[drives.sound]
+    return [
+        success, score, f"{seconds.mean():.2f}", f"{ratio.mean():.3f}, {ratio.max():.3f}", f"{clearance.min():.3f}",
+        f"{change.max():.1f}",
+    ]  # fmt: skip
+
+
+HEAD = (
+    "planner", "worlds", "success", "score", "mean time, s", "time / shortest: mean, largest", "least clearance, m",
+    "change of turn rate, rad/s^2", "seconds per world",
+)  # fmt: skip
+# README of Daffan/the-barn-challenge: 50 worlds, ten runs each, "Avg Success: 0.8800".
+DWA = ["DWA, as published", "test", "0.88 of 500 runs", "0.169", "33.47", *["-"] * 4]
+
+
+def table(first: int | None, seed: int) -> str:
+    """The results of the solvers, in Markdown."""
+    lines, notes = [list(HEAD), ["---"] * len(HEAD)], []
+    for test in (True, False):
+        layouts, known = worlds(test, first)
+        problem, optimal = problems(layouts), known["optimal"].to_numpy()
+        for name, solver in solvers(problem).items():
+            solve(problem.take(slice(0, 1)), solver=solver)  # compiles
+            began = perf_counter()
+            U = solve(problem, solver=solver, seed=seed).U
+            seconds = (perf_counter() - began) / problem.B
+            drives, kind = Drives.of(problem, layouts, U), "test" if test else "others"
+            lines.append([name, kind, *cells(drives, optimal), f"{seconds:.2f}"])
+            missed = ", ".join(str(world) for world in known["world"][~drives.sound]) or "none"
+            notes.append(f"Worlds without success, {kind}, {name}: {missed}.")
+    lines.append(DWA)
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n\n" + "\n\n".join(notes)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.barn", description="The worlds of BARN.")
+    parser.add_argument("--first", type=int, default=None, help="only the first worlds of each kind, this many")
+    parser.add_argument("--seed", type=int, default=0, help="of the random draws of guidance")
+    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/barn.md")
+    asked = parser.parse_args(words)
+    torch.set_num_threads(1)
+    text = table(asked.first, asked.seed)
+    print(text)
+    if asked.write:
+        origin = provenance("cpu")
+        head = (
+            f"Measured on {origin['date']} at commit {origin['commit']}, seed {asked.seed}, one batch each, one thread "
+            f"on one core, {origin['processor']}, shared and busy; set-up excluded; 95 % Wilson intervals in percent."
+        )
+        put_between(PAGE, "<!-- barn -->", "<!-- end barn -->", f"{head}\n\n{text}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,81 @@
+"""A scenario for the unicycle: discs and rotated boxes between start and goal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchgco.errors import InputError
+from torchgco.scenarios import checks
+from torchgco.scenarios.base import Family, uniform_clear
+from torchgco.scenarios.layouts import Layouts
+
+
+@dataclass(frozen=True, kw_only=True)
+class Yard(Family):
+    """Discs and boxes at any angle, centres uniform in `region`, which may overlap; for the unicycle, n = 4.
+
+    num_discs, num_boxes
+                 how many of each
+    disc_radius, box_length, box_width
+                 pairs [low, high] in m: radii, and the full lengths of a box's sides, are uniform between them
+    region       2 pairs [low, high] in m
+    clearance    a centre is redrawn until it is more than this from start and goal, m
+
+    The start is at rest and heads along the x axis. Control bounds are the model's.
+    """
+
+    name: str = "yard"
+    vehicle_radius: float = 0.3
+    start: Sequence[float] = (-5.0, 0.0)
+    goal: Sequence[float] = (5.0, 0.0)
+    goal_radius: float = 0.5
+    stages: int = 100
+    dt: float = 0.1
+    num_discs: int = 8
+    num_boxes: int = 6
+    disc_radius: Sequence[float] = (0.3, 0.6)
+    box_length: Sequence[float] = (1.0, 2.2)
+    box_width: Sequence[float] = (0.3, 0.6)
+    region: Sequence[Sequence[float]] = ((-3.5, 3.5), (-2.5, 2.5))
+    clearance: float = 1.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for field in ("num_discs", "num_boxes"):
+            self._set(field, checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
+        for field in ("disc_radius", "box_length", "box_width"):
+            self._set(field, checks.vector, length=2)
+            low, high = getattr(self, field)
+            if not 0 < low <= high:
+                raise InputError(f"scenario.{field}", "a pair [low, high] with 0 < low <= high", [low, high])
+        self._set("region", checks.box, dimension=2)
+        self._set("clearance", checks.number, at_least=0)
+
+    @property
+    def dimension(self) -> int:
+        """2."""
+        return 2
+
+    def _at_rest(self, position: Sequence[float]) -> np.ndarray:
+        return np.array([*position, 0.0, 0.0])
+
+    def _draw_one(self, rng: np.random.Generator) -> Layouts:
+        keep_clear = ((self.start, self.clearance), (self.goal, self.clearance))
+        discs, boxes = self.num_discs, self.num_boxes
+        centers = uniform_clear(rng, self.region, discs + boxes, keep_clear)
+        length, width = _between(rng, self.box_length, boxes), _between(rng, self.box_width, boxes)
+        return self._layout(
+            centers=centers[None, :discs],
+            radii=_between(rng, self.disc_radius, discs)[None],
+            box_centers=centers[None, discs:],
+            box_half_sizes=0.5 * np.stack((length, width), axis=-1)[None],
+            box_rotations=rng.uniform(0.0, np.pi, boxes)[None],
+        )
+
+
+def _between(rng: np.random.Generator, limits: Sequence[float], count: int) -> np.ndarray:
+    """Uniform numbers (count,) between two limits."""
+    return rng.uniform(limits[0], limits[1], count)
