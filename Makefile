@@ -62,7 +62,7 @@ oracle: $(RUNTIME)
 worlds: $(PEERS)
 	$(BIN)/python -m benchmarks.worlds --write $(ARGS)
 	$(BIN)/python -m benchmarks.barn --write
-	$(BIN)/python -m benchmarks.maze --write
+	$(BIN)/python -m benchmarks.maze --write --fatrop 8
 	$(BIN)/python -m benchmarks.navigation --write
 
 benchmark: $(PEERS)

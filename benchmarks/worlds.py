@@ -51,7 +51,7 @@ def main(words: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.worlds", description="Fly the worlds, and count.")
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
-    parser.add_argument("--peers", type=int, default=4, metavar="N", help="layouts that the peers fly; 0: none")
+    parser.add_argument("--peers", type=int, default=3, metavar="N", help="layouts that the peers fly; 0: none")
     parser.add_argument("--fresh", type=int, default=0, metavar="N", help="N drawn layouts per world, not the 32")
     parser.add_argument("--seed", type=int, default=0, help="of the drawn layouts")
     parser.add_argument("--write", action="store_true", help=f"put the table into {PAGE.relative_to(ROOT)}")

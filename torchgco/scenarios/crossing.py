@@ -62,7 +62,7 @@ class Crossing(Quadrotor):
         low, high = np.array(self.corridor).T
         point = rng.uniform(low, high, (count, 3))
         time = rng.uniform(0.0, self.stages * self.dt, (count, 1))
-        speed = rng.uniform(*self.speeds, (count, 1))
+        speed = rng.uniform(self.speeds[0], self.speeds[1], (count, 1))
         heading = rng.uniform(-np.pi, np.pi, count)
         velocity = speed * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(count)])
         return point - time * velocity, velocity

@@ -65,7 +65,11 @@ class Mazes(Quadrotor):
         walls = np.concatenate(pieces) if pieces else np.empty((0, 2, 3))
         low_end, high_end = np.array(self.region).T
         loose = np.stack(
-            [rng.uniform(low_end, high_end, (self.loose, 3)), rng.uniform(*self.sizes, (self.loose, 3))], axis=1
+            [
+                rng.uniform(low_end, high_end, (self.loose, 3)),
+                rng.uniform(self.sizes[0], self.sizes[1], (self.loose, 3)),
+            ],
+            axis=1,
         )
         half_turn = 0.5 * rng.uniform(-np.pi, np.pi, self.loose)
         turns = np.zeros((len(walls) + self.loose, 4))

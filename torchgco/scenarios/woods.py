@@ -60,5 +60,5 @@ class Woods(Quadrotor):
         return self._layout(
             box_centers=np.column_stack([axes, np.full(count, 0.5 * (low + high))])[None],
             box_half_sizes=half,
-            box_radii=rng.uniform(*self.radii, (1, count)),
+            box_radii=rng.uniform(self.radii[0], self.radii[1], (1, count)),
         )
