@@ -272,7 +272,7 @@ ERRORS = {
     "pitch": (lambda: Walls(pitch=0), "scenario.pitch: expected a finite number > 0, got 0"),
     "holes": (lambda: Walls(holes=1.5), "scenario.holes: expected an integer >= 0, got 1.5"),  # type: ignore
     "discs": (lambda: Yard(num_discs=-1), "scenario.num_discs: expected an integer >= 0, got -1"),
-    "sides": (lambda: Yard(box_width=(0.5, 0.2)), "scenario.box_width: expected a pair [low, high] with 0 < low"),
+    "sides": (lambda: Yard(box_width=(0.5, 0.2)), "scenario.box_width: expected [least, largest] in this order"),
     "radii": (lambda: Yard(disc_radius=[0.3]), "scenario.disc_radius: expected a list of 2 numbers, got [0.3]"),
     "yard": (lambda: Yard(region=[[0, 1]]), "scenario.region: expected 2 pairs [low, high]"),
     "walls": (

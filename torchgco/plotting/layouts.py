@@ -89,9 +89,9 @@ def _ends(ids: np.ndarray, solvers: list[str], trials: pd.DataFrame) -> dict[tup
 
 
 def _scale(scene: Scene, count: int) -> Normalize | None:
-    """From heights to shades; None in the plane, and where there is nothing to shade."""
+    """From heights to shades; None in the plane, and where all heights are the same."""
     heights = scene.shown_heights(count)
-    return Normalize(heights.min(), heights.max()) if len(heights) else None
+    return Normalize(heights.min(), heights.max()) if len(heights) and heights.min() < heights.max() else None
 
 
 def _obstacles(ax: Axes, scene: Scene, i: int, scale: Normalize | None) -> None:

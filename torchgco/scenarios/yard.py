@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchgco.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import Family, uniform_clear
 from torchgco.scenarios.layouts import Layouts
@@ -20,7 +19,7 @@ class Yard(Family):
     num_discs, num_boxes
                  how many of each
     disc_radius, box_length, box_width
-                 pairs [low, high] in m: radii, and the full lengths of a box's sides, are uniform between them
+                 pairs [least, largest] in m: radii, and the full lengths of a box's sides, are uniform between them
     region       2 pairs [low, high] in m
     clearance    a centre is redrawn until it is more than this from start and goal, m
 
@@ -47,10 +46,7 @@ class Yard(Family):
         for field in ("num_discs", "num_boxes"):
             self._set(field, checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
         for field in ("disc_radius", "box_length", "box_width"):
-            self._set(field, checks.vector, length=2)
-            low, high = getattr(self, field)
-            if not 0 < low <= high:
-                raise InputError(f"scenario.{field}", "a pair [low, high] with 0 < low <= high", [low, high])
+            self._set(field, checks.interval, above=0)
         self._set("region", checks.box, dimension=2)
         self._set("clearance", checks.number, at_least=0)
 
