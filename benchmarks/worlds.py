@@ -1,8 +1,8 @@
 """python -m benchmarks.worlds: woods, mazes and crossing spheres that can't be flown around, by `gco` and its peers.
 
 Every world and solver is a separate study below outputs/worlds, so that a run that was stopped resumes where it was.
-The peers are slow among so many obstacles and get the first layouts only. With --write the table goes into
-benchmarks/results/worlds.md, with date and commit.
+The peers take up to minutes per problem among so many obstacles: `--peers N` lets them fly the first N layouts. With
+--write the table goes into benchmarks/results/worlds.md, with date and commit.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main(words: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.worlds", description="Fly the worlds, and count.")
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
-    parser.add_argument("--peers", type=int, default=3, metavar="N", help="layouts that the peers fly; 0: none")
+    parser.add_argument("--peers", type=int, default=0, metavar="N", help="layouts that the peers fly, too")
     parser.add_argument("--fresh", type=int, default=0, metavar="N", help="N drawn layouts per world, not the 32")
     parser.add_argument("--seed", type=int, default=0, help="of the drawn layouts")
     parser.add_argument("--write", action="store_true", help=f"put the table into {PAGE.relative_to(ROOT)}")
