@@ -1,8 +1,9 @@
 """python -m benchmarks.worlds: woods, mazes and crossing spheres that can't be flown around, by `gco` and its peers.
 
 Every world and solver is a separate study below outputs/worlds, so that a run that was stopped resumes where it was.
-The peers take up to minutes per problem among so many obstacles: `--peers N` lets them fly the first N layouts. With
---write the table goes into benchmarks/results/worlds.md, with date and commit.
+The peers take up to minutes per problem among so many obstacles: their rows on the public layouts are read from the
+file that `benchmarks.worlds_peers` keeps. With --write the table goes into benchmarks/results/worlds.md, with date and
+commit.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from pathlib import Path
 import pandas as pd
 
 from benchmarks.families import WORLDS
-from benchmarks.quality import study
+from benchmarks.quality import study, succeeded
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
+from benchmarks.worlds_peers import FILE, NAMES, rows_of
 from torchgco.experiments.statistics import summarise, wilson
 from torchgco.experiments.success import sound
 from torchgco.scenarios import Layouts
@@ -25,7 +27,6 @@ from torchgco.scenarios import Layouts
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "benchmarks" / "results" / "worlds.md"
 SOLVERS = ("gco", "al_ilqr")
-PEERS = ("fatrop", "fatrop_guided", "ipopt")
 HEAD = (
     "world", "solver", "n", "reached", "reached, of solved layouts", "success", "cost / best known, median",
     "seconds per problem, median",
@@ -36,38 +37,50 @@ def main(words: Sequence[str] | None = None) -> int:
     asked = _parser().parse_args(words)
     rows = []
     for name in asked.worlds:
-        tables = [_flown(name, solver, asked, None) for solver in SOLVERS]
-        if not asked.fresh and asked.peers > 0:
-            tables += [_flown(name, solver, asked, asked.peers) for solver in PEERS]
-        rows += table(pd.concat(tables, ignore_index=True), solved(name, tables, asked))
-        print("\n".join(rows[-len(tables) :]), flush=True)
+        trials = pd.concat([study(WORLDS[name], solver, asked) for solver in SOLVERS], ignore_index=True)
+        if not asked.fresh:
+            trials = with_peers(name, trials, rows_of(asked.peers))
+        new = table(trials, solved(name, trials, asked))
+        print("\n".join(new), flush=True)
+        rows += new
     if asked.write and set(asked.worlds) == set(WORLDS):
         head = ["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|"]
         mark = "drawn" if asked.fresh else "worlds"
-        put_between(PAGE, f"<!-- {mark} -->", f"<!-- end {mark} -->", "\n".join([_source(asked), "", *head, *rows]))
+        source = _source(asked) + ("" if asked.fresh else _peers_source(rows_of(asked.peers)))
+        put_between(PAGE, f"<!-- {mark} -->", f"<!-- end {mark} -->", "\n".join([source, "", *head, *rows]))
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.worlds", description="Fly the worlds, and count.")
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
-    parser.add_argument("--peers", type=int, default=0, metavar="N", help="layouts that the peers fly, too")
+    parser.add_argument("--peers", type=Path, default=FILE, metavar="FILE", help="rows of benchmarks.worlds_peers")
     parser.add_argument("--fresh", type=int, default=0, metavar="N", help="N drawn layouts per world, not the 32")
     parser.add_argument("--seed", type=int, default=0, help="of the drawn layouts")
     parser.add_argument("--write", action="store_true", help=f"put the table into {PAGE.relative_to(ROOT)}")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "worlds")
+    parser.set_defaults(overrides=[])
     return parser
 
 
-def _flown(name: str, solver: str, asked: argparse.Namespace, first: int | None) -> pd.DataFrame:
-    """The trials of one solver on a world's layouts, or on its first ones."""
-    overrides = [] if first is None else [f"study.layouts={first}"]
-    return study(WORLDS[name], solver, argparse.Namespace(**(vars(asked) | {"overrides": overrides})))
+def with_peers(name: str, trials: pd.DataFrame, peers: pd.DataFrame) -> pd.DataFrame:
+    """The trials of a world, and behind them those of its peers on the same layouts, solver by solver.
+
+    trials  of a study
+    peers   rows of `benchmarks.worlds_peers`; rows of other worlds and of layouts that have changed are left out
+    """
+    same = ["layout", "layout_digest"]
+    flown = peers[peers["world"] == name].merge(trials[[*same, "model", "seed"]].drop_duplicates(), on=same)
+    if flown.empty:
+        return trials
+    flown = flown.assign(place=flown["solver"].map(NAMES.index)).sort_values(["place", "layout"], kind="stable")
+    flown = flown.assign(scenario=name, feasible=pd.NA, outer_iterations=float("nan"), guided=float("nan"))
+    judged = succeeded(flown, Layouts.load(WORLDS[name].file()))
+    return pd.concat([trials, judged], ignore_index=True)
 
 
-def solved(name: str, tables: Sequence[pd.DataFrame], asked: argparse.Namespace) -> set[int]:
+def solved(name: str, trials: pd.DataFrame, asked: argparse.Namespace) -> set[int]:
     """The layouts that any solver is known to solve: here, or when the best costs were sought."""
-    trials = pd.concat(tables, ignore_index=True)
     known = set(trials.loc[sound(trials), "layout"].tolist())
     path = WORLDS[name].file(asked.fresh, asked.seed)
     if path.is_file() and (best := Layouts.load(path).best_cost) is not None:
@@ -109,6 +122,18 @@ def _source(asked: argparse.Namespace) -> str:
     return (
         f"Flown on {origin['date']} at commit {origin['commit']}, {layouts}, seed {asked.seed}, 95 % Wilson intervals "
         f"in percent; one thread per process, two processes, {origin['processor']}, shared."
+    )
+
+
+def _peers_source(peers: pd.DataFrame) -> str:
+    if peers.empty:
+        return ""
+    limit, version, date, commit = (
+        ", ".join(peers[name].astype(str).unique()) for name in ("limit", "version", "date", "commit")
+    )
+    return (
+        f" FATROP, IPOPT and acados: {version}, flown on {date} at commit {commit}, processor time of one thread, at "
+        f"most {limit} s per problem."
     )
 
 

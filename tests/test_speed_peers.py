@@ -15,9 +15,9 @@ from benchmarks.speed.bench import Bench
 from benchmarks.speed.peers import AcadosPeer
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.results import Results
-from tests.problems import planar_batch, quadrotor_batch
+from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from tests.test_benchmarks import TINY
-from torchgco import ControlBounds, InputError, Problem, QuadraticCost, StateBounds
+from torchgco import ControlBounds, InputError, Problem, QuadraticCost, Spheres, StateBounds
 from torchgco.baselines import CasADiSolver
 from torchgco.rollout import open_loop
 
@@ -60,13 +60,13 @@ def test_the_worker_gets_the_problem(batch, tmp_path: Path) -> None:
     U = torch.randn(2, problem.N, m, generator=draw, dtype=torch.float64)
     spheres, bounds = problem.constraints
     rows = spheres.value(X, U).numpy()
-    symbols = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", numbers["p"].shape[1])
+    symbols = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", numbers["p"].shape[-1])
     step, stage, last = (
         ca.Function(word, symbols, [acados_worker.replay(form[word], *symbols)])
         for word in ("step", "rows", "last_rows")
     )
     for b in range(2):
-        x, u, p = X[b, 3].numpy(), U[b, 3].numpy(), numbers["p"][b]
+        x, u, p = X[b, 3].numpy(), U[b, 3].numpy(), numbers["p"][b, 0]
         after = problem.dynamics.step(X[:, 3], U[:, 3])[b]
         np.testing.assert_allclose(np.ravel(step(x, u, p)), after, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(np.ravel(stage(x, u, p)), rows[b, 3 - spheres.knots.start], rtol=1e-10)
@@ -79,6 +79,42 @@ def test_the_worker_gets_the_problem(batch, tmp_path: Path) -> None:
     assert form["equality"] == form["last_equality"] == [False] * rows.shape[-1]
     for side in ("lower", "upper"):
         np.testing.assert_allclose(numbers[side], getattr(bounds, side).expand(2, problem.N, m))
+
+
+def rows_at(folder: Path, b: int, k: int, x: np.ndarray, m: int) -> np.ndarray:
+    """The rows that the worker gets for problem b at knot k."""
+    form, numbers = read_problem(folder)
+    own = numbers["p"][b]
+    p = own[k if len(own) > 1 else 0]
+    symbols = ca.SX.sym("x", len(x)), ca.SX.sym("u", m), ca.SX.sym("p", len(p))
+    word = "last_rows" if k == form["N"] else "rows"
+    rows = ca.Function("rows", symbols, [acados_worker.replay(form[word], *symbols)])
+    return np.ravel(rows(x, np.zeros(m), p))
+
+
+def moving_spheres() -> Problem:
+    """Two problems with three spheres, absent in one; at 0.1 s per stage a time of 1 s simplifies products."""
+    plain, _ = planar_batch(B=2, N=14)
+    rng = np.random.default_rng(0)
+    centers, velocities, radii = rng.normal(size=(2, 3, 2)), rng.normal(size=(2, 3, 2)), np.full((2, 3), 0.1)
+    for array in (centers, velocities, radii):
+        array[0, 2] = np.nan
+    spheres = Spheres(centers, radii, 0.06, velocities)
+    return Problem(plain.dynamics, plain.cost, [spheres, plain.constraints[1]], plain.x0, 14)
+
+
+@pytest.mark.parametrize("kind", ["moving", "boxes", "rounded"])
+def test_the_worker_gets_the_rows_of_every_knot(kind: str, tmp_path: Path) -> None:
+    """Spheres that move, and boxes, with some absent: rows at random states equal those of the problem in PyTorch."""
+    problem = moving_spheres() if kind == "moving" else boxed_batch(3, B=2, N=14, rounded=kind == "rounded")[0]
+    B, N, m = problem.B, problem.N, problem.m
+    U0 = torch.zeros(B, N, m, dtype=torch.float64)
+    acados_peer.write(problem, *guess(problem, U0), tmp_path)
+    X = torch.randn(B, N + 1, problem.n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    obstacles = [c for c in problem.constraints if c.geometric]
+    values = np.concatenate([c.value(X, U0).numpy() for c in obstacles], axis=-1)
+    for b, k in ((0, 1), (1, 5), (0, 10), (1, N)):
+        np.testing.assert_allclose(rows_at(tmp_path, b, k, X[b, k].numpy(), m), values[b, k - 1], rtol=1e-9, atol=1e-9)
 
 
 def write_problem(problem: Problem, U0: torch.Tensor, folder: Path) -> None:
@@ -131,6 +167,16 @@ def test_acados_agrees_with_fatrop(tmp_path: Path) -> None:
     part = problem.take(rows)
     alone = acados_peer.fly(part, *guess(part, U0[rows]), tmp_path)
     torch.testing.assert_close(alone.U, first.U[rows], rtol=1e-9, atol=1e-9)
+
+
+@needs_acados
+def test_acados_ends_at_its_limit(tmp_path: Path) -> None:
+    """A limit below 0 s is exceeded by any solve."""
+    problem, U0 = planar_batch(B=1, N=30, obstacles=3, seed=2)
+    program = acados_peer.program_of(problem)
+    with pytest.raises(TimeoutError, match="longer than -1 s"):
+        acados_peer.fly(problem, *guess(problem, U0), tmp_path, program, limit=-1)
+    assert int(acados_peer.fly(problem, *guess(problem, U0), tmp_path, program, limit=60).status[0]) == 0
 
 
 @needs_acados

@@ -7,8 +7,9 @@ of CasADi can't read each other's own files.
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ import torch
 from torch import Tensor
 
 from torchgco.baselines.nlp import Program, transcribe
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.errors import InputError
 from torchgco.problem import Problem
@@ -49,16 +52,32 @@ def installed() -> bool:
     return version() != "not installed"
 
 
-def fly(problem: Problem, X: Tensor, U: Tensor, folder: Path) -> Answer:
+def fly(
+    problem: Problem,
+    X: Tensor,
+    U: Tensor,
+    folder: Path,
+    program: Program | None = None,
+    limit: int | None = None,
+) -> Answer:
     """Solve all problems, one after the other, from the guesses X (B, N+1, n) and U (B, N, m).
+
+    Args:
+        problem, X, U: the problems and their guesses.
+        folder: where files are written and code is compiled; a form that was compiled there isn't compiled again.
+        program: as for `write`.
+        limit: s of processor time per problem. None: no limit.
 
     Raises:
         InputError: a problem that can't be written down for acados.
+        TimeoutError: a problem took longer than `limit`.
         RuntimeError: acados failed; the message holds the end of its output.
     """
-    write(problem, X, U, folder)
-    python = str(ENVIRONMENT / "bin" / "python")
-    done = subprocess.run([python, str(WORKER), str(folder)], capture_output=True, text=True)
+    write(problem, X, U, folder, program)
+    command = [str(ENVIRONMENT / "bin" / "python"), str(WORKER), str(folder)]
+    done = subprocess.run(command + ([] if limit is None else [str(limit)]), capture_output=True, text=True)
+    if done.returncode == -signal.SIGXCPU:
+        raise TimeoutError(f"acados took longer than {limit} s")
     if done.returncode != 0 or not (folder / "answer.npz").is_file():
         raise RuntimeError(f"acados ended with {done.returncode}: {(done.stdout + done.stderr)[-2000:]}")
     return read(folder)
@@ -71,17 +90,26 @@ def read(folder: Path) -> Answer:
     return Answer(torch.from_numpy(found.pop("U")), setup=float(found.pop("setup")), **found)
 
 
-def write(problem: Problem, X: Tensor, U: Tensor, folder: Path) -> None:
+def program_of(problem: Problem) -> Program:
+    """The program of a batch, with moving spheres as resting ones: they differ from knot to knot in their numbers."""
+    return transcribe(_at_knots(problem, 0) if _moving(problem) else problem)
+
+
+def write(problem: Problem, X: Tensor, U: Tensor, folder: Path, program: Program | None = None) -> None:
     """Write the problems in the format of the worker (see its docstring).
+
+    Args:
+        problem, X, U, folder: as for `fly`.
+        program: `program_of` problems of the same form, which saves the time to build it.
 
     Raises:
         InputError: a cost that isn't diagonal and quadratic, bounds on states, unbounded controls, rows that differ
-            from knot to knot.
+            from knot to knot, other than by the motion of spheres; a program of another form.
     """
-    program = transcribe(problem)
+    program = program_of(problem) if program is None else program
     B, N, n, m = problem.B, problem.N, problem.n, problem.m
-    p = np.stack([program.values(problem, b) for b in range(B)])
-    bounds = np.stack([np.stack(program.limits.bounds(p[b], N * (n + m) + n)) for b in range(B)])
+    p = _parameters(problem, program)
+    bounds = np.stack([np.stack(program.limits.bounds(p[b, 0], N * (n + m) + n)) for b in range(B)])
     stages = bounds[:, :, : N * (n + m)].reshape(B, 2, N, n + m)
     if np.isfinite(stages[..., :n]).any() or np.isfinite(bounds[:, :, -n:]).any():
         raise InputError("constraints", "no bounds on states, for acados", "some")
@@ -94,6 +122,39 @@ def write(problem: Problem, X: Tensor, U: Tensor, folder: Path) -> None:
     np.savez(
         folder / "problems.npz", p=p, x0=problem.x0.numpy(), lower=lower, upper=upper, X=X.numpy(), U=U.numpy(),
         **_cost(problem),
+    )  # fmt: skip
+
+
+def _parameters(problem: Problem, program: Program) -> np.ndarray:
+    """The programs' numbers (B, K, P), for K = N + 1 knots where spheres move, else K = 1."""
+    if _moving(problem):
+        of_problems = []
+        for b in range(problem.B):
+            still = _at_knots(problem, b)
+            own = program.of(still)
+            of_problems.append([own.values(still, k) for k in range(problem.N + 1)])
+        return np.array(of_problems)
+    own = program.of(problem)
+    return np.array([[own.values(problem, b)] for b in range(problem.B)])
+
+
+def _moving(problem: Problem) -> bool:
+    return any(isinstance(c, BoundSpheres) and c.moving for c in problem.constraints)
+
+
+def _at_knots(problem: Problem, b: int) -> Problem:
+    """Problem b once per knot 0..N, with its spheres at rest where they are at that knot."""
+    part = problem.take(torch.full((problem.N + 1,), b))
+    return replace(part, constraints=[_resting(constraint, problem.N) for constraint in part.constraints])
+
+
+def _resting(constraint: Constraint, N: int) -> Constraint:
+    if not isinstance(constraint, BoundSpheres) or constraint.velocities is None:
+        return constraint
+    t = constraint.dt * torch.arange(N + 1, dtype=constraint.centers.dtype).view(-1, 1, 1)
+    return BoundSpheres.prepare(
+        constraint.centers + t * constraint.velocities, constraint.inflated_radii, None, constraint.absent,
+        constraint.vehicle_radius, constraint.knots, constraint.position, constraint.dt,
     )  # fmt: skip
 
 

@@ -1,18 +1,21 @@
-"""acados on the problems in a folder: `python acados_worker.py FOLDER`, in a separate environment.
+"""acados on the problems in a folder: `python acados_worker.py FOLDER [LIMIT]`, in a separate environment.
 
 That environment has only acados' wheel and NumPy, as the wheel contains a CasADi that would shadow torchgco's.
 So nothing of torchgco is imported here; `acados_peer.py` writes the folder and reads the answer.
 
     form.json      N, n, m; step, rows, last_rows: functions of (x, u, p) by instructions; equality, last_equality
-    problems.npz   p (B, P), x0 (B, n), lower, upper (B, N, m), weight, reference (B, n + m), last_weight,
-                   last_reference (B, n), X (B, N+1, n), U (B, N, m)
+    problems.npz   p (B, K, P), K = N+1 or 1 for all knots, x0 (B, n), lower, upper (B, N, m), weight,
+                   reference (B, n + m), last_weight, last_reference (B, n), X (B, N+1, n), U (B, N, m)
     answer.npz     U (B, N, m), status, iterations, wall, processor (B,), setup (): seconds
+
+LIMIT is the processor time per problem in seconds: the process is ended where a problem takes longer.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import resource
 import sys
 import time
 from pathlib import Path
@@ -26,7 +29,7 @@ ITERATIONS = 60  # of SQP
 NO_BOUND = 1e9  # the open side of an inequality
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, limit: int | None = None) -> None:
     template = _acados()
     text = (folder / "form.json").read_text()
     form = json.loads(text)
@@ -40,7 +43,7 @@ def main(folder: Path) -> None:
     solver = template.AcadosOcpSolver(program, json_file="program.json", generate=new, build=new, verbose=False)
     built.write_text(text)
     setup = time.perf_counter() - began
-    flights = [_fly(solver, form, problems, b) for b in range(len(problems.x0))]
+    flights = [_fly(solver, form, problems, b, limit) for b in range(len(problems.x0))]
     names = ("U", "status", "iterations", "wall", "processor")
     answer = {name: np.stack(values) for name, values in zip(names, zip(*flights, strict=True), strict=True)}
     np.savez(folder / "answer.npz", setup=setup, **answer)
@@ -74,12 +77,12 @@ def _program(template: Any, form: dict[str, Any], problems: SimpleNamespace) -> 
     import casadi as ca
 
     N, n, m = form["N"], form["n"], form["m"]
-    x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", problems.p.shape[1])
+    x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", problems.p.shape[-1])
     ocp = template.AcadosOcp()
     model, cost, constraints, options = ocp.model, ocp.cost, ocp.constraints, ocp.solver_options
     model.name, model.x, model.u, model.p = "torchgco_form", x, u, p
     model.disc_dyn_expr = replay(form["step"], x, u, p)
-    ocp.dims.N, ocp.parameter_values = N, problems.p[0]
+    ocp.dims.N, ocp.parameter_values = N, problems.p[0, 0]
 
     cost.cost_type = cost.cost_type_e = "LINEAR_LS"
     cost.Vx, cost.Vu = np.eye(n + m, n), np.eye(n + m, m, -n)
@@ -108,12 +111,12 @@ def _sides(equality: list[bool]) -> tuple[np.ndarray, np.ndarray]:
     return np.where(equality, 0.0, -NO_BOUND), np.zeros(len(equality))
 
 
-def _fly(solver: Any, form: dict[str, Any], problems: SimpleNamespace, b: int) -> tuple:
+def _fly(solver: Any, form: dict[str, Any], problems: SimpleNamespace, b: int, limit: int | None) -> tuple:
     """Set the numbers of problem b, untimed, then solve it, timed."""
-    N = form["N"]
+    N, own = form["N"], problems.p[b]
     solver.reset()
     for k in range(N + 1):
-        solver.set(k, "p", problems.p[b])
+        solver.set(k, "p", own[min(k, len(own) - 1)])
         solver.set(k, "x", problems.X[b, k])
         last = k == N
         weight, reference = (problems.last_weight, problems.last_reference) if last else (
@@ -126,6 +129,10 @@ def _fly(solver: Any, form: dict[str, Any], problems: SimpleNamespace, b: int) -
             solver.set(k, "ubu", problems.upper[b, k])
     for side in ("lbx", "ubx"):
         solver.set(0, side, problems.x0[b])
+    if limit is not None:
+        end = int(time.process_time()) + 1 + limit
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_CPU, (end, resource.getrlimit(resource.RLIMIT_CPU)[1]))
     wall, processor = time.perf_counter(), time.process_time()
     status = solver.solve()
     wall, processor = time.perf_counter() - wall, time.process_time() - processor
@@ -155,4 +162,4 @@ def replay(function: dict[str, Any], *inputs: Any) -> Any:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]).resolve())
+    main(Path(sys.argv[1]).resolve(), *(int(word) for word in sys.argv[2:]))

@@ -86,6 +86,19 @@ def test_the_program_is_the_same_alone_and_in_a_batch() -> None:
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
+def test_a_prepared_program_serves_other_problems_of_its_form(plugin: str, solved) -> None:
+    problem, U0 = three_problems()
+    first, last = (torch.tensor([b]) for b in (0, 2))
+    other = problem.take(last)
+    prepared = CasADiSolver(plugin).prepare(problem.take(first)).of(other)
+    assert torch.equal(prepared.solve(other, U0[last]).U, solved[plugin].U[last])
+    plain, _ = planar_batch(B=1, N=30, obstacles=4)
+    for different in (plain, Problem(other.dynamics, other.cost, other.constraints[1:], other.x0, 30)):
+        with pytest.raises(InputError, match="another form"):
+            prepared.of(different)
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
 def test_a_bad_start_affects_its_own_problem_alone(plugin: str) -> None:
     problem, U0 = planar_batch(B=4, N=12, obstacles=2, seed=1)
     x0 = problem.x0.clone()

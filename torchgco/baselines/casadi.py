@@ -118,6 +118,15 @@ class PreparedCasADi(Solver):
         X0 = open_loop(problem.dynamics, problem.x0, U0)
         return self._all(torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1)), U0, call.callback)
 
+    def of(self, problem: Problem) -> PreparedCasADi:
+        """The same solver for other problems of the same form: only the parts' own numbers may differ.
+
+        Raises:
+            InputError: a problem of another form.
+        """
+        check_problem(problem)
+        return replace(self, problem=problem, program=self.program.of(problem))
+
     def run_from(self, X0: Tensor, U0: Tensor) -> Solution:
         """Solve from states X0 (B, N+1, n) that the controls U0 (B, N, m) need not lead to, such as waypoints.
 

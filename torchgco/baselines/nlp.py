@@ -7,7 +7,7 @@ then the constraint rows of knot k. Interior-point solvers for optimal control f
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.errors import InputError
 from torchgco.problem import Problem
 from torchgco.tracing import Traced, own_tensors
 from torchgco.tree import PerElement
@@ -40,6 +41,18 @@ class Program:
         index = torch.tensor([b], device=problem.x0.device)
         own = [source.parameters(index) for source in self.sources]
         return np.concatenate([problem.x0[b].double().cpu().numpy(), *own])
+
+    def of(self, problem: Problem) -> Program:
+        """The same program for other problems, whose parts differ from those of the first in their own numbers alone.
+
+        Raises:
+            InputError: problems that differ in more, such as sizes, knots, or kinds of parts; errors of `transcribe`.
+        """
+        step, cost, constraints = _traces(problem)
+        sources = (step, cost, *constraints)
+        if [source.fingerprint() for source in sources] != [source.fingerprint() for source in self.sources]:
+            raise InputError("problem", "one of the form that was prepared", "another form")
+        return replace(self, sources=sources)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,270 @@
+"""python -m benchmarks.worlds_peers: FATROP, IPOPT and acados in the worlds, from rest and from the roadmap's path.
+
+They take seconds to minutes per problem, so they aren't flown with `gco`: every flight is kept as a row of
+benchmarks/data/worlds/peers.csv, which `benchmarks.worlds` reads. Rows that are there aren't flown again, so that a
+stopped run resumes. Every flight is a process of its own, which ends at a limit of processor time; building the program
+and compiling it isn't counted, computing the guess is. Among moving obstacles there is no path, and nothing guided.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import multiprocessing
+import resource
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from time import process_time
+
+import pandas as pd
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from benchmarks.families import DATA, WORLDS, Family
+from benchmarks.speed import acados_peer
+from benchmarks.speed.provenance import provenance
+from torchgco import Problem, compose, judge, presets
+from torchgco.baselines import CasADiSolver, GuidedCasADi
+from torchgco.baselines.casadi import PreparedCasADi
+from torchgco.baselines.nlp import Program
+from torchgco.constraints import Obstacles
+from torchgco.experiments.identity import layout_digests
+from torchgco.rollout import open_loop
+from torchgco.scenarios import Task
+from torchgco.status import Status
+
+FILE = DATA / "worlds" / "peers.csv"
+# By the program that they share: acados gets FATROP's.
+SOLVERS = {
+    "fatrop": ("fatrop", "fatrop_guided", "acados", "acados_guided"),
+    "ipopt": ("ipopt", "ipopt_guided"),
+}
+NAMES = tuple(name for names in SOLVERS.values() for name in names)
+COLUMNS: tuple[str, ...] = (
+    "world", "solver", "guess", "layout", "layout_digest", "status", "reached", "sound", "cost", "violation",
+    "clearance", "seconds", "limit", "iterations", "version", "date", "commit",
+)  # fmt: skip
+ACADOS_STATUS = {0: Status.CONVERGED.name, 2: Status.MAX_ITERATIONS.name}
+LIMIT = 120  # s of processor time per problem
+BLOCK = 4  # layouts of every world and solver before the next ones: a program is built once per block
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    asked = _parser().parse_args(words)
+    torch.set_num_threads(1)
+    origin = provenance("cpu")
+    with tempfile.TemporaryDirectory() as folder:
+        for begin in range(0, asked.layouts, asked.block):
+            block = range(begin, min(begin + asked.block, asked.layouts))
+            for name in asked.worlds:
+                world = World.of(WORLDS[name], Path(folder) / name)
+                for row in flights(world, asked.solvers, block, asked.limit, asked.file):
+                    append(asked.file, row | {"date": origin["date"], "commit": origin["commit"]})
+                    print(*(row[column] for column in COLUMNS[:-2] if column in row), flush=True)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.worlds_peers", description="Fly the worlds' peers.")
+    parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
+    parser.add_argument("--solvers", nargs="+", default=list(NAMES), choices=NAMES, metavar="NAME")
+    parser.add_argument("--layouts", type=int, default=32, metavar="N", help="the first N of each world")
+    parser.add_argument("--limit", type=int, default=LIMIT, metavar="SECONDS", help="of processor time per problem")
+    parser.add_argument("--block", type=int, default=BLOCK, metavar="N", help="layouts of all worlds before the next")
+    parser.add_argument("--file", type=Path, default=FILE, help="where the rows are kept")
+    return parser
+
+
+def rows_of(file: Path) -> pd.DataFrame:
+    """The kept rows; none where there is no file."""
+    return pd.read_csv(file) if file.is_file() else pd.DataFrame(columns=pd.Index(COLUMNS))
+
+
+def append(file: Path, row: dict[str, object]) -> None:
+    """Add a row to the file, which is complete again when this returns."""
+    new = not file.is_file()
+    with file.open("a", newline="") as handle:
+        writer = csv.DictWriter(handle, COLUMNS)
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+@dataclass
+class World:
+    """The layouts of a world as problems, padded to the same number of obstacles, as `gco` flies them, too."""
+
+    name: str
+    task: Task
+    digests: dict[int, str]
+    folder: Path  # where acados compiles
+
+    @classmethod
+    def of(cls, family: Family, folder: Path) -> World:
+        setup = compose(family.overrides())
+        task = setup.task()
+        vehicle = OmegaConf.to_container(setup.config.model.vehicle, resolve=True)
+        assert isinstance(vehicle, dict)
+        return cls(family.name, task, layout_digests(task.layouts, {str(k): v for k, v in vehicle.items()}), folder)
+
+    def problem(self, layout: int) -> Problem:
+        return self.task.problem.take(torch.tensor([layout]))
+
+    @property
+    def moving(self) -> bool:
+        return any(isinstance(c, Obstacles) and c.moving for c in self.task.problem.constraints)
+
+
+def flights(
+    world: World, solvers: Sequence[str], layouts: Sequence[int], limit: int, file: Path
+) -> Iterator[dict[str, object]]:
+    """The rows that the file lacks, one after the other, without date and commit."""
+    keys = ["world", "solver", "layout", "layout_digest"]
+    known = {tuple(key) for key in rows_of(file)[keys].itertuples(index=False)}
+    for plugin, names in SOLVERS.items():
+        lacking = [
+            (name, layout)
+            for layout in layouts
+            for name in names
+            if name in solvers
+            and (world.name, name, layout, world.digests[layout]) not in known
+            and not (name.endswith("guided") and world.moving)
+            and not (name.startswith("acados") and not acados_peer.installed())
+        ]
+        if not lacking:
+            continue
+        began = process_time()
+        peers = Peers.ready(world, plugin, {name for name, _ in lacking})
+        print(f"{world.name}: set-up of {plugin} took {process_time() - began:.0f} s", flush=True)
+        for name, layout in lacking:
+            yield _judged(world, name, layout, peers.fly(name, layout, limit)) | {"limit": limit}
+
+
+@dataclass
+class Flight:
+    """What one solver returned for one layout; no controls where it didn't return."""
+
+    U: Tensor | None  # (1, N, m)
+    status: str
+    seconds: float  # of processor time
+    iterations: int | None
+    follows: bool = False  # whether the guess follows a path
+
+
+def _judged(world: World, name: str, layout: int, flight: Flight) -> dict[str, object]:
+    task, rows = world.task, torch.tensor([layout])
+    held: dict[str, object] = {
+        "world": world.name, "solver": name, "guess": "path" if flight.follows else "rest", "layout": layout,
+        "layout_digest": world.digests[layout], "status": flight.status, "reached": False, "sound": False,
+        "seconds": f"{flight.seconds:.4g}", "iterations": flight.iterations,
+        "version": f"acados {acados_peer.version()}" if name.startswith("acados") else f"CasADi {version('casadi')}",
+    }  # fmt: skip
+    if flight.U is not None:
+        verdict = judge(world.problem(layout), flight.U, task.goal[rows], task.goal_radius)
+        for column in ("reached", "sound"):
+            held[column] = bool(getattr(verdict, column))
+        for column in ("cost", "violation", "clearance"):
+            held[column] = f"{float(getattr(verdict, column)):.9g}"
+    return held
+
+
+@dataclass
+class Peers:
+    """The solvers that share a world's program, ready to fly."""
+
+    world: World
+    prepared: PreparedCasADi | None
+    guided: GuidedCasADi
+    program: Program | None  # acados's
+
+    @classmethod
+    def ready(cls, world: World, plugin: str, names: set[str]) -> Peers:
+        """The program of the first layout, which serves all others of its world."""
+        first = world.problem(0)
+        prepared = program = None
+        if plugin in {name.removesuffix("_guided") for name in names}:
+            solver = presets.PRESETS[plugin](first)
+            assert isinstance(solver, CasADiSolver)
+            prepared = solver.prepare(first)
+        if any(name.startswith("acados") for name in names):
+            shared = None if prepared is None or world.moving else prepared.program
+            program = acados_peer.program_of(first) if shared is None else shared
+        guided = presets.fatrop_guided(first)
+        if any(name.endswith("guided") for name in names):
+            guided.guess(first, world.task.U0[:1])  # compiles
+        return cls(world, prepared, guided, program)
+
+    def fly(self, name: str, layout: int, limit: int) -> Flight:
+        """One flight, in a process of its own."""
+        problem, U0 = self.world.problem(layout), self.world.task.U0[layout : layout + 1]
+        guided = self.guided if name.endswith("guided") else None
+        if name.startswith("acados"):
+            return self._acados(problem, U0, guided, limit)
+        assert self.prepared is not None
+        return _limited(self.prepared.of(problem), U0, guided, limit)
+
+    def _acados(self, problem: Problem, U0: Tensor, guided: GuidedCasADi | None, limit: int) -> Flight:
+        began = process_time()
+        U, follows = _guess(problem, U0, guided)
+        seconds = process_time() - began
+        X = open_loop(problem.dynamics, problem.x0, U)
+        X = torch.where(torch.isfinite(X), X, problem.x0.unsqueeze(1))
+        try:
+            answer = acados_peer.fly(problem, X, U, self.world.folder, self.program, limit)
+        except TimeoutError:
+            return _late(limit, follows)
+        status = int(answer.status[0])
+        ended = ACADOS_STATUS.get(status, f"acados {status}")
+        return Flight(answer.U, ended, seconds + float(answer.processor[0]), int(answer.iterations[0]), follows)
+
+
+def _guess(problem: Problem, U0: Tensor, guided: GuidedCasADi | None) -> tuple[Tensor, bool]:
+    """Controls along the cheapest path, where there is one, else U0."""
+    if guided is None:
+        return U0, False
+    guess = guided.guess(problem, U0)
+    return guess.U, bool(guess.found)
+
+
+def _late(limit: int, follows: bool) -> Flight:
+    return Flight(None, Status.TIME_LIMIT.name, limit, None, follows)
+
+
+def _limited(prepared: PreparedCasADi, U0: Tensor, guided: GuidedCasADi | None, limit: int) -> Flight:
+    """A solve in a child, which shares the program that was built here: FATROP may hang within an iteration."""
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+
+    def solve() -> None:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
+        began = process_time()
+        U, follows = _guess(prepared.problem, U0, guided)
+        sender.send(follows)
+        solution = prepared.solve(prepared.problem, U)
+        sender.send((solution.U.numpy(), solution.statuses[0].name, process_time() - began, int(solution.iterations)))
+
+    child = context.Process(target=solve)
+    child.start()
+    sender.close()
+    follows = False
+    try:
+        follows = receiver.recv()
+        U, status, seconds, iterations = receiver.recv()
+        return Flight(torch.from_numpy(U), status, seconds, iterations, follows)
+    except EOFError:  # ended by its limit, or by a fault of the solver
+        child.join()
+        late = child.exitcode in (-signal.SIGXCPU, -signal.SIGKILL)
+        return _late(limit, follows) if late else Flight(None, f"ended with {child.exitcode}", limit, None, follows)
+    finally:
+        child.join()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
