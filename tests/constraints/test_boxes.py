@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -40,6 +42,23 @@ def points(d: int, count: int, seed: int = 1) -> Tensor:
     return torch.as_tensor(np.random.default_rng(seed).uniform(-2, 2, (1, count, d)))
 
 
+def one_by_one(boxes: BoundBoxes, a: Tensor, b: Tensor) -> Tensor:
+    """Distances (E, M) of segments a to b (1, E, d), each as if there were no other box and no other segment."""
+    segments, columns = range(a.shape[1]), []
+    for i in range(boxes.absent.shape[1]):
+        others = torch.arange(boxes.absent.shape[1]) != i
+        box = replace(boxes, absent=boxes.absent | others)
+        columns.append([float(box.segment_clearance(a[:, e : e + 1], b[:, e : e + 1])[0, 0, i]) for e in segments])
+    return torch.tensor(columns, dtype=a.dtype).T
+
+
+def check_bounds(boxes: BoundBoxes, found: Tensor, alone: Tensor) -> None:
+    """Of all together, distances within a margin of the smallest are exact, the others at most as large."""
+    near = alone <= alone.min() + boxes.margins.amax()
+    torch.testing.assert_close(found[near], alone[near], rtol=0, atol=1e-12)
+    assert bool((found <= alone + 1e-12).all()) and bool((found[~near] > alone.min()).all()) and bool(near.any())
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_distances_by_hand(d: int) -> None:
     boxes, (centers, half, rotations) = bound(d)
@@ -57,7 +76,7 @@ def test_segments_by_hand(d: int) -> None:
     a, b = points(d, 25, seed=2), points(d, 25, seed=3)
     b[:, :5] = a[:, :5]  # segments of no length
     b[:, 5:10, 1:] = a[:, 5:10, 1:]  # along the first axis
-    found = boxes.segment_clearance(a, b)
+    found, alone = boxes.segment_clearance(a, b), one_by_one(boxes, a, b)
     cuboids = boxes.inflated().boxes
     assert cuboids is not None
     squares = cuboids.squares_from_segments(a, b)
@@ -65,8 +84,9 @@ def test_segments_by_hand(d: int) -> None:
         for i in range(len(centers)):
             ends = a[0, e].numpy(), b[0, e].numpy()
             sampled = brute_force.segment_distance(*ends, centers[i], half[i], rotations[i], samples=801)
-            assert sampled - 3e-3 <= float(found[0, e, i]) + 0.1 <= sampled + 1e-12
-            assert float(squares[0, e, i]) ** 0.5 == pytest.approx(max(float(found[0, e, i]) + 0.1, 0.0), abs=1e-7)
+            assert sampled - 3e-3 <= float(alone[e, i]) + 0.1 <= sampled + 1e-12
+            assert float(squares[0, e, i]) ** 0.5 == pytest.approx(max(float(alone[e, i]) + 0.1, 0.0), abs=1e-7)
+    check_bounds(boxes, found[0], alone)
 
 
 @pytest.mark.parametrize("d", [2, 3])

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.constraints.test_boxes import check_bounds, one_by_one
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch, random_trajectory
 from tests.reference import boxes as brute_force
 from torchgco import Boxes, Capsules, Constraint, InputError, Problem, Spheres
@@ -88,7 +89,9 @@ def test_segments_against_dense_samples(d: int) -> None:
     a, b = points(d, 10, seed=2), points(d, 10, seed=3)
     b[:, 0] = a[:, 0]  # a segment of no length
     a[:, 1:6], b[:, 1:6] = torch.as_tensor(centers[:5]) - 0.2, torch.as_tensor(centers[:5]) + 0.2  # through the middles
-    found = boxes.segment_clearance(a, b)[0].numpy() + VEHICLE
+    alone = one_by_one(boxes, a, b)
+    check_bounds(boxes, boxes.segment_clearance(a, b)[0], alone)
+    found = alone.numpy() + VEHICLE
     for e in range(10):
         for i in range(len(centers)):
             ends, box = (a[0, e].numpy(), b[0, e].numpy()), (centers[i], half[i], rotations[i], radii[i])
@@ -136,7 +139,7 @@ def test_a_capsule_without_length_is_as_far_as_a_sphere(d: int) -> None:
         torch.testing.assert_close(kind.signed_distance(p, t), spheres.signed_distance(p, t))
         torch.testing.assert_close(kind.margins, spheres.margins)
         a, b = p[:, :25], p[:, 25:]
-        torch.testing.assert_close(kind.segment_clearance(a, b), spheres.segment_clearance(a, b))
+        torch.testing.assert_close(one_by_one(kind, a, b), spheres.segment_clearance(a, b)[0])
 
 
 @pytest.mark.parametrize("d", [2, 3])

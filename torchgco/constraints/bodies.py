@@ -54,7 +54,10 @@ class Obstacles(Constraint):
         raise NotImplementedError
 
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
-        """Smallest distances (B, E, M), m, of the straight segments from a to b (B, E, d), from obstacles at t = 0."""
+        """Smallest distances (B, E, M), m, of the straight segments from a to b (B, E, d), from obstacles at t = 0.
+
+        A lower bound will do where it exceeds the smallest of the problem by more than its largest margin.
+        """
         raise NotImplementedError
 
     def inflated(self) -> Inflated | None:

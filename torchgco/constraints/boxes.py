@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
-from torchgco.constraints.bodies import Inflated, Obstacles
+from torchgco.constraints.bodies import Inflated, Obstacles, least
 from torchgco.constraints.cuboids import Cuboids, excess, segment_distance, signed_distance
 from torchgco.constraints.obstacles import FAR, per_problem, vehicle_radius
 from torchgco.errors import InputError
@@ -154,9 +154,18 @@ class BoundBoxes(Obstacles):
 
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
         boxes = self._cuboids()
-        along = boxes.local([(b - a)[..., None, j] for j in range(a.shape[-1])])
-        distance = segment_distance(boxes.seen_from(a), along, boxes.halves()) - self.inflated_radii.unsqueeze(1)
-        return torch.where(self.absent.unsqueeze(1), torch.inf, distance)
+        begin, end, half = boxes.seen_from(a), boxes.seen_from(b), boxes.halves()
+        ends = signed_distance(begin, half), signed_distance(end, half)
+        # The distance changes no faster than the point moves. Of many pairs this shows that others are nearer.
+        radii, length = self.inflated_radii.unsqueeze(1), (b - a).square().sum(-1, keepdim=True).sqrt()
+        distance = 0.5 * (ends[0] + ends[1] - length) - radii
+        gap = (torch.minimum(*ends) - radii).masked_fill(self.absent.unsqueeze(1), torch.inf)
+        most = least(gap) + self.inflated_radii.amax(-1) if gap.numel() > 0 else least(gap)
+        i, e, j = ((distance <= most.view(-1, 1, 1)) & ~self.absent.unsqueeze(1)).nonzero(as_tuple=True)
+        start, stop = [x[i, e, j] for x in begin], [x[i, e, j] for x in end]
+        along, sides = [y - x for x, y in zip(start, stop, strict=True)], [h[i, 0, j] for h in half]
+        distance[i, e, j] = segment_distance(start, along, sides) - self.inflated_radii[i, j]
+        return distance.masked_fill(self.absent.unsqueeze(1), torch.inf)
 
     def grown(self, by: Tensor) -> Self:
         more = torch.where(self.absent, 0.0, by.unsqueeze(-1))
