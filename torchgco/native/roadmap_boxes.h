@@ -67,11 +67,25 @@ static inline double square_of_segment(const double *box, const double *start, c
     return square_at(half, begin, along, falls < 0.0 ? low + (high - low) * part : low, &found);
 }
 
+/* The extent of some segments from a to a + along. */
+static inline void extent(int count, double a[DIM][count], double along[DIM][count], double *least, double *most) {
+    for (int i = 0; i < DIM; i++) {
+        least[i] = INFINITY, most[i] = -INFINITY;
+        for (int e = 0; e < count; e++) {
+            double start = a[i][e], end = start + along[i][e], low = start < end ? start : end;
+            double high = start < end ? end : start;
+            least[i] = low < least[i] ? low : least[i];
+            most[i] = high > most[i] ? high : most[i];
+        }
+    }
+}
+
 /* Lowers `gap`, the distances of segments from a to a + along from the surface, and `open`, a measure with the same
-   sign. Distances above `margin` don't count: the segments whose extent shows that they are so far are left out. */
+   sign. Distances above `margin` don't count: the segments whose extent, or that of all together (`least`, `most`),
+   shows that they are so far are left out, as well as those that another box blocks. */
 static inline void measure_box(
-    const double *box, int count, double a[DIM][count], double along[DIM][count], double margin, double *gap,
-    double *open
+    const double *box, int count, double a[DIM][count], double along[DIM][count], const double *least,
+    const double *most, double margin, double *gap, double *open
 ) {
     const double *axes = box + DIM, *half = BOX_HALF(box), radius = BOX_RADIUS(box);
     double low[DIM], high[DIM];
@@ -80,10 +94,11 @@ static inline void measure_box(
         for (int j = 0; j < DIM; j++) reach += fabs(axes[j * DIM + i]) * half[j];
         reach += 1e-9 * (fabs(reach) + fabs(box[i])); /* more than rounding */
         low[i] = box[i] - reach, high[i] = box[i] + reach;
+        if (least[i] > high[i] || most[i] < low[i]) return;
     }
     for (int e = 0; e < count; e++) {
         double start[DIM], step[DIM];
-        int near = 1;
+        int near = open[e] > 0.0;
         for (int i = 0; i < DIM; i++) {
             double end = a[i][e] + along[i][e];
             start[i] = a[i][e], step[i] = along[i][e];

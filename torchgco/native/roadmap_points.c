@@ -236,7 +236,7 @@ static void measure(
 ) {
     double margin = s->margin * (o->largest < 1e-9 ? 1e-9 : o->largest), whole = 0.0;
     for (int i = 0; i < DIM; i++) whole += (p[DIM + i] - p[i]) * (p[DIM + i] - p[i]);
-    double least = s->least * sqrt(whole);
+    double shortest = s->least * sqrt(whole);
     int64_t from = 0, slot = 0;
     for (int64_t first = 0; first < n * k; first += BLOCK) {
         double a[DIM][BLOCK], along[DIM][BLOCK], square[BLOCK], inverse[BLOCK], gap[BLOCK], open[BLOCK];
@@ -262,11 +262,14 @@ static void measure(
                 open[e] = more < open[e] ? more : open[e];
             }
 #if BOXES
-        for (int64_t m = 0; m < o->boxes; m++) measure_box(o->box + m * BOX_NUMBERS, BLOCK, a, along, margin, gap, open);
+        double least[DIM], most[DIM];
+        extent(BLOCK, a, along, least, most);
+        for (int64_t m = 0; m < o->boxes; m++)
+            measure_box(o->box + m * BOX_NUMBERS, BLOCK, a, along, least, most, margin, gap, open);
 #endif
         for (int e = 0; e < BLOCK && first + e < n * k; e++) {
             double close = 1.0 + CLAMP((margin - gap[e]) / margin, 0.0, 1.0);
-            lengths[first + e] = ends[first + e] >= 0 && open[e] > 0 ? (sqrt(square[e]) + least) * close : INFINITY;
+            lengths[first + e] = ends[first + e] >= 0 && open[e] > 0 ? (sqrt(square[e]) + shortest) * close : INFINITY;
         }
     }
 }

@@ -25,7 +25,7 @@ class Scene:
     goal: Tensor  # (B, d)
     centers: Tensor  # (B, M, d)
     inflated_radii: Tensor  # (B, M): r_obs + r_veh, FAR where absent
-    traversal_cost: Callable[[Tensor, slice], Tensor]  # per metre at points (B', V, d) of some problems, (B', V)
+    traversal_cost: Callable[[Tensor, Tensor], Tensor]  # per metre at points (B', V, d) of some problems, (B', V)
     boxes: Cuboids | None = None
 
     @property

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchgco.native import roadmap
-from torchgco.native.roadmap import Graph, NativeSearch
+from torchgco.native.roadmap import NativeSearch
 from torchgco.options import AtLeast, Below, check_options
 from torchgco.search.geometry import Scene
 from torchgco.search.graph import Search
@@ -63,32 +63,31 @@ class Roadmap:
         """
         library = roadmap.library_for(scene.centers, scene.boxes is not None)
         most = AT_ONCE if library is None else roadmap.AT_ONCE
-        B = scene.start.shape[0]
-        parts = [self._paths(scene, slice(i, i + most), count, library) for i in range(0, max(B, 1), most)]
+        everyone = torch.arange(scene.start.shape[0], device=scene.start.device)
+        parts = [self._paths(scene, rows, count, library) for rows in everyone.split(most)]
         return torch.cat([path for path, _ in parts]), torch.cat([found for _, found in parts])
 
-    def _paths(self, scene: Scene, rows: slice, count: int, library: CDLL | None) -> tuple[Tensor, Tensor]:
+    def _paths(self, scene: Scene, rows: Tensor, count: int, library: CDLL | None) -> tuple[Tensor, Tensor]:
+        """Paths of the problems in `rows`; see `paths`."""
+        paths, found, is_full = self._search(scene, rows, count, library, NODES, NEIGHBOURS)
+        straight = length(torch.stack((scene.start[rows], scene.goal[rows]), dim=1))
+        again = (~found | (length(paths[:, 0]) > LONG * straight)).nonzero().flatten()
+        if is_full and again.numel() > 0:
+            more, arrives, _ = self._search(scene, rows[again], count, library, MANY_NODES, MANY_NEIGHBOURS)
+            paths[again[arrives]], found[again[arrives]] = more[arrives], True
+        return paths, found
+
+    def _search(
+        self, scene: Scene, rows: Tensor, count: int, library: CDLL | None, nodes: int, neighbours: int
+    ) -> tuple[Tensor, Tensor, bool]:
+        """Paths (B', count, HOPS+1, d) over a graph of the problems in `rows`, where there are any (B'), and whether
+        there were as many points around obstacles as the graph takes."""
         start, goal, o, R = (t[rows] for t in (scene.start, scene.goal, scene.centers, scene.inflated_radii))
         R = torch.where(R > 0, (1.0 - self.max_overlap) * R, R)
         boxes = None if scene.boxes is None else scene.boxes.rows(rows).cut(self.max_overlap)
         search = Search(o, R, MARGIN, boxes) if library is None else NativeSearch(library, o, R, MARGIN, boxes)
         cube = halton(self.num_halton, o.shape[-1]).to(o)
-
-        graph = search.graph(start, goal, cube, NODES, NEIGHBOURS, HALTON_NEIGHBOURS)
-        paths, found = self._cheapest(search, graph, scene, rows, count)
-        is_full = graph.points.shape[1] == 2 + len(cube) + NODES
-        again = ~found | (length(paths[:, 0]) > LONG * length(torch.stack((start, goal), dim=1)))
-        if is_full and bool(again.any()):
-            graph = search.graph(start, goal, cube, MANY_NODES, MANY_NEIGHBOURS, HALTON_NEIGHBOURS)
-            more, arrives = self._cheapest(search, graph, scene, rows, count)
-            again = again & arrives
-            paths, found = torch.where(again.view(-1, 1, 1, 1), more, paths), found | again
-        return paths, found
-
-    def _cheapest(
-        self, search: Search | NativeSearch, graph: Graph, scene: Scene, rows: slice, count: int
-    ) -> tuple[Tensor, Tensor]:
-        """Paths (B', count, HOPS+1, d) over a graph of the problems in `rows`, and where there are any (B',)."""
+        graph = search.graph(start, goal, cube, nodes, neighbours, HALTON_NEIGHBOURS)
         price = scene.traversal_cost(graph.points, rows)
         paths: list[Tensor] = []
         for _ in range(count):
@@ -100,7 +99,7 @@ class Roadmap:
                 path = torch.where(arrives.view(-1, 1, 1), path, paths[0])
             paths.append(path)
             price = search.raised(price, graph.points, path, 1.0 + DIVERSITY)
-        return torch.stack(paths, dim=1), found
+        return torch.stack(paths, dim=1), found, graph.points.shape[1] == 2 + len(cube) + nodes
 
 
 def length(path: Tensor) -> Tensor:

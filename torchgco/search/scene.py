@@ -34,7 +34,7 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
 
     first = _resting_cost(problem, rest, problem.x0[:, None, at]).clamp(min=1e-12)
 
-    def traversal_cost(points: Tensor, rows: slice) -> Tensor:
+    def traversal_cost(points: Tensor, rows: Tensor) -> Tensor:
         price = _resting_cost(problem, rest, points, rows)
         return price.clamp(min=0.0) / first[rows] + 0.1
 
@@ -97,7 +97,7 @@ def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:
     return torch.ones_like(signs).expand(first.shape[0], *signs.shape)
 
 
-def _resting_cost(problem: Problem, rest: Tensor, points: Tensor, rows: slice = slice(None)) -> Tensor:
+def _resting_cost(problem: Problem, rest: Tensor, points: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
     """Stage cost (B', V) of resting at points (B', V, d) of some problems."""
     x = problem.x0[rows].unsqueeze(1).repeat(1, points.shape[1], 1)
     x[..., problem.position] = points
