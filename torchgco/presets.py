@@ -52,7 +52,7 @@ def gco(space: Space) -> Restarts:
         local=_local(space),
         paths=PathProposals(
             roadmap=Roadmap(num_halton=128), num_paths=6, relax_top=3, arrive=(0.9,), smoothing=0.16, tube=None,
-            stiffness=(200.0,), track_iterations=10,
+            stiffness=(200.0,), track_iterations=10, max_gap=0.15,
         ),
         sampling=GCO(
             MPPI(
@@ -71,7 +71,7 @@ def gco_fast(space: Space) -> Restarts:
     assert solver.paths is not None and solver.sampling is not None
     paths = replace(
         solver.paths, num_paths=1, initial_offsets=(), arrive=solver.paths.paces[:1], track_iterations=10,
-        relax_iterations=0, relax_top=None, refine_top=1,
+        relax_iterations=0, relax_top=None, refine_top=1, max_gap=None,
     )  # fmt: skip
     sampling = replace(solver.sampling, sampler=replace(solver.sampling.sampler, samples=64, rounds=10))
     return replace(solver, paths=paths, sampling=sampling, attempts=1)
@@ -81,7 +81,7 @@ def gco_max(space: Space) -> Restarts:
     """Up to sixteen paths, the sixteen best candidates refined, then sampled attempts; the cheapest result is kept."""
     solver = gco(space)
     assert solver.paths is not None
-    paths = replace(solver.paths, num_paths=16, relax_top=None, refine_top=16)
+    paths = replace(solver.paths, num_paths=16, relax_top=None, refine_top=16, max_gap=None)
     return replace(solver, paths=paths, attempts=4, all_attempts=True)
 
 
@@ -137,7 +137,7 @@ def fatrop_guided(space: Space) -> GuidedCasADi:
     relaxed = 0 if _in_the_plane(space) else 20  # in the plane, relaxed candidates fall back into the trap
     paths = replace(
         paths, num_paths=4, initial_offsets=(), arrive=paths.paces[:1], relax_iterations=relaxed, relax_top=None,
-        refine_top=1, max_penetration=1.0,
+        refine_top=1, max_penetration=1.0, max_gap=None,
     )  # fmt: skip
     return GuidedCasADi(fatrop(space), paths)
 

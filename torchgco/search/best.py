@@ -21,7 +21,7 @@ class Best:
     def __init__(
         self, call: Call, first: SolveEnd, solver: AugmentedLagrangian, recorder: Recorder | None = None
     ) -> None:
-        self.call, self.first, self.solver, self.recorder = call, first, solver, recorder
+        self.call, self.solver, self.recorder = call, solver, recorder
         self.end = copied(first)
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
 
@@ -30,6 +30,11 @@ class Best:
         best = self.end.best
         fits = best.violation <= self.solver.violation_tolerance
         return fits & has_arrived(self.call.problem, best.X, tolerances)
+
+    def next_attempt(self) -> None:
+        """Count attempts in the trace, also those that no problem of this batch needs."""
+        if self.recorder is not None:
+            self.recorder.attempt += 1
 
     def improve(
         self,

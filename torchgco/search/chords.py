@@ -18,7 +18,7 @@ ROUNDS = 4  # solves at most, each with larger obstacles than the one before
 GROWTH = 1.1  # times the missing clearance: by how much obstacles grow in a round
 
 
-def clear_chords(best: Best, first_attempt: int) -> None:
+def clear_chords(best: Best) -> None:
     """Replace feasible trajectories that touch an obstacle between two knots by ones that keep clear of it.
 
     Obstacles grow by `GROWTH` times the missing clearance, in up to `ROUNDS` rounds, and the solve continues from the
@@ -27,17 +27,15 @@ def clear_chords(best: Best, first_attempt: int) -> None:
 
     Args:
         best: the trajectories so far; changed in place.
-        first_attempt: the number of the first round as an attempt in the trace.
     """
     problem, limit = best.call.problem, best.solver.violation_tolerance
     clearance = chord_clearance(problem, best.end.best.X)
     by = torch.zeros_like(clearance)
     rows = ((best.end.best.violation <= limit) & (clearance < 0)).nonzero().flatten()
-    for number in range(ROUNDS):
+    for _ in range(ROUNDS):
         if rows.numel() == 0:
             return
-        if best.recorder is not None:
-            best.recorder.attempt = first_attempt + number
+        best.next_attempt()
         by[rows] -= GROWTH * clearance[rows]
         whole, old = problem.take(rows), take(best.end.best, rows)
         call = best.call.take(rows)

@@ -4,7 +4,9 @@
 2. Candidates track each path, from rest and from each initial offset of the controls, at each pace.
 3. The candidates are relaxed: solved further without a guide; a penalty keeps them out of the obstacles.
 4. The best by penalised cost are refined: the augmented Lagrangian solves them to convergence.
-5. The cheapest is proposed, with the multipliers to continue with.
+5. Where no candidate arrives, the paths are followed again, closer; where the best costs far more than the trajectory
+   without obstacles, more paths are compared.
+6. The cheapest is proposed, with the multipliers to continue with.
 
 A proposal may touch obstacles slightly: the solver removes that. Candidates that penetrate deeper are rejected, since
 removing it would use up a whole attempt.
@@ -22,18 +24,19 @@ from torch import Tensor
 
 from torchgco.constraints.bodies import Inflated
 from torchgco.errors import InputError
-from torchgco.lagrangian import Multipliers
-from torchgco.native.dispatch import cost_unit
+from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.native.dispatch import cost_unit, open_loop, value
 from torchgco.options import AtLeast, Below, Count, Natural, Positive, check_options
 from torchgco.problem import Problem
 from torchgco.search import scene as seen
 from torchgco.search.candidates import PENALTY, Candidates, Watch, unwatched
+from torchgco.search.geometry import Scene
 from torchgco.search.homotopy import one_per_class
 from torchgco.search.roadmap import Roadmap
 from torchgco.search.tracking import attraction, followed
 from torchgco.shapes import check_shape, tensor
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
-from torchgco.solvers.ilqr import ILQR
+from torchgco.solvers.ilqr import ILQR, descend
 from torchgco.solvers.line_search import LineSearch
 from torchgco.tree import put, take
 
@@ -47,7 +50,10 @@ TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
 # Where no candidate arrives, the paths are followed again, with corners averaged over a share of the horizon that is
 # smaller by a factor. A spring gives way to the cost, so it gets stiffer; in a tube more iterations help.
 SHARPER, STIFFER, LONGER = 4.0, 10.0, 2
-CHORD_PENETRATION = 0.049  # share of an obstacle's margin, between two knots; the judge accepts 0.05
+# Where the best candidate is costly, this many times as many paths are followed and relaxed. The best few are refined
+# for some outer iterations, which show the costs to a few percent, and compared if they violate less than 1 cm.
+MORE, COMPARED, ROUNDS, NEARLY = 2, 3, 4, 1e-2
+VIOLATION = 1e-3  # m for lengths: the most of other refined candidates
 
 
 class Proposal(NamedTuple):
@@ -96,6 +102,8 @@ class PathProposals:
             best relaxed candidate is proposed as it is.
         max_penetration: largest accepted penetration of a relaxed candidate into an obstacle, as a share of the mean
             inflated radius.
+        max_gap: how much more than without constraints the best candidate may cost, as a share; where it costs more,
+            twice as many paths are compared, and the three best candidates refined. None: it may cost anything.
 
     Raises:
         InputError: a field out of its range.
@@ -114,6 +122,7 @@ class PathProposals:
     relax_top: Count | None = None
     refine_top: Count = 1
     max_penetration: Positive = 0.1
+    max_gap: Positive | None = None
 
     def __post_init__(self) -> None:
         check_options(self, "paths")
@@ -154,17 +163,22 @@ class PathProposals:
         scene = seen.scene_of(problem, rest)
         if scene is None:
             return None
+        ways = self._ways(problem, rest, scene)
+        proposal = self._along(problem, rest, ways, watch)
+        more = self._costly(problem, rest, proposal)
+        self._closer(problem, rest, ways, proposal, watch)
+        self._wider(problem, rest, more, proposal, watch)
+        return proposal
+
+    def _ways(self, problem: Problem, rest: Tensor, scene: Scene) -> Ways:
         paths, found = self.roadmap.paths(scene, self.num_paths)
         R, unit = seen.scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
-        ways = Ways(
-            paths, one_per_class(paths, scene) & found.unsqueeze(-1), R, torch.where(found, unit, 1.0), scene.obstacles
-        )
-        proposal = self._along(problem, rest, ways, watch)
-        return self._closer(problem, rest, ways, proposal, watch)
+        live = one_per_class(paths, scene) & found.unsqueeze(-1)
+        return Ways(paths, live, R, torch.where(found, unit, 1.0), scene.obstacles)
 
-    def _closer(self, problem: Problem, rest: Tensor, ways: Ways, proposal: Proposal, watch: Watch) -> Proposal:
-        """The proposal; where it has none though there are paths, these are followed again, closer."""
+    def _closer(self, problem: Problem, rest: Tensor, ways: Ways, proposal: Proposal, watch: Watch) -> None:
+        """Where there are paths but no proposal along them, follow them again, closer."""
         rows = (ways.live.any(-1) & ~proposal.found).nonzero().flatten()
         if rows.numel() > 0:
             closer = replace(self, smoothing=self.smoothing / SHARPER)
@@ -174,10 +188,43 @@ class PathProposals:
                 closer = replace(closer, track_iterations=LONGER * self.track_iterations)
             more = closer._along(problem.take(rows), rest[rows], take(ways, rows), watch)
             put(proposal, rows, more._replace(iterations=more.iterations + proposal.iterations[rows]))
-        return proposal
 
-    def _along(self, problem: Problem, rest: Tensor, ways: Ways, watch: Watch) -> Proposal:
-        """Proposals along paths that are known."""
+    def _costly(self, problem: Problem, rest: Tensor, proposal: Proposal) -> Tensor:
+        """The problems (b,) whose proposal costs far more than the trajectory without constraints."""
+        if self.max_gap is None or not bool(proposal.found.any()):
+            return proposal.found.new_empty(0, dtype=torch.int64)
+        free = Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True)
+        least, _ = descend(_inner(self.track_iterations), free, rest)
+        proposal.iterations.add_(least.iterations)
+        cost, _ = value(free, open_loop(problem, proposal.U), proposal.U)
+        costly = cost > least.cost + self.max_gap * least.cost.abs()
+        return (proposal.found & costly).nonzero().flatten()
+
+    def _wider(self, problem: Problem, rest: Tensor, rows: Tensor, proposal: Proposal, watch: Watch) -> None:
+        """Better proposals for the problems in `rows`, from a comparison of more paths."""
+        if rows.numel() == 0:
+            return
+        part, rest = problem.take(rows), rest[rows]
+        relax_top = None if self.relax_top is None else MORE * self.relax_top
+        wider = replace(self, num_paths=MORE * self.num_paths, relax_top=relax_top, refine_top=COMPARED)
+        scene = seen.scene_of(part, rest)
+        assert scene is not None
+        more = wider._along(part, rest, wider._ways(part, rest, scene), watch, ROUNDS, NEARLY)
+        proposal.iterations[rows] += more.iterations
+        better = more.found.nonzero().flatten()
+        more = more._replace(iterations=proposal.iterations[rows])
+        put(proposal, rows[better], take(more, better))
+
+    def _along(
+        self,
+        problem: Problem,
+        rest: Tensor,
+        ways: Ways,
+        watch: Watch,
+        rounds: int = 20,
+        violation: float = VIOLATION,
+    ) -> Proposal:
+        """Proposals along paths that are known; refined for `rounds` outer iterations, to a `violation`."""
         paths = ways.paths
         starts = self.starts(problem, rest).repeat_interleave(len(self.paces), dim=1)
         live = ways.live.repeat_interleave(starts.shape[1], dim=1)
@@ -187,7 +234,11 @@ class PathProposals:
         candidates, sound = self.relax(candidates)
         order = candidates.order(sound, ALIKE)[:, : self.refine_top]
         sound = sound[candidates.rows(order).flatten()]
-        candidates, multipliers, best = self.refine(candidates.pick(order), sound)
+        candidates, solver = candidates.pick(order), None
+        if self.refine_top > 1:
+            inner = replace(_inner(self.track_iterations), tolerance=0.1 * TOLERANCE)
+            solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=rounds)
+        candidates, multipliers, best = candidates.refined(solver, sound, violation)
         multipliers, found = take(multipliers, best), ways.live.any(-1)
         multipliers = replace(multipliers, mu=torch.where(found, multipliers.mu, torch.nan))
         return Proposal(candidates.U[best], found & sound[best], multipliers, candidates.iterations)
@@ -229,34 +280,6 @@ class PathProposals:
             candidates = replace(relaxed, X=X, U=U)
         shallow = candidates.penetration() <= self.max_penetration * candidates.R
         return candidates, candidates.live & candidates.arrive() & shallow
-
-    def refine(self, candidates: Candidates, sound: Tensor) -> tuple[Candidates, Multipliers, Tensor]:
-        """The sound candidates solved to convergence by AL-iLQR.
-
-        Returns the candidates, the multipliers for each to continue with, and the rows (B,) of the cheapest: the
-        first of each problem where none converges, or `refine_top` is 1.
-        """
-        everyone = torch.arange(candidates.live.numel(), device=sound.device)
-        multipliers = candidates.multipliers(everyone, PENALTY)
-        rows = sound.nonzero().flatten()
-        if self.refine_top == 1 or rows.numel() == 0:
-            return candidates, multipliers, everyone[:: candidates.count]
-        part = candidates.of(rows)
-        inner = replace(_inner(self.track_iterations), tolerance=0.1 * TOLERANCE)
-        solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=20)
-        end = solver.solve(
-            part, candidates.U[rows], warm=take(multipliers, rows),
-            callback=lambda progress: candidates.watch(progress.finished, progress.total),
-        )  # fmt: skip
-        good = (end.violation <= solver.violation_tolerance) & seen.arrives(part, end.X)
-        good &= seen.chord_penetration(part, end.X, CHORD_PENETRATION) <= 0
-        won = rows[good]
-        X, U, cost = candidates.X.clone(), candidates.U.clone(), torch.full_like(candidates.unit, torch.inf)
-        X[won], U[won], cost[won] = end.X[good], end.U[good], end.cost[good]
-        iterations = candidates.iterations.index_add(0, rows // candidates.count, end.iterations)
-        put(multipliers, won, take(end.multipliers, good.nonzero().flatten()))
-        best = cost.view(-1, candidates.count).argsort(dim=-1, stable=True)[:, :1]
-        return replace(candidates, X=X, U=U, iterations=iterations), multipliers, candidates.rows(best)[:, 0]
 
 
 def _inner(iterations: int) -> ILQR:

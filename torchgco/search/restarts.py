@@ -1,6 +1,7 @@
 """The default solver: AL-iLQR with restarts, from paths of several homotopy classes and from samples.
 
-1. The solver works on every problem until its trajectory is caught between obstacles, or its solve ends.
+1. The solver works on every problem until its trajectory is caught between obstacles, or its solve ends. Where no path
+   can be sought, as among moving obstacles, it first works to the end, and again on the problems that don't arrive.
 2. Where it is caught, `paths` proposes a trajectory along the best of several paths, and the solver continues from it.
 3. Without a path, or where that attempt doesn't arrive, further attempts start from the caught trajectory, guided by
    samples.
@@ -30,14 +31,15 @@ from torchgco.problem import Problem
 from torchgco.search.best import Best
 from torchgco.search.chords import clear_chords
 from torchgco.search.paths import PathProposals
-from torchgco.search.suitability import suited_paths
+from torchgco.search.suitability import has_paths, suited_paths
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Advice, Call, Progress, Solver
 from torchgco.solvers.state import STOPPED, Iterate, SolveEnd
 from torchgco.solvers.trace import Recorder
 from torchgco.solvers.verdict import finished
-from torchgco.tree import take
+from torchgco.status import Status
+from torchgco.tree import copied, put, take
 
 CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal in a last attempt
 WITHIN = 0.95  # share of the goal tolerance to which they are attracted
@@ -86,11 +88,10 @@ class Restarts(Solver):
         if paths is None and sampling is None:
             best = Best(scaled, solver.iterate(scaled, recorder=recorder, by_arrival=True), solver, recorder)
         else:
-            after = None if self.sampling is None else self.sampling.single_contact_after
-            caught = solver.iterate(scaled, StopWhenCaught(after), recorder=recorder, by_arrival=True)
-            best = self._restarted(scaled, caught, paths, sampling, recorder)
+            best, caught = self._first(scaled, not has_paths(scaled.problem), recorder)
+            self._restart(best, caught, paths, sampling)
         if not call.late:
-            clear_chords(best, self.attempts + 3)
+            clear_chords(best)
         phr = not solver.inner.as_printed
         return finished(call, scaled, unit, best.end, phr, solver.violation_tolerance, solver.slots, recorder)
 
@@ -104,32 +105,46 @@ class Restarts(Solver):
         warn_of_losses([why for why in (unsampled, unsought) if why is not None], sampling is None and paths is None)
         return paths, sampling
 
-    def _restarted(
-        self,
-        call: Call,
-        caught: SolveEnd,
-        paths: PathProposals | None,
-        sampling: GCO | None,
-        recorder: Recorder | None,
-    ) -> Best:
-        """The best of the solves so far and of all attempts, for the problems that were stopped."""
-        best = Best(call, caught, self.local, recorder)
+    def _first(self, call: Call, to_the_end: bool, recorder: Recorder | None) -> tuple[Best, SolveEnd]:
+        """The first solves: the best trajectories, and the solves that were stopped where they were caught.
+
+        Waiting is enough among most moving obstacles: `to_the_end`, only problems that a solve to its end doesn't bring
+        to the goal are solved again and stopped; nor are those solved again that converge, where the goal is assumed:
+        it may lie beyond the horizon.
+        """
+        solver = self.local
+        stop = StopWhenCaught(None if self.sampling is None else self.sampling.single_contact_after)
+        if not to_the_end:
+            caught = solver.iterate(call, stop, recorder=recorder, by_arrival=True)
+            return Best(call, caught, solver, recorder), caught
+        best = Best(call, solver.iterate(call, recorder=recorder, by_arrival=True), solver, recorder)
+        caught = copied(best.end)
+        goal, done = call.problem.goal, best.arrived()
+        if goal is not None and goal.assumed:
+            done = done | (caught.status == Status.CONVERGED)
+        rows = (torch.ones_like(done) if self.all_attempts else ~done).nonzero().flatten()
+        best.next_attempt()
+        if rows.numel() > 0 and not call.late:
+            again = best.attempt(call.take(rows), stop)
+            best.keep(rows, again)
+            put(caught, rows, again)
+        return best, caught
+
+    def _restart(self, best: Best, caught: SolveEnd, paths: PathProposals | None, sampling: GCO | None) -> None:
+        """All attempts for the problems that were stopped."""
         stopped = caught.status == STOPPED
         for attempt in range(1, self.attempts + 1):
-            if call.late:
-                return best
-            if recorder is not None:
-                recorder.attempt = attempt + 1  # a problem gets the same number in any batch
+            if best.call.late:
+                return
+            best.next_attempt()
             wanted = (stopped if self.all_attempts else stopped & ~best.arrived()).nonzero().flatten()
             start = take(caught.last, wanted)
             if attempt == 1 and paths is not None:
                 wanted, start = self._along_paths(best, wanted, start, paths)
             if wanted.numel() > 0 and (sampling is not None or attempt == 1):
-                self._from_samples(best, wanted, start, attempt, sampling)
-        if recorder is not None:
-            recorder.attempt = self.attempts + 2
+                self._from_samples(best, wanted, start, attempt, sampling, caught.outer)
+        best.next_attempt()
         self._into_the_goal(best, (stopped & ~best.arrived() & best.arrived(CLOSE)).nonzero().flatten())
-        return best
 
     def _along_paths(self, best: Best, rows: Tensor, start: Iterate, paths: PathProposals) -> tuple[Tensor, Iterate]:
         """An attempt from the proposal of each problem in `rows`; returns the problems without one, and their start.
@@ -151,14 +166,16 @@ class Restarts(Solver):
         start = take(start, others)
         return rows[others], replace(start, multipliers=replace(start.multipliers, mu=mu[others]))
 
-    def _from_samples(self, best: Best, rows: Tensor, start: Iterate, attempt: int, sampling: GCO | None) -> None:
+    def _from_samples(
+        self, best: Best, rows: Tensor, start: Iterate, attempt: int, sampling: GCO | None, outer: Tensor
+    ) -> None:
         """An attempt at the problems in `rows` from their caught trajectories, guided by samples from the start.
 
-        Without `sampling` the solve that was stopped continues to its end.
+        Without `sampling` the solve that was stopped, after `outer` (B,) outer iterations, continues to its end.
         """
         call = replace(best.call.take(rows), U0=start.U, warm=start.multipliers)
         if attempt == 1:
-            call = replace(call, outer=best.first.outer[rows])
+            call = replace(call, outer=outer[rows])
         else:  # other random draws
             call = replace(call, seed=call.seed + SEED_STEP * (attempt - 1))
         best.improve(rows, call, guidance=sampling, guide_first=True)

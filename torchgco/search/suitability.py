@@ -32,12 +32,18 @@ def suited_paths(paths: PathProposals | None, problem: Problem) -> tuple[PathPro
         return None, f"no path is sought around obstacles in {d}-D, as the roadmap knows only 2-D and 3-D"
     if any(len(offset) != problem.m for offset in paths.initial_offsets):
         paths = replace(paths, initial_offsets=())
-    one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
-    rest = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))
-    if scene_of(one, rest) is None:
-        return paths, None
+    if not has_paths(problem):
+        return None, None
     why = None if engine_of(problem) is not None else failure(_expand, problem, problem.x0.dtype)
     return (paths, None) if why is None else (None, f"no path can be followed ({why})")
+
+
+def has_paths(problem: Problem) -> bool:
+    """Whether there is a goal, and obstacles among which the roadmap can seek a path to it."""
+    if problem.dynamics.position is None:
+        return False
+    one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
+    return scene_of(one, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))) is not None
 
 
 def _expand(problem: Problem) -> None:

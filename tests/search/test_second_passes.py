@@ -1,0 +1,123 @@
+"""Where a first pass isn't enough: more paths for costly proposals, and samples only where a whole solve fails."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchgco import PathProposals, Problem, Restarts, Status, compose, presets
+from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.rollout import open_loop
+from torchgco.search.paths import MORE, Proposal
+from torchgco.search.restarts import StopWhenCaught
+from torchgco.search.suitability import has_paths
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
+from torchgco.solvers.ilqr import ILQR, descend
+
+LAYOUTS = 4
+
+
+@pytest.fixture(scope="module")
+def woods() -> Problem:
+    """Some problems that a vehicle crosses almost straight, and some with long detours."""
+    setup = compose(["scenario=woods", "scenario.density=0.2", "scenario.stages=160", "seed=1"])
+    return setup.task(setup.layouts(LAYOUTS)).problem
+
+
+@pytest.fixture(scope="module")
+def options() -> PathProposals:
+    paths = presets.gco(3).paths
+    assert paths is not None
+    return replace(paths, num_paths=3)
+
+
+def proposed(options: PathProposals, problem: Problem, monkeypatch) -> tuple[Proposal, list[tuple[int, int]]]:
+    """The proposals, and of every pass along paths the numbers of paths and of problems."""
+    passes, along = [], PathProposals._along
+
+    def noted(self: PathProposals, problem: Problem, *words) -> Proposal:
+        passes.append((self.num_paths, problem.B))
+        return along(self, problem, *words)
+
+    monkeypatch.setattr(PathProposals, "_along", noted)
+    found = options.propose(problem)
+    monkeypatch.setattr(PathProposals, "_along", along)
+    return found, passes
+
+
+def gaps(problem: Problem, U: Tensor) -> Tensor:
+    """How much more than without constraints the controls U cost, as a share, (B,)."""
+    lagrangian = Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True)
+    rest = problem.cost.rest_controls(torch.zeros_like(U))
+    free, _ = descend(ILQR(tolerance=1e-9, max_iterations=100), lagrangian, rest)
+    return problem.cost.total(open_loop(problem.dynamics, problem.x0, U), U) / free.cost - 1
+
+
+def test_costly_proposals_are_compared_with_those_along_more_paths(woods, options, monkeypatch) -> None:
+    once, passes = proposed(replace(options, max_gap=None), woods, monkeypatch)
+    assert passes == [(options.num_paths, LAYOUTS)] and bool(once.found.all())
+    gap = gaps(woods, once.U)
+    limit = float(gap.sort().values[1:3].mean())  # two of four problems cost more
+    twice, passes = proposed(replace(options, max_gap=limit), woods, monkeypatch)
+    assert passes == [(options.num_paths, LAYOUTS), (MORE * options.num_paths, 2)]
+    cheap = gap <= limit
+    assert torch.equal(twice.U[cheap], once.U[cheap]) and bool((twice.U[~cheap] != once.U[~cheap]).any())
+    assert bool((twice.iterations[~cheap] > once.iterations[~cheap] + 50).all())
+    # The new proposals are refined, which removes contacts at some cost; those with a cheaper path are cheaper.
+    assert bool((gaps(woods, twice.U) < gap + 0.05).all())
+
+
+def test_a_proposal_within_the_gap_keeps_its_bits(woods, options, monkeypatch) -> None:
+    once, _ = proposed(replace(options, max_gap=None), woods, monkeypatch)
+    same, passes = proposed(replace(options, max_gap=100.0), woods, monkeypatch)
+    assert torch.equal(once.U, same.U) and len(passes) == 1
+
+
+def test_the_gap_depends_on_no_other_problem(woods, options) -> None:
+    whole = replace(options, max_gap=0.15).propose(woods)
+    index = torch.tensor([2, 0])
+    part = replace(options, max_gap=0.15).propose(woods.take(index))
+    assert torch.equal(part.U, whole.U[index]) and torch.equal(part.iterations, whole.iterations[index])
+
+
+def test_among_moving_obstacles_the_first_solve_runs_to_its_end(monkeypatch) -> None:
+    """Problems that arrive have the bits of the local solve; the others are solved again, stopped and sampled."""
+    setup = compose(["scenario=crossing", "scenario.num_obstacles=30", "seed=3"])
+    layouts = setup.layouts(8)
+    task = setup.task(layouts)
+    problem, U0 = task.problem, task.U0
+    solver = presets.gco(3)
+    assert not has_paths(problem) and isinstance(solver, Restarts)
+    local = replace(solver.local, max_outer_iterations=10)  # too few for some
+    guides, iterate = [], AugmentedLagrangian.iterate
+
+    def noted(self, call, guidance=None, *words, **more):
+        guides.append((type(guidance), call.problem.B))
+        return iterate(self, call, guidance, *words, **more)
+
+    monkeypatch.setattr(AugmentedLagrangian, "iterate", noted)
+    alone = local.solve(problem, U0)
+    guides.clear()
+    found = replace(solver, local=local, attempts=1).solve(problem, U0)
+    arrived = (alone.violation <= local.violation_tolerance) & (
+        (alone.X[:, -1, :3] - task.goal).norm(dim=-1) < task.goal_radius
+    )
+    left = int((~arrived).sum())
+    assert guides[0] == (type(None), 8) and guides[1] == (StopWhenCaught, left) and 0 < left < 8
+    assert torch.equal(found.U[arrived], alone.U[arrived])
+    assert bool((found.iterations[~arrived] > alone.iterations[~arrived]).all())
+
+
+def test_a_converged_solve_is_enough_where_the_goal_is_assumed() -> None:
+    """With x_ref beyond the horizon no solve arrives; a goal that is given is still sought by further attempts."""
+    setup = compose(["scenario=crossing", "scenario.stages=30"])
+    problem = setup.task(setup.layouts(2)).problem
+    given, assumed = problem, replace(problem, goal=None)
+    assert assumed.goal is not None and assumed.goal.assumed
+    solver = replace(presets.gco(3), attempts=1)
+    U0 = problem.cost.rest_controls(torch.zeros(2, problem.N, problem.m, dtype=torch.float64))
+    alone = solver.local.solve(assumed, U0)
+    assert alone.statuses == [Status.CONVERGED] * 2 and float(assumed.goal.distance(alone.X[:, -1, :3]).min()) > 2
+    assert torch.equal(solver.solve(assumed, U0).iterations, alone.iterations)
+    assert bool((solver.solve(given, U0).iterations > alone.iterations).all())
