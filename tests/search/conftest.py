@@ -11,16 +11,19 @@ from torchgco import (
     AugmentedLagrangian,
     Solution,
 )
+from torchgco.search.paths import SEARCH
 
 
 @pytest.fixture
 def solves(monkeypatch) -> Iterator[list[Solve]]:
-    """All local solves made after this fixture, in order."""
+    """All local solves made after this fixture, in order; those that refine candidates are left out."""
     made, iterate = [], AugmentedLagrangian.iterate
 
     def noted(self, call, guidance=None, penalty=None, *rest, **options):
-        made.append(Solve(call, guidance, penalty, iterate(self, call, guidance, penalty, *rest, **options)))
-        return made[-1].end
+        end = iterate(self, call, guidance, penalty, *rest, **options)
+        if self.inner.line_search != SEARCH:
+            made.append(Solve(call, guidance, penalty, end))
+        return end
 
     monkeypatch.setattr(AugmentedLagrangian, "iterate", noted)
     yield made

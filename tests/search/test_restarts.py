@@ -86,7 +86,7 @@ def test_arriving_ends_the_attempts_unless_all_are_wanted(all_attempts: bool, so
 def test_the_first_attempt_is_along_a_path_without_guidance(solves: list[Solve]) -> None:
     problem, U0 = gates()
     SOLVER.solve(problem, U0, seed=3)
-    caught, along, sampled, again, last = solves
+    caught, along, thorough, sampled, again, last = solves
     proposal = PATHS.propose(problem.in_cost_units())
     assert proposal.found.tolist() == [True, True, True, False]
     assert along.rows == [PASSES, SHORT] and along.guidance is along.penalty is None
@@ -94,6 +94,10 @@ def test_the_first_attempt_is_along_a_path_without_guidance(solves: list[Solve])
     before = caught.end.last.multipliers.mu[1:3]
     assert torch.equal(along.call.warm.mu, torch.maximum(proposal.multipliers.mu[1:3], before))
     assert not any(bool(lam.any()) for lam in along.call.warm.lam)
+    # The attempt of SHORT doesn't arrive: it is repeated from the best of more candidates. CLOSED has none either.
+    more = PATHS.thorough.propose(problem.in_cost_units().take(torch.tensor([SHORT, CLOSED])))
+    assert more.found.tolist() == [True, False] and thorough.rows == [SHORT]
+    assert torch.equal(thorough.call.U0, more.U[:1]) and thorough.guidance is thorough.penalty is None
     # Without a path the first attempt is sampled. A second, sampled one follows where the first does not arrive.
     assert sampled.rows == [CLOSED] and again.rows == [SHORT, CLOSED] and last.rows == [SHORT]
     assert [s.call.seed for s in (sampled, again)] == [3, 3 + SEED_STEP]
@@ -105,10 +109,12 @@ def test_without_a_path_and_without_samples_the_stopped_solve_continues(solves: 
     problem, U0 = problem.take(torch.tensor([PASSES])), U0[:1]
     caught = LOCAL.iterate(Call.checked(problem, U0).in_cost_units()[0], StopWhenCaught(None))
     shallow = replace(PATHS, max_penetration=1e-9)
-    proposal, solution = shallow.propose(problem), Restarts(LOCAL, shallow, sampling=None).solve(problem, U0)
-    assert caught.status.tolist() == [STOPPED] and not bool(proposal.found) and int(solution.guided) == 0
+    proposal, more = shallow.propose(problem), shallow.thorough.propose(problem)
+    solution = Restarts(LOCAL, shallow, sampling=None).solve(problem, U0)
+    assert caught.status.tolist() == [STOPPED] and not bool(proposal.found | more.found)
+    assert int(solution.guided) == 0
     assert torch.equal(solves[-1].call.U0, caught.last.U)
-    counts = caught.iterations + proposal.iterations + solves[-1].end.iterations
+    counts = caught.iterations + proposal.iterations + more.iterations + solves[-1].end.iterations
     assert torch.equal(solution.iterations, counts) and int(solves[-1].end.iterations) > 0
 
 
@@ -154,8 +160,9 @@ def test_counts_are_those_of_all_attempts_and_candidates(solves: list[Solve], mo
         expected[:, s.call.rows] += torch.stack((s.end.iterations, s.end.outer, s.end.guided))
         if s.guidance is None and s.penalty is None:
             expected[2, s.call.rows] += 1  # along a path
-    assert len(made) == 1 and int(made[0].iterations.min()) == 0 < int(made[0].iterations[:2].min())
+    assert len(made) == 2 and int(made[0].iterations.min()) == 0 < int(made[0].iterations[:2].min())
     expected[0, PASSES:] += made[0].iterations
+    expected[0, SHORT:] += made[1].iterations
     assert torch.equal(torch.stack((solution.iterations, solution.outer_iterations, solution.guided)), expected)
     assert solution.guided[FREE] == 0 and solution.guided[PASSES] == 1 < int(solution.guided[SHORT])
 

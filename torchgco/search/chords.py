@@ -16,14 +16,15 @@ from torchgco.tree import take
 
 ROUNDS = 4  # solves at most, each with larger obstacles than the one before
 GROWTH = 1.1  # times the missing clearance: by how much obstacles grow in a round
+LEAST = 0.1  # and at least this share of the allowed violation: solves differ by as much
 
 
 def clear_chords(best: Best) -> None:
     """Replace feasible trajectories that touch an obstacle between two knots by ones that keep clear of it.
 
-    Obstacles grow by `GROWTH` times the missing clearance, in up to `ROUNDS` rounds, and the solve continues from the
-    best trajectory. A trajectory is replaced where the new one is feasible for the obstacles as they are, has arrived
-    if the old one had, and keeps more clearance between the knots. Openings may leave no room for that.
+    Obstacles grow by `GROWTH` times the missing clearance or a little more, in up to `ROUNDS` rounds, and the solve
+    continues from the best trajectory. A trajectory is replaced where the new one is feasible for the obstacles as they
+    are, has arrived if the old one had, and keeps more clearance between the knots. Openings may leave no room for it.
 
     Args:
         best: the trajectories so far; changed in place.
@@ -36,7 +37,7 @@ def clear_chords(best: Best) -> None:
         if rows.numel() == 0:
             return
         best.next_attempt()
-        by[rows] -= GROWTH * clearance[rows]
+        by[rows] += (-GROWTH * clearance[rows]).clamp(min=LEAST * limit)
         whole, old = problem.take(rows), take(best.end.best, rows)
         call = best.call.take(rows)
         call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)

@@ -53,6 +53,7 @@ SHARPER, STIFFER, LONGER = 4.0, 10.0, 2
 # Where the best candidate is costly, this many times as many paths are followed and relaxed. The best few are refined
 # for some outer iterations, which show the costs to a few percent, and compared if they violate less than 1 cm.
 MORE, COMPARED, ROUNDS, NEARLY = 2, 3, 4, 1e-2
+THOROUGH = 3  # times as many iterations of tracking, where an attempt along the best path has failed
 VIOLATION = 1e-3  # m for lengths: the most of other refined candidates
 
 
@@ -139,6 +140,14 @@ class PathProposals:
     def paces(self) -> tuple[float, ...]:
         """The values of `arrive`, as a tuple."""
         return tuple(self.arrive) if isinstance(self.arrive, Sequence) else (self.arrive,)
+
+    @property
+    def thorough(self) -> PathProposals:
+        """Proposals for problems that these don't bring to the goal: more paths, followed closer, and all refined."""
+        return replace(
+            self, num_paths=MORE * self.num_paths, track_iterations=THOROUGH * self.track_iterations, relax_top=None,
+            refine_top=max(MORE * self.num_paths, self.refine_top), max_gap=None,
+        )  # fmt: skip
 
     def propose(self, problem: Problem, watch: Watch = unwatched) -> Proposal:
         """A proposal for every problem, from the vehicle at rest.

@@ -3,6 +3,7 @@
 1. The solver works on every problem until its trajectory is caught between obstacles, or its solve ends. Where no path
    can be sought, as among moving obstacles, it first works to the end, and again on the problems that don't arrive.
 2. Where it is caught, `paths` proposes a trajectory along the best of several paths, and the solver continues from it.
+   Where that attempt doesn't arrive, the best of more and better candidates is proposed.
 3. Without a path, or where that attempt doesn't arrive, further attempts start from the caught trajectory, guided by
    samples.
 4. Where no attempt arrives but the best one ends close to the goal, a last attempt attracts its end to the goal.
@@ -141,6 +142,12 @@ class Restarts(Solver):
             start = take(caught.last, wanted)
             if attempt == 1 and paths is not None:
                 wanted, start = self._along_paths(best, wanted, start, paths)
+                if self.attempts > 1 and not best.call.late:
+                    best.next_attempt()
+                    failed = (stopped & ~best.arrived()).nonzero().flatten()
+                    left, _ = self._along_paths(best, failed, take(caught.last, failed), paths.thorough)
+                    still = torch.isin(wanted, left).nonzero().flatten()
+                    wanted, start = wanted[still], take(start, still)
             if wanted.numel() > 0 and (sampling is not None or attempt == 1):
                 self._from_samples(best, wanted, start, attempt, sampling, caught.outer)
         best.next_attempt()
@@ -154,7 +161,7 @@ class Restarts(Solver):
         if rows.numel() == 0:
             return rows, start
         try:
-            proposal = paths.propose(best.call.problem.take(rows), partial(_watched, best.call, rows))
+            proposal = paths.propose(best.call.problem.take(rows), partial(_watched, best, rows))
         except _Late:
             return rows[:0], take(start, rows[:0])
         best.end.iterations[rows] += proposal.iterations
@@ -192,13 +199,14 @@ class _Late(Exception):
     """The time limit has passed during the search for paths."""
 
 
-def _watched(call: Call, rows: Tensor, done: int, total: int) -> None:
+def _watched(best: Best, rows: Tensor, done: int, total: int) -> None:
     """Report that `done` of `total` candidates for the problems `rows` are solved; raises _Late after the deadline."""
+    call = best.call
     if call.late:
         raise _Late
     if call.callback is not None:
-        finished = call.problem.B - rows.numel()
-        call.callback(Progress(0, call.rows[rows], finished, call.problem.B, candidates=(done, total)))
+        best.finished = max(best.finished, call.problem.B - rows.numel())
+        call.callback(Progress(0, call.rows[rows], best.finished, call.problem.B, candidates=(done, total)))
 
 
 class StopWhenCaught:
