@@ -86,7 +86,7 @@ def test_arriving_ends_the_attempts_unless_all_are_wanted(all_attempts: bool, so
 def test_the_first_attempt_is_along_a_path_without_guidance(solves: list[Solve]) -> None:
     problem, U0 = gates()
     SOLVER.solve(problem, U0, seed=3)
-    caught, along, thorough, sampled, again, last = solves
+    caught, along, attracted, sampled, again = solves
     proposal = PATHS.propose(problem.in_cost_units())
     assert proposal.found.tolist() == [True, True, True, False]
     assert along.rows == [PASSES, SHORT] and along.guidance is along.penalty is None
@@ -94,13 +94,26 @@ def test_the_first_attempt_is_along_a_path_without_guidance(solves: list[Solve])
     before = caught.end.last.multipliers.mu[1:3]
     assert torch.equal(along.call.warm.mu, torch.maximum(proposal.multipliers.mu[1:3], before))
     assert not any(bool(lam.any()) for lam in along.call.warm.lam)
-    # The attempt of SHORT doesn't arrive: it is repeated from the best of more candidates. CLOSED has none either.
-    more = PATHS.thorough.propose(problem.in_cost_units().take(torch.tensor([SHORT, CLOSED])))
-    assert more.found.tolist() == [True, False] and thorough.rows == [SHORT]
-    assert torch.equal(thorough.call.U0, more.U[:1]) and thorough.guidance is thorough.penalty is None
+    # The attempt of SHORT ends close to the goal, and is attracted to it.
+    assert attracted.rows == [SHORT] and attracted.penalty is not None
     # Without a path the first attempt is sampled. A second, sampled one follows where the first does not arrive.
-    assert sampled.rows == [CLOSED] and again.rows == [SHORT, CLOSED] and last.rows == [SHORT]
+    assert sampled.rows == [CLOSED] and again.rows == [CLOSED]
     assert [s.call.seed for s in (sampled, again)] == [3, 3 + SEED_STEP]
+
+
+def test_where_the_first_path_fails_the_best_of_more_candidates_is_proposed(solves: list[Solve]) -> None:
+    """The optimum of SHORT ends far from the goal for this weight; CLOSED has no path."""
+    problem, U0 = gates(1.0)
+    SOLVER.solve(problem, U0, seed=3)
+    caught, along, thorough, sampled, again = solves
+    assert (along.rows, thorough.rows, sampled.rows) == ([PASSES, SHORT], [SHORT], [CLOSED])
+    assert again.rows == [SHORT, CLOSED] and torch.equal(again.call.U0, caught.end.last.U[[SHORT, CLOSED]])
+    more = PATHS.thorough.propose(problem.in_cost_units().take(torch.tensor([SHORT, CLOSED])))
+    assert more.found.tolist() == [True, False]
+    assert torch.equal(thorough.call.U0, more.U[:1]) and thorough.guidance is thorough.penalty is None
+    solves.clear()
+    replace(SOLVER, attempts=1).solve(problem, U0, seed=3)
+    assert [s.rows for s in solves[1:]] == [[PASSES, SHORT], [CLOSED]]
 
 
 def test_without_a_path_and_without_samples_the_stopped_solve_continues(solves: list[Solve]) -> None:
@@ -125,9 +138,8 @@ def test_a_trajectory_that_ends_close_to_the_goal_is_finally_attracted_to_it(
     """The optimum ends far from the goal (unchanged), slightly short of it (attracted), or at it (unchanged)."""
     problem, U0 = gates(weight)
     solution = SOLVER.solve(problem, U0)
-    last = solves[-1]
-    assert (last.penalty is not None) == attracted
-    assert all(s.penalty is None for s in solves[:-1])
+    pulled = [s for s in solves if s.penalty is not None]
+    assert len(pulled) == attracted
     monkeypatch.setattr("torchgco.search.restarts.CLOSE", 0.0)
     plain = SOLVER.solve(problem, U0)
     away, optimal = ((s.X[:, -1, :2] - torch.tensor([10.0, 0.0])).norm(dim=-1) for s in (solution, plain))
@@ -135,6 +147,7 @@ def test_a_trajectory_that_ends_close_to_the_goal_is_finally_attracted_to_it(
     others = torch.tensor([FREE, PASSES, CLOSED])
     assert torch.equal(solution.U[others], plain.U[others])
     if attracted:
+        (last,) = pulled
         assert last.rows == [SHORT] and last.guidance is None and isinstance(last.penalty, GuideRegion)
         assert torch.isfinite(last.penalty.radius).nonzero().tolist() == [[0, 40]]  # at the last knot alone
         assert away[SHORT] > 0.8 and solution.cost[SHORT] < 1.05 * plain.cost[SHORT]
@@ -162,9 +175,9 @@ def test_counts_are_those_of_all_attempts_and_candidates(solves: list[Solve], mo
             expected[2, s.call.rows] += 1  # along a path
     assert len(made) == 2 and int(made[0].iterations.min()) == 0 < int(made[0].iterations[:2].min())
     expected[0, PASSES:] += made[0].iterations
-    expected[0, SHORT:] += made[1].iterations
+    expected[0, CLOSED:] += made[1].iterations
     assert torch.equal(torch.stack((solution.iterations, solution.outer_iterations, solution.guided)), expected)
-    assert solution.guided[FREE] == 0 and solution.guided[PASSES] == 1 < int(solution.guided[SHORT])
+    assert solution.guided[FREE] == 0 and solution.guided[PASSES] == 1 < int(solution.guided[CLOSED])
 
 
 def test_restarts_lead_around_a_trap_that_catches_the_solver() -> None:

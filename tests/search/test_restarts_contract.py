@@ -112,8 +112,8 @@ def test_the_trace_names_the_attempt() -> None:
     assert {b: list(attempts[b]) for b in range(4)} == {
         FREE: [1],
         PASSES: [1, 2],
-        SHORT: [1, 2, 3, 4, 5],
-        CLOSED: [1, 3, 4],
+        SHORT: [1, 2, 3],
+        CLOSED: [1, 4, 5],
     }
     for b in (SHORT, CLOSED):
         index = torch.tensor([b])

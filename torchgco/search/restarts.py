@@ -3,10 +3,11 @@
 1. The solver works on every problem until its trajectory is caught between obstacles, or its solve ends. Where no path
    can be sought, as among moving obstacles, it first works to the end, and again on the problems that don't arrive.
 2. Where it is caught, `paths` proposes a trajectory along the best of several paths, and the solver continues from it.
-   Where that attempt doesn't arrive, the best of more and better candidates is proposed.
+   Where that attempt ends close to the goal, another one attracts its end to the goal; where it ends farther away, the
+   best of more and better candidates is proposed.
 3. Without a path, or where that attempt doesn't arrive, further attempts start from the caught trajectory, guided by
    samples.
-4. Where no attempt arrives but the best one ends close to the goal, a last attempt attracts its end to the goal.
+4. Where no attempt arrives but the best one ends close to the goal, it is attracted to the goal, too.
 5. The best trajectory of all attempts is taken: one that arrives before one that is feasible, then the cheapest. Where
    it touches an obstacle between two knots, it is solved again with grown obstacles.
 """
@@ -42,7 +43,7 @@ from torchgco.solvers.verdict import finished
 from torchgco.status import Status
 from torchgco.tree import copied, put, take
 
-CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal in a last attempt
+CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal
 WITHIN = 0.95  # share of the goal tolerance to which they are attracted
 STIFF = 1e3  # weight of that attraction, in units of cost per radius^4
 SEED_STEP = 1_000_003  # between the seeds of two attempts
@@ -141,17 +142,27 @@ class Restarts(Solver):
             wanted = (stopped if self.all_attempts else stopped & ~best.arrived()).nonzero().flatten()
             start = take(caught.last, wanted)
             if attempt == 1 and paths is not None:
-                wanted, start = self._along_paths(best, wanted, start, paths)
-                if self.attempts > 1 and not best.call.late:
-                    best.next_attempt()
-                    failed = (stopped & ~best.arrived()).nonzero().flatten()
-                    left, _ = self._along_paths(best, failed, take(caught.last, failed), paths.thorough)
-                    still = torch.isin(wanted, left).nonzero().flatten()
-                    wanted, start = wanted[still], take(start, still)
+                wanted, start = self._path_attempts(best, stopped, wanted, start, paths)
             if wanted.numel() > 0 and (sampling is not None or attempt == 1):
                 self._from_samples(best, wanted, start, attempt, sampling, caught.outer)
         best.next_attempt()
-        self._into_the_goal(best, (stopped & ~best.arrived() & best.arrived(CLOSE)).nonzero().flatten())
+        self._into_the_goal(best, stopped)
+
+    def _path_attempts(
+        self, best: Best, stopped: Tensor, rows: Tensor, start: Iterate, paths: PathProposals
+    ) -> tuple[Tensor, Iterate]:
+        """Attempts along paths at the problems in `rows`; returns those of them without a proposal, and their start."""
+        left, last = self._along_paths(best, rows, start, paths)
+        best.next_attempt()
+        self._into_the_goal(best, stopped)
+        best.next_attempt()
+        if self.attempts == 1 or best.call.late:
+            return left, last
+        failed = ~best.arrived()[rows] & ~best.arrived(CLOSE)[rows]
+        again = failed.nonzero().flatten()
+        none, _ = self._along_paths(best, rows[again], take(start, again), paths.thorough)
+        still = torch.isin(left, none).nonzero().flatten()
+        return left[still], take(last, still)
 
     def _along_paths(self, best: Best, rows: Tensor, start: Iterate, paths: PathProposals) -> tuple[Tensor, Iterate]:
         """An attempt from the proposal of each problem in `rows`; returns the problems without one, and their start.
@@ -187,9 +198,10 @@ class Restarts(Solver):
             call = replace(call, seed=call.seed + SEED_STEP * (attempt - 1))
         best.improve(rows, call, guidance=sampling, guide_first=True)
 
-    def _into_the_goal(self, best: Best, rows: Tensor) -> None:
-        """A last attempt from the best trajectories of `rows`, their ends attracted to the goal."""
-        if rows.numel() > 0:
+    def _into_the_goal(self, best: Best, stopped: Tensor) -> None:
+        """An attempt from the best trajectories that end close to the goal, their ends attracted to it."""
+        rows = (stopped & ~best.arrived() & best.arrived(CLOSE)).nonzero().flatten()
+        if rows.numel() > 0 and not best.call.late:
             start = take(best.end.best, rows)
             call = replace(best.call.take(rows), U0=start.U, warm=start.multipliers)
             best.improve(rows, call, penalty=_goal_region(call.problem))
