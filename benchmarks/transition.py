@@ -28,7 +28,9 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 DENSITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 STAGES = (80, 120, 160, 240)
-SOLVERS = ("gco", "al_ilqr", "gco_paper")
+SOLVERS = ("gco", "gco_paper", "al_ilqr")
+PEERS = ("fatrop",)  # takes up to a minute per problem: fewer layouts, and only the sparser woods
+PEER_DENSITIES, PEER_LAYOUTS = DENSITIES[:4], 8
 DENSITY, HORIZON = "scenario.density", "scenario.stages"
 # Discs of one radius r at random in the plane leave no way through, in the limit of a large region, from
 # density * pi r^2 = 1.128 on (Quintanilla and Ziff, Physical Review E 76, 051115, 2007).
@@ -37,30 +39,38 @@ COVERED = 1.128
 
 def main(words: Sequence[str] | None = None) -> int:
     asked = _parser().parse_args(words)
-    command = [
-        sys.executable, "-m", "torchgco", "-m", "scenario=woods", f"{DENSITY}={','.join(map(str, DENSITIES))}",
-        f"{HORIZON}={','.join(map(str, STAGES))}", f"solver={','.join(asked.solvers)}", "study.baselines=[]",
-        f"study.layouts={asked.layouts}", f"seed={asked.seed}", f"hydra.sweep.dir={asked.outputs}",
-    ]  # fmt: skip
-    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    for solver in asked.solvers:
+        sweep(solver, asked)
     summary = summarise(merge([asked.outputs]))
     print(table(summary))
     if asked.write:
         save(figure(summary), RESULTS / "transition.png")
         origin = provenance("cpu")
         head = (
-            f"Flown on {origin['date']} at commit {origin['commit']}, {asked.layouts} layouts per point, seed "
-            f"{asked.seed}; 95 % Wilson intervals; {origin['processor']}, shared."
+            f"Flown on {origin['date']} at commit {origin['commit']}, n layouts per point, seed {asked.seed}; "
+            f"95 % Wilson intervals in the figure; {origin['processor']}, shared."
         )
         marks = "<!-- transition -->", "<!-- end transition -->"
         put_between(RESULTS / "transition.md", *marks, f"{head}\n\n![Rates](transition.png)\n\n{table(summary)}")
     return 0
 
 
+def sweep(solver: str, asked: argparse.Namespace) -> None:
+    """Fly one solver at all densities and speeds, in a folder of its own; what is there already isn't flown again."""
+    peer = solver in PEERS
+    densities, layouts = (PEER_DENSITIES, PEER_LAYOUTS) if peer else (DENSITIES, asked.layouts)
+    command = [
+        sys.executable, "-m", "torchgco", "-m", "scenario=woods", f"{DENSITY}={','.join(map(str, densities))}",
+        f"{HORIZON}={','.join(map(str, STAGES))}", f"solver={solver}", "study.baselines=[]", "device.threads=1",
+        f"study.layouts={layouts}", f"seed={asked.seed}", f"hydra.sweep.dir={asked.outputs / solver}",
+    ]  # fmt: skip
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.transition", description="Sweep density and speed.")
     parser.add_argument("--layouts", type=int, default=32, metavar="N", help="per density and speed")
-    parser.add_argument("--solvers", nargs="+", default=list(SOLVERS), metavar="NAME", help="configs")
+    parser.add_argument("--solvers", nargs="+", default=[*SOLVERS, *PEERS], metavar="NAME", help="configs")
     parser.add_argument("--seed", type=int, default=0, help="of the layouts")
     parser.add_argument("--write", action="store_true", help="put table and figure into benchmarks/results")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "transition")

@@ -20,7 +20,7 @@ PHASES = {
     "paths sought": "torchgco.search.roadmap:Roadmap.paths",
     "paths tracked": "torchgco.search.paths:PathProposals.track",
     "candidates relaxed": "torchgco.search.paths:PathProposals.relax",
-    "candidates refined": "torchgco.search.paths:PathProposals.refine",
+    "candidates refined": "torchgco.search.candidates:Candidates.refined",
     "rest of the proposal": "torchgco.search.paths:PathProposals.propose",
     "plans sampled": "torchgco.guidance.mppi:MPPI.improve",
     "set-up": "torchgco.native.engine:Engine.__init__",
