@@ -163,17 +163,17 @@ def fly(family: Family, count: int, seed: int) -> tuple[pd.DataFrame, dict[str, 
     return pd.DataFrame(rows), examples
 
 
-def table(trials: pd.DataFrame) -> str:
-    """Markdown: one row per cause, with its count in every family."""
+def table(trials: pd.DataFrame, causes: dict[str, str] = CAUSES, missed: str = "not reached") -> str:
+    """Markdown: one row per cause, with its count in every family; `missed` names the sum."""
     families = list(dict.fromkeys(trials.family))
-    counts = pd.crosstab(trials.cause, trials.family).reindex(list(CAUSES), fill_value=0)
+    counts = pd.crosstab(trials.cause, trials.family).reindex(list(causes), fill_value=0)
     lines = [f"| cause | what it means | {' | '.join(families)} |", "|---" * (2 + len(families)) + "|"]
-    for name, meaning in CAUSES.items():
+    for name, meaning in causes.items():
         cells = " | ".join(str(counts.loc[name].get(family, 0)) for family in families)
         lines.append(f"| {name} | {meaning} | {cells} |")
-    flown = trials.groupby("family").reached
-    missed = " | ".join(f"{(~flown.get_group(f)).sum()} of {flown.get_group(f).size}" for f in families)
-    return "\n".join([*lines, f"| **not reached** | | {missed} |"])
+    flown = trials.groupby("family").cause
+    sums = " | ".join(f"{flown.get_group(f).notna().sum()} of {flown.get_group(f).size}" for f in families)
+    return "\n".join([*lines, f"| **{missed}** | | {sums} |"])
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -1,0 +1,251 @@
+"""python -m benchmarks.shortfalls: why `gco` misses the best known solution in the worlds, counted, with pictures.
+
+`gco` flies the public layouts of each world. Every layout where it isn't a success is solved again alone, and its
+search is watched; then candidates along 24 paths are all refined to their end. Where the good ones among them were
+dropped is the cause. With --write, table, list and pictures go to benchmarks/results/shortfalls.md and shortfalls.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from math import inf, isnan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from benchmarks.failures import table
+from benchmarks.failures_picture import Example, picture
+from benchmarks.families import WORLDS, Family
+from benchmarks.shortfalls_watch import Search, watching
+from benchmarks.speed.provenance import provenance
+from benchmarks.speed.tables import put_between
+from torchgco import compose, judge
+from torchgco.judge import SUCCESS_COST
+from torchgco.plotting.boxes import outlines
+from torchgco.problem import Problem
+from torchgco.scenarios import Layouts
+from torchgco.search.paths import SHARPER, STIFFER, THOROUGH, PathProposals
+from torchgco.search.suitability import has_paths
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "benchmarks" / "results" / "shortfalls.md"
+MARKS = "<!-- shortfalls -->", "<!-- end shortfalls -->"
+PATHS = 24  # whose candidates are all refined
+CAUSES = {
+    "no solution known": "neither `gco` nor any other search has found a way",
+    "another local solution": "moving obstacles, and no paths: waiting, or passing on another side, costs less",
+    "not reached": "moving obstacles, and no paths: no attempt is sound",
+    "not among the paths": f"no candidate along the first {PATHS} paths ends within 5 % of the best known cost",
+    "left its path": "a candidate does only where its path is followed closer than `gco` follows it",
+    "no path sought": "a candidate does, but the first solve was never caught, so that `gco` sought no path",
+    "a later path": "a candidate does, but its path comes after those that `gco` sought",
+    "dropped as tracked": "its path was sought, but cheaper tracked candidates were relaxed in its place",
+    "dropped as relaxed": "it was relaxed, but was then unsound, or dearer than those taken",
+    "lost in the solve": "it was compared or chosen, and the solve ended elsewhere",
+}
+FATES = ("dropped as tracked", "dropped as relaxed", "lost in the solve")  # of a sought candidate
+HEAD = (
+    "world", "layout", "cost / best known", "cheapest of all candidates / best known", "first path within 5 %",
+    "paths sought", "cause",
+)  # fmt: skip
+
+
+def cause(
+    best: float, sound: bool, costs: Sequence[float], searches: Sequence[Search], closer: Sequence[float] = ()
+) -> str:
+    """The cause for one layout on which `gco` isn't a success; of several good candidates the one that got farthest.
+
+    best      the best known cost, NaN where no solution is known
+    sound     whether the result of `gco` is
+    costs     of a refined candidate along each path, infinite where it has no good end; none: no paths can be sought
+    searches  those that `gco` made
+    closer    the costs where the paths are followed closer
+    """
+    if isnan(best) and not sound:
+        return "no solution known"
+    if not costs:
+        return "another local solution" if sound else "not reached"
+    good = within(best, costs)
+    if not good:
+        return "left its path" if within(best, closer) else "not among the paths"
+    if not searches:
+        return "no path sought"
+    sought = [path for path in good if path < _sought(searches)]
+    return max((_fate(path, searches) for path in sought), key=FATES.index, default="a later path")
+
+
+def within(best: float, costs: Sequence[float]) -> list[int]:
+    """Numbers of the paths whose candidates end within 5 % of the best known cost."""
+    return [path for path, cost in enumerate(costs) if cost <= SUCCESS_COST * best]
+
+
+def _sought(searches: Sequence[Search]) -> int:
+    return max((search.count for search in searches), default=0)
+
+
+def _fate(path: int, searches: Sequence[Search]) -> str:
+    """Where the candidate along a path was dropped, in the last search for it that made a proposal."""
+    own = [search for search in searches if path < search.count]
+    last = next((search for search in reversed(own) if search.chosen is not None), own[-1])
+    return FATES[2] if path in last.compared else FATES[1] if path in last.relaxed else FATES[0]
+
+
+def refined(paths: PathProposals, problem: Problem, count: int = PATHS) -> tuple[list[float], dict[int, Tensor]]:
+    """Costs of a candidate along each of `count` paths, all refined to the end, infinite where it has no good end.
+
+    Also returns the states (N+1, n) of the others by the number of their path.
+    """
+    every = replace(paths, num_paths=count, relax_top=None, refine_top=count, max_gap=None)
+    with watching() as searches:
+        every.propose(problem)
+    costs, ends = [inf] * count, {}
+    for search in searches:  # the second one, where there is any, follows the same paths closer
+        for path, (X, U) in search.ends.items():
+            cost = float(problem.cost.total(X[None], U[None]))
+            if cost < costs[path]:
+                costs[path], ends[path] = cost, X
+    return costs, ends
+
+
+def closer(paths: PathProposals) -> PathProposals:
+    """The same proposals, whose paths are followed closer than in any attempt of `gco` in space."""
+    return replace(
+        paths, smoothing=paths.smoothing / SHARPER, stiffness=(STIFFER * paths.stiffness[-1],),
+        track_iterations=THOROUGH * paths.track_iterations,
+    )  # fmt: skip
+
+
+def fly(family: Family, first: int | None, seed: int) -> tuple[pd.DataFrame, dict[str, Example]]:
+    """One row per layout, with its cause where it isn't a success, and one example per cause."""
+    setup = compose([*family.overrides(seed=seed), "solver=gco", "device.threads=1"])
+    layouts = setup.layouts(first)
+    task = setup.task(layouts)
+    verdict = judge(task.problem, setup.solver.solve(task.problem, task.U0, seed=seed).U, task.goal, task.goal_radius)
+    assert layouts.best_cost is not None
+    best = torch.as_tensor(layouts.best_cost)
+    short = ~verdict.success(best) & ~(best.isnan() & verdict.sound)
+    rows, examples = [], {}
+    for i in range(task.problem.B):
+        row: dict[str, Any] = {"family": family.name, "layout": i, "cause": None}
+        if short[i]:
+            cost = float(verdict.cost[i]) if verdict.sound[i] else inf
+            found, example = study(setup.solver, task, layouts, i, seed, cost)
+            row |= found
+            examples.setdefault(row["cause"], example)
+            print(_line(row), flush=True)
+        rows.append(row)
+    return pd.DataFrame(rows), examples
+
+
+def study(
+    solver: Any, task: Any, layouts: Layouts, i: int, seed: int, cost: float, count: int = PATHS
+) -> tuple[dict[str, Any], Example]:
+    """The cause for layout i, on which `gco` isn't a success, with the figures that led to it.
+
+    cost   of the result of `gco`, infinite where it isn't sound
+    count  paths whose candidates are refined
+    """
+    assert layouts.best_cost is not None
+    best, part = float(layouts.best_cost[i]), task.problem.take(torch.tensor([i]))
+    with watching() as searches:
+        solution = solver.solve(part, task.U0[i : i + 1], seed=seed, ids=torch.tensor([i]))
+    costs, ends = refined(solver.paths, part, count) if has_paths(part) else ([], {})
+    name = cause(best, cost < inf, costs, searches)
+    if name == "not among the paths":
+        again, others = refined(closer(solver.paths), part, count)
+        name = cause(best, cost < inf, costs, searches, again)
+        if min(again) < min(costs):
+            costs, ends = again, others
+    good, cheapest, at = within(best, costs), min(costs, default=inf), part.position
+    found = {
+        "cause": name,
+        "ratio": cost / best,
+        "cheapest": cheapest / best,
+        "path": good[0] + 1 if good else None,
+        "sought": _sought(searches) if costs else None,
+    }
+    plan = ends[costs.index(cheapest)][:, at] if ends else None
+    return found, _example(layouts, i, solution.X[0, :, at], plan, part)
+
+
+def _example(layouts: Layouts, i: int, path: Tensor, plan: Tensor | None, problem: Problem) -> Example:
+    """The layout with its obstacles inflated, a moving sphere where it is closest to the trajectory."""
+    centers, radius = torch.as_tensor(layouts.centers[i]), layouts.vehicle_radius or 0.0
+    if layouts.velocities is not None and len(centers) > 0:
+        times = (layouts.dt or problem.dynamics.dt) * torch.arange(len(path)).view(-1, 1, 1)
+        moved = centers + times * torch.as_tensor(layouts.velocities[i])  # (N+1, M, d)
+        closest = (moved - path.unsqueeze(1)).norm(dim=-1).nan_to_num(inf).argmin(0)
+        centers = moved[closest, torch.arange(len(centers))]
+    boxes = tuple(outline.grown(radius) for outline in outlines(layouts.arrays(), i))
+    distances = torch.as_tensor(layouts.radii[i]) + radius
+    assert problem.goal is not None
+    return Example(layouts.name, i, centers, distances, path, plan, problem.goal.position[0], boxes)
+
+
+def listed(trials: pd.DataFrame) -> str:
+    """Markdown: a row per layout on which `gco` isn't a success."""
+    rows = trials[trials.cause.notna()].to_dict(orient="records")
+    return "\n".join(["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|", *map(_line, rows)])
+
+
+def _line(row: dict[Any, Any]) -> str:
+    ratio = "not sound" if not np.isfinite(row["ratio"]) else f"{row['ratio']:.3f}"
+    cheapest = f"{row['cheapest']:.3f}" if np.isfinite(row["cheapest"]) else "-"
+    path, sought = ("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name in ("path", "sought"))
+    return f"| {row['family']} | {row['layout']} | {ratio} | {cheapest} | {path} | {sought} | {row['cause']} |"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.shortfalls", description="Sort the layouts of the worlds where gco isn't a success."
+    )
+    parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
+    parser.add_argument("--first", type=int, metavar="N", help="the first N layouts of each world; default: all")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--write", action="store_true", help="put a whole run into benchmarks/results/shortfalls.md")
+    return parser
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = _parser()
+    asked = parser.parse_args(words)
+    if asked.write and (set(asked.worlds) != set(WORLDS) or asked.first is not None):
+        parser.error("--write: only with all layouts of all worlds")
+    parts, examples = [], {}
+    for name in asked.worlds:
+        trials, found = fly(WORLDS[name], asked.first, asked.seed)
+        parts.append(trials)
+        examples = {**found, **examples}
+    trials = pd.concat(parts, ignore_index=True)
+    shown = {name: examples[name] for name in CAUSES if name in examples}
+    if asked.write:
+        write(PAGE, trials, shown, asked.seed)
+    else:
+        print(f"{_table(trials)}\n\n{listed(trials)}")
+    return 0
+
+
+def _table(trials: pd.DataFrame) -> str:
+    return table(trials, CAUSES, "short")
+
+
+def write(page: Path, trials: pd.DataFrame, examples: dict[str, Example], seed: int) -> None:
+    """Put table and list between the marks of the page, and the picture next to it."""
+    origin = provenance("cpu")
+    head = f"`gco` on {origin['date']} at commit {origin['commit']}, seed {seed}, the public layouts."
+    blocks = [head, _table(trials), listed(trials)]
+    if examples:
+        file = picture(examples, page.with_suffix(".png"), "cheapest candidate")
+        blocks.append(f"![One layout for every cause]({file.name})")
+    put_between(page, *MARKS, "\n\n".join(blocks))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
