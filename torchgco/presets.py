@@ -52,7 +52,7 @@ def gco(space: Space) -> Restarts:
         local=_local(space),
         paths=PathProposals(
             roadmap=Roadmap(num_halton=128), num_paths=6, relax_top=3, arrive=(0.9,), smoothing=0.16, tube=None,
-            stiffness=(200.0,), track_iterations=10, max_gap=0.15,
+            stiffness=(200.0,), track_iterations=10, pace=1.75, max_gap=0.15,
         ),
         sampling=GCO(
             MPPI(
@@ -137,7 +137,7 @@ def fatrop_guided(space: Space) -> GuidedCasADi:
     relaxed = 0 if _in_the_plane(space) else 20  # in the plane, relaxed candidates fall back into the trap
     paths = replace(
         paths, num_paths=4, initial_offsets=(), arrive=paths.paces[:1], relax_iterations=relaxed, relax_top=None,
-        refine_top=1, max_penetration=1.0, max_gap=None,
+        refine_top=1, max_penetration=1.0, pace=None, max_gap=None,
     )  # fmt: skip
     return GuidedCasADi(fatrop(space), paths)
 

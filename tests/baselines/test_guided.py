@@ -85,7 +85,7 @@ def test_the_configuration_serves_every_model(model: str) -> None:
     guided, fatrop, gco = solvers
     own = dict(
         num_paths=4, initial_offsets=(), arrive=gco.paths.paces[:1], relax_iterations=guided.paths.relax_iterations,
-        relax_top=None, refine_top=1, max_penetration=1.0, max_gap=None,
+        relax_top=None, refine_top=1, max_penetration=1.0, pace=None, max_gap=None,
     )  # fmt: skip
     assert guided.solver == fatrop and guided.paths == replace(gco.paths, **own)
 

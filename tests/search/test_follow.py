@@ -14,9 +14,9 @@ from torchgco.constraints.bodies import Inflated
 from torchgco.rollout import open_loop
 from torchgco.search.candidates import Candidates
 from torchgco.search.geometry import FAR, depth
-from torchgco.search.paths import Ways
 from torchgco.search.scene import scene_of
 from torchgco.search.tracking import CUT, followed, travel
+from torchgco.search.ways import Ways
 from torchgco.solvers.ilqr import ILQR
 
 END = torch.tensor([0.7], dtype=torch.float64)

@@ -164,7 +164,7 @@ def test_an_offset_turns_the_vehicle_before_it_departs() -> None:
 CHANGES = dict(
     roadmap=Roadmap(num_halton=8), num_paths=1, initial_offsets=((0.7, -0.7),), depart=0.2, arrive=(0.7,),
     smoothing=0.2, tube=None, stiffness=(50.0,), track_iterations=2, relax_iterations=2, relax_top=1, refine_top=2,
-    max_penetration=1e-3, max_gap=1e-3,
+    max_penetration=1e-3, pace=0.5, max_gap=1e-3,
 )  # fmt: skip
 CONSTANTS = {
     "paths.TOLERANCE": 0.5, "paths.TRACK_PENALTY": 50.0, "paths.PENALTY": 5.0,
@@ -221,7 +221,7 @@ def test_lists_of_a_configuration_equal_tuples() -> None:
         (dict(arrive=(0.5, 1.1)), "paths.depart"), (dict(arrive=()), "paths.depart"),
         (dict(smoothing=1.0), "paths.smoothing"), (dict(smoothing=-0.1), "paths.smoothing"),
         (dict(tube=0.0), "paths.tube"), (dict(max_penetration=0.0), "paths.max_penetration"),
-        (dict(max_gap=0.0), "paths.max_gap"), (dict(stiffness=()), "paths.stiffness"),
+        (dict(max_gap=0.0), "paths.max_gap"), (dict(pace=0.0), "paths.pace"), (dict(stiffness=()), "paths.stiffness"),
         (dict(stiffness=(0.0,)), "paths.stiffness"),
         (dict(num_paths=0), "paths.num_paths"), (dict(track_iterations=0), "paths.track_iterations"),
         (dict(relax_iterations=-1), "paths.relax_iterations"), (dict(relax_top=0), "paths.relax_top"),

@@ -12,6 +12,7 @@ from torchgco.rollout import open_loop
 from torchgco.search.paths import MORE, Proposal
 from torchgco.search.restarts import StopWhenCaught
 from torchgco.search.suitability import has_paths
+from torchgco.search.tracking import followed
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR, descend
 
@@ -72,6 +73,28 @@ def test_a_proposal_within_the_gap_keeps_its_bits(woods, options, monkeypatch) -
     once, _ = proposed(replace(options, max_gap=None), woods, monkeypatch)
     same, passes = proposed(replace(options, max_gap=100.0), woods, monkeypatch)
     assert torch.equal(once.U, same.U) and len(passes) == 1
+
+
+def test_no_path_is_followed_more_slowly_than_the_pace(woods, options, monkeypatch) -> None:
+    """The time without constraints, measured here as it is defined, times the stretch of each path, is the limit."""
+    seen, first = [], []
+    monkeypatch.setattr("torchgco.search.paths.followed", lambda *words: seen.append(words) or followed(*words))
+    for pace in (None, 1.2, 0.9):
+        seen.clear()
+        replace(options, pace=pace, max_gap=None, arrive=0.9).propose(woods)
+        first.append(seen[0])
+    (path, _, slow, *_), (_, _, limited, *_), (_, _, fast, *_) = first
+    assert bool((slow == 0.9).all())
+    lagrangian = Lagrangian(woods, Multipliers.zero(woods, 0.0), None, True)
+    rest = woods.cost.rest_controls(torch.zeros(LAYOUTS, woods.N, woods.m, dtype=torch.float64))
+    X = descend(ILQR(tolerance=1e-9, max_iterations=100), lagrangian, rest)[0].X
+    left = (X[..., :3] - woods.goal.position.unsqueeze(1)).norm(dim=-1)
+    share = (left > 0.1 * left[:, :1]).sum(-1).double() / woods.N
+    stretch = path.diff(dim=1).norm(dim=-1).sum(-1) / (path[:, 0] - path[:, -1]).norm(dim=-1)
+    for found, pace in ((limited, 1.2), (fast, 0.9)):
+        expected = torch.minimum(slow, pace * share.repeat_interleave(options.num_paths) * stretch)
+        torch.testing.assert_close(found, expected, atol=1.5 / woods.N, rtol=0)
+    assert bool((fast < limited).all())
 
 
 def test_the_gap_depends_on_no_other_problem(woods, options) -> None:

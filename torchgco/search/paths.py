@@ -22,9 +22,8 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bodies import Inflated
 from torchgco.errors import InputError
-from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import cost_unit, open_loop, value
 from torchgco.options import AtLeast, Below, Count, Natural, Positive, check_options
 from torchgco.problem import Problem
@@ -34,9 +33,10 @@ from torchgco.search.geometry import Scene
 from torchgco.search.homotopy import one_per_class
 from torchgco.search.roadmap import Roadmap
 from torchgco.search.tracking import attraction, followed
+from torchgco.search.ways import Ways, plain, unconstrained
 from torchgco.shapes import check_shape, tensor
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
-from torchgco.solvers.ilqr import ILQR, descend
+from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
 from torchgco.tree import put, take
 
@@ -54,6 +54,7 @@ SHARPER, STIFFER, LONGER = 4.0, 10.0, 2
 # for some outer iterations, which show the costs to a few percent, and compared if they violate less than 1 cm.
 MORE, COMPARED, ROUNDS, NEARLY = 2, 3, 4, 1e-2
 THOROUGH = 3  # times as many iterations of tracking, where an attempt along the best path has failed
+LEAST = 0.05  # share of the horizon between departure and arrival
 VIOLATION = 1e-3  # m for lengths: the most of other refined candidates
 
 
@@ -64,17 +65,6 @@ class Proposal(NamedTuple):
     found: Tensor  # (B,) bool: whether there is a proposal; elsewhere U is not to be used
     multipliers: Multipliers  # to continue with; mu keeps the solver from leaving the path, NaN where there is none
     iterations: Tensor  # (B,) int64: of all solves of all candidates, also where none is found
-
-
-@dataclass(frozen=True)
-class Ways:
-    """Paths of B problems, K each, and the units to follow them in."""
-
-    paths: Tensor  # (B, K, P, d), m
-    live: Tensor  # (B, K) bool: one per homotopy class
-    R: Tensor  # (B,): mean inflated radius, m
-    unit: Tensor  # (B,): q0 / R^4
-    obstacles: Inflated
 
 
 @dataclass(frozen=True)
@@ -90,6 +80,8 @@ class PathProposals:
             don't fit the number of controls.
         depart, arrive: shares of the horizon at which the vehicle leaves the start and reaches the goal. Several
             values of `arrive`: every path is tracked at each pace.
+        pace: times the time that the vehicle takes without constraints, per length of the way: no path is followed more
+            slowly than this, whatever `arrive` says. None: no such limit.
         smoothing: share of the horizon over which the corners of a path are averaged, at most (`tracking.followed`).
         tube: radius of the tube that a candidate is kept in, as a share of the mean inflated radius; None: a spring to
             the path instead. A spring takes half the iterations; a vehicle that can't move sideways ends closer to the
@@ -115,6 +107,7 @@ class PathProposals:
     initial_offsets: tuple[tuple[float, ...], ...] = ()
     depart: float = 0.0
     arrive: float | tuple[float, ...] = 0.9
+    pace: Positive | None = None
     smoothing: Annotated[float, AtLeast(0), Below(1)] = 0.08
     tube: Positive | None = 0.05
     stiffness: tuple[Positive, ...] = (20.0, 200.0)
@@ -146,7 +139,7 @@ class PathProposals:
         """Proposals for problems that these don't bring to the goal: more paths, followed closer, and all refined."""
         return replace(
             self, num_paths=MORE * self.num_paths, track_iterations=THOROUGH * self.track_iterations, relax_top=None,
-            refine_top=max(MORE * self.num_paths, self.refine_top), max_gap=None,
+            refine_top=max(MORE * self.num_paths, self.refine_top), pace=None, max_gap=None,
         )  # fmt: skip
 
     def propose(self, problem: Problem, watch: Watch = unwatched) -> Proposal:
@@ -174,7 +167,9 @@ class PathProposals:
             return None
         ways = self._ways(problem, rest, scene)
         proposal = self._along(problem, rest, ways, watch)
-        more = self._costly(problem, rest, proposal)
+        if ways.free is not None:
+            proposal.iterations.add_(ways.free.iterations)
+        more = self._costly(problem, ways, proposal)
         self._closer(problem, rest, ways, proposal, watch)
         self._wider(problem, rest, more, proposal, watch)
         return proposal
@@ -184,7 +179,9 @@ class PathProposals:
         R, unit = seen.scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
         live = one_per_class(paths, scene) & found.unsqueeze(-1)
-        return Ways(paths, live, R, torch.where(found, unit, 1.0), scene.obstacles)
+        compared = self.pace is not None or self.max_gap is not None
+        free = unconstrained(problem, rest, _inner(self.track_iterations)) if compared else None
+        return Ways(paths, live, R, torch.where(found, unit, 1.0), scene.obstacles, free)
 
     def _closer(self, problem: Problem, rest: Tensor, ways: Ways, proposal: Proposal, watch: Watch) -> None:
         """Where there are paths but no proposal along them, follow them again, closer."""
@@ -198,15 +195,12 @@ class PathProposals:
             more = closer._along(problem.take(rows), rest[rows], take(ways, rows), watch)
             put(proposal, rows, more._replace(iterations=more.iterations + proposal.iterations[rows]))
 
-    def _costly(self, problem: Problem, rest: Tensor, proposal: Proposal) -> Tensor:
+    def _costly(self, problem: Problem, ways: Ways, proposal: Proposal) -> Tensor:
         """The problems (b,) whose proposal costs far more than the trajectory without constraints."""
-        if self.max_gap is None or not bool(proposal.found.any()):
+        if self.max_gap is None or ways.free is None:
             return proposal.found.new_empty(0, dtype=torch.int64)
-        free = Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True)
-        least, _ = descend(_inner(self.track_iterations), free, rest)
-        proposal.iterations.add_(least.iterations)
-        cost, _ = value(free, open_loop(problem, proposal.U), proposal.U)
-        costly = cost > least.cost + self.max_gap * least.cost.abs()
+        cost, _ = value(plain(problem), open_loop(problem, proposal.U), proposal.U)
+        costly = cost > ways.free.cost + self.max_gap * ways.free.cost.abs()
         return (proposal.found & costly).nonzero().flatten()
 
     def _wider(self, problem: Problem, rest: Tensor, rows: Tensor, proposal: Proposal, watch: Watch) -> None:
@@ -218,8 +212,10 @@ class PathProposals:
         wider = replace(self, num_paths=MORE * self.num_paths, relax_top=relax_top, refine_top=COMPARED)
         scene = seen.scene_of(part, rest)
         assert scene is not None
-        more = wider._along(part, rest, wider._ways(part, rest, scene), watch, ROUNDS, NEARLY)
-        proposal.iterations[rows] += more.iterations
+        ways = wider._ways(part, rest, scene)
+        more = wider._along(part, rest, ways, watch, ROUNDS, NEARLY)
+        assert ways.free is not None
+        proposal.iterations[rows] += more.iterations + ways.free.iterations
         better = more.found.nonzero().flatten()
         more = more._replace(iterations=proposal.iterations[rows])
         put(proposal, rows[better], take(more, better))
@@ -268,6 +264,9 @@ class PathProposals:
         paces, K = len(self.paces), ways.paths.shape[1]
         path = ways.paths.flatten(0, 1).repeat_interleave(paces, dim=0)
         arrive = path.new_tensor(self.paces).repeat(path.shape[0] // paces)
+        if self.pace is not None:
+            latest = self.pace * ways.shares().flatten().repeat_interleave(paces)
+            arrive = torch.minimum(arrive, latest.clamp(min=self.depart + LEAST))
         center = followed(path, self.depart, arrive, self.smoothing, candidates.problem.N, ways.obstacles, ways.R)
         problem = torch.arange(candidates.problem.B, device=path.device).repeat_interleave(K * paces) * candidates.count
         number = torch.arange(candidates.live.numel(), device=path.device)
