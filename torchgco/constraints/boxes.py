@@ -10,11 +10,12 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.constraints.bodies import Inflated, Obstacles, least
-from torchgco.constraints.cuboids import Cuboids, excess, segment_distance, signed_distance
+from torchgco.constraints.cuboids import Cuboids, excess, from_quaternions, segment_distance, signed_distance
 from torchgco.constraints.obstacles import FAR, per_problem, vehicle_radius
 from torchgco.errors import InputError
 from torchgco.shapes import Dimensions, check_shape, tensor
 
+AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
 UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
 
 
@@ -149,10 +150,18 @@ class BoundBoxes(Obstacles):
         p = X[:, self.knots, self.position]
         return (-self.signed_distance(p, self.times(X))).clamp(min=0.0)
 
+    def worst(self, X: Tensor, U: Tensor) -> Tensor:
+        parts = self._parts(X.shape[1])
+        return torch.cat([super(BoundBoxes, self.take(rows)).worst(X[rows], U[rows]) for rows in parts])
+
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
         return torch.where(self.absent.unsqueeze(1), torch.inf, self._outside(p))
 
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
+        parts = self._parts(a.shape[1])
+        return torch.cat([self.take(rows)._segment_clearance(a[rows], b[rows]) for rows in parts])
+
+    def _segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
         boxes = self._cuboids()
         begin, end, half = boxes.seen_from(a), boxes.seen_from(b), boxes.halves()
         ends = signed_distance(begin, half), signed_distance(end, half)
@@ -181,8 +190,17 @@ class BoundBoxes(Obstacles):
 
     def _outside(self, p: Tensor) -> Tensor:
         """Distances (B, K, M) of points p (B, K, d) from the full surfaces, as if none were absent."""
-        boxes = self._cuboids()
-        return signed_distance(boxes.seen_from(p), boxes.halves()) - self.inflated_radii.unsqueeze(1)
+        distances = []
+        for rows in self._parts(p.shape[1]):
+            boxes = self._cuboids().rows(rows)
+            distances.append(signed_distance(boxes.seen_from(p[rows]), boxes.halves()))
+        return torch.cat(distances) - self.inflated_radii.unsqueeze(1)
+
+    def _parts(self, points: int) -> list[slice]:
+        """The problems of a batch, as many at a time as the processor's cache holds distances of `points` points."""
+        B, M = self.absent.shape
+        size = max(B, 1) if self.absent.is_cuda else max(1, AT_ONCE // max(1, points * M))
+        return [slice(first, first + size) for first in range(0, max(B, 1), size)]
 
     def _rows(self, p: Tensor) -> Tensor:
         """c (B, K, M) at points (B, K, d); an absent box is c = -1 everywhere."""
@@ -274,12 +292,3 @@ def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
     if not _finite(axes):
         raise InputError("boxes.rotations", "finite numbers for every box that is there", "NaN or infinity")
     return axes.contiguous()
-
-
-def from_quaternions(turns: Tensor) -> Tensor:
-    """The images (..., 3, 3), as rows, of the three axes under turns [w, x, y, z] (..., 4)."""
-    w, x, y, z = turns.unbind(-1)
-    first = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-    second = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
-    third = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-    return torch.stack([torch.stack(row, dim=-1) for row in (first, second, third)], dim=-2)

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
-from torchgco.constraints.boxes import BoundBoxes, dimension, from_quaternions, own_radii, vehicle_radii
+from torchgco.constraints.boxes import BoundBoxes, dimension, own_radii, vehicle_radii
+from torchgco.constraints.cuboids import from_quaternions
 from torchgco.constraints.obstacles import per_problem
 from torchgco.errors import InputError
 from torchgco.shapes import Dimensions, check_shape, tensor

@@ -136,6 +136,15 @@ def segment_distance(begin: Coordinates, along: Coordinates, half: Coordinates) 
     return torch.minimum(outside, within)
 
 
+def from_quaternions(turns: Tensor) -> Tensor:
+    """The images (..., 3, 3), as rows, of the three axes under turns [w, x, y, z] (..., 4)."""
+    w, x, y, z = turns.unbind(-1)
+    first = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+    second = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
+    third = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    return torch.stack([torch.stack(row, dim=-1) for row in (first, second, third)], dim=-2)
+
+
 def beside(boxes: Cuboids, start: Tensor, goal: Tensor, shells: Sequence[float]) -> tuple[Tensor, Tensor]:
     """Points (B, C, d) around corners, edges and sides of the boxes, and whether each one's box is present (B, C).
 

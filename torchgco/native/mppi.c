@@ -53,7 +53,9 @@ static V hits(const Samples *q, int64_t k, const V *x) {
 #endif
 #if WITH_BOXES
         if (con->kind == BOXES) {
-            for (int j = 0; j < con->rows; j++) count += tgco_truth(solid(q->s.rows + i, j, x, 0) >= SET(0.0));
+            const Rows *rows = q->s.rows + i;
+            for (int j = 0; j < con->rows; j++)
+                if (!is_far(con, rows, j, x)) count += tgco_truth(solid(con, rows, j, x, 0) >= SET(0.0));
             continue;
         }
 #endif

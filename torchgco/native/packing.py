@@ -18,6 +18,7 @@ ABSENT = -1.0  # stands for the squared inflated radius of an absent obstacle
 BOUNDS, SPHERES, FUNCTION, BOXES = range(4)
 # All other constraints, subclasses of these too, are traced.
 KINDS = {ControlBounds: BOUNDS, StateBounds: BOUNDS, BoundSpheres: SPHERES, BoundBoxes: BOXES}
+BOUND_SLACK = 1.0 + 1e-4  # so that rounding, in single precision too, can't make a row active beyond its box's bounds
 NO_GUIDE, REGION, PATH = range(3)
 
 
@@ -99,13 +100,17 @@ def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: 
         if constraint.velocities is not None:
             c.velocities = array(constraint.velocities.flatten(1), keep, knots=False)
     elif isinstance(constraint, BoundBoxes):
-        c.bound = array(_box_numbers(constraint).flatten(1), keep, knots=False)
+        c.bound = array(_box_numbers(constraint), keep, knots=False)
 
 
 def _box_numbers(boxes: BoundBoxes) -> Tensor:
-    """The numbers that boxes.c reads per box, (B, M, ...)."""
+    """The numbers (B, ...) that boxes.c reads: bounds of all boxes, axis by axis, then all numbers of each box."""
     radius, factor = boxes.inflated_radii.unsqueeze(-1), 2.0 * boxes.depths.unsqueeze(-1)
-    return torch.cat((boxes.centers, boxes.axes.flatten(2), boxes.half_sizes, radius, factor), dim=-1)
+    reach = (boxes.axes.abs() * boxes.half_sizes.unsqueeze(-1)).sum(-2) + radius
+    reach = torch.where(boxes.absent.unsqueeze(-1), -1.0, BOUND_SLACK * reach)
+    bounds = torch.stack((boxes.centers, reach), dim=-1).transpose(1, 2)
+    numbers = torch.cat((boxes.centers, boxes.axes.flatten(2), boxes.half_sizes, radius, factor), dim=-1)
+    return torch.cat((bounds.flatten(1), numbers.flatten(1)), dim=1)
 
 
 def array(value: Tensor | None, keep: list[Any], knots: bool) -> Array:
