@@ -31,19 +31,21 @@ from torchgco.judge import SUCCESS_COST
 from torchgco.plotting.boxes import outlines
 from torchgco.problem import Problem
 from torchgco.scenarios import Layouts
-from torchgco.search.paths import SHARPER, STIFFER, THOROUGH, PathProposals
+from torchgco.search import scene as seen
+from torchgco.search.candidates import unwatched
+from torchgco.search.paths import PathProposals
 from torchgco.search.suitability import has_paths
+from torchgco.search.ways import joined
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "benchmarks" / "results" / "shortfalls.md"
 MARKS = "<!-- shortfalls -->", "<!-- end shortfalls -->"
-PATHS = 24  # whose candidates are all refined
+PATHS = 12  # of each of the two searches that `gco` compares where the best candidate is costly
 CAUSES = {
     "no solution known": "neither `gco` nor any other search has found a way",
     "another local solution": "moving obstacles, and no paths: waiting, or passing on another side, costs less",
     "not reached": "moving obstacles, and no paths: no attempt is sound",
-    "not among the paths": f"no candidate along the first {PATHS} paths ends within 5 % of the best known cost",
-    "left its path": "a candidate does only where its path is followed closer than `gco` follows it",
+    "not among the paths": f"no candidate along {PATHS} paths of each search ends within 5 % of the best known cost",
     "no path sought": "a candidate does, but the first solve was never caught, so that `gco` sought no path",
     "a later path": "a candidate does, but its path comes after those that `gco` sought",
     "dropped as tracked": "its path was sought, but cheaper tracked candidates were relaxed in its place",
@@ -57,16 +59,13 @@ HEAD = (
 )  # fmt: skip
 
 
-def cause(
-    best: float, sound: bool, costs: Sequence[float], searches: Sequence[Search], closer: Sequence[float] = ()
-) -> str:
+def cause(best: float, sound: bool, costs: Sequence[float], searches: Sequence[Search]) -> str:
     """The cause for one layout on which `gco` isn't a success; of several good candidates the one that got farthest.
 
     best      the best known cost, NaN where no solution is known
     sound     whether the result of `gco` is
     costs     of a refined candidate along each path, infinite where it has no good end; none: no paths can be sought
     searches  those that `gco` made
-    closer    the costs where the paths are followed closer
     """
     if isnan(best) and not sound:
         return "no solution known"
@@ -74,7 +73,7 @@ def cause(
         return "another local solution" if sound else "not reached"
     good = within(best, costs)
     if not good:
-        return "left its path" if within(best, closer) else "not among the paths"
+        return "not among the paths"
     if not searches:
         return "no path sought"
     sought = [path for path in good if path < _sought(searches)]
@@ -91,35 +90,37 @@ def _sought(searches: Sequence[Search]) -> int:
 
 
 def _fate(path: int, searches: Sequence[Search]) -> str:
-    """Where the candidate along a path was dropped, in the last search for it that made a proposal."""
+    """Where the candidates along a path were dropped, in the last searches for it that made a proposal."""
     own = [search for search in searches if path < search.count]
-    last = next((search for search in reversed(own) if search.chosen is not None), own[-1])
-    return FATES[2] if path in last.compared else FATES[1] if path in last.relaxed else FATES[0]
+    own = [search for search in own if search.chosen is not None] or own
+    last = [search for search in own if search.count == own[-1].count]  # the same paths, followed in two ways
+    if any(path in search.compared for search in last):
+        return FATES[2]
+    return FATES[1] if any(path in search.relaxed for search in last) else FATES[0]
 
 
 def refined(paths: PathProposals, problem: Problem, count: int = PATHS) -> tuple[list[float], dict[int, Tensor]]:
-    """Costs of a candidate along each of `count` paths, all refined to the end, infinite where it has no good end.
+    """Costs of the cheaper candidate, followed loosely or closer, along each of `count` paths of each search.
 
-    Also returns the states (N+1, n) of the others by the number of their path.
+    All are refined to the end; the cost is infinite where neither has a good end. Also returns the states (N+1, n) of
+    the others by the number of their path.
     """
-    every = replace(paths, num_paths=count, relax_top=None, refine_top=count, max_gap=None)
+    every = replace(paths, num_paths=count, relax_top=None, refine_top=2 * count, max_gap=None)
+    scaled = problem.in_cost_units()
+    rest = problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m))
+    scene = seen.scene_of(scaled, rest)
+    assert scene is not None
+    ways = joined(every._ways(scaled, rest, scene), every.among_more_points()._ways(scaled, rest, scene), scene)
     with watching() as searches:
-        every.propose(problem)
-    costs, ends = [inf] * count, {}
-    for search in searches:  # the second one, where there is any, follows the same paths closer
+        for proposals in (every, every.closer()):
+            proposals._along(scaled, rest, ways, unwatched)
+    costs, ends = [inf] * (2 * count), {}
+    for search in searches:
         for path, (X, U) in search.ends.items():
             cost = float(problem.cost.total(X[None], U[None]))
             if cost < costs[path]:
                 costs[path], ends[path] = cost, X
     return costs, ends
-
-
-def closer(paths: PathProposals) -> PathProposals:
-    """The same proposals, whose paths are followed closer than in any attempt of `gco` in space."""
-    return replace(
-        paths, smoothing=paths.smoothing / SHARPER, stiffness=(STIFFER * paths.stiffness[-1],),
-        track_iterations=THOROUGH * paths.track_iterations,
-    )  # fmt: skip
 
 
 def fly(family: Family, first: int | None, seed: int) -> tuple[pd.DataFrame, dict[str, Example]]:
@@ -158,11 +159,6 @@ def study(
         solution = solver.solve(part, task.U0[i : i + 1], seed=seed, ids=torch.tensor([i]))
     costs, ends = refined(solver.paths, part, count) if has_paths(part) else ([], {})
     name = cause(best, cost < inf, costs, searches)
-    if name == "not among the paths":
-        again, others = refined(closer(solver.paths), part, count)
-        name = cause(best, cost < inf, costs, searches, again)
-        if min(again) < min(costs):
-            costs, ends = again, others
     good, cheapest, at = within(best, costs), min(costs, default=inf), part.position
     found = {
         "cause": name,

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torchgco.search.candidates import Candidates
+from torchgco.search.candidates import Candidates, Refining
 from torchgco.search.paths import PathProposals, Proposal
 
 
@@ -45,14 +45,15 @@ def watching() -> Iterator[list[Search]]:
         numbers[:] = [numbers[place] for place in places]
         return pick(self, order)
 
-    def noting_refined(self: Candidates, solver: Any, sound: Tensor, violation: float) -> Any:
-        end, multipliers, best = refined(self, solver, sound, violation)
+    def noting_refined(self: Candidates, inner: Any, sound: Tensor, refining: Refining) -> Any:
+        end, multipliers, best, cost = refined(self, inner, sound, refining)
         search = searches[-1]
         search.compared = [number for number, is_sound in zip(numbers, sound.tolist(), strict=True) if is_sound]
-        search.chosen = numbers[int(best)] if bool(sound[best]) else None
+        counts = cost.isfinite() if refining.needed else sound[best]
+        search.chosen = numbers[int(best)] if bool(counts) else None
         changed = (end.U != self.U).flatten(1).any(-1)  # a solve with a bad end leaves its candidate unchanged
         search.ends = {numbers[row]: (end.X[row], end.U[row]) for row in changed.nonzero().flatten().tolist()}
-        return end, multipliers, best
+        return end, multipliers, best, cost
 
     try:
         for (owner, name), noting in zip(methods, (noting_along, noting_pick, noting_refined), strict=True):

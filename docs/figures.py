@@ -115,7 +115,7 @@ def draw(calls: Calls, layouts: Layouts, final: np.ndarray) -> dict[str, Figure]
         ax.plot(*_xy(relaxed.X[row]), color=PALE, linewidth=0.6)
     _shaded(ax, relaxed, sound.nonzero().flatten().tolist(), 0.8)
 
-    (before, _, kept, _), (refined, _, best) = calls["refined"][0]
+    (before, _, kept, _), (refined, _, best, _) = calls["refined"][0]
     rows = [row for row in kept.nonzero().flatten().tolist() if not torch.equal(before.U[row], refined.U[row])]
     figures["5-refined"], ax = _scene(layouts, f"5  Refined: {len(rows)} end feasible, darker is cheaper")
     _shaded(ax, refined, rows, 1.2)

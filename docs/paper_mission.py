@@ -165,7 +165,7 @@ def free(path: Path) -> Path:
     relaxed, sound = calls["relaxed"][0][1]
     sets = relaxed.X[sound.nonzero().flatten(), :, :2].numpy()
     pictures.append(Picture(f"3  relaxed: {len(sets)} are sound", sets, seconds=1.5))
-    (before, _, kept, _), (refined, _, best) = calls["refined"][0]
+    (before, _, kept, _), (refined, _, best, _) = calls["refined"][0]
     kept = [row for row in kept.nonzero().flatten().tolist() if not torch.equal(before.U[row], refined.U[row])]
     few = refined.X[kept, :, :2].numpy()
     pictures.append(Picture(f"4  refined: {len(few)} end feasible", few, seconds=1.5))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgco import Boxes, ControlBounds, Goal, Planar, Problem, QuadraticCost, Spheres, judge, presets, solve
+from torchgco import Boxes, ControlBounds, Goal, Planar, Problem, QuadraticCost, Spheres, compose, judge, presets, solve
 from torchgco.evaluation import chord_clearance
 from torchgco.kernels import use_native
 from torchgco.native.dispatch import open_loop
@@ -57,6 +57,15 @@ def test_chords_are_cleared_and_nothing_else_changes(make, monkeypatch: pytest.M
 def test_a_coarse_disc_is_cleared_for_every_start() -> None:
     problem = coarse_disc()
     assert bool(judge(problem, solve(problem).U).sound.all())
+
+
+def test_growth_counts_from_the_clearance_that_the_last_solve_missed() -> None:
+    """In this maze a first growth of 0.3 mm leads to a cut three times as deep as before."""
+    setup = compose(["scenario=mazes", "scenario.walls=4", "seed=99"])
+    task = setup.task(setup.layouts(27))
+    problem = task.problem.take(torch.tensor([26]))
+    solution = presets.gco(problem).solve(problem, task.U0[26:27])
+    assert bool(judge(problem, solution.U).sound.all())
 
 
 def test_a_problem_is_cleared_alike_in_every_batch() -> None:

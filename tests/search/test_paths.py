@@ -1,5 +1,6 @@
 """Proposals along paths: they lead to the goal, report where there is none, and count their iterations."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -19,7 +20,7 @@ from torchgco.solvers.ilqr import descend
 
 
 def test_a_proposal_ends_near_the_goal_and_has_a_penalty() -> None:
-    U, found, multipliers, _ = replace(QUICK, track_iterations=20, max_penetration=0.5).propose(cup())
+    U, found, multipliers, *_ = replace(QUICK, track_iterations=20, max_penetration=0.5).propose(cup())
     assert bool(found.all()) and bool((multipliers.mu > 0).all()) and bool(torch.isfinite(U).all())
     assert float(judge(cup(), U, GOAL, 0.3).goal_distance.max()) < 0.3
 
@@ -39,13 +40,13 @@ def test_a_proposal_scales_with_the_unit_of_cost() -> None:
     ids=["no path", "moving", "no obstacles"],
 )
 def test_where_there_is_no_path_nothing_is_proposed(problem: Problem) -> None:
-    U, found, multipliers, iterations = QUICK.propose(problem)
+    U, found, multipliers, iterations, cost = QUICK.propose(problem)
     assert not bool(found.any()) and U.shape == (2, 100, 2) and iterations.tolist() == [0, 0]
-    assert bool(multipliers.mu.isnan().all())
+    assert bool(multipliers.mu.isnan().all()) and cost.tolist() == [math.inf] * 2
 
 
 def test_no_problems_have_no_proposals() -> None:
-    U, found, _, iterations = QUICK.propose(cup().take(torch.arange(0)))
+    U, found, _, iterations, _ = QUICK.propose(cup().take(torch.arange(0)))
     assert U.shape == (0, 100, 2) and found.shape == iterations.shape == (0,)
 
 
@@ -113,7 +114,7 @@ def test_the_iterations_of_every_candidate_are_counted(monkeypatch) -> None:
 
         return call
 
-    for place in ("torchgco.search.candidates.descend", "torchgco.search.paths.AugmentedLagrangian.solve"):
+    for place in ("torchgco.search.candidates.descend", "torchgco.search.candidates.AugmentedLagrangian.solve"):
         monkeypatch.setattr(place, noted(resolve_name(place)))
     options = replace(QUICK, num_paths=3, initial_offsets=((0.7, -0.7),), relax_top=3, relax_iterations=4, refine_top=2)
     problem = cups()

@@ -108,7 +108,7 @@ def test_where_the_first_path_fails_the_best_of_more_candidates_is_proposed(solv
     caught, along, thorough, sampled, again = solves
     assert (along.rows, thorough.rows, sampled.rows) == ([PASSES, SHORT], [SHORT], [CLOSED])
     assert again.rows == [SHORT, CLOSED] and torch.equal(again.call.U0, caught.end.last.U[[SHORT, CLOSED]])
-    more = PATHS.thorough.propose(problem.in_cost_units().take(torch.tensor([SHORT, CLOSED])))
+    more = PATHS.thorough().propose(problem.in_cost_units().take(torch.tensor([SHORT, CLOSED])))
     assert more.found.tolist() == [True, False]
     assert torch.equal(thorough.call.U0, more.U[:1]) and thorough.guidance is thorough.penalty is None
     solves.clear()
@@ -121,8 +121,8 @@ def test_without_a_path_and_without_samples_the_stopped_solve_continues(solves: 
     problem, U0 = gates()
     problem, U0 = problem.take(torch.tensor([PASSES])), U0[:1]
     caught = LOCAL.iterate(Call.checked(problem, U0).in_cost_units()[0], StopWhenCaught(None))
-    shallow = replace(PATHS, max_penetration=1e-9)
-    proposal, more = shallow.propose(problem), shallow.thorough.propose(problem)
+    shallow = replace(PATHS, max_penetration=1e-9, refine_top=2)
+    proposal, more = shallow.propose(problem), shallow.thorough().propose(problem)
     solution = Restarts(LOCAL, shallow, sampling=None).solve(problem, U0)
     assert caught.status.tolist() == [STOPPED] and not bool(proposal.found | more.found)
     assert int(solution.guided) == 0

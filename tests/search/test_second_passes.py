@@ -9,10 +9,12 @@ from torch import Tensor
 from torchgco import PathProposals, Problem, Restarts, Status, compose, presets
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.rollout import open_loop
-from torchgco.search.paths import MORE, Proposal
+from torchgco.search.paths import Proposal
 from torchgco.search.restarts import StopWhenCaught
+from torchgco.search.settings import MORE
 from torchgco.search.suitability import has_paths
 from torchgco.search.tracking import followed
+from torchgco.search.ways import Ways
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR, descend
 
@@ -33,13 +35,13 @@ def options() -> PathProposals:
     return replace(paths, num_paths=3)
 
 
-def proposed(options: PathProposals, problem: Problem, monkeypatch) -> tuple[Proposal, list[tuple[int, int]]]:
-    """The proposals, and of every pass along paths the numbers of paths and of problems."""
+def proposed(options: PathProposals, problem: Problem, monkeypatch) -> tuple[Proposal, list[tuple[int, int, bool]]]:
+    """The proposals, and of every pass along paths the numbers of paths and of problems, and whether it is closer."""
     passes, along = [], PathProposals._along
 
-    def noted(self: PathProposals, problem: Problem, *words) -> Proposal:
-        passes.append((self.num_paths, problem.B))
-        return along(self, problem, *words)
+    def noted(self: PathProposals, problem: Problem, rest: Tensor, ways: Ways, *words) -> Proposal:
+        passes.append((ways.paths.shape[1], problem.B, self.smoothing < options.smoothing))
+        return along(self, problem, rest, ways, *words)
 
     monkeypatch.setattr(PathProposals, "_along", noted)
     found = options.propose(problem)
@@ -57,16 +59,31 @@ def gaps(problem: Problem, U: Tensor) -> Tensor:
 
 def test_costly_proposals_are_compared_with_those_along_more_paths(woods, options, monkeypatch) -> None:
     once, passes = proposed(replace(options, max_gap=None), woods, monkeypatch)
-    assert passes == [(options.num_paths, LAYOUTS)] and bool(once.found.all())
+    assert passes == [(options.num_paths, LAYOUTS, False)] and bool(once.found.all())
     gap = gaps(woods, once.U)
     limit = float(gap.sort().values[1:3].mean())  # two of four problems cost more
     twice, passes = proposed(replace(options, max_gap=limit), woods, monkeypatch)
-    assert passes == [(options.num_paths, LAYOUTS), (MORE * options.num_paths, 2)]
+    both = 2 * MORE * options.num_paths  # paths of two searches
+    assert passes == [(options.num_paths, LAYOUTS, False), (both, 2, False), (both, 2, True)]
     cheap = gap <= limit
     assert torch.equal(twice.U[cheap], once.U[cheap]) and bool((twice.U[~cheap] != once.U[~cheap]).any())
     assert bool((twice.iterations[~cheap] > once.iterations[~cheap] + 50).all())
     # The new proposals are refined, which removes contacts at some cost; those with a cheaper path are cheaper.
     assert bool((gaps(woods, twice.U) < gap + 0.05).all())
+
+
+def test_a_candidate_that_is_too_deep_counts_where_refining_mends_it(woods, options, monkeypatch) -> None:
+    shallow = replace(options, max_gap=None, max_penetration=1e-9)
+    some, passes = proposed(shallow, woods, monkeypatch)
+    again = passes[1][1]
+    assert passes == [(3, LAYOUTS, False), (3, again, True)] and again > 0
+    X = open_loop(woods.dynamics, woods.x0, some.U)
+    depth = torch.stack([c.worst(X, some.U) for c in woods.geometric]).amax(0)
+    refined = some.cost.isfinite()
+    assert bool(refined.any()) and torch.equal(refined, some.found) and bool((depth[refined] < 1e-2 + 1e-9).all())
+    torch.testing.assert_close(woods.cost.total(X, some.U)[refined], some.cost[refined])
+    none, _ = proposed(replace(shallow, refine_top=2), woods, monkeypatch)
+    assert not bool(none.found[~some.cost.isfinite()].any())
 
 
 def test_a_proposal_within_the_gap_keeps_its_bits(woods, options, monkeypatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +22,19 @@ AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
 PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4
 CHORD_PENETRATION = 0.049  # share of an obstacle's margin, between two knots; the judge accepts 0.05
 Watch = Callable[[int, int], None]  # is called with the candidates solved so far, and of how many
+
+
+class Refining(NamedTuple):
+    """How far candidates are refined."""
+
+    rounds: int  # outer iterations, at most
+    violation: float  # m for lengths: the most at which a refined candidate counts
+    cut: float  # m: the deepest that it may lie in an obstacle between two knots, beyond the judge's tolerance
+    needed: bool  # whether candidates count only as refined
+
+
+TO_THE_END = Refining(20, 1e-3, 0.0, needed=False)
+ROUGH = Refining(4, 1e-2, 0.1, needed=True)  # shows the costs to a few percent; the solver removes what is left
 
 
 def unwatched(done: int, total: int) -> None:
@@ -108,33 +122,34 @@ class Candidates:
         return replace(self, X=X, U=U, iterations=iterations)
 
     def refined(
-        self, solver: AugmentedLagrangian | None, sound: Tensor, violation: float
-    ) -> tuple[Candidates, Multipliers, Tensor]:
-        """The candidates with those in `sound` solved by `solver`, or as they are without one.
+        self, inner: ILQR | None, sound: Tensor, refining: Refining
+    ) -> tuple[Candidates, Multipliers, Tensor, Tensor]:
+        """The candidates with those in `sound` solved by AL-iLQR around `inner`, or as they are without one.
 
-        A solve counts where it ends near the goal, with at most this violation, and clear of obstacles between knots.
+        A solve counts where it ends near the goal and violates no more than `refining` says, at knots and between them.
 
-        Returns the candidates, the multipliers for each to continue with, and the rows (B,) of the cheapest: of
-        problems where no solve counts, the first ones.
+        Returns the candidates, the multipliers for each to continue with, the rows (B,) of the cheapest, and its cost
+        (B,): of problems where no solve counts, the first row, and infinite.
         """
         everyone = torch.arange(self.live.numel(), device=sound.device)
         multipliers, rows = self.multipliers(everyone, PENALTY), sound.nonzero().flatten()
-        if solver is None or rows.numel() == 0:
-            return self, multipliers, everyone[:: self.count]
+        if inner is None or rows.numel() == 0:
+            return self, multipliers, everyone[:: self.count], torch.full_like(self.unit[:: self.count], torch.inf)
         part = self.of(rows)
+        solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=refining.rounds)
         end = solver.solve(
             part, self.U[rows], warm=take(multipliers, rows),
             callback=lambda progress: self.watch(progress.finished, progress.total),
         )  # fmt: skip
-        good = (end.violation <= violation) & seen.arrives(part, end.X)
-        good &= seen.chord_penetration(part, end.X, CHORD_PENETRATION) <= 0
+        good = (end.violation <= refining.violation) & seen.arrives(part, end.X)
+        good &= seen.chord_penetration(part, end.X, CHORD_PENETRATION) <= refining.cut
         won = rows[good]
         X, U, cost = self.X.clone(), self.U.clone(), torch.full_like(self.unit, torch.inf)
         X[won], U[won], cost[won] = end.X[good], end.U[good], end.cost[good]
         iterations = self.iterations.index_add(0, rows // self.count, end.iterations)
         put(multipliers, won, take(end.multipliers, good.nonzero().flatten()))
-        best = cost.view(-1, self.count).argsort(dim=-1, stable=True)[:, :1]
-        return replace(self, X=X, U=U, iterations=iterations), multipliers, self.rows(best)[:, 0]
+        best = self.rows(cost.view(-1, self.count).argsort(dim=-1, stable=True)[:, :1])[:, 0]
+        return replace(self, X=X, U=U, iterations=iterations), multipliers, best, cost[best]
 
     def order(self, first: Tensor, alike: float | None = None) -> Tensor:
         """Places (B, count) of each problem's candidates, the best first.

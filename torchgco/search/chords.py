@@ -22,30 +22,31 @@ LEAST = 0.1  # and at least this share of the allowed violation: solves differ b
 def clear_chords(best: Best) -> None:
     """Replace feasible trajectories that touch an obstacle between two knots by ones that keep clear of it.
 
-    Obstacles grow by `GROWTH` times the missing clearance or a little more, in up to `ROUNDS` rounds, and the solve
-    continues from the best trajectory. A trajectory is replaced where the new one is feasible for the obstacles as they
-    are, has arrived if the old one had, and keeps more clearance between the knots. Openings may leave no room for it.
+    Obstacles grow by `GROWTH` times the clearance that the last solve missed, or a little more, in up to `ROUNDS`
+    rounds, and the solve continues from the best trajectory. A trajectory is replaced where the new one is feasible for
+    the obstacles as they are, has arrived if the old one had, and keeps more clearance between the knots. Openings may
+    leave no room for it.
 
     Args:
         best: the trajectories so far; changed in place.
     """
     problem, limit = best.call.problem, best.solver.violation_tolerance
     clearance = chord_clearance(problem, best.end.best.X)
-    by = torch.zeros_like(clearance)
+    by, now = torch.zeros_like(clearance), clearance.clone()
     rows = ((best.end.best.violation <= limit) & (clearance < 0)).nonzero().flatten()
     for _ in range(ROUNDS):
         if rows.numel() == 0:
             return
         best.next_attempt()
-        by[rows] += (-GROWTH * clearance[rows]).clamp(min=LEAST * limit)
+        by[rows] += (-GROWTH * now[rows]).clamp(min=LEAST * limit)
         whole, old = problem.take(rows), take(best.end.best, rows)
         call = best.call.take(rows)
         call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
         new = best.attempt(call)
         found = replace(new.best, violation=violation(whole, new.best.X, new.best.U))
-        now = chord_clearance(whole, found.X)
-        serves = (found.violation <= limit) & (now > clearance[rows])
+        now[rows] = chord_clearance(whole, found.X)
+        serves = (found.violation <= limit) & (now[rows] > clearance[rows])
         serves &= has_arrived(whole, found.X) | ~has_arrived(whole, old.X)
         best.replace(rows, serves, found, new)
-        clearance[rows] = torch.where(serves, now, clearance[rows])
+        clearance[rows] = torch.where(serves, now[rows], clearance[rows])
         rows = rows[clearance[rows] < 0]

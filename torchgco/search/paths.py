@@ -5,37 +5,33 @@
 3. The candidates are relaxed: solved further without a guide; a penalty keeps them out of the obstacles.
 4. The best by penalised cost are refined: the augmented Lagrangian solves them to convergence.
 5. Where no candidate arrives, the paths are followed again, closer; where the best costs far more than the trajectory
-   without obstacles, more paths are compared.
+   without obstacles, more paths are compared, each followed in both ways.
 6. The cheapest is proposed, with the multipliers to continue with.
 
 A proposal may touch obstacles slightly: the solver removes that. Candidates that penetrate deeper are rejected, since
-removing it would use up a whole attempt.
+removing it would use up a whole attempt, or must first be refined (`PathSettings.roughly`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
 from torchgco.native.dispatch import cost_unit, open_loop, value
-from torchgco.options import AtLeast, Below, Count, Natural, Positive, check_options
 from torchgco.problem import Problem
 from torchgco.search import scene as seen
-from torchgco.search.candidates import PENALTY, Candidates, Watch, unwatched
+from torchgco.search.candidates import PENALTY, ROUGH, TO_THE_END, Candidates, Refining, Watch, unwatched
 from torchgco.search.geometry import Scene
 from torchgco.search.homotopy import one_per_class
-from torchgco.search.roadmap import Roadmap
+from torchgco.search.settings import PathSettings
 from torchgco.search.tracking import attraction, followed
-from torchgco.search.ways import Ways, plain, unconstrained
+from torchgco.search.ways import Ways, joined, plain, unconstrained
 from torchgco.shapes import check_shape, tensor
-from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
 from torchgco.tree import put, take
@@ -47,15 +43,7 @@ ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a sh
 TOLERANCE = 5e-5  # of tracking and relaxing, as a share of L_M; refining takes a tenth of it
 SEARCH = LineSearch(back=2)
 TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
-# Where no candidate arrives, the paths are followed again, with corners averaged over a share of the horizon that is
-# smaller by a factor. A spring gives way to the cost, so it gets stiffer; in a tube more iterations help.
-SHARPER, STIFFER, LONGER = 4.0, 10.0, 2
-# Where the best candidate is costly, this many times as many paths are followed and relaxed. The best few are refined
-# for some outer iterations, which show the costs to a few percent, and compared if they violate less than 1 cm.
-MORE, COMPARED, ROUNDS, NEARLY = 2, 3, 4, 1e-2
-THOROUGH = 3  # times as many iterations of tracking, where an attempt along the best path has failed
 LEAST = 0.05  # share of the horizon between departure and arrival
-VIOLATION = 1e-3  # m for lengths: the most of other refined candidates
 
 
 class Proposal(NamedTuple):
@@ -65,82 +53,15 @@ class Proposal(NamedTuple):
     found: Tensor  # (B,) bool: whether there is a proposal; elsewhere U is not to be used
     multipliers: Multipliers  # to continue with; mu keeps the solver from leaving the path, NaN where there is none
     iterations: Tensor  # (B,) int64: of all solves of all candidates, also where none is found
+    cost: Tensor  # (B,): as refined; infinite where no candidate was refined with success
 
 
 @dataclass(frozen=True)
-class PathProposals:
+class PathProposals(PathSettings):
     """Follow short paths between static obstacles, and propose the candidate that is cheapest to fly.
 
-    Args:
-        roadmap: finds the paths.
-        num_paths: paths per problem, before those of one homotopy class are merged.
-        initial_offsets: offsets (m,) of the controls over the first tenth of the horizon, as shares of the range from
-            rest to the control bounds; every path is tracked from rest and once from each offset. An initial turn lets
-            a vehicle that turns slowly find reversing and three-point turns. `Restarts` leaves them out where they
-            don't fit the number of controls.
-        depart, arrive: shares of the horizon at which the vehicle leaves the start and reaches the goal. Several
-            values of `arrive`: every path is tracked at each pace.
-        pace: times the time that the vehicle takes without constraints, per length of the way: no path is followed more
-            slowly than this, whatever `arrive` says. None: no such limit.
-        smoothing: share of the horizon over which the corners of a path are averaged, at most (`tracking.followed`).
-        tube: radius of the tube that a candidate is kept in, as a share of the mean inflated radius; None: a spring to
-            the path instead. A spring takes half the iterations; a vehicle that can't move sideways ends closer to the
-            path in a tube.
-        stiffness: of tube or spring, one tracking solve per value, in units of the cost of resting at the start per
-            squared distance to the goal.
-        track_iterations, relax_iterations: iLQR iterations of each of these solves, at most; relax_iterations=0
-            compares the candidates as tracked.
-        relax_top: candidates per problem that are relaxed, the cheapest as tracked; None: all.
-        refine_top: candidates per problem that AL-iLQR solves to convergence, of the relaxed ones that differ; 1: the
-            best relaxed candidate is proposed as it is.
-        max_penetration: largest accepted penetration of a relaxed candidate into an obstacle, as a share of the mean
-            inflated radius.
-        max_gap: how much more than without constraints the best candidate may cost, as a share; where it costs more,
-            twice as many paths are compared, and the three best candidates refined. None: it may cost anything.
-
-    Raises:
-        InputError: a field out of its range.
+    The arguments are those of `PathSettings`.
     """
-
-    roadmap: Roadmap = Roadmap()
-    num_paths: Count = 1
-    initial_offsets: tuple[tuple[float, ...], ...] = ()
-    depart: float = 0.0
-    arrive: float | tuple[float, ...] = 0.9
-    pace: Positive | None = None
-    smoothing: Annotated[float, AtLeast(0), Below(1)] = 0.08
-    tube: Positive | None = 0.05
-    stiffness: tuple[Positive, ...] = (20.0, 200.0)
-    track_iterations: Count = 20
-    relax_iterations: Natural = 20
-    relax_top: Count | None = None
-    refine_top: Count = 1
-    max_penetration: Positive = 0.1
-    max_gap: Positive | None = None
-
-    def __post_init__(self) -> None:
-        check_options(self, "paths")
-        for name in ("arrive", "stiffness", "initial_offsets"):  # lists of a configuration file equal tuples
-            if isinstance(value := getattr(self, name), Sequence):
-                rows = (tuple(row) if isinstance(row, list) else row for row in value)
-                object.__setattr__(self, name, tuple(rows))
-        if not self.paces or not all(0 <= self.depart < arrive <= 1 for arrive in self.paces):
-            raise InputError("paths.depart", f"at least 0 and below arrive, {self.arrive}", self.depart)
-        if not self.stiffness:
-            raise InputError("paths.stiffness", "one or more numbers above 0", self.stiffness)
-
-    @property
-    def paces(self) -> tuple[float, ...]:
-        """The values of `arrive`, as a tuple."""
-        return tuple(self.arrive) if isinstance(self.arrive, Sequence) else (self.arrive,)
-
-    @property
-    def thorough(self) -> PathProposals:
-        """Proposals for problems that these don't bring to the goal: more paths, followed closer, and all refined."""
-        return replace(
-            self, num_paths=MORE * self.num_paths, track_iterations=THOROUGH * self.track_iterations, relax_top=None,
-            refine_top=max(MORE * self.num_paths, self.refine_top), pace=None, max_gap=None,
-        )  # fmt: skip
 
     def propose(self, problem: Problem, watch: Watch = unwatched) -> Proposal:
         """A proposal for every problem, from the vehicle at rest.
@@ -153,13 +74,14 @@ class PathProposals:
         """
         rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
         none = torch.zeros(problem.B, dtype=torch.int64, device=problem.x0.device)
-        whole = Proposal(rest, none.bool(), Multipliers.zero(problem, torch.nan), none)
         unit, scaled = cost_unit(problem), problem.in_cost_units()
+        least = torch.full_like(unit, torch.inf)
+        whole = Proposal(rest, none.bool(), Multipliers.zero(problem, torch.nan), none, least)
         for rows in torch.arange(problem.B, device=none.device).split(max(1, MOST // self.num_paths)):
             part = self._propose(scaled.take(rows), rest[rows], watch)
             if part is not None:
                 put(whole, rows, part)
-        return whole._replace(multipliers=whole.multipliers.scaled(unit))
+        return whole._replace(multipliers=whole.multipliers.scaled(unit), cost=whole.cost * unit)
 
     def _propose(self, problem: Problem, rest: Tensor, watch: Watch) -> Proposal | None:
         scene = seen.scene_of(problem, rest)
@@ -187,12 +109,10 @@ class PathProposals:
         """Where there are paths but no proposal along them, follow them again, closer."""
         rows = (ways.live.any(-1) & ~proposal.found).nonzero().flatten()
         if rows.numel() > 0:
-            closer = replace(self, smoothing=self.smoothing / SHARPER)
-            if self.tube is None:
-                closer = replace(closer, stiffness=(STIFFER * self.stiffness[-1],))
-            else:
-                closer = replace(closer, track_iterations=LONGER * self.track_iterations)
-            more = closer._along(problem.take(rows), rest[rows], take(ways, rows), watch)
+            proposals, refining = self.closer(), TO_THE_END
+            if self.refine_top == 1:
+                proposals, refining = replace(proposals.roughly(), relax_top=None), ROUGH
+            more = proposals._along(problem.take(rows), rest[rows], take(ways, rows), watch, refining)
             put(proposal, rows, more._replace(iterations=more.iterations + proposal.iterations[rows]))
 
     def _costly(self, problem: Problem, ways: Ways, proposal: Proposal) -> Tensor:
@@ -204,21 +124,22 @@ class PathProposals:
         return (proposal.found & costly).nonzero().flatten()
 
     def _wider(self, problem: Problem, rest: Tensor, rows: Tensor, proposal: Proposal, watch: Watch) -> None:
-        """Better proposals for the problems in `rows`, from a comparison of more paths."""
+        """Better proposals for the problems in `rows`, from a comparison of more paths, each followed in two ways."""
         if rows.numel() == 0:
             return
         part, rest = problem.take(rows), rest[rows]
-        relax_top = None if self.relax_top is None else MORE * self.relax_top
-        wider = replace(self, num_paths=MORE * self.num_paths, relax_top=relax_top, refine_top=COMPARED)
         scene = seen.scene_of(part, rest)
         assert scene is not None
-        ways = wider._ways(part, rest, scene)
-        more = wider._along(part, rest, ways, watch, ROUNDS, NEARLY)
+        wide, close = self.wider(), self.wider().closer()
+        ways = joined(wide._ways(part, rest, scene), wide.among_more_points()._ways(part, rest, scene), scene)
         assert ways.free is not None
-        proposal.iterations[rows] += more.iterations + ways.free.iterations
-        better = more.found.nonzero().flatten()
-        more = more._replace(iterations=proposal.iterations[rows])
-        put(proposal, rows[better], take(more, better))
+        wide, close = (proposals._along(part, rest, ways, watch, ROUGH) for proposals in (wide, close))
+        cheaper = close.found & (~wide.found | (close.cost < wide.cost))
+        iterations = proposal.iterations[rows] + ways.free.iterations + wide.iterations + close.iterations
+        proposal.iterations[rows] = iterations
+        for more, where in ((wide, wide.found & ~cheaper), (close, cheaper)):
+            better = where.nonzero().flatten()
+            put(proposal, rows[better], take(more._replace(iterations=iterations), better))
 
     def _along(
         self,
@@ -226,10 +147,9 @@ class PathProposals:
         rest: Tensor,
         ways: Ways,
         watch: Watch,
-        rounds: int = 20,
-        violation: float = VIOLATION,
+        refining: Refining = TO_THE_END,
     ) -> Proposal:
-        """Proposals along paths that are known; refined for `rounds` outer iterations, to a `violation`."""
+        """Proposals along paths that are known."""
         paths = ways.paths
         starts = self.starts(problem, rest).repeat_interleave(len(self.paces), dim=1)
         live = ways.live.repeat_interleave(starts.shape[1], dim=1)
@@ -239,14 +159,12 @@ class PathProposals:
         candidates, sound = self.relax(candidates)
         order = candidates.order(sound, ALIKE)[:, : self.refine_top]
         sound = sound[candidates.rows(order).flatten()]
-        candidates, solver = candidates.pick(order), None
-        if self.refine_top > 1:
-            inner = replace(_inner(self.track_iterations), tolerance=0.1 * TOLERANCE)
-            solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=rounds)
-        candidates, multipliers, best = candidates.refined(solver, sound, violation)
+        inner = replace(_inner(self.track_iterations), tolerance=0.1 * TOLERANCE) if self.refine_top > 1 else None
+        candidates, multipliers, best, cost = candidates.pick(order).refined(inner, sound, refining)
         multipliers, found = take(multipliers, best), ways.live.any(-1)
         multipliers = replace(multipliers, mu=torch.where(found, multipliers.mu, torch.nan))
-        return Proposal(candidates.U[best], found & sound[best], multipliers, candidates.iterations)
+        found &= cost.isfinite() if refining.needed else sound[best]
+        return Proposal(candidates.U[best], found, multipliers, candidates.iterations, cost)
 
     def starts(self, problem: Problem, rest: Tensor) -> Tensor:
         """Initial controls of the candidates of each path, (B, 1 + offsets, N, m): rest, and rest after each offset."""

@@ -160,7 +160,7 @@ class Restarts(Solver):
             return left, last
         failed = ~best.arrived()[rows] & ~best.arrived(CLOSE)[rows]
         again = failed.nonzero().flatten()
-        none, _ = self._along_paths(best, rows[again], take(start, again), paths.thorough)
+        none, _ = self._along_paths(best, rows[again], take(start, again), paths.thorough())
         still = torch.isin(left, none).nonzero().flatten()
         return left[still], take(last, still)
 

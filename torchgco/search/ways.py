@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -11,6 +11,8 @@ from torch import Tensor
 from torchgco.constraints.bodies import Inflated
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.problem import Problem
+from torchgco.search.geometry import Scene
+from torchgco.search.homotopy import one_per_class
 from torchgco.search.roadmap import length
 from torchgco.solvers.ilqr import ILQR, descend
 
@@ -43,6 +45,13 @@ class Ways:
         lengths = length(self.paths.flatten(0, 1)).view(self.paths.shape[:2])
         stretch = lengths / ends.square().sum(-1).sqrt().clamp(min=1e-12)
         return (self.free.share.unsqueeze(-1) * stretch).nan_to_num(torch.inf)
+
+
+def joined(few: Ways, more: Ways, scene: Scene) -> Ways:
+    """The paths of both searches, one per homotopy class."""
+    paths = torch.cat((few.paths, more.paths), dim=1)
+    live = one_per_class(paths, scene) & torch.cat((few.live, more.live), dim=1)
+    return replace(few, paths=paths, live=live)
 
 
 def unconstrained(problem: Problem, rest: Tensor, inner: ILQR) -> Free:
