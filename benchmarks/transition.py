@@ -30,7 +30,7 @@ DENSITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 STAGES = (80, 120, 160, 240)
 SOLVERS = ("gco", "gco_paper", "al_ilqr")
 PEERS = ("fatrop",)  # takes up to a minute per problem: fewer layouts, and only the sparser woods
-PEER_DENSITIES, PEER_LAYOUTS = DENSITIES[:4], 8
+PEER_DENSITIES, PEER_LAYOUTS = DENSITIES[:4], 4
 DENSITY, HORIZON = "scenario.density", "scenario.stages"
 # Discs of one radius r at random in the plane leave no way through, in the limit of a large region, from
 # density * pi r^2 = 1.128 on (Quintanilla and Ziff, Physical Review E 76, 051115, 2007).
