@@ -26,21 +26,22 @@ from benchmarks.families import WORLDS, Family
 from benchmarks.shortfalls_watch import Search, watching
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
-from torchgco import compose, judge
+from torchgco import compose, judge, presets
 from torchgco.judge import SUCCESS_COST
 from torchgco.plotting.boxes import outlines
 from torchgco.problem import Problem
 from torchgco.scenarios import Layouts
 from torchgco.search import scene as seen
-from torchgco.search.candidates import unwatched
+from torchgco.search.candidates import TO_THE_END, unwatched
 from torchgco.search.paths import PathProposals
+from torchgco.search.settings import MORE
 from torchgco.search.suitability import has_paths
 from torchgco.search.ways import joined
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "benchmarks" / "results" / "shortfalls.md"
 MARKS = "<!-- shortfalls -->", "<!-- end shortfalls -->"
-PATHS = 12  # of each of the two searches that `gco` compares where the best candidate is costly
+PATHS = MORE * presets.gco(3).paths.num_paths  # of each of the two searches where the best candidate is costly
 CAUSES = {
     "no solution known": "neither `gco` nor any other search has found a way",
     "another local solution": "moving obstacles, and no paths: waiting, or passing on another side, costs less",
@@ -105,7 +106,7 @@ def refined(paths: PathProposals, problem: Problem, count: int = PATHS) -> tuple
     All are refined to the end; the cost is infinite where neither has a good end. Also returns the states (N+1, n) of
     the others by the number of their path.
     """
-    every = replace(paths, num_paths=count, relax_top=None, refine_top=2 * count, max_gap=None)
+    every = replace(paths.roughly(), num_paths=count, relax_top=None, refine_top=2 * count, max_gap=None)
     scaled = problem.in_cost_units()
     rest = problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m))
     scene = seen.scene_of(scaled, rest)
@@ -113,7 +114,7 @@ def refined(paths: PathProposals, problem: Problem, count: int = PATHS) -> tuple
     ways = joined(every._ways(scaled, rest, scene), every.among_more_points()._ways(scaled, rest, scene), scene)
     with watching() as searches:
         for proposals in (every, every.closer()):
-            proposals._along(scaled, rest, ways, unwatched)
+            proposals._along(scaled, rest, ways, unwatched, TO_THE_END)
     costs, ends = [inf] * (2 * count), {}
     for search in searches:
         for path, (X, U) in search.ends.items():

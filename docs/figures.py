@@ -38,7 +38,7 @@ WATCHED = {
     "classes": "torchgco.search.homotopy:_wind_alike",  # (paths, scene) -> which paths share a class
     "tracked": "torchgco.search.paths:PathProposals.track",  # -> Candidates
     "relaxed": "torchgco.search.paths:PathProposals.relax",  # -> Candidates, which of them are sound
-    "refined": "torchgco.search.candidates:Candidates.refined",  # (self, solver, sound, ...) -> Candidates, ..., best
+    "refined": "torchgco.search.candidates:Candidates.refined",  # (self, inner, sound, ...) -> Candidates, _, best, _
 }
 Calls = dict[str, list[tuple[tuple[Any, ...], Any]]]
 

@@ -89,6 +89,24 @@ def test_segments_by_hand(d: int) -> None:
     check_bounds(boxes, found[0], alone)
 
 
+def test_parts_of_a_batch_have_the_bits_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, U = boxed_batch(3, B=7, N=5)
+    X, _ = random_trajectory(problem, spread=1.0)
+    boxes, p = boxes_of(problem), X[..., problem.position]
+
+    def distances(rows: slice) -> list[Tensor]:
+        some, x, u, at = boxes.take(rows), X[rows], U[rows], p[rows]
+        return [some.value(x, u), some.worst(x, u), some.segment_clearance(at[:, :-1], at[:, 1:])]
+
+    everything = slice(None)
+    whole = distances(everything)
+    for size in (1, 3, 7):  # problems at once, or parts of one
+        monkeypatch.setattr("torchgco.constraints.boxes.AT_ONCE", size * 6 * boxes.absent.shape[1])
+        for part, expected in zip(distances(everything), whole, strict=True):
+            assert torch.equal(part, expected)
+    assert [d.shape[0] for d in distances(slice(0, 0))] == [0, 0, 0]
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_rows_and_their_expansion(d: int) -> None:
     problem, U = boxed_batch(d, B=3, N=12)

@@ -13,9 +13,10 @@ from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import engine_of, terms_of
 
 
+@pytest.mark.parametrize("pushed", ["half", "few", "none"])  # of the multipliers
 @pytest.mark.parametrize(("phr", "rounded"), [(True, False), (False, False), (True, True)])
 @pytest.mark.parametrize("d", [2, 3])
-def test_values_and_expansions_are_pytorchs(d: int, phr: bool, rounded: bool) -> None:
+def test_values_and_expansions_are_pytorchs(d: int, phr: bool, rounded: bool, pushed: str) -> None:
     problem, _ = boxed_batch(d, B=5, N=40, boxes=6, rounded=rounded)
     X, U = random_trajectory(problem, spread=0.5)
     (boxes,) = (c for c in problem.constraints if isinstance(c, BoundBoxes))
@@ -31,7 +32,10 @@ def test_values_and_expansions_are_pytorchs(d: int, phr: bool, rounded: bool) ->
             X[:, 1 + 5 * i + j, problem.dynamics.position] = at
     assert float(boxes.violation(X, U).amax()) > 0.05
     multipliers = Multipliers.zero(problem, 3.0)
-    lam = [torch.rand(t.shape, generator=generator, dtype=t.dtype).clamp(min=0.5) - 0.5 for t in multipliers.lam]
+    least = {"half": 0.5, "few": 0.99, "none": 1.0}[pushed]
+    lam = [torch.rand(t.shape, generator=generator, dtype=t.dtype).clamp(min=least) - least for t in multipliers.lam]
+    (rows,) = (r for r, c in zip(lam, problem.constraints, strict=True) if c is boxes)
+    assert bool(rows.any()) == (pushed != "none") and bool((rows == 0).any())
     lagrangian = Lagrangian(problem, Multipliers(tuple(lam), multipliers.mu), None, phr)
     engine = engine_of(problem)
     assert engine is not None and not engine.functions  # nothing is traced

@@ -12,7 +12,7 @@ from tests.search.test_paths import alone
 from torchgco import AugmentedLagrangian, PathProposals, Problem, Restarts, compose, judge
 from torchgco.constraints.bodies import Inflated
 from torchgco.rollout import open_loop
-from torchgco.search.candidates import Candidates
+from torchgco.search.candidates import TO_THE_END, Candidates
 from torchgco.search.geometry import FAR, depth
 from torchgco.search.scene import scene_of
 from torchgco.search.tracking import CUT, followed, travel
@@ -143,7 +143,7 @@ def test_a_refined_candidate_that_cuts_through_an_obstacle_between_two_knots_is_
     problem, one = cup(B=1, N=120), replace(QUICK, num_paths=2, track_iterations=20, refine_top=2)
     refined = one.propose(problem)
     assert bool(refined.found) and bool(refined.multipliers.lam[0].any())
-    monkeypatch.setattr("torchgco.search.candidates.CHORD_PENETRATION", -9.0)
+    monkeypatch.setattr("torchgco.search.paths.TO_THE_END", TO_THE_END._replace(cut=-9.0))
     rejected = one.propose(problem)
     assert torch.equal(rejected.U, replace(one, refine_top=1).propose(problem).U)
     assert not torch.equal(refined.U, rejected.U) and not any(bool(lam.any()) for lam in rejected.multipliers.lam)

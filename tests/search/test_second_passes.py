@@ -73,7 +73,7 @@ def test_costly_proposals_are_compared_with_those_along_more_paths(woods, option
 
 
 def test_a_candidate_that_is_too_deep_counts_where_refining_mends_it(woods, options, monkeypatch) -> None:
-    shallow = replace(options, max_gap=None, max_penetration=1e-9)
+    shallow = replace(options, max_gap=100.0, max_penetration=1e-9)
     some, passes = proposed(shallow, woods, monkeypatch)
     again = passes[1][1]
     assert passes == [(3, LAYOUTS, False), (3, again, True)] and again > 0
@@ -82,8 +82,8 @@ def test_a_candidate_that_is_too_deep_counts_where_refining_mends_it(woods, opti
     refined = some.cost.isfinite()
     assert bool(refined.any()) and torch.equal(refined, some.found) and bool((depth[refined] < 1e-2 + 1e-9).all())
     torch.testing.assert_close(woods.cost.total(X, some.U)[refined], some.cost[refined])
-    none, _ = proposed(replace(shallow, refine_top=2), woods, monkeypatch)
-    assert not bool(none.found[~some.cost.isfinite()].any())
+    few, _ = proposed(replace(shallow, max_gap=None), woods, monkeypatch)  # nothing is refined
+    assert bool((some.found & ~few.found).any())
 
 
 def test_a_proposal_within_the_gap_keeps_its_bits(woods, options, monkeypatch) -> None:
@@ -112,6 +112,14 @@ def test_no_path_is_followed_more_slowly_than_the_pace(woods, options, monkeypat
         expected = torch.minimum(slow, pace * share.repeat_interleave(options.num_paths) * stretch)
         torch.testing.assert_close(found, expected, atol=1.5 / woods.N, rtol=0)
     assert bool((fast < limited).all())
+
+
+def test_costly_problems_in_small_parts_keep_their_bits(woods, options, monkeypatch) -> None:
+    whole, passes = proposed(replace(options, max_gap=1e-9), woods, monkeypatch)
+    monkeypatch.setattr("torchgco.search.paths.MOST", 2 * options.num_paths)
+    parts, more = proposed(replace(options, max_gap=1e-9), woods, monkeypatch)
+    assert [size for _, size, _ in passes] == [4, 4, 4] and [size for _, size, _ in more] == [2, 1, 1, 1, 1] * 2
+    assert torch.equal(parts.U, whole.U) and torch.equal(parts.iterations, whole.iterations)
 
 
 def test_the_gap_depends_on_no_other_problem(woods, options) -> None:

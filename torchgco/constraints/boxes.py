@@ -190,9 +190,9 @@ class BoundBoxes(Obstacles):
 
     def _outside(self, p: Tensor) -> Tensor:
         """Distances (B, K, M) of points p (B, K, d) from the full surfaces, as if none were absent."""
-        distances = []
+        cuboids, distances = self._cuboids(), []
         for rows in self._parts(p.shape[1]):
-            boxes = self._cuboids().rows(rows)
+            boxes = cuboids.rows(rows)
             distances.append(signed_distance(boxes.seen_from(p[rows]), boxes.halves()))
         return torch.cat(distances) - self.inflated_radii.unsqueeze(1)
 

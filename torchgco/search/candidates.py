@@ -20,7 +20,6 @@ from torchgco.tree import put, take
 
 AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
 PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4
-CHORD_PENETRATION = 0.049  # share of an obstacle's margin, between two knots; the judge accepts 0.05
 Watch = Callable[[int, int], None]  # is called with the candidates solved so far, and of how many
 
 
@@ -29,12 +28,12 @@ class Refining(NamedTuple):
 
     rounds: int  # outer iterations, at most
     violation: float  # m for lengths: the most at which a refined candidate counts
-    cut: float  # m: the deepest that it may lie in an obstacle between two knots, beyond the judge's tolerance
+    cut: float  # the deepest that it may lie in an obstacle between two knots, as a share of the obstacle's margin
     needed: bool  # whether candidates count only as refined
 
 
-TO_THE_END = Refining(20, 1e-3, 0.0, needed=False)
-ROUGH = Refining(4, 1e-2, 0.1, needed=True)  # shows the costs to a few percent; the solver removes what is left
+TO_THE_END = Refining(20, 1e-3, 0.049, needed=False)  # the judge accepts a cut of 0.05
+ROUGH = Refining(4, 1e-2, 0.3, needed=True)  # shows the costs to a few percent; the solver removes what is left
 
 
 def unwatched(done: int, total: int) -> None:
@@ -142,7 +141,7 @@ class Candidates:
             callback=lambda progress: self.watch(progress.finished, progress.total),
         )  # fmt: skip
         good = (end.violation <= refining.violation) & seen.arrives(part, end.X)
-        good &= seen.chord_penetration(part, end.X, CHORD_PENETRATION) <= refining.cut
+        good &= seen.chord_penetration(part, end.X, refining.cut) <= 0.0
         won = rows[good]
         X, U, cost = self.X.clone(), self.U.clone(), torch.full_like(self.unit, torch.inf)
         X[won], U[won], cost[won] = end.X[good], end.U[good], end.cost[good]

@@ -17,6 +17,7 @@ from torchgco.tree import take
 ROUNDS = 4  # solves at most, each with larger obstacles than the one before
 GROWTH = 1.1  # times the missing clearance: by how much obstacles grow in a round
 LEAST = 0.1  # and at least this share of the allowed violation: solves differ by as much
+MOST = 5.0  # and at most this many times what the best trajectory misses: a solve that failed says nothing
 
 
 def clear_chords(best: Best) -> None:
@@ -38,7 +39,7 @@ def clear_chords(best: Best) -> None:
         if rows.numel() == 0:
             return
         best.next_attempt()
-        by[rows] += (-GROWTH * now[rows]).clamp(min=LEAST * limit)
+        by[rows] += torch.minimum(-GROWTH * now[rows], -MOST * clearance[rows]).clamp(min=LEAST * limit)
         whole, old = problem.take(rows), take(best.end.best, rows)
         call = best.call.take(rows)
         call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)

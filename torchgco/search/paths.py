@@ -28,7 +28,7 @@ from torchgco.search import scene as seen
 from torchgco.search.candidates import PENALTY, ROUGH, TO_THE_END, Candidates, Refining, Watch, unwatched
 from torchgco.search.geometry import Scene
 from torchgco.search.homotopy import one_per_class
-from torchgco.search.settings import PathSettings
+from torchgco.search.settings import MORE, PathSettings
 from torchgco.search.tracking import attraction, followed
 from torchgco.search.ways import Ways, joined, plain, unconstrained
 from torchgco.shapes import check_shape, tensor
@@ -36,7 +36,7 @@ from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
 from torchgco.tree import put, take
 
-MOST = 1536  # paths of all problems that are tracked together: bounds the memory
+MOST = 1536  # paths of all problems that are compared and tracked together: bounds the memory
 OFFSET_LASTS = 0.1  # share of the horizon that an initial offset lasts
 ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a share, count as the same
 
@@ -60,7 +60,7 @@ class Proposal(NamedTuple):
 class PathProposals(PathSettings):
     """Follow short paths between static obstacles, and propose the candidate that is cheapest to fly.
 
-    The arguments are those of `PathSettings`.
+    The arguments and the errors are those of `PathSettings`.
     """
 
     def propose(self, problem: Problem, watch: Watch = unwatched) -> Proposal:
@@ -88,12 +88,13 @@ class PathProposals(PathSettings):
         if scene is None:
             return None
         ways = self._ways(problem, rest, scene)
-        proposal = self._along(problem, rest, ways, watch)
+        proposal = self._along(problem, rest, ways, watch, TO_THE_END)
         if ways.free is not None:
             proposal.iterations.add_(ways.free.iterations)
         more = self._costly(problem, ways, proposal)
         self._closer(problem, rest, ways, proposal, watch)
-        self._wider(problem, rest, more, proposal, watch)
+        for rows in more.split(max(1, MOST // (2 * MORE * self.num_paths))):
+            self._wider(problem, rest, rows, proposal, watch)
         return proposal
 
     def _ways(self, problem: Problem, rest: Tensor, scene: Scene) -> Ways:
@@ -110,7 +111,7 @@ class PathProposals(PathSettings):
         rows = (ways.live.any(-1) & ~proposal.found).nonzero().flatten()
         if rows.numel() > 0:
             proposals, refining = self.closer(), TO_THE_END
-            if self.refine_top == 1:
+            if self.max_gap is not None:  # a costly problem: the repair of deep candidates is worth its time
                 proposals, refining = replace(proposals.roughly(), relax_top=None), ROUGH
             more = proposals._along(problem.take(rows), rest[rows], take(ways, rows), watch, refining)
             put(proposal, rows, more._replace(iterations=more.iterations + proposal.iterations[rows]))
@@ -130,25 +131,18 @@ class PathProposals(PathSettings):
         part, rest = problem.take(rows), rest[rows]
         scene = seen.scene_of(part, rest)
         assert scene is not None
-        wide, close = self.wider(), self.wider().closer()
+        wide = self.wider()
         ways = joined(wide._ways(part, rest, scene), wide.among_more_points()._ways(part, rest, scene), scene)
         assert ways.free is not None
-        wide, close = (proposals._along(part, rest, ways, watch, ROUGH) for proposals in (wide, close))
-        cheaper = close.found & (~wide.found | (close.cost < wide.cost))
-        iterations = proposal.iterations[rows] + ways.free.iterations + wide.iterations + close.iterations
-        proposal.iterations[rows] = iterations
-        for more, where in ((wide, wide.found & ~cheaper), (close, cheaper)):
-            better = where.nonzero().flatten()
-            put(proposal, rows[better], take(more._replace(iterations=iterations), better))
+        proposal.iterations[rows] += ways.free.iterations
+        for proposals in (wide, wide.closer()):
+            more = proposals._along(part, rest, ways, watch, ROUGH)
+            iterations = proposal.iterations[rows] + more.iterations
+            better = (more.found & (more.cost < proposal.cost[rows])).nonzero().flatten()
+            put(proposal, rows[better], take(more, better))
+            proposal.iterations[rows] = iterations
 
-    def _along(
-        self,
-        problem: Problem,
-        rest: Tensor,
-        ways: Ways,
-        watch: Watch,
-        refining: Refining = TO_THE_END,
-    ) -> Proposal:
+    def _along(self, problem: Problem, rest: Tensor, ways: Ways, watch: Watch, refining: Refining) -> Proposal:
         """Proposals along paths that are known."""
         paths = ways.paths
         starts = self.starts(problem, rest).repeat_interleave(len(self.paces), dim=1)

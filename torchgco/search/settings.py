@@ -10,8 +10,8 @@ from torchgco.errors import InputError
 from torchgco.options import AtLeast, Below, Count, Natural, Positive, check_options
 from torchgco.search.roadmap import Roadmap
 
-# Corners are averaged over a share of the horizon that is smaller by a factor. A spring gives way to the cost, so it
-# gets stiffer; more iterations help it and a tube.
+# Of closer paths. Corners are averaged over a share of the horizon that is smaller by a factor. A spring gives way to
+# the cost: it gets stiffer, and then takes more iterations to reach the path. So does a tube around sharper corners.
 SHARPER, STIFFER, LONGER_BY_SPRING, LONGER_IN_TUBE = 4.0, 10.0, 3, 2
 MORE = 2  # times as many paths, and times as many points
 # Candidates that are refined roughly, and how deep they may penetrate an obstacle before, as a share of the mean
@@ -47,10 +47,11 @@ class PathSettings:
         refine_top: candidates per problem that AL-iLQR solves to convergence, of the relaxed ones that differ; 1: the
             best relaxed candidate is proposed as it is.
         max_penetration: largest accepted penetration of a relaxed candidate into an obstacle, as a share of the mean
-            inflated radius; up to half of it where the candidate is refined before it counts.
+            inflated radius; at least 0.5 where the candidate is refined before it counts.
         max_gap: how much more than without constraints the best candidate may cost, as a share; where it costs more,
-            twice as many paths of two searches are compared, followed in two ways, and the best candidates refined.
-            None: it may cost anything.
+            twice as many paths from each of two searches are compared, followed in two ways, and the best candidates
+            refined. Where no candidate is sound, the best are refined, too. None: it may cost anything, and nothing
+            more is refined.
 
     Raises:
         InputError: a field out of its range.
@@ -109,6 +110,7 @@ class PathSettings:
     def among_more_points(self) -> Self:
         """Proposals along paths over a roadmap with more points: other paths, but not always better ones."""
         roadmap = replace(self.roadmap, num_halton=MORE * self.roadmap.num_halton)
+        # The trajectory without constraints, which pace and gap are measured by, is known from the first search.
         return replace(self, roadmap=roadmap, pace=None, max_gap=None)
 
     def thorough(self) -> Self:

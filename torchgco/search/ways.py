@@ -50,7 +50,8 @@ class Ways:
 def joined(few: Ways, more: Ways, scene: Scene) -> Ways:
     """The paths of both searches, one per homotopy class."""
     paths = torch.cat((few.paths, more.paths), dim=1)
-    live = one_per_class(paths, scene) & torch.cat((few.live, more.live), dim=1)
+    found = torch.cat([ways.live.any(-1, keepdim=True).expand_as(ways.live) for ways in (few, more)], dim=1)
+    live = one_per_class(paths, scene) & found
     return replace(few, paths=paths, live=live)
 
 
