@@ -1,5 +1,5 @@
 # make study   the default study, in its own environment (ARGS="experiment=planar_trap seed=1" for others)
-# make ladder   every solver on the public layouts (ten minutes on one core)
+# make ladder   seven solvers on the public layouts (ten minutes on one core)
 # make quality   how often gco reaches the goal on the public layouts, and how well (ARGS="--solvers gco gco_max" for more
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
 # make worlds   woods, mazes, crossing spheres and the outside benchmarks, with pages in benchmarks/results (half an hour)

@@ -41,7 +41,7 @@ FAMILIES = {
     )
 }
 
-# Worlds that can't be flown around: woods by trunks per 100 m^2, mazes by walls, crossing spheres by their number.
+# Worlds: woods by trunks per 100 m^2, mazes by walls, crossing spheres by their number.
 WORLDS = {
     family.name: family
     for family in (

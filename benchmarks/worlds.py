@@ -1,4 +1,4 @@
-"""python -m benchmarks.worlds: woods, mazes and crossing spheres that can't be flown around, by `gco` and its peers.
+"""python -m benchmarks.worlds: woods, mazes and crossing spheres, by `gco` and its peers.
 
 Every world and solver is a separate study below outputs/worlds, so that a run that was stopped resumes where it was.
 The peers take up to minutes per problem among so many obstacles: their rows on the public layouts are read from the

@@ -5,7 +5,7 @@
 3. The candidates are relaxed: solved further without a guide; a penalty keeps them out of the obstacles.
 4. The best by penalised cost are refined: the augmented Lagrangian solves them to convergence.
 5. Where no candidate arrives, the paths are followed again, closer; where the best costs far more than the trajectory
-   without obstacles, more paths are compared, each followed in both ways.
+   without constraints, more paths are compared, each followed in both ways.
 6. The cheapest is proposed, with the multipliers to continue with.
 
 A proposal may touch obstacles slightly: the solver removes that. Candidates that penetrate deeper are rejected, since
