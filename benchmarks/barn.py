@@ -20,8 +20,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.barn_data import DATA, GOAL, GOAL_RADIUS, RADIUS, TEST
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.page import INTERVALS, SET_UP, put_table
 from torchgco import ControlBounds, Goal, Problem, QuadraticCost, Spheres, StateBounds, Unicycle, judge, solve
 from torchgco.experiments.statistics import wilson
 from torchgco.scenarios import Layouts
@@ -162,12 +161,7 @@ def main(words: Sequence[str] | None = None) -> int:
     text = table(asked.first, asked.seed)
     print(text)
     if asked.write:
-        origin = provenance("cpu")
-        head = (
-            f"Measured on {origin['date']} at commit {origin['commit']}, seed {asked.seed}, one batch each, one thread "
-            f"on one core, {origin['processor']}, shared and busy; set-up excluded; 95 % Wilson intervals in percent."
-        )
-        put_between(PAGE, "<!-- barn -->", "<!-- end barn -->", f"{head}\n\n{text}")
+        put_table(PAGE, f"seed {asked.seed}, one batch each, one thread on one core", text, SET_UP, INTERVALS)
     return 0
 
 

@@ -20,13 +20,13 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.page import SET_UP, put_table
 from torchgco import Problem, Solution, Status, judge
 from torchgco.baselines import CasADiSolver
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "benchmarks" / "data"
+PAGE = ROOT / "benchmarks" / "results" / "concar.md"
 GOAL, GOAL_RADIUS = torch.ones(2, dtype=torch.float64), 0.1  # m
 FEASIBLE, EXACT = 1e-3, 1e-6  # violation of the full radii, m
 NOTABLE = 1.01  # the cost ratio beyond which one trajectory counts as cheaper than another
@@ -136,17 +136,8 @@ def main(words: Sequence[str] | None = None) -> int:
     text = "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n\n" + compared(ours, peer)
     print(text)
     if asked.write:
-        marks = "<!-- concar -->", "<!-- end concar -->"
-        put_between(ROOT / "benchmarks" / "results" / "concar.md", *marks, f"{_source(asked.seed)}\n\n{text}")
+        put_table(PAGE, f"seed {asked.seed}, one thread on one core", text, SET_UP)
     return 0
-
-
-def _source(seed: int) -> str:
-    origin = provenance("cpu")
-    return (
-        f"Measured on {origin['date']} at commit {origin['commit']}, seed {seed}, one thread on one core, "
-        f"{origin['processor']}, shared and busy; set-up excluded."
-    )
 
 
 if __name__ == "__main__":

@@ -16,8 +16,7 @@ from time import process_time
 import torch
 
 from benchmarks.golden_problems import GOLDEN, Golden
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.page import SET_UP, put_table
 from torchgco import Certificate, Polish, Problem, Solution, certify, solve
 from torchgco.baselines import CasADiSolver
 
@@ -100,12 +99,7 @@ def main(words: Sequence[str] | None = None) -> int:
     text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     print(text)
     if asked.write:
-        origin = provenance("cpu")
-        head = (
-            f"Measured on {origin['date']} at commit {origin['commit']}, {asked.starts} starts, seed {asked.seed}, "
-            f"processor time with one thread, {origin['processor']}, shared; set-up excluded."
-        )
-        put_between(PAGE, "<!-- golden -->", "<!-- end golden -->", f"{head}\n\n{text}")
+        put_table(PAGE, f"{asked.starts} starts, seed {asked.seed}, processor time with one thread", text, SET_UP)
     return 0
 
 

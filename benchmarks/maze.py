@@ -21,8 +21,7 @@ from torch import Tensor
 import torchgco
 from benchmarks.golden import IPOPT
 from benchmarks.maze_problem import maze, recount, starts, waypoint_guess
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.page import INTERVALS, SET_UP, put_table
 from torchgco import Problem, presets
 from torchgco.baselines import CasADiSolver
 from torchgco.experiments.statistics import wilson
@@ -166,13 +165,8 @@ def main(words: Sequence[str] | None = None) -> int:
     text = table(asked.starts, asked.seed, asked.fatrop)
     print(text)
     if asked.write:
-        origin = provenance("cpu")
-        head = (
-            f"Measured on {origin['date']} at commit {origin['commit']}, {asked.starts} starts, seed {asked.seed}, "
-            f"processor time with one thread, {origin['processor']}, shared; CasADi {origin['casadi']}; set-up "
-            "excluded; 95 % Wilson intervals in percent."
-        )
-        put_between(PAGE, "<!-- maze -->", "<!-- end maze -->", f"{head}\n\n{text}")
+        how = f"{asked.starts} starts, seed {asked.seed}, processor time with one thread"
+        put_table(PAGE, how, text, "CasADi", SET_UP, INTERVALS)
     return 0
 
 

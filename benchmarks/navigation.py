@@ -21,8 +21,7 @@ from torch import Tensor
 
 import torchgco
 from benchmarks.navigation_problem import fan, line_guess, navigation, recount
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.page import INTERVALS, put_table
 from torchgco import Problem, Solution, presets
 from torchgco.baselines import CasADiSolver
 from torchgco.experiments.statistics import wilson
@@ -159,13 +158,8 @@ def main(words: Sequence[str] | None = None) -> int:
     text = table(asked.starts, asked.sectors)
     print(text)
     if asked.write:
-        origin = provenance("cpu")
-        head = (
-            f"Measured on {origin['date']} at commit {origin['commit']}, {asked.starts} starts per fan, processor "
-            f"time without set-up, one thread per process, {origin['processor']}, shared; CasADi {origin['casadi']}; "
-            "95 % Wilson intervals in percent."
-        )
-        put_between(PAGE, "<!-- navigation -->", "<!-- end navigation -->", f"{head}\n\n{text}")
+        how = f"{asked.starts} starts per fan, processor time without set-up, one thread per process"
+        put_table(PAGE, how, text, "CasADi", INTERVALS)
     return 0
 
 

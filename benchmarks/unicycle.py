@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 import torchgco
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.page import INTERVALS, put_table
 from torchgco.baselines import CasADiSolver
 from torchgco.experiments.statistics import wilson
 from torchgco.judge import Verdict, judge
@@ -123,12 +122,7 @@ def main(words: Sequence[str] | None = None) -> int:
     text = table(problems(asked.count, asked.seed), asked.seed)
     print(text)
     if asked.write:
-        origin = provenance("cpu")
-        head = (
-            f"Measured on {origin['date']} at commit {origin['commit']}, seed {asked.seed}, one thread on one core, "
-            f"{origin['processor']}, shared; 95 % Wilson intervals in percent."
-        )
-        put_between(PAGE, "<!-- unicycle -->", "<!-- end unicycle -->", f"{head}\n\n{text}")
+        put_table(PAGE, f"seed {asked.seed}, one thread on one core", text, INTERVALS)
     return 0
 
 

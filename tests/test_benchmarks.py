@@ -16,6 +16,7 @@ import torch
 
 from benchmarks import oracle, quality
 from benchmarks.families import FAMILIES
+from benchmarks.page import SET_UP, put_table
 from benchmarks.speed import (
     acados_peer,
     batch,
@@ -309,3 +310,20 @@ def test_the_generators_draw_the_families_of_the_files() -> None:
         np.testing.assert_allclose(np.nanmax(drawn.radii), np.nanmax(held.radii))
         if family.name != "walls":
             assert drawn.centers.shape[1:] == held.centers.shape[1:]
+
+
+def test_a_table_replaces_the_one_between_the_marks_of_its_page(tmp_path: Path) -> None:
+    page = tmp_path / "maze.md"
+    page.write_text("before\n<!-- maze -->\nold\n<!-- end maze -->\nafter\n")
+    put_table(page, "64 starts, seed 0", "| new |", "CasADi", SET_UP)
+    text = page.read_text()
+    origin = provenance("cpu")
+    first = (
+        f"Measured on {origin['date']} at commit {origin['commit']}, 64 starts, seed 0, {origin['processor']}, shared"
+    )
+    assert f"<!-- maze -->\n{first}; CasADi {origin['casadi']}; set-up excluded.\n\n| new |\n" in text
+    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    empty = tmp_path / "barn.md"
+    empty.write_text("no marks\n")
+    with pytest.raises(ValueError, match="no part between"):
+        put_table(empty, "", "")
