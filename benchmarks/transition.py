@@ -70,7 +70,9 @@ def sweep(solver: str, asked: argparse.Namespace) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.transition", description="Sweep density and speed.")
     parser.add_argument("--layouts", type=int, default=32, metavar="N", help="per density and speed")
-    parser.add_argument("--solvers", nargs="+", default=[*SOLVERS, *PEERS], metavar="NAME", help="configs")
+    parser.add_argument(
+        "--solvers", nargs="*", default=[*SOLVERS, *PEERS], metavar="NAME", help="to fly; none: only table and figure"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the layouts")
     parser.add_argument("--write", action="store_true", help="put table and figure into benchmarks/results")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "transition")
