@@ -38,7 +38,10 @@ COVERED = 1.128
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    asked = _parser().parse_args(words)
+    parser = _parser()
+    asked = parser.parse_args(words)
+    if not asked.solvers and not asked.outputs.is_dir():
+        parser.error(f"--outputs: expected a folder with flights, got {asked.outputs}")
     for solver in asked.solvers:
         sweep(solver, asked)
     summary = summarise(merge([asked.outputs]))

@@ -121,7 +121,7 @@ def test_without_a_path_and_without_samples_the_stopped_solve_continues(solves: 
     problem, U0 = gates()
     problem, U0 = problem.take(torch.tensor([PASSES])), U0[:1]
     caught = LOCAL.iterate(Call.checked(problem, U0).in_cost_units()[0], StopWhenCaught(None))
-    shallow = replace(PATHS, max_penetration=1e-9, refine_top=2)
+    shallow = replace(PATHS, max_penetration=1e-9)
     proposal, more = shallow.propose(problem), shallow.thorough().propose(problem)
     solution = Restarts(LOCAL, shallow, sampling=None).solve(problem, U0)
     assert caught.status.tolist() == [STOPPED] and not bool(proposal.found | more.found)

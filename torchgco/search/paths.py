@@ -93,7 +93,8 @@ class PathProposals(PathSettings):
             proposal.iterations.add_(ways.free.iterations)
         more = self._costly(problem, ways, proposal)
         self._closer(problem, rest, ways, proposal, watch)
-        for rows in more.split(max(1, MOST // (2 * MORE * self.num_paths))):
+        both = 2 * MORE * self.num_paths  # paths of two searches
+        for rows in more.split(max(1, MOST // both)):
             self._wider(problem, rest, rows, proposal, watch)
         return proposal
 
