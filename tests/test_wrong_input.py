@@ -135,9 +135,12 @@ CASES: dict[str, list[Callable[[], object]]] = {
     "dynamics": [lambda: make(dynamics=None), lambda: make(dynamics=Planar)],
     "cost": [
         lambda: make(cost=None), lambda: make(cost=QuadraticCost), lambda: make(cost=Cost()),
-        lambda: make(cost=Odd(lambda x, u: x)), lambda: make(cost=Odd(lambda x, u: None)),
-        lambda: make(cost=Odd(lambda x, u: {}["weight"])), lambda: make(cost=Odd(lambda x, u: x.sum(-1), True)),
     ],
+    "cost.stage": [
+        lambda: make(cost=Odd(lambda x, u: x)), lambda: make(cost=Odd(lambda x, u: None)),
+        lambda: make(cost=Odd(lambda x, u: {}["weight"])),
+    ],
+    "cost.terminal": [lambda: make(cost=Odd(lambda x, u: x.sum(-1), True))],
     "cost.Q": [
         lambda q=q: make(cost=QuadraticCost(q, [1, 1], [1] * 6))
         for q in ("a", None, {}, True, 1j, nan, [[1], [1, 2]], np.array([1j] * 6), np.array([True] * 6), [10**400] * 6)

@@ -29,6 +29,7 @@ from torchgco.constraints import FunctionConstraint as FunctionConstraint
 from torchgco.constraints import Spheres as Spheres
 from torchgco.constraints import StateBounds as StateBounds
 from torchgco.costs import Cost as Cost
+from torchgco.costs import FunctionCost as FunctionCost
 from torchgco.costs import QuadraticCost as QuadraticCost
 from torchgco.dynamics import Airframe as Airframe
 from torchgco.dynamics import Dynamics as Dynamics

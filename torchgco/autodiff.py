@@ -10,6 +10,36 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch import _is_functional_tensor as is_functional  # type: ignore[attr-defined]
+from torch._C._functorch import is_functorch_wrapped_tensor  # type: ignore[import]
+from torch.overrides import TorchFunctionMode
+
+
+class ReadsMemory(RuntimeError):
+    """A function hands a tensor to NumPy or Python where only operations of PyTorch are seen."""
+
+
+class WithoutReading(TorchFunctionMode):
+    """Raises ReadsMemory where a function leaves PyTorch.
+
+    A tensor that is differentiated or recorded has no memory of its own: reading it may crash, and what is made of the
+    numbers is a constant.
+    """
+
+    NUMPY = ("numpy", "__array__", "__dlpack__")
+    READERS = ("tolist", "data_ptr", "storage", "untyped_storage")
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        name = getattr(func, "__name__", "")
+        if name in self.NUMPY or (name in self.READERS and _stands_for_another(args[0])):
+            raise ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
+        return func(*args, **(kwargs or {}))
+
+
+def _stands_for_another(value: object) -> bool:
+    if not isinstance(value, Tensor):
+        return False
+    return is_functional(value) or is_functorch_wrapped_tensor(value)
 
 
 def jacobian(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
@@ -31,6 +61,23 @@ def gradients(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, .
     created there, where `torch.autograd.grad` raises or sees constants.
     """
     return torch.func.grad(lambda *z: function(*z).sum(), argnums=tuple(range(len(args))))(*args)
+
+
+def gradients_at_once(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
+    """`gradients` without loading `torch.func`, which takes seconds at its first use, where that isn't needed."""
+    if not torch.is_inference_mode_enabled():
+        try:
+            with torch.enable_grad():
+                z = [arg.detach().clone().requires_grad_() for arg in args]
+                total = function(*z).sum()
+                found = torch.autograd.grad(total, z, allow_unused=True) if total.requires_grad else [None] * len(z)
+        except ReadsMemory:
+            raise
+        except RuntimeError:  # a tensor of the function was made in inference mode, say
+            pass
+        else:
+            return tuple(torch.zeros_like(arg) if g is None else g for g, arg in zip(found, args, strict=True))
+    return gradients(function, *args)
 
 
 def gradient_and_hessian(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,7 +26,7 @@ from torchgco.errors import InputError
 from torchgco.judge import by_kind, segment_distance
 from torchgco.measure import box_distance, box_segment_distance
 from torchgco.problem import Problem, check_problem
-from torchgco.shapes import check_shape, check_tensor
+from torchgco.shapes import check_shape, check_tensor, computing_on
 
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
@@ -83,6 +83,11 @@ def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None)
     check_shape(asked, (problem.B,), "asked")
     if asked.dtype != torch.bool:
         raise InputError("asked", "a tensor of bool", asked.dtype)
+    with computing_on(problem.x0.device):
+        return _certified(problem, X, U, asked)
+
+
+def _certified(problem: Problem, X: Tensor, U: Tensor, asked: Tensor) -> Certificate:
     columns = torch.full((4, problem.B), torch.nan, dtype=X.dtype, device=X.device)
     finite = torch.isfinite(X).flatten(1).all(-1) & torch.isfinite(U).flatten(1).all(-1)
     for b in (asked & finite).nonzero().flatten():

@@ -20,7 +20,7 @@ from torchgco.errors import InputError
 from torchgco.goal import Goal
 from torchgco.measure import box_distance, box_segment_distance
 from torchgco.problem import Problem, check_problem
-from torchgco.shapes import check_shape, tensor
+from torchgco.shapes import check_shape, computing_on, tensor
 
 OTHERS_WITHIN = 1e-3  # how far all constraints but the obstacles may be violated by a feasible trajectory
 SUCCESS_VIOLATION = 1e-3  # full radii, in metres
@@ -69,14 +69,15 @@ def judge(
         raise InputError("x0", "torch.float64 for the judge", problem.x0.dtype)
     if problem.dynamics.position is None:
         raise InputError("dynamics.position", "a model with a position", type(problem.dynamics).__name__)
-    center, radius = _goal(problem, goal, goal_radius)
-    X = [problem.x0]
-    cost = torch.zeros_like(problem.x0[:, 0])
-    for k in range(problem.N):
-        cost = cost + problem.cost.stage(X[-1], U[:, k], k)
-        X.append(problem.dynamics.step(X[-1], U[:, k]))
-    cost = cost + problem.cost.terminal(X[-1])
-    return _verdict(problem, torch.stack(X, dim=1), U, cost, center, radius)
+    with computing_on(problem.x0.device):
+        center, radius = _goal(problem, goal, goal_radius)
+        X = [problem.x0]
+        cost = torch.zeros_like(problem.x0[:, 0])
+        for k in range(problem.N):
+            cost = cost + problem.cost.stage(X[-1], U[:, k], k)
+            X.append(problem.dynamics.step(X[-1], U[:, k]))
+        cost = cost + problem.cost.terminal(X[-1])
+        return _verdict(problem, torch.stack(X, dim=1), U, cost, center, radius)
 
 
 def _goal(problem: Problem, center: Any, radius: Any) -> tuple[Tensor, Tensor]:

@@ -10,15 +10,15 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
+from torchgco.border import check_constraint, check_cost, check_dynamics
 from torchgco.constraints.base import Constraint
 from torchgco.costs.base import Cost
-from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 from torchgco.errors import InputError
 from torchgco.goal import Goal
 from torchgco.options import Count, Seconds, check_value
-from torchgco.shapes import MISTAKES, Dimensions, check_tensor, describe
+from torchgco.shapes import MISTAKES, Dimensions, check_tensor, computing_on, describe
 from torchgco.tree import Rows, cast
 
 LEAST_UNIT = 1e-3  # share of the controls' curvature in the unit of cost
@@ -54,15 +54,31 @@ class Problem:
 
     def __post_init__(self) -> None:
         self._check_border()
+        with computing_on(self.x0.device):
+            self._bind()
+
+    def _bind(self) -> None:
         dims = self._dimensions(self.x0)
+        object.__setattr__(self, "dynamics", self.dynamics.bind(dims))
         self._check_dynamics()
         object.__setattr__(self, "cost", self.cost.bind(dims))
         object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
-        self._check_cost()
+        self._check_code(self.dynamics, self.cost, self.constraints)
         given = self.goal if self.goal is not None and not self.goal.assumed else None
         goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
         object.__setattr__(self, "goal", goal)
         object.__setattr__(self, "form", {})
+
+    def _check_code(self, dynamics: Dynamics | None, cost: Cost | None, constraints: Sequence[Constraint]) -> None:
+        """Try what a user's code does; bound constraints."""
+        if dynamics is not None:
+            check_dynamics(dynamics, self.x0)
+        if cost is not None:
+            check_cost(cost, self.x0, self.N, self.m)
+        for i, constraint in enumerate(constraints):
+            name = getattr(constraint, "name", None)
+            field = f"{name}.function" if isinstance(name, str) else f"constraints[{i}].value"
+            check_constraint(constraint, field, self.x0, self.N, self.m)
 
     def _dimensions(self, x0: Tensor) -> Dimensions:
         dt = getattr(self.dynamics, "dt", None)
@@ -149,6 +165,14 @@ class Problem:
         }
         return self._with(parts, form=self.form)
 
+    def renewed(self) -> Self:
+        """The same problems, with nothing kept that was computed from their parts."""
+        return self._with({})
+
+    def is_same(self, other: Problem) -> bool:
+        """Whether both have the very same parts."""
+        return all(getattr(self, f.name) is getattr(other, f.name) for f in fields(self))
+
     def grown(self, by: Tensor) -> Self:
         """The same problems with their obstacles grown by `by` (B,), m."""
         return self._with({"constraints": tuple(c.grown(by) for c in self.constraints)}, form=self.form)
@@ -162,11 +186,10 @@ class Problem:
     ) -> Self:
         """The same problems from other states x0 (B, n): for receding horizons.
 
-        Constraints are of the same kinds and knots in the same order, cost and dynamics of the same kinds; None: as
-        they are. What is known of the problems' form (native kernels) is kept.
+        Constraints are of the same kinds in the same order; cost and dynamics as they are where None is given.
 
         Raises:
-            InputError: x0 of another shape, dtype or device, constraints of other kinds.
+            InputError: x0 of another shape, dtype or device, constraints of other kinds, or parts that don't fit.
         """
         check_tensor(x0, "x0")
         if x0.shape != self.x0.shape or x0.dtype != self.x0.dtype or x0.device != self.x0.device:
@@ -174,14 +197,24 @@ class Problem:
         _check_constraints(constraints)
         if cost is not None and not isinstance(cost, Cost):
             raise InputError("cost", "a Cost", _named(cost))
-        dims = self._dimensions(x0)
-        bound = tuple(constraint.bind(dims) for constraint in constraints)
-        if [type(part) for part in bound] != [type(part) for part in self.constraints]:
-            kinds = ", ".join(type(part).__name__ for part in self.constraints)
-            raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in bound))
-        cost = self.cost if cost is None else cost.bind(dims)
-        parts = {"x0": x0, "constraints": bound, "cost": cost, "dynamics": dynamics or self.dynamics}
-        return self._with(parts, form=self.form)
+        if dynamics is not None and not isinstance(dynamics, Dynamics):
+            raise InputError("dynamics", "a Dynamics", _named(dynamics))
+        if dynamics is not None and (dynamics.n, dynamics.m) != (self.n, self.m):
+            raise InputError("dynamics", f"{self.n} states and {self.m} controls", f"{dynamics.n} and {dynamics.m}")
+        with computing_on(x0.device):
+            dims = self._dimensions(x0)
+            bound = tuple(constraint.bind(dims) for constraint in constraints)
+            if [type(part) for part in bound] != [type(part) for part in self.constraints]:
+                kinds = ", ".join(type(part).__name__ for part in self.constraints)
+                raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in bound))
+            parts: dict[str, Any] = {"x0": x0, "constraints": bound}
+            parts |= {} if cost is None else {"cost": cost.bind(dims)}
+            parts |= {} if dynamics is None else {"dynamics": dynamics.bind(dims)}
+            started = self._with(parts)
+            known = set(map(id, self.constraints))
+            new = [b for b, given in zip(bound, constraints, strict=True) if id(given) not in known]
+            started._check_code(parts.get("dynamics"), parts.get("cost"), new)
+        return started
 
     def cast(self, dtype: torch.dtype) -> Self:
         """The same problems in another precision."""
@@ -204,8 +237,9 @@ class Problem:
         check_tensor(U, field, self.x0)
 
     def _check_border(self) -> None:
+        # The bases themselves compute nothing.
         for name, part, kind in (("dynamics", self.dynamics, Dynamics), ("cost", self.cost, Cost)):
-            if not isinstance(part, kind):
+            if not isinstance(part, kind) or type(part) is kind:
                 raise InputError(name, f"a {kind.__name__}", _named(part))
         for name in ("n", "m"):
             check_value(getattr(self.dynamics, name, None), Count, f"dynamics.{name}")
@@ -247,20 +281,6 @@ class Problem:
             raise InputError("dynamics.step", f"a step for states {tuple(self.x0.shape)}", message) from error
         if not isinstance(after, Tensor) or after.shape != self.x0.shape or after.dtype != self.x0.dtype:
             raise InputError("dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", describe(after))
-
-    def _check_cost(self) -> None:
-        """Evaluate a user's cost for the first problem, which stays at its start."""
-        if isinstance(self.cost, BoundQuadratic):
-            return
-        X, U = self.x0[:1].unsqueeze(1).repeat(1, self.N + 1, 1), self.x0.new_zeros(1, self.N, self.m)
-        try:
-            total = self.cost.take(slice(0, 1)).total(X, U)
-        except MISTAKES as error:
-            message = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError("cost", "a stage cost and a terminal cost of states and controls", message) from error
-        if not isinstance(total, Tensor) or total.shape != (1,) or total.dtype != self.x0.dtype:
-            got = f"for one problem {describe(total)}"
-            raise InputError("cost", f"one number in {self.x0.dtype} per state and control", got)
 
 
 def check_problem(problem: Any) -> None:

@@ -11,7 +11,8 @@ Dimensions, always these letters in this order:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,6 +71,14 @@ def check_device(device: Any) -> torch.device:
         return torch.empty(0, device=device).device
     except (RuntimeError, AssertionError, TypeError, ValueError):
         raise InputError("device", "a device that is there, such as cpu", repr(device)) from None
+
+
+@contextmanager
+def computing_on(device: torch.device) -> Iterator[None]:
+    """No gradients are recorded, and new tensors lie on `device`, whatever the process's default device is."""
+    elsewhere = torch.get_default_device() != device
+    with torch.no_grad(), device if elsewhere else nullcontext():
+        yield
 
 
 def describe(value: object) -> str:

@@ -31,6 +31,11 @@ class PerElement:
         return replace(self, **changes) if changes else self  # type: ignore[type-var]
 
 
+def is_users(part: object) -> bool:
+    """Whether a part's code is a user's: a class from elsewhere, or one of torchgco's that calls a user's function."""
+    return getattr(part, "calls_function", False) or type(part).__module__.partition(".")[0] != "torchgco"
+
+
 def take(tree: Any, index: Rows) -> Any:
     """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged."""
     if isinstance(tree, Tensor):

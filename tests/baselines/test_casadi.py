@@ -266,7 +266,7 @@ def test_a_study_prepares_before_the_clock_starts(monkeypatch) -> None:
 
         def run(self, call: Call) -> Solution:
             events.append("solve")
-            assert call.problem is self.problem
+            assert call.problem.is_same(self.problem)
             return Hold().run(call)
 
     monkeypatch.setattr("torchgco.experiments.flight._now", lambda device: float(events.append("clock") or 0.0))

@@ -1,6 +1,5 @@
 """A model in C equals that in PyTorch: its step, its derivatives, and the parameters of each problem."""
 
-import gc
 import subprocess
 import sys
 from pathlib import Path
@@ -216,32 +215,6 @@ def test_functions_that_cannot_be_traced() -> None:
     for function, message in ((torch.erfinv, "erfinv"), (lambda x: x if x.sum() > 0 else -x, "traced")):
         with pytest.raises(InputError, match=message):
             trace_dynamics(FunctionDynamics(lambda x, u, f=function: f(x), n=2, m=1, dt=0.1))
-
-
-def test_a_models_trace_is_kept_for_as_long_as_nothing_changes(monkeypatch) -> None:
-    counted = []
-    trace = made_by._trace
-    monkeypatch.setattr(made_by, "_trace", lambda *words: counted.append(words) or trace(*words))
-    drag = torch.tensor([1.0, 2.0], dtype=torch.float64)
-    kept = Planar(drag=drag)
-    first = trace_dynamics(kept)
-    assert trace_dynamics(kept) is first and len(counted) == 1
-    assert trace_dynamics(kept, dtype=torch.float32) is not first and len(counted) == 2
-    drag[0] = 3.0
-    assert trace_dynamics(kept).parameters(torch.arange(2))[0, 0] == 3.0 and len(counted) == 3
-    place = id(kept)
-    assert place in made_by._traced
-    counted.clear()
-    del kept
-    gc.collect()
-    assert place not in made_by._traced
-
-    class Heavy(Planar):
-        """A subclass may read more than its fields."""
-
-    heavy = Heavy(drag=drag)
-    trace_dynamics(heavy), trace_dynamics(heavy)
-    assert len(counted) == 2
 
 
 def test_parameters_of_a_part_of_the_batch() -> None:

@@ -214,7 +214,8 @@ class FirstIsFree(Smooth):
 
 class Sums(Smooth):
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
-        return super().stage(x, u, k).cumsum(-1)
+        value = super().stage(x, u, k)
+        return value if isinstance(k, int) else value.cumsum(-1)
 
 
 @dataclass(frozen=True)

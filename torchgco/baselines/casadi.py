@@ -113,7 +113,7 @@ class PreparedCasADi(Solver):
     def run(self, call: Call) -> Solution:
         """As `CasADiSolver.run`; InputError for another problem than the prepared one."""
         problem, U0 = call.problem, call.U0
-        if problem is not self.problem:
+        if not problem.is_same(self.problem):
             raise InputError("problem", "the one that was prepared", "another")
         X0 = open_loop(problem.dynamics, problem.x0, U0)
         return self._all(torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1)), U0, call.callback)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from torchgco.errors import InputError, shown
 from torchgco.options import check_options
 from torchgco.shapes import MISTAKES, Dimensions, check_shape
 from torchgco.tree import PerElement
+from torchgco.values import bound_values, keywords
 
 Sense = Literal["inequality", "equality"]
 Knots = slice | Sequence[int] | Tensor
@@ -112,8 +113,18 @@ class FunctionConstraint(Constraint):
     `of` says what the function takes: "x" for function(x), "u" for function(u), "xu" for function(x, u). It maps
     (..., n), (..., m) to rows (..., p). Default knots: 1..N for "x" (x_0 is given), 0..N-1 otherwise.
 
+        near = FunctionConstraint(
+            lambda x, goal, k: (x[..., :2] - goal).square().sum(-1, keepdim=True) - sizes[k],  # sizes (N+1, 1)
+            values={"goal": goals},  # (B, 2)
+        )
+
+    The function may take an argument k, the numbers (K,) of the knots of x (B, K, n). `values` are numbers per problem
+    by name, (B, ...), `knot_values` numbers per problem and knot, (B|1, N+1, ...); the function takes them as arguments
+    of these names, shaped to fit x.
+
     Raises:
-        InputError: on `Problem(...)`: bad sense, knots, or `of`; a function that doesn't return (..., p).
+        InputError: on `Problem(...)`: bad sense, knots, or `of`; values of another shape or that the function doesn't
+            take; a function that doesn't return (..., p).
     """
 
     function: Callable[..., Tensor]
@@ -122,6 +133,11 @@ class FunctionConstraint(Constraint):
     of: Literal["x", "u", "xu"] = "x"
     geometric: bool = False
     name: str = "constraint"
+    values: Any = None
+    knot_values: Any = None
+
+    batched: ClassVar[tuple[str, ...]] = ("values",)
+    calls_function: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Self:
         check_options(self, self.name if isinstance(self.name, str) else "constraint")
@@ -132,26 +148,39 @@ class FunctionConstraint(Constraint):
         knots = resolve_knots(
             default if self.knots is None else self.knots, last, f"{self.name}.knots", dims.like.device
         )
-        where, arguments = f"{self.name}.function", [dims.n if a == "x" else dims.m for a in self.of]
+        where = f"{self.name}.function"
+        if not callable(self.function):
+            raise InputError(where, f"a function of {' and '.join(self.of)}", shown(self.function))
+        values = bound_values(self.values, self.knot_values, (self.function,), dims, self.name)
+        bound = replace(self, knots=knots, values=values)
         try:
-            rows = self.function(*(dims.like.new_zeros(dims.B, 1, size) for size in arguments))
+            rows = bound.value(*(dims.like.new_zeros(dims.B, *size) for size in ((last + 1, dims.n), (dims.N, dims.m))))
         except MISTAKES as error:
             message = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(where, f"a function of {' and '.join(self.of)}", message) from error
-        check_shape(rows, (dims.B, 1, "p"), where)
+        check_shape(rows, (dims.B, len(range(last + 1)[knots]) if isinstance(knots, slice) else len(knots), "p"), where)
         if rows.dtype != dims.like.dtype:
             raise InputError(where, f"rows of {dims.like.dtype} as x0", rows.dtype)
-        return replace(self, knots=knots)
+        return bound
+
+    @property
+    def reads_knots(self) -> bool:
+        """Whether the function takes more than states and controls: values, or the number of the knot."""
+        return bool(self.values.names or self.values.knot_names) or "k" in keywords(self.function)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.function(*self._arguments(X, U))
+        return self._along(X)(*self._arguments(X, U))
+
+    def _along(self, X: Tensor) -> Callable[..., Tensor]:
+        k = torch.arange(X.shape[1], device=X.device)[self.knots]
+        return lambda *z: self.values.call(self.function, *z, k=k)
 
     def at(self, x: Tensor, k: int) -> Tensor:
-        return self.function(x)
+        return self.values.call(self.function, x, k=k)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         n = X.shape[-1]
-        parts = dict(zip(self.of, jacobian(self.function, *self._arguments(X, U)), strict=True))
+        parts = dict(zip(self.of, jacobian(self._along(X), *self._arguments(X, U)), strict=True))
         cx, cu = parts.get("x"), parts.get("u")
         add = H.new_zeros(*g.shape[:2], *H.shape[2:])
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Self
 
 from torch import Tensor
 
 from torchgco.autodiff import jacobian
 from torchgco.dynamics.integrators import INTEGRATORS
 from torchgco.options import Count, Seconds, check_options
+from torchgco.shapes import Dimensions
 from torchgco.tree import PerElement
+from torchgco.values import NONE, bound_values
 
 
 class Dynamics(PerElement):
@@ -37,8 +39,11 @@ class Dynamics(PerElement):
     dt: float
     integrator: str = "euler"
     position: slice | None = None
-    # Set in a class whose step depends on nothing but its dataclass fields: its traced step may then be cached.
-    reads_fields_alone: ClassVar[bool]
+
+    @property
+    def is_integrated(self) -> bool:
+        """Whether `step` integrates `field`."""
+        return type(self).step is Dynamics.step
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         """Time derivative of x, (..., n)."""
@@ -47,6 +52,10 @@ class Dynamics(PerElement):
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         """The state one time step later, (..., n)."""
         return INTEGRATORS[self.integrator](lambda x: self.field(x, u), x, self.dt)
+
+    def bind(self, dims: Dimensions) -> Self:
+        """The model checked and shaped for one problem; called once, by Problem."""
+        return self
 
     def jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of `step` by `torch.func`: fx (..., n, n) and fu (..., n, m)."""
@@ -58,8 +67,17 @@ class Dynamics(PerElement):
 class FunctionDynamics(Dynamics):
     """Dynamics from function(x, u) on (..., n), (..., m): the derivative x', or with integrator="none" the next state.
 
+        drag = torch.tensor([0.2, 0.5]).double()  # of two problems
+        boat = FunctionDynamics(field, n=4, m=2, dt=0.1, values={"drag": drag})  # calls field(x, u, drag=...)
+
+    Args:
+        values: numbers per problem by name, (B, ...), which the function takes as arguments of these names, shaped to
+            fit x: (B, ...), or (B, 1, ...) where x has an axis of knots or samples. Dynamics that change with time
+            have a clock among their states.
+
     Raises:
-        InputError: a field out of its range or of another kind.
+        InputError: a field out of its range or of another kind; on `Problem(...)`: values of another shape or that the
+            function doesn't take.
     """
 
     function: Callable[[Tensor, Tensor], Tensor]
@@ -68,12 +86,26 @@ class FunctionDynamics(Dynamics):
     dt: Seconds
     integrator: Literal["euler", "midpoint", "rk4", "none"] = "euler"
     position: slice | None = None
+    values: Any = None
+
+    batched: ClassVar[tuple[str, ...]] = ("values",)
+    calls_function: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_options(self, "dynamics")
 
+    def bind(self, dims: Dimensions) -> Self:
+        return replace(self, values=bound_values(self.values, None, (self.function,), dims, "dynamics"))
+
+    @property
+    def is_integrated(self) -> bool:
+        return self.integrator != "none"
+
     def field(self, x: Tensor, u: Tensor) -> Tensor:
-        return self.function(x, u)
+        return self._called(x, u)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
-        return self.function(x, u) if self.integrator == "none" else super().step(x, u)
+        return super().step(x, u) if self.is_integrated else self._called(x, u)
+
+    def _called(self, x: Tensor, u: Tensor) -> Tensor:
+        return (self.values or NONE).call(self.function, x, u)

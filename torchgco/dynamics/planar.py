@@ -36,7 +36,6 @@ class Planar(Dynamics):
 
     n: ClassVar[int] = 6
     m: ClassVar[int] = 2
-    reads_fields_alone: ClassVar[bool] = True
     position: ClassVar[slice] = slice(0, 2)
     per_element: ClassVar[tuple[str, ...]] = ("drag", "thrust_gain", "turn_drag", "turn_gain")
 

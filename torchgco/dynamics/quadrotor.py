@@ -124,7 +124,6 @@ class QuadrotorPlanning(Dynamics):
 
     n: ClassVar[int] = 14
     m: ClassVar[int] = 4
-    reads_fields_alone: ClassVar[bool] = True
     position: ClassVar[slice] = slice(0, 3)
     per_element: ClassVar[tuple[str, ...]] = ("rate_time_constant", "thrust_time_constant")
 
@@ -157,7 +156,6 @@ class QuadrotorPlant(Dynamics):
 
     n: ClassVar[int] = 17
     m: ClassVar[int] = 4
-    reads_fields_alone: ClassVar[bool] = True
     position: ClassVar[slice] = slice(0, 3)
 
     def __post_init__(self) -> None:
@@ -196,7 +194,6 @@ class RotorTracking(Dynamics):
 
     n: ClassVar[int] = 7
     m: ClassVar[int] = 4
-    reads_fields_alone: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_options(self, "rotors")

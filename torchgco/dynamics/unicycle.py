@@ -33,7 +33,6 @@ class Unicycle(Dynamics):
 
     n: ClassVar[int] = 4
     m: ClassVar[int] = 2
-    reads_fields_alone: ClassVar[bool] = True
     position: ClassVar[slice] = slice(0, 2)
 
     def __post_init__(self) -> None:

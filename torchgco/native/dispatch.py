@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Hashable
 
 import torch
 from torch import Tensor
@@ -11,17 +12,35 @@ from torchgco import rollout
 from torchgco.errors import InputError
 from torchgco.kernels import native
 from torchgco.lagrangian import Lagrangian
-from torchgco.native.compiler import NativeError
+from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine, Terms
+from torchgco.native.identity import signature
 from torchgco.native.sampler import Sampler
 from torchgco.problem import Problem
 
 NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
+CURRENT = "current"  # marks the form of problems that a solve works on
+SAID = "said"  # the reasons that an EagerWarning has named for a problem
+KEPT = 64  # engines of problems without a user's code, the most recent ones
 AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
 
 
 class EagerWarning(UserWarning):
     """Native kernels can't be used for a problem; PyTorch's are, which takes longer."""
+
+
+def current(problem: Problem) -> Problem:
+    """The problem as its parts are now: nothing is kept from an earlier solve but code of the same computation.
+
+    Every solve begins with this call. A user's code is traced anew: the tensors, numbers and modules that it captures
+    may have changed. Within a solve, subsets and other forms of the problem share the kernels of its beginning.
+    """
+    if CURRENT in problem.form:
+        return problem
+    fresh = problem.renewed()
+    fresh.form[CURRENT] = True
+    fresh.form[SAID] = problem.form.setdefault(SAID, set())
+    return fresh
 
 
 def engine_of(problem: Problem) -> Engine | None:
@@ -34,12 +53,32 @@ def engine_of(problem: Problem) -> Engine | None:
         return None
     if "engine" not in problem.form:
         try:
-            problem.form["engine"] = Engine(problem)
+            problem.form["engine"] = _engine(problem)
         except (InputError, NativeError) as error:
             problem.form["engine"] = None
             reason = str(error).splitlines()[0]
-            warnings.warn(f"solved by PyTorch's kernels, many times slower: {reason}", EagerWarning, stacklevel=4)
+            said = problem.form.setdefault(SAID, set())
+            if reason not in said:
+                said.add(reason)
+                warnings.warn(f"solved by PyTorch's kernels, many times slower: {reason}", EagerWarning, stacklevel=4)
     return problem.form["engine"]
+
+
+def _engine(problem: Problem) -> Engine:
+    same = signature(problem)
+    if same is None:
+        return Engine(problem)
+    key = same, find_compiler()
+    if key in _engines:
+        _engines[key] = _engines.pop(key)  # the most recent one is the last
+    else:
+        _engines[key] = Engine(problem)
+        if len(_engines) > KEPT:
+            del _engines[next(iter(_engines))]
+    return _engines[key]
+
+
+_engines: dict[Hashable, Engine] = {}
 
 
 def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:

@@ -7,7 +7,6 @@ differ from knot to knot.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
@@ -101,14 +100,12 @@ def knot_source(kind: str, span: Span, code_of: Callable[[Knot, str], str], *fil
         InputError: an operation without a counterpart; rows that join knots, or whose operations differ between knots.
     """
     shape = str((span.n, span.m, span.states, span.controls, list(span.knots)))
-    key = store.key_of((kind, shape, span.traced.fingerprint(), *makers(__file__, *files)))
-    known = store.read(key, ".json")
-    if known is None:
+
+    def make(key: str) -> dict[str, Any]:
         knot, places = _one_knot(span)
-        made = {"code": code_of(knot, key[:16]), "size": knot.rows.numel(), "places": places}
-        known = json.dumps(made).encode()
-        store.save(key, ".json", known)
-    parts = json.loads(known)
+        return {"code": code_of(knot, key[:16]), "size": knot.rows.numel(), "places": places}
+
+    key, parts = store.made((kind, shape, span.traced.fingerprint(), *makers(__file__, *files)), make)
     places = torch.tensor(parts["places"], dtype=torch.int64).reshape(len(parts["places"]), -1)
     return KnotSource(parts["code"], key[:16], parts["size"], places, span)
 

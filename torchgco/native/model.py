@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,44 +81,12 @@ def trace_dynamics(
         InputError: the step can't be traced, or holds an operation without a counterpart.
     """
     n, m = n or dynamics.n, m or dynamics.m
-    known = _traced.get(id(dynamics))
-    # In an application that solves one problem after another, tracing would take half of the time.
-    if known is not None and known.dynamics() is dynamics and known.versions == _versions(dynamics, dtype, device):
-        return known.source
-    source = _trace(dynamics, n, m, dtype, device)
-    if type(dynamics).__dict__.get("reads_fields_alone", False):
-        place = id(dynamics)
-        forget = weakref.ref(dynamics, lambda _: _traced.pop(place, None))
-        _traced[place] = _Known(forget, _versions(dynamics, dtype, device), source)
-    return source
-
-
-class _Known(NamedTuple):
-    dynamics: weakref.ref[Dynamics]
-    versions: tuple[Any, ...]
-    source: DynamicsSource
-
-
-_traced: dict[int, _Known] = {}
-
-
-def _versions(dynamics: Dynamics, dtype: torch.dtype, device: torch.device | str) -> tuple[Any, ...]:
-    """A tuple that changes with every write into a tensor of the model."""
-    return dtype, str(device), *(value._version for value in vars(dynamics).values() if isinstance(value, Tensor))
-
-
-def _trace(dynamics: Dynamics, n: int, m: int, dtype: torch.dtype, device: torch.device | str) -> DynamicsSource:
     x, u = (torch.zeros(1, size, dtype=dtype, device=device) for size in (n, m))
     own = own_tensors(dynamics)
     traced = Traced("dynamics.step", lambda i, x, u: dynamics.take(i).step(x, u), x, u, own=own)
-    key = store.key_of(("model", traced.fingerprint(), *makers()))
-    known = store.read(key, ".json")
-    if known is None:
-        known = json.dumps(_made(traced, n, m)).encode()
-        store.save(key, ".json", known)
-    parts = json.loads(known)
-    lists = {name: tuple(parts[name]) for name in ("rows", "columns", "places", "values")}
-    return DynamicsSource(n, m, traced.count, parts["code"], **lists, key=key, traced=traced, own=own)
+    parts = store.made(("model", traced.fingerprint(), *makers()), lambda _: _made(traced, n, m))
+    lists = {name: tuple(parts.content[name]) for name in ("rows", "columns", "places", "values")}
+    return DynamicsSource(n, m, traced.count, parts.content["code"], **lists, key=parts.key, traced=traced, own=own)
 
 
 def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:

@@ -35,7 +35,7 @@ def rows_numbers(problem: Problem, i: int, source: KnotSource) -> Tensor:
 def span_of_rows(problem: Problem, i: int) -> Span:
     """Constraint i, traced: at one knot where it is given as a function of one, else along whole trajectories."""
     constraint, n, m, N = problem.constraints[i], problem.n, problem.m, problem.N
-    if type(constraint) is FunctionConstraint:
+    if type(constraint) is FunctionConstraint and not constraint.reads_knots:
 
         def of_knot(index: Tensor, X: Tensor, U: Tensor) -> Tensor:
             rows = constraint.function(*(X if a == "x" else U for a in constraint.of))

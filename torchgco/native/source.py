@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torchgco.native.costs import CostSource
 from torchgco.native.emit import PRELUDE, literal
@@ -43,6 +44,9 @@ SOLVER = ("problem.c", COST, "knot.c", "passes.c", "ilqr.c", "trajectories.c")
 SAMPLER = ("problem.c", COST, "knot.c", "normal.c", "mppi.c")
 
 
+_sources: dict[tuple[Any, ...], str] = {}  # reading and joining the files takes longer than a small solve
+
+
 @dataclass(frozen=True)
 class Form:
     """Everything that a problem's code depends on; two problems of one form share a library."""
@@ -56,6 +60,19 @@ class Form:
 
     def source(self, parts: tuple[str, ...] = SOLVER, real: str = "double", lanes: int = LANES) -> str:
         """The C file of the solver or the sampler, for numbers of type `real`."""
+        key = (*self._key, parts, real, lanes)
+        if key not in _sources:
+            _sources[key] = self._written(parts, real, lanes)
+        return _sources[key]
+
+    @property
+    def _key(self) -> tuple[Any, ...]:
+        at = self.position
+        cost = None if self.cost is None else (self.cost.stage.key, self.cost.last.key)
+        functions = tuple((i, rows.key) for i, rows in self.functions)
+        return self.dynamics.key, at and (at.start, at.stop), cost, self.dense, functions, self.boxes
+
+    def _written(self, parts: tuple[str, ...], real: str, lanes: int) -> str:
         model, at = self.dynamics, self.position
         defines = {
             "REAL": real, "LANES": lanes, "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,

@@ -8,18 +8,42 @@ A folder that is missing or can't be written costs time, never correctness: noth
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from tempfile import mkstemp
+from typing import Any, NamedTuple
 
 FILES = 200  # at most; the least recently used are removed
 _ABANDONED = 3600.0  # s after which a half-written file belongs to a process that was killed
 _PART = ("torchgco-", ".part")
 _OURS = re.compile(r"[0-9a-f]{32}-[0-9a-f]{32}\.[a-z]+")
+
+
+class Made(NamedTuple):
+    """What was generated, and its key."""
+
+    key: str
+    content: dict[str, Any]
+
+
+_made: dict[tuple[str, str], Made] = {}
+
+
+def made(parts: Sequence[str], make: Callable[[str], dict[str, Any]]) -> Made:
+    """What `make` generates for the key of `parts`: of this process, else from the folder, else made now and stored."""
+    key, place = key_of(parts), str(folder())
+    if (key, place) not in _made:
+        known = read(key, ".json")
+        if known is None:
+            known = json.dumps(make(key)).encode()
+            save(key, ".json", known)
+        _made[key, place] = Made(key, json.loads(known))
+    return _made[key, place]
 
 
 def folder() -> Path:

@@ -30,7 +30,6 @@ class BiasedPlanning(QuadrotorPlanning):
     bias: Tensor = torch.zeros(1, 3)  # (B, 3), m/s^2
 
     batched: ClassVar[tuple[str, ...]] = ("bias",)
-    reads_fields_alone: ClassVar[bool] = True
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         rates, bias = super().field(x, u), self.bias.view(-1, *([1] * (x.dim() - 2)), 3)

@@ -13,11 +13,11 @@ from torch import Tensor
 from torchgco.draws import DrawKey
 from torchgco.errors import InputError
 from torchgco.lagrangian import Multipliers
-from torchgco.native.dispatch import cost_unit
+from torchgco.native.dispatch import cost_unit, current
 from torchgco.options import Seconds, Seed, check_value
 from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem, check_problem
-from torchgco.shapes import describe
+from torchgco.shapes import computing_on, describe
 from torchgco.solution import Solution
 from torchgco.tree import Rows, take
 
@@ -70,7 +70,6 @@ class Call:
         Raises:
             InputError: U0, ids or warm don't fit the problem, or an argument is of another kind or out of its range.
         """
-        check_problem(problem)
         seed = check_value(seed, Seed, "seed")
         max_seconds = check_value(max_seconds, Seconds | None, "max_seconds")
         check_value(callback, Callable | None, "callback")
@@ -85,7 +84,7 @@ class Call:
             if not isinstance(warm, Multipliers):
                 raise InputError("warm", "Multipliers, such as those of a solution", type(warm).__name__)
             warm.check(problem)
-        return cls(problem, U0, seed, ids, rows, torch.zeros_like(rows), warm, callback, deadline)
+        return cls(current(problem), U0, seed, ids, rows, torch.zeros_like(rows), warm, callback, deadline)
 
     @property
     def late(self) -> bool:
@@ -141,7 +140,9 @@ class Solver:
         Raises:
             InputError: U0, ids or warm don't fit the problem, or an option of the solver doesn't.
         """
-        return self.run(Call.checked(problem, U0, seed, ids, warm, callback, max_seconds))
+        check_problem(problem)
+        with computing_on(problem.x0.device):
+            return self.run(Call.checked(problem, U0, seed, ids, warm, callback, max_seconds))
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""

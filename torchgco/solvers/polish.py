@@ -16,8 +16,10 @@ from torch import Tensor
 from torchgco.errors import InputError
 from torchgco.evaluation import chord_clearance, violation
 from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.native.dispatch import current
 from torchgco.options import Count, NonNegative, Positive, check_options
 from torchgco.problem import Problem, check_problem
+from torchgco.shapes import computing_on
 from torchgco.solution import Solution
 from torchgco.solvers.active_set import multipliers, projected
 from torchgco.solvers.condensed import Condensed
@@ -83,6 +85,10 @@ class Polish:
             raise InputError("solution", "a Solution", type(solution).__name__)
         problem.check_controls(solution.U, "solution.U")
         solution.multipliers.check(problem)
+        with computing_on(problem.x0.device):
+            return self._refined(current(problem), solution)
+
+    def _refined(self, problem: Problem, solution: Solution) -> Solution:
         result = copied(replace(solution, trace=None))
         near = (violation(problem, solution.X, solution.U) <= self.reach) & torch.isfinite(solution.cost)
         for b in (near & problem.start_is_clear).nonzero().flatten():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import count
 from typing import Any
 
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
+from torchgco.autodiff import WithoutReading
 from torchgco.errors import InputError
 from torchgco.tracing.operations import OPERATIONS
 
@@ -33,11 +34,11 @@ class Call:
     kwargs: dict[str, Any]
     result: Any  # a slot, or a sequence of them
 
-    @property
+    @cached_property
     def inputs(self) -> list[Slot]:
         return [leaf for leaf in tree_leaves((self.args, self.kwargs)) if isinstance(leaf, Slot)]
 
-    @property
+    @cached_property
     def outputs(self) -> list[Slot]:
         return [leaf for leaf in tree_leaves(self.result) if isinstance(leaf, Slot)]
 
@@ -80,8 +81,10 @@ class Recorder(TorchDispatchMode):
         kwargs = kwargs or {}
         if func is torch.ops.aten._local_scalar_dense.default:
             if self.slot(args[0]) in self._followers:
-                raise _LooksAtValues
+                raise _Unfit("one that looks at the values of its arguments")
             return func(*args, **kwargs)  # a constant's value may be read
+        if torch.Tag.nondeterministic_seeded in func.tags:
+            raise _Unfit(f"one that draws at random ({name_of(func)})")
         if name_of(func) not in OPERATIONS:
             with self:  # the parts are dispatched here in turn
                 parts = func.decompose(*args, **kwargs)
@@ -104,9 +107,8 @@ class Recorder(TorchDispatchMode):
         return any(isinstance(leaf, Tensor) and self.slot(leaf) in self._followers for leaf in tree_leaves(tree))
 
 
-class _LooksAtValues(Exception):
-    def __str__(self) -> str:
-        return "one that looks at the values of its arguments"
+class _Unfit(Exception):
+    """A function does what a recording can't hold."""
 
 
 def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Recorder:
@@ -119,7 +121,7 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
     # Writes in place become writes into a copy: PyTorch's part and CasADi's must not share memory.
     pure = torch.func.functionalize(function, remove="mutations")
     try:
-        with torch.no_grad(), recorder:
+        with torch.no_grad(), recorder, WithoutReading():
             result = pure(*examples)
     except InputError:
         raise  # the function itself says what is wrong

@@ -1,0 +1,201 @@
+"""Draws models, costs and constraints as users write them, and solves each as often as what they capture changes.
+
+    python -m tests.fuzz.user_code FIRST COUNT
+
+prints a line per drawn problem: its seed, and "equal" or "refused"; a line for any other outcome begins with "wrong".
+A crash ends the process, so that whoever counts the lines sees it.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco import (
+    ILQR,
+    ControlBounds,
+    Cost,
+    Dynamics,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    InputError,
+    Problem,
+    QuadraticCost,
+    Solution,
+    kernels,
+)
+from torchgco.rollout import open_loop
+
+D = torch.float64
+B, N, SIZE = 3, 8, 3
+UNARY: dict[str, Callable[[Tensor], Tensor]] = {
+    "sin": torch.sin, "tanh": torch.tanh, "softplus": torch.nn.functional.softplus, "square": torch.square,
+    "root": lambda z: (1.0 + z * z).sqrt(), "bump": lambda z: torch.exp(-z * z), "flip": lambda z: z.flip(-1),
+    "clamped": lambda z: z.clamp(-0.7, 0.9), "chosen": lambda z: torch.where(z > 0.1, z, 0.3 * z),
+    "sorted sum": lambda z: z.cumsum(-1) / SIZE, "norm": lambda z: z / (1.0 + z.norm(dim=-1, keepdim=True)),
+}  # fmt: skip
+FAULTS = ("numpy", "dropout", "randn", "python random", "one column", "scalar", "coupled", "integer", "missing")
+CAPTURES = ("nothing", "number", "tensor", "data", "array", "module", "branch on a number", "list")
+
+
+class Memory:
+    """What drawn code captures."""
+
+    def __init__(self, rng: random.Random) -> None:
+        self.number, self.items = rng.uniform(0.2, 1.0), [rng.uniform(0.2, 1.0) for _ in range(SIZE)]
+        self.tensor = torch.tensor(self.items, dtype=D)
+        self.array = np.array(self.items)
+        self.module = torch.nn.Linear(SIZE, SIZE).double()
+
+    def change(self, kind: str) -> None:
+        """Another value, by every way that leaves the object the same."""
+        if kind == "tensor":
+            self.tensor.mul_(-0.5)
+        elif kind == "data":
+            self.tensor.data = self.tensor.data * -0.5
+        elif kind == "array":
+            self.array *= -0.5
+        elif kind == "list":
+            self.items[0] *= -0.5
+        elif kind == "module":
+            with torch.no_grad():
+                self.module.weight.mul_(-0.5)
+        else:
+            self.number *= -0.5
+
+    def read(self, kind: str, z: Tensor) -> Tensor:
+        if kind in ("tensor", "data"):
+            return z * self.tensor
+        if kind == "array":
+            return z * torch.from_numpy(self.array)
+        if kind == "list":
+            return z * torch.tensor(self.items, dtype=D)
+        if kind == "module":
+            return self.module(z)
+        if kind == "number":
+            return self.number * z
+        if kind == "branch on a number":
+            return z if self.number > 0 else z.sin()
+        return z
+
+
+def drawn_function(rng: random.Random, memory: Memory, capture: str) -> Callable[[Tensor], Tensor]:
+    """A smooth, bounded or growing function of (..., SIZE) that reads `memory`."""
+    names, weight = rng.choices(list(UNARY), k=rng.randint(1, 3)), rng.uniform(0.2, 0.8)
+
+    def function(z: Tensor) -> Tensor:
+        for name in names:
+            z = z + weight * UNARY[name](memory.read(capture, z))
+        return z
+
+    return function
+
+
+def spoilt(rng: random.Random, function: Callable[[Tensor], Tensor], fault: str) -> Callable[[Tensor], Any]:
+    """The function with a fault."""
+    dropout = torch.nn.Dropout(0.5)
+    return {
+        "numpy": lambda z: torch.tensor(np.sin(function(z).detach().numpy())),
+        "dropout": lambda z: dropout(function(z)),
+        "randn": lambda z: function(z) + torch.randn(SIZE, dtype=D),
+        "python random": lambda z: function(z) * random.random(),
+        "one column": lambda z: function(z)[..., :1, None],
+        "scalar": lambda z: function(z).sum(),
+        "coupled": lambda z: function(z - z.mean(0)),
+        "integer": lambda z: function(z).long(),
+        "missing": lambda z: None,
+    }[fault]
+
+
+def drawn_problem(seed: int) -> tuple[Callable[[], Problem], Memory, str, str]:
+    """How to make the problem, what it captures, how, and its fault; "" for none."""
+    rng = random.Random(seed)
+    torch.manual_seed(seed)
+    memory, capture = Memory(rng), rng.choice(CAPTURES)
+    fault = rng.choice(FAULTS) if rng.random() < 0.3 else ""
+    place = rng.choice(("model", "cost", "constraint"))
+    inner = drawn_function(rng, memory, capture)
+    inner = spoilt(rng, inner, fault) if fault else inner
+    shape, integrator = rng.choice((0, 1)), rng.choice(("euler", "midpoint", "rk4", "none"))
+    subclass = rng.random() < 0.5
+    own = rng.random() < 0.3
+    X0 = 0.5 * torch.randn(B, SIZE, dtype=D)
+
+    def model() -> Dynamics:
+        known = (lambda z: torch.tanh(z)) if place != "model" else inner
+        field = lambda x, u: 0.5 * known(x) + 0.3 * torch.cat((u, u[..., :1]), dim=-1)
+        if fault and place == "model":
+            field = lambda x, u: known(x)
+        if not subclass:
+            return FunctionDynamics(field, SIZE, 2, 0.1, integrator)
+        members = {"n": SIZE, "m": 2, "dt": 0.1, "integrator": "rk4", "field": lambda self, x, u: field(x, u)}
+        return type("Drawn", (Dynamics,), members)()
+
+    def cost() -> Cost:
+        if place != "cost":
+            return QuadraticCost([1.0] * SIZE, [0.1] * 2, [5.0] * SIZE)
+        stage = lambda x, u: inner(x).square().sum(-1) + 0.1 * u.square().sum(-1)
+        if fault:
+            stage = lambda x, u: inner(x)[..., 0] if fault == "coupled" else inner(x)
+        if not own:
+            return FunctionCost(stage, lambda x: 3.0 * x.square().sum(-1))
+        members = {"stage": lambda self, x, u, k: stage(x, u), "terminal": lambda self, x: x.square().sum(-1)}
+        return type("Drawn", (Cost,), members)()
+
+    def constraints() -> list[Any]:
+        rows = FunctionConstraint(lambda x: (inner(x) - 0.5) if fault else inner(x)[..., : 1 + shape] - 0.5)
+        return [ControlBounds(-2, 2), *([rows] if place == "constraint" else [])]
+
+    return lambda: Problem(model(), cost(), constraints(), X0, N), memory, capture, fault
+
+
+def solved(problem: Problem, native: bool) -> Solution:
+    kernels.use_native(native)
+    try:
+        U0 = torch.zeros(B, N, 2, dtype=D)
+        return torchgco.AugmentedLagrangian(ILQR(max_iterations=3), max_outer_iterations=3).solve(problem, U0)
+    finally:
+        kernels.use_native(True)
+
+
+def outcome(seed: int) -> str:
+    """What becomes of a drawn problem."""
+    make, memory, capture, fault = drawn_problem(seed)
+    try:
+        problem = make()
+    except InputError as error:
+        return "refused" if fault and "\n" not in str(error) else f"wrong: {capture}, {fault}: {error}"
+    if fault:
+        return f"wrong: accepted with {fault}"
+    for turn in range(3):
+        found, fresh = solved(problem, native=True), make()
+        expected = solved(fresh, native=False)
+        for name in ("X", "U", "cost", "violation"):
+            if not torch.allclose(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-7):
+                return f"wrong: {name} after {turn} changes of {capture}"
+        if not torch.allclose(open_loop(fresh.dynamics, fresh.x0, found.U), found.X, rtol=1e-9, atol=1e-9):
+            return f"wrong: states after {turn} changes of {capture}"
+        memory.change(capture)
+    return "equal"
+
+
+def main(first: int, count: int) -> None:
+    warnings.simplefilter("ignore")
+    for seed in range(first, first + count):
+        try:
+            print(seed, outcome(seed), flush=True)
+        except Exception as error:
+            print(seed, f"wrong: {type(error).__name__}: {error}".splitlines()[0], flush=True)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]))

@@ -1,0 +1,95 @@
+"""Values per problem and per knot for the functions of a problem."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, kernels
+from torchgco.native.dispatch import EagerWarning
+
+D = torch.float64
+B, N = 3, 20
+GOALS = torch.tensor([[1.0, 0.0], [2.0, 1.0], [0.0, 2.0]], dtype=D)
+DRAGS = torch.tensor([0.2, 0.5, 1.0], dtype=D)
+LIMITS = torch.linspace(2.5, 1.5, N + 1, dtype=D).unsqueeze(-1)
+THRUSTS = 4.0 + torch.arange(B * (N + 1), dtype=D).reshape(B, N + 1, 1).sin()
+
+
+def field(x: Tensor, u: Tensor, drag: Tensor) -> Tensor:
+    return torch.cat((x[..., 2:], u - drag.unsqueeze(-1) * x[..., 2:]), dim=-1)
+
+
+def stage(x: Tensor, u: Tensor, goal: Tensor, k: int | Tensor) -> Tensor:
+    return 0.1 * (x[..., :2] - goal).square().sum(-1) + 0.1 * u.square().sum(-1) * (1.0 + 0.125 * k)
+
+
+def problem(rows: slice = slice(None), **more: Any) -> Problem:
+    cost = FunctionCost(stage, lambda x, goal: 500.0 * (x[..., :2] - goal).square().sum(-1), {"goal": GOALS[rows]})
+    slow = FunctionConstraint(lambda x, k: x[..., 2:3] - LIMITS[k])
+    weak = FunctionConstraint(lambda u, most: u[..., :1] - most, of="u", knot_values={"most": THRUSTS[rows]})
+    dynamics = FunctionDynamics(field, 4, 2, 0.1, position=slice(0, 2), values={"drag": DRAGS[rows]})
+    return Problem(dynamics, cost, [slow, weak], torch.zeros(len(GOALS[rows]), 4, dtype=D), N, **more)
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_every_problem_has_its_own_values(native: bool) -> None:
+    kernels.use_native(native)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", EagerWarning)
+            whole = torchgco.solve(problem())
+            for b in range(B):
+                alone, part = problem(slice(b, b + 1)), problem().take(torch.tensor([b]))
+                for one in (alone, part):
+                    assert torch.equal(torchgco.solve(one).X[0], whole.X[b])
+    finally:
+        kernels.use_native(True)
+    assert bool((whole.X[:, 1:, 2] <= LIMITS[1:, 0] + 1e-3).all())
+    assert bool((whole.U[..., 0] <= THRUSTS[:, :N, 0] + 1e-3).all())
+    assert float((whole.X[:, -1, :2] - GOALS).norm(dim=-1).max()) < 0.2
+
+
+def test_sums_are_those_of_a_loop() -> None:
+    made, generator = problem(), torch.Generator().manual_seed(3)
+    X, U = (torch.randn(B, K, size, dtype=D, generator=generator) for K, size in ((N + 1, 4), (N, 2)))
+    total = made.cost.total(X, U)
+    for b in range(B):
+        expected = sum(float(stage(X[b, k], U[b, k], GOALS[b], k)) for k in range(N))
+        expected += 500.0 * float((X[b, -1, :2] - GOALS[b]).square().sum())
+        assert abs(expected - float(total[b])) < 1e-9
+        for k in range(N):
+            samples = U[:, :5]  # (B, S, m)
+            rows = made.constraints[1].values.call(made.constraints[1].function, samples, k=k)
+            torch.testing.assert_close(rows[b], samples[b, :, :1] - THRUSTS[b, k], rtol=0, atol=0)
+
+
+def test_new_values_need_no_new_kernel() -> None:
+    first = problem()
+    torchgco.solve(first)
+    cost = FunctionCost(stage, lambda x, goal: 500.0 * (x[..., :2] - goal).square().sum(-1), {"goal": GOALS + 0.25})
+    moved = first.started_at(first.x0 + 0.1, first.constraints, cost=cost)
+    assert float((torchgco.solve(moved).X[:, -1, :2] - GOALS - 0.25).norm(dim=-1).max()) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("make", "line"),
+    [
+        (lambda: FunctionCost(5), "cost.stage_function: expected a function"),
+        (lambda: FunctionCost(stage, 5), "cost.terminal_function: expected a function"),
+        (lambda: FunctionCost(stage, None, [1.0]), "cost.values: expected a dict of tensors by name"),
+        (lambda: FunctionCost(stage, None, {"goal": GOALS[:2]}), r"cost.values\['goal'\]: expected shape \(3, ...\)"),
+        (lambda: FunctionCost(stage, None, {"goals": GOALS}), r"cost.values\['goals'\]: .*doesn't take"),
+        (lambda: FunctionCost(stage, None, None, {"goal": GOALS}), r"cost.knot_values\['goal'\]: expected shape"),
+        (lambda: FunctionCost(stage), "cost.stage: expected a number"),
+    ],
+)
+def test_values_that_do_not_fit_are_named(make: Any, line: str) -> None:
+    good = problem()
+    with pytest.raises(InputError, match=line):
+        Problem(good.dynamics, make(), [], good.x0, N)
