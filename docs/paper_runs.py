@@ -21,8 +21,10 @@ from torchgco.solution import Solution
 from torchgco.solvers.contracts import Advice
 
 HORIZON = 10.0  # of the planar problem, s
+# Table 3's start as our copy of the paper prints it; with a lost minus sign it would be (-1, 1, 0).
 FOREST = ("scenario=forest", "scenario.start=[1,1,0]", "scenario.num_obstacles=12")
-FOREST_LAYOUT = 26  # under seed 0: the first solve of al_ilqr ends inside spheres
+FOREST_LAYOUT = 26  # under seed 0; chosen, as the first solve of al_ilqr ends inside spheres
+PAPERS_LOOP = ("mission=paper", "plant=rotors")
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from torchgco.options import (
     Extended,
     Natural,
     Positive,
+    PositiveOrInfinite,
     Seconds,
     Share,
     check_options,
@@ -56,6 +57,7 @@ class Options:
     open: Annotated[float, AtLeast(0, "m"), Below(1)] = 0.5
     factor: Annotated[float, Above(0), AtMost(2)] = 1.0
     bound: Extended = 1.0
+    limit: PositiveOrInfinite = 1.0
     flag: bool = True
     word: Literal["a", "b"] | None = "a"
     text: str = ""
@@ -81,6 +83,7 @@ BAD = [
     ("rate", torch.tensor(1.0), "a number"), ("rate", 1j, "a number"),
     ("share", 1.1, "between 0 and 1"), ("time", 0.0, "a number above 0 s"), ("open", 1, "of at least 0 m and below 1"),
     ("factor", 0, "above 0 and at most 2"), ("factor", 2.1, "at most 2"), ("bound", nan, "a number or infinity"),
+    ("limit", 0.0, "a number above 0 or infinity"), ("limit", nan, "above 0 or infinity"), ("limit", -inf, "above 0"),
     ("flag", 1, "true or false"), ("word", "c", "a or b, or null"), ("word", ["a"], "a or b"), ("text", 5, "text"),
     ("row", 1.0, "a list of numbers above 0"), ("row", "12", "a list"), ("row", (1.0, 0.0), "numbers above 0"),
     ("rows", [[1.0]], "a list of lists of 2 numbers"), ("rows", [5], "a list"), ("per_problem", 0.0, "above 0 or"),
@@ -88,7 +91,8 @@ BAD = [
     ("function", 5, "a function, or null"), ("table", 5, "of class Mapping, or null"),
 ]  # fmt: skip
 GOOD = [
-    ("count", 2**62), ("natural", 0), ("rate", 1), ("bound", -inf), ("word", None), ("row", [1, 2.5]), ("row", ()),
+    ("count", 2**62), ("natural", 0), ("rate", 1), ("bound", -inf), ("limit", inf), ("word", None),
+    ("row", [1, 2.5]), ("row", ()),
     ("rows", [(1, 2), [3.0, 4.0]]), ("row", np.array([1.0, 2.0])), ("per_problem", torch.zeros(2)),
     ("function", len), ("table", {}), ("anything", object()), ("hidden", 5),
 ]  # fmt: skip

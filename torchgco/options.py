@@ -39,7 +39,9 @@ class Limit:
 
     def holds(self, value: float) -> bool:
         """Whether a number lies in the range."""
-        return self.low < value < self.high if self.open else self.low <= value <= self.high
+        if self.open:
+            return self.low < value and (value < self.high or self.high == math.inf)
+        return self.low <= value <= self.high
 
 
 def AtLeast(low: float, unit: str = "") -> Limit:
@@ -73,6 +75,7 @@ Share = Annotated[float, Within(0, 1)]
 Seconds = Annotated[float, Above(0, "s")]
 Meters = Annotated[float, Above(0, "m")]
 Extended = Annotated[float, UNBOUNDED]
+PositiveOrInfinite = Annotated[float, Above(0), UNBOUNDED]
 Seed = Annotated[int, AtLeast(0), AtMost(1e18)]  # the seeds that solvers derive from it fit into 64 bits, too
 
 
@@ -166,8 +169,11 @@ def _limited(kind: Any, limits: list[Limit]) -> Rule | None:
     rule = _rule(kind)
     if rule is None or not limits:
         return rule
-    text, fits = " and ".join(limit.text for limit in limits), _is_number if UNBOUNDED in limits else rule.fits
-    for limit in limits:
+    fits, ranges = _is_number if UNBOUNDED in limits else rule.fits, [limit for limit in limits if limit != UNBOUNDED]
+    text = " and ".join(limit.text for limit in ranges)
+    if UNBOUNDED in limits:
+        text = f"{text} {UNBOUNDED.text}".lstrip()
+    for limit in ranges:
         fits = _both(fits, limit.holds)
     return Rule(fits, f"{rule.one} {text}", f"{rule.many} {text}")
 

@@ -216,6 +216,14 @@ def test_the_former_plan_is_kept_where_the_new_one_is_infeasible_and_worse() -> 
         assert torch.equal(mine[1:3, :-1], old[1:3, 1:])
 
 
+def test_with_an_infinite_tolerance_every_new_plan_is_flown() -> None:
+    problem, planner = far(4), Planner(Failing(), tolerance=torch.inf)
+    plan, now = first_plan(planner, problem)
+    kept, now = next_plan(planner, problem, now, plan, plan.measured)
+    assert kept.shifted.tolist() == [False, False, True, False]  # but for one that is not a number
+    assert bool((kept.U[[1, 3]] == 77.0).all()) and kept.violation[[1, 3]].tolist() == [9.0, 0.02]
+
+
 def test_the_estimated_bias_is_the_acceleration_that_the_model_lacks() -> None:
     solver, heavier = Recording(), torch.tensor([0.1, -0.1, 0.0], **DOUBLE)
     wind = Disturbance(wind=1.0)
@@ -242,6 +250,7 @@ def test_the_estimated_bias_is_the_acceleration_that_the_model_lacks() -> None:
 
 BAD = {
     "multipliers": "kept", "max_seconds": 0.0, "margin": -0.1, "margin_growth": -1.0, "estimation": 1.5,
+    "tolerance": 0.0,
 }  # fmt: skip
 
 

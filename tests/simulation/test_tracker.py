@@ -1,5 +1,6 @@
 """The tracker: its equality and limits, its rates, and a dense solution of the same problem by SciPy."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,20 @@ from torch import Tensor
 
 from tests.reference import models, tracking
 from tests.simulation.missions import DOUBLE
-from torchgco import Airframe, InputError
+from torchgco import Airframe, InputError, compose
 from torchgco.simulation.plant import RotorPlant, hovering
 from torchgco.simulation.tracker import Reference, Tracker, Tracking
 
 FRAME = Airframe()
 PERIOD = 0.05
+WORDS = ("experiment=mission", "mission=paper", "solver=gco_paper")
+
+
+def printed() -> Tracker:
+    """The paper's tracker."""
+    mission = compose(WORDS).mission
+    assert mission is not None
+    return mission.tracker
 
 
 def plan(rates: list[list[float]], acceleration: list[float], B: int = 1) -> Reference:
@@ -104,13 +113,14 @@ CASES = {
 
 
 @pytest.mark.filterwarnings("ignore:Values in x were outside bounds:RuntimeWarning")  # of SLSQP before SciPy 1.16
+@pytest.mark.parametrize("tracker", [Tracker, printed])
 @pytest.mark.parametrize("name", CASES)
-def test_commands_have_the_effect_of_a_dense_solution(name: str) -> None:
+def test_commands_have_the_effect_of_a_dense_solution(name: str, tracker: Callable[[], Tracker]) -> None:
     w, F, wanted, acceleration = CASES[name]
     x = hovering(FRAME, torch.zeros(1, 3, **DOUBLE))
     x[0, 10:] = torch.tensor(w + F, **DOUBLE)
     reference = plan([w, wanted, wanted], [acceleration] * 3)
-    answer = Tracker().track(x, reference, 0.01)
+    answer = tracker().track(x, reference, 0.01)
     rates, a = reference.at(0.01 + 0.01 * torch.arange(7, **DOUBLE))
     X, U = tracking.solve(x[0, 10:].numpy(), rates[0].numpy(), a[0, 1:].numpy(), 0.01)
     mine, parameters = planned(x, answer), models.QuadrotorParameters()
@@ -138,7 +148,32 @@ def test_a_batch_equals_its_parts() -> None:
     assert torch.equal(later.U, tracker.track(states[-1], reference, 0.04, answers[-1]).U[index])
 
 
-@pytest.mark.parametrize(("name", "value"), [("penalty", 0.0), ("dt", -0.01), ("stages", 0)])
+def test_the_papers_tracker_starts_every_call_from_the_beginning() -> None:
+    """Ten outer iterations from hovering rotors and zero multipliers, whatever the call before has found."""
+    tracker, reference = printed(), turning()
+    x = hovering(FRAME, torch.zeros(1, 3, **DOUBLE))
+    _, answers = fly(reference, x, 5, tracker)
+    last = answers[-1]
+    assert last.multipliers.mu.tolist() == [20.0 * 2.0**10]
+    alone, again = tracker.track(x, reference, 0.0), tracker.track(x, reference, 0.0, last)
+    assert torch.equal(alone.U, again.U) and torch.equal(alone.U, answers[0].U)
+    going_on = Tracker().track(x, reference, 0.0, fly(reference, x, 5, Tracker())[1][-1])
+    assert not torch.equal(going_on.U, Tracker().track(x, reference, 0.0).U)
+
+
+def test_the_papers_tracker_flies_as_the_default_does() -> None:
+    x = hovering(FRAME, torch.zeros(1, 3, **DOUBLE))
+    states, answers = zip(*(fly(turning(), x, 40, tracker) for tracker in (Tracker(), printed())), strict=True)
+    torch.testing.assert_close(torch.stack(states[0]), torch.stack(states[1]), rtol=0, atol=1e-4)
+    for mine, papers in zip(*answers, strict=True):
+        torch.testing.assert_close(mine.commands, papers.commands, rtol=0, atol=1.0)
+        assert float(papers.violation) <= 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("penalty", 0.0), ("penalty_growth", 0.5), ("multipliers", "kept"), ("dt", -0.01), ("stages", 0)],
+)
 def test_bad_fields_are_named(name: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         Tracker(**{name: value})

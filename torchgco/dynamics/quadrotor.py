@@ -54,7 +54,11 @@ class Airframe:
 
     @property
     def thrust_coefficient(self) -> float:
-        """b in F = b Omega^2, N/rpm^2: four rotors at `hover_speed` carry the weight."""
+        """b in F = b Omega^2, N/rpm^2: four rotors at `hover_speed` carry the weight, b = m g / (4 hover_speed^2).
+
+        A reading of a damaged text: Table 2 has m g / 5000^2 in the copy at hand, which would hover at 2500 rpm, but
+        Table 5 starts from 5000 rpm "for hovering".
+        """
         return self.mass * GRAVITY / (4.0 * self.hover_speed**2)
 
     def allocation(self, like: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torchgco.dynamics.quadrotor import Airframe
 from torchgco.evaluation import violation
 from torchgco.lagrangian import Multipliers, shifted
 from torchgco.native.dispatch import open_loop
-from torchgco.options import NonNegative, Positive, Seconds, Share, check_options
+from torchgco.options import NonNegative, PositiveOrInfinite, Seconds, Share, check_options
 from torchgco.problem import Problem
 from torchgco.simulation.horizon import Margin, acceleration, biased, check_model, first_step, planning_state
 from torchgco.solution import Solution
@@ -66,7 +66,8 @@ class Planner:
         airframe: as the planner knows it.
         multipliers: "shifted" starts from those of the former plan one stage later, "reset" from zero, as the paper.
         max_seconds: time limit of a plan, s; None: none. With a limit, results depend on the machine.
-        tolerance: violation (m for lengths) up to which a plan is flown without a look at the former one.
+        tolerance: violation (m for lengths) up to which a plan is flown without a look at the former one; infinity: a
+            new plan always is, as in the paper, unless its violation is not a number.
         margin: by which obstacles are grown, m; margin_growth: by how much more per second of the horizon, m/s, in
             four steps.
         first_step: the body rates of the second knot are the ones that the rotors lead to (`FirstStepRates`).
@@ -81,7 +82,7 @@ class Planner:
     airframe: Airframe = Airframe()
     multipliers: Literal["shifted", "reset"] = "shifted"
     max_seconds: Seconds | None = None
-    tolerance: Positive = 0.01
+    tolerance: PositiveOrInfinite = 0.01
     margin: NonNegative = 0.01
     margin_growth: NonNegative = 0.0
     first_step: bool = True

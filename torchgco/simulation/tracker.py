@@ -1,9 +1,10 @@
-"""The tracker: rotor speeds that make the vehicle turn and climb as the plan says (section 5.2.1, Table 5)."""
+"""The tracker: rotor speeds that make the vehicle turn and climb as the plan says (section 5.2.1)."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.quadrotor import GRAVITY, Airframe, RotorTracking
 from torchgco.evaluation import violation
 from torchgco.lagrangian import Lagrangian, Multipliers, shifted, update
-from torchgco.options import Count, Positive, Seconds, check_options
+from torchgco.options import AtLeast, Count, Positive, Seconds, check_options
 from torchgco.problem import Problem
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
 from torchgco.solvers.ilqr import ILQR, descend
@@ -63,13 +64,18 @@ class Tracking:
 class Tracker:
     """AL-iLQR on the rotor model: rates follow the plan, thrusts sum up to its acceleration and keep their limits.
 
-    Successive tracking problems are alike, so the augmented Lagrangian goes on from call to call: one inner solve and
-    one update of the multipliers each, from the controls and multipliers of the call before (three at first).
+    Successive tracking problems are alike, so by default the augmented Lagrangian goes on from call to call: one inner
+    solve and one update of the multipliers each, from the controls and multipliers of the call before (three at first).
+    The paper's tracker (Table 5, `mission=paper`) solves every problem from the beginning.
 
     Args:
         airframe: as the planner knows it.
-        inner: iLQR.
-        penalty: mu, constant, in units of the cost per N^2.
+        inner: iLQR; with `inner.as_printed`, inequalities have the printed form, too (`lagrangian.penalty_weights`).
+        multipliers: "shifted" goes on from the call before, with a constant penalty; "reset" starts every call from
+            rotor speeds that hover, multipliers of zero and the first penalty.
+        penalty: mu, in units of the cost per N^2; the first one with "reset".
+        penalty_growth: eta, the factor of mu per outer iteration, with "reset".
+        outer_iterations: inner solves of a call, each with an update of the multipliers, with "reset".
         dt: time between two commands, s; stages: N.
 
     Raises:
@@ -78,7 +84,10 @@ class Tracker:
 
     airframe: Airframe = Airframe()
     inner: ILQR = ILQR(tolerance=1e-4, max_iterations=10)
+    multipliers: Literal["shifted", "reset"] = "shifted"
     penalty: Positive = 1e3
+    penalty_growth: Annotated[float, AtLeast(1)] = 2.0
+    outer_iterations: Count = 10
     dt: Seconds = 0.01
     stages: Count = 6
 
@@ -91,17 +100,20 @@ class Tracker:
         x0 = x[:, RATES.start :].contiguous()
         if before is None:
             problem = self._problem(x0, x_ref, acceleration)
-            U = x.new_full((problem.B, self.stages, 4), self.airframe.hover_speed)
-            multipliers, rounds = Multipliers.zero(problem, self.penalty), FIRST_ROUNDS
         else:
             cost, (thrust_sum, bounds) = before.problem.cost, before.problem.constraints
             assert isinstance(cost, BoundQuadratic) and isinstance(thrust_sum, ThrustSum)
             sums = replace(thrust_sum, acceleration=acceleration)
             problem = before.problem.started_at(x0, [sums, bounds], cost.toward(x_ref))
+        reset = self.multipliers == "reset"
+        if before is None or reset:
+            U = x.new_full((problem.B, self.stages, 4), self.airframe.hover_speed)
+            multipliers, rounds = Multipliers.zero(problem, self.penalty), FIRST_ROUNDS
+        else:
             U, multipliers, rounds = shifted(before.U), before.multipliers.shifted(), 1
-        growth = torch.ones_like(x0[:, 0])
+        growth, rounds = (self.penalty_growth, self.outer_iterations) if reset else (1.0, rounds)
         for _ in range(rounds):
-            found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, phr=True), U)
+            found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, not self.inner.as_printed), U)
             U = found.U
             multipliers = update(problem, found.X, U, multipliers, growth, PENALTY_MAX)
         return Tracking(problem, U[:, 0], violation(problem, found.X, U), U, multipliers)
