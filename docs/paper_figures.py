@@ -1,6 +1,8 @@
-"""python docs/paper_figures.py: the paper's figures from runs of our solvers, Table A4, and a table of missions.
+"""python docs/paper_figures.py: the paper's figures from runs of our solvers, Table A4, a table of missions, and ours
+against the paper's tables line by line.
 
-Figures and animations go to `--outputs`, the tables there and into the page, docs/paper.md.
+Figures and animations go to `--outputs`, the tables there and into the page. The page of docs/paper is docs/paper.md;
+any other folder gets a copy of it.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import numpy as np
 import paper_mission
 import paper_planar
 import paper_quadrotor
+import paper_tables
 from matplotlib.figure import Figure
 from paper_runs import Solve, planar, quadrotor
 from PIL import Image
@@ -23,13 +26,15 @@ from benchmarks.speed.tables import put_between
 from torchgco.plotting.style import save
 
 ROOT = Path(__file__).resolve().parents[1]
+FOLDER, PAGE = ROOT / "docs" / "paper", ROOT / "docs" / "paper.md"
 DPI = 110
 ROUNDING = 5  # of the 255 shades of a colour
 DRAWS = (0, 112)  # of the two trials: 112 is the only one of 0 to 191 that passes below the circles
 SOLVERS = ("al_ilqr", "gco_paper", "gco")  # of Figures 6 and 7
 MARKS = "<!-- table-A4 -->", "<!-- end table-A4 -->"
 MISSION_MARKS = "<!-- missions -->", "<!-- end missions -->"
-PARTS = ("planar", "quadrotor", "mission")
+PRINTED_MARKS = "<!-- printed -->", "<!-- end printed -->"
+PARTS = ("tables", "planar", "quadrotor", "mission")
 
 
 def planar_figures(trials: Sequence[Solve], alone: Solve) -> dict[str, Callable[[], Figure]]:
@@ -71,6 +76,16 @@ def fly(outputs: Path, page: Path, duration: float) -> dict[str, Callable[[], Fi
     return paper_mission.figures(flights)
 
 
+def page_of(outputs: Path) -> Path:
+    """The page that shows the pictures of a folder; a new copy with its own links, but for docs/paper."""
+    if outputs.resolve() == FOLDER:
+        return PAGE
+    outputs.mkdir(parents=True, exist_ok=True)
+    page = outputs / PAGE.name
+    page.write_text(PAGE.read_text().replace(f"]({FOLDER.name}/", "]("))
+    return page
+
+
 def _head() -> str:
     origin = provenance("cpu")
     return f"Measured on {origin['date']} at commit {origin['commit']}, {origin['processor']}."
@@ -86,21 +101,24 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python docs/paper_figures.py", description="Draw the figures of paper.md.")
-    parser.add_argument("--outputs", type=Path, default=ROOT / "docs" / "paper")
-    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "paper.md", help="where the tables go")
+    parser.add_argument("--outputs", type=Path, default=FOLDER)
+    parser.add_argument("--page", type=Path, help="where the tables go; by default the page of --outputs")
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS, help="by default all")
     parser.add_argument("--stages", type=int, default=1000, help="of the planar problem; the paper has 1000")
     parser.add_argument("--duration", type=float, default=15.0, help="of the missions at most, s")
     asked = parser.parse_args(words)
+    page = asked.page or page_of(asked.outputs)
     drawings: dict[str, Callable[[], Figure]] = {}
+    if "tables" in asked.parts:
+        put_between(page, *PRINTED_MARKS, paper_tables.markdown(paper_tables.tables()))
     if "planar" in asked.parts:
         trials = [planar("gco_paper", number, asked.stages) for number in DRAWS]
         drawings |= planar_figures(trials, planar("al_ilqr", 0, asked.stages))
-        write_table(trials, asked.outputs, asked.page)
+        write_table(trials, asked.outputs, page)
     if "quadrotor" in asked.parts:
         drawings |= quadrotor_figures([quadrotor(name) for name in SOLVERS])
     if "mission" in asked.parts:
-        drawings |= fly(asked.outputs, asked.page, asked.duration)
+        drawings |= fly(asked.outputs, page, asked.duration)
     for name, make in drawings.items():
         write_picture(make(), asked.outputs / f"{name}.png")
     return 0

@@ -41,8 +41,14 @@ def costs(solves: Sequence[Solve]) -> Figure:
     traces = [solve.solution.trace for solve in solves]
     trace = pd.concat([part.assign(element=i) for i, part in enumerate(traces) if part is not None])
     figure = convergence_figure(trace, range(len(solves)))
-    for ax, solve, letter in zip(figure.axes, solves, "abcdef", strict=False):
-        tidy(ax, f"({letter}) {solve.name}, $J_{{var}}$ {float(solve.solution.cost[0]):.0f}")
+    column = figure.add_gridspec(len(solves), 1)  # one below the other: two columns would leave a quarter blank
+    figure.set_size_inches(7.6, 2.2 * len(solves) + 0.5)
+    for i, (ax, solve) in enumerate(zip(figure.axes, solves, strict=True)):
+        ax.set_subplotspec(column[i])
+        ax.set_ylabel("cost $J_{var}$")
+        tidy(ax, f"({'abcdef'[i]}) {solve.name}, $J_{{var}}$ {float(solve.solution.cost[0]):.0f}")
+    for ax in figure.axes[:-1]:
+        ax.set_xlabel("")
     return figure
 
 

@@ -70,13 +70,14 @@ class Witness:
     """Guidance of a single problem that records its calls, and those of its sampler, and changes nothing."""
 
     guidance: GCO
-    steps: list[Step] = field(default_factory=list)
+    solves: list[list[Step]] = field(default_factory=list)  # of a mission: one solve per control step
     sampling: Sampling | None = None  # the call of MPPI in the present update
 
     def suited(self, problem: Problem) -> Any:
         return self
 
     def start(self, problem: Problem, X: Tensor) -> GuideRegion:
+        self.solves.append([])
         return self.guidance.start(problem, X)
 
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
@@ -86,7 +87,7 @@ class Witness:
         advice = replace(self.guidance, sampler=noted).update(problem, X, U, penalty, key)
         assert advice.penalty is not None
         path, center, radius = (x[0].clone().numpy() for x in (X, advice.penalty.center, advice.penalty.radius))
-        self.steps.append(Step(int(key.outer[0]), path[:, problem.position], center, radius, self.sampling))
+        self.solves[-1].append(Step(int(key.outer[0]), path[:, problem.position], center, radius, self.sampling))
         return advice
 
 
@@ -167,4 +168,4 @@ def _solve(name: str, overrides: tuple[str, ...], number: int, draws: int) -> So
         proposal = open_loop(task.problem, U)[0, :, task.problem.position].numpy()
     assert layout.vehicle_radius is not None and layout.dt is not None and task.goal_radius is not None
     scene = (layout.centers[0], layout.radii[0], layout.vehicle_radius, float(task.goal_radius), layout.dt)
-    return Solve(name, task.problem, *scene, solution, [] if witness is None else witness.steps, proposal)
+    return Solve(name, task.problem, *scene, solution, [] if witness is None else witness.solves[0], proposal)

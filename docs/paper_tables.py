@@ -9,25 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
-import torch
-from paper_runs import FOREST, FOREST_LAYOUT, PAPERS_LOOP
+import paper_settings as settings
+from paper_runs import FOREST_LAYOUT
+from paper_settings import Ours
 from torch import Tensor
 
-from torchgco import AugmentedLagrangian, compose
-from torchgco.constraints import ControlBounds
+from torchgco import AugmentedLagrangian
 from torchgco.constraints.bodies import CONTACT_FACTOR
 from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics import Planar, QuadrotorPlanning
-from torchgco.dynamics.quadrotor import GRAVITY
 from torchgco.experiments.build import Setup
 from torchgco.guidance import GCO
 from torchgco.guidance.mppi import COLLISION_PENALTY
-from torchgco.lagrangian import Multipliers
 from torchgco.problem import Problem
+from torchgco.simulation import plant
 from torchgco.simulation.plant import RotorPlant, hovering
 
 SIGN = "reading: a minus sign is lost in our copy"
@@ -51,37 +48,9 @@ class Line:
         if isinstance(self.meant, str) or isinstance(self.ours, str):
             return self.meant == self.ours
         meant, ours = _numbers(self.meant), _numbers(self.ours)
-        return len(meant) == len(ours) and all(math.isclose(a, b, rel_tol=1e-9) for a, b in zip(meant, ours, strict=True))
-
-
-class Ours:
-    """The objects behind the figures: the quadrotor's problem and mission, and the planar problem."""
-
-    @cached_property
-    def flight(self) -> Setup:
-        return compose([*FOREST, *PAPERS_LOOP, "solver=gco_paper", "device.threads=1"])
-
-    @cached_property
-    def plane(self) -> Setup:
-        return compose(["experiment=planar_trap_paper", "solver=gco_paper", "device.threads=1"])
-
-    @cached_property
-    def space_problem(self) -> Problem:
-        return _problem(self.flight, FOREST_LAYOUT)
-
-    @cached_property
-    def plane_problem(self) -> Problem:
-        return _problem(self.plane, 0)
-
-    @cached_property
-    def tracking_problem(self) -> Problem:
-        """Of the first call of the tracker, at hover."""
-        mission = self.flight.mission
-        assert mission is not None
-        x = hovering(mission.planner.airframe, self.space_problem.x0[:, :3])
-        rates = torch.zeros(1, mission.tracker.stages + 1, 7, dtype=x.dtype)
-        rates[..., 3:] = mission.planner.airframe.mass * GRAVITY / 4.0
-        return mission.tracker._problem(x[:, 10:], rates, torch.full_like(rates[:, 1:, 0], GRAVITY))
+        return len(meant) == len(ours) and all(
+            math.isclose(a, b, rel_tol=1e-9) for a, b in zip(meant, ours, strict=True)
+        )
 
 
 def tables() -> dict[str, list[Line]]:
@@ -101,18 +70,18 @@ def tables() -> dict[str, list[Line]]:
             Line("k2", "1.00", 1.0, model.thrust_gain),
             Line("k3 (1/s)", "0.001", 0.001, model.turn_drag),
             Line("k4 (1/m)", "0.10", 0.1, model.turn_gain),
-            Line("u_max (m/s²)", "10, 10", (10, 10), _bounds(ours.plane_problem).upper),
-            Line("u_min (m/s²)", "0, 0", (0, 0), _bounds(ours.plane_problem).lower),
+            Line("u_max (m/s²)", "10, 10", (10, 10), settings.bounds(ours.plane_problem).upper),
+            Line("u_min (m/s²)", "0, 0", (0, 0), settings.bounds(ours.plane_problem).lower),
         ],
         "Table A3: MPPI and AL-iLQR in the plane": [
             *_solver_lines(ours.plane, ours.plane_problem, "1.0 × 10 18", 1e-18, 100, 20),
-            Line("saturated range in sampling", "u_max, u_max", (-10, -10, 10, 10), _saturation(ours), SIGN),
+            Line("saturated range in sampling", "u_max, u_max", (-10, -10, 10, 10), settings.saturation(ours), SIGN),
         ],
     }
 
 
 def _table_1(ours: Ours) -> list[Line]:
-    problem, cost = ours.space_problem, _cost(ours.space_problem)
+    problem, cost = ours.space_problem, settings.cost(ours.space_problem)
     model, goal = problem.dynamics, [20, 1, 0.2, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 9.81]
     assert isinstance(model, QuadrotorPlanning)
     planner = "in the first control step; later the former plan, one stage later"
@@ -125,12 +94,12 @@ def _table_1(ours: Ours) -> list[Line]:
         Line("R", "diag 10, 10, 10, 1", [10, 10, 10, 1], cost.R),
         Line("target state x_G", "20, 1, 0.2, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, g", goal, cost.xf_ref),
         Line("target input u_G", "0, 0, 0, g", [0, 0, 0, 9.81], cost.u_ref),
-        Line("initial guess u_k", "0, 0, 0, g", [0, 0, 0, 9.81], _guess(ours.flight, FOREST_LAYOUT), planner),
+        Line("initial guess u_k", "0, 0, 0, g", [0, 0, 0, 9.81], settings.guess(ours.flight, FOREST_LAYOUT), planner),
     ]
 
 
 def _table_2(ours: Ours) -> list[Line]:
-    mission, bounds, model = ours.flight.mission, _bounds(ours.space_problem), ours.space_problem.dynamics
+    mission, bounds, model = ours.flight.mission, settings.bounds(ours.space_problem), ours.space_problem.dynamics
     assert mission is not None and isinstance(model, QuadrotorPlanning)
     body = mission.planner.airframe
     inertia = [0.0366, 0, 0.0065, 0, 0.0327, 0.0046, 0.0065, 0.0046, 0.0187]
@@ -163,10 +132,10 @@ def _table_3(ours: Ours) -> list[Line]:
     assert isinstance(spheres, BoundSpheres)
     vehicle, x = float(spheres.vehicle_radius), hovering(mission.planner.airframe, problem.x0[:, :3])
     obstacle = float(spheres.inflated_radii[0, 0]) - vehicle
-    start = "reading: (-1, 1, 0) fits as well, as our copy has lost its minus signs; all open-loop scenarios start there"
-    plant = "the plant also limits the thrusts and renormalises q in every step"
+    start = "reading: our copy has lost its minus signs; the quadrotor's open-loop scenarios start at (-1, 1, 0)"
+    limits = "the plant also limits the thrusts and renormalises q in every step"
     return [
-        Line("simulation method", "Runge–Kutta method", NAMES["rk4"], NAMES["rk4"], plant),
+        Line("simulation method", "Runge–Kutta method", "Runge–Kutta method", NAMES[plant.rk4.__name__], limits),
         Line("time period of the simulation (s)", "0.01", 0.01, mission.plant.dt),
         Line("initial position (m)", "1, 1, 0", [1, 1, 0], x[:, :3], start),
         Line("initial velocity (m/s)", "0, 0, 0", [0, 0, 0], x[:, 3:6]),
@@ -182,9 +151,7 @@ def _table_3(ours: Ours) -> list[Line]:
     ]
 
 
-def _solver_lines(
-    setup: Setup, problem: Problem, printed: str, tolerance: float, inner: int, outer: int
-) -> list[Line]:
+def _solver_lines(setup: Setup, problem: Problem, printed: str, tolerance: float, inner: int, outer: int) -> list[Line]:
     """Table 4, and Table A3 without its last line."""
     solver, plane = setup.solver, problem.m == 2
     assert isinstance(solver, AugmentedLagrangian) and isinstance(solver.guidance, GCO)
@@ -195,7 +162,7 @@ def _solver_lines(
         Line("tolerance of J_curr - J_pre in iLQR", printed, tolerance, solver.inner.tolerance, SIGN if plane else ""),
         Line("iLQR, most iterations", str(inner), inner, solver.inner.max_iterations),
         Line("ALM, most iterations", str(outer), outer, solver.max_outer_iterations, best),
-        Line("initial multiplier", "0", 0, _first_multiplier(problem)),
+        Line("initial multiplier", "0", 0, settings.first_multiplier(setup, problem)),
         Line("multiplier update gain (eta)", "2.2", 2.2, solver.penalty_growth),
         Line("initial penalty", "20", 20, solver.initial_penalty),
         Line("update gain for GCO (nu)", "eta 2", 2.2**2, guide.penalty_growth, "reading: eta²"),
@@ -208,31 +175,33 @@ def _solver_lines(
 
 
 def _table_5(ours: Ours) -> list[Line]:
-    mission, problem, cost = ours.flight.mission, ours.tracking_problem, _cost(ours.tracking_problem)
+    mission, cost = ours.flight.mission, settings.cost(ours.tracking_problem)
     assert mission is not None
     tracker, b = mission.tracker, mission.planner.airframe.thrust_coefficient
-    weights, plan = [1, 1, 1, *[b * b] * 4], "the plan's states"
+    weights, plan = [1, 1, 1, *[b * b] * 4], "optimal states in path planning"
+    speeds = [mission.planner.airframe.hover_speed] * 4
+    zero = 0 if tracker.multipliers == "reset" else "the former call's"
     squared, call = "reading: b²", "in every call; the text doesn't say whether later calls start anew"
     return [
         Line("number of predictions N", "6", 6, tracker.stages, "the text doesn't say the time step: ours is 0.01 s"),
         Line("S", "diag 1, 1, 1, b 2, b 2, b 2, b 2", weights, cost.Qf, squared),
         Line("Q", "diag 1, 1, 1, b 2, b 2, b 2, b 2", weights, cost.Q, squared),
         Line("R", "diag b 2 × 10 2, ...", [1e-2 * b * b] * 4, cost.R, "reading: 10⁻² b²"),
-        Line("a_ref (m/s²)", "optimal states in path planning", plan, plan, "interpolated between its knots"),
-        Line("w_ref (rad/s)", "optimal states in path planning", plan, plan, "interpolated between its knots"),
+        Line("a_ref (m/s²)", plan, plan, settings.reference("a"), "interpolated between the plan's knots"),
+        Line("w_ref (rad/s)", plan, plan, settings.reference("w"), "interpolated between the plan's knots"),
         Line("F_ref (N)", "m g 4, ...", [1.608 * 9.81 / 4] * 4, cost.xf_ref[..., 3:]),
-        Line("initial guess u_k (rpm), for hovering", "5000, 5000, 5000, 5000", [5000] * 4, cost.u_ref, call),
+        Line("initial guess u_k (rpm), for hovering", "5000, 5000, 5000, 5000", [5000] * 4, speeds, call),
         Line("tolerance of L_M", "0.10", 0.1, tracker.inner.tolerance),
         Line("iLQR, most iterations", "50", 50, tracker.inner.max_iterations),
         Line("ALM, most iterations", "10", 10, tracker.outer_iterations),
-        Line("initial multiplier", "0", 0, _first_multiplier(problem) if tracker.multipliers == "reset" else "shifted"),
+        Line("initial multiplier", "0", 0, zero),
         Line("multiplier update gain (eta)", "2.0", 2, tracker.penalty_growth),
         Line("initial penalty", "20", 20, tracker.penalty),
     ]
 
 
 def _table_a1(ours: Ours) -> list[Line]:
-    problem, cost = ours.plane_problem, _cost(ours.plane_problem)
+    problem, cost = ours.plane_problem, settings.cost(ours.plane_problem)
     weights, tiny = [5, 5, 1e-8, 1, 1, 1e-8], "reading: 10⁻⁸"
     return [
         Line("prediction method", "Euler method", "Euler method", NAMES[str(problem.dynamics.integrator)]),
@@ -243,7 +212,7 @@ def _table_a1(ours: Ours) -> list[Line]:
         Line("S", "Q", weights, cost.Qf, tiny),
         Line("target state x_G", "1, 0.4, 0, 0, 0, 0", [1, 0.4, 0, 0, 0, 0], cost.xf_ref),
         Line("target input u_G", "0, 0", [0, 0], cost.u_ref),
-        Line("initial guess u_k", "0, 0", [0, 0], _guess(ours.plane, 0)),
+        Line("initial guess u_k", "0, 0", [0, 0], settings.guess(ours.plane, 0)),
     ]
 
 
@@ -255,38 +224,6 @@ def markdown(found: dict[str, list[Line]]) -> str:
         rows += [(line.name, line.printed, _text(line.ours), line.why) for line in lines]
         blocks.append(f"### {name}\n\n" + "\n".join(f"| {' | '.join(row)} |" for row in rows))
     return "\n\n".join(blocks)
-
-
-def _problem(setup: Setup, layout: int) -> Problem:
-    return setup.task(setup.scenario.draw([layout], setup.seed)).problem
-
-
-def _guess(setup: Setup, layout: int) -> Tensor:
-    """The controls that a first solve starts from, one stage of them: all are alike."""
-    U0 = setup.task(setup.scenario.draw([layout], setup.seed)).U0
-    assert torch.equal(U0, U0[:, :1].expand_as(U0))
-    return U0[:, 0]
-
-
-def _cost(problem: Problem) -> BoundQuadratic:
-    cost = problem.cost
-    assert isinstance(cost, BoundQuadratic) and cost.diagonal
-    assert all(part is None for part in (cost.q, cost.r, cost.qf, cost.H))
-    return cost
-
-
-def _bounds(problem: Problem) -> ControlBounds:
-    return next(part for part in problem.constraints if isinstance(part, ControlBounds))
-
-
-def _saturation(ours: Ours) -> list[float]:
-    held = ours.plane.solver.guidance.sampler._bounds(ours.plane_problem)
-    assert held is not None
-    return _numbers(held)
-
-
-def _first_multiplier(problem: Problem) -> float:
-    return max(float(part.abs().max()) for part in Multipliers.zero(problem, 1.0).lam)
 
 
 def _numbers(values: Any) -> list[float]:

@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
+from matplotlib.collections import LineCollection
 from matplotlib.image import imread
 
 from torchgco.plotting import animation
@@ -68,6 +70,78 @@ def test_missions_and_animations_are_written(
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
     assert "| control steps | 4 | 4 | 4 |" in text and "| outcome | TIMEOUT | TIMEOUT | TIMEOUT |" in text
+    assert "| violation accepted in a new plan | any | any | 0.01 |" in text and "| shifted plans | 0 | 0 | 0 |" in text
+
+
+def test_figures_of_a_mission_show_samples_medians_and_names(script: ModuleType) -> None:
+    mission = importlib.import_module("paper_mission")
+    part = mission.fly("gco_paper", 0.1)
+    assert part.tolerance == np.inf and (part.frame["guided"] > 0).all()
+    seconds = part.frame["planner_seconds"]
+    (ax,) = mission.times([part]).axes
+    assert ax.get_title(loc="left") == f"gco_paper: median of the planner {1e3 * seconds.median():.0f} ms"
+    assert list(ax.get_yticks()) == [5, 10, 20, 50, 100]
+    drawn = mission.snapshots(part).axes
+    for ax, plane in zip(drawn[:2], ((0, 1), (0, 2)), strict=True):
+        (samples,) = (lines for lines in ax.collections if isinstance(lines, LineCollection))
+        expected = part.sampled[0].samples(mission.SAMPLES)[..., plane]
+        assert np.array_equal(np.stack([path.vertices for path in samples.get_paths()]), expected)
+    names = [[text.get_text() for text in ax.get_legend().get_texts()] for ax in mission.states(part).axes[3:]]
+    assert names == [["x", "y", "z"], ["roll", "pitch", "yaw"], ["x", "y", "z"]]
+
+
+def test_samples_of_a_mission_belong_to_their_control_step(script: ModuleType) -> None:
+    mission = importlib.import_module("paper_mission")
+    part = mission.fly("gco_paper", 0.15)
+    for step, call in enumerate(part.sampled):
+        state = part.frame.loc[step, [f"x{i}" for i in range(13)]].to_numpy(dtype=float)
+        assert np.array_equal(call.problem.x0[0, :13].numpy(), state)
+        assert np.array_equal(call.samples(2)[:, 0], np.stack([state[:3]] * 2))
+
+
+def test_costs_are_drawn_one_below_the_other(script: ModuleType) -> None:
+    solve = importlib.import_module("paper_runs").quadrotor("gco_paper")
+    figure = importlib.import_module("paper_quadrotor").costs([solve, solve, solve])
+    figure.draw_without_rendering()
+    boxes = [ax.get_position() for ax in figure.axes]
+    assert len({round(box.x0, 6) for box in boxes}) == 1 and boxes[0].y0 > boxes[1].y1 > boxes[1].y0 > boxes[2].y1
+
+
+def test_another_folder_gets_a_page_of_its_own(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, folder = tmp_path / "docs" / "paper.md", tmp_path / "docs" / "paper"
+    folder.mkdir(parents=True)
+    before = "![a picture](paper/figure-03.png)\n<!-- printed -->\nold\n<!-- end printed -->\n"
+    page.write_text(before)
+    monkeypatch.setattr(script, "PAGE", page)
+    monkeypatch.setattr(script, "FOLDER", folder)
+    assert script.main(["--parts", "tables", "--outputs", str(tmp_path / "out")]) == 0
+    other = (tmp_path / "out" / "paper.md").read_text()
+    assert page.read_text() == before and "](figure-03.png)" in other and "### Table 5" in other
+    assert script.main(["--parts", "tables", "--outputs", str(folder)]) == 0
+    assert page.read_text() == other.replace("](figure", "](paper/figure") and not list(folder.iterdir())
+
+
+def test_the_papers_tables_have_our_values(script: ModuleType) -> None:
+    tables = importlib.import_module("paper_tables")
+    found = tables.tables()
+    begin, end = script.PRINTED_MARKS
+    shown = (DOCS / "paper.md").read_text().split(begin)[1].split(end)[0]
+    assert shown.strip() == tables.markdown(found)
+    assert {name.split(":")[0]: len(lines) for name, lines in found.items()} == {
+        "Table 1": 9, "Table 2": 15, "Table 3": 13, "Table 4": 12, "Table 5": 14,
+        "Table A1": 9, "Table A2": 6, "Table A3": 13,
+    }  # fmt: skip
+    unlike = [line.name for lines in found.values() for line in lines if not line.agrees]
+    assert unlike == ["the same for collisions, 0.95 r_veh (m)"]  # 0.342, rounded in print
+
+
+def test_a_line_agrees_only_with_equal_values(script: ModuleType) -> None:
+    line = importlib.import_module("paper_tables").Line
+    assert line("", "", [1, 2.0], torch.tensor([[1.0, 2.0]])).agrees and line("", "", "a", "a").agrees
+    assert not line("", "", [1, 2], [1, 2.1]).agrees and not line("", "", 1, [1, 1]).agrees
+    assert not line("", "", 0, "shifted").agrees
 
 
 def _cost(runs: ModuleType, draws: int) -> float:
