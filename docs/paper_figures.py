@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import paper_flights
 import paper_mission
 import paper_planar
 import paper_quadrotor
@@ -67,7 +68,7 @@ def write_table(trials: Sequence[Solve], outputs: Path, page: Path) -> None:
 
 def fly(outputs: Path, page: Path, duration: float) -> dict[str, Callable[[], Figure]]:
     """Fly the missions, write their table and the animations; what to draw of them."""
-    flights = [paper_mission.fly(name, duration) for name in paper_mission.SOLVERS]
+    flights = paper_flights.fly(duration=duration)
     rows = paper_mission.table(flights)
     outputs.mkdir(parents=True, exist_ok=True)
     rows.to_csv(outputs / "missions.csv", index_label="quantity")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,101 +12,20 @@ from figures import solve
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
-from paper_runs import FOREST, FOREST_LAYOUT, PAPERS_LOOP, Sampling, Witness
+from paper_flights import Flight
 
-from torchgco import compose
-from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.dynamics.quadrotor import Airframe
-from torchgco.flights import mission_frame, mission_row, samples
-from torchgco.outcome import Ending, judge_flight
 from torchgco.plotting import missions as draw
 from torchgco.plotting import trajectory
 from torchgco.plotting.animation import Picture, mission_animation, planar_animation
-from torchgco.plotting.course import VIEWS, Course, flight
+from torchgco.plotting.course import VIEWS, flight
 from torchgco.plotting.style import INK, PALETTE, SMALL, legend
-from torchgco.problem import Problem
-from torchgco.simulation.log import MissionLog
-from torchgco.simulation.mission import Mission
 
-SOLVERS = ("al_ilqr", "gco_paper", "gco")
 SHOWN = "gco_paper"  # the solver of Figures 10 to 12, A4 and A5
 SNAPSHOTS = (1, 3)  # of Figure 10: guided control steps, and later ones
 SAMPLES = 30  # shown of a call of MPPI
 INFEASIBLE = 1e-3  # violation from which a plan counts as infeasible
-REPEATS = 5  # flights with each planner, which differ in their times alone
 BEGIN, END = 10, 20  # control steps whose medians are compared
 TICKS = (5, 10, 20, 50, 100)  # ms
-OWN_LOOP = ("mission=default", "plant=rotors")
-
-
-@dataclass(frozen=True)
-class Flight:
-    """One mission with one planner."""
-
-    name: str  # of the solver
-    course: Course
-    period: float  # s
-    frame: pd.DataFrame  # a row per control step
-    fine: pd.DataFrame  # a row per time step of the plant: t, x0 to x16, f1 to f4 and u1 to u4
-    plans: np.ndarray  # (K, N+1, 3), m
-    end: Ending
-    row: Mapping[str, object]  # see `flights.mission_row`
-    tolerance: float  # violation up to which a new plan is flown
-    sampled: Sequence[Sampling | None]  # the last call of MPPI in each control step; empty with gco
-
-
-def mission_of(name: str, duration: float) -> tuple[Mission, Problem]:
-    """The paper's closed loop with al_ilqr or gco_paper, the library's with gco; and the problem of Figure 6."""
-    loop = OWN_LOOP if name == "gco" else PAPERS_LOOP
-    setup = compose([*FOREST, *loop, f"solver={name}", f"mission.duration={duration}", "device.threads=1"])
-    task = setup.task(setup.scenario.draw([FOREST_LAYOUT], setup.seed))
-    assert setup.mission is not None
-    return setup.mission, task.problem
-
-
-def fly(name: str, duration: float = 15.0) -> Flight:
-    """Fly the mission of Figure 6's layout for at most `duration`, s; times are the least of `REPEATS` flights."""
-    mission, problem = mission_of(name, duration)
-    log, sampled = _witnessed(mission, problem)
-    ids = torch.tensor([FOREST_LAYOUT])
-    logs = [log, *(mission.fly(problem, ids=ids) for _ in range(REPEATS - 1))]
-    assert all(torch.equal(log.x.nan_to_num(), other.x.nan_to_num()) for other in logs)
-    spheres, goal, radius = problem.geometric[0], problem.goal, mission.goal_radius
-    assert goal is not None and isinstance(spheres, BoundSpheres) and spheres.velocities is None and radius is not None
-    place = goal.position[0].numpy()
-    course = Course(spheres.centers[0].numpy(), spheres.inflated_radii[0].numpy(), place, radius)
-    arrays, contact = log.arrays(), draw.CONTACT * course.inflated_radii
-    for part in ("planner_seconds", "tracker_seconds"):
-        arrays[part] = np.min([getattr(other, part).numpy() for other in logs], axis=0)
-    t, x = samples(arrays, 0, log.period)
-    end = judge_flight(t, x[:, :3], course.centers, contact, None, place, radius)
-    gaps = np.linalg.norm(arrays["x"][0, :, 0, None, :3] - course.centers, axis=-1) - contact
-    frame = mission_frame(arrays, [FOREST_LAYOUT], log.period, [gaps.min(axis=-1)])
-    row, fine = mission_row(arrays, 0, log.period, end, Airframe()), _fine(t, x, arrays["commands"][0])
-    tolerance = mission.planner.tolerance
-    return Flight(name, course, log.period, frame, fine, log.plan[0].numpy(), end, row, tolerance, sampled)
-
-
-def _witnessed(mission: Mission, problem: Problem) -> tuple[MissionLog, list[Sampling | None]]:
-    """The log of a flight, and the last call of MPPI in each control step; none where the solver has no GCO."""
-    solver = mission.planner.solver
-    guidance = getattr(solver, "guidance", None)
-    witness = None if guidance is None else Witness(guidance)
-    if witness is not None:
-        planner = replace(mission.planner, solver=replace(solver, guidance=witness))
-        mission = replace(mission, planner=planner)
-    log = mission.fly(problem, ids=torch.tensor([FOREST_LAYOUT]))
-    calls = [] if witness is None else [[step.sampling for step in steps] for steps in witness.solves]
-    return log, [next((call for call in reversed(made) if call is not None), None) for made in calls]
-
-
-def _fine(t: np.ndarray, x: np.ndarray, commands: np.ndarray) -> pd.DataFrame:
-    """A row per time step; a command holds from its row to the next, and the last is repeated."""
-    u = commands.reshape(-1, 4)[: len(t) - 1]
-    u = np.concatenate((u, u[-1:]))
-    columns = {"t": t} | {f"x{i}": x[:, i] for i in range(17)}
-    columns |= {f"f{i + 1}": x[:, 13 + i] for i in range(4)} | {f"u{i + 1}": u[:, i] for i in range(4)}
-    return pd.DataFrame(columns)
 
 
 def figures(flights: Sequence[Flight]) -> dict[str, Callable[[], Figure]]:
@@ -125,10 +43,11 @@ def figures(flights: Sequence[Flight]) -> dict[str, Callable[[], Figure]]:
 
 
 def times(flights: Sequence[Flight]) -> Figure:
-    """Figure 8: times in every control step, with the planner's median in the titles."""
+    """Figure 8: processor times in every control step, with the planner's median in the titles."""
     figure = draw.compute_figure({part.name: part.frame for part in flights}, flights[0].period)
     for ax, part in zip(figure.axes, flights, strict=True):
         ax.set_title(f"{part.name}: median of the planner {1e3 * _median(part):.0f} ms", loc="left")
+        ax.set_ylabel("processor time [ms]")
         ax.yaxis.set_major_locator(FixedLocator(TICKS))
         ax.yaxis.set_major_formatter(ScalarFormatter())
         ax.yaxis.set_minor_formatter(NullFormatter())
@@ -194,12 +113,12 @@ def _column(part: Flight, own: float) -> dict[str, str]:
         "shifted plans": f"{row['shifted_plans']}",
         "plans flown with a violation above 1e-3": f"{int((frame['violation'] > INFEASIBLE).sum())}",
         "largest violation of a plan": f"{frame['violation'].max():.1e}",
-        "planner, first step (ms)": f"{1e3 * frame['planner_seconds'].iloc[0]:.0f}",
-        "planner, median (ms)": f"{1e3 * _median(part):.0f}",
-        f"the same of the first {BEGIN} steps": f"{1e3 * _median(part, slice(BEGIN)):.0f}",
-        f"the same of the last {END} steps": f"{1e3 * _median(part, slice(-END, None)):.0f}",
-        "planner's median, as a multiple of gco's": f"{_median(part) / own:.1f}",
-        "tracker per control step, median (ms)": f"{tracked.median():.1f}",
+        "planner's processor time, first step (ms)": f"{1e3 * frame['planner_seconds'].iloc[0]:.0f}",
+        "the same, median (ms)": f"{1e3 * _median(part):.0f}",
+        f"the same, median of the first {BEGIN} steps (ms)": f"{1e3 * _median(part, slice(BEGIN)):.0f}",
+        f"the same, median of the last {END} steps (ms)": f"{1e3 * _median(part, slice(-END, None)):.0f}",
+        "the same, median as a multiple of gco's": f"{_median(part) / own:.1f}",
+        "tracker's processor time per control step, median (ms)": f"{tracked.median():.1f}",
         "tracker's largest violation (N)": f"{frame['tracking_violation'].max():.1e}",
         "largest speed (m/s)": f"{np.linalg.norm(fine[['x3', 'x4', 'x5']], axis=1).max():.1f}",
         "largest tilt, roll or pitch (deg)": f"{_tilt(fine):.0f}",

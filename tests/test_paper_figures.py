@@ -75,7 +75,7 @@ def test_missions_and_animations_are_written(
 
 def test_figures_of_a_mission_show_samples_medians_and_names(script: ModuleType) -> None:
     mission = importlib.import_module("paper_mission")
-    part = mission.fly("gco_paper", 0.1)
+    (part,) = importlib.import_module("paper_flights").fly(["gco_paper"], 0.1)
     assert part.tolerance == np.inf and (part.frame["guided"] > 0).all()
     seconds = part.frame["planner_seconds"]
     (ax,) = mission.times([part]).axes
@@ -91,8 +91,7 @@ def test_figures_of_a_mission_show_samples_medians_and_names(script: ModuleType)
 
 
 def test_samples_of_a_mission_belong_to_their_control_step(script: ModuleType) -> None:
-    mission = importlib.import_module("paper_mission")
-    part = mission.fly("gco_paper", 0.15)
+    (part,) = importlib.import_module("paper_flights").fly(["gco_paper"], 0.15)
     for step, call in enumerate(part.sampled):
         state = part.frame.loc[step, [f"x{i}" for i in range(13)]].to_numpy(dtype=float)
         assert np.array_equal(call.problem.x0[0, :13].numpy(), state)
