@@ -73,6 +73,15 @@ def test_missions_and_animations_are_written(
     assert "| violation accepted in a new plan | any | any | 0.01 |" in text and "| shifted plans | 0 | 0 | 0 |" in text
 
 
+def test_the_papers_planners_have_nothing_of_the_librarys_own(script: ModuleType) -> None:
+    flights = importlib.import_module("paper_flights")
+    for name in ("al_ilqr", "gco_paper", "gco"):
+        planner, tracker = flights.mission_of(name, 1.0)[0].planner, flights.mission_of(name, 1.0)[0].tracker
+        papers = (planner.multipliers, planner.tolerance, planner.margin, planner.margin_growth, planner.estimation)
+        assert (papers == ("reset", np.inf, 0.0, 0.0, 0.0)) == (name != "gco")
+        assert (tracker.multipliers == "reset" and tracker.inner.as_printed) == (name != "gco")
+
+
 def test_figures_of_a_mission_show_samples_medians_and_names(script: ModuleType) -> None:
     mission = importlib.import_module("paper_mission")
     (part,) = importlib.import_module("paper_flights").fly(["gco_paper"], 0.1)
