@@ -181,7 +181,7 @@ def _table_5(ours: Ours) -> list[Line]:
     weights, plan = [1, 1, 1, *[b * b] * 4], "optimal states in path planning"
     speeds = [mission.planner.airframe.hover_speed] * 4
     zero = 0 if tracker.multipliers == "reset" else "the former call's"
-    squared, call = "reading: b²", "in every call; the text doesn't say whether later calls start anew"
+    squared, call = "reading: b²", "in every call; the text doesn't say whether later calls start there, too"
     return [
         Line("number of predictions N", "6", 6, tracker.stages, "the text doesn't say the time step: ours is 0.01 s"),
         Line("S", "diag 1, 1, 1, b 2, b 2, b 2, b 2", weights, cost.Qf, squared),
