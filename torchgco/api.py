@@ -5,9 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco import rollout
+from torchgco.constraints import ControlBounds
 from torchgco.errors import InputError, shown
 from torchgco.presets import gco
 from torchgco.problem import Problem, check_problem
+from torchgco.shapes import computing_on
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 
@@ -25,7 +28,8 @@ def solve(
 
     Args:
         problem: B problems.
-        U0: initial controls (B, N, m). Default: those of `warm`, else the cost's reference, else zero.
+        U0: initial controls (B, N, m). Default: those of `warm`, else the cost's reference, else zero; the middle of
+            the bounds where that breaks these, or where the rollout overflows.
         solver: default: `presets.gco`, the settings of the configuration `gco`.
         seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
         warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
@@ -41,13 +45,29 @@ def solve(
     if solver is not None and not isinstance(solver, Solver):
         raise InputError("solver", "a solver, such as presets.gco(problem), or None", shown(solver))
     if U0 is None:
-        U0 = warm.U if warm is not None else _at_rest(problem)
+        U0 = warm.U if warm is not None else _guess(problem)
     if solver is None:
         solver = gco(problem)
     multipliers = None if warm is None else warm.multipliers
     return solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds)
 
 
-def _at_rest(problem: Problem) -> Tensor:
-    like = torch.zeros(problem.B, problem.N, problem.m, dtype=problem.x0.dtype, device=problem.x0.device)
-    return problem.cost.rest_controls(like)
+def _guess(problem: Problem) -> Tensor:
+    """Controls (B, N, m) at rest; the middle of their bounds where rest breaks these or overflows.
+
+    A bound at infinity has no middle: there the other bound, or rest.
+    """
+    with computing_on(problem.x0.device):
+        rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
+        middle, outside = rest.clone(), torch.zeros_like(rest, dtype=torch.bool)
+        for bounds in problem.constraints:
+            if isinstance(bounds, ControlBounds):
+                lower, upper = (bound.unsqueeze(1) for bound in (bounds.lower, bounds.upper))
+                at = torch.zeros(problem.N, dtype=torch.bool, device=rest.device)
+                at[bounds.knots] = True
+                at = at.view(1, -1, 1)
+                outside |= at & ((rest < lower) | (rest > upper))
+                center = torch.where(torch.isfinite(upper - lower), 0.5 * (lower + upper), rest.clamp(lower, upper))
+                middle = torch.where(at, center, middle)
+        lost = ~torch.isfinite(rollout.open_loop(problem.dynamics, problem.x0, rest)).flatten(1).all(-1)
+        return torch.where(outside.flatten(1).any(-1).logical_or(lost).view(-1, 1, 1), middle, rest)

@@ -64,6 +64,15 @@ def standard_normal(
     return normal[:rows].to(dtype)
 
 
+def smooth_normal(key: DrawKey, knots: int, like: Tensor) -> Tensor:
+    """Draws shaped as controls (B, N, m): N(0, 1) at `knots` points evenly spaced in time, linear between them."""
+    N, m = like.shape[1:]
+    z = standard_normal(key, knots * m, range(1), like.dtype).view(knots, m, -1).permute(2, 0, 1)
+    place = torch.linspace(0, knots - 1, N, dtype=like.dtype, device=like.device)
+    left = place.floor().clamp(max=knots - 2).long()
+    return torch.lerp(z[:, left], z[:, left + 1], (place - left).view(-1, 1))
+
+
 def _uniform(word: Tensor) -> Tensor:
     """24 bits of each word as a float32 in (0, 1]."""
     return ((word >> 8) & 0xFFFFFF).to(torch.float32).add_(0.5).mul_(2.0**-24)

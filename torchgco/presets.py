@@ -47,6 +47,7 @@ def gco(space: Space) -> Restarts:
                 initial_penalty=2.0, start_from_sample=True, sample_from_rest=True, single_contact_after=3,
             ),
             attempts=3,
+            finish=_finish(space),
         )  # fmt: skip
     return Restarts(
         local=_local(space),
@@ -62,6 +63,7 @@ def gco(space: Space) -> Restarts:
             initial_penalty=0.09, start_from_sample=True, single_contact_after=6,
         ),
         attempts=4,
+        finish=_finish(space),
     )  # fmt: skip
 
 
@@ -166,6 +168,17 @@ def _local(space: Space) -> AugmentedLagrangian:
     penalty, iterations = (2.0, 20) if _in_the_plane(space) else (0.09, 10)
     inner = ILQR(tolerance=5e-6, max_iterations=iterations)
     return AugmentedLagrangian(inner, initial_penalty=penalty, max_outer_iterations=20)
+
+
+def _finish(space: Space) -> AugmentedLagrangian:
+    """The local solver with limits that only the slowest of ordinary problems reach, and an end where nothing changes.
+
+    Penalties grow tenfold where the violation doesn't fall by half: costs without states, whose unit is small, begin
+    with a penalty that is far too low.
+    """
+    local = _local(space)
+    inner = replace(local.inner, max_iterations=200, damp_below=0.125)
+    return replace(local, inner=inner, max_outer_iterations=100, stalled_growth=10.0, patience=8)
 
 
 def _printed_sampler(space: Space) -> MPPI:

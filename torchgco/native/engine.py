@@ -46,6 +46,7 @@ class Options:
     damping: float
     rounding: float
     lost_beyond: float
+    damp_below: float
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,8 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
         V up = SET(10.0) * before, down = before / SET(3.0);
         up = tgco_choose(up < SET(p->damping), SET(p->damping), up);
         up = tgco_choose(up > SET(p->most), zero, up);
-        next = tgco_choose(*refused, up, tgco_choose(down < SET(p->damping), zero, down));
+        I crawls = accepted & (s->alpha < SET(p->damp_below));
+        next = tgco_choose(*refused | crawls, up, tgco_choose(down < SET(p->damping), zero, down));
     }
     s->mu_r = tgco_choose(failed | ~running, s->mu_r, next);
     I stuck = *refused & (s->mu_r == zero);

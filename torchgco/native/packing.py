@@ -47,7 +47,7 @@ COST_ARRAYS = len(QUADRATIC)
 CHOICES = ("guide", "phr", "accept_last", "replicas", "optimality")
 NUMBERS = (
     "tolerance", "absolute_tolerance", "ratio_min", "ratio_max", "smallest", "first", "growth", "most", "damping",
-    "rounding", "lost_beyond",
+    "rounding", "lost_beyond", "damp_below",
 )  # fmt: skip
 
 

@@ -50,7 +50,7 @@ typedef struct {
     Array center, radius, weight;
     const double *ladder;
     double tolerance, absolute_tolerance, ratio_min, ratio_max, smallest;
-    double first, growth, most, damping, rounding, lost_beyond, gain;
+    double first, growth, most, damping, rounding, lost_beyond, damp_below, gain;
 } Problem;
 
 /* A constraint's multipliers and numbers. */

@@ -54,10 +54,11 @@ class Best:
         guidance: Guidance | None = None,
         penalty: Penalty | None = None,
         guide_first: bool = False,
+        solver: AugmentedLagrangian | None = None,
     ) -> SolveEnd:
-        """A solve with progress and trace of the whole; see `AugmentedLagrangian.iterate`."""
+        """A solve with progress and trace of the whole; see `AugmentedLagrangian.iterate`. None: by the own solver."""
         call = replace(call, callback=self._callback(call))
-        return self.solver.iterate(call, guidance, penalty, self.recorder, guide_first, by_arrival=True)
+        return (solver or self.solver).iterate(call, guidance, penalty, self.recorder, guide_first, by_arrival=True)
 
     def keep(self, rows: Tensor, new: SolveEnd) -> None:
         """Keep the better of the old and the new trajectories of `rows`: arrived, then feasible, then cheapest."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from torchgco.draws import DrawKey, standard_normal
+from torchgco.draws import DrawKey, smooth_normal
 from torchgco.errors import InputError
 from torchgco.options import AtLeast, Count, check_options
 from torchgco.problem import Problem
@@ -65,19 +65,11 @@ class MultiStart(Solver):
             if rows.numel() == 0 or call.late:
                 break
             part = scaled.take(rows)
-            noise = self._noise(DrawKey(call.seed, part.ids, torch.full_like(rows, start)), call.problem.N, sigma)
+            key = DrawKey(call.seed, part.ids, torch.full_like(rows, start))
+            noise = sigma.sqrt() * smooth_normal(key, self.noise_knots, part.U0)
             best.improve(rows, replace(part, U0=part.U0 + noise, warm=None), guidance)
         phr = not solver.inner.as_printed
         return finished(call, scaled, unit, best.end, phr, solver.violation_tolerance, solver.slots)
-
-    def _noise(self, key: DrawKey, N: int, sigma: Tensor) -> Tensor:
-        """(B, N, m), linear between knots."""
-        m = sigma.numel()
-        z = standard_normal(key, self.noise_knots * m, range(1), sigma.dtype)
-        z = z.view(self.noise_knots, m, -1).permute(2, 0, 1)
-        place = torch.linspace(0, self.noise_knots - 1, N, dtype=sigma.dtype, device=sigma.device)
-        left = place.floor().clamp(max=self.noise_knots - 2).long()
-        return sigma.sqrt() * torch.lerp(z[:, left], z[:, left + 1], (place - left).view(-1, 1))
 
     def _sigma(self, problem: Problem) -> Tensor:
         sigma = tensor(self.covariance, "multistart.covariance", problem.x0)

@@ -32,6 +32,7 @@ from torchgco.penalties import GuideRegion
 from torchgco.problem import Problem
 from torchgco.search.best import Best
 from torchgco.search.chords import clear_chords
+from torchgco.search.finish import finish
 from torchgco.search.paths import PathProposals
 from torchgco.search.suitability import has_paths, suited_paths
 from torchgco.solution import Solution
@@ -61,6 +62,8 @@ class Restarts(Solver):
             caught. None: no sampled attempts.
         attempts: number per problem, after its trajectory is caught.
         all_attempts: make all attempts even if one arrives, and return the cheapest result.
+        finish: continues the best trajectories that no attempt has solved to the end, with more iterations; None: they
+            are returned as they are.
 
     Raises:
         InputError: a field out of its range, or a `local` with guidance.
@@ -71,6 +74,7 @@ class Restarts(Solver):
     sampling: GCO | None = GCO()
     attempts: Count = 4
     all_attempts: bool = False
+    finish: AugmentedLagrangian | None = None
 
     def __post_init__(self) -> None:
         check_options(self, "solver")
@@ -92,6 +96,8 @@ class Restarts(Solver):
         else:
             best, caught = self._first(scaled, not has_paths(scaled.problem), recorder)
             self._restart(best, caught, paths, sampling)
+        if self.finish is not None:
+            finish(best, self.finish)
         if not call.late:
             clear_chords(best)
         phr = not solver.inner.as_printed

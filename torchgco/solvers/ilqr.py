@@ -12,13 +12,13 @@ from torchgco.expansion import linearise
 from torchgco.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import engine_of, open_loop, terms_of, value
 from torchgco.native.engine import Options
-from torchgco.options import Count, NonNegative, check_options
+from torchgco.options import Count, NonNegative, Share, check_options
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.lifted import LOST, diverges, lifted_search, native_lifted_search
 from torchgco.solvers.line_search import LineSearch
 from torchgco.solvers.riccati import BackwardPass, backward
-from torchgco.solvers.state import InnerState, Iterate, PassEnd, SolveEnd
+from torchgco.solvers.state import STALLED, InnerState, Iterate, PassEnd, SolveEnd
 from torchgco.solvers.verdict import finished, start_status
 from torchgco.status import Status
 from torchgco.tree import put, take
@@ -47,6 +47,8 @@ class ILQR(Solver):
             as printed: where the actual change is below it, in units of cost.
         max_iterations: inner limit.
         line_search: how step lengths are chosen.
+        damp_below: an accepted step length below it raises mu_r too, as a failed line search does: where dynamics are
+            curved and multipliers large, steps of a thousandth would use up all iterations. As printed: never.
 
     Raises:
         InputError: a field out of its range.
@@ -56,6 +58,7 @@ class ILQR(Solver):
     tolerance: NonNegative = 1e-6
     max_iterations: Count = 50
     line_search: LineSearch = LineSearch()
+    damp_below: Share = 0.0
 
     def __post_init__(self) -> None:
         check_options(self, "ilqr")
@@ -72,6 +75,9 @@ class ILQR(Solver):
         lagrangian = Lagrangian(problem, fixed, None, phr=False)
         s, status = descend(self, lagrangian, scaled.U0, start_is_clear=problem.start_is_clear)
         end = Iterate(s.X, s.U, fixed, s.cost, violation(problem, s.X, s.U))
+        # Multipliers are fixed: a trajectory that has converged and isn't feasible stays so.
+        done = (status == Status.MAX_ITERATIONS) & (s.inner < self.max_iterations)
+        status = torch.where(done, STALLED, status)
         none = torch.zeros_like(status)
         ended = SolveEnd(end, end, status, s.iterations, (s.iterations > 0).long(), none)
         return finished(call, scaled, unit, ended, False, VIOLATION_TOLERANCE)
@@ -90,7 +96,8 @@ class ILQR(Solver):
         refused = self._lift(s, lagrangian, step, refused)
         change, used = (s.merit - old_merit).abs(), s.regularisation
         s.inner, s.iterations = s.inner + ~step.failed, s.iterations + ~step.failed
-        s.regularisation = torch.where(step.failed, used, self._damping(used, refused))
+        hard = refused | (moving & (alpha < self.damp_below))
+        s.regularisation = torch.where(step.failed, used, self._damping(used, hard))
         stuck = refused & (s.regularisation == 0)
         if self.as_printed:
             flat = change < self.tolerance
@@ -125,13 +132,13 @@ class ILQR(Solver):
         refused[rows] = ~found.accepted
         return old_merit, alpha, refused
 
-    def _damping(self, now: Tensor, refused: Tensor) -> Tensor:
-        """mu_r (B,) of the next iteration: 0 as printed; otherwise raised where the search failed, else lowered."""
+    def _damping(self, now: Tensor, hard: Tensor) -> Tensor:
+        """mu_r (B,) of the next iteration: 0 as printed; otherwise raised where the search was hard, else lowered."""
         if self.as_printed:
             return torch.zeros_like(now)
         up, down = (DAMPING_GROWTH * now).clamp(min=DAMPING), now / DAMPING_DECAY
         up = torch.where(up > REGULARISATION_MAX, 0.0, up)
-        return torch.where(refused, up, torch.where(down < DAMPING, 0.0, down))
+        return torch.where(hard, up, torch.where(down < DAMPING, 0.0, down))
 
     def _lift(self, s: InnerState, lagrangian: Lagrangian, step: BackwardPass, refused: Tensor) -> Tensor:
         """A lifted search where rollouts diverge at every step length; returns which problems are still refused.
@@ -209,6 +216,7 @@ def _native_options(inner: ILQR) -> Options:
         0.0 if printed else inner.tolerance, inner.tolerance if printed else 0.0,
         search.ratio_min, search.ratio_max, search.smallest,
         REGULARISATION_FIRST, REGULARISATION_GROWTH, REGULARISATION_MAX, 0.0 if printed else DAMPING, ROUNDING, LOST,
+        inner.damp_below,
     )  # fmt: skip
 
 

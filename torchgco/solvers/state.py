@@ -12,7 +12,9 @@ from torchgco.penalties import Penalty
 from torchgco.problem import Problem
 from torchgco.tree import copied
 
-STOPPED = -1  # ended by guidance, for another attempt; users never see this status
+# Users never see these two as statuses.
+STOPPED = -1  # ended by guidance, for another attempt
+STALLED = -2  # neither the violation nor the cost of a feasible trajectory falls any more
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,9 @@ class State(InnerState):
     guided: Tensor  # outer iterations with guidance on
     replaced: Tensor  # bool: guidance replaced the iterate, and isn't called again
     last_cost: Tensor  # J_var at the end of the previous inner solve
+    last_violation: Tensor  # at the end of the previous inner solve
+    mark: Tensor  # (b, 2): violation and J_var at the end of the last inner solve that made progress
+    waited: Tensor  # inner solves since then
     best: Iterate  # best iterate that ended an inner solve; infinite violation before the first
 
 

@@ -19,7 +19,7 @@ from torchgco.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.riccati import BackwardPass, backward
-from torchgco.solvers.state import STOPPED, SolveEnd
+from torchgco.solvers.state import STALLED, STOPPED, SolveEnd
 from torchgco.status import Status
 from torchgco.tree import take
 
@@ -127,12 +127,14 @@ def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: floa
     """The status (B,) of the returned trajectories, for statuses `ended` that say why the solve stopped.
 
     CONVERGED: stationary and feasible. FEASIBLE: feasible but not stationary, for problems with constraints.
-    INFEASIBLE: stationary but not feasible. Where neither holds, and where a solve failed, the reason stays.
+    INFEASIBLE: not feasible, although higher penalties were tried for as long as they gained anything. Where neither
+    holds, and where a solve failed, the reason stays.
     """
     stationary, fits = left <= STATIONARY, violation <= tolerance
-    reason = torch.where(ended == Status.CONVERGED, int(Status.MAX_ITERATIONS), ended)
+    reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED), int(Status.MAX_ITERATIONS), ended)
     status = torch.where(fits & constrained, int(Status.FEASIBLE), reason)
-    status = torch.where(stationary, torch.where(fits, int(Status.CONVERGED), int(Status.INFEASIBLE)), status)
+    status = torch.where(stationary & fits, int(Status.CONVERGED), status)
+    status = torch.where(~fits & (ended == STALLED), int(Status.INFEASIBLE), status)
     status = torch.where(torch.isinf(left), int(Status.NOT_POSITIVE_DEFINITE), status)
     status = torch.where((ended == Status.TIME_LIMIT) & ~fits, ended, status)  # more time might find more
     failed = (ended == Status.NON_FINITE) | (ended == Status.NOT_POSITIVE_DEFINITE) | (ended == Status.INVALID_START)
