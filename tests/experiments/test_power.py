@@ -74,3 +74,22 @@ def test_bad_rates_get_one_line(words: list[str], capsys) -> None:
     assert len(capsys.readouterr().err.splitlines()) == 1
     with pytest.raises(InputError):
         power_table(0.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["0.5", "0.5000000001"], ["0", "1e-300"], ["0.5", "0.5009"], ["0.1", "0.2", "--level", "5e-324"],
+    ],
+)  # fmt: skip
+def test_rates_that_nobody_can_tell_apart_end_in_one_line(words: list[str], capsys) -> None:
+    assert main(["--power", *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--power: expected rates that at most 1,000,000 layouts tell apart" in line
+
+
+def test_pairs_that_need_too_many_layouts_are_refused_too() -> None:
+    """Different layouts tell these rates apart, the same ones with outcomes that hardly agree don't."""
+    assert unpaired_layouts(0.0, 1e-4, 0.05, 0.8) < 200_000
+    with pytest.raises(InputError, match="1,000,000 layouts"):
+        paired_layouts(1e-4, 0.5, 0.05, 0.8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import ceil, sqrt
+from typing import NoReturn
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ from torchgco.errors import InputError
 from torchgco.experiments.paired import compare
 from torchgco.experiments.statistics import task_columns
 
+MOST = 1_000_000  # layouts; nobody flies more, and the search for their number takes seconds
 WIDTH = 9.0  # standard deviations around the expected number of discordant layouts; the rest is below 1e-17
 SEARCHED = 40  # numbers below the one found, where the power, which isn't quite monotone, may reach the target too
 
@@ -31,7 +33,8 @@ def power_table(
     least the difference of the rates.
 
     Raises:
-        InputError: a rate outside 0..1, equal rates, or a level or target not between 0 and 1.
+        InputError: a rate outside 0..1, equal rates, a level or target not between 0 and 1, or rates so close, a level
+            so small or a target so large that more than a million layouts are needed.
     """
     for name, value in (("level", level), ("power-target", target)):
         if not 0 < value < 1:
@@ -80,14 +83,20 @@ def unpaired_layouts(rate_a: float, rate_b: float, level: float, target: float) 
     Levin and Paik, Statistical Methods for Rates and Proportions, 3rd ed. (2003), chapter 4.
     """
     null, other = _deviations(rate_a, rate_b)
-    z = norm.ppf(1 - level / 2) * null + norm.ppf(target) * other
-    return max(1, ceil(float((z / (rate_a - rate_b)) ** 2)))
+    z = norm.isf(level / 2) * null + norm.ppf(target) * other
+    needed = float((z / (rate_a - rate_b)) ** 2)
+    return max(1, ceil(needed)) if needed <= MOST else _beyond(abs(rate_a - rate_b), level, target)
+
+
+def _beyond(gap: float, level: float, target: float) -> NoReturn:
+    expected = f"rates that at most {MOST:,} layouts tell apart"
+    raise InputError("--power", expected, f"a difference of {gap:.3g} at level {level:g} and power {target:g}")
 
 
 def unpaired_power(n: int, rate_a: float, rate_b: float, level: float) -> float:
     """The power of the same test with n layouts per solver."""
     null, other = _deviations(rate_a, rate_b)
-    z = sqrt(n) * abs(rate_a - rate_b) - norm.ppf(1 - level / 2) * null
+    z = sqrt(n) * abs(rate_a - rate_b) - norm.isf(level / 2) * null
     return float(norm.cdf(z / other)) if other > 0 else float(z > 0)
 
 
@@ -119,7 +128,7 @@ def paired_layouts(gap: float, share: float, level: float, target: float) -> int
     """The smallest number of layouts with which `paired_power` reaches a target."""
     high = 1
     while paired_power(high, gap, share, level) < target:
-        high *= 2
+        high = 2 * high if 2 * high <= MOST else _beyond(gap, level, target)
     low = high // 2
     while high - low > 1:
         middle = (low + high) // 2
