@@ -72,6 +72,8 @@ def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances:
         arrays: see `MissionLog.arrays`.
         ids: numbers of the missions; period: of a control step, s.
         clearances: of each mission, at the starts of its control steps, m.
+
+    Commands `u1` to `u4` are the first of a control step; `u1_low` and `u1_high` the least and the largest of it.
     """
     frames = []
     for b, number in enumerate(ids):
@@ -81,11 +83,35 @@ def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances:
         columns |= {f"x{i}": x[:, i] for i in range(x.shape[1])}
         columns |= {name: arrays[name][b, :K] for name in ("cost", "violation")}
         columns |= {f"f{i + 1}": x[:, 13 + i] for i in range(4)}
-        columns |= {f"u{i + 1}": arrays["commands"][b, :K, 0, i] for i in range(4)}
+        columns |= _commands(arrays["commands"][b, :K])
         columns |= {"clearance": clearances[b][:K]}
         columns |= {name: arrays[name][b, :K] for name in ("planner_seconds", "tracker_seconds", "tracking_violation")}
         columns |= {"guided": arrays["guided"][b, :K].astype(int)}
         columns |= {"source": np.where(arrays["shifted"][b, :K] == 1, "shifted", "solved")}
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
+
+
+def _commands(u: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of commands (K, J, 4), rpm, NaN after a mission's end: the first of each control step and their range."""
+    parts = {"": u[:, 0], "_low": np.fmin.reduce(u, axis=1), "_high": np.fmax.reduce(u, axis=1)}
+    return {f"u{i + 1}{end}": values[:, i] for end, values in parts.items() for i in range(ROTORS)}
+
+
+def time_step_frame(arrays: Arrays, ids: Sequence[int], period: float) -> pd.DataFrame:
+    """A row per mission and time step of the plant: mission, t, states, thrusts and commands.
+
+    A command holds from its row to the next one; the last row is the mission's end and repeats the last command.
+    Arguments as `mission_frame`.
+    """
+    frames = []
+    for b, number in enumerate(ids):
+        u = arrays["commands"][b, : _steps(arrays, b)].reshape(-1, ROTORS)
+        u = u[: int((~np.isnan(u).all(-1)).sum())]  # of a control step in which the mission ends, a part is flown
+        t, x = (part[: len(u) + 1] for part in samples(arrays, b, period))
+        u = np.concatenate((u, u[-1:] if len(u) else np.full((1, ROTORS), np.nan)))
+        columns = {"mission": np.full(len(t), number), "t": t} | {f"x{i}": x[:, i] for i in range(STATES)}
+        columns |= {f"f{i + 1}": x[:, 13 + i] for i in range(ROTORS)} | {f"u{i + 1}": u[:, i] for i in range(ROTORS)}
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
 

@@ -118,6 +118,16 @@ def test_speeds_and_thrusts_have_their_limits(frame: pd.DataFrame) -> None:
     assert "[rpm]" in speeds.get_ylabel() and "[N]" in thrusts.get_ylabel()
 
 
+def test_commands_between_control_steps_are_a_band(frame: pd.DataFrame) -> None:
+    assert not missions.commands_figure(frame).axes[0].collections
+    ends = {
+        f"u{i}_{end}": np.full(STEPS, value) for i in range(1, 5) for end, value in (("low", 2000.0), ("high", 6e3))
+    }
+    speeds, thrusts = missions.commands_figure(frame.assign(**ends)).axes
+    heights = [path.vertices[:, 1] for band in speeds.collections for path in band.get_paths()]
+    assert [(held.min(), held.max()) for held in heights] == [(2000.0, 6000.0)] * 4 and not thrusts.collections
+
+
 def test_states_have_their_targets_and_angles_are_in_degrees(frame: pd.DataFrame) -> None:
     frame["x6"], frame["x9"] = np.cos(np.pi / 8), np.sin(np.pi / 8)  # 45 degrees about z
     axes = missions.states_figure(frame, np.array([6.0, 1.0, 2.0])).axes

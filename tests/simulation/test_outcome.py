@@ -10,7 +10,7 @@ import torch
 from tests.simulation.missions import DT, mission
 from tests.simulation.test_mission import NAMES, RADII, ends, six
 from torchgco import Airframe
-from torchgco.flights import energy, mission_frame, mission_row, samples
+from torchgco.flights import energy, mission_frame, mission_row, samples, time_step_frame
 from torchgco.outcome import Ending, Outcome, judge_flight
 from torchgco.simulation.log import MissionLog
 
@@ -162,8 +162,8 @@ def test_a_row_per_mission_and_control_step(flights: tuple[MissionLog, list[Endi
     table = mission_frame(log.arrays(), [10, 11, 12, 13, 14, 15], DT, clearances)
     assert list(table.columns) == [
         "mission", "step", "t", *(f"x{i}" for i in range(17)), "cost", "violation", "f1", "f2", "f3", "f4",
-        "u1", "u2", "u3", "u4", "clearance", "planner_seconds", "tracker_seconds", "tracking_violation", "guided",
-        "source",
+        *(f"u{i}{end}" for end in ("", "_low", "_high") for i in range(1, 5)), "clearance", "planner_seconds",
+        "tracker_seconds", "tracking_violation", "guided", "source",
     ]  # fmt: skip
     assert table.groupby("mission").size().to_dict() == {10 + b: K for b, K in enumerate(log.steps()) if K > 0}
     row = table[(table["mission"] == 12) & (table["step"] == 3)].iloc[0]
@@ -177,6 +177,42 @@ def test_a_row_per_mission_and_control_step(flights: tuple[MissionLog, list[Endi
     log.shifted[2, 3] = 0.0
     assert changed[changed["source"] == "shifted"][["mission", "step"]].to_numpy().tolist() == [[2, 3]]
     assert not table.drop(columns="source").isna().to_numpy().any()
+
+
+def test_a_control_step_shows_all_of_its_commands(flights: tuple[MissionLog, list[Ending]]) -> None:
+    log, _ = flights
+    arrays = log.arrays()
+    clearances = [np.zeros(K) for K in log.steps()]
+    table = mission_frame(arrays, range(6), DT, clearances).set_index(["mission", "step"])
+    for (b, k), row in table.iterrows():  # type: ignore[misc]
+        u = arrays["commands"][b, k]
+        u = u[~np.isnan(u).any(-1)]
+        assert row[[f"u{i}_low" for i in range(1, 5)]].tolist() == u.min(0).tolist()
+        assert row[[f"u{i}_high" for i in range(1, 5)]].tolist() == u.max(0).tolist()
+    assert (table["u1_low"] < table["u1"]).any() and (table["u1_high"] > table["u1"]).any()
+
+
+def test_a_row_per_time_step_until_a_mission_ends(flights: tuple[MissionLog, list[Ending]]) -> None:
+    log, found = flights
+    table = time_step_frame(log.arrays(), range(6), DT)
+    for b, end in enumerate(found):
+        rows = table[table["mission"] == b]
+        assert len(rows) == round(100 * end.flight_time) + 1 and rows["t"].iloc[-1] == pytest.approx(end.flight_time)
+        steps = len(rows) - 1
+        x = torch.cat((log.x[b, :1, 0], log.x[b, :, 1:].flatten(0, 1)))[: steps + 1].numpy()
+        np.testing.assert_array_equal(rows[[f"x{i}" for i in range(17)]].to_numpy(), x)
+        np.testing.assert_array_equal(rows[["f1", "f2", "f3", "f4"]].to_numpy(), x[:, 13:])
+        u = log.commands[b].flatten(0, 1)[:steps].numpy()
+        np.testing.assert_array_equal(rows[["u1", "u2", "u3", "u4"]].to_numpy()[:-1], u)
+        assert np.isfinite(u).all()
+
+
+def test_commands_after_a_mission_has_ended_are_not_in_the_log(flights: tuple[MissionLog, list[Ending]]) -> None:
+    log, found = flights
+    assert any(round(100 * end.flight_time) % 5 > 0 for end in found), "one that ends within a control period"
+    for b, end in enumerate(found):
+        commanded = torch.isfinite(log.commands[b]).all(-1).flatten()
+        assert int(commanded.sum()) == round(100 * end.flight_time) and bool(commanded[: int(commanded.sum())].all())
 
 
 def test_the_columns_of_a_mission(flights: tuple[MissionLog, list[Ending]]) -> None:

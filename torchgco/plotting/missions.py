@@ -138,7 +138,8 @@ def snapshots_figure(
 def commands_figure(frame: pd.DataFrame, airframe: Airframe | None = None) -> Figure:
     """Commanded rotor speeds and thrusts of the four rotors over time.
 
-    frame  with columns t, u1 to u4 (rpm) and f1 to f4 (N)
+    frame  with columns t, u1 to u4 (rpm) and f1 to f4 (N), a row per time step, or per control step: in such a frame
+           u1_low to u4_high, the least and the largest speed of each step, are drawn as a band around the first one
 
     Dashed are the limits of the thrusts, and the speeds that hold a thrust at its limits. Commands may exceed these, as
     a rotor answers with a lag. Raises InputError as `compute_figure`.
@@ -150,7 +151,11 @@ def commands_figure(frame: pd.DataFrame, airframe: Airframe | None = None) -> Fi
     figure, axes = panels(2, 1, (7.6, 2.5), share=False)
     for ax, (kind, (label, marks)) in zip(axes, rows.items(), strict=True):
         for colour, name in zip(PALETTE, (f"{kind}{i}" for i in range(1, 5)), strict=False):
-            ax.plot(t, flight(frame, name)[name], color=colour, linewidth=0.8)
+            style = "steps-post" if kind == "u" else "default"  # a command is held until the next one
+            ax.plot(t, flight(frame, name)[name], color=colour, linewidth=0.8, drawstyle=style)
+            if f"{name}_low" in frame.columns:
+                low, high = flight(frame, f"{name}_low", f"{name}_high").values()
+                ax.fill_between(t, low, high, color=colour, alpha=0.25, linewidth=0, step="post")
         for mark in marks:
             ax.axhline(mark, color=LIMIT, linestyle="--", linewidth=1.0)
         ax.set_ylabel(label)

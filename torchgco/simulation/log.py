@@ -18,7 +18,7 @@ class MissionLog:
 
     period: float  # s
     x: Tensor  # (B, K, J+1, 17): states of the plant; the first of a period is the last of the one before
-    commands: Tensor  # (B, K, J, 4): rotor speeds, rpm
+    commands: Tensor  # (B, K, J, 4): rotor speeds, rpm; within the period of a mission's end, NaN after it
     tracking_violation: Tensor  # (B, K): largest of the tracking problems, N
     plan: Tensor  # (B, K, N+1, 3): planned positions, m
     cost: Tensor  # (B, K): of the plan
@@ -54,10 +54,12 @@ class MissionLog:
         self.tracker_seconds[rows, step] = 0.0
         self.tracking_violation[rows, step] = 0.0
 
-    def add_sample(self, rows: Tensor, step: int, j: int, x: Tensor, tracking: Tracking, seconds: float) -> None:
-        """A time step: the states after it, and the commands that led there."""
+    def add_sample(
+        self, rows: Tensor, step: int, j: int, x: Tensor, tracking: Tracking, seconds: float, flew: Tensor
+    ) -> None:
+        """A time step: the states after it, and the commands that led there where a vehicle still flew, (b,) bool."""
         self.x[rows, step, j + 1] = x
-        self.commands[rows, step, j] = tracking.commands
+        self.commands[rows, step, j] = torch.where(flew.unsqueeze(-1), tracking.commands, torch.nan)
         self.tracker_seconds[rows, step] += seconds
         worst = torch.maximum(self.tracking_violation[rows, step], tracking.violation)
         self.tracking_violation[rows, step] = worst
