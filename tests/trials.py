@@ -50,3 +50,24 @@ def flights(solver: str, reached: Iterable[bool], **more: Any) -> list[dict[str,
         {"solver": solver, "layout": i, "feasible": hit, "reached": hit, "success": hit, **more}
         for i, hit in zip(count(), reached, strict=False)
     ]
+
+
+ENDS = {"R": "REACHED", "C": "COLLISION", "T": "TIMEOUT", "D": "DIVERGED"}
+
+
+def missions(solver: str, ends: str, **more: Any) -> list[dict[str, Any]]:
+    """One row per mission 0, 1, ..., which end as the letters of `ends` say, after 5, 6, ... seconds."""
+    rows = []
+    for i, outcome in enumerate(ENDS[end] for end in ends):
+        row = {"solver": solver, "layout": i, "outcome": outcome, "status": outcome, "reached": outcome == "REACHED"}
+        row |= {"feasible": outcome in ("REACHED", "TIMEOUT"), "success": None, "cost": float("nan")}
+        row |= {"best_cost": float("nan"), "flight_time": 5.0 + i, "energy": 500.0 + i, "missed_deadlines": 1 + i}
+        row |= {
+            "shifted_plans": 0,
+            "tracker_seconds_median": 0.007,
+            "tracking_violation": 1e-9,
+            "outer_iterations": 120,
+        }
+        row |= {"planner_seconds_median": 0.012, "planner_seconds_p99": 0.025, "batch_size": len(ends)}
+        rows.append(row | more)
+    return rows

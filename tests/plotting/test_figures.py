@@ -14,7 +14,7 @@ from tests.trials import flights, trials
 from torchgco.errors import InputError
 from torchgco.experiments.statistics import summarise
 from torchgco.plotting.convergence import convergence_figure
-from torchgco.plotting.distributions import clearance_histogram, violation_histogram
+from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.rates import rates_figure
 from torchgco.plotting.style import PALETTE, save, solver_colours
@@ -78,34 +78,58 @@ def test_an_undefined_rate_has_no_bar() -> None:
     assert ax.texts[-1].get_text() == "not defined"
 
 
+def test_solvers_with_different_numbers_of_trials_are_marked() -> None:
+    same, other = (trials(*flights("gco", [True] * 3), *flights("mine", [True] * n)) for n in (3, 2))
+    assert rates_figure(summarise(same)).axes[0].get_xlabel() == ""
+    assert rates_figure(summarise(other)).axes[0].get_xlabel() == "different numbers of layouts: gco 3, mine 2"
+
+
 def test_each_task_has_its_panel() -> None:
-    table = trials(*flights("gco", [True]), *flights("gco", [True], scenario="trap", model="planar"))
-    for figure in (rates_figure(summarise(table)), clearance_histogram(table), violation_histogram(table)):
+    table = trials(*flights("gco", [True] * 2), *flights("gco", [True] * 2, scenario="trap", model="planar"))
+    for figure in (rates_figure(summarise(table)), clearance_figure(table), violation_figure(table)):
         assert [ax.get_title(loc="left") for ax in figure.axes] == ["forest (quadrotor)", "trap (planar)"]
 
 
-def test_clearances_are_counted_and_no_bin_holds_both_signs() -> None:
-    values = [-0.21, -0.01, 0.01, 0.02, 0.33, np.nan]
-    (ax,) = clearance_histogram(trials(*({"layout": i, "clearance": v} for i, v in enumerate(values)))).axes
-    held = bars(ax)
-    assert sum(bar.get_height() for bar in held) == 5
-    assert sum(bar.get_height() for bar in held if bar.get_x() < 0) == 2
-    assert not [bar for bar in held if bar.get_x() < -1e-9 and bar.get_x() + bar.get_width() > 1e-9]
+def spread(figure: Any, column: str, values: list[float], solver: str = "gco") -> Axes:
+    (ax,) = figure(trials(*({"layout": i, column: v, "solver": solver} for i, v in enumerate(values)))).axes
+    return ax
+
+
+def share(ax: Axes, x: float, line: int = 0) -> float:
+    """The height of a step line at x."""
+    at, height = (np.asarray(held) for held in ax.lines[line].get_data())
+    return float(height[np.searchsorted(at, x, side="right") - 1])
+
+
+def test_the_share_of_collisions_is_read_at_the_surface() -> None:
+    ax = spread(clearance_figure, "clearance", [0.33, -0.01, 0.01, 0.02, -0.21, np.nan])
+    assert [share(ax, x) for x in (-0.22, -0.2, 0.0, 0.015, 0.34)] == pytest.approx([0, 1 / 6, 2 / 6, 3 / 6, 5 / 6])
+    assert ax.lines[0].get_drawstyle() == "steps-post" and "gco 1" in ax.get_xlabel()
+
+
+def test_solvers_are_drawn_over_each_other_at_their_own_values() -> None:
+    """Bars side by side would move a violation beyond the tolerance."""
+    rows = [{"solver": name, "layout": i, "violation": v} for name in ("a", "b") for i, v in enumerate((9e-4, 2e-3))]
+    (ax,) = violation_figure(trials(*rows)).axes
+    for line in (0, 1):
+        assert [share(ax, x, line) for x in (-3.05, -3.0, -2.6)] == [0, 0.5, 1]
+    assert np.asarray(ax.lines[2].get_xdata()).tolist() == [-3, -3]
+
+
+def test_violations_below_the_floor_are_drawn_there() -> None:
+    ax = spread(violation_figure, "violation", [0.0, 1e-15, 3e-5, 2.0, np.inf])
+    assert [share(ax, x) for x in (-12.1, -12, -4, 0.31)] == pytest.approx([0, 0.4, 0.6, 0.8])
     assert "gco 1" in ax.get_xlabel()
 
 
-def test_violations_are_counted_by_decade_from_the_floor_on() -> None:
-    values = [0.0, 1e-15, 3e-5, 2.0, np.inf]
-    (ax,) = violation_histogram(trials(*({"layout": i, "violation": v} for i, v in enumerate(values)))).axes
-    held = {round(bar.get_x() + bar.get_width() / 2, 3): bar.get_height() for bar in bars(ax) if bar.get_height()}
-    assert held == {-11.5: 2, -4.5: 1, 0.5: 1}
-    assert "gco 1" in ax.get_xlabel()
-
-
-@pytest.mark.parametrize("histogram", [clearance_histogram, violation_histogram])
-def test_a_histogram_of_non_finite_values_has_no_bars(histogram: Any) -> None:
-    (ax,) = histogram(trials({"clearance": np.nan, "violation": np.nan})).axes
-    assert sum(bar.get_height() for bar in bars(ax)) == 0 and "gco 1" in ax.get_xlabel()
+@pytest.mark.parametrize("column", ["clearance", "violation"])
+def test_what_has_no_spread_is_not_drawn(column: str) -> None:
+    figure = clearance_figure if column == "clearance" else violation_figure
+    for values in ([0.05], [np.nan, np.nan], [0.05, np.inf]):
+        assert not is_spread(trials(*({"layout": i, column: v} for i, v in enumerate(values))), column)
+    rows = [{"layout": i, column: 0.05 + i} for i in range(2)] + [{"scenario": "empty", column: np.nan}]
+    assert is_spread(trials(*rows), column)
+    assert [ax.get_title(loc="left") for ax in figure(trials(*rows)).axes] == ["forest (quadrotor)"]
 
 
 def plane(count: int = 3, **more: Any) -> dict[str, np.ndarray]:

@@ -5,7 +5,8 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from tests.trials import flights, trials
+from tests.trials import flights, missions, trials
+from torchgco.experiments.mission_statistics import summarise_missions
 from torchgco.experiments.statistics import summarise
 from torchgco.plotting.style import solver_colours
 from torchgco.plotting.sweeps import sweep_figure
@@ -73,3 +74,24 @@ def test_a_task_that_lacks_the_variable_or_a_solver_is_drawn_as_far_as_it_goes()
     figure = sweep_figure(summary, VARIABLE)
     assert [ax.get_title(loc="left") for ax in figure.axes if ax.get_title(loc="left")] == ["forest (quadrotor)"]
     assert [len(line.get_xdata()) for line in figure.axes[0].lines] == [1, 1]
+
+
+def test_a_cost_that_no_trial_has_gets_no_panel() -> None:
+    rows = [row | {VARIABLE: 10, "cost": np.nan, "best_cost": np.nan} for row in flights("gco", [True, False])]
+    figure = sweep_figure(summarise(trials(*rows)), VARIABLE)
+    assert [ax.get_ylabel().split(",")[0] for ax in figure.axes] == ["feasible", "reached", "success"]
+
+
+def test_missions_have_the_outcomes_that_occur_and_flight_times() -> None:
+    variable = "mission.disturbance.wind"
+    rows = [*missions("gco", "RRRC", **{variable: 0.0}), *missions("gco", "RRCC", **{variable: 1.0})]
+    figure = sweep_figure(summarise_missions(trials(*rows)), variable)
+    labels = [ax.get_ylabel() for ax in figure.axes]
+    assert labels == ["reached, 95 % interval", "collision, 95 % interval", "median flight time, reached [s]"]
+    drawn = [np.asarray(ax.lines[0].get_ydata()).tolist() for ax in figure.axes]
+    assert drawn == [[0.75, 0.5], [0.25, 0.5], [6.0, 5.5]]
+    assert {ax.get_xlabel() for ax in figure.axes} == {"wind [N]"}
+    lost = trials(*missions("gco", "CC", **{variable: 0.0}))
+    assert [ax.get_ylabel().split(",")[0] for ax in sweep_figure(summarise_missions(lost), variable).axes] == [
+        "reached", "collision"
+    ]  # fmt: skip

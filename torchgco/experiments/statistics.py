@@ -38,6 +38,11 @@ def task_columns(table: pd.DataFrame) -> list[str]:
     return [*TASK, *(str(name) for name in table.columns if "." in str(name))]
 
 
+def are_missions(trials: pd.DataFrame) -> pd.Series:
+    """Which rows (rows,) are missions: those with an outcome of their own."""
+    return trials["outcome"].notna() if "outcome" in trials.columns else pd.Series(False, index=trials.index)
+
+
 def grouped(table: pd.DataFrame, names: Sequence[str]) -> list[np.ndarray]:
     """Positions of the rows with the same values in some columns, NA being a value, in order of appearance.
 

@@ -2,62 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
 from torchgco.plotting.style import INK, legend, panels, solver_colours, tasks_of, tidy
 
 FLOOR = 1e-12
 TOLERANCE = 1e-3  # violations up to this count as none, metres for lengths
 SIZE = (5.2, 3.2)  # of a panel, inches
+SPACE = 0.04  # share of the axis left free at both ends
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")  # matplotlib's own formulas take long to load
 
 
-def clearance_histogram(trials: pd.DataFrame) -> Figure:
-    """Layouts by clearance along the trajectory (m), solvers side by side, a panel per (scenario, model).
+def is_spread(trials: pd.DataFrame, column: str) -> bool:
+    """Whether a solver has two finite values in a task: of fewer, no distribution can be drawn."""
+    return any(_drawable(task, column) for _, task in tasks_of(trials))
 
-    trials  with columns scenario, model, solver, clearance
 
-    Left of the line at 0 the trajectory cuts an obstacle. Clearances that aren't finite are counted below the axis.
+def clearance_figure(trials: pd.DataFrame) -> Figure:
+    """Share of the layouts with at most a given clearance along the trajectory (m): a step line per solver.
+
+    trials  with columns scenario, model, solver, clearance, two finite ones of a solver in a task at least
+
+    Every (scenario, model) with such clearances has a panel. Left of the line at 0 trajectories cut an obstacle: the
+    height there is the share of collisions. Clearances that aren't finite are counted below the axis; a line ends
+    below 100 % where there are some.
     """
-    tasks = list(tasks_of(trials))
+    tasks = [(title, task) for title, task in tasks_of(trials) if _drawable(task, "clearance")]
     figure, axes = panels(len(tasks), 2, SIZE)
     for ax, (title, task) in zip(axes, tasks, strict=True):
-        clearance = _by_solver(task, "clearance")
-        finite = np.concatenate([_finite(values) for values in clearance.values()])
-        low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
-        # Round edges, 0 among them wherever both signs occur: no bin holds both collisions and clear trajectories.
-        edges = MaxNLocator(nbins=16).tick_values(low, high)
-        _bars(ax, clearance, edges, "clearance [m]", mark=0.0)
+        _steps(ax, _by_solver(task, "clearance"), "clearance [m]", mark=0.0)
         tidy(ax, title)
     _legend(figure, trials, "surface (0.95 of both radii)")
     return figure
 
 
-def violation_histogram(trials: pd.DataFrame) -> Figure:
-    """Layouts by their largest violation, a bin per decade, otherwise as `clearance_histogram`.
+def violation_figure(trials: pd.DataFrame) -> Figure:
+    """Share of the layouts with at most a given violation, on a logarithmic axis, otherwise as `clearance_figure`.
 
     trials  with columns scenario, model, solver, violation
 
-    Violations below 1e-12, zero included, are counted in the bin that begins there. Success requires
-    a violation left of the line at 1e-3.
+    Violations below 1e-12, zero included, are drawn there. Success requires a violation left of the line at 1e-3.
     """
-    tasks = list(tasks_of(trials))
+    tasks = [(title, task) for title, task in tasks_of(trials) if _drawable(task, "violation")]
     figure, axes = panels(len(tasks), 2, SIZE)
     for ax, (title, task) in zip(axes, tasks, strict=True):
         decades = {name: np.log10(values.clip(FLOOR)) for name, values in _by_solver(task, "violation").items()}
-        finite = np.concatenate([_finite(values) for values in decades.values()])
-        top = max(np.floor(finite.max(initial=0.0)) + 1, np.log10(TOLERANCE) + 1)
-        edges = np.arange(np.log10(FLOOR), top + 1).tolist()
-        # A linear axis of exponents: side by side on a logarithmic one, bars would differ in width.
-        _bars(ax, decades, edges, "violation [m, or the input's unit]", mark=np.log10(TOLERANCE))
+        # A linear axis of exponents: its lower end stands for all below.
+        _steps(ax, decades, "violation [m, or the input's unit]", mark=np.log10(TOLERANCE))
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         ax.xaxis.set_major_formatter(FuncFormatter(_power))
         tidy(ax, title)
@@ -70,6 +66,10 @@ def _power(exponent: float, _: object) -> str:
     return f"≤ {text}" if exponent <= np.log10(FLOOR) else text
 
 
+def _drawable(task: pd.DataFrame, column: str) -> bool:
+    return any(len(_finite(values)) > 1 for values in _by_solver(task, column).values())
+
+
 def _by_solver(task: pd.DataFrame, column: str) -> dict[str, np.ndarray]:
     groups = task.groupby("solver", sort=False, observed=True)[column]
     return {str(solver): values.to_numpy(dtype=float, na_value=np.nan) for solver, values in groups}
@@ -79,13 +79,20 @@ def _finite(values: np.ndarray) -> np.ndarray:
     return values[np.isfinite(values)]
 
 
-def _bars(ax: Axes, values: dict[str, np.ndarray], edges: Sequence[float], label: str, mark: float) -> None:
+def _steps(ax: Axes, values: dict[str, np.ndarray], label: str, mark: float) -> None:
+    """The share of each solver's values up to a value, over all values from the left to the right end of the axis."""
     colours = solver_colours(values)
-    data = [_finite(held) for held in values.values()]
-    ax.hist(data, bins=list(edges), color=[colours[name] for name in values], alpha=0.85, rwidth=0.9)
+    finite = np.concatenate([mark + np.zeros(1), *(_finite(held) for held in values.values())])
+    space = SPACE * (float(np.ptp(finite)) or 1.0)
+    ends = finite.min() - space, finite.max() + space
+    for name, held in values.items():
+        x = np.sort(_finite(held))
+        share = np.arange(len(x) + 1) / len(held)
+        x, share = np.concatenate((ends[:1], x, ends[1:])), np.append(share, share[-1])
+        ax.plot(x, share, color=colours[name], drawstyle="steps-post", linewidth=1.6)
     ax.axvline(mark, color=INK, linestyle="--", linewidth=1.2)
-    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_ylabel("layouts")
+    ax.set(xlim=ends, ylim=(-0.02, 1.02), ylabel="share of the layouts up to here")
+    ax.yaxis.set_major_formatter(PercentFormatter(1, symbol=" %"))
     lost = {name: int((~np.isfinite(held)).sum()) for name, held in values.items()}
     missing = ", ".join(f"{name} {count}" for name, count in lost.items() if count)
     ax.set_xlabel(f"{label}\nnot finite, hence not shown: {missing}" if missing else label)
@@ -93,5 +100,5 @@ def _bars(ax: Axes, values: dict[str, np.ndarray], edges: Sequence[float], label
 
 def _legend(figure: Figure, trials: pd.DataFrame, mark: str) -> None:
     colours = solver_colours(trials["solver"].unique())
-    handles: list = [Patch(color=colour, label=solver) for solver, colour in colours.items()]
+    handles = [Line2D([], [], color=colour, linewidth=1.6, label=solver) for solver, colour in colours.items()]
     legend(figure, [*handles, Line2D([], [], color=INK, linestyle="--", linewidth=1.2, label=mark)])

@@ -19,7 +19,7 @@ def rates_figure(summary: pd.DataFrame) -> Figure:
     summary  as `experiments.statistics.summarise` returns it
 
     The label above a bar counts the trials that attained the outcome, of all where it is defined. An outcome that is
-    defined nowhere has no bar.
+    defined nowhere has no bar. Solvers that flew different numbers of trials, hence different layouts, are marked.
     """
     tasks = list(tasks_of(summary))
     colours = solver_colours(summary["solver"])
@@ -36,6 +36,9 @@ def rates_figure(summary: pd.DataFrame) -> Figure:
         ax.set_yticks([0, 0.25, 0.5, 0.75, 1])
         ax.yaxis.set_major_formatter(PercentFormatter(1, symbol=" %"))
         ax.set_ylabel("layouts, 95 % interval")
+        if task["n"].nunique() > 1:
+            counts = ", ".join(f"{row['solver']} {row['n']}" for _, row in task.iterrows())
+            ax.set_xlabel(f"different numbers of layouts: {counts}", fontsize=SMALL)
         tidy(ax, title)
     legend(figure, [Patch(color=colour, label=solver) for solver, colour in colours.items()])
     return figure

@@ -18,27 +18,41 @@ SIZE = (3.4, 2.8)  # of a panel, inches
 DECADES = 50.0  # ratio of the largest to the smallest value from which the axis is logarithmic
 TICKS = 8  # values that are all marked on the axis
 LETTERS = 18  # of the name of a bar group
+ENDS = ("collision", "timeout", "diverged")  # of missions that don't reach the goal
+EFFORT = (
+    ("flight_time", "flight_time", "median flight time, reached [s]"),
+    ("cost_ratio_median", "cost_ratio_p90", "cost / best, median to 90 %"),
+    ("cost_median_reached", "cost_median_reached", "median cost, reached"),
+)
+WORDS = {
+    "scenario.num_obstacles": "number of obstacles", "mission.disturbance.wind": "wind [N]",
+    "mission.disturbance.gust": "gusts, standard deviation [N]", "mission.latency": "latency [control periods]",
+    "mission.planner.margin": "margin [m]", "plant.mass_error": "relative error of the mass",
+    "plant.thrust_error": "relative error of the thrust", "plant.drag": "drag [N s/m]",
+}  # fmt: skip
 
 
 def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
     """Rates with 95 % Wilson intervals and costs against one swept variable: a panel per outcome, a line per solver.
 
-    summary   as `experiments.statistics.summarise` returns it, with a column `variable`
+    summary   as `experiments.statistics.summarise` or `summarise_missions` returns it, with a column `variable`
     variable  a column of numbers gives lines with bands, any other column groups of bars
 
-    Every task, which are the values of the other swept variables too, has its row of panels. An outcome that is
-    defined nowhere has no panel. The cost is the median ratio to the best known cost, with a whisker or band up to the
-    90 % quantile; where no best cost is known, the median cost, both over the trials that reached the goal.
+    Every task, which are the values of the other swept variables too, has its row of panels. What has no value
+    anywhere has no panel: an outcome that is defined nowhere, of missions one that never occurs, a cost. The cost is
+    the median ratio to the best known cost, with a whisker or band up to the 90 % quantile; where no best cost is
+    known, the median cost; of missions it is the median flight time; all over the trials that reached the goal.
     """
     rows = summary[summary[variable].notna()]
     tasks = list(tasks_of(rows.rename(columns={variable: "value"})))
-    shown = [name for name in OUTCOMES if rows[f"{name}_n"].sum() > 0]
-    figure, axes = panels(len(tasks) * (len(shown) + 1), len(shown) + 1, SIZE)
+    shown, effort = _shown(rows), _effort(rows)
+    width = len(shown) + (effort is not None)
+    figure, axes = panels(len(tasks) * width, width, SIZE)
     numeric = pd.api.types.is_numeric_dtype(rows[variable])
     draw, place = (_line, _numbers) if numeric else (_bars, _categories)
     colours = solver_colours(rows["solver"])
     for i, (title, task) in enumerate(tasks):
-        row = axes[i * (len(shown) + 1) : (i + 1) * (len(shown) + 1)]
+        row = axes[i * width : (i + 1) * width]
         values = place(row, task["value"])
         for j, (solver, held) in enumerate(task.groupby("solver", sort=False)):
             x = held["value"].map(values).to_numpy(dtype=float)
@@ -49,16 +63,37 @@ def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
                 low, rate, high = (held[f"{name}_{part}"].to_numpy() for part in ("low", "rate", "high"))
                 # Rounding can put an end of the interval slightly inside the rate at 0 and at 1.
                 draw(ax, x, np.minimum(low, rate), rate, np.maximum(high, rate), colours[solver], side)
-            _cost(row[-1], _line if numeric else _points, x, held, colours[solver], side)
+            if effort is not None:
+                middle, high = (held[name].to_numpy(dtype=float) for name in effort[:2])
+                (_line if numeric else _points)(row[-1], x, middle, middle, high, colours[solver], side)
+                row[-1].set_ylabel(effort[2])
         for ax, name in zip(row, shown, strict=False):
             _as_rate(ax, name)
         for ax in row:
-            ax.set_xlabel(variable)
+            ax.set_xlabel(_words(variable))
             tidy(ax, title if ax is row[0] else "")
     kind = (lambda colour, name: Line2D([], [], color=colour, marker="o", label=name)) if numeric else _patch
     handles: list[Artist] = [kind(colour, solver) for solver, colour in colours.items()]
     legend(figure, handles)
     return figure
+
+
+def _shown(rows: pd.DataFrame) -> list[str]:
+    """The outcomes that have panels."""
+    if f"{ENDS[0]}_n" not in rows.columns:
+        return [name for name in OUTCOMES if rows[f"{name}_n"].sum() > 0]
+    return ["reached", *(name for name in ENDS if rows[f"{name}_count"].sum() > 0)]
+
+
+def _effort(rows: pd.DataFrame) -> tuple[str, str, str] | None:
+    """Columns of the last panel, its middle and its upper end, and its label; None where no trial has a value."""
+    found = (held for held in EFFORT if held[0] in rows.columns and rows[held[0]].notna().any())
+    return next(found, None)
+
+
+def _words(variable: str) -> str:
+    """A swept variable for a reader: no key of the command line, with its unit where it has one."""
+    return WORDS.get(variable, variable.split(".")[-1].replace("_", " "))
 
 
 def _patch(colour: str, name: str) -> Patch:
@@ -70,16 +105,6 @@ def _as_rate(ax: Axes, name: str) -> None:
     ax.set_yticks([0, 0.25, 0.5, 0.75, 1])
     ax.yaxis.set_major_formatter(PercentFormatter(1, symbol=" %"))
     ax.set_ylabel(f"{name}, 95 % interval")
-
-
-def _cost(ax: Axes, draw, x: np.ndarray, held: pd.DataFrame, colour: str, side: tuple[int, int]) -> None:
-    names = ("cost_ratio_median", "cost_ratio_p90")
-    label = "cost / best, median to 90 %"
-    if held[names[0]].isna().all():
-        names, label = ("cost_median_reached",) * 2, "median cost, reached"
-    median, high = (held[name].to_numpy(dtype=float) for name in names)
-    draw(ax, x, median, median, high, colour, side)
-    ax.set_ylabel(label)
 
 
 def _numbers(row: list[Axes], values: pd.Series) -> dict[object, float]:
