@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
+from tqdm import tqdm
 
 from tests.experiments.commands import problem_line
+from tests.trials import missions
+from tests.trials import trials as hand_made
 from torchgco import compose, presets
-from torchgco.experiments import report
+from torchgco.experiments import report, study
+from torchgco.experiments.mission_tables import mission_lines
+from torchgco.plotting import missions as draw
 from torchgco.simulation import Mission, Planner
 
 SHORT = ["mission.duration=0.2", "scenario.num_obstacles=3", "study.workers=1", "hydra.run.dir=out"]
@@ -35,9 +42,63 @@ def test_one_mission_writes_log_figures_and_animation(run, tmp_path) -> None:
     assert set(wanted) <= set(log.columns) and log["source"].isin(["solved", "shifted"]).all()
     assert log.loc[0, ["x0", "x1", "x2"]].tolist() == [1.0, 1.0, 0.0]
     figures = {path.name for path in (tmp_path / "out" / "figures").iterdir()}
-    assert {"outcomes.png", "0-compute.png", "0-distance.png", "0-gco-snapshots.png", "0-gco.gif"} <= figures
+    assert {"0-compute.png", "0-distance.png", "0-gco-snapshots.png", "0-gco.gif"} <= figures
+    assert "outcomes.png" not in figures, "a bar of one mission says nothing"
     code, out, _ = run("experiment=mission", *SHORT)
     assert code == 0 and "Already done" in out and "TIMEOUT after 0.20 s" in out
+
+
+def test_the_figures_show_all_commands(run, tmp_path, monkeypatch) -> None:
+    seen = {}
+    for name in ("commands", "states", "distance"):
+        monkeypatch.setattr(draw, f"{name}_figure", lambda frame, *_, name=name: seen.update({name: frame}) or Figure())
+    assert run("experiment=mission", *SHORT)[0] == 0
+    fine = pd.read_parquet(tmp_path / "out" / "time_steps.parquet").drop(columns="solver")
+    assert np.allclose(fine["t"], 0.01 * np.arange(21))
+    for frame in (seen["commands"], seen["states"], seen["distance"]["gco"]):
+        pd.testing.assert_frame_equal(frame.drop(columns="solver"), fine)
+    log = pd.read_parquet(tmp_path / "out" / "mission.parquet")
+    for i in range(1, 5):
+        by_step = fine[f"u{i}"][:20].groupby(np.arange(20) // 5)
+        assert (
+            by_step.min().tolist() == log[f"u{i}_low"].tolist() and by_step.max().tolist() == log[f"u{i}_high"].tolist()
+        )
+
+
+def test_the_bar_shows_the_time_and_figures_are_announced(run, monkeypatch) -> None:
+    monkeypatch.setattr(study, "tqdm", partial(tqdm, mininterval=0))
+    _, _, err = run("experiment=mission", *SHORT)
+    assert "t = 0.1 of 0.2 s" in err and "step=" not in err and " 50%|" in err
+    assert err.index("drawing 7 figures") > err.index("t = 0.2 of 0.2 s")
+
+
+def test_missions_fly_without_figures_which_are_drawn_when_asked_for(run, tmp_path) -> None:
+    words = ["experiment=mission", *SHORT]
+    code, out, err = run(*words, "study.figures=false")
+    assert code == 0 and "TIMEOUT" in out and "drawing" not in err and not (tmp_path / "out" / "figures").exists()
+    code, out, _ = run(*words)
+    assert code == 0 and "Already done" in out and (tmp_path / "out" / "figures" / "0-gco-commands.png").exists()
+    code, _, err = run(*words, "study.figures=some")
+    assert code == 2 and "study.figures: expected true or false, got 'some'" in problem_line(err)
+
+
+def test_times_of_a_batch_are_not_printed_as_latencies(run) -> None:
+    code, out, _ = run("experiment=mission", *SHORT, "study.layouts=2", "study.figures=false")
+    lines = out.splitlines()[:2]
+    assert code == 0 and all(" per mission of a batch of 2. " in line and "deadline" not in line for line in lines)
+    words = ["experiment=mission_study", *SHORT, "study.layouts=5", "study.baselines=[]", "study.figures=false"]
+    code, out, _ = run(*words, "hydra.run.dir=five")
+    head = next(line.split() for line in out.splitlines() if "flight time" in line)
+    assert code == 0 and "divided by its missions" in out and head[-3:-1] == ["missed", "kept"]
+    cells = out.splitlines()[[line.split() for line in out.splitlines()].index(head) + 1].split()
+    assert cells[-2] == "-" and cells[4] == "5", "no deadlines, and five at once"
+
+
+@pytest.mark.parametrize(("missed", "text"), [(0, "0 missed deadlines of 4"), (1, "1 missed deadline of 4")])
+def test_a_mission_alone_has_its_deadlines_and_both_times(missed: int, text: str) -> None:
+    row = missions("gco", "R", missed_deadlines=missed, outer_iterations=4)
+    line = mission_lines(hand_made(*row))
+    assert f"planner 12 ms (99 %: 25 ms) and tracker 7 ms per control period, {text}. " in line
 
 
 def test_a_study_of_missions_compares_planners_and_is_cut_as_one_likes(run, tmp_path) -> None:
@@ -81,6 +142,14 @@ def test_bad_missions_are_refused_in_one_line(run, tmp_path, words: list[str], f
     assert not (tmp_path / "out" / "study.json").exists()
 
 
+@pytest.mark.parametrize(("scenario", "words"), [("woods", "trunks (capsules)"), ("mazes", "boxes")])
+def test_worlds_without_spheres_are_refused_in_the_words_of_the_command(run, scenario: str, words: str) -> None:
+    code, _, err = run("experiment=mission", f"scenario={scenario}", "hydra.run.dir=out")
+    line = problem_line(err)
+    assert code == 2 and line.startswith("torchgco: scenario: expected one with spheres alone")
+    assert f"got {scenario}, which has {words}" in line and "Bound" not in line
+
+
 def test_a_plant_needs_a_mission(run) -> None:
     code, _, err = run("plant=rotors", "hydra.run.dir=out")
     assert code == 2 and "experiment=mission" in problem_line(err)
@@ -96,7 +165,15 @@ def test_a_sweep_over_missions_becomes_columns_of_one_report(run, tmp_path, caps
     assert merged.groupby(["mission.disturbance.wind", "plant.drag"]).size().to_dict() == {
         (0.0, 0.0): 2, (0.0, 0.5): 2, (1.0, 0.0): 2,
     }  # fmt: skip
-    assert merged["layout_digest"].nunique() == 6 and "wind" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert merged["layout_digest"].nunique() == 6 and "wind" in text
+    (tmp_path / "report" / "summary.csv").unlink()
+    single = ["study.layouts=2", "solver=hold", "study.baselines=[]", "scenario.num_obstacles=3", "study.figures=false"]
+    assert run(*single, "study.workers=1", "hydra.run.dir=all/single")[0] == 0
+    assert report.main([str(tmp_path / "all"), "--output", str(tmp_path / "report")]) == 0
+    both = capsys.readouterr().out
+    assert text.split("written to")[0].rstrip() in both, "the missions are reported as without the trajectories"
+    assert "hydra.run.dir" not in both and "forest (quadrotor), seed 0" in both
 
 
 def test_the_configuration_has_the_defaults_of_the_classes() -> None:

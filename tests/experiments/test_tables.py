@@ -13,11 +13,13 @@ import pytest
 from tests.experiments.commands import HOLD, problem_line
 from tests.trials import flights, trials
 from torchgco.experiments import report
+from torchgco.experiments.formats import format_report
+from torchgco.experiments.kinds import parts_of
 from torchgco.experiments.merge import merge
-from torchgco.experiments.paired import compare, paired
+from torchgco.experiments.paired import paired
 from torchgco.experiments.report import main
 from torchgco.experiments.statistics import plain, summarise
-from torchgco.experiments.tables import FORMATS, format_report
+from torchgco.experiments.tables import FORMATS
 
 HITS = [i < 30 for i in range(32)]
 
@@ -44,7 +46,7 @@ def sweep(tmp_path: Path) -> Path:
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports draw nothing: their figures take most of the time of a small report."""
-    monkeypatch.setattr(report, "_figures", lambda trials, summary: {})
+    monkeypatch.setattr(report, "_figures", lambda parts: {})
 
 
 def read(text: str, form: str) -> pd.DataFrame:
@@ -77,13 +79,13 @@ def test_stdout_holds_the_table_alone(form: str, sweep: Path, capsys) -> None:
 
 def test_json_gives_both_tables_without_a_number_that_json_lacks() -> None:
     table = trials(*flights("a", [False]), *flights("b", [False], cost=np.inf))
-    held = json.loads(format_report(summarise(table), compare(table), "json"), parse_constant=pytest.fail)
+    held = json.loads(format_report(parts_of(table), "json"), parse_constant=pytest.fail)
     assert held["summary"][0]["cost_median_reached"] is None and len(held["paired"]) == 3
 
 
 def test_latex_escapes_names() -> None:
     table = trials(*flights("al_ilqr [a_b=50%]", [True]))
-    assert r"al\_ilqr [a\_b=50\%]" in format_report(summarise(table), compare(table), "latex")
+    assert r"al\_ilqr [a\_b=50\%]" in format_report(parts_of(table), "latex")
 
 
 def test_the_command_writes_both_tables_and_a_figure_per_swept_variable(sweep: Path, capsys) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from tests.experiments.commands import problem_line
 from torchgco.experiments.report import main
 
 WORDS = ["solver=al_ilqr", "study.baselines=[hold]", "study.layouts=3", "scenario.stages=8", "study.workers=1"]
+WORDS += ["study.figures=false"]
 MISSIONS = ["experiment=mission_study", "study.layouts=2", "study.baselines=[]", "mission.duration=0.2"]
-MISSIONS += ["scenario.num_obstacles=3", "study.workers=1"]
+MISSIONS += ["scenario.num_obstacles=3", "study.workers=1", "study.figures=false"]
 
 
 @pytest.fixture(scope="session")
@@ -23,15 +25,14 @@ def whole(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def out(run, tmp_path, whole, without_report) -> Path:
+def out(run, tmp_path, whole) -> Path:
     """A copy of a finished study."""
     return copied(whole / "out", run, tmp_path, WORDS)
 
 
 @pytest.fixture
-def flown(run, tmp_path, whole, monkeypatch) -> Path:
+def flown(run, tmp_path, whole) -> Path:
     """A copy of a finished study of missions."""
-    monkeypatch.setattr("torchgco.experiments.study.write_mission_report", lambda folder, setup: "")
     return copied(whole / "missions", run, tmp_path, MISSIONS)
 
 
@@ -40,8 +41,8 @@ def copied(source: Path, run, tmp_path: Path, words: list[str]) -> Path:
         assert run(*words, "hydra.run.dir=first")[0] == 0
         shutil.copytree(tmp_path / "first", source)
         shutil.rmtree(tmp_path / "first")
-    shutil.copytree(source, tmp_path / "all" / "out")
-    return tmp_path / "all" / "out"
+    shutil.copytree(source, tmp_path / "all" / source.name)
+    return tmp_path / "all" / source.name
 
 
 def change(folder: Path, column: str, row: int, value: object = None) -> None:
@@ -56,7 +57,60 @@ def change(folder: Path, column: str, row: int, value: object = None) -> None:
 def test_an_unchanged_study_is_confirmed(out, capsys) -> None:
     assert main(["--verify", str(out)]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("6 rows confirmed\n") and "goal_distance" in text and "not confirmed" not in text
+    assert text.startswith("6 rows confirmed\n") and "goal_distance" in text
+    assert "not computed again, but as the study wrote them (checksum): scenario, status, dynamics_residual, " in text
+    assert text.splitlines()[-2:] == ["2 rows of summary.csv confirmed", "3 rows of paired.csv confirmed"]
+
+
+TABLES = {"summary.csv": ("reached_count", "hold"), "paired.csv": ("only_a", "al_ilqr hold reached")}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_that_count_the_rows_are_counted_again(name: str, out, capsys) -> None:
+    column, key = TABLES[name]
+    path = out / name
+    kept = pd.read_csv(path)
+    changed = kept.copy()
+    changed.loc[1, column] += 1
+    changed.to_csv(path, index=False)
+    assert main(["--verify", str(out)]) == 1
+    first, header, line, last, *_ = capsys.readouterr().out.splitlines()
+    assert first == f"{path}: 1 value differs in {len(kept)} rows" and last == "0 rows confirmed"
+    assert header.split()[-3:] == ["column", "held", "computed"]
+    assert line.split() == [*key.split(), column, str(changed.loc[1, column]), str(kept.loc[1, column])]
+    kept.iloc[1:].to_csv(path, index=False)
+    assert main(["--verify", str(out)]) == 1
+    assert f"{len(kept) - 1} rows, {len(kept.columns)} columns" in capsys.readouterr().out
+    path.unlink()
+    assert main(["--verify", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert f"not confirmed: {path}, which is missing" in text and f"rows of {name}" not in text
+
+
+@pytest.mark.parametrize("form", ["csv", "json", "markdown", "latex"])
+def test_the_formats_give_what_was_confirmed_and_what_was_not(form: str, out, flown, capsys) -> None:
+    assert main(["--verify", str(out), str(flown), "--format", form]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == "" and "rows confirmed" not in captured.out
+    if form == "csv":
+        table = pd.read_csv(io.StringIO(captured.out), keep_default_na=False)
+        assert table["study"].tolist() == [str(out)] * 3 + [str(flown)] * 2
+        assert table["file"].tolist() == [
+            "trials.parquet",
+            "summary.csv",
+            "paired.csv",
+            "trials.parquet",
+            "summary.csv",
+        ]
+        assert table["rows"].tolist() == [6, 2, 3, 2, 1] and not table["differing"].any()
+        held = pd.read_parquet(out / "trials.parquet")
+        names = [set(table.loc[0, kind].split()) for kind in ("confirmed", "by_outcome", "checksum", "unconfirmed")]
+        assert set().union(*names) == set(held.columns) - {"solver", "layout"} and not names[1] | names[3]
+        assert table.loc[3, "by_outcome"].split() == ["status", "feasible", "reached"]
+        assert "flight_time" in table.loc[3, "unconfirmed"].split()
+    change(out, "cost", 0)
+    assert main(["--verify", str(out), "--format", form]) == 1
+    assert "1 value differs" in capsys.readouterr().err
 
 
 COLUMNS = [
@@ -71,7 +125,7 @@ def test_a_changed_value_is_found(column: str, out, capsys) -> None:
     held = pd.read_parquet(out / "trials.parquet").iloc[4]
     assert main(["--verify", str(out)]) == 1
     first, header, line, last, *_ = capsys.readouterr().out.splitlines()
-    assert str(out) in first and "1 values differ" in first and last == "0 rows confirmed"
+    assert str(out) in first and "1 value differs" in first and last == "0 rows confirmed"
     assert header.split() == ["solver", "layout", "column", "held", "computed"]
     assert line.split()[:4] == [held["solver"], str(held["layout"]), column, str(held[column])]
 
@@ -125,7 +179,7 @@ def test_rows_that_are_missing_or_twice_are_refused(out, capsys) -> None:
 
 
 def test_several_studies_and_their_report(out, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("torchgco.experiments.report._figures", lambda trials, summary: {})
+    monkeypatch.setattr("torchgco.experiments.report._figures", lambda parts: {})
     shutil.copytree(out, out.parent / "second")
     assert main([str(out.parent)]) == 0
     capsys.readouterr()
@@ -145,7 +199,10 @@ def test_a_study_that_still_runs_is_left_out(run_until, tmp_path, capsys, withou
 def test_missions_are_confirmed_as_far_as_their_log_goes(flown, capsys) -> None:
     assert main(["--verify", str(flown)]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("2 rows confirmed") and "not confirmed: outcome" in text
+    assert text.startswith("2 rows confirmed\n") and "not confirmed: iterations, outcome, flight_time" in text.replace(
+        "clearance, goal_distance, iterations", "iterations"
+    )
+    assert "agree with the outcome: status, feasible, reached\n" in text and "1 rows of summary.csv" in text
     kept = (flown / "trials.parquet").read_bytes()
     for column in ("reached", "status", "violation", "clearance_knots", "planner_seconds_p99", "layout_digest"):
         change(flown, column, 1)

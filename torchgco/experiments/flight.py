@@ -44,6 +44,7 @@ class Plan:
     shard_size  layouts to a file
     workers     processes
     repair      damaged files are redone
+    figures     figures are drawn when all is flown
     job, jobs   this process flies share `job` (0..jobs-1) of the layouts; job is None where it flies all
     """
 
@@ -51,6 +52,7 @@ class Plan:
     shard_size: int
     workers: int
     repair: bool
+    figures: bool
     job: int | None
     jobs: int
 
@@ -65,8 +67,9 @@ class Plan:
 def plan_of(setup: Setup) -> Plan:
     """The plan of a configuration; InputError names the option that is malformed."""
     given = setup.config.study
-    if not isinstance(given.repair, bool):
-        raise InputError("study.repair", "true or false", repr(given.repair))
+    for name in ("repair", "figures"):
+        if not isinstance(given[name], bool):
+            raise InputError(f"study.{name}", "true or false", repr(given[name]))
     jobs = 1 if given.jobs is None else _count(given.jobs, "jobs", ", or null for a study in one piece")
     job = given.job
     if (job is None) != (given.jobs is None) or (job is not None and not _is_one_of(job, jobs)):
@@ -81,6 +84,7 @@ def plan_of(setup: Setup) -> Plan:
         shard_size=_count(given.shard_size, "shard_size"),
         workers=processes if given.workers is None else _count(given.workers, "workers", ", or null: all cores", MOST),
         repair=given.repair,
+        figures=given.figures,
         job=job,
         jobs=jobs,
     )
@@ -168,17 +172,17 @@ class Flight:
             return solution, seconds, together.cpu().numpy()
 
     def _progress(self, together: Tensor, progress: Progress) -> None:
-        """Show a pass, and note in `together` how many problems ran together in it."""
+        """Show how far the batch is, and note in `together` how many problems ran together."""
         if progress.candidates is None:
             together[progress.rows] = together[progress.rows].clamp(min=progress.rows.numel())
-            state = {"pass": progress.passes}
+            state = f"solved {progress.finished}/{progress.total}"
         else:
-            state = {"candidates": "{}/{}".format(*progress.candidates)}
+            state = "candidates {}/{}".format(*progress.candidates)
         self.bar.update(max(0, progress.finished - self.shown))
         self.shown = max(self.shown, progress.finished)
         now = time.monotonic()
         # A bar draws itself only where its count changes, and candidates may be solved for a minute.
-        self.bar.set_postfix(state, refresh=now - self.drawn > REDRAW)
+        self.bar.set_postfix_str(state, refresh=now - self.drawn > REDRAW)
         self.drawn = now if now - self.drawn > REDRAW else self.drawn
 
 

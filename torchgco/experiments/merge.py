@@ -18,7 +18,7 @@ import pandas as pd
 from torchgco.errors import InputError
 from torchgco.experiments.identity import ARITHMETIC, digest, flat
 from torchgco.experiments.runs import MERGED, ROW, Run, find_runs
-from torchgco.experiments.statistics import PAIR, TASK, grouped, task_columns
+from torchgco.experiments.statistics import PAIR, TASK, are_missions, grouped, task_columns
 from torchgco.experiments.success import judged, sound
 from torchgco.experiments.variants import labels, task_of_runs
 
@@ -40,7 +40,7 @@ def merge(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
 
     - Keys of scenario and vehicle in which runs of one (scenario, model) differ become columns, named as on the
       command line: `scenario.num_obstacles`. Runs that flew other layouts without such a key get their folder in a
-      column `hydra.run.dir`.
+      column `hydra.run.dir`. Missions are compared with missions alone.
     - A solver that flew under several settings, versions or devices has a name for each, with the differing settings:
       "gco [max_outer_iterations=10]". Seeds don't count: other seeds are further trials of the same solver.
     - A flight that several runs hold counts once, as the first run has it.
@@ -205,6 +205,7 @@ def _judged_together(rows: pd.DataFrame) -> pd.DataFrame:
         }
     ).groupby(LAYOUT)
     rivals = groups["solver"].transform("min") < groups["solver"].transform("max")
+    rivals &= ~are_missions(new)  # they have no costs to compare
     narrow = new[["cost"]].assign(sound=sound(new), **{LAYOUT: groups.obj[LAYOUT]})
     again = judged(narrow, groups["best"].transform("min"), rivals, [LAYOUT])
     names = ["best_cost", "success", "best_from"]

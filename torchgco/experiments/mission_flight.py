@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ class MissionFlight:
     solver: Any
     bar: Bar
     plans: bool = False  # keep the planned positions, for figures
-    shown: int = 0
+    shown: float = 0.0
 
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
         """Rows (without success), and logs (L, K, W) as `flights.packed` has them, NaN after a mission's end."""
@@ -41,7 +42,8 @@ class MissionFlight:
         mission = replace(setup.mission, planner=replace(setup.mission.planner, solver=self.solver))
         problem = setup.vehicle.task(layouts).problem
         ids = torch.as_tensor(layouts.ids)
-        log = mission.fly(problem, seed=setup.seed, ids=ids, report=self._progress)
+        progress = partial(self._progress, float(problem.dynamics.dt), mission.duration)
+        log = mission.fly(problem, seed=setup.seed, ids=ids, report=progress)
         self.bar.update(layouts.count - self.shown)
         arrays, spheres = log.arrays(self.plans), spheres_of(problem)
         goal, radius = problem.goal.position.numpy(), problem.goal.radius.numpy()  # type: ignore[union-attr]
@@ -64,11 +66,14 @@ class MissionFlight:
             "dtype": str(setup.dtype).removeprefix("torch."), "version": torchgco.__version__,
         }  # fmt: skip
 
-    def _progress(self, step: int, flying: int) -> None:
-        ended = self.layouts.count - flying
-        self.bar.update(max(0, ended - self.shown))
-        self.bar.set_postfix({"step": step, "flying": flying}, refresh=False)
-        self.shown = max(self.shown, ended)
+    def _progress(self, period: float, duration: float, step: int, flying: int) -> None:
+        """Show the time in the missions; one that flies counts with the share of its duration."""
+        t = min((step + 1) * period, duration)
+        done = self.layouts.count - flying * (1 - t / duration)
+        count = f", {flying} flying" if self.layouts.count > 1 else ""
+        self.bar.set_postfix_str(f"t = {t:.1f} of {duration:g} s{count}", refresh=False)
+        self.bar.update(max(0.0, done - self.shown))
+        self.shown = max(self.shown, done)
 
 
 def _judged(arrays: Any, b: int, period: float, spheres: Any, end: Any) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +14,15 @@ from matplotlib.figure import Figure
 from torchgco.constraints.bodies import CONTACT_FACTOR
 from torchgco.experiments.build import Setup
 from torchgco.experiments.files import write
+from torchgco.experiments.formats import format_report
+from torchgco.experiments.kinds import parts_of, write_tables
 from torchgco.experiments.mission_flight import FEW
-from torchgco.experiments.paired import compare
+from torchgco.experiments.mission_tables import mission_lines
+from torchgco.experiments.progress import draw as draw_all
 from torchgco.experiments.records import LAYOUTS, MISSION, TRIALS
+from torchgco.experiments.report_figures import several
 from torchgco.experiments.runs import read_trials
-from torchgco.experiments.statistics import summarise, wilson
-from torchgco.experiments.tables import aligned, paired_lines
-from torchgco.flights import clearances, mission_frame, spheres_of, unpacked
-from torchgco.outcome import Outcome
+from torchgco.flights import clearances, mission_frame, spheres_of, time_step_frame, unpacked
 from torchgco.plotting import missions as draw
 from torchgco.plotting.animation import mission_animation
 from torchgco.plotting.course import Course
@@ -27,125 +30,108 @@ from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts
 
 SNAPSHOTS = 4  # instants of a mission in one figure
-PLANS = "plans.npz"  # planned positions (solver, L, K, N+1, 3), where few missions fly
+# Where few missions fly: planned positions (solver, L, K, N+1, 3), and a row per time step of the plant.
+PLANS, TIME_STEPS = "plans.npz", "time_steps.parquet"
 
 
 def mission_table(
     folder: Path, setup: Setup, layouts: Layouts, solvers: Sequence[str], logs: np.ndarray
 ) -> pd.DataFrame:
-    """The rows of mission.parquet from packed logs (solver, L, K, W); where they hold plans, plans.npz is written."""
+    """The rows of mission.parquet from packed logs (solver, L, K, W).
+
+    Where the logs hold plans, these and all time steps are written into files of their own.
+    """
     assert setup.mission is not None
     problem = setup.vehicle.task(layouts).problem
-    period, spheres, frames, plans = float(problem.dynamics.dt), spheres_of(problem), [], []
+    period, spheres = float(problem.dynamics.dt), spheres_of(problem)
+    frames, plans, fine = [], [], []
     for name, rows in zip(solvers, logs, strict=True):
         arrays = unpacked(rows, setup.mission.substeps(period) or 1)
         distances = [clearances(arrays, b, period, spheres[b]) for b in range(layouts.count)]
         frame = mission_frame(arrays, layouts.ids.tolist(), period, distances)
         frame.insert(0, "solver", name)
         frames.append(frame)
-        plans.append(arrays.get("plan"))
-    if plans[0] is not None:
+        if "plan" in arrays:
+            plans.append(arrays["plan"])
+            fine.append(time_step_frame(arrays, layouts.ids.tolist(), period))
+            fine[-1].insert(0, "solver", name)
+    if plans:
+        steps = pd.concat(fine, ignore_index=True)
+        write(folder / TIME_STEPS, lambda file: steps.to_parquet(file, index=False))
         held = {"plan": np.stack(plans), "solver": np.array(solvers), "layout": layouts.ids}
         write(folder / PLANS, lambda file: np.savez_compressed(file, **held))
     return pd.concat(frames, ignore_index=True)
 
 
-def write_mission_report(folder: Path, setup: Setup) -> str:
-    """Write summary.csv and figures next to the mission.parquet in a folder, and return the report as text."""
+def write_mission_report(folder: Path, setup: Setup, figures: bool = True) -> str:
+    """Write summary.csv, paired.csv and figures next to the mission.parquet in a folder; return the report as text."""
     trials = read_trials(folder / TRIALS)
-    summary = summarise(trials)
-    write(folder / "summary.csv", lambda file: summary.to_csv(file, index=False))
-    blocks = [outcome_table(trials), effort_table(trials)]
-    paired = compare(trials)
-    if len(paired):
-        blocks.append(paired_lines(paired))
-    if trials["layout"].nunique() <= FEW:
-        blocks = [mission_lines(trials), *blocks[2:]]
-    write_figures(folder, trials, pd.read_parquet(folder / MISSION), setup)
-    return "\n\n".join(blocks)
+    parts = parts_of(trials)
+    write_tables(folder, parts)
+    if figures:
+        draw_all(_drawings(folder, trials, setup))
+    text = format_report(parts, "table")
+    return mission_lines(trials) if trials["layout"].nunique() <= FEW else text
 
 
-def mission_lines(trials: pd.DataFrame) -> str:
-    """A line per mission."""
-    lines = []
-    for row in trials.itertuples():
-        lines.append(
-            f"{row.scenario} {row.layout}, {row.solver}: {row.outcome} after {row.flight_time:.2f} s, clearance "
-            f"{row.clearance:.3f} m, planner {1000 * row.planner_seconds_median:.0f} ms (99 %: "
-            f"{1000 * row.planner_seconds_p99:.0f} ms), {row.missed_deadlines} missed deadlines. "
-            f"{Outcome[row.outcome].sentence}"
-        )
-    return "\n".join(lines)
+def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Callable[[], object]]:
+    """Functions that draw and write: outcomes, and where few missions fly, for each what the paper shows of it."""
+    held: dict[str, Callable[[], object]] = {}
 
+    def add(name: str, figure: Callable[[], Figure]) -> None:
+        path = folder / "figures" / f"{name}.png"
+        held[name] = lambda: write(path, lambda file: save(figure(), file, dpi=110))
 
-def outcome_table(trials: pd.DataFrame) -> str:
-    """Shares of the four outcomes by solver, which are disjoint, with 95 % Wilson intervals in percent."""
-    rows = [["solver", "n", *(outcome.name for outcome in Outcome)]]
-    for name, group in trials.groupby("solver", sort=False):
-        n, cells = len(group), []
-        for outcome in Outcome:
-            count = int((group["outcome"] == outcome.name).sum())
-            low, high = wilson(count, n)
-            cells.append(f"{count} [{100 * low:.0f}, {100 * high:.0f}]")
-        rows.append([str(name), str(n), *cells])
-    return aligned(rows, 1)
-
-
-COUNTS = ("missed_deadlines", "shifted_plans")
-EFFORT = (
-    ("flight time", "flight_time", "{:.2f} s"), ("clearance", "clearance", "{:.3f} m"),
-    ("energy", "energy", "{:.0f} J"),
-    ("planner", "planner_seconds_median", "{:.4f} s"), ("99 %", "planner_seconds_p99", "{:.4f} s"),
-    ("missed", "missed_deadlines", "{:.1f}"), ("kept plans", "shifted_plans", "{:.1f}"),
-)  # fmt: skip
-
-
-def effort_table(trials: pd.DataFrame) -> str:
-    """Medians by solver: over the missions that reached the goal, deadlines and kept plans as means over all."""
-    rows = [["solver", *(head for head, _, _ in EFFORT)]]
-    for name, group in trials.groupby("solver", sort=False):
-        reached = group[group["reached"].astype(bool)]
-        cells = []
-        for _, column, form in EFFORT:
-            value = group[column].mean() if column in COUNTS else reached[column].median()
-            cells.append("-" if pd.isna(value) else form.format(value))
-        rows.append([str(name), *cells])
-    return aligned(rows, 1)
-
-
-def write_figures(folder: Path, trials: pd.DataFrame, missions: pd.DataFrame, setup: Setup) -> None:
-    """figures/outcomes.png; where few missions fly, for each of them those of the paper, and an animation."""
-    held: dict[str, Figure] = {"outcomes": draw.outcomes_figure(trials)}
-    plans = _plans(folder)
+    if several(trials):
+        add("outcomes", lambda: draw.outcomes_figure(trials))
+    flown = _Flown.read(folder)
     layouts = Layouts.load(folder / LAYOUTS)
-    for i, number in enumerate(layouts.ids.tolist() if plans else []):
+    for i, number in enumerate(layouts.ids.tolist() if flown else []):
+        assert flown is not None
         course, period = _course(setup, layouts.take([i]))
-        flown = {
-            str(name): rows for name, rows in missions[missions["mission"] == number].groupby("solver", sort=False)
-        }
-        if not flown:  # a start in contact
+        rows, fine = flown.of(number)
+        if not rows:  # a start in contact
             continue
-        held[f"{number}-compute"] = draw.compute_figure(flown, period)
-        held[f"{number}-distance"] = draw.distance_figure(flown, course)
-        for name, rows in flown.items():
-            plan = plans[name][i][: len(rows)]
-            steps = np.linspace(0, 0.8 * (len(rows) - 1), SNAPSHOTS).round().astype(int).tolist()
-            label = f"{number}-{name}"
-            held[f"{label}-snapshots"] = draw.snapshots_figure(rows, plan, course, steps, period)
-            held[f"{label}-commands"] = draw.commands_figure(rows)
-            held[f"{label}-states"] = draw.states_figure(rows, course.goal)
-            held[f"{label}-tracking"] = draw.tracking_figure(rows)
-            mission_animation(rows, plan, course, period, folder / "figures" / f"{label}.gif", name)
-    for name, figure in held.items():
-        write(folder / "figures" / f"{name}.png", lambda file, figure=figure: save(figure, file, dpi=110))
+        add(f"{number}-compute", partial(draw.compute_figure, rows, period))
+        add(f"{number}-distance", partial(draw.distance_figure, fine, course))
+        for name, frame in rows.items():
+            plan, label = flown.plans[name][i][: len(frame)], f"{number}-{name}"
+            steps = np.linspace(0, 0.8 * (len(frame) - 1), SNAPSHOTS).round().astype(int).tolist()
+            add(f"{label}-snapshots", partial(draw.snapshots_figure, frame, plan, course, steps, period))
+            add(f"{label}-commands", partial(draw.commands_figure, fine[name]))
+            add(f"{label}-states", partial(draw.states_figure, fine[name], course.goal))
+            add(f"{label}-tracking", partial(draw.tracking_figure, frame))
+            gif = folder / "figures" / f"{label}.gif"
+            held[f"{label}.gif"] = partial(mission_animation, frame, plan, course, period, gif, name)
+    return held
 
 
-def _plans(folder: Path) -> dict[str, np.ndarray]:
-    """Planned positions (L, K, N+1, 3) by solver; empty where none were kept."""
-    if not (folder / PLANS).is_file():
-        return {}
-    with np.load(folder / PLANS, allow_pickle=False) as held:
-        return dict(zip(held["solver"].tolist(), held["plan"], strict=True))
+@dataclass(frozen=True)
+class _Flown:
+    """What is kept of few missions.
+
+    steps  rows of mission.parquet; fine: rows of time_steps.parquet
+    plans  planned positions (L, K, N+1, 3) by solver
+    """
+
+    steps: pd.DataFrame
+    fine: pd.DataFrame
+    plans: dict[str, np.ndarray]
+
+    @classmethod
+    def read(cls, folder: Path) -> _Flown | None:
+        """None where a study has many missions, or where an older version flew them."""
+        if not all((folder / name).is_file() for name in (PLANS, TIME_STEPS)):
+            return None
+        with np.load(folder / PLANS, allow_pickle=False) as held:
+            plans = dict(zip(held["solver"].tolist(), held["plan"], strict=True))
+        return cls(pd.read_parquet(folder / MISSION), pd.read_parquet(folder / TIME_STEPS), plans)
+
+    def of(self, number: int) -> tuple[dict[str, pd.DataFrame], dict[str, pd.DataFrame]]:
+        """The rows of one layout per control step, and those per time step, by solver; none that never flew."""
+        tables = (table[table["mission"] == number] for table in (self.steps, self.fine))
+        rows, fine = ({str(name): held for name, held in table.groupby("solver", sort=False)} for table in tables)
+        return rows, {name: fine[name] for name in rows}
 
 
 def _course(setup: Setup, layouts: Layouts) -> tuple[Course, float]:

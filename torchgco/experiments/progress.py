@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Mapping
 from typing import IO, Any, Protocol, Self
 
+from tqdm import tqdm
+
+from torchgco.experiments.launching import side_by_side
+
+# Parts of a trial count too: a mission is one, and takes seconds.
+LAYOUT = "{l_bar}{bar}| {n:.0f}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 PERIOD = 30.0  # s between two lines of a job
 
 
@@ -13,7 +20,7 @@ class Bar(Protocol):
     """The part of a tqdm bar that a flight uses."""
 
     def update(self, n: float) -> Any: ...
-    def set_postfix(self, ordered_dict: Any, refresh: bool) -> Any: ...
+    def set_postfix_str(self, s: str, refresh: bool) -> Any: ...
     def write(self, s: str, file: IO[str]) -> Any: ...
 
 
@@ -23,7 +30,7 @@ class NoBar:
     def update(self, n: float) -> None:
         """Nothing is shown."""
 
-    def set_postfix(self, ordered_dict: Any, refresh: bool) -> None:
+    def set_postfix_str(self, s: str, refresh: bool) -> None:
         """Nothing is shown."""
 
     def write(self, s: str, file: IO[str]) -> None:
@@ -53,3 +60,14 @@ class Lines(NoBar):
         if time.monotonic() - self.shown >= PERIOD:
             self.shown = time.monotonic()
             print(f"{self.name}: {self.done:.0f}/{self.total} trials, {self.solver}", file=sys.stderr, flush=True)
+
+
+def draw(drawings: Mapping[str, Callable[[], object]]) -> None:
+    """Draw figures, and say before how many: they may take longer than what they show."""
+    if not drawings:
+        return
+    text = f"drawing {len(drawings)} figure{'s' if len(drawings) > 1 else ''}"
+    if side_by_side():
+        print(f"{text} ...", file=sys.stderr, flush=True)
+    for drawing in tqdm(drawings.values(), text, unit="figure", dynamic_ncols=True, disable=side_by_side()):
+        drawing()

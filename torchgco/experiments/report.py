@@ -10,6 +10,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
@@ -19,30 +20,34 @@ from matplotlib.figure import Figure
 
 from torchgco.errors import InputError
 from torchgco.experiments.files import say, write
+from torchgco.experiments.formats import format_report
+from torchgco.experiments.kinds import Part, parts_of, write_tables
 from torchgco.experiments.merge import OLDER, REPEATED, UNFINISHED, merge
-from torchgco.experiments.paired import compare
 from torchgco.experiments.power import power_table
+from torchgco.experiments.progress import draw
 from torchgco.experiments.records import MANIFEST, TRIALS
+from torchgco.experiments.report_figures import Drawings, drawings
 from torchgco.experiments.runs import is_merged, read_trials
-from torchgco.experiments.statistics import TASK, plain, summarise, task_columns
-from torchgco.experiments.tables import FORMATS, aligned, format_frame, format_report
-from torchgco.experiments.verify import Verification, unconfirmed, verify
+from torchgco.experiments.statistics import plain
+from torchgco.experiments.tables import FORMATS, format_frame
+from torchgco.experiments.verify import verify
+from torchgco.experiments.verify_text import confirmed_frame, confirmed_text, difference_texts
 from torchgco.interrupts import REPORT, farewell, raised
-from torchgco.plotting.distributions import clearance_histogram, violation_histogram
 from torchgco.plotting.layouts import layout_grid
-from torchgco.plotting.rates import rates_figure
 from torchgco.plotting.style import save
-from torchgco.plotting.sweeps import sweep_figure
 from torchgco.scenarios.layouts import Layouts
 
 Arrays = Mapping[str, np.ndarray]
 # X (L, N+1, n) by solver, or a function that makes them from the arrays in layouts.npz and in solutions.npz.
 Trajectories = Arrays | Callable[[Arrays, Arrays], Arrays]
-FACETS = 6  # most tasks that have panels of their own; more are pooled over the swept variables
-DIFFERENT = 10  # differing values that `--verify` prints per study
 
 
-def write_report(folder: str | os.PathLike[str], trajectories: Trajectories | None = None, form: str = "table") -> str:
+def write_report(
+    folder: str | os.PathLike[str],
+    trajectories: Trajectories | None = None,
+    form: str = "table",
+    figures: bool = True,
+) -> str:
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
     trajectories  states for the picture of the layouts, which needs `layouts.npz` too: X (L, N+1, n) by
@@ -50,45 +55,38 @@ def write_report(folder: str | os.PathLike[str], trajectories: Trajectories | No
                   files, that returns this (`solutions` is empty without `solutions.npz`). None: no such
                   picture.
     form          one of `tables.FORMATS`
+    figures       False: tables alone
 
     Raises InputError if the table is missing, unreadable or empty, and where the trajectories don't fit the
     layouts.
     """
     folder = Path(folder)
-    return _written(folder, read_trials(folder / TRIALS), trajectories, form)
+    return _written(folder, read_trials(folder / TRIALS), trajectories, form, figures)
 
 
-def _written(folder: Path, trials: pd.DataFrame, trajectories: Trajectories | None, form: str) -> str:
-    summary, paired = summarise(trials), compare(trials)
-    for name, table in (("summary", summary), ("paired", paired)):
-        if name == "summary" or len(table):
-            write(folder / f"{name}.csv", lambda file, table=table: table.to_csv(file, index=False))
-    figures = _figures(trials, summary)
-    if trajectories is not None:
+def _written(
+    folder: Path, trials: pd.DataFrame, trajectories: Trajectories | None, form: str, figures: bool = True
+) -> str:
+    parts = parts_of(trials)
+    write_tables(folder, parts)
+    held = _figures(parts) if figures else {}
+    if figures and trajectories is not None:
         layouts = Layouts.load(folder / "layouts.npz").arrays()
-        if callable(trajectories):
-            trajectories = trajectories(layouts, _solutions(folder / "solutions.npz"))
-        figures["layouts"] = layout_grid(layouts, trajectories, trials)
-    for name, figure in figures.items():
-        write(folder / "figures" / f"{name}.png", lambda file, figure=figure: save(figure, file))
-    return format_report(summary, paired, form)
+        states = trajectories(layouts, _solutions(folder / "solutions.npz")) if callable(trajectories) else trajectories
+        held["layouts"] = lambda: layout_grid(layouts, states, trials)
+    draw({name: partial(_draw, folder, name, figure) for name, figure in held.items()})
+    return format_report(parts, form)
 
 
-def _figures(trials: pd.DataFrame, summary: pd.DataFrame) -> dict[str, Figure]:
-    """Figures by name: rates against every swept variable, then rates and distributions of each task."""
-    swept = task_columns(trials)[len(TASK) :]
-    figures = {}
-    for name in swept:
-        others = [other for other in swept if other != name]
-        rows, table = trials[trials[name].notna()], summary[summary[name].notna()]
-        if len(table[[*TASK, *others]].drop_duplicates()) > FACETS:
-            table = summarise(rows.drop(columns=others))
-        figures[f"rates-{name}"] = sweep_figure(table, name)
-    if len(summary[[*TASK, *swept]].drop_duplicates()) > FACETS:
-        trials = trials.drop(columns=swept)
-        summary = summarise(trials)
-    figures["rates"] = rates_figure(summary)
-    return figures | {"clearance": clearance_histogram(trials), "violation": violation_histogram(trials)}
+def _figures(parts: Sequence[Part]) -> Drawings:
+    held: Drawings = {}
+    for part in parts:
+        held |= drawings(part)
+    return held
+
+
+def _draw(folder: Path, name: str, figure: Callable[[], Figure]) -> None:
+    write(folder / "figures" / f"{name}.png", lambda file: save(figure(), file))
 
 
 def _solutions(path: Path) -> Arrays:
@@ -122,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     parser.add_argument("--format", choices=FORMATS, default="table", help="of the tables on stdout; default: table")
     other = parser.add_mutually_exclusive_group()
-    other.add_argument("--verify", action="store_true", help="confirm all rows from the stored controls instead")
+    other.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
     other.add_argument(
         "--power", nargs=2, type=float, metavar="RATE", help="instead: layouts that tell two success rates apart"
     )
@@ -140,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with raised():
             if options.power is not None:
                 return _power(options)
-            return _verify(options.folders) if options.verify else _report(options)
+            return _verify(options) if options.verify else _report(options)
     except InputError as error:
         print(f"torchgco-report: {error}", file=sys.stderr)
         return 2
@@ -185,28 +183,14 @@ def _power(options: argparse.Namespace) -> int:
     return 0
 
 
-def _verify(folders: Sequence[Path]) -> int:
+def _verify(options: argparse.Namespace) -> int:
     """Print what was confirmed; returns 1 where anything differs."""
-    studies, unfinished = verify(folders)
+    studies, unfinished = verify(options.folders)
     for folder in unfinished:
         print(f"unfinished, not verified: {folder}", file=sys.stderr)
-    differing = [study for study in studies if len(study.differences)]
-    for study in differing:
-        say(_difference(study))
-    right = [study for study in studies if study.differences.empty]
-    where = f" in {len(right)} studies" if len(right) > 1 else ""
-    say(f"{sum(study.rows for study in right)} rows confirmed{where}")
-    columns = dict.fromkeys((study.columns, tuple(unconfirmed(study).items())) for study in right)
-    for confirmed, more in columns:
-        say(f"  columns: {', '.join(confirmed)}")
-        for names, reason in more:
-            say(f"  not confirmed: {names} ({reason})")
-    return 1 if differing else 0
-
-
-def _difference(study: Verification) -> str:
-    rows = [[str(value) for value in row] for row in study.differences.head(DIFFERENT).to_numpy().tolist()]
-    lines = [f"{study.folder}: {len(study.differences)} values differ in {study.rows} rows"]
-    lines.append(aligned([list(study.differences.columns), *rows], 1))
-    more = len(study.differences) - len(rows)
-    return "\n".join([*lines, *([f"... and {more} more"] if more else [])])
+    if options.format == "table":
+        say(confirmed_text(studies))
+    else:
+        say(format_frame(confirmed_frame(studies), options.format))
+        print("".join(f"{line}\n" for line in difference_texts(studies)), end="", file=sys.stderr)
+    return 1 if any(study.differs for study in studies) else 0

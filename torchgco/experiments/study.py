@@ -23,7 +23,7 @@ from torchgco.experiments.identity import Manifest, closed_loop, difference, dig
 from torchgco.experiments.launching import side_by_side
 from torchgco.experiments.mission_flight import FEW, MissionFlight
 from torchgco.experiments.mission_report import mission_table, write_mission_report
-from torchgco.experiments.progress import Bar, Lines
+from torchgco.experiments.progress import LAYOUT, Bar, Lines
 from torchgco.experiments.provenance import recorded
 from torchgco.experiments.records import DONE, JUDGED, TRIALS, Records
 from torchgco.experiments.report import write_report
@@ -32,6 +32,7 @@ from torchgco.experiments.workers import Shared, run_all
 from torchgco.kernels import native
 from torchgco.rollout import open_loop
 from torchgco.scenarios import Layouts
+from torchgco.simulation.mission import other_obstacles
 from torchgco.status import Status
 
 # From a baseline's name to the whole configuration with that solver.
@@ -139,8 +140,8 @@ def _finish(study: _Study, records: Records, rows: pd.DataFrame, flown: np.ndarr
 def _report(study: _Study, folder: Path) -> str:
     """Write the report of a finished study, and return it as text."""
     if study.setup.mission is not None:
-        return write_mission_report(folder, study.setup)
-    return write_report(folder, lambda held, flown: _trajectories(study, flown))
+        return write_mission_report(folder, study.setup, figures=study.plan.figures)
+    return write_report(folder, lambda held, flown: _trajectories(study, flown), figures=study.plan.figures)
 
 
 def _study(config: DictConfig, recompose: Recompose) -> _Study:
@@ -149,6 +150,9 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
     task = setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
     if setup.mission is not None:
         setup.mission.check(task.problem.dynamics)
+        if others := other_obstacles(task.problem):
+            expected = "one with spheres alone, as missions fly among no other obstacles so far"
+            raise InputError("scenario", expected, f"{layouts.name}, which has {others}")
     configs = _rivals(config, recompose)
     solvers = {name: setup.solver if held is config else solver_of(held) for name, held in configs.items()}
     configuration = {"version": torchgco.__version__, **plain(config)}
@@ -195,7 +199,7 @@ def _bar(study: _Study, left: int, name: str) -> tqdm | Lines:
     count = layouts * len(study.solvers)
     if side_by_side():
         return Lines(name, count, count - left)
-    return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True)
+    return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True, bar_format=LAYOUT)
 
 
 def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
@@ -223,11 +227,13 @@ def _fly_side_by_side(
 
     shown = 0.0
 
-    def watch(finished: float, passes: float) -> None:
+    total = sum(len(ids) for _, ids in batches)
+
+    def watch(finished: float) -> None:
         nonlocal shown
         bar.update(max(0.0, finished - shown))
-        bar.set_postfix({"pass": int(passes)}, refresh=True)
         shown = max(shown, finished)
+        bar.set_postfix_str(f"solved {int(shown)}/{total}", refresh=True)
 
     bar.set_description(f"{workers} processes")
     run_all(

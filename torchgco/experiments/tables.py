@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 
 import pandas as pd
@@ -25,31 +24,12 @@ def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
     for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
         seeds = ", ".join(dict.fromkeys(seed for held in task["seed"] for seed in held.split()))
         blocks.append(f"{scenario} ({model}), seed {seeds}")
-        swept = _swept(task)
+        swept = swept_of(task)
         blocks += [_rates(task, swept), _effort(task, swept), _statuses(task, swept)]
         rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
-        if len(rows):
+        if (rows["n"] > 0).any():
             blocks.append(paired_lines(rows, swept))
     return "\n\n".join(blocks)
-
-
-def format_report(summary: pd.DataFrame, paired: pd.DataFrame, form: str) -> str:
-    """The summary, for a paper with the comparisons, in one of FORMATS.
-
-    csv             the summary with all its columns
-    json            all columns of both tables, under "summary" and "paired"; null where a number is undefined
-    markdown, latex the columns that a paper prints, of both tables
-    table           as `format_table`
-    """
-    if form == "table":
-        return format_table(summary, paired)
-    if form == "csv":
-        return format_frame(summary, form)
-    if form == "json":
-        held = {"summary": summary, "paired": paired}
-        return json.dumps({name: json.loads(format_frame(table, form)) for name, table in held.items()}, indent=1)
-    tables = [_printed_summary(summary)] + ([_printed_pairs(paired)] if len(paired) else [])
-    return "\n\n".join(format_frame(table, form) for table in tables)
 
 
 def format_frame(table: pd.DataFrame, form: str) -> str:
@@ -60,12 +40,12 @@ def format_frame(table: pd.DataFrame, form: str) -> str:
         return table.to_json(orient="records", double_precision=15, indent=1) or "[]"
     if form == "latex":
         return table.to_latex(index=False, escape=True).rstrip("\n")
-    cells = [[str(name) for name in table.columns], *table.astype(str).to_numpy().tolist()]
+    text = [[str(name) for name in table.columns], *table.astype(str).to_numpy().tolist()]
     left = sum(not pd.api.types.is_numeric_dtype(kind) for kind in table.dtypes[:1])
     if form == "table":
-        return aligned(cells, left)
-    cells = [[cell.replace("|", "\\|") for cell in row] for row in cells]
-    return "\n".join("| " + " | ".join(row) + " |" for row in [cells[0], ["---"] * len(cells[0]), *cells[1:]])
+        return aligned(text, left)
+    text = [[cell.replace("|", "\\|") for cell in row] for row in text]
+    return "\n".join("| " + " | ".join(row) + " |" for row in [text[0], ["---"] * len(text[0]), *text[1:]])
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int) -> str:
@@ -79,33 +59,34 @@ def aligned(rows: Sequence[Sequence[str]], left: int) -> str:
     return "\n".join(lines)
 
 
-def _swept(table: pd.DataFrame) -> list[str]:
+def swept_of(table: pd.DataFrame) -> list[str]:
     """Swept variables that have a value somewhere in the table."""
     return [name for name in task_columns(table)[len(TASK) :] if table[name].notna().any()]
 
 
-def _headers(swept: Sequence[str]) -> list[str]:
+def headers(swept: Sequence[str]) -> list[str]:
     """Swept variables as column heads: without the group of the key; of missions the last part alone."""
     short = (name.removeprefix("scenario.").removeprefix("model.vehicle.") for name in swept)
     return [name.split(".")[-1] if name.startswith(("mission.", "plant.")) else name for name in short]
 
 
-def _cells(row: pd.Series, swept: Sequence[str]) -> list[str]:
-    return ["-" if pd.isna(row[name]) else str(row[name]) for name in swept]
+def cells(row: pd.Series, swept: Sequence[str]) -> list[str]:
+    """The values of the swept variables in a row; whole numbers that pandas holds as floats without a point."""
+    values = (row[name] for name in swept)
+    return ["-" if pd.isna(value) else f"{value:g}" if isinstance(value, float) else str(value) for value in values]
 
 
 def _rates(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    rows = [
-        [*_cells(row, swept), row["solver"], *(_rate(row, name) for name in OUTCOMES)] for _, row in task.iterrows()
-    ]
-    return aligned([[*_headers(swept), "solver", *OUTCOMES], *rows], len(swept) + 1)
+    rows = [[*cells(row, swept), row["solver"], *(rate(row, name) for name in OUTCOMES)] for _, row in task.iterrows()]
+    return aligned([[*headers(swept), "solver", *OUTCOMES], *rows], len(swept) + 1)
 
 
-def _rate(row: pd.Series, name: str) -> str:
+def rate(row: pd.Series, name: str) -> str:
+    """Attained of defined, and the share with its interval in percent."""
     if not row[f"{name}_n"]:
         return "-"
-    rate, low, high = (100 * row[f"{name}_{part}"] for part in ("rate", "low", "high"))
-    return f"{row[f'{name}_count']}/{row[f'{name}_n']} {rate:.0f} % [{low:.0f}, {high:.0f}]"
+    share, low, high = (100 * row[f"{name}_{part}"] for part in ("rate", "low", "high"))
+    return f"{row[f'{name}_count']}/{row[f'{name}_n']} {share:.0f} % [{low:.0f}, {high:.0f}]"
 
 
 # Header in the terminal, column of the summary, column in parentheses, and how the numbers are written.
@@ -131,19 +112,19 @@ def _measured(row: pd.Series, median: str, p90: str | None, form: str) -> str:
 
 
 def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
-    rows = [[*_headers(swept), "solver", *(header for header, *_ in EFFORT)]]
+    rows = [[*headers(swept), "solver", *(header for header, *_ in EFFORT)]]
     columns_of = [(median, p90, form) for _, median, p90, form in EFFORT]
     for _, row in task.iterrows():
-        rows.append([*_cells(row, swept), row["solver"], *(_measured(row, *columns) for columns in columns_of)])
+        rows.append([*cells(row, swept), row["solver"], *(_measured(row, *columns) for columns in columns_of)])
     return aligned(rows, len(swept) + 1)
 
 
 def _statuses(task: pd.DataFrame, swept: Sequence[str]) -> str:
     """How many trials ended with each status that occurs."""
     names = [name for name in task.columns if str(name).startswith(STATUS) and task[name].sum() > 0]
-    rows = [[*_headers(swept), "solver", *(name.removeprefix(STATUS) for name in names)]]
+    rows = [[*headers(swept), "solver", *(name.removeprefix(STATUS) for name in names)]]
     for _, row in task.iterrows():
-        rows.append([*_cells(row, swept), row["solver"], *(str(row[name]) for name in names)])
+        rows.append([*cells(row, swept), row["solver"], *(str(row[name]) for name in names)])
     return aligned(rows, len(swept) + 1)
 
 
@@ -151,12 +132,11 @@ COUNTS = {"n": "n", "both": "both", "only_a": "first", "only_b": "second", "neit
 PAIRED = ("paired", "outcome", *COUNTS.values(), "difference", "McNemar p", "left out", "cost ratio")
 
 
-def paired_lines(rows: pd.DataFrame, swept: Sequence[str] | None = None) -> str:
-    """Comparisons for a terminal; `swept` names the swept variables to show, by default all that have a value."""
-    swept = _swept(rows) if swept is None else swept
-    lines = [[*_headers(swept), *PAIRED]]
-    for _, row in rows.iterrows():
-        lines.append([*_cells(row, swept), *_pair(row)])
+def paired_lines(rows: pd.DataFrame, swept: Sequence[str]) -> str:
+    """Comparisons for a terminal, with the swept variables `swept`; none without a trial that counts."""
+    lines = [[*headers(swept), *PAIRED]]
+    for _, row in rows[rows["n"] > 0].iterrows():
+        lines.append([*cells(row, swept), *_pair(row)])
     return aligned(lines, len(swept) + 1)
 
 
@@ -172,19 +152,26 @@ def _pair(row: pd.Series) -> list[str]:
     return [pair, row["outcome"], *counts, difference, p_value, str(left_out), ratio]
 
 
+def printed(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:
+    """The tables that a paper prints: rates and effort, and comparisons where there are any."""
+    return [_printed_summary(summary), *([printed_pairs(paired)] if (paired["n"] > 0).any() else [])]
+
+
 def _printed_summary(summary: pd.DataFrame) -> pd.DataFrame:
-    swept = _swept(summary)
+    swept = swept_of(summary)
     columns = [(header, (median, p90, form)) for header, median, p90, form in EFFORT if header in PRINTED]
     rows = []
     for _, row in summary.iterrows():
-        cells = [row["scenario"], row["model"], *_cells(row, swept), row["solver"]]
-        cells += [_rate(row, name) for name in OUTCOMES]
-        rows.append([*cells, *(_measured(row, *parts) for _, parts in columns)])
-    headers = [header for header, _ in columns]
-    return pd.DataFrame(rows, columns=[*TASK, *_headers(swept), "solver", *OUTCOMES, *headers])
+        rates = [rate(row, name) for name in OUTCOMES]
+        measured = [_measured(row, *parts) for _, parts in columns]
+        rows.append([row["scenario"], row["model"], *cells(row, swept), row["solver"], *rates, *measured])
+    heads = [*TASK, *headers(swept), "solver", *OUTCOMES, *(header for header, _ in columns)]
+    return pd.DataFrame(rows, columns=heads)
 
 
-def _printed_pairs(paired: pd.DataFrame) -> pd.DataFrame:
-    swept = _swept(paired)
-    rows = [[row["scenario"], row["model"], *_cells(row, swept), *_pair(row)] for _, row in paired.iterrows()]
-    return pd.DataFrame(rows, columns=[*TASK, *_headers(swept), *PAIRED])
+def printed_pairs(paired: pd.DataFrame) -> pd.DataFrame:
+    """The comparisons that a paper prints: those with a trial that both flew and that defines the outcome."""
+    paired = paired[paired["n"] > 0]
+    swept = swept_of(paired)
+    rows = [[row["scenario"], row["model"], *cells(row, swept), *_pair(row)] for _, row in paired.iterrows()]
+    return pd.DataFrame(rows, columns=[*TASK, *headers(swept), *PAIRED])

@@ -12,7 +12,7 @@ import pandas as pd
 
 from torchgco.experiments.identity import CLOSED_LOOP, flat
 from torchgco.experiments.runs import Run
-from torchgco.experiments.statistics import TASK
+from torchgco.experiments.statistics import TASK, are_missions
 
 # Prefixes of keys that define the problems and missions; `model` has keys for solvers, too.
 SWEPT = ("scenario.", "model.vehicle.", "mission.", "plant.")
@@ -25,13 +25,16 @@ MOST = 3  # settings named in a label
 def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
     """For each run the columns that its rows get: the swept variables of each row's (scenario, model).
 
-    A key is swept where all runs of a (scenario, model) have it, with different values. `scenario.path` is left
-    out while the layouts agree. Runs that differ in their layouts without such a key are distinguished by their folder.
+    A key is swept where all runs of a (scenario, model) have it, with different values; runs of missions are
+    compared with each other only, as others lack their keys. `scenario.path` is left out while the layouts agree. Runs
+    that differ in their layouts without such a key are distinguished by their folder.
     """
     tasks = [list(run.trials[TASK].drop_duplicates().itertuples(index=False, name=None)) for run in runs]
+    missions = [bool(are_missions(run.trials).all()) for run in runs]
     chosen: dict[tuple[int, Any], dict[str, Any]] = {}
-    for task in dict.fromkeys(task for found in tasks for task in found):
-        members = [i for i, found in enumerate(tasks) if task in found]
+    of_kind = [(task, kind) for found, kind in zip(tasks, missions, strict=True) for task in found]
+    for task, kind in dict.fromkeys(of_kind):
+        members = [i for i, found in enumerate(tasks) if task in found and missions[i] == kind]
         tables = [_rows_of(runs[i].trials, task, len(tasks[i])) for i in members]
         cells = _swept([runs[i] for i in members], tables)
         chosen |= {(i, task): held for i, held in zip(members, cells, strict=True)}

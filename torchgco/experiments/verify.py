@@ -1,14 +1,16 @@
 """Confirms the tables of finished studies from their stored controls, layouts and settings.
 
 The controls of every row are simulated again, open-loop, with the model of study.json, and judged by `torchgco.judge`,
-which shares no code with a solver. Missions are confirmed from the log in mission.parquet, as far as it goes.
+which shares no code with a solver. Missions are confirmed from the log in mission.parquet, as far as it goes. Then
+summary.csv and paired.csv are counted again from the table.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from torchgco.errors import InputError
 from torchgco.experiments.build import vehicle_of
 from torchgco.experiments.files import checksum, damaged
 from torchgco.experiments.identity import Manifest, closed_loop, layout_digests
+from torchgco.experiments.kinds import joined, parts_of
 from torchgco.experiments.mission_flight import LOST
 from torchgco.experiments.records import (
     DONE,
@@ -42,23 +45,43 @@ TOLERANCE = 1e-8  # of numbers, relative above 1: other processors and libraries
 BATCH = 256  # layouts judged at once
 ROW = ["solver", "layout"]
 IDENTITY = ("model", "seed", "version", "device", "dtype", "layout_digest", "settings_digest")
-NOT_LOGGED = ("outcome", "flight_time", "clearance", "goal_distance", "energy", "iterations")
+KEYS = pd.Index(["solver", "solver_a", "solver_b", "outcome"])  # of a row of summary.csv or paired.csv
+
+
+@dataclass(frozen=True)
+class Table:
+    """What was confirmed of one table of a study.
+
+    rows         of the table
+    columns      that were computed again and compared
+    others       its other columns, which only the checksum of the file guards, if anything
+    differences  names of the row (solver and layout), column, held and computed, in the order of the table; no rows:
+                 all columns are confirmed
+    """
+
+    name: str
+    rows: int
+    columns: tuple[str, ...]
+    others: tuple[str, ...]
+    differences: pd.DataFrame
 
 
 @dataclass(frozen=True)
 class Verification:
-    """What was confirmed of one study.
+    """What was confirmed of one study: its trials.parquet, and where no row differs, summary.csv and paired.csv.
 
-    rows         of its table
-    columns      that were computed again and compared
-    differences  columns solver, layout, column, held and computed, in the order of the table; no rows: all confirmed
+    absent  of these two, those that should exist, but don't
     """
 
     folder: Path
-    rows: int
-    columns: tuple[str, ...]
-    differences: pd.DataFrame
+    tables: tuple[Table, ...]
+    absent: tuple[str, ...]
     missions: bool
+
+    @property
+    def differs(self) -> bool:
+        """Whether any value differs from the one computed again."""
+        return any(len(table.differences) for table in self.tables)
 
 
 def verify(folders: Iterable[str | os.PathLike[str]]) -> tuple[list[Verification], list[str]]:
@@ -103,7 +126,30 @@ def verify_study(folder: Path) -> Verification:
     differences = _differences(held, computed)
     if differences.empty:  # nothing that can be computed differs: has any other column been changed?
         _check_checksums(folder)
-    return Verification(folder, len(held), tuple(computed.columns), differences, missions)
+    others = tuple(str(name) for name in held.columns if name not in computed.columns)
+    trials = Table(TRIALS, len(held), tuple(computed.columns), others, differences)
+    # Of rows that differ, the tables that count them would differ, too.
+    counted, absent = _counted(folder, held.reset_index()) if differences.empty else ([], ())
+    return Verification(folder, (trials, *counted), absent, missions)
+
+
+def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str, ...]]:
+    """What is confirmed of summary.csv and paired.csv, counted again from the table of trials; and which are absent."""
+    found, absent = [], []
+    for name, table in joined(parts_of(trials)).items():
+        path = folder / f"{name}.csv"
+        if not path.is_file():
+            absent += [path.name] if len(table) else []
+            continue
+        held, computed = _read(path, pd.read_csv), pd.read_csv(io.StringIO(table.to_csv(index=False)))
+        if list(held.columns) != list(computed.columns) or len(held) != len(computed):
+            shapes = (f"{len(some)} rows, {len(some.columns)} columns" for some in (held, computed))
+            differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])
+        else:
+            keys = pd.MultiIndex.from_frame(computed[KEYS.intersection(computed.columns)])
+            differences = _differences(held.set_axis(keys), computed.set_axis(keys))
+        found.append(Table(path.name, len(computed), tuple(computed.columns), (), differences))
+    return found, tuple(absent)
 
 
 def _read(path: Path, reader: Any) -> Any:
@@ -208,7 +254,7 @@ def _differences(held: pd.DataFrame, computed: pd.DataFrame) -> pd.DataFrame:
         values = held[name] if name in held.columns else pd.Series(pd.NA, index=held.index)
         differ = np.flatnonzero(~_equal(values, computed[name]))
         found += [(i, *held.index[i], name, values.iloc[i], computed[name].iloc[i]) for i in differ.tolist()]
-    names = [*ROW, "column", "held", "computed"]
+    names = [*held.index.names, "column", "held", "computed"]
     return pd.DataFrame(sorted(found, key=lambda row: row[0]), columns=["row", *names])[names]
 
 
@@ -223,10 +269,3 @@ def _equal(held: pd.Series, computed: pd.Series) -> np.ndarray:
     equal, known = pd.isna(a) & pd.isna(b), ~pd.isna(a) & ~pd.isna(b)
     equal[known] = (a[known] == b[known]).astype(bool)
     return equal
-
-
-def unconfirmed(held: Verification) -> Mapping[str, str]:
-    """For readers: columns that can't be confirmed, with the reason."""
-    if not held.missions:
-        return {}
-    return {", ".join(NOT_LOGGED): "missions are judged at time steps, of which the log has only the control steps"}

@@ -32,7 +32,7 @@ def run_all(
     options: tuple[Any, ...],
     keep: Callable[[Result], None],
     say: Callable[[str], None],
-    watch: Callable[[float, float], None],
+    watch: Callable[[float], None],
 ) -> None:
     """`keep(work(job))` for every job, `work` in other processes, `keep` in this one, in any order.
 
@@ -42,16 +42,16 @@ def run_all(
     Args:
         prepare, options: `prepare(*options)` runs first in every process.
         say: receives a line for each broken pool.
-        watch: called every POLL seconds with the sums of what `Shared` bars counted in all jobs: trials and passes.
+        watch: called every POLL seconds with the sum of what `Shared` bars counted in all jobs: trials.
 
     Raises:
         InputError: the last pool broke, too.
     """
     left = dict(enumerate(jobs))
-    counts = CONTEXT.RawArray("d", 2 * len(left))  # of trials and passes, by job: each is written by one process
+    counts = CONTEXT.RawArray("d", len(left))  # of trials, by job: each is written by one process
 
     def look() -> None:
-        watch(sum(counts[::2]), sum(counts[1::2]))
+        watch(sum(counts))
 
     for number in range(NEW_POOLS + 1):
         _run_pool(work, left, min(processes, len(left)), (prepare, options, counts), keep, look)
@@ -147,7 +147,7 @@ def _interrupts_noted() -> Iterator[_Noted]:
 
 
 class Shared(NoBar):
-    """The bar of a worker process: counts trials and passes of its job where the parent sees them."""
+    """The bar of a worker process: counts the trials of its job where the parent sees them."""
 
     counts: ClassVar[Any] = None  # of all jobs; None outside worker processes
     job: ClassVar[int] = 0
@@ -155,12 +155,7 @@ class Shared(NoBar):
     def update(self, n: float) -> None:
         """Count trials."""
         if self.counts is not None:
-            self.counts[2 * self.job] += n
-
-    def set_postfix(self, ordered_dict: Any, refresh: bool) -> None:
-        """Count a pass."""
-        if self.counts is not None:
-            self.counts[2 * self.job + 1] += 1
+            self.counts[self.job] += n
 
 
 def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...], counts: Any) -> None:
@@ -171,7 +166,7 @@ def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...], counts
 
 def _work(work: Callable[[Job], Result], job: Job, number: int) -> Result:
     Shared.job = number
-    Shared.counts[2 * number] = 0.0  # a former pool may have died in this job
+    Shared.counts[number] = 0.0  # a former pool may have died in this job
     return work(job)
 
 

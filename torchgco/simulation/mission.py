@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.bodies import CONTACT_FACTOR
+from torchgco.constraints.boxes import BoundBoxes
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.dynamics.base import Dynamics
 from torchgco.errors import InputError
@@ -167,10 +168,10 @@ class _Flight:
             began = time.perf_counter()
             tracking = self.mission.tracker.track(seen, reference, j * self.plant.dt, tracking)
             seconds = (time.perf_counter() - began) / self.rows.numel()
-            x = self.plant.advance(self.x, tracking.commands, self.force[self.rows, step])
+            flew, x = ~ended, self.plant.advance(self.x, tracking.commands, self.force[self.rows, step])
             self.x = torch.where(ended.unsqueeze(-1), self.x, x)
             ended |= self._ends((step * self.substeps + j + 1) * self.plant.dt)
-            self.log.add_sample(self.rows, step, j, self.x, tracking, seconds)
+            self.log.add_sample(self.rows, step, j, self.x, tracking, seconds, flew)
         assert tracking is not None
         return tracking, ended
 
@@ -195,12 +196,25 @@ class _Flight:
         self.x, self.rows, self.ids = take((self.x, self.rows, self.ids), stay)
 
 
+def other_obstacles(problem: Problem) -> str:
+    """The obstacles of a problem that missions can't fly among, in words; empty where there are spheres alone."""
+    words = []
+    for part in problem.geometric:
+        if isinstance(part, BoundBoxes):
+            sides = (part.half_sizes[~part.absent] > 0).sum(-1)
+            words.append("trunks (capsules)" if bool((sides <= 1).all()) else "boxes")
+        elif not isinstance(part, BoundSpheres):
+            words.append(type(part).__name__)
+    return " and ".join(dict.fromkeys(words))
+
+
 def _spheres(problem: Problem) -> list[tuple[Tensor, Tensor | None, Tensor]]:
     """Centres (B, M, 3), velocities and distances of contact (B, M), m, of the problems' spheres."""
+    if others := other_obstacles(problem):
+        raise InputError("constraints", "spheres alone, as missions fly among no other obstacles so far", others)
     found = []
     for part in problem.geometric:
-        if not isinstance(part, BoundSpheres):
-            raise InputError("constraints", "spheres as the obstacles of a mission", type(part).__name__)
+        assert isinstance(part, BoundSpheres)
         contact = torch.where(part.absent, -torch.inf, CONTACT_FACTOR * part.inflated_radii)
         found.append((part.centers, part.velocities, contact))
     return found
