@@ -19,7 +19,6 @@ def work(job: tuple[int, str]) -> int:
     number, path = job
     bar = Shared()
     bar.update(1)
-    bar.set_postfix_str("", False)
     if path == "always":
         time.sleep(1.0)  # the others are done by then
         os.kill(os.getpid(), signal.SIGKILL)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from tqdm import tqdm
 
 import torchgco
 from tests.experiments.commands import ROOT, TINY, command, problem_line
 from torchgco import kernels
+from torchgco.experiments import study
 from torchgco.experiments.build import compose, config_dir
 from torchgco.experiments.identity import decisive, plain
 from torchgco.experiments.records import COLUMNS
@@ -50,6 +54,25 @@ def test_a_study_writes_all_its_files(run, tmp_path) -> None:
     assert code == 0 and "nothing was flown again" in text
     code, _, err = run(*words, "seed=4")
     assert code == 2 and "seed is 3 there, 4 here" in problem_line(err)
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.usefixtures("without_report")
+def test_the_bar_counts_the_solved_problems(workers: int, run, monkeypatch) -> None:
+    monkeypatch.setattr(study, "tqdm", partial(tqdm, mininterval=0))
+    words = ["solver=al_ilqr", "study.baselines=[]", *TINY[:4], f"study.workers={workers}", "hydra.run.dir=out"]
+    code, _, err = run(*words)
+    assert code == 0 and ("solved 2/2" if workers == 1 else "solved 3/3") in err
+    assert "| 3/3 [" in err and "pass" not in err and ".0/" not in err
+
+
+def test_figures_may_be_left_out(run, tmp_path) -> None:
+    words = ["solver=hold", "study.baselines=[]", *TINY[:4], "study.workers=1", "hydra.run.dir=out"]
+    code, out, err = run(*words, "study.figures=false")
+    assert code == 0 and "reached" in out and "drawing" not in err
+    assert (tmp_path / "out" / "summary.csv").exists() and not (tmp_path / "out" / "figures").exists()
+    code, _, err = run(*words)
+    assert code == 0 and "drawing 4 figures" in err and (tmp_path / "out" / "figures" / "rates.png").exists()
 
 
 def test_the_configuration_chooses_the_kernels() -> None:

@@ -5,8 +5,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.trials import flights, trials
+from tests.trials import flights, missions, trials
 from torchgco.errors import InputError
+from torchgco.experiments.formats import format_report
+from torchgco.experiments.kinds import joined, parts_of
 from torchgco.experiments.merge import merge
 from torchgco.experiments.paired import compare
 from torchgco.experiments.report import main, write_report
@@ -214,3 +216,83 @@ def test_a_merged_table_is_written_with_text_and_can_be_merged_again(tmp_path: P
     # Older versions of pandas read a missing text as None, and merge it to NaN.
     same = [table.astype(object).where(table.notna(), None) for table in (again, given)]
     pd.testing.assert_frame_equal(*same)
+
+
+def test_missions_have_tables_of_their_own_beside_trajectories() -> None:
+    both = trials(*flights("gco", HITS), *missions("gco", "RRRC"), *missions("al_ilqr", "RCTD"))
+    single, flown = parts_of(both)
+    assert (single.kind, flown.kind) == ("trajectory", "mission")
+    assert len(single.trials) == 32 and len(flown.trials) == 8
+    text = format_report([single, flown], "table")
+    above, below = text.split("missions in forest (quadrotor), seed 0")
+    assert "30/32 94 %" in above and "viol. ok" in above and "FEASIBLE" not in above
+    assert "viol. ok" not in below and "cost" not in below and "success" not in below
+    outcomes, effort, pairs = below.strip().split("\n\n")
+    assert outcomes.splitlines()[0].split() == ["solver", "n", "REACHED", "COLLISION", "TIMEOUT", "DIVERGED"]
+    assert " ".join(outcomes.splitlines()[1].split()).startswith(
+        "gco 4 3/4 75 % [30, 95] 1/4 25 % [5, 70] 0/4 0 % [0, 49]"
+    )
+    assert effort.splitlines()[1].split()[:8] == ["gco", "6.00", "s", "0.050", "m", "501", "J", "4"]
+    assert pairs.splitlines()[1].split()[:5] == ["gco", "-", "al_ilqr", "reached", "4"]
+
+
+def test_the_numbers_of_missions_are_in_the_summary() -> None:
+    tables = joined(parts_of(trials(*flights("gco", HITS), *missions("gco", "RRCT"))))
+    summary = tables["summary"].set_index("kind")
+    assert summary.index.tolist() == ["trajectory", "mission"] and summary["n"].tolist() == [32, 4]
+    row = summary.loc["mission"]
+    ends = {name: row[f"{name}_count"] for name in ("reached", "collision", "timeout", "diverged")}
+    assert ends == {"reached": 2, "collision": 1, "timeout": 1, "diverged": 0}
+    assert (row["collision_low"], row["collision_high"]) == pytest.approx((0.0456, 0.6994), abs=1e-4)
+    assert row["flight_time"] == 5.5 and row["missed_deadlines"] == 2.5 and row["missions_at_once"] == 4
+    assert summary.loc["trajectory", "collision_count"] is pd.NA and summary["collision_count"].dtype == "Int64"
+
+
+@pytest.mark.parametrize("form", ["csv", "json", "markdown", "latex"])
+def test_missions_are_in_every_format(form: str) -> None:
+    text = format_report(parts_of(trials(*flights("gco", HITS), *missions("gco", "RRCT"))), form)
+    assert "COLLISION" in text if form in ("markdown", "latex") else "collision_rate" in text
+
+
+def test_missions_keep_their_columns_beside_a_study(tmp_path: Path, capsys) -> None:
+    """Without keys of missions in the other study, rows were named by their folders."""
+    base = "scenario: {{name: forest, num_obstacles: 10}}\nmodel: {{vehicle: {{name: quadrotor}}}}\n{}"
+    for wind in (0.0, 2.0):
+        config = base.format(f"mission: {{disturbance: {{wind: {wind}}}}}\nplant: {{mass_error: 0.0}}")
+        digests = {"layout_digest": f"mission {wind}", "settings_digest": "one", "success": pd.NA}
+        study(tmp_path / f"wind{wind}", *missions("gco", "RRC", **digests), config=config)
+    digests = {"layout_digest": "single", "settings_digest": "one"}
+    study(tmp_path / "single", *flights("gco", HITS, **digests), config=base.format(""))
+    merged = merge([tmp_path])
+    assert [name for name in merged.columns if "." in name] == ["mission.disturbance.wind"]
+    assert merged.groupby("mission.disturbance.wind", dropna=False).size().to_dict() == {0.0: 3, 2.0: 3, pd.NA: 32}
+    assert main([str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "wind  solver" in text and "hydra.run.dir" not in text
+    written = {path.name for path in (tmp_path / "report" / "figures").iterdir()}
+    single = {"rates.png", "clearance.png", "violation.png"}
+    assert written - single == {"outcomes.png", "outcomes-mission.disturbance.wind.png", "missions-clearance.png"}
+
+
+def test_missions_of_several_planners_have_no_success(tmp_path: Path) -> None:
+    more = {"layout_digest": "one", "success": pd.NA, "best_from": None}
+    rows = [*missions("gco", "RR", settings_digest="a", **more), *missions("mine", "RR", settings_digest="b", **more)]
+    study(tmp_path / "a", *rows)
+    merged = merge([tmp_path])
+    assert merged["success"].isna().all() and merged["best_from"].isna().all()
+
+
+def test_a_single_mission_has_no_figure_of_shares_or_distributions(tmp_path: Path, capsys) -> None:
+    study(tmp_path / "a", *missions("gco", "R"))
+    assert main([str(tmp_path)]) == 0
+    assert not (tmp_path / "report" / "figures").exists() and "1/1 100 %" in capsys.readouterr().out
+
+
+def test_pairs_without_a_trial_are_not_printed_and_whole_numbers_have_no_point() -> None:
+    rows = [*flights("gco", HITS), *flights("mine", HITS)]
+    summary, pairs = summarise(trials(*rows)), compare(trials(*({**row, "success": pd.NA} for row in rows)))
+    pairs.insert(2, "scenario.num_obstacles", 10.0)
+    summary.insert(2, "scenario.num_obstacles", 10.0)
+    text = format_table(summary, pairs)
+    assert "reached" in text.split("\n\n")[-1] and "success" not in text.split("\n\n")[-1]
+    assert "10.0" not in text and text.split("\n\n")[-1].splitlines()[1].startswith("10 ")

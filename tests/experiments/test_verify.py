@@ -107,7 +107,7 @@ def test_the_formats_give_what_was_confirmed_and_what_was_not(form: str, out, fl
         names = [set(table.loc[0, kind].split()) for kind in ("confirmed", "by_outcome", "checksum", "unconfirmed")]
         assert set().union(*names) == set(held.columns) - {"solver", "layout"} and not names[1] | names[3]
         assert table.loc[3, "by_outcome"].split() == ["status", "feasible", "reached"]
-        assert "flight_time" in table.loc[3, "unconfirmed"].split()
+        assert "flight_time" in table.loc[3, "unconfirmed"].split() and table.loc[1, "confirmed"] == "all"
     change(out, "cost", 0)
     assert main(["--verify", str(out), "--format", form]) == 1
     assert "1 value differs" in capsys.readouterr().err
@@ -202,7 +202,7 @@ def test_missions_are_confirmed_as_far_as_their_log_goes(flown, capsys) -> None:
     assert text.startswith("2 rows confirmed\n") and "not confirmed: iterations, outcome, flight_time" in text.replace(
         "clearance, goal_distance, iterations", "iterations"
     )
-    assert "agree with the outcome: status, feasible, reached\n" in text and "1 rows of summary.csv" in text
+    assert "agree with the outcome: status, feasible, reached\n" in text and "1 row of summary.csv confirmed" in text
     kept = (flown / "trials.parquet").read_bytes()
     for column in ("reached", "status", "violation", "clearance_knots", "planner_seconds_p99", "layout_digest"):
         change(flown, column, 1)

@@ -44,7 +44,7 @@ def test_a_line_per_solver_runs_through_its_rates() -> None:
 def test_other_swept_variables_have_rows_of_panels() -> None:
     figure, _ = drawn([10, 20], other=(0.0, 0.5))
     titles = [ax.get_title(loc="left") for ax in figure.axes]
-    assert len(titles) == 8 and "gust 0.0" in titles[0] and "gust 0.5" in titles[4]
+    assert len(titles) == 8 and titles[0].endswith("gust 0") and "gust 0.5" in titles[4]
 
 
 def test_a_variable_of_text_gives_groups_of_bars() -> None:

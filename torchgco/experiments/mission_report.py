@@ -82,8 +82,8 @@ def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Cal
         path = folder / "figures" / f"{name}.png"
         held[name] = lambda: write(path, lambda file: save(figure(), file, dpi=110))
 
-    if several(trials):
-        add("outcomes", lambda: draw.outcomes_figure(trials))
+    if len(shown := several(trials)):
+        add("outcomes", lambda: draw.outcomes_figure(shown))
     flown = _Flown.read(folder)
     layouts = Layouts.load(folder / LAYOUTS)
     for i, number in enumerate(layouts.ids.tolist() if flown else []):

@@ -60,7 +60,7 @@ def format_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
             blocks[-1] += f"\n{DIVIDED}"
         rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
         if (rows["n"] > 0).any():
-            blocks.append(paired_lines(rows, swept))
+            blocks.append(paired_lines(rows, swept, costs=False))
     return "\n\n".join(blocks)
 
 
@@ -71,7 +71,11 @@ def printed_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.Dat
         rows.append([row["scenario"], row["model"], *cells(row, swept), row["solver"], row["n"]])
         rows[-1] += [*(rate(row, name.lower()) for name in Outcome.__members__), *_measured(row)]
     heads = [*TASK, *headers(swept), "solver", "n", *Outcome.__members__, *(head for head, *_ in EFFORT)]
-    return [pd.DataFrame(rows, columns=heads), *([printed_pairs(paired)] if (paired["n"] > 0).any() else [])]
+    return [pd.DataFrame(rows, columns=heads), *_printed_pairs(paired)]
+
+
+def _printed_pairs(paired: pd.DataFrame) -> list[pd.DataFrame]:
+    return [printed_pairs(paired).iloc[:, :-1]] if (paired["n"] > 0).any() else []  # without the ratio of costs
 
 
 def _outcomes(task: pd.DataFrame, swept: Sequence[str]) -> str:

@@ -39,14 +39,17 @@ def drawings(part: Part) -> Drawings:
         summary = again(trials)
     if not mission:
         held["rates"] = lambda: rates_figure(summary)
-    elif several(trials):
-        held["outcomes"] = lambda: outcomes_figure(trials)
+    elif len(shown := several(trials)):
+        held["outcomes"] = lambda: outcomes_figure(shown)
     return held | _distributions(trials, "missions-" if mission else "")
 
 
-def several(trials: pd.DataFrame) -> bool:
-    """Whether a solver flew more than one mission of a task, so that shares say something."""
-    return bool((trials.groupby([*task_columns(trials), "solver"], dropna=False, observed=True).size() > 1).any())
+def several(trials: pd.DataFrame) -> pd.DataFrame:
+    """The missions of those tasks in which a solver flew more than one: shares of a single mission say nothing."""
+    tasks = task_columns(trials)
+    counts = trials.groupby([*tasks, "solver"], sort=False, dropna=False, observed=True)["layout"].transform("size")
+    most = trials.assign(_n=counts).groupby(tasks, sort=False, dropna=False, observed=True)["_n"].transform("max")
+    return trials[most > 1]
 
 
 def _distributions(trials: pd.DataFrame, prefix: str) -> Drawings:

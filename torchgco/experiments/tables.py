@@ -132,11 +132,15 @@ COUNTS = {"n": "n", "both": "both", "only_a": "first", "only_b": "second", "neit
 PAIRED = ("paired", "outcome", *COUNTS.values(), "difference", "McNemar p", "left out", "cost ratio")
 
 
-def paired_lines(rows: pd.DataFrame, swept: Sequence[str]) -> str:
-    """Comparisons for a terminal, with the swept variables `swept`; none without a trial that counts."""
-    lines = [[*headers(swept), *PAIRED]]
+def paired_lines(rows: pd.DataFrame, swept: Sequence[str], costs: bool = True) -> str:
+    """Comparisons for a terminal, with the swept variables `swept`; none without a trial that counts.
+
+    costs  False: without the ratio of costs
+    """
+    width = len(PAIRED) if costs else len(PAIRED) - 1
+    lines = [[*headers(swept), *PAIRED[:width]]]
     for _, row in rows[rows["n"] > 0].iterrows():
-        lines.append([*cells(row, swept), *_pair(row)])
+        lines.append([*cells(row, swept), *_pair(row)[:width]])
     return aligned(lines, len(swept) + 1)
 
 

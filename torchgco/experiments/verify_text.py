@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
@@ -20,13 +20,23 @@ def confirmed_text(studies: Sequence[Verification]) -> str:
     """The values that differ, study by study, and what is confirmed of all others together."""
     right = [study for study in studies if not study.differs]
     where = f" in {len(right)} studies" if len(right) > 1 else ""
-    lines = [*difference_texts(studies), f"{sum(study.tables[0].rows for study in right)} rows confirmed{where}"]
-    lines += list(dict.fromkeys(f"  {line}" for study in right for line in _columns(study)))
+    lines = [*difference_texts(studies), f"{_rows(study.tables[0].rows for study in right)} confirmed{where}"]
+    for kind in (False, True):
+        of_kind = [study for study in right if study.missions == kind]
+        if 0 < len(of_kind) < len(right):
+            rows = _rows(study.tables[0].rows for study in of_kind)
+            lines.append(f"{rows} of {'missions' if kind else 'trajectories'}:")
+        lines += list(dict.fromkeys(f"  {line}" for study in of_kind for line in _columns(study)))
     for name in ("summary.csv", "paired.csv"):
         counted = [table.rows for study in right for table in study.tables if table.name == name]
-        lines += [f"{sum(counted)} rows of {name} confirmed"] if counted else []
+        lines += [f"{_rows(counted)} of {name} confirmed"] if counted else []
     lines += [f"not confirmed: {study.folder / name}, which is missing" for study in right for name in study.absent]
     return "\n".join(lines)
+
+
+def _rows(counts: Iterable[int]) -> str:
+    total = sum(counts)
+    return "1 row" if total == 1 else f"{total} rows"
 
 
 def difference_texts(studies: Sequence[Verification]) -> list[str]:
@@ -38,14 +48,16 @@ def difference_texts(studies: Sequence[Verification]) -> list[str]:
 def confirmed_frame(studies: Sequence[Verification]) -> pd.DataFrame:
     """A row per study and file.
 
-    Columns: `study`, `file`, `rows`, `differing` values, and the names of the columns that are `confirmed`, that follow
-    from the outcome of a mission alone (`by_outcome`), that the `checksum` guards alone, and that are `unconfirmed`.
-    A table that is missing has no rows, and neither kind of columns.
+    Columns: `study`, `file`, `rows`, `differing` values, and the names of the columns that are `confirmed` ("all" where
+    there are no others), that follow from the outcome of a mission alone (`by_outcome`), that the `checksum` guards
+    alone, and that are `unconfirmed`. A table that is missing has no rows and no columns.
     """
     rows = []
     for study in studies:
         for table in study.tables:
-            held = {name: " ".join(names) for name, names in _sorted(study, table).items()}
+            names = _sorted(study, table)
+            held = {kind: " ".join(found) for kind, found in names.items()}
+            held |= {} if any(found for kind, found in names.items() if kind != "confirmed") else {"confirmed": "all"}
             first = {"study": str(study.folder), "file": table.name, "rows": table.rows}
             rows.append({**first, "differing": len(table.differences), **held})
         empty = dict.fromkeys(("confirmed", "by_outcome", "checksum", "unconfirmed"), "")
@@ -84,7 +96,7 @@ def _differences(study: Verification, table: Table) -> str:
     place = place if table is study.tables[0] else place / table.name
     rows = [[str(value) for value in row] for row in table.differences.head(DIFFERENT).to_numpy().tolist()]
     values = "1 value differs" if count == 1 else f"{count} values differ"
-    lines = [f"{place}: {values} in {table.rows} rows"]
+    lines = [f"{place}: {values} in {_rows([table.rows])}"]
     lines.append(aligned([list(table.differences.columns), *rows], 1))
     more = count - len(rows)
     return "\n".join([*lines, *([f"... and {more} more"] if more else [])])

@@ -85,8 +85,13 @@ def tasks_of(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     swept = [name for name in table.columns if "." in str(name)]
     groups = table.groupby(["scenario", "model", *swept], sort=False, dropna=False, observed=True)
     for (scenario, model, *values), rows in groups:
-        more = [f"{name.split('.')[-1]} {value}" for name, value in zip(swept, values, strict=True) if pd.notna(value)]
+        more = [_setting(str(name), value) for name, value in zip(swept, values, strict=True) if pd.notna(value)]
         yield ", ".join([f"{scenario} ({model})", *more]), rows
+
+
+def _setting(name: str, value: object) -> str:
+    words = name.split(".")[-1].replace("_", " ")
+    return f"{words} {value:g}" if isinstance(value, float) else f"{words} {value}"
 
 
 def save(figure: Figure, path: str | os.PathLike[str] | IO[bytes], dpi: int = 150) -> Path | None:
