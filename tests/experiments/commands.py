@@ -34,7 +34,8 @@ def begin(*words: str, cwd: Path) -> subprocess.Popen[str]:
 
 
 def problem_line(err: str) -> str:
-    """The line of an error: the only line of `err` but for the progress bar."""
-    lines = [line for line in err.splitlines() if line.strip() and "trial/s" not in line and "s/trial" not in line]
+    """The line of an error: the only line of `err` but for the progress bars."""
+    bars = ("trial/s", "s/trial", "figure/s", "s/figure")
+    lines = [line for line in err.splitlines() if line.strip() and not any(bar in line for bar in bars)]
     assert len(lines) == 1, err
     return lines[0]

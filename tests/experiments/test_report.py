@@ -218,7 +218,7 @@ def test_a_merged_table_is_written_with_text_and_can_be_merged_again(tmp_path: P
     pd.testing.assert_frame_equal(*same)
 
 
-def test_missions_have_tables_of_their_own_beside_trajectories() -> None:
+def test_missions_have_tables_of_their_own_next_to_trajectories() -> None:
     both = trials(*flights("gco", HITS), *missions("gco", "RRRC"), *missions("al_ilqr", "RCTD"))
     single, flown = parts_of(both)
     assert (single.kind, flown.kind) == ("trajectory", "mission")
@@ -254,7 +254,7 @@ def test_missions_are_in_every_format(form: str) -> None:
     assert "COLLISION" in text if form in ("markdown", "latex") else "collision_rate" in text
 
 
-def test_missions_keep_their_columns_beside_a_study(tmp_path: Path, capsys) -> None:
+def test_missions_keep_their_columns_next_to_a_study(tmp_path: Path, capsys) -> None:
     """Without keys of missions in the other study, rows were named by their folders."""
     base = "scenario: {{name: forest, num_obstacles: 10}}\nmodel: {{vehicle: {{name: quadrotor}}}}\n{}"
     for wind in (0.0, 2.0):

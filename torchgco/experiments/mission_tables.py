@@ -33,7 +33,9 @@ def mission_lines(trials: pd.DataFrame) -> str:
             f"planner {1000 * row.planner_seconds_median:.0f} ms (99 %: {1000 * row.planner_seconds_p99:.0f} ms) and "
             f"tracker {1000 * row.tracker_seconds_median:.0f} ms"
         )
-        if row.batch_size > 1:
+        if row.outer_iterations == 0:
+            times = "no plan made"
+        elif row.batch_size > 1:
             times += f" per mission of a batch of {row.batch_size}"
         else:
             ending = "" if row.missed_deadlines == 1 else "s"
