@@ -62,12 +62,10 @@ def _guess(problem: Problem) -> Tensor:
         middle, outside = rest.clone(), torch.zeros_like(rest, dtype=torch.bool)
         for bounds in problem.constraints:
             if isinstance(bounds, ControlBounds):
-                lower, upper = (bound.unsqueeze(1) for bound in (bounds.lower, bounds.upper))
                 at = torch.zeros(problem.N, dtype=torch.bool, device=rest.device)
                 at[bounds.knots] = True
-                at = at.view(1, -1, 1)
-                outside |= at & ((rest < lower) | (rest > upper))
-                center = torch.where(torch.isfinite(upper - lower), 0.5 * (lower + upper), rest.clamp(lower, upper))
-                middle = torch.where(at, center, middle)
+                breaks = (rest < bounds.lower.unsqueeze(1)) | (rest > bounds.upper.unsqueeze(1))
+                outside |= at.view(1, -1, 1) & breaks
+                middle = torch.where(at.view(1, -1, 1), bounds.middle(rest), middle)
         lost = ~torch.isfinite(rollout.open_loop(problem.dynamics, problem.x0, rest)).flatten(1).all(-1)
         return torch.where(outside.flatten(1).any(-1).logical_or(lost).view(-1, 1, 1), middle, rest)

@@ -12,6 +12,8 @@ from torchgco.constraints.base import Constraint, resolve_knots
 from torchgco.errors import InputError
 from torchgco.shapes import Dimensions, check_shape, tensor
 
+UNBOUNDED = 1e20  # stands for infinity in bound constraints
+
 
 @dataclass(frozen=True)
 class _Bounds(Constraint):
@@ -47,9 +49,20 @@ class _Bounds(Constraint):
         if above.numel() + below.numel() == 0:
             raise InputError(name, "at least one finite bound", "none")
         # A component may be bounded in one problem and free in another, where 0 * infinity would give NaN.
-        lower, upper = lower.nan_to_num(neginf=-1e20), upper.nan_to_num(posinf=1e20)
+        lower, upper = lower.nan_to_num(neginf=-UNBOUNDED), upper.nan_to_num(posinf=UNBOUNDED)
         knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", lower.device)
         return replace(self, lower=lower, upper=upper, knots=knots, above=_range(above), below=_range(below))
+
+    @property
+    def half_range(self) -> Tensor:
+        """Half the distance between the bounds, (B|1, size); infinite where one is missing."""
+        both = (self.lower > -UNBOUNDED) & (self.upper < UNBOUNDED)
+        return torch.where(both, 0.5 * (self.upper - self.lower), torch.inf)
+
+    def middle(self, z: Tensor) -> Tensor:
+        """The middle of the bounds in the shape of z (B, K, size); z within them where one is missing."""
+        lower, upper, half = (part.unsqueeze(1) for part in (self.lower, self.upper, self.half_range))
+        return torch.where(torch.isfinite(half), 0.5 * (lower + upper), torch.clamp(z, lower, upper))
 
     def _checked(self, value: Any, name: str, size: int, dims: Dimensions, refused: float) -> Tensor:
         bound = tensor(value, name, dims.like)

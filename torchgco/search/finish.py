@@ -74,6 +74,6 @@ def _half_ranges(problem: Problem, U: Tensor) -> Tensor:
     half = U.abs().amax(1, keepdim=True).clamp(min=1.0)
     for bounds in problem.constraints:
         if isinstance(bounds, ControlBounds):
-            own = 0.5 * (bounds.upper - bounds.lower).unsqueeze(1)
+            own = bounds.half_range.unsqueeze(1)
             half = torch.where(torch.isfinite(own), own, half)
     return half

@@ -1,0 +1,187 @@
+"""Solves that are on their way are finished, and a problem is called infeasible only where nothing can be gained."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco import (
+    ILQR,
+    AugmentedLagrangian,
+    ControlBounds,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    Problem,
+    Solution,
+    StateBounds,
+    Status,
+    kernels,
+    presets,
+)
+
+D, INF = torch.float64, math.inf
+LIMITS = torch.tensor([0.08, 0.12, 0.16], dtype=D)  # of Bryson and Denham's problem
+
+
+def effort(dt: float, *weights: float) -> FunctionCost:
+    R = torch.tensor(weights, dtype=D)
+    return FunctionCost(lambda x, u: 0.5 * dt * (R * u.square()).sum(-1))
+
+
+def ends_at(*state: float) -> FunctionConstraint:
+    goal = torch.tensor(state, dtype=D)
+    return FunctionConstraint(lambda x: x - goal, sense="equality", knots=[-1], name="end")
+
+
+def bryson_denham() -> Problem:
+    """The least effort from (0, 1) to (0, -1) in 1 s with x <= l; known: 4 / (9 l) for l <= 1/6 in continuous time."""
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), dim=-1), 2, 1, 0.01, "rk4")
+    upper = torch.stack((LIMITS, torch.full_like(LIMITS, INF)), dim=-1)
+    bounds = StateBounds(torch.full_like(upper, -INF), upper)
+    x0 = torch.tensor([[0.0, 1.0]], dtype=D).repeat(len(LIMITS), 1)
+    return Problem(model, effort(0.01, 1.0), [bounds, ends_at(0.0, -1.0)], x0, 100)
+
+
+def parking(B: int = 2) -> Problem:
+    """A car at rest that should stand beside its place: the violation is stationary there, for any penalty."""
+
+    def field(x: Tensor, u: Tensor) -> Tensor:
+        speed, angle = u[..., 0], x[..., 2]
+        return torch.stack((speed * angle.cos(), speed * angle.sin(), 2.0 * speed * u[..., 1].tan()), dim=-1)
+
+    x0 = torch.zeros(B, 3, dtype=D)
+    x0[:, 1] = torch.linspace(0.7, 1.2, B, dtype=D)
+    limits = ControlBounds([-1.0, -0.6], [1.0, 0.6])
+    return Problem(FunctionDynamics(field, 3, 2, 0.1, "rk4"), effort(0.1, 2.0, 0.6), [limits, ends_at(0, 0, 0)], x0, 60)
+
+
+def brachistochrone() -> Problem:
+    """The fastest slide to a point: the angle and the logarithm of the stage time are the controls."""
+
+    def step(x: Tensor, u: Tensor) -> Tensor:
+        h, slope = 0.02 * u[..., 1:].exp(), u[..., :1]
+        field = lambda x: torch.cat((x[..., 2:] * slope.cos(), x[..., 2:] * slope.sin(), -9.81 * slope.sin()), dim=-1)
+        half = x + 0.5 * h * field(x)
+        return x + h * field(half)
+
+    cost = FunctionCost(lambda x, u: 0.02 * u[..., 1].exp() + 1e-6 * u.square().sum(-1))
+    end = FunctionConstraint(lambda x: x[..., :2] - torch.tensor([1.5, -1.0], dtype=D), sense="equality", knots=[-1])
+    return Problem(FunctionDynamics(step, 3, 2, 0.02, "none"), cost, [end], torch.zeros(1, 3, dtype=D), 50)
+
+
+def feasible(problem: Problem, solution: Solution) -> bool:
+    X = torchgco.rollout.open_loop(problem.dynamics, problem.x0, solution.U)
+    return all(float(part.worst(X, solution.U).max()) <= 1e-3 for part in problem.constraints)
+
+
+@pytest.mark.parametrize("make", [bryson_denham, parking, brachistochrone])
+def test_what_a_limit_cut_off_is_finished(make) -> None:
+    problem = make()
+    whole = presets.gco(problem)
+    cut = torchgco.solve(problem, solver=replace(whole, finish=None))
+    done = torchgco.solve(problem)
+    assert not feasible(problem, cut) and feasible(problem, done)
+    assert set(done.statuses) <= {Status.CONVERGED, Status.FEASIBLE} and Status.INFEASIBLE not in cut.statuses
+
+
+def test_the_known_optimum_is_found() -> None:
+    problem = bryson_denham()
+    cost = torchgco.solve(problem).cost
+    # The discrete optimum lies a little above the continuous one: 1.0001 to 1.0008 times, says IPOPT.
+    torch.testing.assert_close(cost, 4.0 / (9.0 * LIMITS), rtol=5e-3, atol=0)
+
+
+def test_solves_that_ended_before_are_left_as_they_are() -> None:
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), dim=-1), 2, 1, 0.05, "rk4")
+    problem = Problem(model, effort(0.05, 1.0), [ends_at(1.0, 0.0)], torch.zeros(2, 2, dtype=D), 40)
+    with_it, without = (torchgco.solve(problem, solver=s) for s in (
+        presets.gco(problem), replace(presets.gco(problem), finish=None),
+    ))  # fmt: skip
+    assert without.statuses == [Status.CONVERGED] * 2
+    assert torch.equal(with_it.U, without.U) and torch.equal(with_it.iterations, without.iterations)
+
+
+def test_a_problem_without_a_solution_is_infeasible_and_soon() -> None:
+    """Too far for its controls: the penalty grows until nothing changes any more."""
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), dim=-1), 2, 1, 0.05, "rk4")
+    bounds, x0 = ControlBounds(-1.0, 1.0), torch.zeros(1, 2, dtype=D)
+    far = Problem(model, effort(0.05, 1.0), [bounds, ends_at(9.0, 0.0)], x0, 40)
+    near = replace(far, constraints=[bounds, ends_at(0.9, 0.0)])
+    lost, found = torchgco.solve(far), torchgco.solve(near)
+    assert lost.statuses == [Status.INFEASIBLE] and found.statuses == [Status.CONVERGED]
+    assert int(lost.outer_iterations.max()) < 60
+    cut = presets.al_ilqr(near).solve(near, torch.zeros(1, 40, 1, dtype=D))
+    assert Status.INFEASIBLE not in cut.statuses  # its limit, not the problem, ended the solve
+
+
+def test_a_problem_keeps_its_bits_in_any_batch() -> None:
+    whole, part = torchgco.solve(parking(3)), parking(3).take(torch.tensor([1]))
+    assert torch.equal(torchgco.solve(part, ids=torch.tensor([1])).U[0], whole.U[1])
+
+
+def test_short_steps_raise_the_regularisation() -> None:
+    problem = brachistochrone()
+    inner = ILQR(max_iterations=60)
+    runs = {}
+    for native in (True, False):
+        kernels.use_native(native)
+        try:
+            for share in (0.0, 0.125):
+                local = AugmentedLagrangian(replace(inner, damp_below=share), initial_penalty=1e3, record=True)
+                runs[native, share] = local.solve(problem, torch.zeros(1, 50, 2, dtype=D)).trace
+        finally:
+            kernels.use_native(True)
+    for native in (True, False):
+        plain, damped = runs[native, 0.0], runs[native, 0.125]
+        first = damped.index[(damped["alpha"] > 0) & (damped["alpha"] < 0.125)][0]
+        same = damped["inner"].shift(-1)[first] > 0
+        assert same and damped["regularisation"][first + 1] > damped["regularisation"][first]
+        assert not plain["alpha"].equals(damped["alpha"])
+    a, b = (runs[native, 0.125]["cost"].to_numpy()[:9] for native in (True, False))
+    assert abs(a - b).max() < 1e-6 * abs(a).max()
+
+
+def rocket() -> Problem:
+    """A rocket whose drag grows a thousandfold where it falls: without thrust the rollout overflows."""
+
+    def field(x: Tensor, u: Tensor) -> Tensor:
+        h, v = x.unbind(-1)
+        drag = 50.0 * v * v.abs() * torch.exp(-100.0 * h)
+        return torch.stack((v, u[..., 0] - drag - 1.0), dim=-1)
+
+    model = FunctionDynamics(field, 2, 1, 0.05, "rk4")
+    x0 = torch.tensor([[0.0, 0.0], [0.1, 0.0]], dtype=D)
+    return Problem(model, FunctionCost(lambda x, u: 1e-3 * u.square().sum(-1), lambda x: -x[..., 0]),
+                   [ControlBounds(0.0, 3.5)], x0, 60)  # fmt: skip
+
+
+def test_a_guess_that_overflows_starts_in_the_middle_of_the_bounds() -> None:
+    problem = rocket()
+    X = torchgco.rollout.open_loop(problem.dynamics, problem.x0, torch.zeros(2, 60, 1, dtype=D))
+    assert not bool(torch.isfinite(X).all())
+    solution = torchgco.solve(problem)
+    assert set(solution.statuses) <= {Status.CONVERGED, Status.FEASIBLE} and feasible(problem, solution)
+
+
+def test_a_guess_that_breaks_the_bounds_starts_in_their_middle() -> None:
+    """The stage time is a control with a positive lower bound: at rest no time would pass."""
+    seen = []
+
+    class Watch(AugmentedLagrangian):
+        def run(self, call):
+            seen.append(call.U0)
+            return super().run(call)
+
+    step = lambda x, u: x + u[..., 1:] * torch.cat((x[..., 1:], u[..., :1]), dim=-1)
+    model = FunctionDynamics(step, 2, 2, 0.1, "none")
+    cost = FunctionCost(lambda x, u: u[..., 1] + 0.1 * u.square().sum(-1), lambda x: x.square().sum(-1))
+    bounds = ControlBounds([-INF, 0.1], [2.0, 0.5])
+    problem = Problem(model, cost, [bounds], torch.ones(1, 2, dtype=D), 5)
+    torchgco.solve(problem, solver=Watch())
+    assert torch.equal(seen[0], torch.tensor([0.0, 0.3], dtype=D).expand(1, 5, 2))
