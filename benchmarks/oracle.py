@@ -22,7 +22,7 @@ import torch
 from benchmarks.families import DATA, EVERY, FAMILIES, Family
 from torchgco import compose, judge
 from torchgco.errors import InputError
-from torchgco.judge import SUCCESS_COST
+from torchgco.judge import near_best
 from torchgco.scenarios import Layouts
 
 # Solver configurations with overrides. `paths` refines 32 candidates along up to 24 paths, `early` at another pace.
@@ -114,7 +114,7 @@ def keep(path: Path, costs: np.ndarray, source: str) -> None:
     if lowered.any():
         replace(layouts, best_cost=best).save(path)
     known, median = int((~np.isnan(best)).sum()), np.nanmedian(best) if not np.isnan(best).all() else np.nan
-    missed = int((old > SUCCESS_COST * costs).sum())
+    missed = int((~near_best(old, costs)).sum())
     print(
         f"{path.stem}: {source} lowers {lowered.sum()} of {layouts.count}, {missed} by over 5 %; "
         f"paths on {known}, median {median:,.1f}",

@@ -27,7 +27,7 @@ from benchmarks.shortfalls_watch import Search, watching
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
 from torchgco import compose, judge, presets
-from torchgco.judge import SUCCESS_COST
+from torchgco.judge import near_best
 from torchgco.plotting.boxes import outlines
 from torchgco.problem import Problem
 from torchgco.scenarios import Layouts
@@ -83,7 +83,7 @@ def cause(best: float, sound: bool, costs: Sequence[float], searches: Sequence[S
 
 def within(best: float, costs: Sequence[float]) -> list[int]:
     """Numbers of the paths whose candidates end within 5 % of the best known cost."""
-    return [path for path, cost in enumerate(costs) if cost <= SUCCESS_COST * best]
+    return [path for path, cost in enumerate(costs) if near_best(cost, best)]
 
 
 def _sought(searches: Sequence[Search]) -> int:
@@ -132,7 +132,7 @@ def fly(family: Family, first: int | None, seed: int) -> tuple[pd.DataFrame, dic
     verdict = judge(task.problem, setup.solver.solve(task.problem, task.U0, seed=seed).U, task.goal, task.goal_radius)
     assert layouts.best_cost is not None
     best = torch.as_tensor(layouts.best_cost)
-    short = ~verdict.success(best) & ~(best.isnan() & verdict.sound)
+    short = ~torch.where(best.isnan(), verdict.sound, verdict.success(best.nan_to_num(0.0)))
     rows, examples = [], {}
     for i in range(task.problem.B):
         row: dict[str, Any] = {"family": family.name, "layout": i, "cause": None}

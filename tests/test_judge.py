@@ -1,5 +1,7 @@
 """The judge against plain NumPy, and its verdicts against hand-made cases."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -101,7 +103,20 @@ def test_feasible_reached_sound_and_success() -> None:
     sound = judge(free, U, goal, 0.1)
     assert bool(sound.sound)
     assert bool(sound.success(sound.cost / 1.04)) and not bool(sound.success(sound.cost / 1.06))
-    assert not bool(sound.success(torch.full_like(sound.cost, torch.nan)))
+    with pytest.raises(InputError, match="best_cost: expected the best known cost of every problem, got NaN"):
+        sound.success(torch.full_like(sound.cost, torch.nan))
+
+
+@pytest.mark.parametrize("best", [-100.0, 0.0, 100.0])
+def test_the_best_solution_is_a_success_whatever_the_sign_of_its_cost(best: float) -> None:
+    free, U = passing(speed=1.0, offset=0.5)
+    cost = torch.tensor([best], dtype=torch.float64)
+    verdict = replace(judge(free, U, [0.0, 0.0], 0.1), cost=cost, sound=torch.tensor([True]))
+    assert bool(verdict.success(cost))
+    margin = 0.05 * abs(best)
+    assert bool(verdict.success(cost - 0.9 * margin)) or best == -100.0
+    assert not bool(verdict.success(cost - 1.2 * margin - 1e-9))
+    assert bool(replace(verdict, cost=cost - 1.0).success(cost))  # cheaper than the best known
 
 
 def test_missing_controls_and_missing_obstacles() -> None:

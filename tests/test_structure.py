@@ -14,7 +14,7 @@ LAYERS = [
     ["shapes"],
     ["values"],
     ["dynamics", "costs", "constraints", "penalties", "goal"],
-    ["border", "measure"],
+    ["border", "measure", "scale"],
     ["problem"],
     ["tracing"],
     ["rollout", "expansion", "evaluation", "judge", "outcome"],

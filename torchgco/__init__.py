@@ -41,6 +41,7 @@ from torchgco.dynamics import RotorTracking as RotorTracking
 from torchgco.dynamics import Unicycle as Unicycle
 from torchgco.errors import GuidanceWarning as GuidanceWarning
 from torchgco.errors import InputError as InputError
+from torchgco.errors import ScaleWarning as ScaleWarning
 from torchgco.goal import Goal as Goal
 from torchgco.guidance import GCO as GCO
 from torchgco.guidance import MPPI as MPPI

@@ -25,3 +25,7 @@ def shown(value: object) -> str:
 
 class GuidanceWarning(UserWarning):
     """Guidance, or a part of it, can't be used for a problem, which is solved without it."""
+
+
+class ScaleWarning(UserWarning):
+    """A problem's lengths are so small that the tolerances, which are in metres, don't see them."""

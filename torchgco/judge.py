@@ -24,7 +24,7 @@ from torchgco.shapes import check_shape, computing_on, tensor
 
 OTHERS_WITHIN = 1e-3  # how far all constraints but the obstacles may be violated by a feasible trajectory
 SUCCESS_VIOLATION = 1e-3  # full radii, in metres
-SUCCESS_COST = 1.05  # share of the best known cost
+SUCCESS_COST = 0.05  # by how much a success may exceed the best known cost, as a share of its amount
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,21 @@ class Verdict:
     sound: Tensor  # bool: reached, violation <= 1e-3, clearance >= 0: success without its condition on the cost
 
     def success(self, best_cost: Tensor) -> Tensor:
-        """Whether sound, and within 5 % of the best known cost (B,); False, without meaning, where that is NaN."""
-        return self.sound & (self.cost <= SUCCESS_COST * best_cost)
+        """Whether sound, and within 5 % of the best known cost (B,), (B,) bool.
+
+        Raises:
+            InputError: a best cost that isn't a number: without one, success is unknown.
+        """
+        best_cost = tensor(best_cost, "best_cost", self.cost)
+        check_shape(best_cost, () if best_cost.dim() == 0 else tuple(self.cost.shape), "best_cost")
+        if bool(best_cost.isnan().any()):
+            raise InputError("best_cost", "the best known cost of every problem", "NaN")
+        return self.sound & near_best(self.cost, best_cost)
+
+
+def near_best(cost: Any, best: Any) -> Any:
+    """Whether costs, tensors or columns of a table, exceed the best known ones by at most 5 % of their amounts."""
+    return cost - best <= SUCCESS_COST * abs(best)
 
 
 def judge(

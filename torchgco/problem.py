@@ -12,16 +12,17 @@ from torch import Tensor
 
 from torchgco.border import check_constraint, check_cost, check_dynamics
 from torchgco.constraints.base import Constraint
-from torchgco.costs.base import Cost
+from torchgco.constraints.bodies import Obstacles, warn_of_small
+from torchgco.costs.base import Cost, ShiftedCost
+from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 from torchgco.errors import InputError
 from torchgco.goal import Goal
 from torchgco.options import Count, Seconds, check_value
+from torchgco.scale import CostScale, changes_of, cost_scale
 from torchgco.shapes import MISTAKES, Dimensions, check_tensor, computing_on, describe
 from torchgco.tree import Rows, cast
-
-LEAST_UNIT = 1e-3  # share of the controls' curvature in the unit of cost
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,9 @@ class Problem:
         object.__setattr__(self, "cost", self.cost.bind(dims))
         object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
         self._check_code(self.dynamics, self.cost, self.constraints)
+        for i, part in enumerate(self.constraints):
+            if isinstance(part, Obstacles):
+                warn_of_small(part, f"constraints[{i}]")
         given = self.goal if self.goal is not None and not self.goal.assumed else None
         goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
         object.__setattr__(self, "goal", goal)
@@ -122,16 +126,27 @@ class Problem:
         return clear
 
     @cached_property
-    def cost_unit(self) -> Tensor:
-        """A scale of each problem's cost, (B,), above 0: the mean cost per stage of staying at the start at rest.
-
-        A thousandth of the controls' mean curvature is added; only this is left where the start is the goal.
-        """
+    def cost_scale(self) -> CostScale:
+        """The unit of each problem's cost, above 0, and its constant; see `scale.cost_scale`."""
         X, U = self.at_rest
         s = self.n + 1 + self.m
         H = self.x0.new_empty(self.B, self.N + 1, s, s)
         self.cost.expand(X, U, H)
-        return self.unit_of(self.cost.total(X, U), H[:, :-1, self.n + 1 :, self.n + 1 :])
+        return self.scale_of(H[:, :-1, self.n + 1 :, self.n + 1 :])
+
+    def scale_of(self, Huu: Tensor) -> CostScale:
+        """`cost_scale` from the Hessians (B, N, m, m) of the cost of staying at the start in the controls."""
+        X, U = self.at_rest
+        total, changes = self.cost.total(X, U), None
+        if not isinstance(self.cost, BoundQuadratic):
+            goal = None if self.goal is None else self.goal.position
+            changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position)
+        return cost_scale(total, Huu, changes)
+
+    @property
+    def cost_unit(self) -> Tensor:
+        """The unit of each problem's cost, (B,)."""
+        return self.cost_scale.unit
 
     @property
     def at_rest(self) -> tuple[Tensor, Tensor]:
@@ -139,16 +154,16 @@ class Problem:
         like = self.x0.new_zeros(self.B, self.N, self.m)
         return self.x0.unsqueeze(1).repeat(1, self.N + 1, 1), self.cost.rest_controls(like)
 
-    def unit_of(self, total: Tensor, Huu: Tensor) -> Tensor:
-        """`cost_unit` from the cost (B,) of staying at the start and its Hessians in the controls (B, N, m, m)."""
-        # Contiguous and one axis at a time: the order of summation must not depend on the batch.
-        curvature = Huu.diagonal(dim1=-2, dim2=-1).abs().contiguous().sum(-1).sum(-1) / (self.N * self.m)
-        unit = total.abs() / self.N + LEAST_UNIT * curvature
-        return torch.where(torch.isfinite(unit) & (unit > 0), unit, 1.0)
-
     def in_cost_units(self) -> Self:
-        """The same problems with costs divided by `cost_unit`: no solver option then depends on the cost's scale."""
-        return self._with({"cost": self.cost.scaled(1.0 / self.cost_unit)}, form=self.form)
+        """The same problems with costs divided by `cost_unit`, without a constant that dwarfs the rest.
+
+        No solver option then depends on the cost's scale or zero.
+        """
+        unit, constant = self.cost_scale
+        cost = self.cost.scaled(1.0 / unit)
+        if bool((constant != 0).any()):
+            cost = ShiftedCost(cost, constant / (unit * self.N))
+        return self._with({"cost": cost}, form=self.form)
 
     def __getstate__(self) -> dict[str, Any]:
         """The parts alone: native kernels stay in their process."""

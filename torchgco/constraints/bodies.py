@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -9,8 +10,12 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint, Sense
 from torchgco.constraints.cuboids import Cuboids
+from torchgco.errors import ScaleWarning
 
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
+
+
+ADMITTED = 1e-3  # m: the violation up to which solvers and judge call a trajectory feasible, unless options say else
 
 
 class Inflated(NamedTuple):
@@ -49,6 +54,11 @@ class Obstacles(Constraint):
         """Lengths (B, M), m: bodies touch at (1 - CONTACT_FACTOR) times these beneath the full surface."""
         raise NotImplementedError
 
+    @property
+    def sizes(self) -> Tensor:
+        """The smallest distance from an obstacle's centre to its full surface, (B, M), m."""
+        return self.margins
+
     def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
         """Distances (B, K, M), m, of points p (B, K, d), m, at times t (K,), s."""
         raise NotImplementedError
@@ -81,6 +91,16 @@ class Obstacles(Constraint):
     def times(self, X: Tensor) -> Tensor:
         """t = k dt (K,) at the constraint's knots, s."""
         return torch.arange(X.shape[1], dtype=X.dtype, device=X.device)[self.knots] * self.dt
+
+
+def warn_of_small(obstacles: Obstacles, field: str) -> None:
+    """A ScaleWarning where an admitted violation could be a contact: lengths may not be in metres."""
+    sizes = obstacles.sizes[~obstacles.absent]
+    sizes = sizes[sizes > 0]  # a point that is marked, not an obstacle
+    if sizes.numel() > 0 and (1.0 - CONTACT_FACTOR) * float(sizes.min()) < ADMITTED:
+        text = f"an obstacle of {float(sizes.min()):.3g} m is too small for violations of up to {ADMITTED:g} m"
+        text += ", which count as feasible: scale the problem, or are its lengths not in metres?"
+        warnings.warn(f"{field}: {text}", ScaleWarning, stacklevel=6)
 
 
 def least(distances: Tensor) -> Tensor:

@@ -131,6 +131,10 @@ class BoundBoxes(Obstacles):
     def margins(self) -> Tensor:
         return self.inflated_radii
 
+    @property
+    def sizes(self) -> Tensor:
+        return self.half_sizes.amin(-1) + self.inflated_radii
+
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self._rows(X[:, self.knots, self.position])
 

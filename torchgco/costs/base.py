@@ -96,6 +96,35 @@ class ScaledCost(Cost):
         H.mul_(self.factor.view(-1, 1, 1, 1))
 
 
+@dataclass(frozen=True)
+class ShiftedCost(Cost):
+    """A cost less one number per problem and stage."""
+
+    cost: Cost
+    shift: Tensor  # (B,)
+
+    batched: ClassVar[tuple[str, ...]] = ("cost", "shift")
+
+    def scaled(self, factor: Tensor) -> ShiftedCost:
+        return ShiftedCost(self.cost.scaled(factor), self.shift * factor)
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        value = self.cost.stage(x, u, k)
+        return value - lead(self.shift, value)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return self.cost.terminal(x)
+
+    def rest_controls(self, like: Tensor) -> Tensor:
+        return self.cost.rest_controls(like)
+
+    def goal(self, x0: Tensor) -> Tensor | None:
+        return self.cost.goal(x0)
+
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        self.cost.expand(X, U, H)
+
+
 def add_blocks(
     H: Tensor,
     n: int,

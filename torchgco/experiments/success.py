@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from torchgco.experiments.records import COLUMNS
-from torchgco.judge import SUCCESS_COST, SUCCESS_VIOLATION
+from torchgco.judge import SUCCESS_VIOLATION, near_best
 from torchgco.scenarios import Layouts
 
 
@@ -33,7 +33,7 @@ def judged(rows: pd.DataFrame, best: pd.Series, rivals: pd.Series, layout: Seque
     cheapest = rows.assign(_cost=rows["cost"].where(is_sound)).groupby(list(layout), dropna=False)["_cost"]
     filled = best.where(best.notna() | ~rivals, cheapest.transform("min")).astype(float)
     source = pd.Series(None, index=rows.index, dtype=object).mask(rivals, "study").mask(best.notna(), "file")
-    success = (is_sound & (rows["cost"] <= SUCCESS_COST * filled)).astype("boolean")
+    success = (is_sound & near_best(rows["cost"], filled)).astype("boolean")
     return rows.assign(best_cost=filled, success=success.where(source.notna(), pd.NA), best_from=source)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.costs.base import Cost, ScaledCost
+from torchgco.costs.base import Cost, ScaledCost, ShiftedCost
 from torchgco.errors import InputError
 from torchgco.native import emit
 from torchgco.native.knots import Knot, KnotSource, Span, knot_source
@@ -30,14 +30,17 @@ class CostSource:
         return f"{self.stage.code}\n{self.last.code}"
 
 
-def unscaled(problem: Problem) -> tuple[Cost, Tensor]:
-    """The cost of a problem without the factors of a ScaledCost, and their product (B,)."""
+def unscaled(problem: Problem) -> tuple[Cost, Tensor, Tensor]:
+    """The cost of a problem without the factors of a ScaledCost, their product (B,), and the shift per stage (B,)."""
     # A cost that overrides `scaled` may have another form once scaled, so it is always scaled here, if only by 1.
-    factor = problem.x0.new_ones(problem.B)
+    factor, shift = problem.x0.new_ones(problem.B), problem.x0.new_zeros(problem.B)
     cost = problem.cost.scaled(factor)
-    while type(cost) is ScaledCost:
-        cost, factor = cost.cost, factor * cost.factor
-    return cost, factor
+    while isinstance(cost, (ScaledCost, ShiftedCost)):
+        if isinstance(cost, ScaledCost):
+            cost, factor = cost.cost, factor * cost.factor
+        else:
+            cost, shift = cost.cost, shift + factor * cost.shift
+    return cost, factor, shift
 
 
 def trace_cost(problem: Problem) -> CostSource:
@@ -48,7 +51,7 @@ def trace_cost(problem: Problem) -> CostSource:
     Raises:
         InputError: a part that can't be traced, holds an operation without a counterpart, or joins several knots.
     """
-    cost, _ = unscaled(problem)
+    cost, *_ = unscaled(problem)
     if type(cost).total is not Cost.total:
         raise InputError(_named("total", cost), "the sum of stage and terminal costs for native kernels", "its own")
     own = None if type(cost).expand is Cost.expand else problem.n + 1 + problem.m
@@ -60,17 +63,17 @@ def trace_cost(problem: Problem) -> CostSource:
 
 
 def cost_numbers(problem: Problem, source: CostSource) -> tuple[Tensor, Tensor, Tensor]:
-    """The arrays of traced.c: factor (B, 1, 1), and the numbers (B|1, K|1, count) of stages and last knot."""
-    cost, factor = unscaled(problem)
+    """The arrays of traced.c: factor and shift (B, 1, 2), and the numbers (B|1, K|1, count) of stages and last knot."""
+    cost, factor, shift = unscaled(problem)
     own = own_tensors(cost)
     stage = source.stage.numbers(problem.B, own, lambda: spans_of_cost(problem)[0])
     last = source.last.numbers(problem.B, own, lambda: spans_of_cost(problem)[1])
-    return factor.view(-1, 1, 1), stage, last
+    return torch.stack((factor, shift), dim=-1).unsqueeze(1), stage, last
 
 
 def spans_of_cost(problem: Problem) -> tuple[Span, Span]:
     """Stages and last knot, traced: the value, followed by the block (s, s) of the cost's own `expand`, if any."""
-    (cost, _), N, n, m = unscaled(problem), problem.N, problem.n, problem.m
+    (cost, *_), N, n, m = unscaled(problem), problem.N, problem.n, problem.m
     own = own_tensors(cost)
 
     def stage(i: Tensor, X: Tensor, U: Tensor) -> Tensor:

@@ -97,14 +97,12 @@ def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:
 def cost_unit(problem: Problem) -> Tensor:
     """`problem.cost_unit` (B,), computed by the native library where PyTorch would need autodiff for it.
 
-    The problem keeps it: `problem.in_cost_units()` then needs no autodiff either.
+    The problem keeps its scale: `problem.in_cost_units()` then needs no autodiff either.
     """
     engine = engine_of(problem)
-    if engine is not None and engine.cost is not None and "cost_unit" not in vars(problem):
-        X, U = problem.at_rest
-        _, H = engine.expand(problem, X, U, None)
-        unit = problem.unit_of(problem.cost.total(X, U), H[:, :-1, problem.n :, problem.n :])
-        object.__setattr__(problem, "cost_unit", unit)
+    if engine is not None and engine.cost is not None and "cost_scale" not in vars(problem):
+        _, H = engine.expand(problem, *problem.at_rest, None)
+        object.__setattr__(problem, "cost_scale", problem.scale_of(H[:, :-1, problem.n :, problem.n :]))
     return problem.cost_unit
 
 

@@ -1,4 +1,4 @@
-/* A traced cost times one number per problem: its value, gradient and Hessian at a knot.
+/* A traced cost times one number per problem, less another one per stage: its value, gradient and Hessian at a knot.
 
    The generated part defines, for `stage` and `last` alike, with a knot's own numbers p:
 
@@ -11,9 +11,10 @@ enum { FACTOR, STAGE, LAST };
 /* The cost of stage k at x, u; of the last knot where u is NULL. */
 static inline V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
     V value;
+    const V *scale = cost_at(s, FACTOR, k);
     if (u) tgco_stage_value(x, u, cost_at(s, STAGE, k), &value);
     else tgco_last_value(x, u, cost_at(s, LAST, k), &value);
-    return cost_at(s, FACTOR, k)[0] * value;
+    return u ? scale[0] * value - scale[1] : scale[0] * value;
 }
 
 static inline void add_entries(V factor, int slopes, int count, const int *places, const V *e, V *g, V *H) {

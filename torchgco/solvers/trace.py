@@ -40,10 +40,11 @@ class Recorder:
         }
         self._passes.append({name: value[~end.failed].clone() for name, value in row.items()})
 
-    def frame(self, unit: Tensor) -> pd.DataFrame:
+    def frame(self, unit: Tensor, constant: Tensor) -> pd.DataFrame:
         """The table, sorted by element (the problem), attempt and iteration.
 
-        `unit` (B,) is the unit that costs were divided by; the table holds the undivided costs.
+        `unit` (B,) is the unit that costs were divided by, `constant` (B,) what was subtracted from them before; the
+        table holds the costs as they were.
         """
         import pandas as pd
 
@@ -57,4 +58,6 @@ class Recorder:
             scale = unit.cpu().numpy()[frame["element"]]
             for name in ("cost", "merit", "regularisation"):
                 frame[name] *= scale
+            for name in ("cost", "merit"):
+                frame[name] += constant.cpu().numpy()[frame["element"]]
         return frame.sort_values(["element", "attempt", "iteration"], ignore_index=True) if self._passes else frame

@@ -59,9 +59,10 @@ def finished(
     limit = Status.TIME_LIMIT if call.late else Status.MAX_ITERATIONS
     ended = torch.where(end.status == STOPPED, int(limit), end.status)
     status = final_status(ended, left, best.violation, tolerance, bool(problem.constraints))
+    constant = call.problem.cost_scale.constant if scaled is not call else torch.zeros_like(unit)
     return Solution(
         X, U, K, d, best.multipliers.scaled(unit), call.problem.cost.total(X, U), best.violation, status,
-        end.iterations, end.outer, end.guided, None if recorder is None else recorder.frame(unit),
+        end.iterations, end.outer, end.guided, None if recorder is None else recorder.frame(unit, constant),
     )  # fmt: skip
 
 

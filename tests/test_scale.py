@@ -1,0 +1,82 @@
+"""A constant in a cost hides nothing, and lengths that the tolerance can't see are named."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco import FunctionCost, FunctionDynamics, Problem, QuadraticCost, Spheres, kernels, presets
+from torchgco.costs.base import ShiftedCost
+
+D = torch.float64
+
+
+def swing_up(constant: float, B: int = 2) -> Problem:
+    """A pendulum whose cost has a constant per stage."""
+
+    def field(x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat((x[..., 1:], 9.81 * x[..., :1].sin() + u), dim=-1)
+
+    def stage(x: Tensor, u: Tensor) -> Tensor:
+        return constant + (1.0 - x[..., 0].cos()) + 0.1 * x[..., 1].square() + 0.01 * u.square().sum(-1)
+
+    x0 = torch.tensor([[3.1, 0.0], [2.0, 0.5], [1.0, 1.0]], dtype=D)[:B]
+    cost = FunctionCost(stage, lambda x: 20.0 * (1.0 - x[..., 0].cos()) + x[..., 1].square())
+    return Problem(FunctionDynamics(field, 2, 1, 0.05, "rk4"), cost, [], x0, 50)
+
+
+@pytest.mark.parametrize("native", [True, False])
+@pytest.mark.parametrize("constant", [1e5, -1e5, 1e9])
+def test_a_constant_in_the_cost_hides_nothing(constant: float, native: bool) -> None:
+    kernels.use_native(native)
+    try:
+        plain, shifted = (torchgco.solve(swing_up(c), solver=presets.gco(2)) for c in (0.0, constant))
+    finally:
+        kernels.use_native(True)
+    assert plain.statuses == shifted.statuses
+    own = swing_up(0.0).cost.total(shifted.X, shifted.U)
+    torch.testing.assert_close(own, plain.cost, rtol=1e-3, atol=0)
+    torch.testing.assert_close(shifted.cost, own + 50 * constant, rtol=1e-9, atol=0)
+
+
+def test_the_unit_of_cost_does_not_see_constants() -> None:
+    plain, shifted = swing_up(0.0), swing_up(1e6)
+    assert bool((shifted.cost_unit < 3.0 * plain.cost_unit).all() & (shifted.cost_unit > plain.cost_unit / 3.0).all())
+    assert not bool(plain.cost_scale.constant.any())
+    assert isinstance(shifted.in_cost_units().cost, ShiftedCost)
+    assert not isinstance(shifted.in_cost_units().in_cost_units().cost.cost, ShiftedCost)
+    quadratic = QuadraticCost([1.0, 0.0], [1e-6], [1.0, 0.0], x_ref=[1e3, 0.0])
+    far = Problem(plain.dynamics, quadratic, [], plain.x0, plain.N)
+    assert not bool(far.cost_scale.constant.any())  # a quadratic cost has no constant
+
+
+def test_a_trace_shows_costs_with_their_constant() -> None:
+    problem = swing_up(1e5, B=1)
+    solution = torchgco.AugmentedLagrangian(record=True).solve(problem, torch.zeros(1, 50, 1, dtype=D))
+    assert solution.trace is not None
+    assert abs(float(solution.trace["cost"].iloc[-1]) - float(solution.cost)) < 1e-6 * float(solution.cost)
+
+
+def test_problems_with_and_without_a_constant_keep_their_bits_in_one_batch() -> None:
+    constants = torch.tensor([0.0, 1e6, 3.0], dtype=D)
+
+    def made(rows: slice) -> Problem:
+        base = swing_up(0.0, B=3).take(rows)
+        stage = lambda x, u, c: c + (1.0 - x[..., 0].cos()) + 0.01 * u.square().sum(-1)
+        cost = FunctionCost(stage, lambda x: x.square().sum(-1), {"c": constants[rows]})
+        return Problem(base.dynamics, cost, [], base.x0, base.N)
+
+    whole = torchgco.solve(made(slice(0, 3)))
+    for b in range(3):
+        assert torch.equal(torchgco.solve(made(slice(b, b + 1))).U[0], whole.U[b])
+
+
+@pytest.mark.parametrize(("radius", "warned"), [(0.004, True), (0.3, False)])
+def test_obstacles_that_the_tolerance_cannot_see_are_named(radius: float, warned: bool, recwarn) -> None:
+    base = swing_up(0.0)
+    model = FunctionDynamics(base.dynamics.function, 2, 1, 0.05, "rk4", position=slice(0, 2))
+    Problem(model, base.cost, [Spheres([[50.0, 50.0]], [radius], 0.001)], base.x0, base.N)
+    found = [str(w.message) for w in recwarn if issubclass(w.category, torchgco.ScaleWarning)]
+    assert len(found) == warned and all("0.005" in line and "0.001 m" in line for line in found)

@@ -1,0 +1,60 @@
+"""The scale of a problem's cost: its unit, and a constant that would hide everything else."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchgco.costs.base import Cost
+
+LEAST_UNIT = 1e-3  # share of the controls' curvature in the unit of cost
+DWARFS = 100.0  # times the rest of the cost: a smaller constant leaves tests relative to the cost meaningful
+
+
+class CostScale(NamedTuple):
+    """One number per problem, (B,)."""
+
+    unit: Tensor  # above 0
+    constant: Tensor  # in the cost of a whole trajectory; 0 where it doesn't dwarf the rest
+
+
+def cost_scale(total: Tensor, Huu: Tensor, changes: Tensor | None) -> CostScale:
+    """The mean cost per stage of staying at the start at rest, without its constant.
+
+    A thousandth of the controls' mean curvature is added; only this is left where the start is the goal.
+
+    Args:
+        total: the cost of staying at the start, (B,).
+        Huu: its Hessians in the controls, (B, N, m, m).
+        changes: by how much the cost changes elsewhere, (B,). Where `total` is over `DWARFS` times as large, all but
+            the change is a constant. None: the cost has none.
+    """
+    N, m = Huu.shape[1], Huu.shape[-1]
+    # Contiguous and one axis at a time: the order of summation must not depend on the batch.
+    curvature = Huu.diagonal(dim1=-2, dim2=-1).abs().contiguous().sum(-1).sum(-1) / (N * m)
+    least, constant = LEAST_UNIT * curvature, torch.zeros_like(total)
+    if changes is not None:
+        rest = total.abs() - torch.maximum(changes, N * least)
+        dwarfs = (rest > DWARFS * torch.maximum(changes, N * least)) & torch.isfinite(rest)
+        constant = torch.where(dwarfs, total.sign() * rest, constant)
+    unit = (total - constant).abs() / N + least
+    return CostScale(torch.where(torch.isfinite(unit) & (unit > 0), unit, 1.0), constant)
+
+
+def changes_of(cost: Cost, X: Tensor, U: Tensor, total: Tensor, goal: Tensor | None, position: slice | None) -> Tensor:
+    """The largest change (B,) of a cost between X (B, N+1, n), U (B, N, m) and a few other places.
+
+    These are the origin, states and controls larger and smaller by one and by as much as they are, and the goal (B, d).
+    """
+    step = 1.0 + X.abs()
+    # No two components change alike, so that differences of states change too.
+    uneven = 1.0 + 0.3 * torch.arange(X.shape[-1], dtype=X.dtype, device=X.device).cos()
+    places = [(torch.zeros_like(X), U), (X + uneven * step, U + 1.0 + U.abs()), (X - uneven * step, U - 1.0 - U.abs())]
+    if goal is not None and position is not None:
+        there = X.clone()
+        there[..., position] = goal.unsqueeze(1)
+        places.append((there, U))
+    changes = [(cost.total(*place) - total).abs() for place in places]
+    return torch.stack(changes).nan_to_num(0.0, 0.0, 0.0).amax(0)
