@@ -19,6 +19,12 @@ TINY = [
 HOLD = ["solver=hold", "study.baselines=[]", "study.layouts=4", "scenario.stages=5", "study.workers=1"]
 
 
+def changed(words: list[str], *others: str) -> list[str]:
+    """`words` without those whose key `others` give, and `others`: the command line refuses a key given twice."""
+    keys = {other.partition("=")[0] for other in others}
+    return [*(word for word in words if word.partition("=")[0] not in keys), *others]
+
+
 def command(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run torchgco in a new process, to its end."""
     line = [sys.executable, "-m", "torchgco", *words]

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from functools import partial
+import re
+import subprocess
+import sys
 
 import numpy as np
 import pandas as pd
@@ -11,8 +14,8 @@ import torch
 from tqdm import tqdm
 
 import torchgco
-from tests.experiments.commands import ROOT, TINY, command, problem_line
-from torchgco import kernels
+from tests.experiments.commands import ENVIRONMENT, ROOT, TINY, command, problem_line
+from torchgco import InputError, kernels
 from torchgco.experiments import study
 from torchgco.experiments.build import compose, config_dir
 from torchgco.experiments.identity import decisive, plain
@@ -23,8 +26,19 @@ from torchgco.solvers.augmented_lagrangian import OuterLoop
 DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
 SCENARIOS = sorted(p.stem for p in (ROOT / "conf" / "scenario").glob("*.yaml"))
+# Runs the command with a standard output that nobody reads.
+PIPE = """
+import os, sys
+reader, writer = os.pipe()
+os.close(reader)
+os.dup2(writer, 1)
+sys.stdout.reconfigure(line_buffering=True)
+from torchgco.experiments.app import main
+sys.exit(main())
+"""
 SOLVERS = sorted(p.stem for p in (ROOT / "conf" / "solver").glob("*.yaml"))
 FLOWN_IN = {"planar": "planar_random", "quadrotor": "walls", "unicycle": "yard"}  # every model in one scenario
+VARIANTS = ("layouts", "forest_mission", "planar_trap_paper")  # with other values than the class, or none
 EXPERIMENTS = sorted(p.stem for p in (ROOT / "conf" / "experiment").glob("*.yaml"))
 
 
@@ -144,7 +158,7 @@ BAD = {
     "unknown option": (["solver=rrt"], "rrt"),
     "unknown baseline": (["study.baselines=[rrt]"], "rrt"),
     "added key": (["+solver.local.inner.speed=3"], "speed"),
-    "missing path": (["scenario=layouts"], "scenario.path"),
+    "missing path": (["scenario=layouts"], "scenario.path: expected the layout file: add scenario.path=FILE.npz"),
     "no such file": (["scenario=layouts", "scenario.path=nowhere.npz"], "scenario.path: expected a layout file"),
     "model misfit": (["model=planar"], "model: expected model=quadrotor"),
     "model misfit in a file": (["scenario=layouts", WALLS, "model=planar"], "model=quadrotor"),
@@ -191,7 +205,29 @@ def test_version_and_help(run) -> None:
     code, out, _ = run("--version")
     assert code == 0 and out.strip() == f"torchgco {torchgco.__version__}"
     code, out, _ = run("--help")
-    assert code == 0 and "torchgco -m solver=al_ilqr,gco" in out and "planar_trap" in out
+    assert code == 0 and "torchgco -m solver=al_ilqr,gco" in out and "preset " not in out.split("Groups")[1]
+    assert len(out.splitlines()) < 75 and max(map(len, out.splitlines())) <= 110
+    for folder in (ROOT / "conf").iterdir():
+        options = [path.stem for path in folder.glob("*.yaml")]
+        (listed,) = re.findall(rf"^  {folder.name} +((?:.*\n {{18}})*.*)", out, re.MULTILINE) if options else [""]
+        assert set(re.findall(r"\w+", listed)) == set(options)
+    assert "forest*," in out and "walls*," in run("--help", "scenario=walls")[1]
+
+
+def test_every_key_that_help_names_exists(run) -> None:
+    _, out, _ = run("--help")
+    words = re.findall(r"^  +([a-z_.]+=\S+)", out.split("Common keys")[1], re.MULTILINE)
+    assert len(words) > 12
+    for word in words:
+        mission = [] if word.startswith("experiment=") else ["experiment=mission"]
+        compose([*mission, word, *(["plant=null"] if word == "mission=null" else [])])
+
+
+def test_a_reader_that_has_read_enough_is_no_error(tmp_path) -> None:
+    for words in ("--shell-completion install=bash", "--help", "--version", "--cfg job"):
+        line = [sys.executable, "-c", PIPE, *words.split()]
+        done = subprocess.run(line, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0 and not done.stderr, (words, done.stderr)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -203,11 +239,10 @@ def test_every_solver_fits_every_model(model: str, solver: str) -> None:
     assert setup.solver_name == solver and task.problem.B == 1
 
 
-@pytest.mark.parametrize("scenario", [s for s in SCENARIOS if s != "layouts"])
+@pytest.mark.parametrize("scenario", [s for s in SCENARIOS if s not in VARIANTS])
 def test_scenario_configs_hold_the_defaults_of_the_code(scenario: str) -> None:
     """The numbers in YAML, which users read and override, are the defaults of the class."""
-    model = {"planar_trap": "planar", "planar_random": "planar", "yard": "unicycle"}.get(scenario, "quadrotor")
-    made = compose([f"model={model}", f"scenario={scenario}"]).scenario
+    made = compose([f"scenario={scenario}"]).scenario
     assert made == type(made)(name=scenario)
 
 
@@ -215,6 +250,38 @@ def test_scenario_configs_hold_the_defaults_of_the_code(scenario: str) -> None:
 def test_every_experiment_composes(experiment: str) -> None:
     setup = compose([f"experiment={experiment}"])
     assert setup.task(setup.layouts(1)).problem.B == 1
+
+
+@pytest.mark.parametrize("scenario", [s for s in SCENARIOS if s != "layouts"])
+def test_a_scenario_picks_its_model(scenario: str) -> None:
+    setup = compose([f"scenario={scenario}"])
+    assert setup.task(setup.layouts(1)).problem.B == 1
+    with pytest.raises(InputError, match=r"^model: expected model=.*, got model="):
+        compose([f"scenario={scenario}", f"model={'planar' if setup.scenario.dimension == 3 else 'quadrotor'}"])
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_flies_another_scenario(experiment: str) -> None:
+    """A preset sets no key that only its own scenario has, and asks no more layouts than a file holds."""
+    data = [f"scenario.path={DATA / 'forest30.npz'}", "model=quadrotor"]
+    for scenario, words in (("layouts", data), ("walls", []), ("planar_random", ["mission=null", "plant=null"])):
+        setup = compose([f"experiment={experiment}", f"scenario={scenario}", *words])
+        assert setup.task(setup.layouts().take([0])).problem.B == 1
+    assert compose([f"experiment={experiment}", "scenario=walls"]).layouts().count == setup.config.study.layouts
+
+
+def test_a_preset_flies_all_layouts_of_a_file() -> None:
+    words = ["experiment=mission_study", "scenario=layouts", WALLS]
+    assert compose(words).config.study.layouts is None and compose(words).layouts().count == 32
+    assert compose([*words, "study.layouts=3"]).layouts().count == 3
+    assert compose(["experiment=mission_study", "scenario=walls"]).config.study.layouts == 32
+
+
+def test_null_leaves_a_group_out() -> None:
+    plain_setup, words = compose([]), ["mission=null", "plant=null", "experiment=null"]
+    assert compose(words).config == plain_setup.config
+    without = compose(["experiment=mission", "mission=null", "plant=null"])
+    assert without.mission is None and compose(["experiment=mission"]).mission is not None
 
 
 def test_the_wheel_and_the_checkout_find_their_configs() -> None:

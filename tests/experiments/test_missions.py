@@ -120,8 +120,8 @@ def test_a_study_of_missions_compares_planners_and_is_cut_as_one_likes(run, tmp_
 def test_a_start_in_contact_is_a_collision_and_the_others_fly(run, tmp_path) -> None:
     centers = np.array([[[-0.8, 1.0, 0.0]], [[9.0, 9.0, 0.0]]])
     np.savez(tmp_path / "two.npz", centers=centers, radii=np.full((2, 1), 0.6), vehicle_radius=0.36)
-    words = ["scenario=layouts", f"scenario.path={tmp_path / 'two.npz'}", "~scenario.start"]
-    code, out, _ = run("experiment=mission_study", *words, "mission.duration=0.1", "study.layouts=2", *SHORT[2:])
+    words = ["scenario=layouts", f"scenario.path={tmp_path / 'two.npz'}"]
+    code, out, _ = run("experiment=mission_study", *words, "mission.duration=0.1", *SHORT[2:])
     assert code == 0 and "two 0, gco: COLLISION after 0.00 s" in out and "no plan made" in out and "nan" not in out
     assert trials(tmp_path)["outcome"].tolist()[:2] == ["COLLISION", "TIMEOUT"]
 

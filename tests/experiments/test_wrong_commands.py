@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from tests.experiments import commands
 from tests.experiments.commands import HOLD, problem_line
 from tests.trials import flights, trials
 from torchgco.errors import InputError
@@ -43,7 +44,18 @@ WRONG = {
     "new key": (["+foo=1"], "foo: expected one of the keys seed, study, model"),
     "no experiment": (["experiment=nope"], "experiment: expected one of feasibility, mission"),
     "plant alone": (["plant=rotors"], "plant: expected a mission"),
-    "null plant": (["mission=default", "plant=null"], "plant: expected one of drone_models, rotors, got null"),
+    "null plant": (["mission=default", "plant=null"], "plant: expected the vehicle that flies the mission"),
+    "twice": (["seed=1", "seed=2"], "seed: expected one value, got seed=1 and seed=2"),
+    "a group twice": (["model=planar", "model=unicycle"], "model: expected one value, got model=planar and model=unic"),
+    "a part's key": (
+        [*MISSION, "mission.planer.margin=0"],
+        "mission.planer: expected a key that the configuration has, such as planner, got planer",
+    ),
+    "a group's key": (["scenario.obstacles=3"], "scenario.obstacles: expected a key that the configuration has, such as"),
+    "no mission": (["mission.duration=3"], "mission: expected experiment=mission, as its keys are given"),
+    "mission in a wood": ([*MISSION, "scenario=woods"], "scenario: expected spheres in space for a mission: cro"),
+    "mission in the plane": ([*MISSION, "scenario=yard"], "scenario: expected spheres in space for a mission: cro"),
+    "short mission": ([*MISSION, "mission.duration=1e-9"], "mission.duration: expected at least one control period"),
     "null solver": (["solver=null"], "solver: expected one of al_ilqr, fatrop"),
     "a dict's key": (["hydra.run.dir=null"], "hydra.run.dir: expected a value of the kind that the configuration has"),
     "--resolve": (["--resolve"], "command line: expected words that Hydra accepts, got The --resolve flag"),
@@ -62,7 +74,7 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_words_get_one_line_and_write_nothing(case: str, run, tmp_path) -> None:
     words, line = WRONG[case]
-    code, out, err = run(*HOLD, *words)
+    code, out, err = run(*commands.changed(HOLD, *words))
     assert code == 2 and problem_line(err).startswith(f"torchgco: {line}"), err
     assert not out and not list(tmp_path.iterdir())
 
@@ -166,7 +178,7 @@ def test_a_solver_is_compared_with_its_own_former_settings(run, tmp_path) -> Non
 
 @pytest.mark.usefixtures("without_report")
 def test_a_baseline_that_equals_the_solver_flies_once(run, tmp_path) -> None:
-    assert run(*HOLD, "study.baselines=[hold]", "hydra.run.dir=out")[0] == 0
+    assert run(*commands.changed(HOLD, "study.baselines=[hold]", "hydra.run.dir=out"))[0] == 0
     assert pd.read_parquet(tmp_path / "out" / "trials.parquet")["solver"].tolist() == ["hold"] * 4
 
 

@@ -19,9 +19,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
 from torchgco.errors import InputError
+from torchgco.experiments import help_page
 from torchgco.experiments.build import config_dir, forget_composed, recomposer
-from torchgco.experiments.checks import as_input_error, check, check_words
-from torchgco.experiments.files import write
+from torchgco.experiments.checks import as_input_error, check, check_once, hydra_words
+from torchgco.experiments.files import say, silence, write
 from torchgco.experiments.hydra_versions import ENTRY, register_resolver
 from torchgco.experiments.identity import decisive, digest, plain, settings_of
 from torchgco.experiments.jobs import Report
@@ -59,6 +60,7 @@ def _described(_root_: Any) -> str:
 
 
 register_resolver("torchgco.folder", study_folder)
+help_page.register()
 
 
 def _task(config: DictConfig) -> Report:
@@ -127,7 +129,7 @@ def _keep_configuration(config: DictConfig, folder: Path) -> None:
 def main() -> int:
     """Run the command line; returns the exit code: 0, 2 for malformed input, 130 when interrupted, 143 by SIGTERM."""
     if "--version" in sys.argv[1:]:
-        print(f"torchgco {torchgco.__version__}")
+        say(f"torchgco {torchgco.__version__}")
         return 0
     # Hydra would print and exit by itself; with this it raises its errors, and each is printed as one line.
     os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -135,10 +137,17 @@ def main() -> int:
     parser = get_args_parser()
     parser.error = _refuse_flags
     try:
-        check_words(parser.parse_args().overrides, config_dir())
+        words = parser.parse_args().overrides
+        check_once(words)
+        typed = dict(zip(words, hydra_words(words, config_dir()), strict=True))
+        sys.argv[1:] = [typed.get(word, word) for word in sys.argv[1:]]  # Hydra's own main reads them
         _run()
     except (InputError, HydraException, OmegaConfBaseException) as error:
         return _refuse(as_input_error(error))
+    except BrokenPipeError as error:  # a reader of Hydra's pages has read enough, as `head` does
+        if not _by_hydra(error):
+            raise
+        silence()
     except OSError as error:  # Hydra can't make the study's folder; the study's own files raise InputError
         return _refuse(InputError("hydra.run.dir", "a folder that can be made", error))
     except KeyboardInterrupt as error:

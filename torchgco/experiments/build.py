@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
 from torchgco.errors import InputError
-from torchgco.experiments.checks import as_input_error, check, check_words
+from torchgco.experiments.checks import as_input_error, check, hydra_words
 from torchgco.experiments.hydra_versions import ANY_CLASS, ENTRY
 from torchgco.experiments.identity import plain
 from torchgco.experiments.launching import allotted_cores
@@ -31,6 +31,7 @@ from torchgco.simulation import Mission
 from torchgco.solvers.memory import free_memory, least_bytes
 
 DEFAULT_LAYOUTS = 64
+FLOWN = "spheres in space for a mission: crossing, forest, forest_moving, forest_mission, walls, or a layout file"
 MOST = 1024  # threads or processes: PyTorch ends with an error of the system long before the system's own limit
 register()
 
@@ -104,12 +105,12 @@ def compose(overrides: Sequence[str] = ()) -> Setup:
 def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> DictConfig:
     """The configuration alone; `searchpath` names further folders of configs."""
     extra = [f"hydra.searchpath=[{','.join(searchpath)}]"] if searchpath else []
-    check_words(overrides, config_dir())
+    words = hydra_words(overrides, config_dir())
     running = Singleton.get_state()  # a study composes its baselines while Hydra's own main runs
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(config_dir()), **ENTRY):
-            return hydra.compose("config", [*overrides, *extra])
+            return hydra.compose("config", [*words, *extra])
     except (HydraException, OmegaConfBaseException) as error:
         raise as_input_error(error) from None
     finally:
@@ -153,6 +154,8 @@ def build(config: DictConfig) -> Setup:
         InputError: a value that a part refuses, or parts that don't fit each other.
     """
     check(plain(config), config_dir())
+    if OmegaConf.is_missing(config.scenario, "path"):
+        raise InputError("scenario.path", "the layout file: add scenario.path=FILE.npz", "none")
     device, dtype = _device(config.device)
     setup = Setup(
         config=config,
@@ -195,6 +198,8 @@ def _mission(setup: Setup) -> Mission | None:
         raise InputError("plant", "the vehicle that flies the mission: plant=rotors", "none")
     if setup.device.type != "cpu" or setup.dtype != torch.float64:
         raise InputError("device", "device=cpu in float64 for missions", f"{setup.device.type}, {setup.dtype}")
+    if setup.scenario.dimension != 3:
+        raise InputError("scenario", FLOWN, setup.scenario.name)
     parts = {name: _instantiate(node[name], f"mission.{name}") for name in ("planner", "tracker", "disturbance")}
     held = OmegaConf.to_container(node, resolve=True)
     assert isinstance(held, dict)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +17,48 @@ from torchgco.options import Seed, check_value
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")  # part of the names of files and folders
 MODEL = ("dimension", "vehicle")
 NO_CHOICES = ("null", "true", "false", "")  # values that Hydra reads as no name
+CLOSED_LOOP = ("mission", "plant")  # groups that only missions have
 
 
-def check_words(words: Iterable[str], conf: Path) -> None:
-    """Check the words of a command line that choose an option of a group, as Hydra fails where one is no name.
+def hydra_words(words: Iterable[str], conf: Path) -> list[str]:
+    """The words of a command line as Hydra takes them: `~mission` for `mission=null`.
 
     Raises:
-        InputError: a value that is no name.
+        InputError: a value that is no name, where the word chooses an option of a group: Hydra fails there.
     """
+    return [_hydra_word(word, conf) for word in words]
+
+
+def _hydra_word(word: str, conf: Path) -> str:
+    key, equals, value = word.lstrip("+").partition("=")
+    group = key.split("@")[0]
+    if equals and re.fullmatch(r"[\w/]+", group) and (conf / group).is_dir():
+        if value.lower() == "null" and _default_options(conf).get(key, "") is None:
+            return f"~{key}"
+        options = sorted(path.stem for path in (conf / group).glob("*.yaml"))
+        if value.lower() in NO_CHOICES or re.fullmatch(r"[-+]?[\d.]+|\{.*\}", value):
+            raise InputError(group, f"one of {', '.join(options)}", value or "nothing")
+    return word
+
+
+def check_once(words: Iterable[str]) -> None:
+    """Check that no key is given twice: Hydra would take the last value without a word.
+
+    Raises:
+        InputError: a key that is.
+    """
+    given: dict[str, str] = {}
     for word in words:
-        key, equals, value = word.lstrip("+").partition("=")
-        group = key.split("@")[0]
-        if equals and re.fullmatch(r"[\w/]+", group) and (conf / group).is_dir():
-            options = sorted(path.stem for path in (conf / group).glob("*.yaml"))
-            if value.lower() in NO_CHOICES or re.fullmatch(r"[-+]?[\d.]+|\{.*\}", value):
-                raise InputError(group, f"one of {', '.join(options)}", value or "nothing")
+        key, equals, _ = word.lstrip("+").partition("=")
+        if equals and key in given:
+            raise InputError(key, "one value", f"{given[key]} and {word}")
+        given[key] = word
+
+
+def _default_options(conf: Path) -> dict[str, str | None]:
+    """The option of every group in the defaults list of config.yaml; None where the group is left out by default."""
+    base: Any = OmegaConf.to_container(OmegaConf.load(conf / "config.yaml"))
+    return {key: option for entry in base["defaults"] if isinstance(entry, dict) for key, option in entry.items()}
 
 
 def check(held: Mapping[str, Any], conf: Path) -> None:
@@ -40,8 +68,8 @@ def check(held: Mapping[str, Any], conf: Path) -> None:
         InputError: a group or key that is missing or unknown, a malformed seed, name or list of baselines.
     """
     base: Any = OmegaConf.to_container(OmegaConf.load(conf / "config.yaml"))
-    chosen = {key: option for entry in base["defaults"] if isinstance(entry, dict) for key, option in entry.items()}
-    groups = {key: option for key, option in chosen.items() if key.isidentifier() and key != "experiment"}
+    chosen = _default_options(conf).items()
+    groups = {key: option for key, option in chosen if key.isidentifier() and key != "experiment"}
     own = [key for key in base if key not in ("defaults", "hydra")]
     needed = [*own, *(key for key, option in groups.items() if option is not None)]
     _keys(held, "", needed, [*own, *groups])
@@ -101,7 +129,7 @@ def as_input_error(error: BaseException, field: str = "configuration") -> InputE
     text = "\n".join((str(error), *getattr(error, "__notes__", ())))
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if unknown := re.match(r"Could not override '(.+?)'", lines[0] if lines else ""):
-        return InputError(unknown[1], "a key that the configuration has", unknown[1].split(".")[-1])
+        return _unknown_key(error, unknown[1])
     if merged := re.match(r"Error merging override \+*([^=\s]+)=?(.*)", lines[0] if lines else ""):
         return InputError(merged[1], "a value of the kind that the configuration has", merged[2] or _joined(error))
     inside = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), "")
@@ -109,6 +137,17 @@ def as_input_error(error: BaseException, field: str = "configuration") -> InputE
     if extra := re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(.+?)'", str(error)):
         return InputError(f"{key}.{extra[2]}", f"an option that {extra[1]} has", extra[2])
     return InputError(str(key) or field, "a value that the configuration knows", _joined(error))
+
+
+def _unknown_key(error: BaseException, key: str) -> InputError:
+    """The error for an unknown key: it names the first part that the configuration lacks, and the key most like it."""
+    found: Any = error.__cause__  # of OmegaConf
+    key = str(getattr(found, "full_key", None) or key)
+    name, parent = key.rpartition(".")[2], getattr(found, "parent_node", None)
+    if key in CLOSED_LOOP:
+        return InputError(key, "experiment=mission, as its keys are given", "none")
+    near = get_close_matches(name, map(str, parent), n=1) if OmegaConf.is_dict(parent) else []
+    return InputError(key, "a key that the configuration has" + "".join(f", such as {other}" for other in near), name)
 
 
 def _joined(error: BaseException) -> str:

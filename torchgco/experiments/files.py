@@ -84,11 +84,18 @@ def say(text: str) -> None:
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        # What is still buffered, and all that is printed later, goes nowhere: Python would complain when it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        silence()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        silence()
         raise InputError("standard output", "room to write", error.strerror or error) from None
+
+
+def silence() -> None:
+    """Let all that is still buffered for standard output, or printed later, go nowhere: nobody reads it.
+
+    Otherwise Python would complain when it ends.
+    """
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def checksum(path: Path) -> str:

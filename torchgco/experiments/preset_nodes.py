@@ -1,7 +1,7 @@
-"""The presets as nodes of Hydra's configuration store: group `preset`, which conf/solver refers to.
+"""What conf/ takes from code: presets as nodes of Hydra's configuration store, and functions in interpolations.
 
-The values are those of `torchgco.presets`. An option that differs between the plane and space becomes an interpolation
-that chooses by `model.dimension`.
+The group `preset`, which conf/solver refers to, has the values of `torchgco.presets`. An option that differs between
+the plane and space becomes an interpolation that chooses by `model.dimension`.
 """
 
 from __future__ import annotations
@@ -11,22 +11,31 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
 
 from torchgco.experiments.hydra_versions import register_resolver
 from torchgco.presets import PRESETS
 
 BY_DIMENSION = "torchgco.by_dimension"
+DRAWN = "torchgco.drawn"
 
 
 def register() -> None:
     """Store all presets; to be called before Hydra composes anything."""
     register_resolver(BY_DIMENSION, _by_dimension)
+    register_resolver(DRAWN, _drawn)
     for name, make in PRESETS.items():
         ConfigStore.instance().store(group="preset", name=name, node=_joined(_tree(make(2)), _tree(make(3))))
 
 
 def _by_dimension(dimension: int, plane: Any, space: Any) -> Any:
     return space if dimension == 3 else plane
+
+
+def _drawn(count: int, _root_: Any) -> int | None:
+    """A number of layouts where they are drawn; None, all of them, where they come from a file."""
+    scenario = _root_.get("scenario")
+    return None if OmegaConf.is_dict(scenario) and "path" in scenario else count
 
 
 def _tree(value: Any) -> Any:

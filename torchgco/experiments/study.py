@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 import torchgco
 from torchgco.errors import InputError
-from torchgco.experiments.build import Setup, build, solver_of
+from torchgco.experiments.build import FLOWN, Setup, build, solver_of
 from torchgco.experiments.files import say
 from torchgco.experiments.flight import Flight, Plan, fly, plan_of, prepare
 from torchgco.experiments.identity import Manifest, closed_loop, difference, digest, layout_digests, plain, settings_of
@@ -31,7 +31,8 @@ from torchgco.experiments.success import sound, with_success
 from torchgco.experiments.workers import Shared, run_all
 from torchgco.kernels import native
 from torchgco.rollout import open_loop
-from torchgco.scenarios import Layouts
+from torchgco.scenarios import Layouts, Task
+from torchgco.simulation import Mission
 from torchgco.simulation.mission import other_obstacles
 from torchgco.status import Status
 
@@ -149,10 +150,7 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
     layouts = setup.layouts()
     task = setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
     if setup.mission is not None:
-        setup.mission.check(task.problem.dynamics)
-        if others := other_obstacles(task.problem):
-            expected = "one with spheres alone, as missions fly among no other obstacles so far"
-            raise InputError("scenario", expected, f"{layouts.name}, which has {others}")
+        _check_mission(setup.mission, task)
     configs = _rivals(config, recompose)
     solvers = {name: setup.solver if held is config else solver_of(held) for name, held in configs.items()}
     configuration = {"version": torchgco.__version__, **plain(config)}
@@ -162,6 +160,16 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
         layouts=layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(configuration)),
     )
     return _Study(setup, plan_of(setup), layouts, solvers, manifest)
+
+
+def _check_mission(mission: Mission, task: Task) -> None:
+    dynamics = task.problem.dynamics
+    mission.check(dynamics)
+    if others := other_obstacles(task.problem):
+        expected = "one with spheres alone, as missions fly among no other obstacles so far"
+        raise InputError("scenario", expected, f"{task.layouts.name}, which has {others}")
+    if mission.duration < dynamics.dt:
+        raise InputError("mission.duration", f"at least one control period, {dynamics.dt:g} s", mission.duration)
 
 
 def _rivals(config: DictConfig, recompose: Recompose) -> dict[str, DictConfig]:
