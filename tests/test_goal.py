@@ -117,5 +117,5 @@ def test_a_malformed_goal_is_named(goal: object, message: str) -> None:
 
 
 def test_a_goal_needs_a_position() -> None:
-    with pytest.raises(InputError, match="goal: expected dynamics with a position, got dynamics without one"):
+    with pytest.raises(InputError, match=r"goal: expected dynamics with a position: set `position = slice\(0, 2\)`"):
         Problem(WITHOUT_POSITION, AtTheEnd(), [], torch.zeros(1, 1, dtype=torch.float64), 3, Goal([0.0], 0.1))

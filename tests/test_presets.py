@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import torchgco
+from tests.problems import planar_batch
 from torchgco import InputError, Problem, QuadraticCost, presets, solve
 from torchgco.experiments.build import config_dir
 from torchgco.presets import PRESETS
@@ -50,3 +51,12 @@ def test_a_problem_without_a_position_gets_the_planar_settings() -> None:
     dynamics = torchgco.FunctionDynamics(lambda x, u: u, 1, 1, 0.1)
     problem = Problem(dynamics, QuadraticCost([1.0], [1.0], [1.0]), [], torch.ones(1, 1, dtype=torch.float64), 5)
     assert presets.gco(problem) == presets.gco(2) != presets.gco(3)
+
+
+def test_solve_takes_the_name_of_a_preset() -> None:
+    problem, _ = planar_batch(B=2, N=8, obstacles=1)
+    for name in ("al_ilqr", "hold"):
+        assert torch.equal(solve(problem, solver=name).U, solve(problem, solver=presets.PRESETS[name](problem)).U)
+    for name in ("none", "", "gco "):
+        with pytest.raises(InputError, match=r"^solver: expected one of gco, gco_fast, .*, or a solver, got '"):
+            solve(problem, solver=name)

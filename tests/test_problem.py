@@ -33,6 +33,11 @@ def planar(constraints=(), x0=None, N=5, dynamics=None, cost=None) -> Problem:
     return Problem(dynamics or Planar(), cost, list(constraints), x0, N)
 
 
+def nowhere(*constraints) -> Problem:
+    """Dynamics without a position."""
+    return planar(constraints, dynamics=FunctionDynamics(lambda x, u: x, 6, 2, 0.1))
+
+
 @dataclass(frozen=True)
 class Aimed(Cost):
     goal: Tensor
@@ -53,7 +58,9 @@ class Aimed(Cost):
         (lambda: planar(constraints=[ControlBounds([-1, nan], [1, 1])]), "control_bounds.lower"),
         (lambda: planar(constraints=[ControlBounds([-1], [1])]), "control_bounds.lower"),
         (lambda: planar(constraints=[StateBounds([-inf] * 6, [inf] * 6)]), "state_bounds: expected at least one"),
-        (lambda: planar(constraints=[Spheres([[0.0, 0, 0]], [0.1])]), "obstacles.centers"),
+        (lambda: planar(constraints=[Spheres([[0.0, 0, 0]], [0.1])]), "obstacles.centers: expected 2-D centres"),
+        (lambda: nowhere(Spheres([[0.0, 0]], [0.1])), "obstacles.centers: expected dynamics with a position"),
+        (lambda: nowhere(Spheres([], [])), "obstacles.centers: expected dynamics with a position: set `position = sli"),
         (lambda: planar(constraints=[Spheres([[nan, nan]], [0.1])]), "obstacles.radii: expected NaN exactly where"),
         (lambda: planar(constraints=[Spheres([[0.0, 1.0]], [-0.1])]), "obstacles.radii: expected radii of at least 0"),
         (lambda: planar(constraints=[Spheres([[0.0, 1.0]], [0.1, 0.2])]), "obstacles.radii"),

@@ -217,7 +217,7 @@ CASES: dict[str, list[Callable[[], object]]] = {
         lambda: plan_batch(5), lambda: Polish().refine(5, None), lambda: Mission(Planner(LOCAL)).fly(5),  # type: ignore
         lambda: CasADiSolver().prepare(5),  # type: ignore[arg-type]
     ],
-    "solver": [lambda: solve(solved()[0], solver="gco"), lambda: solve(solved()[0], solver=Restarts)],  # type: ignore
+    "solver": [lambda: solve(solved()[0], solver="gco2"), lambda: solve(solved()[0], solver=Restarts)],  # type: ignore
     "solution": [lambda: Polish().refine(solved()[0], None)],  # type: ignore[arg-type]
     "U0": [lambda: call(U0=[[0.0]]), lambda: call(U0=None), lambda: solve(solved()[0], 5)],  # type: ignore[arg-type]
     "seed": [

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchgco import rollout
 from torchgco.constraints import ControlBounds
 from torchgco.errors import InputError, shown
-from torchgco.presets import gco
+from torchgco.presets import named
 from torchgco.problem import Problem, check_problem
 from torchgco.shapes import computing_on
 from torchgco.solution import Solution
@@ -18,7 +18,7 @@ from torchgco.solvers.contracts import Solver
 def solve(
     problem: Problem,
     U0: Tensor | None = None,
-    solver: Solver | None = None,
+    solver: Solver | str | None = None,
     seed: int = 0,
     ids: Tensor | None = None,
     warm: Solution | None = None,
@@ -30,24 +30,26 @@ def solve(
         problem: B problems.
         U0: initial controls (B, N, m). Default: those of `warm`, else the cost's reference, else zero; the middle of
             the bounds where that breaks these, or where the rollout overflows.
-        solver: default: `presets.gco`, the settings of the configuration `gco`.
+        solver: a solver, or the name of a preset (`torchgco.presets`). Default: "gco".
         seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
         warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
             its controls.
         max_seconds: time after which the best trajectories so far are returned; see `Solver.solve`.
 
     Raises:
-        InputError: U0, ids or warm don't fit the problem, or an argument is of another kind or out of its range.
+        InputError: U0, ids or warm don't fit the problem, no preset has this name, or an argument is of another kind or
+            out of its range.
     """
     check_problem(problem)
     if warm is not None and not isinstance(warm, Solution):
         raise InputError("warm", "a Solution, or None", type(warm).__name__)
-    if solver is not None and not isinstance(solver, Solver):
-        raise InputError("solver", "a solver, such as presets.gco(problem), or None", shown(solver))
+    solver = "gco" if solver is None else solver
+    if isinstance(solver, str):
+        solver = named(solver, problem)
+    if not isinstance(solver, Solver):
+        raise InputError("solver", "a solver, such as presets.gco(problem), or the name of a preset", shown(solver))
     if U0 is None:
         U0 = warm.U if warm is not None else _guess(problem)
-    if solver is None:
-        solver = gco(problem)
     multipliers = None if warm is None else warm.multipliers
     return solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds)
 

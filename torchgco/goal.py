@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.errors import InputError
-from torchgco.shapes import Dimensions, check_shape, tensor
+from torchgco.shapes import Dimensions, check_shape, space_of, tensor
 from torchgco.tree import PerElement
 
 SHARE = 0.09  # radius of a goal that is derived from a cost, as a share of the distance from start to goal
@@ -36,9 +36,7 @@ class Goal(PerElement):
 
     def bind(self, dims: Dimensions) -> Goal:
         """The goal with one row per problem; called once, by Problem."""
-        if dims.position is None:
-            raise InputError("goal", "dynamics with a position", "dynamics without one")
-        d = dims.position.stop - dims.position.start
+        d = space_of(dims, "goal")
         position = tensor(self.position, "goal.position", dims.like)
         position = position.expand(dims.B, -1) if position.dim() == 1 else position
         check_shape(position, (dims.B, d), "goal.position")

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from torchgco.baselines import CasADiSolver, GuidedCasADi, Hold, IteratedMPPI
-from torchgco.errors import InputError
+from torchgco.errors import InputError, shown
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.mppi import MPPI
 from torchgco.problem import Problem
@@ -161,6 +161,13 @@ PRESETS: dict[str, Callable[[Space], Solver]] = {
         fatrop_guided,
     )
 }
+
+
+def named(name: str, space: Space) -> Solver:
+    """The solver of a preset by its name; InputError where there is none."""
+    if name not in PRESETS:
+        raise InputError("solver", f"one of {', '.join(PRESETS)}, or a solver", shown(name))
+    return PRESETS[name](space)
 
 
 def _local(space: Space) -> AugmentedLagrangian:

@@ -43,6 +43,22 @@ def tensor(value: Any, field: str, like: Tensor) -> Tensor:
         raise InputError(field, "numbers", shown(value)) from None
 
 
+def as_states(x0: Any) -> Tensor:
+    """States (B, n) from a tensor, an array or lists of numbers; a single state (n,) is a batch of one.
+
+    Floating tensors and arrays keep their dtype, whole numbers and lists become float64.
+
+    Raises InputError (`x0`) where it isn't numeric.
+    """
+    if isinstance(x0, Tensor):
+        whole = not x0.is_floating_point() and not x0.is_complex() and x0.dtype != torch.bool
+        states = x0.double() if whole else x0
+    else:
+        single = isinstance(x0, np.ndarray) and x0.dtype == np.float32
+        states = tensor(x0, "x0", torch.empty(0, dtype=torch.float32 if single else torch.float64))
+    return states.unsqueeze(0) if states.dim() == 1 else states
+
+
 def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
     """`value`, a dense tensor of float64 or float32 without gradients, of the dtype and device of `like`.
 
@@ -99,6 +115,14 @@ class Dimensions:
     dt: float | None  # s, None for dynamics without a time step
     position: slice | None
     like: Tensor  # x0: dtype and device of everything
+
+
+def space_of(dims: Dimensions, field: str) -> int:
+    """d of the position in the dynamics; InputError, naming `field`, where they have none."""
+    if dims.position is None:
+        wanted = "dynamics with a position: set `position = slice(0, 2)`, or whichever states are metres"
+        raise InputError(field, wanted, "dynamics without one")
+    return dims.position.stop - dims.position.start
 
 
 def check_shape(value: Tensor, shape: tuple[int | str, ...], field: str) -> None:

@@ -246,5 +246,5 @@ def test_a_model_without_a_position_takes_no_capsules() -> None:
     plain, _ = planar_batch(B=2, N=4)
     blind = replace(plain.dynamics)
     object.__setattr__(blind, "position", None)
-    with pytest.raises(InputError, match=r"capsules.starts: expected dynamics with a position in 2-D or 3-D"):
+    with pytest.raises(InputError, match=r"capsules.starts: expected dynamics with a position: set"):
         Problem(blind, plain.cost, [Capsules(**POST)], plain.x0, 4)

@@ -51,7 +51,7 @@ WRONG = {
         [*MISSION, "mission.planer.margin=0"],
         "mission.planer: expected a key that the configuration has, such as planner, got planer",
     ),
-    "a group's key": (["scenario.obstacles=3"], "scenario.obstacles: expected a key that the configuration has, such as"),
+    "a group's key": (["scenario.obstacles=3"], "scenario.obstacles: expected a key that the configuration has"),
     "no mission": (["mission.duration=3"], "mission: expected experiment=mission, as its keys are given"),
     "mission in a wood": ([*MISSION, "scenario=woods"], "scenario: expected spheres in space for a mission: cro"),
     "mission in the plane": ([*MISSION, "scenario=yard"], "scenario: expected spheres in space for a mission: cro"),

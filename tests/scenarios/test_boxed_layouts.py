@@ -69,6 +69,19 @@ def test_a_round_trip_keeps_the_boxes(tmp_path: Path) -> None:
     assert example().take([1]).box_centers.shape == (1, 2, 2)
 
 
+def test_a_file_may_hold_boxes_alone(tmp_path: Path) -> None:
+    for layouts in (example(name="boxes"), in_space(name="boxes")):
+        held = {name: value for name, value in layouts.arrays().items() if name not in ("centers", "radii")}
+        np.savez(tmp_path / "boxes.npz", **held)
+        assert Layouts.load(tmp_path / "boxes.npz") == layouts
+    np.savez(tmp_path / "boxes.npz", **held, centers=np.zeros((1, 1, 3)))
+    with pytest.raises(InputError, match=r"^layouts\.radii: expected this array"):
+        Layouts.load(tmp_path / "boxes.npz")
+    np.savez(tmp_path / "flat.npz", **held | {"box_centers": np.zeros(3)})
+    with pytest.raises(InputError, match=r"^layouts\.centers: expected this array"):
+        Layouts.load(tmp_path / "flat.npz")
+
+
 def test_parts_with_and_without_boxes_are_joined() -> None:
     discs = Layouts(np.ones((1, 2, 2)), np.ones((1, 2)))
     plain = example(box_centers=np.zeros((2, 1, 2)), box_half_sizes=np.ones((2, 1, 2)), box_rotations=None)

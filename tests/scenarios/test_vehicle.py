@@ -88,6 +88,23 @@ def test_layouts_without_states_fit_both_models_in_the_plane(tmp_path) -> None:
         compose([*words, "model=quadrotor"])
 
 
+@pytest.mark.parametrize(("name", "positions"), [("quadrotor", [[1.0, 1, 0], [2, 1, 0]]), ("unicycle", [-4.0, 1])])
+def test_a_file_may_give_positions_alone(name: str, positions: list, tmp_path) -> None:
+    """As scenario.start does: the vehicle rests there."""
+    d, n = BUILT_IN[name]
+    np.savez(tmp_path / "some.npz", centers=np.zeros((2, 1, d)), radii=np.full((2, 1), 0.1), start=positions)
+    setup = compose(["scenario=layouts", f"scenario.path={tmp_path / 'some.npz'}", f"model={name}"])
+    x0 = setup.task().problem.x0
+    assert x0.shape == (2, n) and (x0[:, :d].numpy() == positions).all()
+    assert x0[:, d:].tolist() == [list(setup.vehicle.start)[d:]] * 2
+    assert setup.layouts().start.shape == (2, n)  # what a study writes and compares
+    goal = np.array(setup.vehicle.goal)
+    mixed = Layouts(setup.layouts().centers, setup.layouts().radii, start=positions, goal=goal)
+    assert (setup.vehicle.task(mixed).problem.x0 == x0).all()
+    with pytest.raises(InputError, match=rf"^layouts\.start: expected {n} states of model={name}, or {d} coordinates"):
+        setup.vehicle.task(Layouts(mixed.centers, mixed.radii, start=np.zeros(d + 1)))
+
+
 def test_a_yard_makes_the_unicycles_problem() -> None:
     task = vehicle("unicycle").task(Yard().draw(range(3), 0))
     spheres, bounds, boxes = task.problem.constraints

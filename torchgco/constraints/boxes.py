@@ -13,7 +13,7 @@ from torchgco.constraints.bodies import Inflated, Obstacles, least
 from torchgco.constraints.cuboids import Cuboids, excess, from_quaternions, segment_distance, signed_distance
 from torchgco.constraints.obstacles import FAR, per_problem, vehicle_radius
 from torchgco.errors import InputError
-from torchgco.shapes import Dimensions, check_shape, tensor
+from torchgco.shapes import Dimensions, check_shape, space_of, tensor
 
 AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
 UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
@@ -235,11 +235,10 @@ def dimension(dims: Dimensions, name: str) -> int:
     Raises:
         InputError: dynamics without a position in 2-D or 3-D.
     """
-    at = dims.position
-    if at is None or at.stop - at.start not in (2, 3):
-        got = "dynamics without one" if at is None else f"{at.stop - at.start}-D"
-        raise InputError(name, "dynamics with a position in 2-D or 3-D", got)
-    return at.stop - at.start
+    d = space_of(dims, name)
+    if d not in (2, 3):
+        raise InputError(name, "dynamics with a position in 2-D or 3-D", f"{d}-D")
+    return d
 
 
 def vehicle_radii(value: Any, name: str, dims: Dimensions) -> Tensor:

@@ -17,7 +17,7 @@ from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.constraints.bodies import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.bodies import Inflated, Obstacles, least
 from torchgco.errors import InputError
-from torchgco.shapes import Dimensions, check_shape, tensor
+from torchgco.shapes import Dimensions, check_shape, space_of, tensor
 
 FAR = -1e9  # the radius of an absent obstacle
 
@@ -50,12 +50,12 @@ class Spheres(Constraint):
 
     def bind(self, dims: Dimensions) -> Constraint:
         centers = tensor(self.centers, "obstacles.centers", dims.like)
-        if tuple(centers.shape) == (0,) and dims.position is not None:
-            centers = centers.reshape(0, dims.position.stop - dims.position.start)
+        d = space_of(dims, "obstacles.centers")
+        centers = centers.reshape(0, d) if tuple(centers.shape) == (0,) else centers
         centers = per_problem(centers, "obstacles.centers", 3, dims)
-        d = centers.shape[-1]
-        if dims.position is None or dims.position.stop - dims.position.start != d:
-            raise InputError("obstacles.centers", "the dimension of the vehicle's position", f"{d}-D centres")
+        if centers.shape[-1] != d:
+            wanted = f"{d}-D centres, as the vehicle's position is {d}-D"
+            raise InputError("obstacles.centers", wanted, f"{centers.shape[-1]}-D centres")
         M = centers.shape[1]
         radii = per_problem(self.radii, "obstacles.radii", 2, dims)
         check_shape(radii, (dims.B, M), "obstacles.radii")

@@ -70,7 +70,7 @@ class Setup:
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise InputError("study.layouts", "at least 1", repr(count))
         self._refuse_beyond_memory(self.scenario.draw(range(1), self.seed), count)
-        return self.scenario.draw(range(count), self.seed)
+        return self.vehicle.at_rest(self.scenario.draw(range(count), self.seed))
 
     def _refuse_beyond_memory(self, first: Layouts, count: int) -> None:
         """Raise where one problem, or all layouts and controls, exceed the free memory: the system would kill us."""

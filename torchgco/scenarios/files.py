@@ -38,9 +38,9 @@ class LayoutFile(Scenario):
 
     @property
     def states(self) -> int | None:
-        """Number n of states in the file's start and goal; None where it has neither."""
-        given = self.layouts.start if self.layouts.start is not None else self.layouts.goal
-        return None if given is None else given.shape[1]
+        """Number n of states in the file's start and goal; None where it has neither, or positions alone."""
+        given = (self.layouts.start, self.layouts.goal)
+        return next((s.shape[1] for s in given if s is not None and s.shape[1] != self.dimension), None)
 
     @property
     def available(self) -> int:

@@ -37,7 +37,8 @@ class Layouts:
     centers         (L, M, d) m, rows of NaN where an obstacle is absent
     radii           (L, M) m, NaN where absent
     velocities      (L, M, d) m/s, constant, or None if nothing moves
-    start, goal     (L, n) states, given as (n,) or (L, n), or None; positions come first
+    start, goal     (L, n) states, given as (n,) or (L, n), positions first; or positions alone, (d,) or (L, d), where
+                    the vehicle rests; or None
     vehicle_radius  m; goal_radius: m; dt: s; stages: N; each one number for all layouts, or None
     control_lower, control_upper
                     (m,) in the units of the inputs, infinite where unbounded, or None
@@ -86,7 +87,8 @@ class Layouts:
             put(name, value)
         for name in ("start", "goal"):
             put(name, checks.states(getattr(self, name), f"layouts.{name}", centers))
-        if self.start is not None and self.goal is not None and self.start.shape != self.goal.shape:
+        lengths = {state.shape[1] for state in (self.start, self.goal) if state is not None} - {centers.shape[2]}
+        if self.start is not None and self.goal is not None and len(lengths) > 1:
             raise InputError("layouts.goal", f"n = {self.start.shape[1]} as start has", self.goal.shape[1])
         for name, limit in (("vehicle_radius", "at_least"), ("goal_radius", "above"), ("dt", "above")):
             put(name, checks.optional_number(getattr(self, name), f"layouts.{name}", **{limit: 0.0}))
@@ -173,6 +175,7 @@ class Layouts:
         """
         held = read_arrays(path, "scenario.path", "a layout file", room=free_memory())
         path = Path(path)
+        held = _without_spheres(held) | held
         for name in REQUIRED:
             if name not in held:
                 raise InputError(f"layouts.{name}", f"this array in {path}", f"only {sorted(held)}")
@@ -182,6 +185,14 @@ class Layouts:
                 raise InputError(f"layouts.{name}", f"only {', '.join(known)}", f"this one in {path}")
         ids = held.pop(IDS, np.empty(0, np.int64))
         return cls(**held, name=path.stem, ids=ids)  # type: ignore[arg-type]
+
+
+def _without_spheres(held: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays of no spheres for a file that holds boxes alone; none for other files."""
+    shape = np.shape(held.get("box_centers"))
+    if len(shape) != 3 or any(name in held for name in REQUIRED):
+        return {}
+    return {"centers": np.empty((shape[0], 0, shape[2])), "radii": np.empty((shape[0], 0))}
 
 
 def concatenate(parts: Sequence[Layouts]) -> Layouts:

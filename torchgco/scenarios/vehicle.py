@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -103,6 +104,7 @@ class Vehicle:
             given = layouts.start if layouts.start is not None else layouts.goal
             wanted = fitting(layouts.dimension, None if given is None else given.shape[1])
             raise InputError("model", f"{wanted} for the {layouts.dimension}-D {layouts.name}", self.name)
+        layouts = self.at_rest(layouts)
         start, goal = self._states(layouts, "start"), self._states(layouts, "goal")
 
         def tensor(value: object) -> Tensor:
@@ -139,13 +141,24 @@ class Vehicle:
         U0 = tensor(list(self.control_reference)).expand(layouts.count, stages, -1).contiguous()
         return Task(problem, U0, center, goal_radius, layouts)
 
+    def at_rest(self, layouts: Layouts) -> Layouts:
+        """The layouts with states where they give positions alone: the vehicle's own start or goal, moved there."""
+        moved = {}
+        for name in ("start", "goal"):
+            given = getattr(layouts, name)
+            if given is not None and given.shape[1] == layouts.dimension == self.dimension:
+                moved[name] = np.tile(np.array(getattr(self, name), np.float64), (layouts.count, 1))
+                moved[name][:, self.dynamics.position] = given
+        return replace(layouts, **moved) if moved else layouts
+
     def _states(self, layouts: Layouts, name: str):
         """start or goal (L, n): the layouts' own, or the vehicle's for all."""
         states = getattr(layouts, name)
         if states is None:
             return torch.tensor([list(getattr(self, name))] * layouts.count, dtype=torch.float64).numpy()
         if states.shape[1] != self.dynamics.n:
-            raise InputError(f"layouts.{name}", f"{self.dynamics.n} states of model={self.name}", states.shape[1])
+            wanted = f"{self.dynamics.n} states of model={self.name}, or {self.dimension} coordinates"
+            raise InputError(f"layouts.{name}", wanted, states.shape[1])
         return states
 
 

@@ -30,6 +30,8 @@ def suited_paths(paths: PathProposals | None, problem: Problem) -> tuple[PathPro
     d = position.stop - position.start
     if d not in (2, 3) and any(isinstance(c, Obstacles) for c in problem.geometric):
         return None, f"no path is sought around obstacles in {d}-D, as the roadmap knows only 2-D and 3-D"
+    if problem.goal is None and any(isinstance(c, Obstacles) for c in problem.geometric):
+        return None, "no path is sought around obstacles without a goal: Problem(..., goal=Goal(position, radius))"
     if any(len(offset) != problem.m for offset in paths.initial_offsets):
         paths = replace(paths, initial_offsets=())
     if not has_paths(problem):
