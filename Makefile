@@ -73,7 +73,7 @@ benchmark-gpu: $(PEERS)
 	$(SPEED) --device cuda $(ARGS)
 
 docs: $(DEV)
-	$(BIN)/python -m pdoc torchgco --docformat google --output-directory docs/api
+	$(BIN)/python docs/reference.py
 
 figures: $(RUNTIME)
 	$(BIN)/python docs/figures.py

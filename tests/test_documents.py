@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import re
 import shlex
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +22,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from torch import Tensor
 
+import torchgco
 from benchmarks import oracle, quality
 from benchmarks.speed import __main__ as speed
 from torchgco import Problem
@@ -223,6 +227,26 @@ def test_the_figures_of_the_algorithm_are_drawn(tmp_path: Path) -> None:
     assert figures.main(["--output", str(tmp_path)]) == 0
     shown = [link for link in links(page) if link.startswith("figures/")]
     assert shown == [f"figures/{path.name}" for path in sorted(tmp_path.iterdir())]
+
+
+def test_the_api_reference_opens_with_the_public_names(tmp_path: Path) -> None:
+    """Without a warning of pdoc, such as one of a type that it doesn't find."""
+    command = [sys.executable, str(ROOT / "docs" / "reference.py"), "--output", str(tmp_path)]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    assert done.returncode == 0 and not done.stderr, done.stderr
+    shown = set(re.findall(r'<section id="(\w+)">', (tmp_path / "torchgco.html").read_text()))
+    assert set(torchgco.__all__) - {"presets", "judge"} <= shown
+    assert "interrupts" not in shown and not list(tmp_path.rglob("native*"))
+    for name in ("presets", "scenarios", "simulation", "plotting"):
+        assert (tmp_path / "torchgco" / f"{name}.html").is_file()
+
+
+def test_every_public_name_exists() -> None:
+    assert len(set(torchgco.__all__)) == len(torchgco.__all__)
+    public = {name for name, value in vars(torchgco).items() if getattr(value, "__module__", "").startswith("torchgco.")}
+    assert public | {"compose", "presets"} == set(torchgco.__all__)
+    for name in torchgco.__all__:
+        assert getattr(torchgco, name) is not None
 
 
 def test_a_wrong_command_is_not_accepted() -> None:

@@ -63,6 +63,21 @@ from torchgco.status import Status as Status
 if TYPE_CHECKING:
     from torchgco.experiments.build import compose as compose
 
+# In the order of the API reference; `interrupts` is no part of it.
+__all__ = [  # noqa: RUF022
+    # the problem
+    "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",
+    "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules", "ControlBounds",
+    "StateBounds", "FirstStepRates", "FunctionConstraint",
+    # solving it
+    "solve", "Solution", "Status", "presets", "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR",
+    "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
+    # checking the result
+    "judge", "certify", "Certificate",
+    # layouts, configurations, errors
+    "Layouts", "compose", "InputError", "GuidanceWarning",
+]  # fmt: skip
+
 __version__ = "0.1.0"
 
 # On some processors the library behind PyTorch's matrix products (MKL) picks a kernel by a matrix's address in memory,

@@ -235,3 +235,25 @@ def test_offsets_for_another_number_of_controls_are_left_out() -> None:
     problem = make_problem(2, spheres(2))
     plain, more = (solved(problem, replace(SINGLE, paths=PathProposals(initial_offsets=o))) for o in ((), ((1.0,),)))
     assert plain[1] == more[1] == [] and torch.equal(plain[0].U, more[0].U)
+
+
+class Effort(Cost):
+    """A cost that names no goal."""
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return u.square().sum(-1)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return 50.0 * (x[..., 0] - 2.0).square()
+
+
+def test_obstacles_without_a_goal_get_a_hint() -> None:
+    known = make_problem(2, spheres(2))
+    blind = Problem(known.dynamics, Effort(), known.constraints, known.x0, 40)
+    with pytest.warns(GuidanceWarning, match=r"no path is sought around obstacles without a goal: Problem"):
+        torchgco.solve(blind, solver=SINGLE)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", GuidanceWarning)
+        torchgco.solve(Problem(known.dynamics, Effort(), [], known.x0, 40), solver=SINGLE)
+        goal = torchgco.Goal([2.0, 0.0], 0.3)
+        torchgco.solve(Problem(known.dynamics, Effort(), known.constraints, known.x0, 40, goal), solver=SINGLE)
