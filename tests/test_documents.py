@@ -243,7 +243,8 @@ def test_the_api_reference_opens_with_the_public_names(tmp_path: Path) -> None:
 
 def test_every_public_name_exists() -> None:
     assert len(set(torchgco.__all__)) == len(torchgco.__all__)
-    public = {name for name, value in vars(torchgco).items() if getattr(value, "__module__", "").startswith("torchgco.")}
+    held = vars(torchgco).items()
+    public = {name for name, value in held if getattr(value, "__module__", "").startswith("torchgco.")}
     assert public | {"compose", "presets"} == set(torchgco.__all__)
     for name in torchgco.__all__:
         assert getattr(torchgco, name) is not None

@@ -9,7 +9,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "torchgco"
 LAYERS = [
-    ["errors", "interrupts", "tree", "status", "autodiff", "draws", "kernels"],
+    ["errors", "interrupts", "notices", "tree", "status", "autodiff", "draws", "kernels"],
     ["options", "archive"],
     ["shapes"],
     ["values"],

@@ -3,7 +3,10 @@
 import ctypes
 import multiprocessing
 import os
+import signal
+import subprocess
 import sys
+import time
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -167,6 +170,50 @@ def test_errors_are_the_compilers_own(cache: Path) -> None:
         build("no_such_type tgco_times;")
     assert len(str(caught.value).splitlines()) <= 6
     assert not cache.exists()
+
+
+# A compiler that starts a process, as gcc does, and waits for it; both write their numbers.
+SLOW = """#!/bin/sh
+case "$*" in *--version*) echo slow 1.0; exit;; esac
+sleep 300 &
+echo $$ $! > {numbers}.part
+mv {numbers}.part {numbers}
+wait
+"""
+COMPILING = "from torchgco.native.compiler import build; build('int tgco_one(void) { return 1; }')"
+
+
+def alive(number: int) -> bool:
+    """Whether a process runs, and isn't just waiting to be collected."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_the_compiler_and_what_it_started(how: signal.Signals, tmp_path: Path) -> None:
+    """The signal reaches Python alone, as from a scheduler, a notebook or a test."""
+    numbers, script = tmp_path / "numbers", tmp_path / "slow"
+    script.write_text(SLOW.format(numbers=numbers))
+    script.chmod(0o755)
+    environment = {**os.environ, "TORCHGCO_CC": str(script), "TORCHGCO_CACHE": str(tmp_path / "cache")}
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMPILING], env=environment, stderr=subprocess.PIPE, cwd=Path(__file__).parents[2]
+    )
+    while not numbers.exists():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    started = [int(word) for word in numbers.read_text().split()]
+    assert all(map(alive, started))
+    process.send_signal(how)
+    process.communicate(timeout=60)
+    assert process.returncode == -how
+    deadline = time.monotonic() + 30
+    while any(map(alive, started)) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not any(map(alive, started))
 
 
 @pytest.mark.parametrize("word", ["none", "/no/such/cc -O2", "false"])

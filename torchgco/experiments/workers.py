@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, ClassVar, TypeVar
 
+from torchgco import notices
 from torchgco.errors import InputError
 from torchgco.experiments.progress import NoBar
 from torchgco.interrupts import raised, throw
@@ -166,6 +167,7 @@ def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...], counts
 
 def _work(work: Callable[[Job], Result], job: Job, number: int) -> Result:
     Shared.job = number
+    notices.speak(number == 0)  # all workers compile the same, and one line on that is enough
     Shared.counts[number] = 0.0  # a former pool may have died in this job
     return work(job)
 

@@ -11,13 +11,17 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import FrameType
 
 from torchgco.native import store
+from torchgco.notices import notice
 
 # NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact.
 FLAGS = ("-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
@@ -98,18 +102,59 @@ def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDL
 
 
 def _compile(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) -> Path:
+    notice("compiling native kernels (once for this form of problem, some seconds) ...")
     (room / "kernels.c").write_text(source)
-    # Run in its folder: no path gets into the library, which then has the same bytes wherever it is made.
-    done = subprocess.run(
-        [*compiler.command, *flags, "-o", "kernels.so", "kernels.c", "-lm"],
-        cwd=room, env={**os.environ, "LC_ALL": "C"}, stdin=subprocess.DEVNULL, capture_output=True, text=True,
-        errors="replace",
-    )  # fmt: skip
-    if done.returncode:
-        said = done.stderr.splitlines() or [_ended(done.returncode)]
-        errors = [line for line in said if "error" in line] or said
-        raise NativeError(f"{shlex.join(compiler.command)} failed:\n" + "\n".join(errors[:_ERROR_LINES]))
+    returncode, errors = _run([*compiler.command, *flags, "-o", "kernels.so", "kernels.c", "-lm"], room)
+    if returncode:
+        said = errors.splitlines() or [_ended(returncode)]
+        shown = [line for line in said if "error" in line] or said
+        raise NativeError(f"{shlex.join(compiler.command)} failed:\n" + "\n".join(shown[:_ERROR_LINES]))
     return room / "kernels.so"
+
+
+def _run(command: Sequence[str], room: Path) -> tuple[int, str]:
+    """Run a compiler; returns its exit code and what it says on stderr.
+
+    It has a process group of its own, which Ctrl-C and SIGTERM end here: a compiler starts processes of its own, which
+    would go on.
+    """
+    # Run in its folder: no path gets into the library, which then has the same bytes wherever it is made.
+    process = subprocess.Popen(
+        command, cwd=room, env={**os.environ, "LC_ALL": "C"}, process_group=0, stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace",
+    )  # fmt: skip
+    try:
+        with _ending_by_sigterm(process):
+            _, said = process.communicate()
+    except BaseException:
+        _end(process)
+        raise
+    return process.returncode, said
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+@contextmanager
+def _ending_by_sigterm(process: subprocess.Popen[str]) -> Iterator[None]:
+    """In this block a SIGTERM that nobody handles, as in a study's workers, ends the compiler first."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        _end(process)
+        signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
+
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _ended(returncode: int) -> str:

@@ -1,0 +1,79 @@
+"""Lines on what takes long: where somebody watches, or in a program's own log; nowhere else."""
+
+import io
+import logging
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from torchgco import notices
+from torchgco.native.compiler import find_compiler
+
+ROOT = Path(__file__).resolve().parents[1]
+COMPILE = "from torchgco.native.compiler import build; build('int tgco_one(void) { return 1; }')"
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def shown(monkeypatch) -> io.StringIO:
+    """What a terminal shows."""
+    terminal = Terminal()
+    monkeypatch.setattr(notices, "sys", SimpleNamespace(stderr=terminal))
+    return terminal
+
+
+def test_nothing_is_shown_where_nobody_watches(capsys) -> None:
+    notices.notice("working")
+    assert capsys.readouterr().err == ""
+
+
+def test_a_terminal_shows_the_line_in_place_of_a_bar(shown) -> None:
+    notices.notice("working")
+    assert shown.getvalue() == f"{notices.CLEAR}torchgco: working\n"
+
+
+def test_a_notebook_shows_the_line(monkeypatch) -> None:
+    cell = io.StringIO()
+    monkeypatch.setattr(notices, "sys", SimpleNamespace(stderr=cell, ps1="In : "))
+    notices.notice("working")
+    assert cell.getvalue() == "torchgco: working\n"
+
+
+def test_workers_are_silent_unless_one_is_asked_to_speak(shown, monkeypatch) -> None:
+    monkeypatch.setattr(notices.multiprocessing, "parent_process", lambda: object())
+    monkeypatch.setattr(notices, "_speaks", None)
+    notices.notice("working")
+    notices.speak(False)
+    notices.notice("working")
+    assert shown.getvalue() == ""
+    notices.speak(True)
+    notices.notice("working")
+    assert "working" in shown.getvalue()
+
+
+def test_a_configured_log_gets_the_line_instead(shown, caplog) -> None:
+    with caplog.at_level(logging.INFO, "torchgco"):
+        notices.notice("working")
+    assert caplog.messages == ["working"] and shown.getvalue() == ""
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+def test_the_first_compilation_is_announced_in_a_terminal(tmp_path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "TORCHGCO_CACHE": str(tmp_path)}
+    for count in (1, 0):  # the second time the library is there
+        reader, writer = pty.openpty()
+        subprocess.run([sys.executable, "-c", COMPILE], env=environment, stderr=writer, check=True)
+        os.write(writer, b"end")
+        text = os.read(reader, 10_000).decode()
+        assert text.count("compiling native kernels") == count and text.endswith("end")
+        os.close(reader)
+        os.close(writer)

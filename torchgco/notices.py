@@ -1,0 +1,33 @@
+"""Lines on what takes some seconds, for people who watch.
+
+A program that has configured logging gets them from the logger `torchgco`, at INFO. Otherwise they go to stderr where
+somebody watches: in a terminal and in interactive Python, notebooks included, but not from worker processes.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import sys
+
+LOG = logging.getLogger("torchgco")
+CLEAR = "\r\x1b[K"  # erases the line of a terminal, such as a progress bar's
+
+_speaks: bool | None = None
+
+
+def speak(yes: bool | None) -> None:
+    """Whether this process may show lines; None, the default: where it is no worker."""
+    global _speaks
+    _speaks = yes
+
+
+def notice(text: str) -> None:
+    """Show a line, or log it."""
+    if LOG.isEnabledFor(logging.INFO):
+        LOG.info(text)
+        return
+    in_terminal = sys.stderr is not None and sys.stderr.isatty()
+    speaks = multiprocessing.parent_process() is None if _speaks is None else _speaks
+    if speaks and (in_terminal or hasattr(sys, "ps1")):
+        print(f"{CLEAR if in_terminal else ''}torchgco: {text}", file=sys.stderr, flush=True)
