@@ -1,4 +1,5 @@
-# make study   the default study, in its own environment (ARGS="experiment=planar_trap seed=1" for others)
+# make study   the default study, in its own environment (ARGS="experiment=planar_trap seed=1" for others), with a C compiler
+#              from the extra `native` where the machine has none
 # make ladder   seven solvers on the public layouts (ten minutes on one core)
 # make quality   how often gco reaches the goal on the public layouts, and how well (ARGS="--solvers gco gco_max" for more
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
@@ -25,6 +26,13 @@ DEV := $(VENV)/.dev
 PEERS := $(VENV)/.peers
 # A separate environment, without torchgco: the wheel of acados contains a CasADi that would shadow the real one.
 ACADOS := .venv-acados
+
+# After an installation: without a C compiler a solve takes some hundred times as long, and the extra `native` brings one.
+# TORCHGCO_CC says which compiler is used, or "none".
+COMPILER = [ -n "$$TORCHGCO_CC" ] || $(BIN)/python -c "$(FIND)" || { \
+    echo "No C compiler found: installing the extra native, which brings one."; $(INSTALL) -e '.[native]'; } || \
+    echo "It can't be installed here: solves run in PyTorch, many times slower. Any of gcc, clang or zig will do."
+FIND := import sys; from torchgco.native.compiler import find_compiler; sys.exit(find_compiler() is None)
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
@@ -97,14 +105,17 @@ $(BIN)/python:
 # Python is an order-only prerequisite: pip touches its folders with every install.
 $(RUNTIME): pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) -e .
+	@$(COMPILER)
 	touch $@
 
 $(DEV): pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) -e '.[dev,plants,cluster]'
+	@$(COMPILER)
 	touch $@ $(RUNTIME)
 
 $(PEERS): pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) -e '.[dev,plants,cluster,peers]'
+	@$(COMPILER)
 	touch $@ $(RUNTIME) $(DEV)
 
 $(ACADOS)/.ready: constraints.txt
