@@ -11,9 +11,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import torch
 
+from tests.problems import planar_batch
+from torchgco import kernels, presets
 from torchgco.native import compiler, store
 from torchgco.native.compiler import NativeError, build, find_compiler
+from torchgco.native.dispatch import engine_of
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
@@ -250,6 +254,22 @@ def test_where_compilers_are_looked_for(monkeypatch, tmp_path: Path) -> None:
 def test_zig(monkeypatch) -> None:
     monkeypatch.setenv("TORCHGCO_CC", f"{sys.executable} -m ziglang cc")
     assert times(2) == 6.0
+
+
+# What the extra `native` promises: whole kernels, not only a line of C.
+@pytest.mark.parametrize("command", ["clang", f"{sys.executable} -m ziglang cc"])
+def test_clang_and_zig_compile_the_kernels(monkeypatch, command: str) -> None:
+    monkeypatch.setenv("TORCHGCO_CC", command)
+    if find_compiler() is None:
+        pytest.skip(f"no {command}")
+    problem, U0 = planar_batch(B=3, N=12, obstacles=2)
+    assert engine_of(problem) is not None
+    solution, solver = presets.al_ilqr(problem).solve(problem, U0), presets.al_ilqr(problem)
+    kernels.use_native(False)
+    try:
+        torch.testing.assert_close(solution.cost, solver.solve(problem, U0).cost, rtol=1e-6, atol=0.0)
+    finally:
+        kernels.use_native(True)
 
 
 def test_old_files_go_and_used_ones_stay(cache: Path, monkeypatch) -> None:

@@ -6,11 +6,11 @@ static void commit(Lanes *s, I won, const int *from, V alpha, V cost, V merit) {
     int64_t N = s->of->N;
     I index;
     for (int l = 0; l < LANES; l++) index[l] = from[l];
-    for (int64_t i = 0; i < (N + 1) * NX; i++) s->X[i] = tgco_choose(won, __builtin_shuffle(s->Xn[i], index), s->X[i]);
-    for (int64_t i = 0; i < N * NU; i++) s->U[i] = tgco_choose(won, __builtin_shuffle(s->Un[i], index), s->U[i]);
-    s->cost = tgco_choose(won, __builtin_shuffle(cost, index), s->cost);
-    s->merit = tgco_choose(won, __builtin_shuffle(merit, index), s->merit);
-    s->alpha = tgco_choose(won, __builtin_shuffle(alpha, index), s->alpha);
+    for (int64_t i = 0; i < (N + 1) * NX; i++) s->X[i] = tgco_choose(won, tgco_permuted(s->Xn[i], index), s->X[i]);
+    for (int64_t i = 0; i < N * NU; i++) s->U[i] = tgco_choose(won, tgco_permuted(s->Un[i], index), s->U[i]);
+    s->cost = tgco_choose(won, tgco_permuted(cost, index), s->cost);
+    s->merit = tgco_choose(won, tgco_permuted(merit, index), s->merit);
+    s->alpha = tgco_choose(won, tgco_permuted(alpha, index), s->alpha);
 }
 
 /* The line search (lines 14-24) of the lanes `moving`. The `replicas` lanes of a problem try rungs in parallel. */

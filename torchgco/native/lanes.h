@@ -23,6 +23,17 @@ static inline V tgco_if(I where, V a) { return (V)(where & (I)a); }
 static inline V tgco_truth(I where) { return tgco_if(where, SET(1.0)); }
 static inline I tgco_is(V a) { return a != SET(0.0); } /* NaN is true, as in C */
 
+/* The lanes of a in another order: lane i gets lane index[i], 0 to LANES - 1. Clang, and so zig, has no builtin for it. */
+static inline V tgco_permuted(V a, I index) {
+#ifdef __clang__
+    V r;
+    for (int i = 0; i < LANES; i++) r[i] = a[index[i]];
+    return r;
+#else
+    return __builtin_shuffle(a, index);
+#endif
+}
+
 /* Whether a lane is true. */
 static inline int tgco_any(I where) {
     typedef long long Word __attribute__((vector_size(sizeof(I))));
