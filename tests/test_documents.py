@@ -46,7 +46,7 @@ PAGES += [
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?<=\n\n)(?:    .*\n)+")
 PYTHON, SHELL = "python", "sh"
-INSTALLS = ("pip install -e .", "pip install 'torchgco[cluster]'", "pip install 'torchgco[ray]'")
+INSTALLS = ("pip install -e .", "pip install -e '.[cluster]'", "pip install -e '.[ray]'")
 TARGETS = {"quality": quality, "ladder": quality, "oracle": oracle, "benchmark": speed, "benchmark-gpu": speed}
 
 
@@ -90,7 +90,7 @@ def accept(command: str) -> None:
     """Raise, or exit, unless the program accepts the command's arguments; runs nothing."""
     program, *words = shlex.split(command, comments=True)
     if program == "torchgco":
-        accept_overrides(words)
+        accept_overrides([word for word in words if word not in ("--help", "--version")])
     elif program == "torchgco-report":
         options = report._parser().parse_args(words)
         assert options.folders or options.power

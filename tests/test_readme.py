@@ -1,4 +1,4 @@
-"""The README's example runs as printed, and every status is explained; test_documents.py tests links and commands."""
+"""The README's example runs as printed, and it stays short; test_documents.py tests links and commands."""
 
 import re
 from pathlib import Path
@@ -7,7 +7,8 @@ import torch
 
 from torchgco import Problem, Solution, Status, judge
 
-README = (Path(__file__).resolve().parents[1] / "README.md").read_text()
+ROOT = Path(__file__).resolve().parents[1]
+README, WORDS = (ROOT / "README.md").read_text(), (ROOT / "docs" / "words.md").read_text()
 
 
 def test_the_python_example() -> None:
@@ -22,4 +23,8 @@ def test_the_python_example() -> None:
 
 def test_every_status_is_explained() -> None:
     for status in Status:
-        assert status is Status.RUNNING or f"| `{status.name}` |" in README
+        assert status is Status.RUNNING or f"| `{status.name}` |" in WORDS
+
+
+def test_it_is_read_in_a_few_minutes() -> None:
+    assert len(README.split()) <= 900

@@ -123,7 +123,7 @@ def test_a_failing_job_gets_one_line_and_the_others_are_kept(run, tmp_path) -> N
 def test_a_launcher_that_is_not_installed_gets_one_line(launcher: str, extra: str, run, monkeypatch) -> None:
     monkeypatch.setattr(jobs, "find_spec", lambda name: None)
     code, _, err = run("-m", f"hydra/launcher={launcher}", *HOLD)
-    assert code == 2 and f"pip install 'torchgco[{extra}]', got {launcher}" in problem_line(err)
+    assert code == 2 and f"pip install -e '.[{extra}]', got {launcher}" in problem_line(err)
 
 
 def test_a_malformed_number_of_processes_gets_one_line(run) -> None:

@@ -51,6 +51,7 @@ class Spheres(Constraint):
     def bind(self, dims: Dimensions) -> Constraint:
         centers = tensor(self.centers, "obstacles.centers", dims.like)
         d = space_of(dims, "obstacles.centers")
+        assert dims.position is not None
         centers = centers.reshape(0, d) if tuple(centers.shape) == (0,) else centers
         centers = per_problem(centers, "obstacles.centers", 3, dims)
         if centers.shape[-1] != d:

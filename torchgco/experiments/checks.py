@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.errors import MissingConfigException, OverrideParseException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from torchgco.errors import InputError
 from torchgco.options import Seed, check_value
@@ -143,10 +143,11 @@ def _unknown_key(error: BaseException, key: str) -> InputError:
     """The error for an unknown key: it names the first part that the configuration lacks, and the key most like it."""
     found: Any = error.__cause__  # of OmegaConf
     key = str(getattr(found, "full_key", None) or key)
-    name, parent = key.rpartition(".")[2], getattr(found, "parent_node", None)
+    name, parent = key.rpartition(".")[2], found.parent_node if hasattr(found, "parent_node") else None
     if key in CLOSED_LOOP:
         return InputError(key, "experiment=mission, as its keys are given", "none")
-    near = get_close_matches(name, map(str, parent), n=1) if OmegaConf.is_dict(parent) else []
+    known = [str(other) for other in parent] if isinstance(parent, DictConfig) else []
+    near = get_close_matches(name, known, n=1)
     return InputError(key, "a key that the configuration has" + "".join(f", such as {other}" for other in near), name)
 
 

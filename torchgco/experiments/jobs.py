@@ -126,7 +126,7 @@ def _check(config: DictConfig) -> None:
     except ModuleNotFoundError:
         known = False
     if not known:
-        install = f"an installed launcher: pip install 'torchgco[{EXTRAS.get(name, 'cluster')}]'"
+        install = f"an installed launcher: pip install -e '.[{EXTRAS.get(name, 'cluster')}]'"
         raise InputError("hydra/launcher", install, name)
     jobs_at_once(config.hydra.launcher)
 

@@ -189,7 +189,7 @@ class Layouts:
 
 def _without_spheres(held: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Arrays of no spheres for a file that holds boxes alone; none for other files."""
-    shape = np.shape(held.get("box_centers"))
+    shape = held["box_centers"].shape if "box_centers" in held else ()
     if len(shape) != 3 or any(name in held for name in REQUIRED):
         return {}
     return {"centers": np.empty((shape[0], 0, shape[2])), "radii": np.empty((shape[0], 0))}
