@@ -40,7 +40,9 @@ def test_a_tensor_is_not_copied() -> None:
 
 
 @pytest.mark.parametrize(
-    "x0", ["far", None, [[1.0], [1.0, 2.0]], ["a", "b"], {"x": 1.0}, True, 1j, np.array(["a"]), object()], ids=repr
+    "x0",
+    ["far", None, [[1.0], [1.0, 2.0]], ["a", "b"], {"x": 1.0}, True, 1j, np.array(["a"]), object()],
+    ids=lambda x0: type(x0).__name__,
 )
 def test_what_is_not_numeric_is_refused_in_one_line(x0) -> None:
     with pytest.raises(InputError, match=r"^x0: expected numbers, got ") as caught:
