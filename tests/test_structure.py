@@ -25,7 +25,7 @@ LAYERS = [
     ["guidance"],
     ["search"],
     ["baselines", "simulation"],
-    ["presets"],
+    ["presets", "contact"],
     ["scenarios", "api", "flights"],
     ["plotting"],
     ["experiments"],

@@ -90,6 +90,7 @@ def test_no_path_is_proposed(kind: str) -> None:
     assert not bool(PathProposals().propose(problem).found.any())
 
 
+@pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # 0.1 s between knots is long
 def test_empty_spheres_next_to_others_are_as_good_as_none() -> None:
     problem, U0 = planar_batch(B=2, N=25, obstacles=6, seed=4)
     more = Problem(problem.dynamics, problem.cost, [EMPTY["shared"], *problem.constraints], problem.x0, problem.N)

@@ -39,6 +39,7 @@ from torchgco.dynamics import QuadrotorPlanning as QuadrotorPlanning
 from torchgco.dynamics import QuadrotorPlant as QuadrotorPlant
 from torchgco.dynamics import RotorTracking as RotorTracking
 from torchgco.dynamics import Unicycle as Unicycle
+from torchgco.errors import ContactWarning as ContactWarning
 from torchgco.errors import GuidanceWarning as GuidanceWarning
 from torchgco.errors import InputError as InputError
 from torchgco.errors import ScaleWarning as ScaleWarning

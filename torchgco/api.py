@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchgco import rollout
 from torchgco.constraints import ControlBounds
+from torchgco.contact import warned_of_contact
 from torchgco.errors import InputError, shown
 from torchgco.presets import named
 from torchgco.problem import Problem, check_problem
@@ -25,6 +26,8 @@ def solve(
     max_seconds: float | None = None,
 ) -> Solution:
     """Solve every problem of the batch.
+
+    A ContactWarning names the trajectories whose status says feasible although they touch an obstacle between knots.
 
     Args:
         problem: B problems.
@@ -51,7 +54,8 @@ def solve(
     if U0 is None:
         U0 = warm.U if warm is not None else _guess(problem)
     multipliers = None if warm is None else warm.multipliers
-    return solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds)
+    found = solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds)
+    return warned_of_contact(problem, found)
 
 
 def _guess(problem: Problem) -> Tensor:

@@ -1,4 +1,4 @@
-"""The error for malformed input, and the warning for guidance that can't be used."""
+"""The error for malformed input, and the warnings for guidance that can't be used and for trajectories that touch."""
 
 from __future__ import annotations
 
@@ -29,3 +29,7 @@ class GuidanceWarning(UserWarning):
 
 class ScaleWarning(UserWarning):
     """A problem's lengths are so small that the tolerances, which are in metres, don't see them."""
+
+
+class ContactWarning(UserWarning):
+    """A trajectory whose status says feasible touches an obstacle between two knots."""

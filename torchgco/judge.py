@@ -25,6 +25,7 @@ from torchgco.shapes import check_shape, computing_on, tensor
 OTHERS_WITHIN = 1e-3  # how far all constraints but the obstacles may be violated by a feasible trajectory
 SUCCESS_VIOLATION = 1e-3  # full radii, in metres
 SUCCESS_COST = 0.05  # by how much a success may exceed the best known cost, as a share of its amount
+BLOCK = 2**18  # numbers held at once where distances from spheres are measured: 2 MB
 
 
 @dataclass(frozen=True)
@@ -146,20 +147,31 @@ def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
     Infinite where there is no obstacle. All knots count, the given start too. With Euler steps vehicle and obstacle
     both move straight from knot to knot, so the distance is exact; for other integrators it is that of the chord.
     """
-    contact = torch.where(spheres.absent, -torch.inf, CONTACT_FACTOR * spheres.inflated_radii)
-    at_knots = between = torch.full_like(X[:, 0, 0], torch.inf)
-    if contact.shape[1] == 0:
-        return at_knots, between
-    before = None
-    for k in range(X.shape[1]):
-        relative = X[:, k, None, spheres.position] - spheres.centers
-        if spheres.velocities is not None:
-            relative = relative - k * spheres.dt * spheres.velocities
-        at_knots = torch.minimum(at_knots, (relative.norm(dim=-1) - contact).amin(-1))
-        if before is not None:
-            between = torch.minimum(between, (segment_distance(before, relative) - contact).amin(-1))
-        before = relative
-    return at_knots, torch.minimum(between, at_knots)
+    if spheres.centers.shape[1] == 0:
+        far = torch.full_like(X[:, 0, 0], torch.inf)
+        return far, far
+    rows = max(1, BLOCK // (X.shape[1] * spheres.centers[0].numel()))
+    starts = (slice(i, i + rows) for i in range(0, X.shape[0], rows))
+    at_knots, between = zip(*(_sphere_clearance(spheres.take(some), X[some]) for some in starts), strict=True)
+    return torch.cat(at_knots), torch.cat(between)
+
+
+def _sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
+    contact = torch.where(spheres.absent, -torch.inf, CONTACT_FACTOR * spheres.inflated_radii).unsqueeze(1)
+    p = X[..., spheres.position].unsqueeze(2)
+    relative, move = p - spheres.centers.unsqueeze(1), p.diff(dim=1)
+    if spheres.velocities is not None:
+        v = spheres.velocities.unsqueeze(1)
+        t = spheres.dt * torch.arange(X.shape[1], dtype=X.dtype, device=X.device).view(1, -1, 1, 1)
+        relative, move = relative - t * v, move - spheres.dt * v
+    apart = relative.norm(dim=-1)
+    at_knots = (apart - contact).flatten(1).amin(-1)
+    # A segment's closest point lies within half its length of an end: so bounded, most can't be the closest.
+    half = 0.5 * move.norm(dim=-1)
+    least = (torch.minimum(apart[:, :-1], apart[:, 1:]).square() - half.square()).clamp(min=0.0).sqrt()
+    i, k, j = (least - contact < at_knots.view(-1, 1, 1)).nonzero(as_tuple=True)
+    near = segment_distance(relative[i, k, j], relative[i, k + 1, j]) - contact[i, 0, j]
+    return at_knots, at_knots.scatter_reduce(0, i, near, "amin")
 
 
 def box_clearance(boxes: BoundBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
@@ -208,4 +220,29 @@ def segment_distance(a: Tensor, b: Tensor) -> Tensor:
 def frame_columns(verdict: Verdict) -> dict[str, Any]:
     """The verdict as arrays, by the names of a study's columns (`success` needs the best cost first)."""
     names = ("feasible", "reached", "cost", "violation", "clearance", "clearance_knots", "goal_distance")
+    return {name: getattr(verdict, name).cpu().numpy() for name in names}
+
+
+def columns(problem: Problem, U: Tensor) -> dict[str, Any]:
+    """What can be judged of controls U (B, N, m) without being given more than the problem, as columns of a table.
+
+    `clearance` (m) where the problem has obstacles, `reached` where it has a goal; a problem of another precision is
+    judged in float64.
+
+    Raises:
+        InputError: as `judge`.
+    """
+    check_problem(problem)
+    if problem.dynamics.position is None:
+        return {}
+    names = ["clearance"] if any(isinstance(part, Obstacles) for part in problem.constraints) else []
+    names += ["reached"] if problem.goal is not None else []
+    if not names:
+        return {}
+    problem.check_controls(U, "U")
+    if problem.x0.dtype != torch.float64:
+        problem, U = problem.cast(torch.float64), U.double()
+    # Without a goal any will do, as only the clearance is read.
+    start, anywhere = problem.x0[:, problem.position], problem.goal is None
+    verdict = judge(problem, U, start, 1.0) if anywhere else judge(problem, U)
     return {name: getattr(verdict, name).cpu().numpy() for name in names}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections import Counter
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from torchgco.archive import read_arrays
 from torchgco.errors import InputError
+from torchgco.judge import columns as judged
 from torchgco.lagrangian import Multipliers
 from torchgco.shapes import check_device
 from torchgco.status import Status
@@ -21,6 +23,8 @@ from torchgco.tree import take
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from torchgco.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -51,13 +55,32 @@ class Solution:
         """The problems in `index` (the trace is left behind)."""
         return take(replace(self, trace=None), index)
 
-    def to_frame(self) -> pd.DataFrame:
-        """One row per problem: status, cost, violation and the iteration counts."""
+    def __repr__(self) -> str:
+        B, N, m = self.U.shape
+        counts = Counter(status.name for status in self.statuses).most_common()
+        ended = ", ".join(f"{count} {name}" for name, count in counts)
+        finite = self.cost[torch.isfinite(self.cost)].tolist()
+        costs = f"cost {min(finite):.6g} to {max(finite):.6g}" if finite else "no finite cost"
+        return f"Solution(B={B}, N={N}, n={self.X.shape[-1]}, m={m}: {ended}; {costs})"
+
+    def to_frame(self, problem: Problem | None = None) -> pd.DataFrame:
+        """One row per problem: status, cost, violation and the iteration counts.
+
+        Args:
+            problem: the problem that was solved. With it come the columns of `judge.columns`, from a re-simulation:
+                `clearance` where it has obstacles (m, the smallest distance to where bodies touch, also between
+                knots), and `reached` where it has a goal.
+
+        Raises:
+            InputError: a problem of another form, or with obstacles that can't be judged.
+        """
         import pandas as pd
 
         columns: dict[str, Any] = {"status": [s.name for s in self.statuses]}
         for name in ("cost", "violation", "iterations", "outer_iterations", "guided"):
             columns[name] = getattr(self, name).cpu().numpy()
+        if problem is not None:
+            columns |= judged(problem, self.U)
         return pd.DataFrame(columns).rename_axis("element")
 
     def save(self, path: str | Path) -> None:
