@@ -28,7 +28,7 @@ from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
 from torchgco import compose, judge, presets
 from torchgco.judge import near_best
-from torchgco.plotting.boxes import outlines
+from torchgco.plotting.bodies import Box, bodies
 from torchgco.problem import Problem
 from torchgco.scenarios import Layouts
 from torchgco.search import scene as seen
@@ -180,7 +180,7 @@ def _example(layouts: Layouts, i: int, path: Tensor, plan: Tensor | None, proble
         moved = centers + times * torch.as_tensor(layouts.velocities[i])  # (N+1, M, d)
         closest = (moved - path.unsqueeze(1)).norm(dim=-1).nan_to_num(inf).argmin(0)
         centers = moved[closest, torch.arange(len(centers))]
-    boxes = tuple(outline.grown(radius) for outline in outlines(layouts.arrays(), i))
+    boxes = tuple(body.outline(radius) for body in bodies(layouts.arrays(), i) if isinstance(body, Box))
     distances = torch.as_tensor(layouts.radii[i]) + radius
     assert problem.goal is not None
     return Example(layouts.name, i, centers, distances, path, plan, problem.goal.position[0], boxes)

@@ -8,16 +8,16 @@ import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
 from tests.trials import flights, trials
 from torchgco.errors import InputError
 from torchgco.experiments.statistics import summarise
 from torchgco.plotting.convergence import convergence_figure
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
-from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.rates import rates_figure
-from torchgco.plotting.style import PALETTE, save, solver_colours
+from torchgco.plotting.style import PALETTE, legend_columns, save, solver_colours, solver_dash
 
 
 def bars(ax: Axes) -> list[Rectangle]:
@@ -43,6 +43,22 @@ def test_a_solver_keeps_its_colour_among_any_others() -> None:
     assert len(set(together.values())) == 4
     assert solver_colours(["al_ilqr"]) == {"al_ilqr": together["al_ilqr"]}
     assert set(solver_colours([f"s{i}" for i in range(7)]).values()) == set(PALETTE)
+
+
+def test_each_solver_of_the_library_has_a_look_of_its_own() -> None:
+    names = sorted(path.stem for path in (Path(__file__).parents[2] / "conf" / "solver").glob("*.yaml"))
+    assert len(set(solver_colours(names).values())) == len(names) == 12
+    assert all(solver_colours([name])[name] == colour for name, colour in solver_colours(names).items())
+    common = ("gco", "al_ilqr", "gco_paper", "mppi")
+    assert len({solver_dash(name) for name in common}) == len(common) and solver_dash("gco") == "-"
+    assert solver_dash("mine") == solver_dash("mine") and len({solver_dash(f"s{i}") for i in range(50)}) > 3
+
+
+def test_a_legend_takes_as_many_columns_as_fit() -> None:
+    handles = [Line2D([], [], label=word) for word in ("a", "b", "a label of some length", "c", "d")]
+    # Filled column by column: a, b | long, c | d are 0.72 + 2.19 + 0.72 inches wide.
+    assert legend_columns(handles, 99.0) == 5
+    assert legend_columns(handles, 3.7) == 3 and legend_columns(handles, 3.5) == 2 and legend_columns(handles, 1.0) == 1
 
 
 def test_more_solvers_than_colours_still_have_one_each() -> None:
@@ -130,121 +146,6 @@ def test_what_has_no_spread_is_not_drawn(column: str) -> None:
     rows = [{"layout": i, column: 0.05 + i} for i in range(2)] + [{"scenario": "empty", column: np.nan}]
     assert is_spread(trials(*rows), column)
     assert [ax.get_title(loc="left") for ax in figure(trials(*rows)).axes] == ["forest (quadrotor)"]
-
-
-def plane(count: int = 3, **more: Any) -> dict[str, np.ndarray]:
-    centers = np.tile([[0.5, 0.5], [0.2, 0.8]], (count, 1, 1))
-    radii = np.tile([0.1, np.nan], (count, 1))
-    start, goal = np.zeros(6), np.array([1.0, 1.0, 0, 0, 0, 0])
-    scalars = {"vehicle_radius": np.array(0.05), "goal_radius": np.array(0.3), "dt": np.array(0.5)}
-    return {"centers": centers, "radii": radii, "start": start, "goal": goal, **scalars, **more}
-
-
-def straight(count: int = 3, knots: int = 5, n: int = 6) -> np.ndarray:
-    return np.broadcast_to(np.linspace(0, 1, knots)[:, None], (count, knots, n)).copy()
-
-
-def discs(ax: Axes) -> list[float]:
-    """Radii of all obstacles drawn in a panel, the faded copies of moving ones included."""
-    paths = [path for held in ax.collections for path in held.get_paths()]
-    return sorted(round(float(np.ptp(path.vertices[:, 0])) / 2, 6) for path in paths)
-
-
-ENDS = trials(
-    *flights("gco", [True, True, True]),
-    {"solver": "mine", "layout": 0},
-    {"solver": "mine", "layout": 1, "reached": False},
-    {"solver": "mine", "layout": 2, "reached": False, "feasible": False},
-)
-
-
-def test_a_panel_per_layout_with_obstacles_ends_and_a_trajectory_per_solver() -> None:
-    figure = layout_grid(plane(), {"gco": straight(), "mine": straight()}, ENDS, columns=2, rows=2)
-    assert [ax.get_title(loc="left") for ax in figure.axes] == ["layout 0", "layout 1", "layout 2"]
-    ax = figure.axes[0]
-    assert discs(ax) == [0.1, 0.15], "one obstacle, at its radius and with the vehicle's; the absent one is not drawn"
-    rings = [patch.get_radius() for patch in ax.patches if isinstance(patch, Circle)]
-    assert rings == [0.3]
-    points = [tuple(line.get_xydata()[0]) for line in ax.lines if line.get_marker() in ("s", "*")]
-    assert points == [(0, 0), (1, 1)]
-    assert sum(len(line.get_xdata()) == 5 for line in ax.lines) == 2
-
-
-def test_failed_trajectories_are_dashed_and_end_in_a_mark() -> None:
-    figure = layout_grid(plane(), {"mine": straight()}, ENDS)
-    looks = []
-    for ax in figure.axes:
-        path = next(line for line in ax.lines if len(line.get_xdata()) == 5)
-        marks = [(line.get_marker(), *line.get_xydata()[0]) for line in ax.lines if line.get_marker() in ("o", "X")]
-        looks.append((path.get_linestyle(), marks))
-    assert looks == [("-", []), ("--", [("o", 1, 1)]), ("--", [("X", 1, 1)])]
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert any("infeasible" in label for label in labels) and any("short" in label for label in labels)
-
-
-def test_a_solver_without_a_trajectory_is_marked_at_the_start() -> None:
-    states = straight()
-    states[2] = np.nan
-    ax = layout_grid(plane(), {"mine": states}, ENDS).axes[2]
-    assert [tuple(line.get_xydata()[0]) for line in ax.lines if line.get_marker() == "X"] == [(0, 0)]
-
-
-def test_at_most_rows_times_columns_layouts_are_shown() -> None:
-    table = trials(*flights("gco", [True] * 9))
-    assert len(layout_grid(plane(9), {"gco": straight(9)}, table, columns=2, rows=2).axes) == 4
-
-
-def test_ids_assign_trials_to_layouts() -> None:
-    layouts = plane(2, layout=np.array([2, 0]))
-    axes = layout_grid(layouts, {"mine": straight(2)}, ENDS).axes
-    assert [ax.get_title(loc="left") for ax in axes] == ["layout 2", "layout 0"]
-    assert any(line.get_marker() == "X" for line in axes[0].lines)
-    assert not any(line.get_marker() == "X" for line in axes[1].lines)
-
-
-def test_ends_may_differ_by_layout() -> None:
-    goals = np.array([[1.0, 1.0], [2.0, 0.0], [0.0, 2.0]])
-    axes = layout_grid(plane(goal=goals), {"gco": straight()}, ENDS).axes
-    stars = [tuple(line.get_xydata()[0]) for ax in axes for line in ax.lines if line.get_marker() == "*"]
-    assert stars == [(1, 1), (2, 0), (0, 2)]
-
-
-def test_a_diverging_trajectory_does_not_shrink_the_map() -> None:
-    states = straight()
-    states[1, -1] = 1e6
-    ax = layout_grid(plane(), {"gco": states}, ENDS).axes[0]
-    assert ax.get_xlim()[1] < 3 and ax.get_xlim()[0] < 0 and ax.get_ylim()[1] > 1.3
-
-
-def test_moving_obstacles_leave_a_fading_trail() -> None:
-    velocities = np.zeros((3, 2, 2))
-    velocities[1, 0] = [0.1, 0.0]
-    axes = layout_grid(plane(velocities=velocities), {"gco": straight()}, ENDS).axes
-    assert len(discs(axes[0])) == 2 and len(discs(axes[1])) > 3
-    trail = next(line for line in axes[1].lines if line.get_linestyle() == ":")
-    assert trail.get_xydata() == pytest.approx(np.array([[0.5, 0.5], [0.7, 0.5]])), "4 stages of 0.5 s at 0.1 m/s"
-    alphas = [held.get_alpha() for held in axes[1].collections[:4]]
-    assert alphas == sorted(alphas), "the farther in time, the fainter"
-
-
-def test_in_space_obstacles_are_shaded_by_height_highest_on_top() -> None:
-    layouts = plane(1)
-    layouts["centers"] = np.array([[[0.5, 0.5, 2.0], [0.4, 0.5, -1.0]]])
-    layouts["radii"] = np.array([[0.1, 0.2]])
-    figure = layout_grid(layouts, {"gco": straight(1, n=14)}, ENDS)
-    panel, bar = figure.axes
-    assert bar.get_ylabel() == "height of obstacles [m]" and bar.get_ylim() == (-1, 2)
-    fills = panel.collections[-2]
-    radii = [round(float(np.ptp(path.vertices[:, 0])) / 2, 6) for path in fills.get_paths()]
-    low, high = fills.get_facecolor()[:, :3].sum(axis=1)
-    assert radii == [0.2, 0.1] and low > high, "the highest is drawn last and darkest"
-
-
-def test_trajectories_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(InputError, match=r"trajectories\.gco: expected shape \(3, N\+1, n\)"):
-        layout_grid(plane(), {"gco": straight(2)}, ENDS)
-    with pytest.raises(InputError, match="a row of other for layout 0"):
-        layout_grid(plane(), {"other": straight()}, ENDS)
 
 
 def trace(cost: list[float], outer: list[int], guided: list[int], problem: int = 0) -> pd.DataFrame:

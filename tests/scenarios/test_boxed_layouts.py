@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from matplotlib.patches import Polygon
 
 from tests.reference import boxes as slow
 from torchgco import InputError, Planar
 from torchgco.constraints.boxes import BoundBoxes
-from torchgco.plotting.boxes import outlines
+from torchgco.plotting.bodies import Box, bodies
 from torchgco.plotting.layouts import layout_grid
 from torchgco.scenarios.layouts import BOXES, Layouts, concatenate
 from torchgco.scenarios.vehicle import Vehicle
@@ -163,37 +161,47 @@ def test_a_quaternion_of_another_length_is_named() -> None:
 
 
 def test_an_outline_from_above() -> None:
-    (box,) = outlines(in_space().arrays(), 0)  # rotated by 90 degrees about x: 0.6 m wide along y
-    assert box.height == 1.0
-    assert sorted(map(tuple, box.corners.round(12))) == [(-0.1, -0.3), (-0.1, 0.3), (0.1, -0.3), (0.1, 0.3)]
-    ring = box.grown(0.5)
+    (box,) = bodies(in_space().arrays(), 0)  # rotated by 90 degrees about x: 0.6 m wide along y
+    assert isinstance(box, Box) and box.center[2] == 1.0
+    assert sorted(map(tuple, box.outline().round(12))) == [(-0.1, -0.3), (-0.1, 0.3), (0.1, -0.3), (0.1, 0.3)]
+    ring = box.outline(0.5)
     assert ring[0].tolist() == pytest.approx([0.6, ring[0, 1]]) and np.abs(ring).max(axis=0).tolist() == [0.6, 0.8]
-    first, second = outlines(example().arrays(), 0)
-    inner = [slow.distance(c, np.zeros(2), np.array([0.1, 0.2]), 0.3) for c in 0.999 * first.corners]
-    assert max(inner) < 0 and len(second.corners) == 4 and len(outlines(example().arrays(), 1)) == 1
-    assert outlines({"radii": np.zeros((1, 0))}, 0) == ()
+    first, second = boxes_of(example())
+    inner = [slow.distance(c, np.zeros(2), np.array([0.1, 0.2]), 0.3) for c in 0.999 * first.outline()]
+    assert max(inner) < 0 and len(second.outline()) == 4 and len(boxes_of(example(), 1)) == 1
+    assert bodies({"radii": np.zeros((1, 0))}, 0) == ()
+
+
+def boxes_of(layouts: Layouts, i: int = 0) -> list[Box]:
+    return [body for body in bodies(layouts.arrays(), i) if isinstance(body, Box)]
 
 
 def test_outlines_of_rounded_boxes_and_of_a_trunk() -> None:
-    first, second = outlines(with_capsule().arrays(), 0)
+    first, second = boxes_of(with_capsule())
     for box, half, turn, radius in ((first, [0.2, 0.0], 0.3, 0.1), (second, [0.3, 0.1], -0.2, 0.05)):
         center = np.zeros(2) if box is first else np.array([0.5, 0.5])
         for by in (0.0, 0.07):
-            ring = box.grown(by) if by > 0 else box.corners
+            ring = box.outline(by)
             away = [slow.distance(p, center, np.array(half), turn, radius) for p in ring]
             assert away == pytest.approx([by] * len(ring), abs=1e-12)
-    trunk = in_space(box_half_sizes=np.array([[[0.0, 0.0, 2.0]]]), box_radii=np.array([[0.3]]), box_rotations=None)
-    (disc,) = outlines(trunk.arrays(), 0)
-    assert np.linalg.norm(disc.corners, axis=1) == pytest.approx(np.full(len(disc.corners), 0.3)) and disc.height == 1.0
+    (disc,) = boxes_of(trunk())
+    round_it = np.linalg.norm(disc.outline(), axis=1)
+    assert round_it == pytest.approx(np.full(len(round_it), 0.3)) and disc.center[2] == 1.0
+
+
+def trunk() -> Layouts:
+    return in_space(box_half_sizes=np.array([[[0.0, 0.0, 2.0]]]), box_radii=np.array([[0.3]]), box_rotations=None)
 
 
 @pytest.mark.parametrize("layouts", [example(), in_space(), with_capsule()], ids=["plane", "space", "rounded"])
 def test_maps_show_boxes(layouts: Layouts) -> None:
     d, count = layouts.dimension, layouts.count
     ends = pd.DataFrame({"layout": range(count), "solver": "gco", "feasible": True, "reached": True})
-    figure = layout_grid(layouts.arrays(), {"gco": np.zeros((count, 3, 2 * d))}, ends)
-    shown = [patch for patch in figure.axes[0].patches if isinstance(patch, Polygon)]
-    assert len(shown) == 2 * (2 if d == 2 else 1)
-    low, high = figure.axes[0].get_xlim()
-    assert all(low <= patch.get_xy()[:, 0].min() and patch.get_xy()[:, 0].max() <= high for patch in shown)
-    plt.close(figure)
+    paths = np.zeros((count, 3, 2 * d))
+    paths[..., 2:d] = layouts.box_centers[0, 0, 2:] if d == 3 else 0.0
+    paths[..., 0] = [-0.5, 0.0, 0.5]
+    figure = layout_grid(layouts.arrays(), {"gco": paths}, ends.assign(scenario="yard", model="unicycle"))
+    top = figure.axes[0]
+    shapes = [path.vertices for held in top.collections for path in held.get_paths()]
+    present = len(bodies(layouts.arrays(), 0))
+    assert len(shapes) == present * (2 if layouts.vehicle_radius else 1)

@@ -1,103 +1,154 @@
-"""Layouts in the form that a map shows: seen from above, with every optional array filled in."""
+"""Layouts in the form that a map shows, and what a map asks of flights through them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from torchgco.plotting.boxes import Outline, outlines
+from torchgco.constraints.bodies import CONTACT_FACTOR
+from torchgco.plotting.bodies import Body, bodies
 
 Arrays = Mapping[str, np.ndarray]
-SLACK = 0.5  # share of the scene's size by which paths may widen the map
+SLACK = 0.12  # share of the scene's size by which obstacles and flights that miss the goal may widen a map
+EDGE = 0.03  # share of the scene's size left free around it
+BETWEEN = 4  # places per stage at which contact is looked for
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """L layouts from above, lengths in metres, nan rows for obstacles that are absent.
+    """L layouts, lengths in metres.
 
-    centers   (L, M, 2); radii (L, M); heights (L, M) or None in the plane
-    drift     (L, M, 2) displacement of each obstacle during the flight, 0 at rest
-    start, goal
-              (L, 2), nan where unknown
-    margin    the vehicle's radius; goal_radius: nan where unknown
-    ids       (L,) index of each layout in its file or generator
-    boxes     the boxes present in each layout
+    bodies      the obstacles present in each layout
+    start, goal (L, d), nan where unknown
+    margin      the vehicle's radius; goal_radius: nan where unknown
+    dt          s, 0 where unknown: moving obstacles are then drawn where they start
+    ids         (L,) index of each layout in its file or generator
     """
 
-    centers: np.ndarray
-    radii: np.ndarray
-    heights: np.ndarray | None
-    drift: np.ndarray
+    bodies: tuple[tuple[Body, ...], ...]
     start: np.ndarray
     goal: np.ndarray
     margin: float
     goal_radius: float
+    dt: float
     ids: np.ndarray
-    boxes: tuple[tuple[Outline, ...], ...]
 
-    def shown_heights(self, count: int) -> np.ndarray:
-        """Heights of all obstacles of the first `count` layouts, m; none in the plane."""
-        if self.heights is None:
-            return np.empty(0)
-        boxes = [box.height for layout in self.boxes[:count] for box in layout]
-        return np.concatenate([self.heights[:count][np.isfinite(self.heights[:count])], boxes])
+    @property
+    def dimension(self) -> int:
+        return self.start.shape[1]
 
 
-def scene_of(layouts: Arrays, stages: int) -> Scene:
-    """The scene of all layouts in the arrays of a layout file, for flights of N = `stages`.
+class Pass(NamedTuple):
+    """Where a flight passes an obstacle."""
 
-    Without `dt` obstacles are drawn where they start, as it isn't known how far they move.
-    """
-    centers, radii = np.asarray(layouts["centers"], dtype=float), np.asarray(layouts["radii"], dtype=float)
-    count = len(radii)
-    duration = stages * float(layouts.get("dt", 0.0))
-    velocities = np.asarray(layouts.get("velocities", np.zeros_like(centers)), dtype=float)
+    place: np.ndarray  # (d,) of the vehicle, m
+    t: float  # s
+    distance: float  # m, the least between the surfaces at full radii
+
+
+def scene_of(layouts: Arrays) -> Scene:
+    """The scene of all layouts in the arrays of a layout file."""
+    count, d = len(layouts["radii"]), np.shape(layouts["centers"])[2]
 
     def point(name: str) -> np.ndarray:
-        states = np.asarray(layouts.get(name, np.full(2, np.nan)), dtype=float)
-        return np.broadcast_to(states[..., :2], (count, 2))
+        states = np.asarray(layouts.get(name, np.full(d, np.nan)), dtype=float)
+        return np.broadcast_to(states[..., :d], (count, d))
 
     return Scene(
-        centers=centers[..., :2],
-        radii=radii,
-        heights=centers[..., 2] if centers.shape[2] == 3 else None,
-        drift=np.nan_to_num(velocities[..., :2]) * duration,
+        bodies=tuple(bodies(layouts, i) for i in range(count)),
         start=point("start"),
         goal=point("goal"),
         margin=float(layouts.get("vehicle_radius", 0.0)),
         goal_radius=float(layouts.get("goal_radius", np.nan)),
+        dt=float(layouts.get("dt", 0.0)),
         ids=np.asarray(layouts.get("layout", np.arange(count))),
-        boxes=tuple(outlines(layouts, i) for i in range(count)),
     )
 
 
-def map_box(scene: Scene, paths: list[np.ndarray], count: int) -> np.ndarray:
-    """Lower and upper corner (2, 2), m, of a map of the first `count` layouts and their paths (N+1, 2).
+def flown(path: np.ndarray) -> np.ndarray:
+    """The knots (K, d) of a path (N+1, d) before the first one that isn't finite."""
+    finite = np.isfinite(path).all(axis=1)
+    return path if finite.all() else path[: int(finite.argmin())]
 
-    Starts, goals and obstacles make the scene. Paths widen it, but only by half its size: a diverged one would
-    otherwise shrink all the rest to a dot.
+
+def passes(scene: Scene, i: int, path: np.ndarray) -> list[Pass]:
+    """Where a path (N+1, d) passes each obstacle of layout i; without knots, every obstacle where it starts.
+
+    An obstacle at rest is passed where the path has its x (where it has it several times, at the closest of these
+    knots), a moving one where it comes closest.
     """
-    outer = (scene.radii + scene.margin)[:count, :, None]
-    centers = scene.centers[:count]
+    path, found = flown(path), []
+    t = scene.dt * np.arange(len(path))
+    step = np.abs(np.diff(path[:, 0])).max(initial=0.0)
+    for body in scene.bodies[i]:
+        if len(path) == 0:
+            found.append(Pass(body.at(0.0), 0.0, 0.0))
+            continue
+        apart = body.distance(path, t)
+        k = int(apart.argmin())
+        least = float(apart[k] - body.radius - scene.margin)
+        if not body.moving:
+            along = np.abs(path[:, 0] - body.center[0])
+            k = int(np.where(along <= along.min() + 0.5 * step, apart, np.inf).argmin())
+        found.append(Pass(path[k], float(t[k]), least))
+    return found
+
+
+def contacts(scene: Scene, i: int, path: np.ndarray) -> np.ndarray:
+    """Places (C, d) where a path (N+1, d) touches obstacles of layout i: the deepest of each contact.
+
+    Bodies touch at CONTACT_FACTOR of their radii, as the judge has it; between the knots the path is straight.
+    """
+    path = flown(path)
+    if len(path) == 0 or not scene.bodies[i]:
+        return np.empty((0, scene.dimension))
+    knots = np.arange(len(path))
+    fine = np.linspace(0, len(path) - 1, BETWEEN * (len(path) - 1) + 1)
+    places = np.stack([np.interp(fine, knots, column) for column in path.T], axis=-1)
+    depth = np.full(len(places), -np.inf)
+    for body in scene.bodies[i]:
+        reach = CONTACT_FACTOR * (body.radius + scene.margin)
+        depth = np.maximum(depth, reach - body.distance(places, scene.dt * fine))
+    touching = np.flatnonzero(depth > 0)
+    runs = np.split(touching, np.flatnonzero(np.diff(touching) > 1) + 1)
+    return places[[run[depth[run].argmax()] for run in runs if len(run)]]
+
+
+def view(scene: Scene, shown: Iterable[int], whole: list[np.ndarray], others: list[np.ndarray]) -> np.ndarray:
+    """Lower and upper corner (2, d), m, of a map of the layouts `shown`.
+
+    Starts, goals and the paths of `whole`, (N+1, d) each, are inside; obstacles and the paths of `others` widen the map
+    only by a share of its size, as a long wall or a diverged path would shrink all the rest to a dot.
+    """
+    shown = list(shown)
     ring = np.nan_to_num(scene.goal_radius)
-    ends = [scene.start[:count], scene.goal[:count] - ring, scene.goal[:count] + ring]
-    boxes = [box.grown(scene.margin) for layout in scene.boxes[:count] for box in layout]
-    corners = _corners([(centers - outer).reshape(-1, 2), (centers + outer).reshape(-1, 2), *ends, *boxes])
+    ends = [scene.start[shown], scene.goal[shown] - ring, scene.goal[shown] + ring]
+    edges = [_extent(body, scene.margin) for i in shown for body in scene.bodies[i] if not body.moving]
+    corners = _corners([*whole, *ends])
     if corners is None:
-        corners = _corners(paths)
+        corners = _corners(edges)
     if corners is None:
-        return np.array([[0.0, 0.0], [1.0, 1.0]])
-    size = max(corners[1] - corners[0])
-    reach = _corners([*paths, corners])
+        corners = _corners(others)
+    if corners is None:
+        return np.stack([np.zeros(scene.dimension), np.ones(scene.dimension)])
+    size = float(max(corners[1] - corners[0])) or 1.0
+    reach = _corners([*edges, *others, corners])
     assert reach is not None
     box = np.clip(reach, corners[0] - SLACK * size, corners[1] + SLACK * size)
-    return box + 0.04 * size * np.array([[-1.0], [1.0]])
+    return box + EDGE * size * np.array([[-1.0], [1.0]])
+
+
+def _extent(body: Body, margin: float) -> np.ndarray:
+    """Lower and upper corner (2, d) of a body at t = 0."""
+    reach = body.radius + margin
+    return np.stack([body.corners.min(axis=0) - reach, body.corners.max(axis=0) + reach])
 
 
 def _corners(points: list[np.ndarray]) -> np.ndarray | None:
-    """Lower and upper corner of the finite ones among (., 2) points; None if there are none."""
-    held = np.concatenate(points) if points else np.empty((0, 2))
-    finite = held[np.isfinite(held).all(axis=1)]
-    return np.stack([finite.min(axis=0), finite.max(axis=0)]) if len(finite) else None
+    """Lower and upper corner of the finite ones among (., d) points; None if there are none."""
+    finite = [part[np.isfinite(part).all(axis=1)] for part in points]
+    held = np.concatenate([np.empty((0, points[0].shape[1])), *finite]) if points else np.empty((0, 0))
+    return np.stack([held.min(axis=0), held.max(axis=0)]) if len(held) else None

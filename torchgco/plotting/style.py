@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 from math import ceil
 from pathlib import Path
 from typing import IO
@@ -20,7 +21,17 @@ from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, distinct for colour-blind readers too; their yellow is lost on white paper.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-KNOWN = ("gco", "al_ilqr", "fatrop", "ipopt", "mppi", "ilqr")
+Dash = str | tuple[float, tuple[float, ...]]
+DASHES: tuple[Dash, ...] = (
+    "-", (0, (5, 1.5)), (0, (6, 1.5, 1.5, 1.5)), (0, (1.5, 1.5)), (0, (3, 3)), (0, (8, 1.5, 1.5, 1.5, 1.5, 1.5)),
+)  # fmt: skip
+# Colour and dash of the solvers of conf/solver. Those after the first seven have colours of Paul Tol's.
+KNOWN: dict[str, tuple[str, Dash]] = {
+    "gco": (PALETTE[0], DASHES[0]), "al_ilqr": (PALETTE[1], DASHES[1]), "gco_paper": (PALETTE[3], DASHES[2]),
+    "fatrop": (PALETTE[2], DASHES[3]), "mppi": (PALETTE[4], DASHES[3]), "ilqr": (PALETTE[5], DASHES[4]),
+    "hold": ("#7F7F7F", DASHES[4]), "ipopt": ("#882255", DASHES[5]), "gco_fast": ("#44AA99", DASHES[1]),
+    "gco_max": ("#332288", DASHES[2]), "multistart": ("#999933", DASHES[5]), "fatrop_guided": ("#117733", DASHES[2]),
+}  # fmt: skip
 INK, FAINT = "#333333", "#BBBBBB"
 SMALL, TEXT, TITLE = 8, 9, 10  # points
 
@@ -32,12 +43,17 @@ def solver_colours(solvers: Iterable[str]) -> dict[str, str]:
     first free colour from there; two share a colour only if there are more solvers than colours.
     """
     names = list(dict.fromkeys(solvers))
-    colours = {name: PALETTE[KNOWN.index(name)] for name in names if name in KNOWN}
+    colours = {name: KNOWN[name][0] for name in names if name in KNOWN}
     for name in sorted(set(names) - set(KNOWN)):
         start = crc32(name.encode()) % len(PALETTE)
         ring = PALETTE[start:] + PALETTE[:start]
         colours[name] = next((colour for colour in ring if colour not in colours.values()), ring[0])
     return {name: colours[name] for name in names}
+
+
+def solver_dash(solver: str) -> Dash:
+    """The dash of a solver's lines, the same in every figure; solvers of one dash have different colours."""
+    return KNOWN[solver][1] if solver in KNOWN else DASHES[crc32(solver.encode()) % len(DASHES)]
 
 
 def panels(count: int, columns: int, size: tuple[float, float], share: bool = False) -> tuple[Figure, list[Axes]]:
@@ -70,11 +86,20 @@ def tidy(axes: Axes, title: str = "", grid: str | None = "y") -> None:
 
 def legend(figure: Figure, handles: Sequence[Artist]) -> None:
     """One legend above all panels, where it covers no data, in as few rows as the figure's width allows."""
-    # Some 0.07 inches per letter, and the width of nine letters for handle and gap.
-    needed = sum(0.65 + 0.07 * len(str(handle.get_label())) for handle in handles)
-    rows = ceil(needed / figure.get_figwidth())
-    columns = ceil(len(handles) / rows)
+    columns = legend_columns(handles, figure.get_figwidth())
     figure.legend(handles=handles, loc="outside upper center", ncols=columns, fontsize=TEXT, frameon=False)
+
+
+def legend_columns(handles: Sequence[Artist], width: float) -> int:
+    """The most columns in which a legend fits into a width, inches; matplotlib fills it column by column."""
+    # Some 0.07 inches per letter, and 0.65 for handle and gap.
+    needed = [0.65 + 0.07 * len(str(handle.get_label())) for handle in handles]
+    for columns in range(len(handles), 1, -1):
+        rows, longer = divmod(len(handles), columns)
+        ends = [(rows + 1) * min(i, longer) + rows * max(i - longer, 0) for i in range(columns + 1)]
+        if sum(max(needed[first:last]) for first, last in pairwise(ends)) <= width:
+            return columns
+    return 1
 
 
 def tasks_of(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
