@@ -25,7 +25,9 @@ STONE, EDGE = "#CFC8BA", "#A39B8B"
 SIDE: Plane = (0, 2)
 TALLEST = 1.5  # heights of a panel as a share of its width
 TRAIL = 1.0  # s of a moving obstacle's way that are drawn
-NEAR, STILL = 0.05, 0.01  # shares of the way from start to goal: what is near, and what hasn't moved
+# Shares of the way from start to goal: how near obstacles are that a cut misses, how far moving ones that are left out,
+# and what hasn't moved.
+NEAR, FAR, STILL = 0.05, 0.15, 0.01
 INFEASIBLE, SHORT = "infeasible", "feasible, short of the goal"
 
 
@@ -59,7 +61,7 @@ def layout_grid(
     Obstacles are filled as they are and outlined at the vehicle's radius from their sides, as the vehicle is drawn as a
     point. In space each is cut at the height (in the side view: at the y) that the first solver has at its x; those
     that this cut misses are dotted where they are near. A moving obstacle is drawn where it comes closest to the first
-    solver's trajectory. Crosses mark contact, at the knots and between them.
+    solver's trajectory, if it comes near. Crosses mark contact, at the knots and between them.
 
     Raises InputError where the trajectories don't fit the layouts, or one has no row in `trials`.
     """
@@ -143,6 +145,8 @@ def _obstacles(ax: Axes, scene: Scene, i: int, lead: list[Pass], plane: Plane) -
     own, grown, near = [], [], []
     moving = False
     for body, place in zip(scene.bodies[i], lead, strict=True):
+        if body.moving and place.distance > FAR * _way(scene, i):
+            continue
         if scene.dimension == 2:
             cut = [body.outline(margin, plane, place.t) for margin in (0.0, scene.margin)]
         else:
