@@ -1,6 +1,7 @@
 """The judge against plain NumPy, and its verdicts against hand-made cases."""
 
 from dataclasses import replace
+import sys
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from tests.problems import planar_batch, quadrotor_batch, reference_of
 from tests.reference.problem import cost as reference_cost
 from tests.reference.problem import rollout as reference_rollout
 from torchgco import ControlBounds, InputError, Planar, Problem, QuadraticCost, Spheres
-from torchgco.judge import judge
+from torchgco.judge import judge, segment_distance, sphere_clearance
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
 
@@ -57,6 +58,33 @@ def test_judged_by_numpy(batch: str) -> None:
         )  # fmt: skip
         bounds = np.maximum(U[b].numpy() - twin.u_upper, twin.u_lower - U[b].numpy()).max()
         assert float(verdict.violation[b]) == pytest.approx(max(depth, bounds, 0.0), abs=1e-12)
+
+
+@pytest.mark.parametrize("stride", [0.02, 0.5, 5.0])  # m, from knot to knot
+@pytest.mark.parametrize("moving", [False, True])
+def test_spheres_are_measured_as_over_all_segments_one_by_one(
+    stride: float, moving: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    problem, _ = quadrotor_batch(B=7, N=30)
+    given = Spheres(3.0 * normal(7, 5, 3), normal(7, 5).abs(), 0.3, normal(7, 5, 3) if moving else None)
+    (spheres,) = Problem(problem.dynamics, problem.cost, [given], problem.x0, 30).constraints
+    X = problem.x0.unsqueeze(1).repeat(1, 31, 1)
+    X[..., :3] += (stride * normal(7, 31, 3)).cumsum(1)
+    t = spheres.dt * torch.arange(31, dtype=torch.float64).view(1, -1, 1, 1)
+    away = X[:, :, None, :3] - spheres.centers.unsqueeze(1) - (t * spheres.velocities.unsqueeze(1) if moving else 0.0)
+    contact = 0.95 * spheres.inflated_radii.unsqueeze(1)
+    at = (away.norm(dim=-1) - contact).flatten(1).amin(-1)
+    between = (segment_distance(away[:, :-1], away[:, 1:]) - contact).flatten(1).amin(-1)
+    assert stride < 0.1 or bool((between < at).any())
+    for block in (1, 1000, 2**18):  # how many at once changes nothing
+        monkeypatch.setattr(sys.modules["torchgco.judge"], "BLOCK", block)  # the attribute of that name is the function
+        measured = sphere_clearance(spheres, X)
+        assert torch.equal(measured[0], at) and torch.equal(measured[1], torch.minimum(at, between))
 
 
 def passing(
