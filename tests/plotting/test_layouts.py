@@ -212,6 +212,26 @@ def test_in_space_spheres_are_cut_at_the_height_of_the_studied_solver() -> None:
     assert {"obstacle, cut at the height (below: at the y) of gco", "near gco, missed by this cut"} < set(words(figure))
 
 
+def test_a_trunk_that_the_flight_turns_away_from_is_not_cut_in_the_side_view() -> None:
+    sizes = {"box_half_sizes": np.array([[[0.0, 0.0, 8.0]]]), "box_radii": np.array([[0.3]])}
+    layouts = space([np.nan] * 3, np.nan) | {"box_centers": np.array([[[5.0, 0.0, 0.0]]])} | sizes
+    states = straight(1, knots=41, n=14, goal=(10.0, 0.0, 0.0))
+    states[0, :, 1] = np.interp(states[0, :, 0], [4.0, 4.75, 6.0, 10.0], [0.0, 2.0, 2.0, 0.0])
+    top, side = layout_grid(layouts, {"gco": states}, trials(*flights("gco", [True]))).axes
+    assert len(shapes(top)) == 2 and shapes(side) == [] and len(shapes(side, dotted=True)) == 1
+    assert shapes(top, dotted=True) == []
+
+
+def test_a_moving_obstacle_that_stays_far_is_left_out() -> None:
+    near, far = (
+        plane(1, centers=np.array([[[0.5, y]]]), radii=np.array([[0.1]]), velocities=np.array([[[0.01, 0.0]]]))
+        for y in (0.6, 1.3)
+    )
+    for layouts, count in ((near, 2), (far, 0)):
+        (ax,) = layout_grid(layouts, {"gco": straight(1)}, ENDS).axes
+        assert len(shapes(ax)) == count and len(ax.texts) == count / 2
+
+
 def test_in_space_what_is_far_from_the_flight_is_left_out() -> None:
     states = straight(1, knots=21, n=14, goal=(10.0, 0.0, 0.0))
     figure = layout_grid(space([5.0, 0.4, 3.0]), {"gco": states}, trials(*flights("gco", [True])))
