@@ -1,7 +1,7 @@
 """The judge against plain NumPy, and its verdicts against hand-made cases."""
 
-from dataclasses import replace
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest

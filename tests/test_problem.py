@@ -3,6 +3,7 @@
 import pickle
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -49,8 +50,8 @@ class Aimed(Cost):
         (lambda: planar(N=0), "N: expected at least one stage"),
         (lambda: planar(N=2.5), "N: expected"),
         (lambda: planar(x0=torch.zeros(2, 5, dtype=torch.float64)), "x0: expected shape"),
-        (lambda: planar(x0=torch.zeros(6, dtype=torch.float64)), "x0: expected a floating tensor"),
-        (lambda: planar(x0=torch.zeros(2, 6, dtype=torch.int64)), "x0"),
+        (lambda: planar(x0=torch.zeros(1, 2, 6, dtype=torch.float64)), "x0: expected a floating tensor"),
+        (lambda: planar(x0=torch.zeros(2, 6, dtype=torch.bool)), "x0"),
         (lambda: planar(dynamics=Planar(drag=torch.ones(3, dtype=torch.float64))), "dynamics.drag"),
         (lambda: planar(dynamics=Planar(drag=torch.ones(2))), "dynamics.drag: expected torch.float64"),
         (lambda: planar(dynamics=FunctionDynamics(lambda x, u: x[..., :3], 6, 2, 0.1)), "dynamics.step"),
@@ -149,3 +150,9 @@ def test_solve_takes_sensible_defaults() -> None:
     assert solution.X.shape == (2, 9, 6) and bool(torch.isfinite(solution.cost).all())
     again = solve(problem, warm=solution)
     assert bool((again.cost <= solution.cost * 1.01).all())
+
+
+@pytest.mark.parametrize("x0", [[0.0] * 6, [0] * 6, np.zeros(6), torch.zeros(6, dtype=torch.int64), [[0.0] * 6]])
+def test_starts_may_be_lists_arrays_and_single_states(x0) -> None:
+    problem = planar(x0=x0)
+    assert problem.x0.dtype == torch.float64 and tuple(problem.x0.shape) == (1, 6)

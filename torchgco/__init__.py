@@ -69,14 +69,14 @@ __all__ = [  # noqa: RUF022
     # the problem
     "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules", "ControlBounds",
-    "StateBounds", "FirstStepRates", "FunctionConstraint",
+    "StateBounds", "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # solving it
     "solve", "Solution", "Status", "presets", "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR",
     "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors
-    "Layouts", "compose", "InputError", "GuidanceWarning",
+    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "ScaleWarning",
 ]  # fmt: skip
 
 __version__ = "0.1.0"

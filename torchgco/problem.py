@@ -21,7 +21,7 @@ from torchgco.errors import InputError
 from torchgco.goal import Goal
 from torchgco.options import Count, Seconds, check_value
 from torchgco.scale import CostScale, changes_of, cost_scale
-from torchgco.shapes import MISTAKES, Dimensions, check_tensor, computing_on, describe
+from torchgco.shapes import MISTAKES, Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.tree import Rows, cast
 
 
@@ -31,7 +31,8 @@ class Problem:
 
     Args:
         dynamics, cost, constraints: the parts; values given per problem have the batch of x0.
-        x0: (B, n), fixes batch, device and dtype: float64 or float32, without gradients.
+        x0: (B, n), fixes batch, device and dtype: float64 or float32, without gradients. Lists and arrays become a
+            tensor, a single state (n,) is a batch of one.
         N: number of stages.
         goal: where the last knot should lie. None: derived from the cost, around the position in `Cost.goal` (the
             terminal reference of a quadratic cost) with 0.09 of the distance from the start as radius; no goal where
@@ -258,7 +259,8 @@ class Problem:
                 raise InputError(name, f"a {kind.__name__}", _named(part))
         for name in ("n", "m"):
             check_value(getattr(self.dynamics, name, None), Count, f"dynamics.{name}")
-        if not isinstance(self.x0, Tensor) or self.x0.dim() != 2 or not self.x0.is_floating_point():
+        object.__setattr__(self, "x0", as_states(self.x0))
+        if self.x0.dim() != 2 or not self.x0.is_floating_point():
             raise InputError("x0", f"a floating tensor (B, {self.dynamics.n})", describe(self.x0))
         if self.x0.shape[1] != self.dynamics.n or self.x0.shape[0] < 1:
             raise InputError("x0", f"shape (B, {self.dynamics.n})", tuple(self.x0.shape))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from functools import partial
 import re
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pandas as pd

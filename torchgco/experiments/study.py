@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 import torchgco
 from torchgco.errors import InputError
-from torchgco.experiments.build import FLOWN, Setup, build, solver_of
+from torchgco.experiments.build import Setup, build, solver_of
 from torchgco.experiments.files import say
 from torchgco.experiments.flight import Flight, Plan, fly, plan_of, prepare
 from torchgco.experiments.identity import Manifest, closed_loop, difference, digest, layout_digests, plain, settings_of
