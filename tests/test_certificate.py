@@ -26,6 +26,9 @@ from torchgco.experiments.records import COLUMNS
 from torchgco.judge import judge
 from torchgco.rollout import open_loop
 
+# Thin obstacles are the subject here.
+pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ScaleWarning")
+
 
 def passing(radius: float, integrator: str = "euler", velocity: float | None = None) -> tuple[Problem, torch.Tensor]:
     """A point that flies along the x axis at 2 m/s with knots 0.2 m apart, and a disc whose centre lies at x = 0.5."""

@@ -131,7 +131,7 @@ def test_tensors_that_are_not_plain_are_refused(kind: str) -> None:
 
 
 CASES: dict[str, list[Callable[[], object]]] = {
-    "x0": [lambda x=x: make(x0=x) for x in ([["a"] * 6], [[True] * 6], [[0.0] * 5], np.zeros((2, 3, 6)), None)],
+    "x0": [lambda x=x: make(x0=x) for x in ([["a"] * 6], [[0.0] * 5], np.zeros((2, 3, 6)), None)],
     "dynamics": [lambda: make(dynamics=None), lambda: make(dynamics=Planar)],
     "cost": [
         lambda: make(cost=None), lambda: make(cost=QuadraticCost), lambda: make(cost=Cost()),

@@ -86,7 +86,7 @@ def test_times_of_a_batch_are_not_printed_as_latencies(run) -> None:
     code, out, _ = run("experiment=mission", *SHORT, "study.layouts=2", "study.figures=false")
     lines = out.splitlines()[:2]
     assert code == 0 and all(" per mission of a batch of 2. " in line and "deadline" not in line for line in lines)
-    words = ["experiment=mission_study", *SHORT, "study.layouts=5", "study.baselines=[]", "study.figures=false"]
+    words = ["experiment=mission_study", *SHORT[:-1], "study.layouts=5", "study.baselines=[]", "study.figures=false"]
     code, out, _ = run(*words, "hydra.run.dir=five")
     head = next(line.split() for line in out.splitlines() if "flight time" in line)
     assert code == 0 and "divided by its missions" in out and head[-3:-1] == ["missed", "kept"]

@@ -78,6 +78,7 @@ SINGLE = replace(
     paths=PathProposals(),
     sampling=replace(BASE.sampling, sampler=SAMPLER),
     attempts=2,
+    finish=None,
 )
 
 

@@ -13,6 +13,8 @@ from torchgco.kernels import use_native
 from torchgco.native.dispatch import open_loop
 from torchgco.search import restarts
 
+pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
+
 
 def planar(parts: list, B: int, dt: float, N: int) -> Problem:
     """Start at x = -1, goal at (1, 0.4)."""

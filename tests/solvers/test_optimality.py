@@ -66,6 +66,7 @@ def test_the_scale_of_the_cost_changes_no_iterate(factor: float) -> None:
     torch.testing.assert_close(factor * one.cost, other.cost, rtol=1e-9, atol=0)
 
 
+@pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20])
 @pytest.mark.parametrize("batch", [planar_batch, quadrotor_batch])
 def test_the_scale_of_the_cost_changes_no_iterate_with_guidance(batch, factor: float) -> None:
@@ -142,6 +143,7 @@ def test_a_polished_trajectory_has_its_own_status() -> None:
     assert Polish(reach=10.0).refine(problem, rough).statuses == [Status.CONVERGED] * 2
 
 
+@pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 def test_unstable_dynamics_are_solved_from_rest() -> None:
     """Euler steps of 0.5 s make the drag unstable: every rollout diverges until the gains stabilise all states."""
     problem = Problem(
@@ -183,7 +185,12 @@ def test_solve_is_the_configuration_gco(scenario: str, model: str) -> None:
 
 def test_solve_hands_the_problem_to_that_solver(monkeypatch) -> None:
     calls = []
-    note_call = lambda self, problem, U0, **options: calls.append((self, U0, options))
+    whole = Restarts.solve
+
+    def note_call(self, problem, U0, **options):
+        calls.append((self, U0, options))
+        return whole(replace(self, attempts=1, paths=None, sampling=None, finish=None), problem, U0, **options)
+
     monkeypatch.setattr(Restarts, "solve", note_call)
     problem, U0 = planar_batch(B=2, N=25)
     solve(problem, seed=3)
