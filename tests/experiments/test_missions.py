@@ -155,6 +155,7 @@ def test_a_plant_needs_a_mission(run) -> None:
     assert code == 2 and "experiment=mission" in problem_line(err)
 
 
+@pytest.mark.slow
 def test_a_sweep_over_missions_becomes_columns_of_one_report(run, tmp_path, capsys) -> None:
     words = ["experiment=mission_study", *SHORT[:3], "study.layouts=2", "study.baselines=[]"]
     for wind in (0.0, 1.0):
