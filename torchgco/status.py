@@ -35,7 +35,8 @@ _SENTENCES = {
     "problem may be badly scaled.",
     Status.NOT_POSITIVE_DEFINITE: "The regularised control Hessian stayed indefinite up to the largest regularisation.",
     Status.NON_FINITE: "A state, cost or derivative became NaN or infinite.",
-    Status.INFEASIBLE: "No iterate met the constraints; the least violated trajectory is returned.",
+    Status.INFEASIBLE: "No iterate met the constraints, and nothing that was tried lowers the violation further; the "
+    "least violated trajectory is returned. Another guess may still lead to a feasible one.",
     Status.TIME_LIMIT: "The time limit ended the solve before the trajectory was stationary or feasible.",
     Status.INVALID_START: "The start lies inside an obstacle; nothing was solved.",
 }
