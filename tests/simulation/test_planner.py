@@ -10,9 +10,20 @@ from torch import Tensor
 
 from tests.reference import models
 from tests.simulation.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
-from torchgco import Airframe, ControlBounds, FirstStepRates, InputError, Planar, Problem, QuadraticCost, kernels
+from torchgco import (
+    Airframe,
+    ControlBounds,
+    FirstStepRates,
+    InputError,
+    Planar,
+    Problem,
+    QuadraticCost,
+    Restarts,
+    kernels,
+)
 from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.rollout import open_loop
+from torchgco.search import restarts
 from torchgco.simulation.disturbance import Disturbance
 from torchgco.simulation.planner import Plan, Planner
 from torchgco.simulation.plant import RotorPlant, hovering
@@ -66,6 +77,18 @@ def test_the_first_plan_is_the_solvers_own_solution() -> None:
     biased, _ = first_plan(Planner(SOLVER, margin=0.0), problem)  # an estimate of zero changes nothing
     torch.testing.assert_close(biased.X, plan.X, rtol=1e-7, atol=1e-9)
     assert not bool(biased.bias.any())
+
+
+def test_plans_are_not_finished_beyond_the_limits_of_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a limit cuts off, the next plan continues: longer limits would only make this one late."""
+    made = []
+    monkeypatch.setattr(restarts, "finish", lambda *words: made.append(words))
+    problem = varied()
+    whole = Restarts(replace(SOLVER, max_outer_iterations=1), None, None, attempts=1, finish=SOLVER)
+    first_plan(Planner(whole), problem)
+    assert not made
+    whole.solve(problem, problem.x0.new_zeros(problem.B, problem.N, problem.m))
+    assert made
 
 
 def test_rates_that_the_rotors_lead_to_are_planned() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -170,7 +170,9 @@ class _Solve:
 
     def __init__(self, planner: Planner, problem: Problem, seed: int, ids: Tensor, began: float) -> None:
         self.planner, self.problem, self.seed, self.ids, self.began = planner, problem, seed, ids, began
-        self.solver = planner.solver
+        # What a limit cuts off, the next plan continues: finishing it would only make this one late.
+        solver: Any = planner.solver
+        self.solver = solver if getattr(solver, "finish", None) is None else replace(solver, finish=None)
 
     def first(self, U0: Tensor) -> Plan:
         """The solver's plans, from controls U0 (B, N, 4)."""
