@@ -80,3 +80,14 @@ def test_obstacles_that_the_tolerance_cannot_see_are_named(radius: float, warned
     Problem(model, base.cost, [Spheres([[50.0, 50.0]], [radius], 0.001)], base.x0, base.N)
     found = [str(w.message) for w in recwarn if issubclass(w.category, torchgco.ScaleWarning)]
     assert len(found) == warned and all("0.005" in line and "0.001 m" in line for line in found)
+
+
+@pytest.mark.parametrize("goal", [10.0, 1e3, 1e6])
+def test_a_far_goal_is_no_constant(goal: float) -> None:
+    base = swing_up(0.0)
+    terminal = lambda x: 5e3 * ((x[..., 0] - goal).square() + x[..., 1].square())
+    effort = lambda x, u: 0.1 * u.square().sum(-1)
+    problem = Problem(base.dynamics, FunctionCost(effort, terminal), [], 0.0 * base.x0, 40)
+    assert not bool(problem.cost_scale.constant.any())
+    constant = FunctionCost(lambda x, u: 1e12 + 0.1 * u.square().sum(-1), terminal)
+    assert bool(Problem(base.dynamics, constant, [], 0.0 * base.x0, 40).cost_scale.constant.all()) == (goal < 1e4)

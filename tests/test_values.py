@@ -93,3 +93,35 @@ def test_values_that_do_not_fit_are_named(make: Any, line: str) -> None:
     good = problem()
     with pytest.raises(InputError, match=line):
         Problem(good.dynamics, make(), [], good.x0, N)
+
+
+def simple(constraint: FunctionConstraint) -> Problem:
+    cost = FunctionCost(lambda x, u: 0.1 * u.square().sum(-1), lambda x: 50.0 * (x[..., :2] - 1.0).square().sum(-1))
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), dim=-1), 4, 2, 0.1, position=slice(0, 2))
+    return Problem(model, cost, [constraint], torch.zeros(1, 4, dtype=D), N)
+
+
+def test_an_argument_k_with_a_default_is_a_constant_of_the_users() -> None:
+    plain = torchgco.solve(simple(FunctionConstraint(lambda x: 2.0 * x[..., :1] - 1.0)))
+    named = torchgco.solve(simple(FunctionConstraint(lambda x, k=2.0: k * x[..., :1] - 1.0)))
+    assert torch.equal(plain.X, named.X) and float(plain.X[..., 0].max()) > 0.45
+    made = FunctionDynamics(lambda x, u, k=0.5: torch.cat((x[..., 2:], u - k * x[..., 2:]), dim=-1), 4, 2, 0.1)
+    base = simple(FunctionConstraint(lambda x: x[..., :1] - 5.0))
+    assert Problem(made, base.cost, [], base.x0, N).dynamics.step(torch.ones(1, 4), torch.ones(1, 2)).shape == (1, 4)
+
+
+def test_the_last_knot_is_N_for_a_terminal_cost() -> None:
+    cost = FunctionCost(
+        lambda x, u: 1e-4 * u.square().sum(-1), lambda x, k: 50.0 * (x[..., :2] - 0.1 * k).square().sum(-1)
+    )
+    base = simple(FunctionConstraint(lambda x: x[..., :1] - 5.0))
+    solution = torchgco.solve(Problem(base.dynamics, cost, [], base.x0, N))
+    assert float((solution.X[0, -1, :2] - 0.1 * N).abs().max()) < 0.05
+
+
+def test_values_of_another_problem_are_refused() -> None:
+    bound = problem()
+    with pytest.raises(InputError, match=r"cost: value 'goal': expected torch.float64 of shape \(1, ...\)"):
+        Problem(problem(slice(0, 1)).dynamics, bound.cost, [], bound.x0[:1], N)
+    with pytest.raises(InputError, match=r"constraint: value 'most': expected torch.float64 of shape"):
+        Problem(bound.dynamics, bound.cost, [bound.constraints[1]], bound.x0, N - 5)

@@ -20,19 +20,24 @@ class ReadsMemory(RuntimeError):
 
 
 class WithoutReading(TorchFunctionMode):
-    """Raises ReadsMemory where a function leaves PyTorch.
+    """Raises ReadsMemory where a function leaves PyTorch with a tensor that is differentiated or recorded.
 
-    A tensor that is differentiated or recorded has no memory of its own: reading it may crash, and what is made of the
-    numbers is a constant.
+    Such a tensor has no memory of its own: reading it may crash, and what is made of the numbers is a constant. Other
+    tensors may be read; `seen` keeps by which methods.
     """
 
-    NUMPY = ("numpy", "__array__", "__dlpack__")
-    READERS = ("tolist", "data_ptr", "storage", "untyped_storage")
+    READERS = ("numpy", "__array__", "__dlpack__", "tolist", "data_ptr", "storage", "untyped_storage")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         name = getattr(func, "__name__", "")
-        if name in self.NUMPY or (name in self.READERS and _stands_for_another(args[0])):
-            raise ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
+        if name in self.READERS:
+            self.seen.add(name)
+            if _stands_for_another(args[0]):
+                raise ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
         return func(*args, **(kwargs or {}))
 
 

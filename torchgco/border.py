@@ -6,7 +6,7 @@ A mistake that broadcasting or autodiff would hide ends here, in one line, and n
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -108,6 +108,25 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
     _check_slope(field, weighted, X, U, None if by_pytorch else own)
 
 
+def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint], x0: Tensor, N: int) -> None:
+    """Differentiate a user's parts as PyTorch's kernels do, for the first problem.
+
+    Raises:
+        InputError: names the part that `torch.func` can't differentiate.
+    """
+    first, wanted = slice(0, 1), "a function that torch.func can differentiate"
+    X, U = x0[first].unsqueeze(1).repeat(1, N + 1, 1), x0.new_zeros(1, N, dynamics.m)
+    if is_users(dynamics):
+        _called("dynamics.step", wanted, dynamics.take(first).jacobians, X[:, :-1], U)
+    if is_users(cost):
+        _called("cost", wanted, cost.take(first).expand, X, U, _blocks(X, U)[first])
+    for i, constraint in enumerate(constraints):
+        if is_users(constraint) and type(constraint).accumulate is not Constraint.accumulate:
+            part = constraint.take(first)
+            zero = torch.zeros_like(_called(f"constraints[{i}].value", wanted, part.value, X, U))
+            _called(f"constraints[{i}].value", wanted, part.accumulate, X, U, zero, zero, _blocks(X, U)[first])
+
+
 def _check_values(
     field: str,
     function: Callable[..., Any],
@@ -153,15 +172,15 @@ def _check_slope(
 
     `own` (dx, du) is the derivative by the part's own code; None: by PyTorch, in reverse mode.
     """
-    eps = torch.finfo(x.dtype).eps
+    eps, readers = torch.finfo(x.dtype).eps, WithoutReading()
     expected = "a function with derivatives by PyTorch, or the part's own, that agree with differences"
     if own is None:
-        with WithoutReading(), warnings.catch_warnings():
+        with readers, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # PyTorch's, about numbers read from tensors with gradients
             gx, gu = _called(field, expected, gradients_at_once, function, x, u)
         own = lambda dx, du: (gx * dx).flatten(1).sum(-1) + (gu * du).flatten(1).sum(-1)
     # States and controls apart: the derivatives by one may be too large for a mistake in the others to be seen.
-    for dx, du in ((_direction(x), torch.zeros_like(u)), (torch.zeros_like(x), _direction(u))):
+    for dx, du in ((_steps(x), torch.zeros_like(u)), (torch.zeros_like(x), _steps(u))):
         given, h = _called(field, expected, own, dx, du), eps ** (1.0 / 3.0)
         along = lambda t, dx=dx, du=du: function(x + t * dx, u + t * du)
         wide, close = ((along(t) - along(-t)) / (2.0 * t) for t in (h, 0.25 * h))
@@ -170,7 +189,9 @@ def _check_slope(
         wrong = ((given - close).abs() > unsure) & torch.isfinite(close)
         if bool(wrong.any()):
             b = wrong.nonzero()[0, 0]
-            raise InputError(field, expected, f"{float(given[b]):.4g} where differences give {float(close[b]):.4g}")
+            lost = "".join(f"; Tensor.{name} may lose them" for name in sorted(readers.seen))
+            got, due = float(given[b]), float(close[b])
+            raise InputError(field, expected, f"{got:.4g} where differences give {due:.4g}{lost}")
 
 
 def _called(field: str, wanted: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -205,6 +226,11 @@ def _direction(like: Tensor) -> Tensor:
     """Numbers between -1 and 1 in the shape of `like`, without a pattern, the same in every process."""
     place = torch.arange(1, like.numel() + 1, dtype=like.dtype, device=like.device)
     return (place * 1.618).cos().reshape(like.shape)
+
+
+def _steps(z: Tensor) -> Tensor:
+    """A direction of differences, larger where the values are."""
+    return _direction(z) * (1.0 + z.abs())
 
 
 def _blocks(X: Tensor, U: Tensor) -> Tensor:

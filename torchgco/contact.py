@@ -37,9 +37,13 @@ def warned_of_contact(problem: Problem, solution: Solution) -> Solution:
 
 def touches(problem: Problem, solution: Solution) -> Tensor:
     """Which trajectories (B,) claim to be feasible and come below a clearance of 0 m, by the judge's distances."""
-    nearest = torch.full_like(solution.cost, torch.inf)
+    found = torch.stack([solution.status == status for status in CLAIMS]).any(0)
+    rows = found.nonzero().flatten()
+    if rows.numel() == 0:
+        return found
+    nearest = torch.full_like(solution.cost[rows], torch.inf)
     for part in problem.constraints:
         if isinstance(part, Obstacles) and isinstance(part, tuple(CLEARANCES)):
-            nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(part, solution.X)[1])
-    claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
-    return claims & (nearest < 0)
+            nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(part.take(rows), solution.X[rows])[1])
+    found[rows] = nearest < 0
+    return found

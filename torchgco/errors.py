@@ -1,4 +1,4 @@
-"""The error for malformed input, and the warnings for guidance that can't be used and for trajectories that touch."""
+"""The error for malformed input, and the warnings: guidance that can't be used, contacts, lengths too small."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from torchgco.dynamics.integrators import Integrator
 from torchgco.errors import InputError
 from torchgco.goal import Goal
 from torchgco.options import Count, Seconds, check_value
-from torchgco.scale import CostScale, changes_of, cost_scale
+from torchgco.scale import CostScale, changes_of, cost_scale, savings
 from torchgco.shapes import MISTAKES, Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.tree import Rows, cast
 
@@ -85,9 +85,9 @@ class Problem:
             field = f"{name}.function" if isinstance(name, str) else f"constraints[{i}].value"
             check_constraint(constraint, field, self.x0, self.N, self.m)
 
-    def _dimensions(self, x0: Tensor) -> Dimensions:
-        dt = getattr(self.dynamics, "dt", None)
-        return Dimensions(x0.shape[0], self.N, self.n, self.m, dt, self.dynamics.position, x0)
+    def _dimensions(self, x0: Tensor, dynamics: Dynamics | None = None) -> Dimensions:
+        model = dynamics or self.dynamics
+        return Dimensions(x0.shape[0], self.N, self.n, self.m, getattr(model, "dt", None), model.position, x0)
 
     @property
     def B(self) -> int:
@@ -133,16 +133,22 @@ class Problem:
         s = self.n + 1 + self.m
         H = self.x0.new_empty(self.B, self.N + 1, s, s)
         self.cost.expand(X, U, H)
-        return self.scale_of(H[:, :-1, self.n + 1 :, self.n + 1 :])
+        slopes, diagonal = H[..., self.n], H.diagonal(dim1=-2, dim2=-1)
+        z = [i for i in range(s) if i != self.n]
+        return self.scale_of(slopes[..., z], diagonal[..., z])
 
-    def scale_of(self, Huu: Tensor) -> CostScale:
-        """`cost_scale` from the Hessians (B, N, m, m) of the cost of staying at the start in the controls."""
+    def scale_of(self, slopes: Tensor, curvatures: Tensor) -> CostScale:
+        """`cost_scale` from derivatives of the cost of staying at the start: gradients and the Hessians' diagonals.
+
+        Both are (B, N+1, n+m).
+        """
         X, U = self.at_rest
         total, changes = self.cost.total(X, U), None
         if not isinstance(self.cost, BoundQuadratic):
             goal = None if self.goal is None else self.goal.position
             changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position)
-        return cost_scale(total, Huu, changes)
+            changes = torch.maximum(changes, savings(slopes, curvatures))
+        return cost_scale(total, curvatures[:, :-1, self.n :], changes)
 
     @property
     def cost_unit(self) -> Tensor:
@@ -207,6 +213,7 @@ class Problem:
         Raises:
             InputError: x0 of another shape, dtype or device, constraints of other kinds, or parts that don't fit.
         """
+        x0 = as_states(x0)
         check_tensor(x0, "x0")
         if x0.shape != self.x0.shape or x0.dtype != self.x0.dtype or x0.device != self.x0.device:
             raise InputError("x0", f"{self.x0.dtype} of shape {tuple(self.x0.shape)}", describe(x0))
@@ -218,14 +225,23 @@ class Problem:
         if dynamics is not None and (dynamics.n, dynamics.m) != (self.n, self.m):
             raise InputError("dynamics", f"{self.n} states and {self.m} controls", f"{dynamics.n} and {dynamics.m}")
         with computing_on(x0.device):
-            dims = self._dimensions(x0)
+            model = self.dynamics if dynamics is None else dynamics.bind(self._dimensions(x0, dynamics))
+            dims = self._dimensions(x0, model)
             bound = tuple(constraint.bind(dims) for constraint in constraints)
+            for i, part in enumerate(bound):
+                if isinstance(part, Obstacles) and (part.dt, part.position) != (dims.dt, dims.position):
+                    expected = f"obstacles for steps of {dims.dt} s and the position in states {dims.position}"
+                    raise InputError(f"constraints[{i}]", expected, f"bound ones for {part.dt} s and {part.position}")
             if [type(part) for part in bound] != [type(part) for part in self.constraints]:
                 kinds = ", ".join(type(part).__name__ for part in self.constraints)
                 raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in bound))
             parts: dict[str, Any] = {"x0": x0, "constraints": bound}
-            parts |= {} if cost is None else {"cost": cost.bind(dims)}
-            parts |= {} if dynamics is None else {"dynamics": dynamics.bind(dims)}
+            if dynamics is not None:
+                parts["dynamics"] = model
+            if cost is not None:
+                parts["cost"] = cost.bind(dims)
+                if self.goal is None or self.goal.assumed:
+                    parts["goal"] = Goal.derived(parts["cost"].goal(x0), dims)
             started = self._with(parts)
             known = set(map(id, self.constraints))
             new = [b for b, given in zip(bound, constraints, strict=True) if id(given) not in known]

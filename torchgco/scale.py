@@ -20,20 +20,20 @@ class CostScale(NamedTuple):
     constant: Tensor  # in the cost of a whole trajectory; 0 where it doesn't dwarf the rest
 
 
-def cost_scale(total: Tensor, Huu: Tensor, changes: Tensor | None) -> CostScale:
+def cost_scale(total: Tensor, curvatures: Tensor, changes: Tensor | None) -> CostScale:
     """The mean cost per stage of staying at the start at rest, without its constant.
 
     A thousandth of the controls' mean curvature is added; only this is left where the start is the goal.
 
     Args:
         total: the cost of staying at the start, (B,).
-        Huu: its Hessians in the controls, (B, N, m, m).
+        curvatures: diagonals of its Hessians in the controls, (B, N, m).
         changes: by how much the cost changes elsewhere, (B,). Where `total` is over `DWARFS` times as large, all but
             the change is a constant. None: the cost has none.
     """
-    N, m = Huu.shape[1], Huu.shape[-1]
+    N, m = curvatures.shape[1:]
     # Contiguous and one axis at a time: the order of summation must not depend on the batch.
-    curvature = Huu.diagonal(dim1=-2, dim2=-1).abs().contiguous().sum(-1).sum(-1) / (N * m)
+    curvature = curvatures.abs().contiguous().sum(-1).sum(-1) / (N * m)
     least, constant = LEAST_UNIT * curvature, torch.zeros_like(total)
     if changes is not None:
         rest = total.abs() - torch.maximum(changes, N * least)
@@ -58,3 +58,13 @@ def changes_of(cost: Cost, X: Tensor, U: Tensor, total: Tensor, goal: Tensor | N
         places.append((there, U))
     changes = [(cost.total(*place) - total).abs() for place in places]
     return torch.stack(changes).nan_to_num(0.0, 0.0, 0.0).amax(0)
+
+
+def savings(slopes: Tensor, curvatures: Tensor) -> Tensor:
+    """How much of a cost a quadratic model could save, (B,), from slopes and curvatures (B, K, z) of each variable.
+
+    A far goal of a quadratic cost is no constant, however far. Where the cost isn't convex in a variable, nothing is
+    said: the changes of the cost elsewhere count there.
+    """
+    saved = torch.where(curvatures > 0, 0.5 * slopes.square() / curvatures, 0.0)
+    return saved.nan_to_num(0.0, torch.finfo(slopes.dtype).max).contiguous().sum(-1).sum(-1)

@@ -23,7 +23,7 @@ from torch import Tensor
 from torchgco.errors import InputError, shown
 
 # What a user's function raises where it doesn't fit the problem.
-MISTAKES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError)
+MISTAKES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError)
 
 
 def tensor(value: Any, field: str, like: Tensor) -> Tensor:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -16,6 +15,7 @@ from torchgco.shapes import Dimensions, tensor
 from torchgco.tree import PerElement
 
 Knot = int | Tensor | None
+BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 
 
 @dataclass(frozen=True)
@@ -26,16 +26,17 @@ class Values(PerElement):
     rows: tuple[Tensor, ...] = ()  # (B, ...)
     knot_names: tuple[str, ...] = ()
     knot_rows: tuple[Tensor, ...] = ()  # (B, N+1, ...)
+    stages: int = 0  # N
 
     batched: ClassVar[tuple[str, ...]] = ("rows", "knot_rows")
 
     def call(self, function: Callable[..., Tensor], *arguments: Tensor, k: Knot = None) -> Tensor:
         """function(*arguments) with its values, shaped for the first argument, (B, n), (B, K, n) or (B, S, n).
 
-        `k` is the knot, or the knots (K,) of the second axis; it is passed on where the function takes an argument k.
+        `k` is the knot, or the knots (K,) of the second axis; it is passed on where the function asks for it.
         """
         taken, x = keywords(function), arguments[0]
-        more: dict[str, Any] = {"k": k} if "k" in taken else {}
+        more: dict[str, Any] = {"k": k} if k is not None and asks_for_knot(function) else {}
         for name, value in zip(self.names, self.rows, strict=True):
             if name in taken:
                 more[name] = value[(slice(None), *[None] * (x.dim() - 2))]
@@ -58,7 +59,7 @@ def bound_values(
         InputError: no mapping of names to numbers, another shape, or a name that no function takes.
     """
     if isinstance(values, Values):
-        return values
+        return _checked(values, dims, field)
     found: dict[str, dict[str, Tensor]] = {"values": {}, "knot_values": {}}
     for kind, given, shape in (("values", values, (dims.B,)), ("knot_values", knot_values, (dims.B, dims.N + 1))):
         if given is not None and not isinstance(given, Mapping):
@@ -74,7 +75,20 @@ def bound_values(
                 raise InputError(where, "the name of an argument of the function", "a name that it doesn't take")
             found[kind][name] = value
     rows, at_knots = found["values"], found["knot_values"]
-    return Values(tuple(rows), tuple(rows.values()), tuple(at_knots), tuple(at_knots.values()))
+    return Values(tuple(rows), tuple(rows.values()), tuple(at_knots), tuple(at_knots.values()), dims.N)
+
+
+def _checked(values: Values, dims: Dimensions, field: str) -> Values:
+    """Values that were bound before, to another problem maybe."""
+    for names, rows, shape in (
+        (values.names, values.rows, (dims.B,)),
+        (values.knot_names, values.knot_rows, (dims.B, dims.N + 1)),
+    ):
+        for name, row in zip(names, rows, strict=True):
+            if tuple(row.shape[: len(shape)]) != shape or row.dtype != dims.like.dtype:
+                wanted = f"{dims.like.dtype} of shape ({', '.join(map(str, shape))}, ...)"
+                raise InputError(f"{field}: value {name!r}", wanted, f"{row.dtype} {tuple(row.shape)}")
+    return replace(values, stages=dims.N)
 
 
 class _All(frozenset):
@@ -84,21 +98,20 @@ class _All(frozenset):
 
 def keywords(function: Callable[..., Any]) -> frozenset[str]:
     """The arguments that a function takes by name; all of them where it takes **anything."""
-    try:
-        return _keywords(function)
-    except TypeError:  # it can't be hashed
-        return _keywords.__wrapped__(function)
+    found = _parameters(function)
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in found):
+        return _All()
+    return frozenset(p.name for p in found if p.kind in BY_NAME)
 
 
-@lru_cache(maxsize=256)
-def _keywords(function: Callable[..., Any]) -> frozenset[str]:
+def asks_for_knot(function: Callable[..., Any]) -> bool:
+    """Whether a function has an argument k without a default; with one, k is a constant of the user's."""
+    return any(p.name == "k" and p.kind in BY_NAME and p.default is p.empty for p in _parameters(function))
+
+
+def _parameters(function: Callable[..., Any]) -> tuple[inspect.Parameter, ...]:
     called = function.forward if isinstance(function, torch.nn.Module) else function
     try:
-        parameters = inspect.signature(called).parameters.values()
+        return tuple(inspect.signature(called).parameters.values())
     except (TypeError, ValueError):  # a builtin without a signature
-        return frozenset()
-    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
-        return _All()
-    by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    # The first arguments are states and controls, whatever their names.
-    return frozenset(p.name for p in list(parameters) if p.kind in by_name)
+        return ()

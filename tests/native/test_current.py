@@ -244,7 +244,7 @@ MISTAKES: dict[str, tuple[Callable[[], Problem], str]] = {
     ),
     "a goal per row": (
         lambda: boat(constraints=[FunctionConstraint(lambda x: x[..., :2] - GOALS.unsqueeze(1))]),
-        "constraint.function: expected values of a problem that depend on its own row alone",
+        r"constraint.function: expected shape \(1, 25, p\), got \(2, 25, 2\)",
     ),
     "unknown value": (lambda: boat(values={"mass": [1, 2]}), r"dynamics.values\['mass'\]: .*doesn't take"),
     "too few values": (lambda: boat(values={"drag": [1.0]}), r"dynamics.values\['drag'\]: expected shape \(2, ...\)"),
@@ -283,6 +283,58 @@ def test_numpy_with_derivatives_of_its_own_is_solved_by_pytorch() -> None:
         eager = torchgco.solve(problem)
     native = Problem(Boat(drag=0.0, integrator="euler"), WEIGHTS, [], X0, N)
     torch.testing.assert_close(eager.X, torchgco.solve(native).X, rtol=1e-8, atol=1e-8)
+
+
+def test_constants_may_be_read_by_numpy() -> None:
+    table = torch.tensor([0.1, 0.3], dtype=D)
+    problem = boat(lambda x, u: field(x, u, float(np.mean(table.numpy()))))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", EagerWarning)
+        torch.testing.assert_close(torchgco.solve(problem).X, torchgco.solve(boat()).X, rtol=1e-9, atol=1e-9)
+
+
+class Custom(torch.autograd.Function):
+    """A function that `torch.autograd` differentiates, and `torch.func` doesn't."""
+
+    @staticmethod
+    def forward(ctx, u):
+        return 2.0 * u
+
+    @staticmethod
+    def backward(ctx, grad):
+        return 2.0 * grad
+
+
+def test_code_that_only_autograd_differentiates_is_named() -> None:
+    problem = boat(lambda x, u: field(x, Custom.apply(u)))
+    with pytest.raises(InputError, match=r"dynamics.step: expected a function that torch.func can differentiate"):
+        torchgco.solve(problem)
+
+
+@pytest.mark.parametrize("origin", [0.0, 2e5, 4e6])
+def test_large_coordinates_in_single_precision_are_no_mistake(origin: float) -> None:
+    near = lambda x: (x[..., :2] - (origin + 3.0)).square().sum(-1)
+    cost = torchgco.FunctionCost(lambda x, u: near(x) + u.square().sum(-1), near)
+    x0 = torch.tensor([[origin, origin, 0.0, 0.0]])
+    for stages in (5, 20, 44):
+        Problem(FunctionDynamics(field, 4, 2, 0.1, position=slice(0, 2)), cost, [], x0, stages)
+
+
+def test_started_at_binds_moving_obstacles_to_the_new_time_step() -> None:
+    sphere = torchgco.Spheres([[2.0, 1.5]], [0.5], 0.1, velocities=[[0.0, -1.0]])
+    base = Problem(Boat(), WEIGHTS, [sphere], X0, N)
+    moved = base.started_at(X0, [sphere], dynamics=Boat(dt=0.3))
+    assert moved.constraints[0].dt == 0.3
+    with pytest.raises(InputError, match=r"constraints\[0\]: expected obstacles for steps of 0.3 s"):
+        base.started_at(X0, base.constraints, dynamics=Boat(dt=0.3))
+
+
+def test_started_at_with_another_cost_has_its_goal() -> None:
+    there = replace(WEIGHTS, x_ref=[-4, 0, 0, 0])
+    moved, fresh = BASE.started_at(X0, BASE.constraints, cost=there), Problem(Boat(), there, [], X0, N)
+    assert moved.goal is not None and fresh.goal is not None
+    assert torch.equal(moved.goal.position, fresh.goal.position)
+    assert torch.equal(BASE.started_at(X0.tolist(), BASE.constraints).x0, X0)
 
 
 @pytest.mark.parametrize("device", ["meta", "cpu"])

@@ -16,7 +16,7 @@ from torchgco.errors import InputError, shown
 from torchgco.options import check_options
 from torchgco.shapes import MISTAKES, Dimensions, check_shape
 from torchgco.tree import PerElement
-from torchgco.values import bound_values, keywords
+from torchgco.values import asks_for_knot, bound_values
 
 Sense = Literal["inequality", "equality"]
 Knots = slice | Sequence[int] | Tensor
@@ -118,9 +118,10 @@ class FunctionConstraint(Constraint):
             values={"goal": goals},  # (B, 2)
         )
 
-    The function may take an argument k, the numbers (K,) of the knots of x (B, K, n). `values` are numbers per problem
-    by name, (B, ...), `knot_values` numbers per problem and knot, (B|1, N+1, ...); the function takes them as arguments
-    of these names, shaped to fit x.
+    The function may take an argument k (without a default), the numbers (K,) of the knots of x (B, K, n). `values` are
+    numbers per problem by name, (B, ...), `knot_values` numbers per problem and knot, (B|1, N+1, ...); the function
+    takes them as arguments of these names, shaped to fit x. Numbers that change from solve to solve belong there: with
+    another captured number the code is compiled again.
 
     Raises:
         InputError: on `Problem(...)`: bad sense, knots, or `of`; values of another shape or that the function doesn't
@@ -154,11 +155,12 @@ class FunctionConstraint(Constraint):
         values = bound_values(self.values, self.knot_values, (self.function,), dims, self.name)
         bound = replace(self, knots=knots, values=values)
         try:
-            rows = bound.value(*(dims.like.new_zeros(dims.B, *size) for size in ((last + 1, dims.n), (dims.N, dims.m))))
+            one = bound.take(slice(0, 1))  # a whole batch may be large; `Problem` tries two problems
+            rows = one.value(*(dims.like.new_zeros(1, *size) for size in ((last + 1, dims.n), (dims.N, dims.m))))
         except MISTAKES as error:
             message = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError(where, f"a function of {' and '.join(self.of)}", message) from error
-        check_shape(rows, (dims.B, len(range(last + 1)[knots]) if isinstance(knots, slice) else len(knots), "p"), where)
+        check_shape(rows, (1, len(range(last + 1)[knots]) if isinstance(knots, slice) else len(knots), "p"), where)
         if rows.dtype != dims.like.dtype:
             raise InputError(where, f"rows of {dims.like.dtype} as x0", rows.dtype)
         return bound
@@ -166,7 +168,7 @@ class FunctionConstraint(Constraint):
     @property
     def reads_knots(self) -> bool:
         """Whether the function takes more than states and controls: values, or the number of the knot."""
-        return bool(self.values.names or self.values.knot_names) or "k" in keywords(self.function)
+        return bool(self.values.names or self.values.knot_names) or asks_for_knot(self.function)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self._along(X)(*self._arguments(X, U))

@@ -94,7 +94,7 @@ class Obstacles(Constraint):
 
 
 def warn_of_small(obstacles: Obstacles, field: str) -> None:
-    """A ScaleWarning where an admitted violation could be a contact: lengths may not be in metres."""
+    """A ScaleWarning where an admitted violation is over 5 % of an obstacle's size: lengths may not be in metres."""
     sizes = obstacles.sizes[~obstacles.absent]
     sizes = sizes[sizes > 0]  # a point that is marked, not an obstacle
     if sizes.numel() > 0 and (1.0 - CONTACT_FACTOR) * float(sizes.min()) < ADMITTED:

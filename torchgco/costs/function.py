@@ -24,12 +24,13 @@ class FunctionCost(Cost):
             values={"goal": goals},  # (B, 2)
         )
 
-    A solver looks for paths among obstacles only where it knows the goal: pass `goal` to `Problem`.
+    Numbers that change from solve to solve belong into `values`: with another captured number the code is compiled
+    again. A solver looks for paths among obstacles only where it knows the goal: pass `goal` to `Problem`.
 
     Args:
-        stage_function: function(x, u) of (..., n), (..., m) to costs (...); may take an argument k, the number of the
-            stage, or arange(N) where x is (B, N, n).
-        terminal_function: function(x) of the last knot to costs (...); None: no terminal cost.
+        stage_function: function(x, u) of (..., n), (..., m) to costs (...); may take an argument k (without a
+            default), the number of the stage, or arange(N) where x is (B, N, n).
+        terminal_function: function(x) of the last knot to costs (...), which may take k = N; None: no terminal cost.
         values: numbers per problem by name, (B, ...), which the functions take as arguments of these names, shaped to
             fit x: (B, ...), or (B, 1, ...) where x has an axis of knots or samples.
         knot_values: the same per knot, (B|1, N+1, ...); a function sees the rows of its knots.
@@ -61,4 +62,4 @@ class FunctionCost(Cost):
     def terminal(self, x: Tensor) -> Tensor:
         if self.terminal_function is None:
             return x.new_zeros(x.shape[:-1])
-        return self.values.call(self.terminal_function, x, k=-1)
+        return self.values.call(self.terminal_function, x, k=self.values.stages)

@@ -72,7 +72,8 @@ class FunctionDynamics(Dynamics):
 
     Args:
         values: numbers per problem by name, (B, ...), which the function takes as arguments of these names, shaped to
-            fit x: (B, ...), or (B, 1, ...) where x has an axis of knots or samples. Dynamics that change with time
+            fit x: (B, ...), or (B, 1, ...) where x has an axis of knots or samples. Numbers that change from solve to
+            solve belong here: with another captured number the code is compiled again. Dynamics that change with time
             have a clock among their states.
 
     Raises:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco import rollout
+from torchgco.border import check_eager
 from torchgco.errors import InputError
 from torchgco.kernels import native
 from torchgco.lagrangian import Lagrangian
@@ -56,6 +57,7 @@ def engine_of(problem: Problem) -> Engine | None:
             problem.form["engine"] = _engine(problem)
         except (InputError, NativeError) as error:
             problem.form["engine"] = None
+            check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
             reason = str(error).splitlines()[0]
             said = problem.form.setdefault(SAID, set())
             if reason not in said:
@@ -101,8 +103,8 @@ def cost_unit(problem: Problem) -> Tensor:
     """
     engine = engine_of(problem)
     if engine is not None and engine.cost is not None and "cost_scale" not in vars(problem):
-        _, H = engine.expand(problem, *problem.at_rest, None)
-        object.__setattr__(problem, "cost_scale", problem.scale_of(H[:, :-1, problem.n :, problem.n :]))
+        slopes, H = engine.expand(problem, *problem.at_rest, None)
+        object.__setattr__(problem, "cost_scale", problem.scale_of(slopes, H.diagonal(dim1=-2, dim2=-1)))
     return problem.cost_unit
 
 

@@ -14,6 +14,7 @@ from torchgco.native.model import DynamicsSource
 from torchgco.native.packing import COST_ARRAYS
 
 LANES = 8
+KEPT = 64  # texts, the most recent ones
 WRITTEN_OUT = 400  # nonzeros of a Jacobian, at most, that are written out one by one
 LOOPS = """
 static inline V entry(int e, const V *f) { return F_place[e] < 0 ? SET(F_value[e]) : f[F_place[e]]; }
@@ -63,6 +64,8 @@ class Form:
         key = (*self._key, parts, real, lanes)
         if key not in _sources:
             _sources[key] = self._written(parts, real, lanes)
+            if len(_sources) > KEPT:
+                del _sources[next(iter(_sources))]
         return _sources[key]
 
     @property

@@ -43,6 +43,8 @@ def made(parts: Sequence[str], make: Callable[[str], dict[str, Any]]) -> Made:
             known = json.dumps(make(key)).encode()
             save(key, ".json", known)
         _made[key, place] = Made(key, json.loads(known))
+        if len(_made) > FILES:
+            del _made[next(iter(_made))]
     return _made[key, place]
 
 

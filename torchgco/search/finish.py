@@ -65,7 +65,7 @@ def _balanced(problem: Problem, U: Tensor, least: float) -> Multipliers:
     """
     unit, X = Multipliers.zero(problem, 1.0), open_loop(problem, U)
     cost, merit = value(Lagrangian(problem, unit, None, True), X, U)
-    mu = INSISTENCE * (cost.abs() / (merit - cost).clamp(min=TINY)).nan_to_num(least, least, PENALTY_MAX)
+    mu = INSISTENCE * (cost.abs() / (merit - cost).clamp(min=TINY)).nan_to_num(least, PENALTY_MAX, least)
     return replace(unit, mu=mu.clamp(min=least, max=PENALTY_MAX))
 
 
