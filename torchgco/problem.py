@@ -229,7 +229,9 @@ class Problem:
             dims = self._dimensions(x0, model)
             bound = tuple(constraint.bind(dims) for constraint in constraints)
             for i, part in enumerate(bound):
-                if isinstance(part, Obstacles) and (part.dt, part.position) != (dims.dt, dims.position):
+                if not isinstance(part, Obstacles):
+                    continue
+                if part.position != dims.position or (part.moving and part.dt != dims.dt):
                     expected = f"obstacles for steps of {dims.dt} s and the position in states {dims.position}"
                     raise InputError(f"constraints[{i}]", expected, f"bound ones for {part.dt} s and {part.position}")
             if [type(part) for part in bound] != [type(part) for part in self.constraints]:
