@@ -22,7 +22,7 @@ from torch import Tensor
 from benchmarks.barn_data import DATA, GOAL, GOAL_RADIUS, RADIUS, TEST
 from benchmarks.page import INTERVALS, SET_UP, put_table
 from torchgco import ControlBounds, Goal, Problem, QuadraticCost, Spheres, StateBounds, Unicycle, judge, solve
-from torchgco.experiments.statistics import wilson
+from torchgco.experiments.statistics.statistics import wilson
 from torchgco.scenarios import Layouts
 
 PAGE = Path(__file__).resolve().parent / "results" / "barn.md"

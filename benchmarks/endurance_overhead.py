@@ -22,7 +22,8 @@ from typing import Any
 import torch
 
 from torchgco import compose
-from torchgco.experiments import app, flight
+from torchgco.experiments import app
+from torchgco.experiments.flying import flight
 from torchgco.native.dispatch import engine_of
 from torchgco.solvers.memory import plan_batch
 
@@ -30,18 +31,20 @@ COMMON = ["solver=gco", "device.threads=1"]
 # A phase lasts while one of its functions runs, except for phases inside it.
 PHASES = {
     "solve": ["torchgco.solvers.contracts.Solver.solve"],
-    "judge": ["torchgco.experiments.flight.judge", "torchgco.experiments.flight.certify"],
+    "judge": ["torchgco.experiments.flying.flight.judge", "torchgco.experiments.flying.flight.certify"],
     "draw layouts": ["torchgco.scenarios.base.Scenario.draw"],
     "make problems": ["torchgco.scenarios.vehicle.Vehicle.task"],
-    "progress": ["torchgco.experiments.flight.Flight._progress"],
-    "digests": ["torchgco.experiments.study.layout_digests"],
-    "write shards": ["torchgco.experiments.records.Records.keep"],
-    "read shards": ["torchgco.experiments.records.Records.flown", "torchgco.experiments.records.Records.missing"],
-    "tables": [
-        "torchgco.experiments.study.with_success", "torchgco.experiments.records.Records.finish",
-        "torchgco.experiments.records.Records.close",
+    "progress": ["torchgco.experiments.flying.flight.Flight._progress"],
+    "digests": ["torchgco.experiments.flying.study.layout_digests"],
+    "write shards": ["torchgco.experiments.results.records.Records.keep"],
+    "read shards": [
+        "torchgco.experiments.results.records.Records.flown", "torchgco.experiments.results.records.Records.missing",
     ],
-    "report": ["torchgco.experiments.study.write_report"],
+    "tables": [
+        "torchgco.experiments.flying.study.with_success", "torchgco.experiments.results.records.Records.finish",
+        "torchgco.experiments.results.records.Records.close",
+    ],
+    "report": ["torchgco.experiments.flying.study.write_report"],
 }  # fmt: skip
 FLIGHT, REPORT, REST = ("solve", "judge"), "report", "rest"
 

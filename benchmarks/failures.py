@@ -24,12 +24,12 @@ from benchmarks.families import FAMILIES, Family
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
 from torchgco import compose, judge
-from torchgco.draws import DrawKey
-from torchgco.evaluation import violation
+from torchgco.base.draws import DrawKey
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.mppi import MPPI
-from torchgco.problem import Problem
+from torchgco.lagrangian.quality import violation
+from torchgco.problem.problem import Problem
 
 HERE = Path(__file__).resolve().parent
 LAST = 3  # outer iterations that decide the cause

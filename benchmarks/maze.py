@@ -24,7 +24,7 @@ from benchmarks.maze_problem import maze, recount, starts, waypoint_guess
 from benchmarks.page import INTERVALS, SET_UP, put_table
 from torchgco import Problem, presets
 from torchgco.baselines import CasADiSolver
-from torchgco.experiments.statistics import wilson
+from torchgco.experiments.statistics.statistics import wilson
 from torchgco.search.restarts import Restarts
 
 PAGE = Path(__file__).resolve().parent / "results" / "maze.md"

@@ -13,15 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco import (
-    ControlBounds,
-    FunctionConstraint,
-    FunctionDynamics,
-    Problem,
-    QuadraticCost,
-    Spheres,
-    StateBounds,
-)
+from torchgco import ControlBounds, FunctionConstraint, FunctionDynamics, Problem, QuadraticCost, Spheres, StateBounds
 
 N, DT = 100, 0.05
 MASS, GRAVITY, ARM, TORQUE = 0.5, 9.81, 0.175, 0.0245  # kg, m/s^2, m, m (yaw torque per thrust)

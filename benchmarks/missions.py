@@ -19,8 +19,8 @@ import torch
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
 from torchgco import compose
-from torchgco.experiments.statistics import wilson
-from torchgco.outcome import Outcome
+from torchgco.experiments.statistics.statistics import wilson
+from torchgco.missions.outcome import Outcome
 
 ROOT = Path(__file__).resolve().parents[1]
 START = "scenario.start=[1,1,0]"

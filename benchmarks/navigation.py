@@ -24,7 +24,7 @@ from benchmarks.navigation_problem import fan, line_guess, navigation, recount
 from benchmarks.page import INTERVALS, put_table
 from torchgco import Problem, Solution, presets
 from torchgco.baselines import CasADiSolver
-from torchgco.experiments.statistics import wilson
+from torchgco.experiments.statistics.statistics import wilson
 
 PAGE = Path(__file__).resolve().parent / "results" / "navigation.md"
 STARTS, SECTORS = 500, (90.0, 180.0)  # the published batch, and the published widths of the fan in degrees

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from torchgco import ControlBounds, FunctionDynamics, Problem, QuadraticCost, StateBounds
+from torchgco.base.shapes import Dimensions
 from torchgco.constraints import Constraint
 from torchgco.costs.base import add_blocks
-from torchgco.shapes import Dimensions
 
 KNOTS, DT = 30, 0.1  # s
 N = KNOTS - 1

@@ -21,8 +21,8 @@ import torch
 
 from benchmarks.families import DATA, EVERY, FAMILIES, Family
 from torchgco import compose, judge
-from torchgco.errors import InputError
-from torchgco.judge import near_best
+from torchgco.base.errors import InputError
+from torchgco.judging.judge import near_best
 from torchgco.scenarios import Layouts
 
 # Solver configurations with overrides. `paths` refines 32 candidates along up to 24 paths, `early` at another pace.

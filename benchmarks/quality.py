@@ -19,9 +19,9 @@ import pandas as pd
 from benchmarks.families import EVERY, FAMILIES, Family
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
-from torchgco.experiments.statistics import summarise
-from torchgco.experiments.success import with_success
-from torchgco.judge import SUCCESS_VIOLATION
+from torchgco.experiments.results.success import with_success
+from torchgco.experiments.statistics.statistics import summarise
+from torchgco.judging.judge import SUCCESS_VIOLATION
 from torchgco.scenarios import Layouts
 
 ROOT = Path(__file__).resolve().parents[1]

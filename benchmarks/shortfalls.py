@@ -27,11 +27,11 @@ from benchmarks.shortfalls_watch import Search, watching
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
 from torchgco import compose, judge, presets
-from torchgco.judge import near_best
+from torchgco.judging.judge import near_best
 from torchgco.plotting.bodies import Box, bodies
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
+from torchgco.roadmap import scene as seen
 from torchgco.scenarios import Layouts
-from torchgco.search import scene as seen
 from torchgco.search.candidates import TO_THE_END, unwatched
 from torchgco.search.paths import PathProposals
 from torchgco.search.settings import MORE

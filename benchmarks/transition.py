@@ -19,8 +19,8 @@ from matplotlib.lines import Line2D
 
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
-from torchgco.experiments.merge import merge
-from torchgco.experiments.statistics import summarise
+from torchgco.experiments.results.merge import merge
+from torchgco.experiments.statistics.statistics import summarise
 from torchgco.plotting.style import INK, SMALL, legend, panels, save, solver_colours, tidy
 from torchgco.scenarios import Woods
 

@@ -19,9 +19,9 @@ from torch import Tensor
 import torchgco
 from benchmarks.page import INTERVALS, put_table
 from torchgco.baselines import CasADiSolver
-from torchgco.experiments.statistics import wilson
-from torchgco.judge import Verdict, judge
-from torchgco.problem import Problem
+from torchgco.experiments.statistics.statistics import wilson
+from torchgco.judging.judge import Verdict, judge
+from torchgco.problem.problem import Problem
 
 PAGE = Path(__file__).resolve().parent / "results" / "unicycle.md"
 STAGES, STARTS = 100, 12

@@ -20,8 +20,8 @@ from benchmarks.quality import study, succeeded
 from benchmarks.speed.provenance import provenance
 from benchmarks.speed.tables import put_between
 from benchmarks.worlds_peers import FILE, NAMES, rows_of
-from torchgco.experiments.statistics import summarise, wilson
-from torchgco.experiments.success import sound
+from torchgco.experiments.results.success import sound
+from torchgco.experiments.statistics.statistics import summarise, wilson
 from torchgco.scenarios import Layouts
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from benchmarks.families import WORLDS, Family
 from torchgco import compose, judge
-from torchgco.constraints.boxes import BoundBoxes
-from torchgco.measure import box_segment_distance
+from torchgco.judging.distances import box_segment_distance
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.roadmap.roadmap import Roadmap, length
+from torchgco.roadmap.scene import scene_of
 from torchgco.scenarios import Layouts, Task, concatenate
-from torchgco.search.roadmap import Roadmap, length
-from torchgco.search.scene import scene_of
 from torchgco.solvers.contracts import Solver
 
 COUNT, AT_ONCE = 32, 16

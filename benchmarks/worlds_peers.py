@@ -30,14 +30,14 @@ from benchmarks.families import DATA, WORLDS, Family
 from benchmarks.speed import acados_peer
 from benchmarks.speed.provenance import provenance
 from torchgco import Problem, compose, judge, presets
+from torchgco.base.status import Status
 from torchgco.baselines import CasADiSolver, GuidedCasADi
 from torchgco.baselines.casadi import PreparedCasADi
 from torchgco.baselines.nlp import Program
-from torchgco.constraints import Obstacles
-from torchgco.experiments.identity import layout_digests
-from torchgco.rollout import open_loop
+from torchgco.experiments.results.identity import layout_digests
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.obstacles import Obstacles
 from torchgco.scenarios import Task
-from torchgco.status import Status
 
 FILE = DATA / "worlds" / "peers.csv"
 # By the program that they share: acados gets FATROP's.

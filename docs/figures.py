@@ -34,8 +34,8 @@ SIZE, DPI = (4.6, 3.7), 110
 # All that these figures use of the package's internals: module:attributes of the function of each step.
 WATCHED = {
     "caught": "torchgco.search.restarts:StopWhenCaught.update",  # (guidance, problem, X, ...) -> Advice
-    "graph": "torchgco.native.roadmap:NativeSearch.graph",  # -> Graph
-    "classes": "torchgco.search.homotopy:_wind_alike",  # (paths, scene) -> which paths share a class
+    "graph": "torchgco.roadmap.native:NativeSearch.graph",  # -> Graph
+    "classes": "torchgco.roadmap.homotopy:_wind_alike",  # (paths, scene) -> which paths share a class
     "tracked": "torchgco.search.paths:PathProposals.track",  # -> Candidates
     "relaxed": "torchgco.search.paths:PathProposals.relax",  # -> Candidates, which of them are sound
     "refined": "torchgco.search.candidates:Candidates.refined",  # (self, inner, sound, ...) -> Candidates, _, best, _

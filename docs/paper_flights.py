@@ -13,16 +13,16 @@ import torch
 from paper_runs import FOREST, FOREST_LAYOUT, PAPERS_LOOP, Sampling, Witness
 
 from torchgco import compose
-from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.flights import mission_frame, mission_row, samples
-from torchgco.outcome import Ending, judge_flight
+from torchgco.missions.mission import Mission
+from torchgco.missions.outcome import Ending, judge_flight
+from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.tables import mission_frame, mission_row, samples
+from torchgco.missions.tracker import Tracker, Tracking
+from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.plotting.course import Course
 from torchgco.plotting.missions import CONTACT
-from torchgco.problem import Problem
-from torchgco.simulation.mission import Mission
-from torchgco.simulation.planner import Plan, Planner
-from torchgco.simulation.tracker import Tracker, Tracking
+from torchgco.problem.problem import Problem
 
 SOLVERS = ("al_ilqr", "gco_paper", "gco")
 REPEATS = 5  # flights with each planner: alike in all but their times

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from torchgco import compose
-from torchgco.draws import DrawKey
+from torchgco.base.draws import DrawKey
 from torchgco.guidance import GCO, MPPI
 from torchgco.guidance.samples import draw
+from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.native.dispatch import open_loop
-from torchgco.penalties import GuideRegion
 from torchgco.plotting.trajectory import inside
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Advice
 

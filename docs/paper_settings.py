@@ -11,11 +11,11 @@ from torch import Tensor
 from torchgco import compose
 from torchgco.constraints import ControlBounds
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.experiments.build import Setup
-from torchgco.lagrangian import Multipliers
-from torchgco.problem import Problem
-from torchgco.simulation.plant import hovering
-from torchgco.simulation.tracker import RATES, THRUST, Reference
+from torchgco.experiments.config.build import Setup
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.missions.plant import hovering
+from torchgco.missions.tracker import RATES, THRUST, Reference
+from torchgco.problem.problem import Problem
 
 
 class Ours:

@@ -17,15 +17,15 @@ from paper_settings import Ours
 from torch import Tensor
 
 from torchgco import AugmentedLagrangian
-from torchgco.constraints.bodies import CONTACT_FACTOR
-from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.dynamics import Planar, QuadrotorPlanning
-from torchgco.experiments.build import Setup
+from torchgco.experiments.config.build import Setup
 from torchgco.guidance import GCO
 from torchgco.guidance.mppi import COLLISION_PENALTY
-from torchgco.problem import Problem
-from torchgco.simulation import plant
-from torchgco.simulation.plant import RotorPlant, hovering
+from torchgco.missions import plant
+from torchgco.missions.plant import RotorPlant, hovering
+from torchgco.obstacles.base import CONTACT_FACTOR
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.problem import Problem
 
 SIGN = "reading: a minus sign is lost in our copy"
 ROUNDED = "rounded in print"

@@ -18,8 +18,9 @@ import pdoc
 import torchgco
 
 PAGES = (
-    "torchgco", "torchgco.scenarios", "torchgco.simulation", "torchgco.plotting", "torchgco.baselines",
-    "torchgco.constraints", "torchgco.solvers.contracts", "torchgco.penalties", "torchgco.draws", "torchgco.shapes",
+    "torchgco", "torchgco.scenarios", "torchgco.missions", "torchgco.plotting", "torchgco.baselines",
+    "torchgco.constraints", "torchgco.obstacles", "torchgco.solvers.contracts", "torchgco.lagrangian.penalties",
+    "torchgco.base.draws", "torchgco.base.shapes",
 )  # fmt: skip
 
 

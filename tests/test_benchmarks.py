@@ -39,8 +39,9 @@ from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
 from benchmarks.speed.tables import SPEED, TARGETS, rewrite, section_table
 from torchgco import compose
-from torchgco.errors import InputError
-from torchgco.experiments import app, study
+from torchgco.base.errors import InputError
+from torchgco.experiments import app
+from torchgco.experiments.flying import study
 from torchgco.native import engine as native_engine
 from torchgco.scenarios import Layouts
 

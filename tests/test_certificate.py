@@ -21,10 +21,10 @@ from torchgco import (
     StateBounds,
     certify,
 )
-from torchgco.certificate import frame_columns
-from torchgco.experiments.records import COLUMNS
-from torchgco.judge import judge
-from torchgco.rollout import open_loop
+from torchgco.experiments.results.records import COLUMNS
+from torchgco.judging.certificate import frame_columns
+from torchgco.judging.judge import judge
+from torchgco.lagrangian.rollout import open_loop
 
 # Thin obstacles are the subject here.
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ScaleWarning")
@@ -173,7 +173,7 @@ def test_a_fit_that_does_not_end_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> 
     def never(*args, **more):
         raise RuntimeError("Maximum number of iterations reached.")
 
-    monkeypatch.setattr("torchgco.certificate.nnls", never)
+    monkeypatch.setattr("torchgco.judging.certificate.nnls", never)
     problem, U = integrator_problem([ControlBounds([-1.0], [0.5])]), torch.full((1, 1, 1), 0.5, dtype=torch.float64)
     assert float(certified(problem, U).kkt_residual) == pytest.approx(0.0, abs=1e-15)
 

@@ -5,7 +5,7 @@ import torch
 
 from tests.problems import planar_batch
 from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian, ControlBounds, QuadraticCost, Spheres
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 
 pytestmark = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 

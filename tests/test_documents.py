@@ -26,11 +26,11 @@ import torchgco
 from benchmarks import oracle, quality
 from benchmarks.speed import __main__ as speed
 from torchgco import Problem
-from torchgco.certificate import CHORDS
 from torchgco.constraints import Constraint
-from torchgco.experiments import report
-from torchgco.experiments.build import compose_config
-from torchgco.judge import CLEARANCES
+from torchgco.experiments.config.build import compose_config
+from torchgco.experiments.reports import report
+from torchgco.judging.certificate import CHORDS
+from torchgco.judging.judge import CLEARANCES
 from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import EagerWarning
 

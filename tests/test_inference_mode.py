@@ -11,7 +11,7 @@ from torch import Tensor
 import torchgco
 from tests.problems import planar_batch, quadrotor_batch, quick_gco
 from torchgco import Cost, FunctionConstraint, FunctionDynamics, Hold, Polish, Problem, certify, judge
-from torchgco.autodiff import gradients
+from torchgco.base.autodiff import gradients
 
 
 class Race(Cost):

@@ -1,6 +1,5 @@
 """The judge against plain NumPy, and its verdicts against hand-made cases."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from tests.problems import planar_batch, quadrotor_batch, reference_of
 from tests.reference.problem import cost as reference_cost
 from tests.reference.problem import rollout as reference_rollout
 from torchgco import ControlBounds, InputError, Planar, Problem, QuadraticCost, Spheres
-from torchgco.judge import judge, segment_distance, sphere_clearance
+from torchgco.judging.judge import judge, segment_distance, sphere_clearance
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
 
@@ -82,7 +81,7 @@ def test_spheres_are_measured_as_over_all_segments_one_by_one(
     between = (segment_distance(away[:, :-1], away[:, 1:]) - contact).flatten(1).amin(-1)
     assert stride < 0.1 or bool((between < at).any())
     for block in (1, 1000, 2**18):  # how many at once changes nothing
-        monkeypatch.setattr(sys.modules["torchgco.judge"], "BLOCK", block)  # the attribute of that name is the function
+        monkeypatch.setattr("torchgco.judging.judge.BLOCK", block)
         measured = sphere_clearance(spheres, X)
         assert torch.equal(measured[0], at) and torch.equal(measured[1], torch.minimum(at, between))
 

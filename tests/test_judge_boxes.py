@@ -9,11 +9,11 @@ import torch
 from tests.problems import boxed_batch, random_trajectory
 from tests.reference import boxes as brute_force
 from torchgco import Boxes, Problem, certify, judge
-from torchgco.certificate import CHORDS
-from torchgco.constraints.boxes import BoundBoxes
-from torchgco.judge import box_clearance
-from torchgco.measure import box_segment_distance
-from torchgco.rollout import open_loop
+from torchgco.judging.certificate import CHORDS
+from torchgco.judging.distances import box_segment_distance
+from torchgco.judging.judge import box_clearance
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.obstacles.boxes import BoundBoxes
 
 SAMPLES = 601
 

@@ -5,9 +5,9 @@ import torch
 
 from tests.problems import planar_batch, quadrotor_batch, random_trajectory
 from torchgco.constraints import FunctionConstraint, StateBounds
-from torchgco.lagrangian import Lagrangian, Multipliers, penalty_weights, update
-from torchgco.penalties import GuidePath, GuideRegion
-from torchgco.problem import Problem
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, penalty_weights, update
+from torchgco.lagrangian.penalties import GuidePath, GuideRegion
+from torchgco.problem.problem import Problem
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from torchgco import notices
+from torchgco.base import notices
 from torchgco.native.compiler import find_compiler
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco import InputError
-from torchgco.options import (
+from torchgco.base.options import (
     Above,
     AtLeast,
     AtMost,

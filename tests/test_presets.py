@@ -10,7 +10,7 @@ import torch
 import torchgco
 from tests.problems import planar_batch
 from torchgco import InputError, Problem, QuadraticCost, presets, solve
-from torchgco.experiments.build import config_dir
+from torchgco.experiments.config.build import config_dir
 from torchgco.presets import PRESETS
 
 MODELS = {"planar": (2, "planar_trap"), "quadrotor": (3, "forest"), "unicycle": (2, "yard")}

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 import torchgco
-from torchgco import FunctionCost, FunctionDynamics, Problem, QuadraticCost, Spheres, kernels, presets
+from torchgco import FunctionCost, FunctionDynamics, Problem, QuadraticCost, Spheres, presets
+from torchgco.base import kernels
 from torchgco.costs.base import ShiftedCost
 
 D = torch.float64

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchgco import InputError
-from torchgco.shapes import as_states
+from torchgco.base.shapes import as_states
 
 TWO = [[-1.0, 0.5], [2.0, 3.0]]
 

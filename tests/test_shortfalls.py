@@ -14,10 +14,10 @@ from benchmarks.families import WORLDS
 from benchmarks.shortfalls import CAUSES, cause, listed, refined, study, write
 from benchmarks.shortfalls_watch import Search, watching
 from torchgco import compose
-from torchgco.judge import box_clearance
+from torchgco.judging.judge import box_clearance
+from torchgco.roadmap.scene import scene_of
 from torchgco.search.candidates import Candidates
 from torchgco.search.paths import PathProposals
-from torchgco.search.scene import scene_of
 
 FEW = Search(3, relaxed=[2, 0], compared=[2], chosen=2)
 MORE = Search(6, relaxed=[2, 4, 0, 1], compared=[4, 2], chosen=4)

@@ -19,7 +19,7 @@ from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from tests.test_benchmarks import TINY
 from torchgco import ControlBounds, InputError, Problem, QuadraticCost, Spheres, StateBounds
 from torchgco.baselines import CasADiSolver
-from torchgco.rollout import open_loop
+from torchgco.lagrangian.rollout import open_loop
 
 needs_acados = pytest.mark.skipif(not acados_peer.installed(), reason="acados isn't installed: `make benchmark` does")
 

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 import torchgco
-from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, kernels
+from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem
+from torchgco.base import kernels
 from torchgco.native.dispatch import EagerWarning
 
 D = torch.float64

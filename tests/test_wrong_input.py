@@ -46,8 +46,8 @@ from torchgco import (
     solve,
 )
 from torchgco.baselines import CasADiSolver
-from torchgco.outcome import judge_flight
-from torchgco.simulation import Mission, Planner, RotorPlant
+from torchgco.missions import Mission, Planner, RotorPlant
+from torchgco.missions.outcome import judge_flight
 
 D, GOAL = torch.float64, torch.tensor([1.0, 0.4], dtype=torch.float64)
 LOCAL = AugmentedLagrangian(ILQR(max_iterations=1), max_outer_iterations=1)

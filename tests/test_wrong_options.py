@@ -24,8 +24,8 @@ from torchgco import (
     presets,
 )
 from torchgco.baselines import CasADiSolver, GuidedCasADi
+from torchgco.missions import Disturbance, Mission, Planner, RotorPlant, Tracker
 from torchgco.scenarios import Forest, LayoutFile, PlanarTrap, Vehicle, concatenate
-from torchgco.simulation import Disturbance, Mission, Planner, RotorPlant, Tracker
 
 LOCAL = AugmentedLagrangian()
 

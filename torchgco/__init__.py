@@ -11,22 +11,22 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
-from torchgco import interrupts as interrupts  # first: the imports below take seconds
+from torchgco.base import interrupts as interrupts  # first: the imports below take seconds
+from torchgco.base import kernels as kernels
 
 # isort: split
 from torchgco import presets as presets
 from torchgco.api import solve as solve
+from torchgco.base.errors import ContactWarning as ContactWarning
+from torchgco.base.errors import GuidanceWarning as GuidanceWarning
+from torchgco.base.errors import InputError as InputError
+from torchgco.base.errors import ScaleWarning as ScaleWarning
+from torchgco.base.status import Status as Status
 from torchgco.baselines import Hold as Hold
 from torchgco.baselines import IteratedMPPI as IteratedMPPI
-from torchgco.certificate import Certificate as Certificate
-from torchgco.certificate import certify as certify
-from torchgco.constraints import Boxes as Boxes
-from torchgco.constraints import Capsules as Capsules
 from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
-from torchgco.constraints import FirstStepRates as FirstStepRates
 from torchgco.constraints import FunctionConstraint as FunctionConstraint
-from torchgco.constraints import Spheres as Spheres
 from torchgco.constraints import StateBounds as StateBounds
 from torchgco.costs import Cost as Cost
 from torchgco.costs import FunctionCost as FunctionCost
@@ -39,30 +39,31 @@ from torchgco.dynamics import QuadrotorPlanning as QuadrotorPlanning
 from torchgco.dynamics import QuadrotorPlant as QuadrotorPlant
 from torchgco.dynamics import RotorTracking as RotorTracking
 from torchgco.dynamics import Unicycle as Unicycle
-from torchgco.errors import ContactWarning as ContactWarning
-from torchgco.errors import GuidanceWarning as GuidanceWarning
-from torchgco.errors import InputError as InputError
-from torchgco.errors import ScaleWarning as ScaleWarning
-from torchgco.goal import Goal as Goal
 from torchgco.guidance import GCO as GCO
 from torchgco.guidance import MPPI as MPPI
-from torchgco.judge import judge as judge
-from torchgco.problem import Problem as Problem
+from torchgco.judging.certificate import Certificate as Certificate
+from torchgco.judging.certificate import certify as certify
+from torchgco.judging.judge import judge as judge
+from torchgco.missions.constraints import FirstStepRates as FirstStepRates
+from torchgco.obstacles import Boxes as Boxes
+from torchgco.obstacles import Capsules as Capsules
+from torchgco.obstacles import Spheres as Spheres
+from torchgco.problem.goal import Goal as Goal
+from torchgco.problem.problem import Problem as Problem
+from torchgco.roadmap import Roadmap as Roadmap
 from torchgco.scenarios import Layouts as Layouts
 from torchgco.search import MultiStart as MultiStart
 from torchgco.search import PathProposals as PathProposals
 from torchgco.search import Restarts as Restarts
-from torchgco.search import Roadmap as Roadmap
 from torchgco.solution import Solution as Solution
 from torchgco.solvers import ILQR as ILQR
 from torchgco.solvers import AugmentedLagrangian as AugmentedLagrangian
 from torchgco.solvers import LineSearch as LineSearch
 from torchgco.solvers import Polish as Polish
 from torchgco.solvers import plan_batch as plan_batch
-from torchgco.status import Status as Status
 
 if TYPE_CHECKING:
-    from torchgco.experiments.build import compose as compose
+    from torchgco.experiments.config.build import compose as compose
 
 # In the order of the API reference; `interrupts` is no part of it.
 __all__ = [  # noqa: RUF022
@@ -88,7 +89,7 @@ os.environ.setdefault("MKL_CBWR", "AUTO")
 
 def __getattr__(name: str) -> Any:
     if name == "compose":
-        from torchgco.experiments.build import compose
+        from torchgco.experiments.config.build import compose
 
         return compose
     raise AttributeError(f"module 'torchgco' has no attribute {name!r}")

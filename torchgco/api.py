@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchgco import rollout
+from torchgco.base.errors import InputError, shown
+from torchgco.base.shapes import computing_on
 from torchgco.constraints import ControlBounds
 from torchgco.contact import warned_of_contact
-from torchgco.errors import InputError, shown
+from torchgco.lagrangian import rollout
 from torchgco.presets import named
-from torchgco.problem import Problem, check_problem
-from torchgco.shapes import computing_on
+from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 

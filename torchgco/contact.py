@@ -7,12 +7,12 @@ import warnings
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bodies import Obstacles
-from torchgco.errors import ContactWarning
-from torchgco.judge import CLEARANCES, by_kind
-from torchgco.problem import Problem
+from torchgco.base.errors import ContactWarning
+from torchgco.base.status import Status
+from torchgco.judging.judge import CLEARANCES, by_kind
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
-from torchgco.status import Status
 
 CLAIMS = (Status.CONVERGED, Status.FEASIBLE)  # that the constraints hold
 NAMED = 5  # problems that the warning names

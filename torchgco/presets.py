@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from torchgco.base.errors import InputError, shown
 from torchgco.baselines import CasADiSolver, GuidedCasADi, Hold, IteratedMPPI
-from torchgco.errors import InputError, shown
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.mppi import MPPI
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
+from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.multistart import MultiStart
 from torchgco.search.paths import PathProposals
 from torchgco.search.restarts import Restarts
-from torchgco.search.roadmap import Roadmap
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Solver
 from torchgco.solvers.ilqr import ILQR

@@ -13,18 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.archive import read_arrays
-from torchgco.errors import InputError
-from torchgco.judge import columns as judged
-from torchgco.lagrangian import Multipliers
-from torchgco.shapes import check_device
-from torchgco.status import Status
-from torchgco.tree import take
+from torchgco.base.errors import InputError
+from torchgco.base.files import read_arrays
+from torchgco.base.shapes import check_device
+from torchgco.base.status import Status
+from torchgco.base.tree import take
+from torchgco.judging.judge import columns as judged
+from torchgco.lagrangian.lagrangian import Multipliers
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from torchgco.problem import Problem
+    from torchgco.problem.problem import Problem
 
 
 @dataclass(frozen=True)

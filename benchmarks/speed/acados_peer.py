@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
 from torchgco.baselines.nlp import Program, transcribe
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.obstacles import BoundSpheres
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.errors import InputError
-from torchgco.problem import Problem
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.problem import Problem
 
 ENVIRONMENT = Path(__file__).resolve().parents[2] / ".venv-acados"  # made by `make`
 WORKER = Path(__file__).with_name("acados_worker.py")

@@ -12,7 +12,7 @@ import torch
 
 from benchmarks.speed.results import MEASURED, Results
 from benchmarks.speed.sizes import Sizes
-from torchgco.experiments.build import Setup, compose
+from torchgco.experiments.config.build import Setup, compose
 from torchgco.native.dispatch import engine_of
 from torchgco.scenarios import Task
 

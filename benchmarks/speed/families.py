@@ -11,9 +11,9 @@ import torch
 from benchmarks.speed import acados_peer
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.peers import GUIDED, AcadosPeer, CasADiPeer, Peer, first
-from torchgco.errors import InputError
-from torchgco.experiments.build import Setup
-from torchgco.judge import Verdict, judge
+from torchgco.base.errors import InputError
+from torchgco.experiments.config.build import Setup
+from torchgco.judging.judge import Verdict, judge
 
 SECTION = "families"
 FAMILIES = {

@@ -14,7 +14,7 @@ import torch
 import torchgco
 from torchgco import presets
 from torchgco.native.dispatch import engine_of, sampler_of
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 
 MODELS = {
     "Planar": lambda: torchgco.Planar(dt=0.05),

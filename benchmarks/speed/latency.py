@@ -9,9 +9,9 @@ from statistics import mean
 
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.peers import CasADiPeer
-from torchgco.experiments.build import Setup
-from torchgco.judge import Verdict, judge
-from torchgco.lagrangian import Multipliers, shifted
+from torchgco.experiments.config.build import Setup
+from torchgco.judging.judge import Verdict, judge
+from torchgco.lagrangian.lagrangian import Multipliers, shifted
 from torchgco.native.dispatch import engine_of
 from torchgco.scenarios import Task
 from torchgco.solution import Solution

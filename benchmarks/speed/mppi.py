@@ -12,8 +12,8 @@ import torch
 import torchgco
 from benchmarks.speed.bench import SEED, Bench, Took
 from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
+from torchgco.base.draws import DrawKey
 from torchgco.constraints.bounds import ControlBounds
-from torchgco.draws import DrawKey
 from torchgco.guidance.mppi import COLLISION_PENALTY
 from torchgco.native.dispatch import open_loop
 from torchgco.scenarios import Task

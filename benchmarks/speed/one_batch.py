@@ -12,9 +12,9 @@ import torch
 
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.sizes import Sizes
-from torchgco.experiments.build import Setup
+from torchgco.experiments.config.build import Setup
 from torchgco.native.dispatch import engine_of
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 from torchgco.search import Restarts
 
 

@@ -11,8 +11,8 @@ from torch import Tensor
 import torchgco
 from benchmarks.speed.bench import SEED, Bench, Took
 from torchgco.baselines import CasADiSolver
-from torchgco.judge import Verdict, judge
-from torchgco.problem import Problem
+from torchgco.judging.judge import Verdict, judge
+from torchgco.problem.problem import Problem
 
 SECTION = "own_model"
 GOAL = (4.0, 0.0)

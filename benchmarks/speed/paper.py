@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from benchmarks.speed.bench import Bench
-from torchgco.judge import judge
+from torchgco.judging.judge import judge
 
 SECTION = "paper"
 SOLVER = "gco_paper"

@@ -17,8 +17,8 @@ from torch import Tensor
 from benchmarks.speed import acados_peer
 from benchmarks.speed.bench import Bench, Took
 from torchgco.baselines import GuidedCasADi
-from torchgco.judge import Verdict, judge
-from torchgco.rollout import open_loop
+from torchgco.judging.judge import Verdict, judge
+from torchgco.lagrangian.rollout import open_loop
 from torchgco.scenarios import Task
 
 GUIDED = "fatrop_guided"

@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.problem import Problem
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.problem import Problem
 
 
 class QuadrotorAmongSpheres:

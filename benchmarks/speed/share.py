@@ -17,7 +17,7 @@ SECTION = "share"
 
 # A phase lasts while its function (module:attributes) runs, except for phases inside it; the rest is the outer loop.
 PHASES = {
-    "paths sought": "torchgco.search.roadmap:Roadmap.paths",
+    "paths sought": "torchgco.roadmap.roadmap:Roadmap.paths",
     "paths tracked": "torchgco.search.paths:PathProposals.track",
     "candidates relaxed": "torchgco.search.paths:PathProposals.relax",
     "candidates refined": "torchgco.search.candidates:Candidates.refined",
@@ -27,7 +27,7 @@ PHASES = {
 }
 OUTER = "outer loop"
 # These call the native libraries; an argument is the native function or its name.
-CALLS = ("torchgco.native.engine:run", "torchgco.native.sampler:run", "torchgco.native.roadmap:NativeSearch._run")
+CALLS = ("torchgco.native.engine:run", "torchgco.native.sampler:run", "torchgco.roadmap.native:NativeSearch._run")
 PYTHON = "Python and PyTorch"
 
 

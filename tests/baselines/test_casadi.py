@@ -25,9 +25,9 @@ from torchgco import (
 )
 from torchgco.baselines import CasADiSolver, Hold
 from torchgco.constraints import Constraint
-from torchgco.experiments.build import compose
-from torchgco.experiments.flight import Flight
-from torchgco.rollout import open_loop
+from torchgco.experiments.config.build import compose
+from torchgco.experiments.flying.flight import Flight
+from torchgco.lagrangian.rollout import open_loop
 from torchgco.solvers.contracts import Call, Solver
 
 PLUGINS = ["ipopt", "fatrop"]
@@ -269,7 +269,7 @@ def test_a_study_prepares_before_the_clock_starts(monkeypatch) -> None:
             assert call.problem.is_same(self.problem)
             return Hold().run(call)
 
-    monkeypatch.setattr("torchgco.experiments.flight._now", lambda device: float(events.append("clock") or 0.0))
+    monkeypatch.setattr("torchgco.experiments.flying.flight._now", lambda device: float(events.append("clock") or 0.0))
     Flight(setup, layouts, "builder", Builder(), tqdm(disable=True)).fly()
     assert events == ["prepare", "clock", "solve", "clock"]
 

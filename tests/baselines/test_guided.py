@@ -8,8 +8,9 @@ import torch
 from tests.problems import planar_batch
 from torchgco import ControlBounds, InputError, Problem, Status, judge
 from torchgco.baselines import CasADiSolver, GuidedCasADi
-from torchgco.experiments.build import compose
-from torchgco.search import PathProposals, Roadmap
+from torchgco.experiments.config.build import compose
+from torchgco.roadmap import Roadmap
+from torchgco.search import PathProposals
 
 GUIDED = GuidedCasADi(
     paths=PathProposals(

@@ -13,7 +13,7 @@ import pytest
 from tests.cluster.results import same
 from tests.experiments.commands import ROOT, command
 from tests.test_documents import commands
-from torchgco.experiments.report import main as report_main
+from torchgco.experiments.reports.report import main as report_main
 
 pytestmark = pytest.mark.slow
 FEW = ["study.layouts=6", "scenario.stages=12", "study.baselines=[hold]"]

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from tests.problems import planar_batch
 from torchgco import InputError, Problem, certify, judge
-from torchgco.constraints import CONTACT_FACTOR, Obstacles
-from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.rollout import open_loop
-from torchgco.search.scene import scene_of
-from torchgco.shapes import Dimensions
+from torchgco.base.shapes import Dimensions
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.obstacles import CONTACT_FACTOR, Obstacles
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.roadmap.scene import scene_of
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from tests.constraints.test_boxes import check_bounds, one_by_one
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch, random_trajectory
 from tests.reference import boxes as brute_force
 from torchgco import Boxes, Capsules, Constraint, InputError, Problem, Spheres
-from torchgco.constraints import CONTACT_FACTOR
-from torchgco.constraints.boxes import BoundBoxes
+from torchgco.obstacles import CONTACT_FACTOR
+from torchgco.obstacles.boxes import BoundBoxes
 
 VEHICLE = 0.1  # m
 

@@ -17,7 +17,7 @@ from torchgco import (
     RotorTracking,
     Unicycle,
 )
-from torchgco.expansion import linearise
+from torchgco.lagrangian.expansion import linearise
 
 MODELS = [Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking, Unicycle]
 FIELDS = {

@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.concar import EXACT, GOAL, GOAL_RADIUS, main, own_model, read_layouts, zero_controls
 from torchgco import judge
-from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.obstacles.spheres import BoundSpheres
 
 SOME = [0, 1, 2, 3, 4, 5, 11, 51]  # the last two need guidance
 

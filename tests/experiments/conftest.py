@@ -4,8 +4,9 @@ import sys
 
 import pytest
 
-from torchgco.experiments import app, study
-from torchgco.experiments.records import Records
+from torchgco.experiments import app
+from torchgco.experiments.flying import study
+from torchgco.experiments.results.records import Records
 
 
 @pytest.fixture

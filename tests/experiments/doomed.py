@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchgco.baselines import Hold
-from torchgco.experiments.workers import Shared
+from torchgco.experiments.flying.workers import Shared
 
 
 def prepare(*_: object) -> None:

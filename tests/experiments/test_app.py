@@ -15,11 +15,12 @@ from tqdm import tqdm
 
 import torchgco
 from tests.experiments.commands import ENVIRONMENT, ROOT, TINY, command, problem_line
-from torchgco import InputError, kernels
-from torchgco.experiments import study
-from torchgco.experiments.build import compose, config_dir
-from torchgco.experiments.identity import decisive, plain
-from torchgco.experiments.records import COLUMNS
+from torchgco import InputError
+from torchgco.base import kernels
+from torchgco.experiments.config.build import compose, config_dir
+from torchgco.experiments.flying import study
+from torchgco.experiments.results.identity import decisive, plain
+from torchgco.experiments.results.records import COLUMNS
 from torchgco.scenarios import Layouts
 from torchgco.solvers.augmented_lagrangian import OuterLoop
 

@@ -12,10 +12,10 @@ import pandas as pd
 import pytest
 
 from tests.experiments.commands import HOLD, problem_line
-from torchgco.errors import InputError
-from torchgco.experiments import files
-from torchgco.experiments.files import write
-from torchgco.experiments.report import main as report
+from torchgco.base.errors import InputError
+from torchgco.experiments.reports.report import main as report
+from torchgco.experiments.results import files
+from torchgco.experiments.results.files import write
 
 WORDS = [*HOLD, "study.shard_size=2", "hydra.run.dir=out"]
 

@@ -15,11 +15,11 @@ import pytest
 from tests.experiments.commands import ENVIRONMENT, begin, problem_line
 from tests.experiments.test_workers import arguments, wait_for
 from tests.trials import flights, trials
-from torchgco.interrupts import Terminated, raised
+from torchgco.base.interrupts import Terminated, raised
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
 MOMENTS = [0.2, 0.6, 1.0, 1.5, 2.5]  # s after the start: while modules are loaded, or while the study runs
-REPORT = "import sys; from torchgco.experiments.report import main; sys.exit(main())"
+REPORT = "import sys; from torchgco.experiments.reports.report import main; sys.exit(main())"
 
 
 @pytest.fixture

@@ -13,13 +13,14 @@ from omegaconf import OmegaConf
 
 from tests.cluster.results import same
 from tests.experiments.commands import HOLD, problem_line
-from torchgco.errors import InputError
-from torchgco.experiments import jobs, launching, progress
-from torchgco.experiments.build import compose
-from torchgco.experiments.files import PART, create, write
-from torchgco.experiments.flight import plan_of
-from torchgco.experiments.identity import Manifest
-from torchgco.experiments.records import Records
+from torchgco.base.errors import InputError
+from torchgco.experiments.config import launching
+from torchgco.experiments.config.build import compose
+from torchgco.experiments.flying import jobs, progress
+from torchgco.experiments.flying.flight import plan_of
+from torchgco.experiments.results.files import PART, create, write
+from torchgco.experiments.results.identity import Manifest
+from torchgco.experiments.results.records import Records
 
 # Two solvers, so that success compares rows of all jobs.
 STUDY = ["solver=al_ilqr", "solver.max_outer_iterations=1", "study.baselines=[hold]", "study.layouts=5", *HOLD[3:]]

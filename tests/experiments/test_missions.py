@@ -15,10 +15,11 @@ from tests.experiments.commands import problem_line
 from tests.trials import missions
 from tests.trials import trials as hand_made
 from torchgco import compose, presets
-from torchgco.experiments import report, study
-from torchgco.experiments.mission_tables import mission_lines
+from torchgco.experiments.flying import study
+from torchgco.experiments.reports import report
+from torchgco.experiments.statistics.mission_tables import mission_lines
+from torchgco.missions import Mission, Planner
 from torchgco.plotting import missions as draw
-from torchgco.simulation import Mission, Planner
 
 SHORT = ["mission.duration=0.2", "scenario.num_obstacles=3", "study.workers=1", "hydra.run.dir=out"]
 OWN = [

@@ -7,15 +7,15 @@ import pytest
 from scipy.stats import binomtest
 
 from tests.trials import flights, trials
-from torchgco.errors import InputError
-from torchgco.experiments.power import (
+from torchgco.base.errors import InputError
+from torchgco.experiments.reports.report import main
+from torchgco.experiments.statistics.power import (
     paired_layouts,
     paired_power,
     power_table,
     unpaired_layouts,
     unpaired_power,
 )
-from torchgco.experiments.report import main
 
 
 def test_the_two_proportion_test_needs_the_published_numbers() -> None:

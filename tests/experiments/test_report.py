@@ -6,14 +6,14 @@ import pandas as pd
 import pytest
 
 from tests.trials import flights, missions, trials
-from torchgco.errors import InputError
-from torchgco.experiments.formats import format_report
-from torchgco.experiments.kinds import joined, parts_of
-from torchgco.experiments.merge import merge
-from torchgco.experiments.paired import compare
-from torchgco.experiments.report import main, write_report
-from torchgco.experiments.statistics import plain, summarise
-from torchgco.experiments.tables import format_table
+from torchgco.base.errors import InputError
+from torchgco.experiments.reports.report import main, write_report
+from torchgco.experiments.results.kinds import joined, parts_of
+from torchgco.experiments.results.merge import merge
+from torchgco.experiments.statistics.formats import format_report
+from torchgco.experiments.statistics.paired import compare
+from torchgco.experiments.statistics.statistics import plain, summarise
+from torchgco.experiments.statistics.tables import format_table
 from torchgco.scenarios.layouts import Layouts
 
 HITS = [i < 30 for i in range(32)]

@@ -12,7 +12,7 @@ import torch
 
 from tests.experiments.commands import HOLD, TINY, problem_line
 from torchgco import MultiStart
-from torchgco.experiments.records import Records
+from torchgco.experiments.results.records import Records
 from torchgco.scenarios import Layouts
 from torchgco.solvers import AugmentedLagrangian
 from torchgco.solvers.augmented_lagrangian import OuterLoop

@@ -4,9 +4,9 @@ import pandas as pd
 import pytest
 
 from tests.trials import flights, trials
-from torchgco.errors import InputError
-from torchgco.experiments.paired import paired, paired_table
-from torchgco.experiments.statistics import summarise
+from torchgco.base.errors import InputError
+from torchgco.experiments.statistics.paired import paired, paired_table
+from torchgco.experiments.statistics.statistics import summarise
 
 
 def wilson(count: int, n: int) -> tuple[float, float]:

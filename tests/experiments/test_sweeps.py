@@ -12,13 +12,13 @@ import pytest
 
 from tests.experiments.commands import TINY
 from tests.trials import PLAIN, trials
-from torchgco.experiments.identity import Manifest, digest, layout_digests
-from torchgco.experiments.merge import merge
-from torchgco.experiments.paired import compare
-from torchgco.experiments.records import read_manifest
-from torchgco.experiments.report import main
-from torchgco.experiments.statistics import summarise
-from torchgco.experiments.tables import format_table
+from torchgco.experiments.reports.report import main
+from torchgco.experiments.results.identity import Manifest, digest, layout_digests
+from torchgco.experiments.results.merge import merge
+from torchgco.experiments.results.records import read_manifest
+from torchgco.experiments.statistics.paired import compare
+from torchgco.experiments.statistics.statistics import summarise
+from torchgco.experiments.statistics.tables import format_table
 from torchgco.scenarios import Layouts
 
 HIT, MISS = True, False

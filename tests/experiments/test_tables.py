@@ -12,14 +12,14 @@ import pytest
 
 from tests.experiments.commands import HOLD, problem_line
 from tests.trials import flights, trials
-from torchgco.experiments import report
-from torchgco.experiments.formats import format_report
-from torchgco.experiments.kinds import parts_of
-from torchgco.experiments.merge import merge
-from torchgco.experiments.paired import paired
-from torchgco.experiments.report import main
-from torchgco.experiments.statistics import plain, summarise
-from torchgco.experiments.tables import FORMATS
+from torchgco.experiments.reports import report
+from torchgco.experiments.reports.report import main
+from torchgco.experiments.results.kinds import parts_of
+from torchgco.experiments.results.merge import merge
+from torchgco.experiments.statistics.formats import format_report
+from torchgco.experiments.statistics.paired import paired
+from torchgco.experiments.statistics.statistics import plain, summarise
+from torchgco.experiments.statistics.tables import FORMATS
 
 HITS = [i < 30 for i in range(32)]
 

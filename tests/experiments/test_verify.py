@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from tests.experiments.commands import problem_line
-from torchgco.experiments.report import main
+from torchgco.experiments.reports.report import main
 
 WORDS = ["solver=al_ilqr", "study.baselines=[hold]", "study.layouts=3", "scenario.stages=8", "study.workers=1"]
 WORDS += ["study.figures=false"]
@@ -179,7 +179,7 @@ def test_rows_that_are_missing_or_twice_are_refused(out, capsys) -> None:
 
 
 def test_several_studies_and_their_report(out, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("torchgco.experiments.report._figures", lambda parts: {})
+    monkeypatch.setattr("torchgco.experiments.reports.report._figures", lambda parts: {})
     shutil.copytree(out, out.parent / "second")
     assert main([str(out.parent)]) == 0
     capsys.readouterr()

@@ -16,9 +16,9 @@ import pytest
 
 from tests.experiments import doomed
 from tests.experiments.commands import begin, problem_line
-from torchgco.errors import InputError
-from torchgco.experiments import workers
-from torchgco.experiments.workers import run_all
+from torchgco.base.errors import InputError
+from torchgco.experiments.flying import workers
+from torchgco.experiments.flying.workers import run_all
 
 pytestmark = pytest.mark.slow
 WAIT = 120  # s, an upper limit for steps that take a few

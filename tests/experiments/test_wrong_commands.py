@@ -17,11 +17,11 @@ from omegaconf import DictConfig, OmegaConf
 from tests.experiments import commands
 from tests.experiments.commands import HOLD, problem_line
 from tests.trials import flights, trials
-from torchgco.errors import InputError
-from torchgco.experiments import files
-from torchgco.experiments.build import build, compose, compose_config
-from torchgco.experiments.flight import plan_of
-from torchgco.experiments.report import main as report
+from torchgco.base.errors import InputError
+from torchgco.experiments.config.build import build, compose, compose_config
+from torchgco.experiments.flying.flight import plan_of
+from torchgco.experiments.reports.report import main as report
+from torchgco.experiments.results import files
 from torchgco.scenarios import LayoutFile, Walls
 
 MISSION = ["mission=default", "plant=rotors"]
@@ -250,7 +250,7 @@ def test_a_wrong_layout_file_writes_nothing(run, tmp_path) -> None:
 
 def test_more_obstacles_than_fit_into_memory_are_refused(run, tmp_path, monkeypatch) -> None:
     arrays(tmp_path / "some.npz", stages=100)
-    monkeypatch.setattr("torchgco.experiments.build.free_memory", lambda: 10_000)
+    monkeypatch.setattr("torchgco.experiments.config.build.free_memory", lambda: 10_000)
     code, _, err = run(*FILE)
     assert code == 2 and "100 stages with 3 obstacles" in problem_line(err)
 

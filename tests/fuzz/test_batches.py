@@ -13,17 +13,7 @@ from hypothesis import strategies as st
 
 from tests.fuzz.tally import count, examples
 from tests.problems import FIELDS, boxed_batch, planar_batch, quadrotor_batch, quick_gco
-from torchgco import (
-    GCO,
-    ILQR,
-    MPPI,
-    AugmentedLagrangian,
-    MultiStart,
-    Problem,
-    Solution,
-    Spheres,
-    Status,
-)
+from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian, MultiStart, Problem, Solution, Spheres, Status
 from torchgco.baselines import IteratedMPPI
 
 pytestmark = pytest.mark.slow

@@ -29,7 +29,7 @@ from torchgco import (
     StateBounds,
     judge,
 )
-from torchgco.goal import Goal
+from torchgco.problem.goal import Goal
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR
 

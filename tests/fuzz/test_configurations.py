@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.fuzz.tally import accepted_or_refused, examples
-from torchgco.experiments.build import Setup, compose, compose_config
-from torchgco.experiments.flight import plan_of
-from torchgco.experiments.identity import flat, plain
+from torchgco.experiments.config.build import Setup, compose, compose_config
+from torchgco.experiments.flying.flight import plan_of
+from torchgco.experiments.results.identity import flat, plain
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as arrays
 
 from tests.fuzz.tally import accepted_or_refused, examples
 from torchgco import Hold, Status, judge
-from torchgco.experiments.build import compose
+from torchgco.experiments.config.build import compose
 from torchgco.scenarios.files import LayoutFile
 
 pytestmark = pytest.mark.slow

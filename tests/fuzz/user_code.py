@@ -31,9 +31,9 @@ from torchgco import (
     Problem,
     QuadraticCost,
     Solution,
-    kernels,
 )
-from torchgco.rollout import open_loop
+from torchgco.base import kernels
+from torchgco.lagrangian.rollout import open_loop
 
 D = torch.float64
 B, N, SIZE = 3, 8, 3

@@ -10,9 +10,9 @@ import torchgco
 from benchmarks.maze import TOLERANCE, Flight, main, precise
 from benchmarks.maze_problem import DT, GOAL, HOVER, START, THRUST, R, cylinders, maze, recount, starts, waypoint_guess
 from torchgco import ControlBounds, StateBounds
-from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.evaluation import violation
-from torchgco.rollout import open_loop
+from torchgco.lagrangian.quality import violation
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.obstacles.spheres import BoundSpheres
 
 
 def test_the_form_of_the_maze() -> None:

@@ -9,8 +9,8 @@ import torch
 from benchmarks.navigation import TOLERANCE, Flight, cells, local, main
 from benchmarks.navigation_problem import FASTEST, HOVER, SLOWEST, fan, line_guess, navigation, recount
 from torchgco import ControlBounds, StateBounds
-from torchgco.evaluation import violation
-from torchgco.rollout import open_loop
+from torchgco.lagrangian.quality import violation
+from torchgco.lagrangian.rollout import open_loop
 
 # Costs of the source's script with IPOPT, by the place among 80 starts of the fan of 180 degrees.
 KNOWN = {0: 497.919359, 20: 498.304044, 60: 498.304012, 79: 497.919359}

@@ -12,11 +12,11 @@ from tests.problems import planar_batch, quadrotor_batch, reference_of
 from tests.reference.guidance import active_spheres, cpuf, stuck_knots
 from tests.reference.mppi import MppiSettings, mppi
 from torchgco import GCO, MPPI, InputError
-from torchgco.draws import DrawKey, standard_normal
+from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.samples import Flight, Noise, draw, fly
-from torchgco.penalties import GuideRegion
-from torchgco.rollout import open_loop
+from torchgco.lagrangian.penalties import GuideRegion
+from torchgco.lagrangian.rollout import open_loop
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
 

@@ -28,9 +28,9 @@ from torchgco import (
     Solution,
     Spheres,
     Status,
-    kernels,
     presets,
 )
+from torchgco.base import kernels
 from torchgco.guidance.gco import REACH, _radius
 from torchgco.guidance.suitability import SAMPLES, suited_sampler
 from torchgco.native.compiler import find_compiler

@@ -1,17 +1,16 @@
 """Emitted C functions, called on any number of problems."""
 
 import ctypes
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.draws import DrawKey, words
-from torchgco.native import model
+from torchgco.base.draws import DrawKey, words
+from torchgco.native.codegen.dynamics import JACOBIAN, STEP, DynamicsSource
+from torchgco.native.codegen.emit import PRELUDE
+from torchgco.native.codegen.source import C
 from torchgco.native.compiler import build
-from torchgco.native.emit import PRELUDE
-from torchgco.native.model import JACOBIAN, STEP, DynamicsSource
 
 LANES = 8
 
@@ -57,7 +56,7 @@ class Emitted:
 def drawn(key: DrawKey, rows: int, samples: int, stream: int = 0) -> Tensor:
     """Standard normal draws (rows, B, samples), float64, of the native sampler."""
     code = (
-        Path(model.__file__).with_name("normal.c").read_text()
+        (C / "normal.c").read_text()
         + """
 void tgco_draw(uint64_t key, int64_t samples, int64_t rows, double *z) {
     V block[rows];

@@ -8,9 +8,9 @@ import torch
 from tests.problems import boxed_batch, planar_batch, random_trajectory
 from torchgco import Boxes, Capsules, ControlBounds, Goal, Problem, judge
 from torchgco.baselines.casadi import CasADiSolver
-from torchgco.constraints.boxes import BoundBoxes
-from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import engine_of, terms_of
+from torchgco.obstacles.boxes import BoundBoxes
 
 
 @pytest.mark.parametrize("pushed", ["half", "few", "none"])  # of the multipliers

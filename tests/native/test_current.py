@@ -27,9 +27,9 @@ from torchgco import (
     certify,
     judge,
 )
+from torchgco.base.shapes import lead
 from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.native.identity import signature
-from torchgco.shapes import lead
 
 D = torch.float64
 N = 25
@@ -74,7 +74,7 @@ def same(problem: Problem, fresh: Problem) -> None:
     """Both problems have the same solution, and the native one is that of PyTorch's own rollout and cost."""
     one, other = torchgco.solve(problem), torchgco.solve(fresh)
     assert torch.equal(one.X, other.X) and torch.equal(one.cost, other.cost)
-    eager = torchgco.rollout.open_loop(fresh.dynamics, fresh.x0, one.U)
+    eager = torchgco.lagrangian.rollout.open_loop(fresh.dynamics, fresh.x0, one.U)
     torch.testing.assert_close(one.X, eager, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(one.cost, fresh.cost.total(one.X, one.U), rtol=1e-12, atol=1e-12)
 
@@ -357,11 +357,11 @@ def test_a_module_with_trainable_parameters_is_a_model(native: bool) -> None:
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(6, 8), torch.nn.Tanh(), torch.nn.Linear(8, 4)).double()
     problem = boat(lambda x, u: field(x, u) + 0.1 * network(torch.cat((x, u), dim=-1)))
-    torchgco.kernels.use_native(native)
+    torchgco.base.kernels.use_native(native)
     try:
         solution = torchgco.solve(problem, solver=torchgco.presets.al_ilqr(problem))
     finally:
-        torchgco.kernels.use_native(True)
+        torchgco.base.kernels.use_native(True)
     assert not solution.X.requires_grad and not solution.cost.requires_grad
     assert float(certify(problem, solution.X, solution.U).dynamics_residual.max()) < 1e-9
     assert bool(torch.isfinite(judge(problem, solution.U, [4.0, 1.0], 0.5).cost).all())

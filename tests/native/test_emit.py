@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from tests.native.lanes import Emitted
+from torchgco.native.codegen.emit import emit, literal
 from torchgco.native.compiler import find_compiler
-from torchgco.native.emit import emit, literal
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 

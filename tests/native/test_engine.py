@@ -25,16 +25,16 @@ from torchgco import (
     QuadraticCost,
     Spheres,
     StateBounds,
-    kernels,
 )
-from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.base import kernels
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian.penalties import GuidePath, GuideRegion
+from torchgco.lagrangian.rollout import open_loop
 from torchgco.native.dispatch import EagerWarning, engine_of, terms_of
-from torchgco.penalties import GuidePath, GuideRegion
-from torchgco.rollout import open_loop
 from torchgco.solvers import ilqr
+from torchgco.solvers.ending import optimality
 from torchgco.solvers.ilqr import advance
 from torchgco.solvers.state import PassEnd, State
-from torchgco.solvers.verdict import optimality
 
 DAMPED = ILQR()
 BRIEF = replace(DAMPED, line_search=LineSearch(back=2))

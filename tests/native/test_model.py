@@ -19,9 +19,9 @@ from torchgco import (
     RotorTracking,
     Unicycle,
 )
-from torchgco.native import model as made_by
+from torchgco.native.codegen import dynamics as made_by
+from torchgco.native.codegen.dynamics import trace_dynamics
 from torchgco.native.compiler import find_compiler
-from torchgco.native.model import trace_dynamics
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
@@ -174,7 +174,7 @@ def test_made_once(monkeypatch) -> None:
     assert first.code != other.code
     root = Path(__file__).parents[2]
     code = (
-        "import sys, torch; from torchgco import Planar; from torchgco.native.model import trace_dynamics;"
+        "import sys, torch; from torchgco import Planar; from torchgco.native.codegen.dynamics import trace_dynamics;"
         "source = trace_dynamics(Planar(drag=2.0)); print(source.key, 'casadi' in sys.modules, len(source.code))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)

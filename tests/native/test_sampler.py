@@ -14,8 +14,9 @@ from tests.native import users
 from tests.native.lanes import drawn
 from tests.native.test_engine import user_problem
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
-from torchgco import MPPI, Problem, Spheres, kernels, presets
-from torchgco.draws import DrawKey, standard_normal
+from torchgco import MPPI, Problem, Spheres, presets
+from torchgco.base import kernels
+from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.guidance import mppi
 from torchgco.native import dispatch
 from torchgco.native.compiler import find_compiler

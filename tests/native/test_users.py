@@ -18,7 +18,8 @@ import torchgco
 from tests.native.test_engine import DAMPED, eager, natively, normal, running_state
 from tests.native.users import PROBLEMS, Each, Smooth, Tube, each, errands, with_cost
 from tests.problems import planar_batch, quick_gco
-from torchgco import Problem, Status, kernels
+from torchgco import Problem, Status
+from torchgco.base import kernels
 from torchgco.constraints.base import Constraint
 from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import EagerWarning, cost_unit, engine_of, terms_of

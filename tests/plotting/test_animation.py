@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.plotting import animation
 from torchgco.plotting.animation import Picture, mission_animation, planar_animation
 from torchgco.plotting.course import Course

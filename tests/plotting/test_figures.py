@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from tests.trials import flights, trials
-from torchgco.errors import InputError
-from torchgco.experiments.statistics import summarise
+from torchgco.base.errors import InputError
+from torchgco.experiments.statistics.statistics import summarise
 from torchgco.plotting.convergence import convergence_figure
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.rates import rates_figure

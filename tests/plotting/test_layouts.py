@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from tests.trials import flights, trials
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.plotting.bodies import Ball, Box, bodies
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.scene import contacts, scene_of

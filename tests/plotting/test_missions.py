@@ -8,9 +8,9 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.errors import InputError
-from torchgco.outcome import Outcome
+from torchgco.missions.outcome import Outcome
 from torchgco.plotting import missions
 from torchgco.plotting.course import Course
 

@@ -11,7 +11,7 @@ import torch
 
 from tests.reference import boxes as slow
 from torchgco import InputError, Planar
-from torchgco.constraints.boxes import BoundBoxes
+from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.plotting.bodies import Box, bodies
 from torchgco.plotting.layouts import layout_grid
 from torchgco.scenarios.layouts import BOXES, Layouts, concatenate

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.scenarios import Forest, ForestMoving, Layouts, PlanarRandom, PlanarTrap, Scenario, Walls, Yard
 from torchgco.scenarios.base import generator
 from torchgco.scenarios.planar import TRAP

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.scenarios import LayoutFile, Layouts, concatenate
 
 DATA = Path(__file__).parents[2] / "benchmarks" / "data"

@@ -7,7 +7,7 @@ import pytest
 
 from torchgco import InputError
 from torchgco.dynamics import Planar, Unicycle
-from torchgco.experiments.build import compose
+from torchgco.experiments.config.build import compose
 from torchgco.scenarios import Layouts, PlanarTrap, Yard
 from torchgco.scenarios.vehicle import BUILT_IN, fitting
 

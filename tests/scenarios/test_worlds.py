@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.families import WORLDS
 from torchgco import compose
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.scenarios import Crossing, Layouts, Mazes, Woods
 
 SCENARIOS = [Woods(), Mazes(), Crossing()]

@@ -7,10 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.search.gates import CLOSED, PASSES, SHORT, SOLVER, Solve, gates
-from torchgco import (
-    AugmentedLagrangian,
-    Solution,
-)
+from torchgco import AugmentedLagrangian, Solution
 from torchgco.search.paths import SEARCH
 
 

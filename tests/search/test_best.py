@@ -9,16 +9,7 @@ import torch
 
 from tests.problems import planar_batch
 from tests.search.gates import LOCAL, Solve
-from torchgco import (
-    GCO,
-    ILQR,
-    AugmentedLagrangian,
-    LineSearch,
-    Problem,
-    QuadraticCost,
-    Restarts,
-    Solution,
-)
+from torchgco import GCO, ILQR, AugmentedLagrangian, LineSearch, Problem, QuadraticCost, Restarts, Solution
 from torchgco.search.best import Best
 from torchgco.search.restarts import SEED_STEP
 from torchgco.solvers.contracts import Advice, Call
@@ -52,7 +43,7 @@ def given(monkeypatch) -> tuple[Problem, torch.Tensor, AugmentedLagrangian]:
 def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> Solution:
     """The choice among given trajectories, all caught, none improved; `share` is the goal tolerance."""
     problem, U0, local = given(monkeypatch)
-    monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", share)
+    monkeypatch.setattr("torchgco.lagrangian.quality.GOAL_TOLERANCE", share)
     monkeypatch.setattr("torchgco.search.restarts.caught_knots", lambda problem, X, *_: torch.ones_like(X[..., 0]) > 0)
     monkeypatch.setattr("torchgco.search.restarts.clear_chords", lambda *_: None)  # trajectories here do collide
     return Restarts(local, None, Given(levels=levels), attempts=len(levels), **options).solve(problem, U0)
@@ -80,7 +71,7 @@ def test_an_arrived_trajectory_is_preferred_to_a_cheaper_one(
 @pytest.mark.parametrize("by_arrival", [True, False])
 def test_an_arrived_iterate_is_kept_within_an_attempt_too(by_arrival: bool, monkeypatch) -> None:
     """The first inner solve arrives; then guidance replaces it by a cheaper trajectory that stays."""
-    monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", 0.5)
+    monkeypatch.setattr("torchgco.lagrangian.quality.GOAL_TOLERANCE", 0.5)
     problem, U0, local = given(monkeypatch)
     call = Call.checked(problem, torch.full_like(U0, ARRIVES))
     end = local.iterate(call, Given(levels=(STAYS,)), by_arrival=by_arrival)

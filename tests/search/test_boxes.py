@@ -23,13 +23,13 @@ from torchgco import (
     presets,
     solve,
 )
-from torchgco.constraints.boxes import BoundBoxes
-from torchgco.kernels import use_native
+from torchgco.base.kernels import use_native
 from torchgco.native.dispatch import engine_of
-from torchgco.search.geometry import FAR, Scene
-from torchgco.search.homotopy import one_per_class
-from torchgco.search.roadmap import Roadmap
-from torchgco.search.scene import scales, scene_of
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.roadmap.geometry import FAR, Scene
+from torchgco.roadmap.homotopy import one_per_class
+from torchgco.roadmap.roadmap import Roadmap
+from torchgco.roadmap.scene import scales, scene_of
 
 
 def uneven(points: Tensor, rows: slice) -> Tensor:

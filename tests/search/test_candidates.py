@@ -6,9 +6,9 @@ import torch
 
 from tests.search.cup import QUICK, controls, cup
 from torchgco import Problem
-from torchgco.rollout import open_loop
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.roadmap.scene import chord_penetration
 from torchgco.search.candidates import Candidates
-from torchgco.search.scene import chord_penetration
 
 
 def make_candidates(problem: Problem, U: torch.Tensor, *terms: torch.Tensor) -> Candidates:

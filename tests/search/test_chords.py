@@ -7,9 +7,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgco import Boxes, ControlBounds, Goal, Planar, Problem, QuadraticCost, Spheres, compose, judge, presets, solve
-from torchgco.evaluation import chord_clearance
-from torchgco.kernels import use_native
+from torchgco import (
+    Boxes,
+    ControlBounds,
+    Goal,
+    Planar,
+    Problem,
+    QuadraticCost,
+    Spheres,
+    compose,
+    judge,
+    presets,
+    solve,
+)
+from torchgco.base.kernels import use_native
+from torchgco.lagrangian.quality import chord_clearance
 from torchgco.native.dispatch import open_loop
 from torchgco.search import restarts
 

@@ -21,9 +21,9 @@ from torchgco import (
     Solution,
     StateBounds,
     Status,
-    kernels,
     presets,
 )
+from torchgco.base import kernels
 
 D, INF = torch.float64, math.inf
 LIMITS = torch.tensor([0.08, 0.12, 0.16], dtype=D)  # of Bryson and Denham's problem
@@ -76,7 +76,7 @@ def brachistochrone() -> Problem:
 
 
 def feasible(problem: Problem, solution: Solution) -> bool:
-    X = torchgco.rollout.open_loop(problem.dynamics, problem.x0, solution.U)
+    X = torchgco.lagrangian.rollout.open_loop(problem.dynamics, problem.x0, solution.U)
     return all(float(part.worst(X, solution.U).max()) <= 1e-3 for part in problem.constraints)
 
 
@@ -164,7 +164,7 @@ def rocket() -> Problem:
 
 def test_a_guess_that_overflows_starts_in_the_middle_of_the_bounds() -> None:
     problem = rocket()
-    X = torchgco.rollout.open_loop(problem.dynamics, problem.x0, torch.zeros(2, 60, 1, dtype=D))
+    X = torchgco.lagrangian.rollout.open_loop(problem.dynamics, problem.x0, torch.zeros(2, 60, 1, dtype=D))
     assert not bool(torch.isfinite(X).all())
     solution = torchgco.solve(problem)
     assert set(solution.statuses) <= {Status.CONVERGED, Status.FEASIBLE} and feasible(problem, solution)

@@ -10,11 +10,11 @@ from tests.reference import boxes as brute_force
 from tests.search.cup import GOAL, QUICK, controls, cost, cup
 from tests.search.test_paths import alone
 from torchgco import AugmentedLagrangian, PathProposals, Problem, Restarts, compose, judge
-from torchgco.constraints.bodies import Inflated
-from torchgco.rollout import open_loop
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.obstacles.base import Inflated
+from torchgco.roadmap.geometry import FAR, depth
+from torchgco.roadmap.scene import scene_of
 from torchgco.search.candidates import TO_THE_END, Candidates
-from torchgco.search.geometry import FAR, depth
-from torchgco.search.scene import scene_of
 from torchgco.search.tracking import CUT, followed, travel
 from torchgco.search.ways import Ways
 from torchgco.solvers.ilqr import ILQR

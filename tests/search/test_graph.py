@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgco import kernels
-from torchgco.native import roadmap as native
+from torchgco.base import kernels
 from torchgco.native.dispatch import EagerWarning
-from torchgco.native.roadmap import HOPS, Graph, NativeSearch, library_for
-from torchgco.search.geometry import FAR, Scene
-from torchgco.search.graph import Search
-from torchgco.search.roadmap import Roadmap, halton
+from torchgco.roadmap import native as native
+from torchgco.roadmap.geometry import FAR, Scene
+from torchgco.roadmap.native import HOPS, Graph, NativeSearch, library_for
+from torchgco.roadmap.roadmap import Roadmap, halton
+from torchgco.roadmap.search import Search
 
 B = 3
 
@@ -101,7 +101,7 @@ def test_both_return_the_same_paths(name: str, size: str, monkeypatch: pytest.Mo
     if size == "small":
         roadmap = Roadmap(num_halton=12)
         for constant, value in {"NODES": 9, "NEIGHBOURS": 3, "HALTON_NEIGHBOURS": 5, "MARGIN": 1.0}.items():
-            monkeypatch.setattr(f"torchgco.search.roadmap.{constant}", value)
+            monkeypatch.setattr(f"torchgco.roadmap.roadmap.{constant}", value)
     (paths, found), (expected, expected_found) = both(roadmap, SCENES[name], 4)
     assert torch.equal(found, expected_found)
     torch.testing.assert_close(paths, expected, rtol=0, atol=1e-9)

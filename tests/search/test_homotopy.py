@@ -2,8 +2,8 @@
 
 import torch
 
-from torchgco.search.geometry import FAR, Scene
-from torchgco.search.homotopy import one_per_class
+from torchgco.roadmap.geometry import FAR, Scene
+from torchgco.roadmap.homotopy import one_per_class
 
 
 def scene(centers: list[list[float]], distances: list[float], B: int = 1) -> Scene:

@@ -8,7 +8,7 @@ import torch
 
 from tests.problems import planar_batch
 from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian, InputError, LineSearch, MultiStart, QuadraticCost
-from torchgco.evaluation import has_arrived, is_better
+from torchgco.lagrangian.quality import has_arrived, is_better
 
 LOCAL = AugmentedLagrangian(ILQR(max_iterations=4), max_outer_iterations=3)
 MANY = MultiStart(LOCAL, starts=4, covariance=9.0, noise_knots=5)
@@ -105,7 +105,7 @@ def test_an_arrived_trajectory_is_preferred_to_a_cheaper_one(monkeypatch) -> Non
     many = replace(MANY, local=replace(stays, violation_tolerance=10.0), starts=20)
     solutions = []
     for share in (1e-9, 0.9):
-        monkeypatch.setattr("torchgco.evaluation.GOAL_TOLERANCE", share)
+        monkeypatch.setattr("torchgco.lagrangian.quality.GOAL_TOLERANCE", share)
         solutions.append(many.solve(problem, U0))
     rests, arrives = solutions
     nearer = has_arrived(problem, arrives.X)

@@ -13,9 +13,9 @@ import torch
 from tests.problems import quadrotor_batch
 from tests.search.cup import GOAL, QUICK, controls, cost, cup, cups
 from torchgco import ControlBounds, InputError, PathProposals, Problem, Roadmap, judge
-from torchgco.lagrangian import Lagrangian
-from torchgco.rollout import open_loop
-from torchgco.search.homotopy import one_per_class
+from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.roadmap.homotopy import one_per_class
 from torchgco.solvers.ilqr import descend
 
 

@@ -35,8 +35,8 @@ from torchgco import (
     Status,
     judge,
 )
-from torchgco.evaluation import has_arrived
 from torchgco.guidance.region import GuideRegion
+from torchgco.lagrangian.quality import has_arrived
 from torchgco.search.restarts import SEED_STEP, StopWhenCaught
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.state import STOPPED

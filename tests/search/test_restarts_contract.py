@@ -20,12 +20,7 @@ from tests.search.gates import (
     Solve,
     gates,
 )
-from torchgco import (
-    Problem,
-    Restarts,
-    Solution,
-    Status,
-)
+from torchgco import Problem, Restarts, Solution, Status
 from torchgco.search.candidates import Candidates
 from torchgco.solvers import contracts
 from torchgco.solvers.contracts import Progress

@@ -9,11 +9,11 @@ import torch
 
 from tests.reference.roadmap import cheapest_cost, path_length, point_along, segment_gap
 from torchgco import InputError, compose
-from torchgco.native.roadmap import Graph, NativeSearch, library_for
-from torchgco.search.geometry import FAR, Scene, points_along, squares_from_segments
-from torchgco.search.graph import Search
-from torchgco.search.roadmap import HALTON_NEIGHBOURS, Roadmap, halton
-from torchgco.search.scene import scene_of
+from torchgco.roadmap.geometry import FAR, Scene, points_along, squares_from_segments
+from torchgco.roadmap.native import Graph, NativeSearch, library_for
+from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, Roadmap, halton
+from torchgco.roadmap.scene import scene_of
+from torchgco.roadmap.search import Search
 
 
 def flat(points, rows):
@@ -206,9 +206,9 @@ def test_no_option_is_forgotten_above() -> None:
 @pytest.mark.parametrize("name", CONSTANTS)
 def test_every_constant_is_read(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     s, roadmap = random_scene(2, M=20, seed=6), Roadmap(num_halton=30)
-    monkeypatch.setattr("torchgco.search.roadmap.NODES", 60)
+    monkeypatch.setattr("torchgco.roadmap.roadmap.NODES", 60)
     usual = roadmap.paths(s, 3)[0]
-    monkeypatch.setattr(f"torchgco.search.roadmap.{name}", CONSTANTS[name])
+    monkeypatch.setattr(f"torchgco.roadmap.roadmap.{name}", CONSTANTS[name])
     assert not torch.equal(usual, roadmap.paths(s, 3)[0])
 
 

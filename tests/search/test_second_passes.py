@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torchgco import PathProposals, Problem, Restarts, Status, compose, presets
-from torchgco.lagrangian import Lagrangian, Multipliers
-from torchgco.rollout import open_loop
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian.rollout import open_loop
 from torchgco.search.paths import Proposal
 from torchgco.search.restarts import StopWhenCaught
 from torchgco.search.settings import MORE

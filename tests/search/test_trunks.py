@@ -10,22 +10,12 @@ import torch
 
 from tests.problems import quick_gco
 from tests.reference import boxes as brute_force
-from torchgco import (
-    Capsules,
-    ControlBounds,
-    Goal,
-    Planar,
-    Problem,
-    QuadraticCost,
-    QuadrotorPlanning,
-    Spheres,
-    judge,
-)
-from torchgco.constraints.boxes import BoundBoxes
-from torchgco.constraints.cuboids import Cuboids, beside, between
-from torchgco.kernels import use_native
-from torchgco.search.geometry import FAR, Scene
-from torchgco.search.roadmap import Roadmap
+from torchgco import Capsules, ControlBounds, Goal, Planar, Problem, QuadraticCost, QuadrotorPlanning, Spheres, judge
+from torchgco.base.kernels import use_native
+from torchgco.obstacles.box_geometry import Cuboids, beside, between
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.roadmap.geometry import FAR, Scene
+from torchgco.roadmap.roadmap import Roadmap
 
 VEHICLE = 0.36  # m
 START, GOAL = (-12.0, 0.0, 1.0), (12.0, 0.0, 1.0)

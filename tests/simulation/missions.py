@@ -8,9 +8,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco import ILQR, AugmentedLagrangian, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, Spheres
-from torchgco.simulation.mission import Mission
-from torchgco.simulation.planner import Planner
+from torchgco import (
+    ILQR,
+    AugmentedLagrangian,
+    ControlBounds,
+    Goal,
+    Problem,
+    QuadraticCost,
+    QuadrotorPlanning,
+    Spheres,
+)
+from torchgco.missions.mission import Mission
+from torchgco.missions.planner import Planner
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 

@@ -10,7 +10,7 @@ import torch
 
 from tests.problems import assert_same_bits, planar_batch, quick_gco
 from torchgco import ILQR, AugmentedLagrangian, InputError, MultiStart, Problem, Spheres, Status
-from torchgco.constraints.obstacles import BoundSpheres
+from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.solvers import contracts
 from torchgco.solvers.contracts import Solver
 

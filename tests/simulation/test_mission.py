@@ -10,15 +10,15 @@ from torch import Tensor
 
 from tests.simulation.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
 from torchgco import Airframe, Boxes, Cost, Goal, InputError, Planar, Problem, QuadraticCost, QuadrotorPlanning
-from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.flights import ending
-from torchgco.outcome import Ending, Outcome
-from torchgco.simulation.disturbance import Disturbance
-from torchgco.simulation.horizon import planning_state
-from torchgco.simulation.log import MissionLog
-from torchgco.simulation.mission import Mission
-from torchgco.simulation.plant import RotorPlant, hovering
-from torchgco.simulation.tracker import Reference, Tracker
+from torchgco.missions.disturbance import Disturbance
+from torchgco.missions.log import MissionLog
+from torchgco.missions.mission import Mission
+from torchgco.missions.outcome import Ending, Outcome
+from torchgco.missions.planning_problem import planning_state
+from torchgco.missions.plant import RotorPlant, hovering
+from torchgco.missions.tables import ending
+from torchgco.missions.tracker import Reference, Tracker
+from torchgco.obstacles.spheres import BoundSpheres
 
 TIMES = ("planner_seconds", "tracker_seconds")
 

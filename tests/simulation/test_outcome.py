@@ -10,9 +10,9 @@ import torch
 from tests.simulation.missions import DT, mission
 from tests.simulation.test_mission import NAMES, RADII, ends, six
 from torchgco import Airframe
-from torchgco.flights import energy, mission_frame, mission_row, samples, time_step_frame
-from torchgco.outcome import Ending, Outcome, judge_flight
-from torchgco.simulation.log import MissionLog
+from torchgco.missions.log import MissionLog
+from torchgco.missions.outcome import Ending, Outcome, judge_flight
+from torchgco.missions.tables import energy, mission_frame, mission_row, samples, time_step_frame
 
 PER_SEGMENT = 200  # points between two samples of the dense judge
 FRAME = Airframe()

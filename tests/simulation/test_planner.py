@@ -10,23 +10,14 @@ from torch import Tensor
 
 from tests.reference import models
 from tests.simulation.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
-from torchgco import (
-    Airframe,
-    ControlBounds,
-    FirstStepRates,
-    InputError,
-    Planar,
-    Problem,
-    QuadraticCost,
-    Restarts,
-    kernels,
-)
-from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.rollout import open_loop
+from torchgco import Airframe, ControlBounds, FirstStepRates, InputError, Planar, Problem, QuadraticCost, Restarts
+from torchgco.base import kernels
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.missions.disturbance import Disturbance
+from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.plant import RotorPlant, hovering
+from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.search import restarts
-from torchgco.simulation.disturbance import Disturbance
-from torchgco.simulation.planner import Plan, Planner
-from torchgco.simulation.plant import RotorPlant, hovering
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 

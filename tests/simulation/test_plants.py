@@ -17,11 +17,11 @@ from torch import Tensor
 from tests.problems import HOVER, quadrotor_batch
 from torchgco import Airframe, Goal, InputError, Problem, QuadraticCost, QuadrotorPlanning, QuadrotorPlant, presets
 from torchgco.dynamics.quadrotor import GRAVITY
-from torchgco.simulation import drone_models
-from torchgco.simulation.drone_models import DroneModelsPlant
-from torchgco.simulation.mission import Mission
-from torchgco.simulation.planner import Planner
-from torchgco.simulation.plant import RotorPlant, hovering
+from torchgco.missions import drone_models
+from torchgco.missions.drone_models import DroneModelsPlant
+from torchgco.missions.mission import Mission
+from torchgco.missions.planner import Planner
+from torchgco.missions.plant import RotorPlant, hovering
 
 needs_drone_models = pytest.mark.skipif(find_spec("drone_models") is None, reason="drone-models isn't installed")
 PLANTS = [RotorPlant, DroneModelsPlant]

@@ -19,13 +19,13 @@ from torchgco import (
     QuadrotorPlanning,
     Spheres,
     StateBounds,
-    kernels,
 )
+from torchgco.base import kernels
 from torchgco.constraints import Constraint, ControlBounds
+from torchgco.lagrangian.rollout import open_loop as eager_rollout
+from torchgco.missions.planning_problem import BiasedPlanning
 from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import cost_unit, engine_of, open_loop
-from torchgco.rollout import open_loop as eager_rollout
-from torchgco.simulation.horizon import BiasedPlanning
 
 SOLVER = AugmentedLagrangian(ILQR(max_iterations=6), initial_penalty=0.1, max_outer_iterations=4)
 INF = torch.inf

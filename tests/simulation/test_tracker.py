@@ -11,8 +11,8 @@ from torch import Tensor
 from tests.reference import models, tracking
 from tests.simulation.missions import DOUBLE
 from torchgco import Airframe, InputError, compose
-from torchgco.simulation.plant import RotorPlant, hovering
-from torchgco.simulation.tracker import Reference, Tracker, Tracking
+from torchgco.missions.plant import RotorPlant, hovering
+from torchgco.missions.tracker import Reference, Tracker, Tracking
 
 FRAME = Airframe()
 PERIOD = 0.05

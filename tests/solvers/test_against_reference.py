@@ -12,7 +12,7 @@ from tests.reference.augmented_lagrangian import solve as reference_solve
 from tests.reference.guidance import cpuf_hook
 from tests.reference.mppi import MppiSettings
 from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian
-from torchgco.draws import DrawKey, standard_normal
+from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.solvers.contracts import Progress
 
 CASES = {

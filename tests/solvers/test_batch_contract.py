@@ -17,10 +17,11 @@ from torchgco import (
     Restarts,
     Spheres,
 )
+from torchgco.base.status import Status
 from torchgco.baselines import IteratedMPPI
-from torchgco.constraints import ControlBounds, FirstStepRates
+from torchgco.constraints import ControlBounds
+from torchgco.missions.constraints import FirstStepRates
 from torchgco.solution import Solution
-from torchgco.status import Status
 
 SAMPLER = MPPI(samples=20)
 SOLVERS = {

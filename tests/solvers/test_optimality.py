@@ -29,9 +29,9 @@ from torchgco import (
 )
 from torchgco.baselines import Hold, IteratedMPPI
 from torchgco.costs.base import Cost
-from torchgco.lagrangian import Lagrangian
+from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.search.suitability import suited_paths
-from torchgco.solvers.verdict import STATIONARY, optimality
+from torchgco.solvers.ending import STATIONARY, optimality
 
 CAREFUL = ILQR(max_iterations=300)
 

@@ -27,10 +27,10 @@ from torchgco import (
     certify,
 )
 from torchgco.baselines import Hold
-from torchgco.judge import judge, sphere_clearance
-from torchgco.rollout import open_loop
-from torchgco.solvers.active_set import multipliers, projected
-from torchgco.solvers.condensed import Condensed
+from torchgco.judging.judge import judge, sphere_clearance
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.solvers.polish.active_set import multipliers, projected
+from torchgco.solvers.polish.condensed import Condensed
 
 SOLVER = AugmentedLagrangian(
     inner=ILQR(tolerance=3e-5, max_iterations=10),

@@ -26,7 +26,7 @@ from torchgco import (
     StateBounds,
     Unicycle,
 )
-from torchgco.autodiff import gradient_and_hessian
+from torchgco.base.autodiff import gradient_and_hessian
 from torchgco.tracing import Traced
 
 DOUBLE = dict(dtype=torch.float64)

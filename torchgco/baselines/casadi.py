@@ -15,15 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
+from torchgco.base.options import Count, Positive, check_options
+from torchgco.base.shapes import check_shape, check_tensor
+from torchgco.base.status import Status
 from torchgco.baselines.hold import rolled_out
-from torchgco.errors import InputError
-from torchgco.options import Count, Positive, check_options
-from torchgco.problem import Problem, check_problem
-from torchgco.rollout import open_loop
-from torchgco.shapes import check_shape, check_tensor
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Callback, Progress, Solver
-from torchgco.status import Status
 
 if TYPE_CHECKING:
     from torchgco.baselines.nlp import Program

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchgco.base.options import check_options
 from torchgco.baselines.casadi import CasADiSolver
 from torchgco.native.dispatch import engine_of
-from torchgco.options import check_options
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 from torchgco.search.paths import PathProposals
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver

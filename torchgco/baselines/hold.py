@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.evaluation import violation
-from torchgco.lagrangian import Multipliers
-from torchgco.options import Positive, check_options
-from torchgco.problem import Problem
-from torchgco.rollout import open_loop
+from torchgco.base.options import Positive, check_options
+from torchgco.base.status import Status
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.quality import violation
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
-from torchgco.status import Status
 
 
 @dataclass(frozen=True)

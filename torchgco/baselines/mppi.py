@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import torch
 
+from torchgco.base.draws import DrawKey
+from torchgco.base.errors import GuidanceWarning, InputError
+from torchgco.base.options import Count, Positive, check_options
 from torchgco.baselines.hold import rolled_out
-from torchgco.draws import DrawKey
-from torchgco.errors import GuidanceWarning, InputError
-from torchgco.evaluation import is_better, violation
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_sampler
-from torchgco.options import Count, Positive, check_options
+from torchgco.lagrangian.quality import is_better, violation
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.errors import InputError
-from torchgco.problem import Problem
+from torchgco.base.errors import InputError
+from torchgco.base.tree import PerElement
+from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
-from torchgco.tree import PerElement
 
 UNBOUNDED = 1e19  # and above: no bound for this problem; others of the batch have one
 

@@ -10,13 +10,13 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
-from torchgco.autodiff import jacobian
+from torchgco.base.autodiff import jacobian
+from torchgco.base.errors import InputError, shown
+from torchgco.base.options import check_options
+from torchgco.base.shapes import MISTAKES, Dimensions, check_shape
+from torchgco.base.tree import PerElement
+from torchgco.base.values import asks_for_knot, bound_values
 from torchgco.costs.base import add_blocks
-from torchgco.errors import InputError, shown
-from torchgco.options import check_options
-from torchgco.shapes import MISTAKES, Dimensions, check_shape
-from torchgco.tree import PerElement
-from torchgco.values import asks_for_knot, bound_values
 
 Sense = Literal["inequality", "equality"]
 Knots = slice | Sequence[int] | Tensor

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import Dimensions, check_shape, tensor
 from torchgco.constraints.base import Constraint, resolve_knots
-from torchgco.errors import InputError
-from torchgco.shapes import Dimensions, check_shape, tensor
 
 UNBOUNDED = 1e20  # stands for infinity in bound constraints
 

@@ -8,9 +8,9 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.autodiff import gradient_and_hessian
-from torchgco.shapes import Dimensions, lead
-from torchgco.tree import PerElement
+from torchgco.base.autodiff import gradient_and_hessian
+from torchgco.base.shapes import Dimensions, lead
+from torchgco.base.tree import PerElement
 
 
 class Cost(PerElement):

@@ -8,10 +8,10 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
+from torchgco.base.errors import InputError, shown
+from torchgco.base.shapes import Dimensions
+from torchgco.base.values import bound_values
 from torchgco.costs.base import Cost
-from torchgco.errors import InputError, shown
-from torchgco.shapes import Dimensions
-from torchgco.values import bound_values
 
 
 @dataclass(frozen=True)

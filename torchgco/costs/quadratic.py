@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import Dimensions, check_shape, lead, tensor
 from torchgco.costs.base import Cost, add_blocks
-from torchgco.errors import InputError
-from torchgco.shapes import Dimensions, check_shape, lead, tensor
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from typing import Any, ClassVar, Literal, Self
 
 from torch import Tensor
 
-from torchgco.autodiff import jacobian
+from torchgco.base.autodiff import jacobian
+from torchgco.base.options import Count, Seconds, check_options
+from torchgco.base.shapes import Dimensions
+from torchgco.base.tree import PerElement
+from torchgco.base.values import NONE, bound_values
 from torchgco.dynamics.integrators import INTEGRATORS
-from torchgco.options import Count, Seconds, check_options
-from torchgco.shapes import Dimensions
-from torchgco.tree import PerElement
-from torchgco.values import NONE, bound_values
 
 
 class Dynamics(PerElement):

@@ -12,11 +12,11 @@ from typing import Annotated, ClassVar
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
+from torchgco.base.options import Above, Meters, NonNegative, Positive, Seconds, check_options
+from torchgco.base.shapes import components, lead, vectors
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
-from torchgco.errors import InputError
-from torchgco.options import Above, Meters, NonNegative, Positive, Seconds, check_options
-from torchgco.shapes import components, lead, vectors
 
 GRAVITY = 9.81  # m/s^2
 Components = tuple[Tensor, ...]

@@ -8,10 +8,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchgco.base.options import Seconds, check_options
+from torchgco.base.shapes import components, vectors
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
-from torchgco.options import Seconds, check_options
-from torchgco.shapes import components, vectors
 
 
 @dataclass(frozen=True)

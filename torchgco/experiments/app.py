@@ -18,15 +18,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
-from torchgco.errors import InputError
-from torchgco.experiments import help_page
-from torchgco.experiments.build import config_dir, forget_composed, recomposer
-from torchgco.experiments.checks import as_input_error, check, check_once, hydra_words
-from torchgco.experiments.files import say, silence, write
-from torchgco.experiments.hydra_versions import ENTRY, register_resolver
-from torchgco.experiments.identity import decisive, digest, plain, settings_of
-from torchgco.experiments.jobs import Report
-from torchgco.interrupts import farewell, raised
+from torchgco.base.errors import InputError
+from torchgco.base.interrupts import farewell, raised
+from torchgco.experiments.config import help_page
+from torchgco.experiments.config.build import config_dir, forget_composed, recomposer
+from torchgco.experiments.config.checks import as_input_error, check, check_once, hydra_words
+from torchgco.experiments.config.hydra_versions import ENTRY, register_resolver
+from torchgco.experiments.flying.jobs import Report
+from torchgco.experiments.results.files import say, silence, write
+from torchgco.experiments.results.identity import decisive, digest, plain, settings_of
 
 # conf/hydra/launcher extends the plugins' configurations of the same names. Hydra warns that it may stop to join them;
 # ours are whole.
@@ -64,7 +64,7 @@ help_page.register()
 
 
 def _task(config: DictConfig) -> Report:
-    from torchgco.experiments.study import run_study  # here, as workers import this module and need no figures
+    from torchgco.experiments.flying.study import run_study  # here, as workers import this module and need no figures
 
     job = HydraConfig.get()
     folder, overrides = Path(job.runtime.output_dir), list(job.overrides.task)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 
 
 def active_counts(problem: Problem, X: Tensor, U: Tensor) -> Tensor:

@@ -8,18 +8,18 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bodies import Obstacles
-from torchgco.draws import DrawKey
+from torchgco.base.draws import DrawKey
+from torchgco.base.options import AtLeast, Count, Positive, check_options
+from torchgco.base.tree import put, take
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.region import guide_along
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
+from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.native.dispatch import cost_unit
-from torchgco.options import AtLeast, Count, Positive, check_options
-from torchgco.penalties import GuideRegion
-from torchgco.problem import Problem
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.problem import Problem
 from torchgco.solvers.contracts import Advice
-from torchgco.tree import put, take
 
 REACH = 0.02  # r_guide as a share of the distance to be flown; the paper's vehicles have radii of 0.017 and 0.03 of it
 DIVERGED = 1e3  # times the cost of staying at the start: a costlier sample mean is not used

@@ -9,15 +9,15 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import DrawKey, standard_normal, words
+from torchgco.base.errors import InputError
+from torchgco.base.options import Above, AtMost, Count, Natural, NonNegative, Positive, check_options
+from torchgco.base.shapes import check_shape, tensor
 from torchgco.constraints.bounds import ControlBounds
-from torchgco.draws import DrawKey, standard_normal, words
-from torchgco.errors import InputError
 from torchgco.guidance.samples import Flight, Noise, average, draw, fly
 from torchgco.native.dispatch import open_loop, sampler_of
 from torchgco.native.sampler import Rounds
-from torchgco.options import Above, AtMost, Count, Natural, NonNegative, Positive, check_options
-from torchgco.problem import Problem
-from torchgco.shapes import check_shape, tensor
+from torchgco.problem.problem import Problem
 
 CHUNK = 8192  # samples rolled out together: memory stays bounded
 COLLISION_PENALTY = 1e8  # rho_mp, per knot and obstacle touched

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchgco.penalties import GuideRegion
+from torchgco.lagrangian.penalties import GuideRegion
 
 
 def guide_along(guide: GuideRegion, X_safe: Tensor, caught: Tensor, radius: Tensor) -> GuideRegion:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import torch
 
-from torchgco.errors import GuidanceWarning
+from torchgco.base.errors import GuidanceWarning
 from torchgco.guidance.mppi import MPPI
 from torchgco.native.dispatch import engine_of
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 
 SAMPLES = 2  # of a trial
 

@@ -20,8 +20,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
 
+from torchgco.base.notices import notice
 from torchgco.native import store
-from torchgco.notices import notice
 
 # NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact.
 FLAGS = ("-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")

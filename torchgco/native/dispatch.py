@@ -8,16 +8,16 @@ from collections.abc import Hashable
 import torch
 from torch import Tensor
 
-from torchgco import rollout
-from torchgco.border import check_eager
-from torchgco.errors import InputError
-from torchgco.kernels import native
-from torchgco.lagrangian import Lagrangian
+from torchgco.base.errors import InputError
+from torchgco.base.kernels import native
+from torchgco.lagrangian import rollout
+from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine, Terms
 from torchgco.native.identity import signature
 from torchgco.native.sampler import Sampler
-from torchgco.problem import Problem
+from torchgco.problem.border import check_eager
+from torchgco.problem.problem import Problem
 
 NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
 CURRENT = "current"  # marks the form of problems that a solve works on

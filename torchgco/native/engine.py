@@ -11,18 +11,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.constraints.boxes import BoundBoxes
+from torchgco.base.errors import InputError
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.errors import InputError
-from torchgco.lagrangian import Multipliers
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
+from torchgco.native.codegen.constraint import rows_numbers, trace_rows
+from torchgco.native.codegen.cost import cost_numbers, trace_cost
+from torchgco.native.codegen.dynamics import trace_dynamics
+from torchgco.native.codegen.source import LANES, Form
 from torchgco.native.compiler import build
-from torchgco.native.costs import cost_numbers, trace_cost
-from torchgco.native.model import trace_dynamics
 from torchgco.native.packing import FLAGS, KINDS, NUMBERS, PATH, QUADRATIC, REGION, Packed, Rows, array, pack_rows
-from torchgco.native.rows import rows_numbers, trace_rows
-from torchgco.native.source import LANES, Form
-from torchgco.penalties import GuidePath, GuideRegion, Penalty
-from torchgco.problem import Problem
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.problem.problem import Problem
 
 MOST = 128  # states and controls together: the matrices of a stage lie on the stack
 

@@ -12,10 +12,10 @@ from typing import Any
 
 from torch import Tensor
 
+from torchgco.base.tree import PerElement, is_users
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.native.packing import KINDS
-from torchgco.problem import Problem
-from torchgco.tree import PerElement, is_users
+from torchgco.problem.problem import Problem
 
 PLAIN = (bool, int, float, str, type(None))
 

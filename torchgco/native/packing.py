@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
-from torchgco.constraints.boxes import BoundBoxes
-from torchgco.constraints.obstacles import BoundSpheres
-from torchgco.problem import Problem
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.problem import Problem
 
 ABSENT = -1.0  # stands for the squared inflated radius of an absent obstacle
 BOUNDS, SPHERES, FUNCTION, BOXES = range(4)

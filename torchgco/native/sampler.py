@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchgco.native.codegen.source import SAMPLER
 from torchgco.native.compiler import build
 from torchgco.native.engine import Engine, run
 from torchgco.native.packing import Array, Packed, array
-from torchgco.native.source import SAMPLER
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 
 REALS = {torch.float64: ("double", 8), torch.float32: ("float", 16)}  # type and lanes in C
 

@@ -15,7 +15,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.course import VEHICLE, VIEWS, Course, draw_instant, flight, positions
 from torchgco.plotting.missions import check_plans

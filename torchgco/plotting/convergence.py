@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.plotting.style import INK, legend, panels, tidy
 
 COLUMNS = ("element", "iteration", "outer", "cost", "guided")

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.style import INK, PALETTE
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.plotting.bodies import ABOVE, Plane
 from torchgco.plotting.grid import grid, put_head
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, passes, scene_of, view

@@ -1,7 +1,7 @@
 """Figures of missions: computing times, distances, snapshots, commands, states, tracking, and how missions ended.
 
-A frame has a row per control step of one mission (see `torchgco.flights.mission_frame`). Those figures that show a
-motion alone also take a row per time step of the plant.
+A frame has a row per control step of one mission (see `torchgco.missions.tables.mission_frame`). Those figures that
+show a motion alone also take a row per time step of the plant.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import PercentFormatter
 
+from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.errors import InputError
-from torchgco.outcome import Outcome
+from torchgco.missions.outcome import Outcome
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.course import POSITION, VEHICLE, VIEWS, Course, draw_instant, flight, positions
 from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, legend, panels, solver_colours, tasks_of, tidy

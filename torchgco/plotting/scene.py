@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchgco.constraints.bodies import CONTACT_FACTOR
+from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.plotting.bodies import Body, bodies
 
 Arrays = Mapping[str, np.ndarray]

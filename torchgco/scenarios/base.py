@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.layouts import Layouts, concatenate
 

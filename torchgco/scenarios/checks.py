@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from torchgco.constraints.boxes import UNIT_WITHIN
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
+from torchgco.obstacles.boxes import UNIT_WITHIN
 
 LARGEST = 1e6  # m, m/s or s: beyond it, squares and sums lose the digits that obstacles are checked to
 MOST_OBSTACLES = 100_000  # in a layout that is drawn

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import Scenario
 from torchgco.scenarios.layouts import Layouts

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from torchgco.archive import read_arrays
-from torchgco.errors import InputError
-from torchgco.options import check_value
+from torchgco.base.errors import InputError
+from torchgco.base.files import read_arrays
+from torchgco.base.options import check_value
 from torchgco.scenarios import checks
 from torchgco.solvers.memory import free_memory
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.layouts import Layouts
 from torchgco.scenarios.quadrotor import Quadrotor

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import Family, equal_spheres, uniform_clear
 from torchgco.scenarios.layouts import Layouts

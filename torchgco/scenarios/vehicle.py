@@ -10,18 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
+from torchgco.base.options import AtLeast, Count, Extended, Meters, check_options
+from torchgco.base.shapes import check_device
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds
-from torchgco.constraints.boxes import Boxes
-from torchgco.constraints.obstacles import Spheres
 from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.base import Dynamics
-from torchgco.errors import InputError
-from torchgco.goal import Goal
-from torchgco.options import AtLeast, Count, Extended, Meters, check_options
-from torchgco.problem import Problem
+from torchgco.obstacles.boxes import Boxes
+from torchgco.obstacles.spheres import Spheres
+from torchgco.problem.goal import Goal
+from torchgco.problem.problem import Problem
 from torchgco.scenarios.layouts import Layouts
-from torchgco.shapes import check_device
 
 STATES = ("state_weight", "terminal_weight", "start", "goal")  # fields with one number per state
 CONTROLS = ("control_weight", "control_reference", "control_lower", "control_upper")

@@ -3,4 +3,3 @@
 from torchgco.search.multistart import MultiStart as MultiStart
 from torchgco.search.paths import PathProposals as PathProposals
 from torchgco.search.restarts import Restarts as Restarts
-from torchgco.search.roadmap import Roadmap as Roadmap

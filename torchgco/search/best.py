@@ -6,13 +6,13 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from torchgco.evaluation import has_arrived, is_preferred
-from torchgco.penalties import Penalty
+from torchgco.base.tree import copied, put, take
+from torchgco.lagrangian.penalties import Penalty
+from torchgco.lagrangian.quality import has_arrived, is_preferred
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress
+from torchgco.solvers.history import Recorder
 from torchgco.solvers.state import STOPPED, Iterate, SolveEnd
-from torchgco.solvers.trace import Recorder
-from torchgco.tree import copied, put, take
 
 
 class Best:

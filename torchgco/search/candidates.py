@@ -9,14 +9,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.base.tree import put, take
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian.penalties import Penalty
 from torchgco.native.dispatch import value
-from torchgco.penalties import Penalty
-from torchgco.problem import Problem
-from torchgco.search import scene as seen
+from torchgco.problem.problem import Problem
+from torchgco.roadmap import scene as seen
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR, descend
-from torchgco.tree import put, take
 
 AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
 PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4

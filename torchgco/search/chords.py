@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import torch
 
-from torchgco.evaluation import chord_clearance, has_arrived, violation
+from torchgco.base.tree import take
+from torchgco.lagrangian.quality import chord_clearance, has_arrived, violation
 from torchgco.search.best import Best
-from torchgco.tree import take
 
 ROUNDS = 4  # solves at most, each with larger obstacles than the one before
 GROWTH = 1.1  # times the missing clearance: by how much obstacles grow in a round

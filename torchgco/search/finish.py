@@ -7,16 +7,16 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import DrawKey, smooth_normal
+from torchgco.base.status import Status
+from torchgco.base.tree import take
 from torchgco.constraints.bounds import ControlBounds
-from torchgco.draws import DrawKey, smooth_normal
-from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import open_loop, value
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 from torchgco.search.best import Best
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX, AugmentedLagrangian
 from torchgco.solvers.state import STALLED, STOPPED
-from torchgco.status import Status
-from torchgco.tree import take
 
 AWAY = 0.1  # standard deviation of the change of stalled controls, as a share of half their range
 KNOTS = 10  # of its noise

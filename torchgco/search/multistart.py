@@ -8,16 +8,16 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from torchgco.draws import DrawKey, smooth_normal
-from torchgco.errors import InputError
-from torchgco.options import AtLeast, Count, check_options
-from torchgco.problem import Problem
+from torchgco.base.draws import DrawKey, smooth_normal
+from torchgco.base.errors import InputError
+from torchgco.base.options import AtLeast, Count, check_options
+from torchgco.base.shapes import check_shape, tensor
+from torchgco.problem.problem import Problem
 from torchgco.search.best import Best
-from torchgco.shapes import check_shape, tensor
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Solver
-from torchgco.solvers.verdict import finished
+from torchgco.solvers.ending import finished
 
 
 @dataclass(frozen=True)

@@ -21,20 +21,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.lagrangian import Multipliers
+from torchgco.base.shapes import check_shape, tensor
+from torchgco.base.tree import put, take
+from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.dispatch import cost_unit, open_loop, value
-from torchgco.problem import Problem
-from torchgco.search import scene as seen
+from torchgco.problem.problem import Problem
+from torchgco.roadmap import scene as seen
+from torchgco.roadmap.geometry import Scene
+from torchgco.roadmap.homotopy import one_per_class
 from torchgco.search.candidates import PENALTY, ROUGH, TO_THE_END, Candidates, Refining, Watch, unwatched
-from torchgco.search.geometry import Scene
-from torchgco.search.homotopy import one_per_class
 from torchgco.search.settings import MORE, PathSettings
 from torchgco.search.tracking import attraction, followed
 from torchgco.search.ways import Ways, joined, plain, unconstrained
-from torchgco.shapes import check_shape, tensor
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.line_search import LineSearch
-from torchgco.tree import put, take
 
 MOST = 1536  # paths of all problems that are compared and tracked together: bounds the memory
 OFFSET_LASTS = 0.1  # share of the horizon that an initial offset lasts

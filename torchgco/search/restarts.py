@@ -20,16 +20,18 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchgco.draws import DrawKey
-from torchgco.errors import InputError
-from torchgco.evaluation import goal_tolerance
+from torchgco.base.draws import DrawKey
+from torchgco.base.errors import InputError
+from torchgco.base.options import Count, check_options
+from torchgco.base.status import Status
+from torchgco.base.tree import copied, put, take
 from torchgco.guidance.detection import caught_knots
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
+from torchgco.lagrangian.penalties import GuideRegion
+from torchgco.lagrangian.quality import goal_tolerance
 from torchgco.native.dispatch import cost_unit
-from torchgco.options import Count, check_options
-from torchgco.penalties import GuideRegion
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 from torchgco.search.best import Best
 from torchgco.search.chords import clear_chords
 from torchgco.search.finish import finish
@@ -38,11 +40,9 @@ from torchgco.search.suitability import has_paths, suited_paths
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Advice, Call, Progress, Solver
+from torchgco.solvers.ending import finished
+from torchgco.solvers.history import Recorder
 from torchgco.solvers.state import STOPPED, Iterate, SolveEnd
-from torchgco.solvers.trace import Recorder
-from torchgco.solvers.verdict import finished
-from torchgco.status import Status
-from torchgco.tree import copied, put, take
 
 CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal
 WITHIN = 0.95  # share of the goal tolerance to which they are attracted

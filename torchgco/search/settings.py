@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Self
 
-from torchgco.errors import InputError
-from torchgco.options import AtLeast, Below, Count, Natural, Positive, check_options
-from torchgco.search.roadmap import Roadmap
+from torchgco.base.errors import InputError
+from torchgco.base.options import AtLeast, Below, Count, Natural, Positive, check_options
+from torchgco.roadmap.roadmap import Roadmap
 
 # Of closer paths. Corners are averaged over a share of the horizon that is smaller by a factor. A spring gives way to
 # the cost: it gets stiffer, and then takes more iterations to reach the path. So does a tube around sharper corners.

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import torch
 
-from torchgco.constraints.bodies import Obstacles
-from torchgco.expansion import linearise
 from torchgco.guidance.suitability import check_form, failure
-from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian.expansion import linearise
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import engine_of
-from torchgco.problem import Problem
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.problem import Problem
+from torchgco.roadmap.scene import scene_of
 from torchgco.search.paths import PathProposals
-from torchgco.search.scene import scene_of
 
 
 def suited_paths(paths: PathProposals | None, problem: Problem) -> tuple[PathProposals | None, str | None]:

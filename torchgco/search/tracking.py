@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bodies import Inflated
-from torchgco.penalties import GuidePath, GuideRegion, Penalty
-from torchgco.search.geometry import depth, points_along
+from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
+from torchgco.obstacles.base import Inflated
+from torchgco.roadmap.geometry import depth, points_along
 
 CUT = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
 HALVINGS = 3  # of the share of the horizon over which they are averaged

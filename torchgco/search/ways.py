@@ -8,12 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bodies import Inflated
-from torchgco.lagrangian import Lagrangian, Multipliers
-from torchgco.problem import Problem
-from torchgco.search.geometry import Scene
-from torchgco.search.homotopy import one_per_class
-from torchgco.search.roadmap import length
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
+from torchgco.obstacles.base import Inflated
+from torchgco.problem.problem import Problem
+from torchgco.roadmap.geometry import Scene
+from torchgco.roadmap.homotopy import one_per_class
+from torchgco.roadmap.roadmap import length
 from torchgco.solvers.ilqr import ILQR, descend
 
 NEAR = 0.1  # of the distance to the goal: the last part is approached slowly

@@ -4,4 +4,4 @@ from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian as Augment
 from torchgco.solvers.ilqr import ILQR as ILQR
 from torchgco.solvers.line_search import LineSearch as LineSearch
 from torchgco.solvers.memory import plan_batch as plan_batch
-from torchgco.solvers.polish import Polish as Polish
+from torchgco.solvers.polish.polish import Polish as Polish

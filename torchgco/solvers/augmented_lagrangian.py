@@ -8,23 +8,23 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from torchgco.draws import DrawKey
-from torchgco.errors import InputError
-from torchgco.evaluation import is_preferred, violation
-from torchgco.lagrangian import Lagrangian, Multipliers, update
+from torchgco.base.draws import DrawKey
+from torchgco.base.errors import InputError
+from torchgco.base.options import Above, AtLeast, AtMost, Count, Positive, check_options
+from torchgco.base.status import Status
+from torchgco.base.tree import copied, put, take
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, update
+from torchgco.lagrangian.penalties import Penalty
+from torchgco.lagrangian.quality import is_preferred, violation
 from torchgco.native.dispatch import open_loop, value
-from torchgco.options import Above, AtLeast, AtMost, Count, Positive, check_options
-from torchgco.penalties import Penalty
-from torchgco.problem import Problem
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Advice, Call, Guidance, Progress, Solver
+from torchgco.solvers.ending import finished, start_status
+from torchgco.solvers.history import Recorder
 from torchgco.solvers.ilqr import ILQR, advance
 from torchgco.solvers.scheduler import run_all
 from torchgco.solvers.state import STALLED, STOPPED, Iterate, PassEnd, SolveEnd, State
-from torchgco.solvers.trace import Recorder
-from torchgco.solvers.verdict import finished, start_status
-from torchgco.status import Status
-from torchgco.tree import copied, put, take
 
 PENALTY_MAX = 1e12  # ceiling of mu
 HALVED = 0.5  # of a violation: the least that an outer iteration with a growing penalty should give

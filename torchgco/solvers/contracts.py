@@ -10,16 +10,16 @@ from typing import Any, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
-from torchgco.draws import DrawKey
-from torchgco.errors import InputError
-from torchgco.lagrangian import Multipliers
+from torchgco.base.draws import DrawKey
+from torchgco.base.errors import InputError
+from torchgco.base.options import Seconds, Seed, check_value
+from torchgco.base.shapes import computing_on, describe
+from torchgco.base.tree import Rows, take
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.native.dispatch import cost_unit, current
-from torchgco.options import Seconds, Seed, check_value
-from torchgco.penalties import GuideRegion
-from torchgco.problem import Problem, check_problem
-from torchgco.shapes import computing_on, describe
+from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
-from torchgco.tree import Rows, take
 
 
 @dataclass(frozen=True)

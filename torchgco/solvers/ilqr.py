@@ -7,21 +7,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.evaluation import violation
-from torchgco.expansion import linearise
-from torchgco.lagrangian import Lagrangian, Multipliers
+from torchgco.base.options import Count, NonNegative, Share, check_options
+from torchgco.base.status import Status
+from torchgco.base.tree import put, take
+from torchgco.lagrangian.expansion import linearise
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian.quality import violation
 from torchgco.native.dispatch import engine_of, open_loop, terms_of, value
 from torchgco.native.engine import Options
-from torchgco.options import Count, NonNegative, Share, check_options
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
+from torchgco.solvers.ending import finished, start_status
 from torchgco.solvers.lifted import LOST, diverges, lifted_search, native_lifted_search
 from torchgco.solvers.line_search import LineSearch
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import STALLED, InnerState, Iterate, PassEnd, SolveEnd
-from torchgco.solvers.verdict import finished, start_status
-from torchgco.status import Status
-from torchgco.tree import put, take
 
 ROUNDING = 1e-14  # share of L_M: a smaller expected change is rounding error
 # mu_r after a failed Cholesky (Algorithm 2, line 9): first value, growth factor, and the limit that ends a problem.

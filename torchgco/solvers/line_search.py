@@ -12,9 +12,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchgco.lagrangian import Lagrangian
-from torchgco.options import Natural, check_options
-from torchgco.rollout import closed_loop
+from torchgco.base.options import Natural, check_options
+from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.lagrangian.rollout import closed_loop
 from torchgco.solvers.riccati import BackwardPass
 
 SIDE_BY_SIDE = 256  # rollouts that cost little more than one

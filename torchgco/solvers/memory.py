@@ -6,11 +6,11 @@ import os
 
 import torch
 
-from torchgco.lagrangian import Multipliers
+from torchgco.base.options import Count, check_value
+from torchgco.base.shapes import check_device
+from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.dispatch import engine_of
-from torchgco.options import Count, check_value
-from torchgco.problem import Problem, check_problem
-from torchgco.shapes import check_device
+from torchgco.problem.problem import Problem, check_problem
 
 CPU_LIMIT = 256  # a larger batch is no faster on a core: the overhead that problems share is negligible by then
 SHARE = 0.5  # of the free memory; the rest is the system's and other processes'

@@ -12,9 +12,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchgco.base.status import Status
+from torchgco.base.tree import put, take
 from torchgco.solvers.state import State
-from torchgco.status import Status
-from torchgco.tree import put, take
 
 
 class Work(Protocol):

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchgco.lagrangian import Multipliers
-from torchgco.penalties import Penalty
-from torchgco.problem import Problem
-from torchgco.tree import copied
+from torchgco.base.tree import copied
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.penalties import Penalty
+from torchgco.problem.problem import Problem
 
 # Users never see these two as statuses.
 STOPPED = -1  # ended by guidance, for another attempt

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-from torchgco.autodiff import WithoutReading
-from torchgco.errors import InputError
+from torchgco.base.autodiff import WithoutReading
+from torchgco.base.errors import InputError
 from torchgco.tracing.operations import OPERATIONS
 
 

@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.errors import InputError
+from torchgco.base.errors import InputError
+from torchgco.base.tree import PerElement
 from torchgco.tracing.arrays import boxed
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.operations import OPERATIONS
 from torchgco.tracing.recorder import Call, Slot, name_of, record
-from torchgco.tree import PerElement
 
 INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
 

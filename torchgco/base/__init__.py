@@ -1,0 +1,1 @@
+"""What every part stands on: errors, options, shapes, tensors in trees, random draws, files."""

@@ -1,0 +1,156 @@
+"""The glossary of dimensions, and the checks of input.
+
+Dimensions, always these letters in this order:
+
+    B  problems in the batch      S  samples of a problem      N  stages (controls); knots are 0..N
+    n  states                     m  controls                  p  rows of a constraint      d  space (2 or 3)
+    k  index of a stage or knot   s  = n + 1 + m, the size of the homogeneous vector [x, 1, u]
+
+    X  (B, N+1, n) states         U  (B, N, m) controls        c <= 0 is feasible
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError, shown
+
+# What a user's function raises where it doesn't fit the problem.
+MISTAKES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError)
+
+
+def tensor(value: Any, field: str, like: Tensor) -> Tensor:
+    """`value` (tensor, array, nested sequence or number) as a floating tensor of the dtype and device of `like`.
+
+    Raises InputError where it isn't numeric, and where a tensor is refused by `check_tensor`.
+    """
+    if isinstance(value, Tensor):
+        return check_tensor(value, field, like)
+    try:
+        plain = np.array(value) if isinstance(value, np.ndarray) else value  # a copy: it may be read-only or reversed
+        plain = list(plain) if isinstance(plain, Sequence) else plain
+        if isinstance(plain, (bool, complex)) or (isinstance(plain, np.ndarray) and plain.dtype.kind not in "iuf"):
+            raise TypeError
+        return torch.as_tensor(plain, dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise InputError(field, "numbers", shown(value)) from None
+
+
+def as_states(x0: Any) -> Tensor:
+    """States (B, n) from a tensor, an array or lists of numbers; a single state (n,) is a batch of one.
+
+    Floating tensors and arrays keep their dtype, whole numbers and lists become float64.
+
+    Raises InputError (`x0`) where it isn't numeric.
+    """
+    if isinstance(x0, Tensor):
+        whole = not x0.is_floating_point() and not x0.is_complex() and x0.dtype != torch.bool
+        states = x0.double() if whole else x0
+    else:
+        single = isinstance(x0, np.ndarray) and x0.dtype == np.float32
+        states = tensor(x0, "x0", torch.empty(0, dtype=torch.float32 if single else torch.float64))
+    return states.unsqueeze(0) if states.dim() == 1 else states
+
+
+def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
+    """`value`, a dense tensor of float64 or float32 without gradients, of the dtype and device of `like`.
+
+    Raises InputError for all else. Converting another dtype or device silently would hide a mistake; and gradients with
+    respect to the input of a solve don't exist, so a tensor that asks for them is refused as well.
+    """
+    if not isinstance(value, Tensor):
+        raise InputError(field, "a tensor", type(value).__name__)
+    if value.dtype not in (torch.float64, torch.float32):
+        raise InputError(field, f"a {'float64 or float32' if like is None else like.dtype} tensor", describe(value))
+    if value.layout != torch.strided:
+        raise InputError(field, "a dense tensor", value.layout)
+    if value.requires_grad:
+        expected = "a tensor without gradients, `.detach()`, as solves aren't differentiable"
+        raise InputError(field, expected, describe(value))
+    if like is not None and value.dtype != like.dtype:
+        raise InputError(field, f"dtype {like.dtype} as in x0", value.dtype)
+    if like is not None and value.device != like.device:
+        raise InputError(field, f"device {like.device} as in x0", value.device)
+    return value
+
+
+def check_device(device: Any) -> torch.device:
+    """The device by its name; InputError where there is none, or PyTorch can't use it."""
+    try:
+        return torch.empty(0, device=device).device
+    except (RuntimeError, AssertionError, TypeError, ValueError):
+        raise InputError("device", "a device that is there, such as cpu", repr(device)) from None
+
+
+@contextmanager
+def computing_on(device: torch.device) -> Iterator[None]:
+    """No gradients are recorded, and new tensors lie on `device`, whatever the process's default device is."""
+    elsewhere = torch.get_default_device() != device
+    with torch.no_grad(), device if elsewhere else nullcontext():
+        yield
+
+
+def describe(value: object) -> str:
+    """The kind of a value: dtype and shape of a tensor, else its type."""
+    if not isinstance(value, Tensor):
+        return type(value).__name__
+    return f"{value.dtype} {tuple(value.shape)}" + (" with requires_grad" if value.requires_grad else "")
+
+
+@dataclass(frozen=True)
+class Dimensions:
+    """The facts about a problem that a part needs to check and shape its tensors."""
+
+    B: int
+    N: int
+    n: int
+    m: int
+    dt: float | None  # s, None for dynamics without a time step
+    position: slice | None
+    like: Tensor  # x0: dtype and device of everything
+
+
+def space_of(dims: Dimensions, field: str) -> int:
+    """d of the position in the dynamics; InputError, naming `field`, where they have none."""
+    if dims.position is None:
+        wanted = "dynamics with a position: set `position = slice(0, 2)`, or whichever states are metres"
+        raise InputError(field, wanted, "dynamics without one")
+    return dims.position.stop - dims.position.start
+
+
+def check_shape(value: Tensor, shape: tuple[int | str, ...], field: str) -> None:
+    """Raise InputError unless `value` is a tensor of `shape`; a letter stands for any length, named by it."""
+    if not isinstance(value, Tensor):
+        raise InputError(field, f"a tensor ({', '.join(map(str, shape))})", type(value).__name__)
+    fits = value.dim() == len(shape) and all(
+        isinstance(want, str) or want == got for want, got in zip(shape, value.shape, strict=True)
+    )
+    if not fits:
+        raise InputError(field, f"shape ({', '.join(map(str, shape))})", tuple(value.shape))
+
+
+def lead(parameter: Tensor | float, component: Tensor) -> Tensor | float:
+    """A model parameter shaped to multiply a component (B, ...) of states with leading batch axis.
+
+    A number or a tensor without axes is returned as it is; one of shape (B,) gets the axes that the component has.
+    """
+    if isinstance(parameter, Tensor) and parameter.dim() == 1:
+        return parameter.view(-1, *([1] * (component.dim() - 1)))
+    return parameter
+
+
+def components(z: Tensor) -> tuple[Tensor, ...]:
+    """The components (...) of vectors (..., n), each of them contiguous: arithmetic on strided ones takes longer."""
+    return z.movedim(-1, 0).contiguous().unbind(0)
+
+
+def vectors(*parts: Tensor) -> Tensor:
+    """Vectors (..., n) of n components (...), each of which stays contiguous in memory."""
+    return torch.stack(parts).movedim(0, -1)

@@ -1,0 +1,117 @@
+"""Values per problem, and per problem and knot, for the functions that a user passes to a problem's parts."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError, shown
+from torchgco.base.shapes import Dimensions, tensor
+from torchgco.base.tree import PerElement
+
+Knot = int | Tensor | None
+BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+
+
+@dataclass(frozen=True)
+class Values(PerElement):
+    """Named tensors that functions take as keyword arguments, in the order of their names."""
+
+    names: tuple[str, ...] = ()
+    rows: tuple[Tensor, ...] = ()  # (B, ...)
+    knot_names: tuple[str, ...] = ()
+    knot_rows: tuple[Tensor, ...] = ()  # (B, N+1, ...)
+    stages: int = 0  # N
+
+    batched: ClassVar[tuple[str, ...]] = ("rows", "knot_rows")
+
+    def call(self, function: Callable[..., Tensor], *arguments: Tensor, k: Knot = None) -> Tensor:
+        """function(*arguments) with its values, shaped for the first argument, (B, n), (B, K, n) or (B, S, n).
+
+        `k` is the knot, or the knots (K,) of the second axis; it is passed on where the function asks for it.
+        """
+        taken, x = keywords(function), arguments[0]
+        more: dict[str, Any] = {"k": k} if k is not None and asks_for_knot(function) else {}
+        for name, value in zip(self.names, self.rows, strict=True):
+            if name in taken:
+                more[name] = value[(slice(None), *[None] * (x.dim() - 2))]
+        for name, value in zip(self.knot_names, self.knot_rows, strict=True):
+            if name in taken:
+                at_knot = value[:, k]
+                more[name] = at_knot[:, None] if isinstance(k, int) and x.dim() == 3 else at_knot
+        return function(*arguments, **more)
+
+
+NONE = Values()
+
+
+def bound_values(
+    values: Any, knot_values: Any, functions: tuple[Callable[..., Any] | None, ...], dims: Dimensions, field: str
+) -> Values:
+    """Values by name for B problems of N stages: (B, ...), and (B|1, N+1, ...) for those of the knots.
+
+    Raises:
+        InputError: no mapping of names to numbers, another shape, or a name that no function takes.
+    """
+    if isinstance(values, Values):
+        return _checked(values, dims, field)
+    found: dict[str, dict[str, Tensor]] = {"values": {}, "knot_values": {}}
+    for kind, given, shape in (("values", values, (dims.B,)), ("knot_values", knot_values, (dims.B, dims.N + 1))):
+        if given is not None and not isinstance(given, Mapping):
+            raise InputError(f"{field}.{kind}", "a dict of tensors by name, or None", shown(given))
+        for name, value in (given or {}).items():
+            where = f"{field}.{kind}[{name!r}]"
+            value = tensor(value, where, dims.like)
+            if kind == "knot_values" and value.shape[:1] == (1,):
+                value = value.expand(dims.B, *value.shape[1:])
+            if tuple(value.shape[: len(shape)]) != shape:
+                raise InputError(where, f"shape ({', '.join(map(str, shape))}, ...)", tuple(value.shape))
+            if not any(name in keywords(function) for function in functions if function is not None):
+                raise InputError(where, "the name of an argument of the function", "a name that it doesn't take")
+            found[kind][name] = value
+    rows, at_knots = found["values"], found["knot_values"]
+    return Values(tuple(rows), tuple(rows.values()), tuple(at_knots), tuple(at_knots.values()), dims.N)
+
+
+def _checked(values: Values, dims: Dimensions, field: str) -> Values:
+    """Values that were bound before, to another problem maybe."""
+    for names, rows, shape in (
+        (values.names, values.rows, (dims.B,)),
+        (values.knot_names, values.knot_rows, (dims.B, dims.N + 1)),
+    ):
+        for name, row in zip(names, rows, strict=True):
+            if tuple(row.shape[: len(shape)]) != shape or row.dtype != dims.like.dtype:
+                wanted = f"{dims.like.dtype} of shape ({', '.join(map(str, shape))}, ...)"
+                raise InputError(f"{field}: value {name!r}", wanted, f"{row.dtype} {tuple(row.shape)}")
+    return replace(values, stages=dims.N)
+
+
+class _All(frozenset):
+    def __contains__(self, name: object) -> bool:
+        return True
+
+
+def keywords(function: Callable[..., Any]) -> frozenset[str]:
+    """The arguments that a function takes by name; all of them where it takes **anything."""
+    found = _parameters(function)
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in found):
+        return _All()
+    return frozenset(p.name for p in found if p.kind in BY_NAME)
+
+
+def asks_for_knot(function: Callable[..., Any]) -> bool:
+    """Whether a function has an argument k without a default; with one, k is a constant of the user's."""
+    return any(p.name == "k" and p.kind in BY_NAME and p.default is p.empty for p in _parameters(function))
+
+
+def _parameters(function: Callable[..., Any]) -> tuple[inspect.Parameter, ...]:
+    called = function.forward if isinstance(function, torch.nn.Module) else function
+    try:
+        return tuple(inspect.signature(called).parameters.values())
+    except (TypeError, ValueError):  # a builtin without a signature
+        return ()

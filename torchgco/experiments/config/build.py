@@ -1,0 +1,262 @@
+"""From a Hydra config to objects: the only place that instantiates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.singleton import Singleton
+from hydra.errors import HydraException, InstantiationException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+import torchgco
+from torchgco.base.errors import InputError
+from torchgco.base.kernels import use_native
+from torchgco.base.options import check_value
+from torchgco.experiments.config.checks import as_input_error, check, hydra_words
+from torchgco.experiments.config.hydra_versions import ANY_CLASS, ENTRY
+from torchgco.experiments.config.launching import allotted_cores
+from torchgco.experiments.config.preset_nodes import register
+from torchgco.experiments.results.identity import plain
+from torchgco.missions import Mission
+from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
+from torchgco.scenarios.vehicle import BUILT_IN, fitting
+from torchgco.solvers.memory import free_memory, least_bytes
+
+DEFAULT_LAYOUTS = 64
+FLOWN = "spheres in space for a mission: crossing, forest, forest_moving, forest_mission, walls, or a layout file"
+MOST = 1024  # threads or processes: PyTorch ends with an error of the system long before the system's own limit
+register()
+
+
+def config_dir() -> Path:
+    """Absolute path of conf/: next to the package in a checkout, inside it in a wheel."""
+    package = Path(torchgco.__file__).resolve().parent
+    for candidate in (package / "conf", package.parent / "conf"):
+        if (candidate / "config.yaml").is_file():
+            return candidate
+    raise FileNotFoundError(f"no conf/config.yaml in or next to {package}")
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A composed configuration and the objects made from it, for studies and notebooks."""
+
+    config: DictConfig
+    vehicle: Vehicle
+    scenario: Scenario
+    solver: Any
+    solver_name: str
+    seed: int
+    device: torch.device
+    dtype: torch.dtype
+    mission: Mission | None = None  # with the solver under study as its planner's
+
+    def layouts(self, count: int | None = None) -> Layouts:
+        """Layouts 0..count-1 under the seed; by default all of a file, or 64.
+
+        Raises:
+            InputError: count below 1, more than there are, or more than fit into memory.
+        """
+        count = count if count is not None else self.config.study.layouts
+        count = count if count is not None else self.scenario.available or DEFAULT_LAYOUTS
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise InputError("study.layouts", "at least 1", repr(count))
+        self._refuse_beyond_memory(self.scenario.draw(range(1), self.seed), count)
+        return self.vehicle.at_rest(self.scenario.draw(range(count), self.seed))
+
+    def _refuse_beyond_memory(self, first: Layouts, count: int) -> None:
+        """Raise where one problem, or all layouts and controls, exceed the free memory: the system would kill us."""
+        dynamics, free = self.vehicle.dynamics, free_memory()
+        N = self.vehicle.stages if first.stages is None else first.stages
+        bodies = first.radii.shape[1] + (0 if first.box_centers is None else first.box_centers.shape[1])
+        problem = least_bytes(N, dynamics.n, dynamics.m, N * (bodies + 2 * dynamics.m))
+        if problem > free:
+            field = "model.vehicle.stages" if first.stages is None else "scenario.stages"
+            got = f"{N} stages with {bodies} obstacles, {_gigabytes(problem)} or more"
+            raise InputError(field, f"a problem that fits into the free memory, {_gigabytes(free)}", got)
+        flights = count * (sum(held.nbytes for held in first.arrays().values()) + 8 * N * dynamics.m)
+        if flights > free:
+            got = f"{count}, {_gigabytes(flights)} or more"
+            raise InputError("study.layouts", f"layouts that fit into the free memory, {_gigabytes(free)}", got)
+
+    def task(self, layouts: Layouts | None = None) -> Task:
+        """The planning problems of some layouts (default: `layouts()`) on the configured device."""
+        return self.vehicle.task(layouts or self.layouts(), self.device, self.dtype)
+
+
+def compose(overrides: Sequence[str] = ()) -> Setup:
+    """The objects that `torchgco` would use with these command-line overrides.
+
+    Raises:
+        InputError: unknown key or group, or a value that a part refuses; overrides that aren't a list of texts.
+    """
+    check_value(overrides, Sequence[str], "overrides")
+    return build(compose_config(overrides))
+
+
+def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> DictConfig:
+    """The configuration alone; `searchpath` names further folders of configs."""
+    extra = [f"hydra.searchpath=[{','.join(searchpath)}]"] if searchpath else []
+    words = hydra_words(overrides, config_dir())
+    running = Singleton.get_state()  # a study composes its baselines while Hydra's own main runs
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(config_dir()), **ENTRY):
+            return hydra.compose("config", [*words, *extra])
+    except (HydraException, OmegaConfBaseException) as error:
+        raise as_input_error(error) from None
+    finally:
+        Singleton.set_state(running)
+
+
+def recomposer(overrides: Sequence[str], sources: Iterable[Any]) -> Callable[[str | None], DictConfig]:
+    """A function that composes the configuration of some overrides with another solver, with None as it is.
+
+    `sources` are Hydra's own `config_sources` of the command.
+    """
+    given = [o for o in overrides if not o.lstrip("+~").startswith(("solver=", "solver."))]
+    folders = [source.path for source in sources if source.schema == "file"]
+    others = tuple(f"file://{path}" for path in folders if str(config_dir()) not in path)
+
+    def recompose(solver: str | None) -> DictConfig:
+        try:
+            return _composed(tuple(overrides) if solver is None else (*given, f"solver={solver}"), others)
+        except InputError as error:
+            if solver is None or error.field != "solver":
+                raise
+            raise InputError("study.baselines", error.expected, solver) from None
+
+    return recompose
+
+
+@cache
+def _composed(overrides: tuple[str, ...], searchpath: tuple[str, ...]) -> DictConfig:
+    return compose_config(overrides, searchpath)  # needed several times by the folder's name
+
+
+def forget_composed() -> None:
+    """Compose anew what `recomposer` composes: the files of conf/ may have changed."""
+    _composed.cache_clear()
+
+
+def build(config: DictConfig) -> Setup:
+    """Instantiate model, scenario, solver and device of a configuration.
+
+    Raises:
+        InputError: a value that a part refuses, or parts that don't fit each other.
+    """
+    check(plain(config), config_dir())
+    if OmegaConf.is_missing(config.scenario, "path"):
+        raise InputError("scenario.path", "the layout file: add scenario.path=FILE.npz", "none")
+    device, dtype = _device(config.device)
+    setup = Setup(
+        config=config,
+        vehicle=_instantiate(config.model.vehicle, "model.vehicle"),
+        scenario=_instantiate(config.scenario, "scenario"),
+        solver=solver_of(config),
+        solver_name=config.solver.name,
+        seed=config.seed,
+        device=device,
+        dtype=dtype,
+    )
+    setup = replace(setup, mission=_mission(setup))
+    if config.model.dimension != setup.vehicle.dimension:
+        raise InputError("model.dimension", f"{setup.vehicle.dimension}, as its dynamics say", config.model.dimension)
+    d, n = setup.scenario.dimension, setup.scenario.states
+    another = n != setup.vehicle.dynamics.n and (d, n) in BUILT_IN.values()
+    if d != setup.vehicle.dimension or another:
+        form = f"{d}-D" if n is None else f"{d}-D with {n} states"
+        wanted = f"{fitting(d, n)}, as {setup.scenario.name} is {form}"
+        raise InputError("model", wanted, f"model={setup.vehicle.name}")
+    return setup
+
+
+def _gigabytes(count: float) -> str:
+    return f"{count / 1e9:.3g} GB"
+
+
+def _mission(setup: Setup) -> Mission | None:
+    """The closed loop of a configuration; None where it has none.
+
+    Raises:
+        InputError: a value that a part refuses, a model other than the quadrotor, or a device other than the CPU.
+    """
+    node = setup.config.get("mission")
+    if node is None:
+        if setup.config.get("plant") is not None:
+            raise InputError("plant", "a mission: experiment=mission or mission=default", "a plant alone")
+        return None
+    if setup.config.get("plant") is None:
+        raise InputError("plant", "the vehicle that flies the mission: plant=rotors", "none")
+    if setup.device.type != "cpu" or setup.dtype != torch.float64:
+        raise InputError("device", "device=cpu in float64 for missions", f"{setup.device.type}, {setup.dtype}")
+    if setup.scenario.dimension != 3:
+        raise InputError("scenario", FLOWN, setup.scenario.name)
+    parts = {name: _instantiate(node[name], f"mission.{name}") for name in ("planner", "tracker", "disturbance")}
+    held = OmegaConf.to_container(node, resolve=True)
+    assert isinstance(held, dict)
+    others: dict[str, Any] = {str(key): value for key, value in held.items() if key not in parts}
+    plant = _instantiate(setup.config.plant, "plant")
+    field = "mission.planner"
+    try:
+        planner = parts.pop("planner")(solver=setup.solver)
+        field = "mission"
+        mission = Mission(planner=planner, plant=plant, **parts, **others)
+    except TypeError as error:
+        raise as_input_error(error, field) from None
+    mission.check(setup.vehicle.dynamics)
+    return mission
+
+
+def solver_of(config: DictConfig) -> Any:
+    """The solver alone."""
+    return _instantiate(config.solver, "solver", leave_out="name")
+
+
+def vehicle_of(configuration: Mapping[str, Any]) -> Vehicle:
+    """The planning model of a study, from its resolved configuration in plain dicts."""
+    return _instantiate(OmegaConf.create(dict(configuration["model"]["vehicle"])), "model.vehicle")
+
+
+def _instantiate(node: DictConfig, field: str, leave_out: str | None = None) -> Any:
+    if not OmegaConf.is_dict(node):
+        raise InputError(field, "a group of keys", repr(node))
+    try:
+        # Containers become lists here: no part of the library knows OmegaConf.
+        plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+        assert isinstance(plain, dict)
+        parts = {key: value for key, value in plain.items() if key != leave_out}
+        return hydra.utils.instantiate(parts, _convert_="all", **ANY_CLASS)
+    except (InstantiationException, OmegaConfBaseException, TypeError) as error:  # Hydra 1.4 wraps no TypeError
+        raise as_input_error(error, field) from None
+
+
+def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
+    """The device and dtype; also sets the threads and kernels of this process."""
+    if node.name not in ("cpu", "cuda"):
+        raise InputError("device.name", "cpu or cuda", node.name)
+    if node.name == "cuda" and not torch.cuda.is_available():
+        raise InputError("device", "device=cpu, as no CUDA device is visible", "device=cuda")
+    if node.dtype not in ("float64", "float32"):
+        raise InputError("device.dtype", "float64 or float32", node.dtype)
+    if node.kernels not in ("native", "eager"):
+        raise InputError("device.kernels", "native or eager", repr(node.kernels))
+    torch.set_num_threads(_threads(node.threads))
+    use_native(node.kernels == "native")
+    return torch.device(node.name), getattr(torch, node.dtype)
+
+
+def _threads(wanted: int | None) -> int:
+    if wanted is None:
+        return allotted_cores()
+    if isinstance(wanted, bool) or not isinstance(wanted, int) or not 1 <= wanted <= MOST:
+        raise InputError("device.threads", f"1 to {MOST}, or null for all that are allotted", repr(wanted))
+    return wanted

@@ -1,0 +1,157 @@
+"""Checks of a composed configuration: its groups, keys and names. Parts check their own options."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from hydra.errors import MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+
+from torchgco.base.errors import InputError
+from torchgco.base.options import Seed, check_value
+
+NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")  # part of the names of files and folders
+MODEL = ("dimension", "vehicle")
+NO_CHOICES = ("null", "true", "false", "")  # values that Hydra reads as no name
+CLOSED_LOOP = ("mission", "plant")  # groups that only missions have
+
+
+def hydra_words(words: Iterable[str], conf: Path) -> list[str]:
+    """The words of a command line as Hydra takes them: `~mission` for `mission=null`.
+
+    Raises:
+        InputError: a value that is no name, where the word chooses an option of a group: Hydra fails there.
+    """
+    return [_hydra_word(word, conf) for word in words]
+
+
+def _hydra_word(word: str, conf: Path) -> str:
+    key, equals, value = word.lstrip("+").partition("=")
+    group = key.split("@")[0]
+    if equals and re.fullmatch(r"[\w/]+", group) and (conf / group).is_dir():
+        if value.lower() == "null" and _default_options(conf).get(key, "") is None:
+            return f"~{key}"
+        options = sorted(path.stem for path in (conf / group).glob("*.yaml"))
+        if value.lower() in NO_CHOICES or re.fullmatch(r"[-+]?[\d.]+|\{.*\}", value):
+            raise InputError(group, f"one of {', '.join(options)}", value or "nothing")
+    return word
+
+
+def check_once(words: Iterable[str]) -> None:
+    """Check that no key is given twice: Hydra would take the last value without a word.
+
+    Raises:
+        InputError: a key that is.
+    """
+    given: dict[str, str] = {}
+    for word in words:
+        key, equals, _ = word.lstrip("+").partition("=")
+        if equals and key in given:
+            raise InputError(key, "one value", f"{given[key]} and {word}")
+        given[key] = word
+
+
+def _default_options(conf: Path) -> dict[str, str | None]:
+    """The option of every group in the defaults list of config.yaml; None where the group is left out by default."""
+    base: Any = OmegaConf.to_container(OmegaConf.load(conf / "config.yaml"))
+    return {key: option for entry in base["defaults"] if isinstance(entry, dict) for key, option in entry.items()}
+
+
+def check(held: Mapping[str, Any], conf: Path) -> None:
+    """Check the groups, keys and names of a resolved configuration, without its node `hydra`.
+
+    Raises:
+        InputError: a group or key that is missing or unknown, a malformed seed, name or list of baselines.
+    """
+    base: Any = OmegaConf.to_container(OmegaConf.load(conf / "config.yaml"))
+    chosen = _default_options(conf).items()
+    groups = {key: option for key, option in chosen if key.isidentifier() and key != "experiment"}
+    own = [key for key in base if key not in ("defaults", "hydra")]
+    needed = [*own, *(key for key, option in groups.items() if option is not None)]
+    _keys(held, "", needed, [*own, *groups])
+    device: Any = OmegaConf.load(conf / "device" / f"{groups['device']}.yaml")
+    for name, known in (("study", base["study"]), ("device", device), ("model", MODEL)):
+        _keys(held[name], name, list(known), list(known))
+    for name in ("scenario", "solver"):
+        _keys(held[name], name, ["_target_"])
+    _keys(held["model"]["vehicle"], "model.vehicle", ["_target_", "name"])
+    check_value(held["seed"], Seed, "seed")
+    _name(held["solver"].get("name"), "solver.name")
+    _name(held["model"]["vehicle"]["name"], "model.vehicle.name")
+    if "path" not in held["scenario"]:
+        _name(held["scenario"].get("name"), "scenario.name")
+    _baselines(held["study"]["baselines"])
+
+
+def _keys(held: Any, group: str, needed: Sequence[str], known: Sequence[str] = ()) -> None:
+    """Check that `held` is a group with the needed keys and, where others are known at all, with no unknown ones."""
+    if not isinstance(held, Mapping):
+        raise InputError(group, "a group of keys", repr(held))
+    inside = f"{group}." if group else ""
+    for name in needed:
+        if name not in held:
+            raise InputError(f"{inside}{name}", "this key in the configuration", "none")
+    for name in held if known else ():
+        if name not in known:
+            raise InputError(f"{inside}{name}", f"one of the keys {', '.join(known)}", name)
+
+
+def _name(value: Any, field: str) -> None:
+    if not isinstance(value, str) or not NAME.fullmatch(value):
+        expected = "at most 64 letters, digits, '_', '-' and '.', which isn't the first"
+        raise InputError(field, expected, repr(value))
+
+
+def _baselines(names: Any) -> None:
+    if not isinstance(names, list | None) or not all(isinstance(name, str) for name in names or ()):
+        raise InputError("study.baselines", "a list of solver names, such as [al_ilqr]", repr(names))
+    if len(set(names or ())) < len(names or ()):
+        raise InputError("study.baselines", "each name once", repr(names))
+
+
+def as_input_error(error: BaseException, field: str = "configuration") -> InputError:
+    """An error of Hydra or OmegaConf as one line that names the key; keys of the error lie below `field`."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, InputError):
+            return cause
+        cause = cause.__cause__ or cause.__context__  # OmegaConf drops the cause of a failed interpolation
+    if isinstance(error, OverrideParseException):
+        return InputError(repr(error.override), "KEY=VALUE or GROUP=OPTION", _joined(error))
+    options = error.options if isinstance(error, MissingConfigException) else None
+    if isinstance(error, MissingConfigException) and options:
+        group, _, option = str(error.missing_cfg_file).rpartition("/")
+        return InputError(group, f"one of {', '.join(options)}", option)
+    text = "\n".join((str(error), *getattr(error, "__notes__", ())))
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if unknown := re.match(r"Could not override '(.+?)'", lines[0] if lines else ""):
+        return _unknown_key(error, unknown[1])
+    if merged := re.match(r"Error merging override \+*([^=\s]+)=?(.*)", lines[0] if lines else ""):
+        return InputError(merged[1], "a value of the kind that the configuration has", merged[2] or _joined(error))
+    inside = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), "")
+    key = getattr(error, "full_key", None) or ".".join(filter(None, (field, inside)))
+    if extra := re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(.+?)'", str(error)):
+        return InputError(f"{key}.{extra[2]}", f"an option that {extra[1]} has", extra[2])
+    return InputError(str(key) or field, "a value that the configuration knows", _joined(error))
+
+
+def _unknown_key(error: BaseException, key: str) -> InputError:
+    """The error for an unknown key: it names the first part that the configuration lacks, and the key most like it."""
+    found: Any = error.__cause__  # of OmegaConf
+    key = str(getattr(found, "full_key", None) or key)
+    name, parent = key.rpartition(".")[2], found.parent_node if hasattr(found, "parent_node") else None
+    if key in CLOSED_LOOP:
+        return InputError(key, "experiment=mission, as its keys are given", "none")
+    known = [str(other) for other in parent] if isinstance(parent, DictConfig) else []
+    near = get_close_matches(name, known, n=1)
+    return InputError(key, "a key that the configuration has" + "".join(f", such as {other}" for other in near), name)
+
+
+def _joined(error: BaseException) -> str:
+    """The text of an error in one line, without the places that it is about."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    return " ".join(line for line in lines if line and not line.startswith(("full_key:", "object_type=")))

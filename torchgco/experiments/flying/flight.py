@@ -1,0 +1,214 @@
+"""One solver flies a batch of layouts, and every flight becomes a row."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco.base.errors import InputError
+from torchgco.base.kernels import use_native
+from torchgco.base.status import Status
+from torchgco.experiments.config.build import MOST, Setup
+from torchgco.experiments.config.launching import allotted_cores, jobs_at_once
+from torchgco.experiments.flying.progress import Bar
+from torchgco.judging.certificate import certify
+from torchgco.judging.certificate import frame_columns as certificate_columns
+from torchgco.judging.judge import frame_columns, judge
+from torchgco.native.dispatch import engine_of
+from torchgco.problem.problem import Problem
+from torchgco.scenarios import Layouts
+from torchgco.solution import Solution
+from torchgco.solvers.contracts import Progress
+from torchgco.solvers.memory import is_out_of_memory, plan_batch
+
+Flown = tuple[str, tuple[pd.DataFrame, np.ndarray]]  # a solver's name, its rows and controls
+REDRAW = 0.5  # s between two drawings of the bar
+NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a study is flown: checked options of `study` that decide no result.
+
+    batch_size  problems worked on at once by a process; None: as many as are fast and fit into memory
+    shard_size  layouts to a file
+    workers     processes
+    repair      damaged files are redone
+    figures     figures are drawn when all is flown
+    job, jobs   this process flies share `job` (0..jobs-1) of the layouts; job is None where it flies all
+    """
+
+    batch_size: int | None
+    shard_size: int
+    workers: int
+    repair: bool
+    figures: bool
+    job: int | None
+    jobs: int
+
+    def share(self, ids: Sequence[int], count: int) -> list[int]:
+        """The part of `ids` that this process flies, of a study's layouts 0..count-1.
+
+        A layout's share depends on nothing else: a job that is started again flies what it left.
+        """
+        return [number for number in ids if self.job is None or number * self.jobs // count == self.job]
+
+
+def plan_of(setup: Setup) -> Plan:
+    """The plan of a configuration; InputError names the option that is malformed."""
+    given = setup.config.study
+    for name in ("repair", "figures"):
+        if not isinstance(given[name], bool):
+            raise InputError(f"study.{name}", "true or false", repr(given[name]))
+    jobs = 1 if given.jobs is None else _count(given.jobs, "jobs", ", or null for a study in one piece")
+    job = given.job
+    if (job is None) != (given.jobs is None) or (job is not None and not _is_one_of(job, jobs)):
+        raise InputError(
+            "study.job", "one of 0 to study.jobs - 1, as in -m study.jobs=4 'study.job=range(0,4)'",
+            f"study.job={job} study.jobs={given.jobs}",
+        )  # fmt: skip
+    # On a GPU the batches of several processes would share one device.
+    processes = 1 if setup.device.type == "cuda" else max(1, allotted_cores() // torch.get_num_threads())
+    return Plan(
+        batch_size=None if given.batch_size == "auto" else _count(given.batch_size, "batch_size", ", or auto"),
+        shard_size=_count(given.shard_size, "shard_size"),
+        workers=processes if given.workers is None else _count(given.workers, "workers", ", or null: all cores", MOST),
+        repair=given.repair,
+        figures=given.figures,
+        job=job,
+        jobs=jobs,
+    )
+
+
+def _is_one_of(number: object, count: int) -> bool:
+    return isinstance(number, int) and not isinstance(number, bool) and 0 <= number < count
+
+
+def _count(value: object, name: str, otherwise: str = "", most: int | None = None) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1 or (most is not None and value > most):
+        limits = "at least 1" if most is None else f"1 to {most}"
+        raise InputError(f"study.{name}", f"{limits}{otherwise}", repr(value))
+    return value
+
+
+@dataclass
+class Flight:
+    """A batch of layouts flown by one solver."""
+
+    setup: Setup
+    layouts: Layouts
+    name: str
+    solver: Any
+    bar: Bar
+    shown: int = 0
+    drawn: float = 0.0  # s, when the bar was drawn last
+
+    def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
+        """Rows (without success) and controls (L, N, m), NaN where nothing was flown."""
+        setup, layouts = self.setup, self.layouts
+        task = setup.vehicle.task(layouts, setup.device, setup.dtype)
+        ids = torch.as_tensor(layouts.ids, device=setup.device)
+        solution, seconds, together = self._solve(task.problem, task.U0, ids)
+        self.bar.update(layouts.count - self.shown)
+        statuses = [status.name for status in solution.statuses]
+        U = solution.U.detach().to("cpu", torch.float64)
+        U[[status in NOT_FLOWN for status in statuses]] = torch.nan
+        checked = setup.vehicle.task(layouts)
+        verdict = judge(checked.problem, U, checked.goal, checked.goal_radius)
+        certificate = certify(checked.problem, solution.X.detach().to("cpu", torch.float64), U, verdict.feasible)
+        rows = pd.DataFrame(
+            {
+                "scenario": layouts.name, "layout": layouts.ids, "seed": setup.seed, "model": setup.vehicle.name,
+                "solver": self.name, "status": statuses, **frame_columns(verdict), "sound": verdict.sound.numpy(),
+                **certificate_columns(certificate),
+                "iterations": solution.iterations.cpu().numpy(),
+                "outer_iterations": solution.outer_iterations.cpu().numpy(),
+                "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": together,
+                "threads": torch.get_num_threads(), "device": setup.device.type,
+                "dtype": str(setup.dtype).removeprefix("torch."), "version": torchgco.__version__,
+            }
+        )  # fmt: skip
+        return rows, U.numpy()
+
+    def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, np.ndarray]:
+        """The solution, seconds per problem, and how many problems at most ran at the same time as each of them (L,).
+
+        Each time memory runs out, half as many run at once. A solver that reports no pass runs all of them together.
+        """
+        # Building and compiling for a batch are set-up: the clock starts after them.
+        engine_of(problem)
+        solver, at_once = self.solver.prepare(problem), problem.B
+        if solver.in_slots(1) is not None:
+            plan = plan_of(self.setup)
+            processes = plan.workers * jobs_at_once()
+            at_once = min(problem.B, plan.batch_size or plan_batch(problem, self.setup.device, processes))
+            solver = solver.in_slots(at_once)
+        while True:
+            together = torch.zeros_like(ids)
+            callback = partial(self._progress, together)
+            began = _now(self.setup.device)
+            try:
+                solution = solver.solve(problem, U0, seed=self.setup.seed, ids=ids, callback=callback)
+            except (RuntimeError, MemoryError) as error:
+                smaller = solver.in_slots(max(1, at_once // 2))
+                if at_once == 1 or smaller is None or not is_out_of_memory(error):
+                    raise
+                solver, at_once = smaller, at_once // 2
+                self.bar.write(f"{self.name}: out of memory, on with {at_once} problems at once", sys.stderr)
+                continue
+            seconds = (_now(self.setup.device) - began) / problem.B
+            if not bool(together.any()):
+                together.fill_(problem.B)
+            return solution, seconds, together.cpu().numpy()
+
+    def _progress(self, together: Tensor, progress: Progress) -> None:
+        """Show how far the batch is, and note in `together` how many problems ran together."""
+        if progress.candidates is None:
+            together[progress.rows] = together[progress.rows].clamp(min=progress.rows.numel())
+            state = f"solved {progress.finished}/{progress.total}"
+        else:
+            state = "candidates {}/{}".format(*progress.candidates)
+        self.bar.update(max(0, progress.finished - self.shown))
+        self.shown = max(self.shown, progress.finished)
+        now = time.monotonic()
+        # A bar draws itself only where its count changes, and candidates may be solved for a minute.
+        self.bar.set_postfix_str(state, refresh=now - self.drawn > REDRAW)
+        self.drawn = now if now - self.drawn > REDRAW else self.drawn
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+# Functions of worker processes. They are here, not in `study`, so that no worker loads the report's figures.
+
+
+def prepare(threads: int, in_c: bool) -> None:
+    """Give a worker process the threads and kernels of the study's own."""
+    torch.set_num_threads(threads)
+    use_native(in_c)
+
+
+class AnyFlight(Protocol):
+    """A batch of layouts that one solver flies."""
+
+    name: str
+
+    def fly(self) -> tuple[pd.DataFrame, np.ndarray]: ...
+
+
+def fly(flight: AnyFlight) -> Flown:
+    """The flight's rows and controls, under its solver's name."""
+    return flight.name, flight.fly()

@@ -1,0 +1,92 @@
+"""A solver flies a batch of layouts as the planner of closed-loop missions, and every mission becomes a row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+import torchgco
+from torchgco.experiments.config.build import Setup
+from torchgco.experiments.flying.progress import Bar
+from torchgco.missions.outcome import Outcome
+from torchgco.missions.tables import clearances, ending, mission_row, packed, spheres_of
+from torchgco.scenarios import Layouts
+
+FEW = 4  # missions in a study, up to which plans are kept and each mission gets figures
+LOST = (Outcome.COLLISION, Outcome.DIVERGED)
+# Columns of a study that a mission leaves empty: they belong to a single trajectory.
+SINGLE = ("cost", "dynamics_residual", "clearance_full", "bound_violation", "kkt_residual")
+
+
+@dataclass
+class MissionFlight:
+    """A batch of missions in lockstep, planned by one solver."""
+
+    setup: Setup
+    layouts: Layouts
+    name: str
+    solver: Any
+    bar: Bar
+    plans: bool = False  # keep the planned positions, for figures
+    shown: float = 0.0
+
+    def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
+        """Rows (without success), and logs (L, K, W) as `flights.packed` has them, NaN after a mission's end."""
+        setup, layouts = self.setup, self.layouts
+        assert setup.mission is not None
+        mission = replace(setup.mission, planner=replace(setup.mission.planner, solver=self.solver))
+        problem = setup.vehicle.task(layouts).problem
+        ids = torch.as_tensor(layouts.ids)
+        progress = partial(self._progress, float(problem.dynamics.dt), mission.duration)
+        log = mission.fly(problem, seed=setup.seed, ids=ids, report=progress)
+        self.bar.update(layouts.count - self.shown)
+        arrays, spheres = log.arrays(self.plans), spheres_of(problem)
+        goal, radius = problem.goal.position.numpy(), problem.goal.radius.numpy()  # type: ignore[union-attr]
+        rows = []
+        for b in range(layouts.count):
+            near = float(radius[b]) if mission.goal_radius is None else mission.goal_radius
+            end = ending(arrays, b, log.period, spheres[b], goal[b], near)
+            rows.append({**self._row(b, end.outcome), **_judged(arrays, b, log.period, spheres[b], end)})
+            rows[-1] |= mission_row(arrays, b, log.period, end, mission.planner.airframe)
+        return pd.DataFrame(rows), packed(arrays)
+
+    def _row(self, b: int, outcome: Outcome) -> dict[str, Any]:
+        setup = self.setup
+        return {
+            "scenario": self.layouts.name, "layout": int(self.layouts.ids[b]), "seed": setup.seed,
+            "model": setup.vehicle.name, "solver": self.name, "status": outcome.name,
+            "feasible": outcome not in LOST, "reached": outcome == Outcome.REACHED, "sound": False,
+            **dict.fromkeys(SINGLE, np.nan),
+            "batch_size": self.layouts.count, "threads": torch.get_num_threads(), "device": setup.device.type,
+            "dtype": str(setup.dtype).removeprefix("torch."), "version": torchgco.__version__,
+        }  # fmt: skip
+
+    def _progress(self, period: float, duration: float, step: int, flying: int) -> None:
+        """Show the time in the missions; one that flies counts with the share of its duration."""
+        t = min((step + 1) * period, duration)
+        done = self.layouts.count - flying * (1 - t / duration)
+        count = f", {flying} flying" if self.layouts.count > 1 else ""
+        self.bar.set_postfix_str(f"t = {t:.1f} of {duration:g} s{count}", refresh=False)
+        self.bar.update(max(0.0, done - self.shown))
+        self.shown = max(self.shown, done)
+
+
+def _judged(arrays: Any, b: int, period: float, spheres: Any, end: Any) -> dict[str, Any]:
+    """The study's columns that the log of mission b decides."""
+    knots = clearances(arrays, b, period, spheres)
+    flown = ~np.isnan(arrays["cost"][b])
+    return {
+        "violation": float(arrays["violation"][b][flown].max(initial=0.0)),
+        "clearance": end.clearance,
+        "clearance_knots": float(knots.min(initial=np.inf)),
+        "goal_distance": end.goal_distance,
+        "iterations": int(arrays["iterations"][b][flown].sum()),
+        "outer_iterations": int(flown.sum()),
+        "guided": int((arrays["guided"][b][flown] > 0).sum()),
+        "seconds": float((arrays["planner_seconds"] + arrays["tracker_seconds"])[b][flown].sum()),
+    }

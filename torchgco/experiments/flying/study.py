@@ -1,0 +1,283 @@
+"""A study: several solvers fly the same layouts, and every flight becomes a row."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+import torchgco
+from torchgco.base.errors import InputError
+from torchgco.base.kernels import native
+from torchgco.base.status import Status
+from torchgco.experiments.config.build import Setup, build, solver_of
+from torchgco.experiments.config.launching import side_by_side
+from torchgco.experiments.flying.flight import Flight, Plan, fly, plan_of, prepare
+from torchgco.experiments.flying.mission_flight import FEW, MissionFlight
+from torchgco.experiments.flying.progress import LAYOUT, Bar, Lines
+from torchgco.experiments.flying.workers import Shared, run_all
+from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
+from torchgco.experiments.reports.report import write_report
+from torchgco.experiments.results.files import say
+from torchgco.experiments.results.identity import (
+    Manifest,
+    closed_loop,
+    difference,
+    digest,
+    layout_digests,
+    plain,
+    settings_of,
+)
+from torchgco.experiments.results.provenance import recorded
+from torchgco.experiments.results.records import DONE, JUDGED, TRIALS, Records
+from torchgco.experiments.results.success import sound, with_success
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.missions import Mission
+from torchgco.missions.mission import other_obstacles
+from torchgco.scenarios import Layouts, Task
+
+# From a baseline's name to the whole configuration with that solver.
+Recompose = Callable[[str], DictConfig]
+
+
+def run_study(
+    config: DictConfig,
+    folder: Path,
+    recompose: Recompose,
+    accepted: Callable[[], None] = lambda: None,
+    show: Callable[[str], None] = say,
+    command: Sequence[str] = (),
+    collect: bool = False,
+) -> bool:
+    """Fly, judge, write and report; returns False where a job flew its share of a study that others finish.
+
+    Started again on the same folder it resumes where it was stopped; a finished study only shows its table.
+
+    Args:
+        recompose: makes the configuration of a baseline.
+        accepted: called once the folder is known to be this study's; before that nothing is written.
+        command: the command line, for run.json.
+        collect: fly nothing, only judge, write and report what jobs flew.
+
+    Raises:
+        InputError: malformed configuration, a folder that holds another study, damaged files, worker processes that
+            die again and again, no layout that could be flown at all, missing trials where `collect` is set.
+    """
+    study = _study(config, recompose)
+    records = Records(folder, study.manifest, study.plan.repair)
+    records.claim()
+    accepted()
+    with recorded(folder, study.setup, study.plan, command) as ending:
+        if study.plan.job is not None:
+            _fly_share(study, records, show)
+            ending.append("share flown")
+            return False
+        _fly_and_report(study, records, show, collect)
+        return True
+
+
+def _fly_share(study: _Study, records: Records, show: Callable[[str], None]) -> None:
+    """Fly the share of a job, and leave the tables to the process that finishes the study."""
+    name = f"Job {study.plan.job} of {study.plan.jobs}"
+    if records.finished(study.layouts):
+        show(f"{name}: already done in {records.folder}")
+        return
+    missing = {solver: study.plan.share(records.missing(solver), study.layouts.count) for solver in study.solvers}
+    _fly(study, records, missing, name)
+    if (records.folder / DONE).is_file():  # another process flew the rest, and this share, meanwhile
+        records.drop_shards()
+    show(f"{name}: {sum(map(len, missing.values()))} trials flown in {records.folder}")
+
+
+def _fly_and_report(study: _Study, records: Records, show: Callable[[str], None], collect: bool) -> None:
+    folder = records.folder
+    if records.finished(study.layouts):
+        show(f"Already done in {folder}: nothing was flown again.\n")
+        _update_success(study, records, show)
+    else:
+        missing = {name: records.missing(name) for name in study.solvers}
+        count, left = study.layouts.count * len(study.solvers), sum(map(len, missing.values()))
+        if collect and left:
+            told = f"{left} of {count} trials missing in {folder} (the same command flies them)"
+            raise InputError("study.jobs", "a share from every job", told)
+        if left < count and not collect:
+            show(f"Resumed in {folder}: {count - left} of {count} trials were flown before.\n")
+        _fly(study, records, missing, study.setup.solver_name)
+        flown = [records.flown(name) for name in study.solvers]
+        rows = pd.concat([rows for rows, _ in flown], ignore_index=True)
+        _finish(study, records, rows, np.stack([U for _, U in flown]))
+    show(_report(study, folder))
+    records.close()
+    show(f"\nTable, arrays and figures: {folder}")
+    trials = pd.read_parquet(folder / TRIALS)
+    if (trials["status"] == Status.INVALID_START.name).all():
+        raise InputError("scenario", "a layout whose start is outside its obstacles", "none")
+
+
+@dataclass(frozen=True)
+class _Study:
+    """A configuration, checked and built."""
+
+    setup: Setup
+    plan: Plan
+    layouts: Layouts
+    solvers: dict[str, Any]  # by name, the one under study first
+    manifest: Manifest
+
+    @property
+    def rivals(self) -> int:
+        """How many solvers have costs to compare: none in missions."""
+        return len(self.solvers) if self.setup.mission is None else 1
+
+
+def _finish(study: _Study, records: Records, rows: pd.DataFrame, flown: np.ndarray) -> None:
+    """Write the files of a study from its rows and what was flown, (solver, L, ...)."""
+    held: np.ndarray | pd.DataFrame = flown
+    if study.setup.mission is not None:
+        held = mission_table(records.folder, study.setup, study.layouts, list(study.solvers), flown)
+    records.finish(with_success(rows, study.layouts, study.rivals), held, study.layouts)
+
+
+def _report(study: _Study, folder: Path) -> str:
+    """Write the report of a finished study, and return it as text."""
+    if study.setup.mission is not None:
+        return write_mission_report(folder, study.setup, figures=study.plan.figures)
+    return write_report(folder, lambda held, flown: _trajectories(study, flown), figures=study.plan.figures)
+
+
+def _study(config: DictConfig, recompose: Recompose) -> _Study:
+    setup = build(config)
+    layouts = setup.layouts()
+    task = setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
+    if setup.mission is not None:
+        _check_mission(setup.mission, task)
+    configs = _rivals(config, recompose)
+    solvers = {name: setup.solver if held is config else solver_of(held) for name, held in configs.items()}
+    configuration = {"version": torchgco.__version__, **plain(config)}
+    manifest = Manifest(
+        configuration=configuration,
+        solvers={name: settings_of(held) for name, held in configs.items()},
+        layouts=layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(configuration)),
+    )
+    return _Study(setup, plan_of(setup), layouts, solvers, manifest)
+
+
+def _check_mission(mission: Mission, task: Task) -> None:
+    dynamics = task.problem.dynamics
+    mission.check(dynamics)
+    if others := other_obstacles(task.problem):
+        expected = "one with spheres alone, as missions fly among no other obstacles so far"
+        raise InputError("scenario", expected, f"{task.layouts.name}, which has {others}")
+    if mission.duration < dynamics.dt:
+        raise InputError("mission.duration", f"at least one control period, {dynamics.dt:g} s", mission.duration)
+
+
+def _rivals(config: DictConfig, recompose: Recompose) -> dict[str, DictConfig]:
+    """The configurations of the solvers by name, the one under study first; a baseline that equals it is left out."""
+    own = config.solver.name
+    found = {own: config}
+    for name in config.study.baselines or ():
+        other = recompose(name)
+        here, there = settings_of(config), settings_of(other)
+        if name == own and digest(here) != digest(there):
+            expected = f"another name, as the baseline {own} has other settings: solver.name={own}_changed"
+            raise InputError("solver.name", expected, f"{own} ({difference(there, here)})")
+        found.setdefault(name, other)
+    return found
+
+
+def _fly(study: _Study, records: Records, missing: Mapping[str, Sequence[int]], name: str) -> None:
+    """Fly the missing layouts of every solver, and keep them as shards."""
+    batches = [(name, ids) for name, left in missing.items() for ids in _cut(left, study.plan.shard_size)]
+    if not batches:
+        return
+    with _bar(study, sum(map(len, missing.values())), name) as bar:
+        workers = min(study.plan.workers, len(batches))
+        if workers > 1:
+            _fly_side_by_side(study, records, batches, workers, bar)
+        else:  # in this process, with a bar that moves inside a batch
+            for name, ids in batches:
+                bar.set_description(name)
+                records.keep(name, _flight(study, name, ids, bar).fly())
+
+
+def _bar(study: _Study, left: int, name: str) -> tqdm | Lines:
+    """Progress over the trials that this process flies, those flown before included."""
+    layouts = len(study.plan.share(range(study.layouts.count), study.layouts.count))
+    count = layouts * len(study.solvers)
+    if side_by_side():
+        return Lines(name, count, count - left)
+    return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True, bar_format=LAYOUT)
+
+
+def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
+    """The ids in batches of at most `size` that follow each other without a gap."""
+    batches: list[list[int]] = []
+    for number in ids:
+        if not batches or len(batches[-1]) == size or batches[-1][-1] + 1 != number:
+            batches.append([])
+        batches[-1].append(number)
+    return batches
+
+
+def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar) -> Flight | MissionFlight:
+    # A study's ids are positions, 0..L-1 (`Setup.layouts`).
+    layouts, solver = study.layouts.take(ids), study.solvers[name]
+    if study.setup.mission is None:
+        return Flight(study.setup, layouts, name, solver, bar)
+    return MissionFlight(study.setup, layouts, name, solver, bar, plans=study.layouts.count <= FEW)
+
+
+def _fly_side_by_side(
+    study: _Study, records: Records, batches: Sequence[tuple[str, list[int]]], workers: int, bar: tqdm | Lines
+) -> None:
+    """Fly the batches by several processes; this one writes the shards."""
+
+    shown = 0.0
+
+    total = sum(len(ids) for _, ids in batches)
+
+    def watch(finished: float) -> None:
+        nonlocal shown
+        bar.update(max(0.0, finished - shown))
+        shown = max(shown, finished)
+        bar.set_postfix_str(f"solved {int(shown)}/{total}", refresh=True)
+
+    bar.set_description(f"{workers} processes")
+    run_all(
+        fly,
+        [_flight(study, name, ids, Shared()) for name, ids in batches],
+        workers,
+        prepare=prepare,
+        options=(torch.get_num_threads(), native()),
+        keep=lambda flown: records.keep(*flown),
+        watch=watch,
+        say=lambda line: bar.write(line, sys.stderr),
+    )
+
+
+def _update_success(study: _Study, records: Records, show: Callable[[str], None]) -> None:
+    """Judge the rows of a finished study again where the best costs of its layouts have changed since."""
+    trials = pd.read_parquet(records.folder / TRIALS)
+    new = with_success(trials.assign(sound=sound(trials)), study.layouts, study.rivals)
+    if not new[list(JUDGED)].astype(object).equals(trials[list(JUDGED)].astype(object)):
+        records.replace(new, study.layouts)
+        show("The best costs of the layouts have changed: best_cost and success were computed again.\n")
+
+
+def _trajectories(study: _Study, flown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """States (L, N+1, n) of every solver, for the pictures."""
+    problem = study.setup.vehicle.task(study.layouts).problem
+    names: Sequence[str] = flown["solver"].tolist()
+    return {
+        name: open_loop(problem.dynamics, problem.x0, torch.from_numpy(U)).numpy()
+        for name, U in zip(names, flown["U"], strict=True)
+    }

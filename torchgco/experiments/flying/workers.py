@@ -1,0 +1,180 @@
+"""Work in several processes that survives the death of some of them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, ClassVar, TypeVar
+
+from torchgco.base import notices
+from torchgco.base.errors import InputError
+from torchgco.base.interrupts import raised, throw
+from torchgco.experiments.flying.progress import NoBar
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+CONTEXT = multiprocessing.get_context("spawn")
+POLL = 1.0  # seconds until progress is shown, and an interrupt noticed that Python dropped
+NEW_POOLS = 3  # replacements of broken pools before giving up
+
+
+def run_all(
+    work: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    processes: int,
+    prepare: Callable[..., None],
+    options: tuple[Any, ...],
+    keep: Callable[[Result], None],
+    say: Callable[[str], None],
+    watch: Callable[[float], None],
+) -> None:
+    """`keep(work(job))` for every job, `work` in other processes, `keep` in this one, in any order.
+
+    A process that dies (killed, out of memory) breaks its pool: the jobs without a result are given to a new pool, at
+    most NEW_POOLS times. An interruption or an error of `work` or `keep` ends all processes.
+
+    Args:
+        prepare, options: `prepare(*options)` runs first in every process.
+        say: receives a line for each broken pool.
+        watch: called every POLL seconds with the sum of what `Shared` bars counted in all jobs: trials.
+
+    Raises:
+        InputError: the last pool broke, too.
+    """
+    left = dict(enumerate(jobs))
+    counts = CONTEXT.RawArray("d", len(left))  # of trials, by job: each is written by one process
+
+    def look() -> None:
+        watch(sum(counts))
+
+    for number in range(NEW_POOLS + 1):
+        _run_pool(work, left, min(processes, len(left)), (prepare, options, counts), keep, look)
+        if not left:
+            return
+        if number < NEW_POOLS:
+            say(f"a worker process died: {len(left)} batches are flown again (new pool {number + 1} of {NEW_POOLS})")
+    raise InputError(
+        "study.workers", "processes that live until their batches are flown",
+        f"{NEW_POOLS + 1} pools in which one died (killed, or out of memory?); finished batches are kept, and the "
+        "same command resumes",
+    )  # fmt: skip
+
+
+def _run_pool(
+    work: Callable[[Job], Result],
+    left: dict[int, Job],
+    processes: int,
+    begin: tuple[Any, ...],
+    keep: Callable[[Result], None],
+    look: Callable[[], None],
+) -> None:
+    """Run the jobs that are left by one pool and remove those with a result; returns early where it broke."""
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(processes, CONTEXT, _begin_worker, begin)
+    try:
+        with _interrupts_noted() as noted:
+            with _interrupts_held(noted):
+                futures = {pool.submit(_work, work, job, number): number for number, job in left.items()}
+            while futures:
+                done, _ = wait(futures, timeout=POLL, return_when=FIRST_COMPLETED)
+                noted.raise_late()
+                for future in done:
+                    number = futures.pop(future)  # and with it the memory of the result
+                    try:
+                        result = future.result()
+                    except BrokenProcessPool:
+                        continue
+                    keep(result)
+                    del left[number]
+                look()
+    except BrokenProcessPool:  # while jobs were still being submitted
+        pass
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+class _Noted:
+    """The signals of a pool: each is noted before it raises, because Python drops exceptions of destructors."""
+
+    def __init__(self) -> None:
+        self.held = False  # while true, a signal is noted only
+        self.numbers: list[int] = []
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        self.numbers.append(number)
+        if not self.held:
+            throw(number, frame)
+
+    def raise_late(self) -> None:
+        """Raise for a signal that was noted, but whose exception got lost."""
+        if self.numbers:
+            throw(self.numbers[0], None)
+
+
+@contextmanager
+def _interrupts_held(noted: _Noted) -> Iterator[None]:
+    """Signals wait until the end of the block: a process that is half started would end with an error of its own.
+
+    Processes started in the block never see Ctrl-C, nor the signals of schedulers before a time limit, which reach all
+    processes of a job: the parent handles them. SIGTERM ends them.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2})
+    noted.held = True
+    try:
+        yield
+    finally:
+        noted.held = False
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    noted.raise_late()
+
+
+@contextmanager
+def _interrupts_noted() -> Iterator[_Noted]:
+    """The signals that arrive in the block."""
+    noted = _Noted()
+    with raised(noted):
+        yield noted
+
+
+class Shared(NoBar):
+    """The bar of a worker process: counts the trials of its job where the parent sees them."""
+
+    counts: ClassVar[Any] = None  # of all jobs; None outside worker processes
+    job: ClassVar[int] = 0
+
+    def update(self, n: float) -> None:
+        """Count trials."""
+        if self.counts is not None:
+            self.counts[self.job] += n
+
+
+def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...], counts: Any) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    Shared.counts = counts
+    prepare(*options)
+
+
+def _work(work: Callable[[Job], Result], job: Job, number: int) -> Result:
+    Shared.job = number
+    notices.speak(number == 0)  # all workers compile the same, and one line on that is enough
+    Shared.counts[number] = 0.0  # a former pool may have died in this job
+    return work(job)
+
+
+def _end_with_parent() -> None:
+    """End a worker whose parent was killed: it would wait for its next job forever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -1,0 +1,145 @@
+"""Reports on finished studies of missions: mission.parquet, a table of outcomes, figures and an animation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from torchgco.experiments.config.build import Setup
+from torchgco.experiments.flying.mission_flight import FEW
+from torchgco.experiments.flying.progress import draw as draw_all
+from torchgco.experiments.reports.report_figures import several
+from torchgco.experiments.results.files import write
+from torchgco.experiments.results.kinds import parts_of, write_tables
+from torchgco.experiments.results.records import LAYOUTS, MISSION, TRIALS
+from torchgco.experiments.results.runs import read_trials
+from torchgco.experiments.statistics.formats import format_report
+from torchgco.experiments.statistics.mission_tables import mission_lines
+from torchgco.missions.tables import clearances, mission_frame, spheres_of, time_step_frame, unpacked
+from torchgco.obstacles.base import CONTACT_FACTOR
+from torchgco.plotting import missions as draw
+from torchgco.plotting.animation import mission_animation
+from torchgco.plotting.course import Course
+from torchgco.plotting.style import save
+from torchgco.scenarios import Layouts
+
+SNAPSHOTS = 4  # instants of a mission in one figure
+# Where few missions fly: planned positions (solver, L, K, N+1, 3), and a row per time step of the plant.
+PLANS, TIME_STEPS = "plans.npz", "time_steps.parquet"
+
+
+def mission_table(
+    folder: Path, setup: Setup, layouts: Layouts, solvers: Sequence[str], logs: np.ndarray
+) -> pd.DataFrame:
+    """The rows of mission.parquet from packed logs (solver, L, K, W).
+
+    Where the logs hold plans, these and all time steps are written into files of their own.
+    """
+    assert setup.mission is not None
+    problem = setup.vehicle.task(layouts).problem
+    period, spheres = float(problem.dynamics.dt), spheres_of(problem)
+    frames, plans, fine = [], [], []
+    for name, rows in zip(solvers, logs, strict=True):
+        arrays = unpacked(rows, setup.mission.substeps(period) or 1)
+        distances = [clearances(arrays, b, period, spheres[b]) for b in range(layouts.count)]
+        frame = mission_frame(arrays, layouts.ids.tolist(), period, distances)
+        frame.insert(0, "solver", name)
+        frames.append(frame)
+        if "plan" in arrays:
+            plans.append(arrays["plan"])
+            fine.append(time_step_frame(arrays, layouts.ids.tolist(), period))
+            fine[-1].insert(0, "solver", name)
+    if plans:
+        steps = pd.concat(fine, ignore_index=True)
+        write(folder / TIME_STEPS, lambda file: steps.to_parquet(file, index=False))
+        held = {"plan": np.stack(plans), "solver": np.array(solvers), "layout": layouts.ids}
+        write(folder / PLANS, lambda file: np.savez_compressed(file, **held))
+    return pd.concat(frames, ignore_index=True)
+
+
+def write_mission_report(folder: Path, setup: Setup, figures: bool = True) -> str:
+    """Write summary.csv, paired.csv and figures next to the mission.parquet in a folder; return the report as text."""
+    trials = read_trials(folder / TRIALS)
+    parts = parts_of(trials)
+    write_tables(folder, parts)
+    if figures:
+        draw_all(_drawings(folder, trials, setup))
+    text = format_report(parts, "table")
+    return mission_lines(trials) if trials["layout"].nunique() <= FEW else text
+
+
+def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Callable[[], object]]:
+    """Functions that draw and write: outcomes, and where few missions fly, for each what the paper shows of it."""
+    held: dict[str, Callable[[], object]] = {}
+
+    def add(name: str, figure: Callable[[], Figure]) -> None:
+        path = folder / "figures" / f"{name}.png"
+        held[name] = lambda: write(path, lambda file: save(figure(), file, dpi=110))
+
+    if len(shown := several(trials)):
+        add("outcomes", lambda: draw.outcomes_figure(shown))
+    flown = _Flown.read(folder)
+    layouts = Layouts.load(folder / LAYOUTS)
+    for i, number in enumerate(layouts.ids.tolist() if flown else []):
+        assert flown is not None
+        course, period = _course(setup, layouts.take([i]))
+        rows, fine = flown.of(number)
+        if not rows:  # a start in contact
+            continue
+        add(f"{number}-compute", partial(draw.compute_figure, rows, period))
+        add(f"{number}-distance", partial(draw.distance_figure, fine, course))
+        for name, frame in rows.items():
+            plan, label = flown.plans[name][i][: len(frame)], f"{number}-{name}"
+            steps = np.linspace(0, 0.8 * (len(frame) - 1), SNAPSHOTS).round().astype(int).tolist()
+            add(f"{label}-snapshots", partial(draw.snapshots_figure, frame, plan, course, steps, period))
+            add(f"{label}-commands", partial(draw.commands_figure, fine[name]))
+            add(f"{label}-states", partial(draw.states_figure, fine[name], course.goal))
+            add(f"{label}-tracking", partial(draw.tracking_figure, frame))
+            gif = folder / "figures" / f"{label}.gif"
+            held[f"{label}.gif"] = partial(mission_animation, frame, plan, course, period, gif, name)
+    return held
+
+
+@dataclass(frozen=True)
+class _Flown:
+    """What is kept of few missions.
+
+    steps  rows of mission.parquet; fine: rows of time_steps.parquet
+    plans  planned positions (L, K, N+1, 3) by solver
+    """
+
+    steps: pd.DataFrame
+    fine: pd.DataFrame
+    plans: dict[str, np.ndarray]
+
+    @classmethod
+    def read(cls, folder: Path) -> _Flown | None:
+        """None where a study has many missions, or where an older version flew them."""
+        if not all((folder / name).is_file() for name in (PLANS, TIME_STEPS)):
+            return None
+        with np.load(folder / PLANS, allow_pickle=False) as held:
+            plans = dict(zip(held["solver"].tolist(), held["plan"], strict=True))
+        return cls(pd.read_parquet(folder / MISSION), pd.read_parquet(folder / TIME_STEPS), plans)
+
+    def of(self, number: int) -> tuple[dict[str, pd.DataFrame], dict[str, pd.DataFrame]]:
+        """The rows of one layout per control step, and those per time step, by solver; none that never flew."""
+        tables = (table[table["mission"] == number] for table in (self.steps, self.fine))
+        rows, fine = ({str(name): held for name, held in table.groupby("solver", sort=False)} for table in tables)
+        return rows, {name: fine[name] for name in rows}
+
+
+def _course(setup: Setup, layouts: Layouts) -> tuple[Course, float]:
+    """The obstacles and the goal of one layout, and its control period, s."""
+    task = setup.vehicle.task(layouts)
+    centers, contact, velocities = spheres_of(task.problem)[0]
+    assert setup.mission is not None
+    near = setup.mission.goal_radius
+    radius = float(task.goal_radius) if near is None else near
+    course = Course(centers, contact / CONTACT_FACTOR, task.goal[0].numpy(), radius, velocities)
+    return course, float(task.problem.dynamics.dt)

@@ -1,0 +1,271 @@
+"""Confirms the tables of finished studies from their stored controls, layouts and settings.
+
+The controls of every row are simulated again, open-loop, with the model of study.json, and judged by `torchgco.judge`,
+which shares no code with a solver. Missions are confirmed from the log in mission.parquet, as far as it goes. Then
+summary.csv and paired.csv are counted again from the table.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from torchgco.base.errors import InputError
+from torchgco.experiments.config.build import vehicle_of
+from torchgco.experiments.flying.mission_flight import LOST
+from torchgco.experiments.results.files import checksum, damaged
+from torchgco.experiments.results.identity import Manifest, closed_loop, layout_digests
+from torchgco.experiments.results.kinds import joined, parts_of
+from torchgco.experiments.results.records import (
+    DONE,
+    LAYOUTS,
+    MANIFEST,
+    MISSION,
+    SOLUTIONS,
+    TRIALS,
+    read_checksums,
+    read_manifest,
+)
+from torchgco.experiments.results.success import with_success
+from torchgco.judging.judge import frame_columns, judge
+from torchgco.missions.outcome import Outcome
+from torchgco.missions.tables import spheres_of
+from torchgco.scenarios import Layouts, Vehicle
+
+TOLERANCE = 1e-8  # of numbers, relative above 1: other processors and libraries round differently
+BATCH = 256  # layouts judged at once
+ROW = ["solver", "layout"]
+IDENTITY = ("model", "seed", "version", "device", "dtype", "layout_digest", "settings_digest")
+KEYS = pd.Index(["solver", "solver_a", "solver_b", "outcome"])  # of a row of summary.csv or paired.csv
+
+
+@dataclass(frozen=True)
+class Table:
+    """What was confirmed of one table of a study.
+
+    rows         of the table
+    columns      that were computed again and compared
+    others       its other columns, which only the checksum of the file guards, if anything
+    differences  names of the row (solver and layout), column, held and computed, in the order of the table; no rows:
+                 all columns are confirmed
+    """
+
+    name: str
+    rows: int
+    columns: tuple[str, ...]
+    others: tuple[str, ...]
+    differences: pd.DataFrame
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What was confirmed of one study: its trials.parquet, and where no row differs, summary.csv and paired.csv.
+
+    absent  of these two, those that should exist, but don't
+    """
+
+    folder: Path
+    tables: tuple[Table, ...]
+    absent: tuple[str, ...]
+    missions: bool
+
+    @property
+    def differs(self) -> bool:
+        """Whether any value differs from the one computed again."""
+        return any(len(table.differences) for table in self.tables)
+
+
+def verify(folders: Iterable[str | os.PathLike[str]]) -> tuple[list[Verification], list[str]]:
+    """Confirm every finished study in and below some folders; also names the studies that aren't finished.
+
+    Raises:
+        InputError: a missing folder, folders without a finished study, a damaged or missing file, a table that doesn't
+            have one row per solver and layout, a study of an older version.
+    """
+    given = [Path(folder) for folder in folders]
+    for folder in given:
+        if not folder.is_dir():
+            raise InputError("folders", "an existing folder", folder)
+    studies = {path.parent.resolve(): path.parent for folder in given for path in sorted(folder.rglob(MANIFEST))}
+    done = [folder for folder in studies.values() if (folder / DONE).is_file()]
+    if not done:
+        raise InputError("folders", "a finished study in or below them", ", ".join(map(str, given)))
+    return [verify_study(folder) for folder in done], [str(folder) for folder in studies.values() if folder not in done]
+
+
+def verify_study(folder: Path) -> Verification:
+    """Confirm the table of one finished study. Raises InputError as `verify` does."""
+    manifest = read_manifest(folder / MANIFEST)
+    if manifest is None:
+        raise InputError("folders", "studies whose study.json holds digests", f"{folder}, of an older version")
+    missions = manifest.configuration.get("mission") is not None
+    layouts = _read(folder / LAYOUTS, Layouts.load)
+    held = _read(folder / TRIALS, pd.read_parquet)
+    rows = pd.MultiIndex.from_product([list(manifest.solvers), list(manifest.layouts)], names=ROW)
+    if not set(ROW) <= set(held.columns) or not held.set_index(ROW).index.sort_values().equals(rows.sort_values()):
+        raise damaged(folder / TRIALS, "doesn't have one row per solver and layout")
+    held = held.set_index(ROW)
+    try:
+        vehicle = vehicle_of(manifest.configuration)
+        judged = _missions if missions else _trajectories
+        computed = judged(folder, vehicle, manifest, layouts, held).reindex(held.index)
+    except (InputError, KeyError, IndexError, TypeError, AttributeError) as error:
+        if isinstance(error, InputError) and error.field == "hydra.run.dir":
+            raise
+        raise damaged(folder, f"can't be simulated again ({error})") from None
+    computed = computed.join(_identity(manifest, vehicle, layouts, held.index))
+    differences = _differences(held, computed)
+    if differences.empty:  # nothing that can be computed differs: has any other column been changed?
+        _check_checksums(folder)
+    others = tuple(str(name) for name in held.columns if name not in computed.columns)
+    trials = Table(TRIALS, len(held), tuple(computed.columns), others, differences)
+    # Of rows that differ, the tables that count them would differ, too.
+    counted, absent = _counted(folder, held.reset_index()) if differences.empty else ([], ())
+    return Verification(folder, (trials, *counted), absent, missions)
+
+
+def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str, ...]]:
+    """What is confirmed of summary.csv and paired.csv, counted again from the table of trials; and which are absent."""
+    found, absent = [], []
+    for name, table in joined(parts_of(trials)).items():
+        path = folder / f"{name}.csv"
+        if not path.is_file():
+            absent += [path.name] if len(table) else []
+            continue
+        held, computed = _read(path, pd.read_csv), pd.read_csv(io.StringIO(table.to_csv(index=False)))
+        if list(held.columns) != list(computed.columns) or len(held) != len(computed):
+            shapes = (f"{len(some)} rows, {len(some.columns)} columns" for some in (held, computed))
+            differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])
+        else:
+            keys = pd.MultiIndex.from_frame(computed[KEYS.intersection(computed.columns)])
+            differences = _differences(held.set_axis(keys), computed.set_axis(keys))
+        found.append(Table(path.name, len(computed), tuple(computed.columns), (), differences))
+    return found, tuple(absent)
+
+
+def _read(path: Path, reader: Any) -> Any:
+    if not path.is_file():
+        raise damaged(path, "is missing")
+    try:
+        if path.suffix == ".npz":
+            with zipfile.ZipFile(path) as members:
+                if members.testzip() is not None:  # np.load alone doesn't check every member's checksum
+                    raise ValueError("a checksum differs")
+        return reader(path)
+    except Exception as error:  # damaged bytes make readers raise nearly anything
+        raise damaged(path, f"is damaged ({(str(error).splitlines() or [type(error).__name__])[0]})") from None
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as held:
+        return dict(held)
+
+
+def _check_checksums(folder: Path) -> None:
+    for name, sums in read_checksums(folder / DONE).items():
+        if not (folder / name).is_file() or checksum(folder / name) not in sums:
+            raise damaged(folder / name, "isn't as the study wrote it")
+
+
+def _identity(manifest: Manifest, vehicle: Vehicle, layouts: Layouts, index: pd.MultiIndex) -> pd.DataFrame:
+    """The columns that name layouts, settings and surroundings, from layouts.npz and study.json."""
+    given = manifest.configuration
+    codes = layout_digests(layouts, given["model"]["vehicle"], closed_loop(given))
+    rows = pd.DataFrame({"model": vehicle.name, **manifest.constants}, index=index)
+    rows["layout_digest"] = index.get_level_values("layout").map(codes)
+    rows["settings_digest"] = index.get_level_values("solver").map(manifest.settings)
+    return rows[list(IDENTITY)]
+
+
+def _trajectories(
+    folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame
+) -> pd.DataFrame:
+    """The judged columns of single trajectories, by (solver, layout)."""
+    arrays = _read(folder / SOLUTIONS, _arrays)
+    names, place = arrays["solver"].tolist(), {number: i for i, number in enumerate(arrays["layout"].tolist())}
+    parts = []
+    for name in manifest.solvers:
+        controls = torch.from_numpy(arrays["U"][names.index(name)])
+        for first in range(0, layouts.count, BATCH):
+            some = layouts.take(range(first, min(first + BATCH, layouts.count)))
+            task = vehicle.task(some)
+            U = controls[[place[number] for number in some.ids.tolist()]]
+            verdict = judge(task.problem, U, task.goal, task.goal_radius)
+            columns = {"solver": name, "layout": some.ids, **frame_columns(verdict), "sound": verdict.sound.numpy()}
+            parts.append(pd.DataFrame(columns))
+    rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))
+    return rows.set_index(ROW)[[*frame_columns(verdict), "success", "best_cost", "best_from"]]
+
+
+def _missions(folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame) -> pd.DataFrame:
+    """The columns of missions that the log decides, by (solver, layout).
+
+    The log has the plant's state at the start of every control step, and a flight is judged at all time steps: the
+    outcome itself, and what belongs to the end of a flight, can't be confirmed.
+    """
+    log = _read(folder / MISSION, pd.read_parquet)
+    problem = vehicle.task(layouts).problem
+    spheres = dict(zip(layouts.ids.tolist(), spheres_of(problem), strict=True))
+    flights = {key: rows for key, rows in log.groupby(["solver", "mission"], sort=False)}
+    period, rows = float(problem.dynamics.dt), []
+    for (solver, layout), outcome in held["outcome"].items():
+        steps = flights.get((solver, layout), log.iloc[:0])
+        planner, tracker = steps["planner_seconds"].to_numpy(), steps["tracker_seconds"].to_numpy()
+        rows.append(
+            {
+                "solver": solver, "layout": layout, "status": outcome,
+                "feasible": outcome not in {lost.name for lost in LOST}, "reached": outcome == Outcome.REACHED.name,
+                "violation": steps["violation"].max() if len(steps) else 0.0,
+                "clearance_knots": _nearest(steps, *spheres[layout]), "outer_iterations": len(steps),
+                "guided": int((steps["guided"] > 0).sum()), "seconds": float((planner + tracker).sum()),
+                "missed_deadlines": int((planner + tracker > period).sum()),
+                "shifted_plans": int((steps["source"] == "shifted").sum()),
+                "planner_seconds_median": float(np.median(planner)) if len(steps) else np.nan,
+                "planner_seconds_p99": float(np.quantile(planner, 0.99)) if len(steps) else np.nan,
+                "tracker_seconds_median": float(np.median(tracker)) if len(steps) else np.nan,
+                "tracking_violation": steps["tracking_violation"].max() if len(steps) else 0.0,
+            }
+        )  # fmt: skip
+    return pd.DataFrame(rows).set_index(ROW)
+
+
+def _nearest(steps: pd.DataFrame, centers: np.ndarray, contact: np.ndarray, velocities: np.ndarray | None) -> float:
+    """Smallest distance to contact at the starts of the control steps, m; infinite without obstacles."""
+    here = ~np.isnan(contact)
+    if not here.any() or steps.empty:
+        return np.inf
+    at = centers[here] + (0.0 if velocities is None else steps["t"].to_numpy()[:, None, None] * velocities[here])
+    p = steps[["x0", "x1", "x2"]].to_numpy()
+    return float((np.sqrt(((p[:, None] - at) ** 2).sum(-1)) - contact[here]).min())
+
+
+def _differences(held: pd.DataFrame, computed: pd.DataFrame) -> pd.DataFrame:
+    found = []
+    for name in computed.columns:
+        values = held[name] if name in held.columns else pd.Series(pd.NA, index=held.index)
+        differ = np.flatnonzero(~_equal(values, computed[name]))
+        found += [(i, *held.index[i], name, values.iloc[i], computed[name].iloc[i]) for i in differ.tolist()]
+    names = [*held.index.names, "column", "held", "computed"]
+    return pd.DataFrame(sorted(found, key=lambda row: row[0]), columns=["row", *names])[names]
+
+
+def _equal(held: pd.Series, computed: pd.Series) -> np.ndarray:
+    """Whether values agree: numbers within TOLERANCE, all else exactly; undefined values agree with each other."""
+    if computed.dtype == np.float64 and pd.api.types.is_numeric_dtype(held):
+        a, b = held.to_numpy(dtype=float, na_value=np.nan), computed.to_numpy()
+        with np.errstate(invalid="ignore"):  # infinite distances
+            near = np.abs(a - b) <= TOLERANCE * np.maximum(1.0, np.abs(b))
+        return near | (a == b) | (np.isnan(a) & np.isnan(b))
+    a, b = held.astype(object).to_numpy(), computed.astype(object).to_numpy()
+    equal, known = pd.isna(a) & pd.isna(b), ~pd.isna(a) & ~pd.isna(b)
+    equal[known] = (a[known] == b[known]).astype(bool)
+    return equal

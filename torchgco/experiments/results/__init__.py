@@ -1,0 +1,1 @@
+"""The rows of a study on the disk: identity, provenance, merging."""

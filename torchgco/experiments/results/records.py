@@ -1,0 +1,297 @@
+"""The folder of a study: shards while it runs, tables and arrays when it is done.
+
+Every file is moved to its place whole (`files.write`), so that a study killed at any moment leaves whole files and a
+second start resumes from them. Files are checked against the study's manifest when they are read again: a damaged or
+foreign file is named in an error, and redone with `study.repair=true`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import shutil
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import pandas as pd
+
+from torchgco.base.errors import InputError
+from torchgco.experiments.results.files import PART, checksum, create, damaged, write
+from torchgco.experiments.results.identity import Manifest, difference
+from torchgco.scenarios import Layouts
+
+COLUMNS = (
+    "scenario", "layout", "seed", "model", "solver", "status", "feasible", "reached", "success", "cost", "best_cost",
+    "violation", "clearance", "clearance_knots", "goal_distance", "dynamics_residual", "clearance_full",
+    "bound_violation", "kkt_residual", "iterations", "outer_iterations", "guided", "seconds", "batch_size", "threads",
+    "device", "dtype", "version", "best_from", "layout_digest", "settings_digest",
+)  # fmt: skip
+JUDGED = ("success", "best_cost", "best_from")  # columns that compare rows: not in shards
+MANIFEST, TRIALS, SOLUTIONS, LAYOUTS, DONE = "study.json", "trials.parquet", "solutions.npz", "layouts.npz", "done"
+MISSION = "mission.parquet"  # in place of solutions, where missions are flown
+Flown = tuple[pd.DataFrame, np.ndarray]  # rows without the judged columns, controls (rows, N, m)
+Save = Callable[[IO[bytes]], Any]
+
+
+@dataclass(frozen=True)
+class Records:
+    """One study's folder; with `repair`, damaged files are dropped and redone."""
+
+    folder: Path
+    manifest: Manifest
+    repair: bool = False
+
+    @property
+    def files(self) -> tuple[str, str, str]:
+        """The files of the finished study, which are kept under their checksums."""
+        missions = self.manifest.configuration.get("mission") is not None
+        return TRIALS, MISSION if missions else SOLUTIONS, LAYOUTS
+
+    def claim(self) -> None:
+        """Make the folder this study's, or raise and leave it as it is.
+
+        Raises:
+            InputError: results of another study lie there, or the study's manifest is damaged or missing.
+        """
+        path = self.folder / MANIFEST
+        orphaned = (self.folder / TRIALS).is_file() or any(self.folder.glob("shards/*.npz"))
+        there = path.is_file()  # looked at after the results, which another job of the study may be writing
+        if there and self._claimed(path):
+            return
+        if orphaned and not there and not self.repair:
+            raise damaged(path, "is missing")
+        self._refuse_foreign()
+        if there:
+            write(path, lambda file: file.write(self.manifest.to_json()))
+        elif not create(path, lambda file: file.write(self.manifest.to_json())):
+            self._claimed(path)  # by another job meanwhile
+
+    def _claimed(self, path: Path) -> bool:
+        """Whether study.json is this study's; False where it is damaged and to be repaired."""
+        try:
+            held = read_manifest(path)
+        except InputError:
+            if not self.repair:
+                raise
+            return False
+        if held is None:
+            raise self._another("(written by an older version of torchgco)")
+        if held.identity() != self.manifest.identity():
+            raise self._another(f"({difference(held.identity(), self.manifest.identity())})")
+        return True
+
+    def finished(self, layouts: Layouts) -> bool:
+        """Whether all files of the study are present and undamaged.
+
+        Raises:
+            InputError: a file is damaged or missing. With `repair`, `layouts.npz` is written again, and for any other
+                file the study counts as unfinished.
+        """
+        path = self.folder / DONE
+        if not path.is_file():
+            return False
+        for name, sums in (self._checksums() or {TRIALS: []}).items():
+            place = self.folder / name
+            if place.is_file() and checksum(place) in sums:
+                continue
+            if not self.repair:
+                raise damaged(place, "is damaged" if place.is_file() else "is missing")
+            if name != LAYOUTS:
+                path.unlink(missing_ok=True)  # another job may be repairing, too
+                return False
+            write(place, _arrays(layouts.arrays()))
+            self.close()
+        return True
+
+    def missing(self, solver: str) -> list[int]:
+        """Ids of the layouts that a solver hasn't flown.
+
+        Raises:
+            InputError: a shard is damaged or isn't of this study; with `repair` it is removed.
+        """
+        left = dict.fromkeys(self.manifest.layouts)
+        for path in self._shards(solver):
+            try:
+                rows, _ = self._read(path, solver)
+            except InputError:
+                if not path.is_file():  # the study was finished, or the shard repaired, by another process
+                    continue
+                if not self.repair:
+                    raise
+                path.unlink(missing_ok=True)
+            else:
+                for number in rows["layout"]:
+                    left.pop(number, None)
+        return list(left)
+
+    def keep(self, solver: str, flown: Flown) -> None:
+        """Write the results of a batch of consecutive layouts as a shard, named by solver, first and last layout."""
+        rows, U = flown
+        numbers = rows["layout"].tolist()
+        rows = rows.assign(
+            layout_digest=[self.manifest.layouts[number] for number in numbers],
+            settings_digest=self.manifest.settings[solver],
+        )
+        # JSON by way of Python floats keeps every bit, NaN and infinity included.
+        columns = json.dumps(rows.to_dict(orient="list"), default=lambda value: value.item())
+        path = self.folder / "shards" / f"{solver}-{numbers[0]:06d}-{numbers[-1]:06d}.npz"
+        # Not compressed: controls hardly shrink, and a shard is dropped when the study is done.
+        write(path, lambda file: np.savez(file, U=U, rows=np.array(columns)))
+
+    def flown(self, solver: str) -> Flown:
+        """All results of a solver that `keep` wrote, in the order of the layouts.
+
+        Raises:
+            InputError: a shard is damaged or isn't of this study.
+        """
+        held = [self._read(path, solver) for path in self._shards(solver)]
+        if not held:
+            return pd.DataFrame(columns=[name for name in COLUMNS if name not in JUDGED]), np.empty((0, 0, 0))
+        rows = pd.concat([rows for rows, _ in held], ignore_index=True)
+        place = {number: i for i, number in enumerate(self.manifest.layouts)}
+        order = rows["layout"].map(place).drop_duplicates().sort_values().index
+        return rows.loc[order].reset_index(drop=True), np.concatenate([U for _, U in held])[order.to_numpy()]
+
+    def finish(self, trials: pd.DataFrame, flown: np.ndarray | pd.DataFrame, layouts: Layouts) -> None:
+        """Write trials.parquet, layouts.npz, and solutions.npz from controls or mission.parquet from a table."""
+        solvers = np.array(list(self.manifest.solvers))
+        write(self.folder / TRIALS, _table(trials))
+        if isinstance(flown, pd.DataFrame):
+            write(self.folder / MISSION, _table(flown))
+        else:
+            write(self.folder / SOLUTIONS, _arrays({"U": flown, "solver": solvers, "layout": layouts.ids}))
+        write(self.folder / LAYOUTS, _arrays(layouts.arrays()))
+
+    def replace(self, trials: pd.DataFrame, layouts: Layouts) -> None:
+        """Put other trials and layouts in the place of a finished study's."""
+        new = {TRIALS: _bytes(_table(trials)), LAYOUTS: _bytes(_arrays(layouts.arrays()))}
+        # Old and new content both count as whole until `close`: a stop in between damages nothing.
+        sums = self._checksums()
+        both = {name: [*held, sha256(new[name]).hexdigest()] if name in new else held for name, held in sums.items()}
+        write(self.folder / DONE, _json(both))
+        for name, content in new.items():
+            write(self.folder / name, lambda file, content=content: file.write(content))
+
+    def close(self) -> None:
+        """Mark the study as done, with the checksums of its files, and drop its shards."""
+        write(self.folder / DONE, _json({name: [checksum(self.folder / name)] for name in self.files}))
+        self.drop_shards()
+        for part in self.folder.glob(f"*{PART}"):  # of a start that was killed while it wrote
+            part.unlink(missing_ok=True)
+
+    def drop_shards(self) -> None:
+        """Remove the shards of a study that is done."""
+        shutil.rmtree(self.folder / "shards", ignore_errors=True)
+
+    def _shards(self, solver: str) -> list[Path]:
+        name = re.compile(rf"{re.escape(solver)}-\d+-\d+\.npz")
+        return sorted(path for path in self.folder.glob("shards/*.npz") if name.fullmatch(path.name))
+
+    def _read(self, path: Path, solver: str) -> Flown:
+        """A shard's rows and controls; InputError where it is damaged, or doesn't match its name or the study."""
+        rows, U = read_shard(path)
+        first, last = map(int, path.stem.split("-")[-2:])
+        numbers = list(range(first, last + 1))
+        if rows["layout"].tolist() != numbers or not set(numbers) <= self.manifest.layouts.keys():
+            raise damaged(path, f"holds layouts {rows['layout'].tolist()}")
+        wanted = {"solver": solver, "settings_digest": self.manifest.settings[solver], **self.manifest.constants}
+        wanted |= {"layout_digest": [self.manifest.layouts[number] for number in numbers]}
+        for name, value in wanted.items():
+            if not (rows[name] == value).all():
+                raise damaged(path, f"is of another study (column {name})")
+        return rows, U
+
+    def _checksums(self) -> dict[str, list[str]]:
+        """The valid checksums of each file; with `repair`, an empty dict if they can't be read."""
+        try:
+            sums = read_checksums(self.folder / DONE)
+            if sums.keys() != set(self.files):
+                raise damaged(self.folder / DONE, "is damaged (it doesn't name all files)")
+        except InputError:
+            if not self.repair:
+                raise
+            return {}
+        return sums
+
+    def _refuse_foreign(self) -> None:
+        """Raise where a readable file in the folder is of another study than the manifest to be written."""
+        wanted = self.manifest.settings
+        for path in [self.folder / TRIALS, *self.folder.glob("shards/*.npz")]:
+            try:
+                rows = pd.read_parquet(path) if path.name == TRIALS else read_shard(path)[0]
+            except Exception:  # unreadable: to be redone
+                continue
+            allowed = {"solver": wanted.keys(), "settings_digest": wanted.values()}
+            allowed |= {name: [value] for name, value in self.manifest.constants.items()}
+            for name, values in {**allowed, "layout_digest": self.manifest.layouts.values()}.items():
+                if name not in rows.columns or not set(rows[name]) <= set(values):
+                    raise self._another(f"(column {name} of {path.name})")
+
+    def _another(self, which: str) -> InputError:
+        return InputError(
+            "hydra.run.dir", "an empty folder, or one of this very study", f"{self.folder}, which holds another {which}"
+        )
+
+
+def read_manifest(path: Path) -> Manifest | None:
+    """The manifest in a study.json, None for that of an older version; InputError where it is damaged."""
+    try:
+        return Manifest.from_json(path.read_bytes())
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise damaged(path, f"is damaged ({_first_line(error)})") from None
+
+
+def read_checksums(path: Path) -> dict[str, list[str]]:
+    """The valid checksums of each file; an empty dict for a study of an older version, whose mark is empty."""
+    try:
+        text = path.read_bytes()
+        sums = json.loads(text) if text else {}
+        if not all(isinstance(held, list) for held in sums.values()):
+            raise ValueError("no checksums")
+        return sums
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise damaged(path, f"is damaged ({_first_line(error)})") from None
+
+
+def read_shard(path: Path) -> Flown:
+    """The rows and controls in a shard; InputError where it can't be read."""
+    try:
+        with zipfile.ZipFile(path) as members:
+            if members.testzip() is not None:  # np.load alone doesn't check every member's checksum
+                raise ValueError("a checksum differs")
+        with np.load(path, allow_pickle=False) as held:
+            rows, U = pd.DataFrame(json.loads(str(held["rows"]))), held["U"]
+        absent = {*COLUMNS, "sound"} - {*JUDGED, *rows.columns}
+        if absent or U.ndim != 3 or len(U) != len(rows):
+            raise ValueError(f"{len(rows)} rows, controls {U.shape}, no {', '.join(sorted(absent)) or 'more'}")
+    except Exception as error:  # damaged bytes make numpy, zipfile and zlib raise nearly anything
+        raise damaged(path, f"is damaged ({_first_line(error)})") from None
+    return rows, U
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _table(trials: pd.DataFrame) -> Save:
+    return lambda file: trials.to_parquet(file, index=False)
+
+
+def _arrays(arrays: Mapping[str, np.ndarray]) -> Save:
+    return lambda file: np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def _json(held: Mapping[str, Sequence[str]]) -> Save:
+    return lambda file: file.write(json.dumps(held, indent=1).encode())
+
+
+def _bytes(save: Save) -> bytes:
+    held = io.BytesIO()
+    save(held)
+    return held.getvalue()

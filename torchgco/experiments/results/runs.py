@@ -1,0 +1,147 @@
+"""The runs below some folders, finished or not, as `torchgco-report` finds them."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from torchgco.base.errors import InputError
+from torchgco.experiments.results.files import checksum, damaged
+from torchgco.experiments.results.identity import Manifest
+from torchgco.experiments.results.records import (
+    COLUMNS,
+    DONE,
+    MANIFEST,
+    TRIALS,
+    Records,
+    read_checksums,
+    read_manifest,
+)
+from torchgco.experiments.results.success import with_success
+from torchgco.experiments.statistics.statistics import PAIR, check_trials
+from torchgco.scenarios import Layouts
+
+MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
+ROW = [*PAIR, "solver"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One table of trials with its known origin.
+
+    configuration  of the study, from its study.json, else from `.hydra/`; empty where there is neither
+    solvers        resolved settings by name; empty for a run of an older version
+    planned        trials of the whole study where it isn't finished; None where it is
+    """
+
+    folder: Path
+    trials: pd.DataFrame
+    configuration: dict[str, Any]
+    solvers: dict[str, Any]
+    planned: int | None = None
+
+
+def find_runs(folders: Iterable[str | os.PathLike[str]]) -> list[Run]:
+    """The runs in and below `folders`, each once, in the order of the folders and by name below each.
+
+    Tables that a merge wrote are passed over below a folder, and read where the folder itself is given. The trials of
+    an unfinished study come from its shards; their success is provisional.
+
+    Raises:
+        InputError: a missing folder, folders without trials, a damaged file, a table that is no study's.
+    """
+    given = [Path(folder) for folder in folders]
+    places = {place.resolve(): (place, place in given) for place in _places(given)}
+    runs = [run for place, is_given in places.values() if (run := _run(place, is_given)) is not None]
+    if not runs:
+        raise InputError("folders", f"a {TRIALS} in or below them", ", ".join(map(str, given)) or "no folder")
+    return runs
+
+
+def read_trials(path: str | os.PathLike[str]) -> pd.DataFrame:
+    """The table in a `trials.parquet`.
+
+    Raises:
+        InputError: it can't be read, doesn't name its trials, or isn't as the study left it.
+    """
+    mark = Path(path).parent / DONE
+    sums = read_checksums(mark).get(TRIALS, []) if mark.is_file() else []
+    if sums and Path(path).is_file() and checksum(Path(path)) not in sums:
+        raise damaged(Path(path), "isn't as the study wrote it")
+    trials = _read(path)
+    missing = [name for name in ROW if name not in trials.columns]
+    if missing:
+        raise InputError("trials", f"columns {', '.join(ROW)}", f"{path} without {', '.join(missing)}")
+    return trials
+
+
+def is_merged(path: Path) -> bool:
+    """Whether a table comes out of a merge rather than out of a study. Raises InputError if it can't be read."""
+    return MERGED in _read(path, columns=[]).attrs
+
+
+def _read(path: str | os.PathLike[str], **options: Any) -> pd.DataFrame:
+    try:
+        # Most tables are small: threads cost more than they save.
+        return pd.read_parquet(path, use_threads=False, **options)
+    except Exception as error:  # damaged bytes make the reader raise nearly anything
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError("trials", "a readable parquet file", f"{path} ({reason})") from None
+
+
+def _places(folders: list[Path]) -> Iterator[Path]:
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError("folders", "an existing folder", folder)
+        yield from sorted({path.parent for name in (TRIALS, MANIFEST) for path in folder.rglob(name)})
+
+
+def _run(folder: Path, given: bool) -> Run | None:
+    """The run in a folder; None for a table that a merge wrote, unless the folder itself was given."""
+    if (folder / TRIALS).is_file():
+        trials = read_trials(folder / TRIALS)
+        check_trials(trials, folder / TRIALS)
+        return Run(folder, trials, *_origin(folder)) if given or MERGED not in trials.attrs else None
+    manifest = read_manifest(folder / MANIFEST)
+    if manifest is None or (folder / DONE).is_file():
+        raise damaged(folder / TRIALS, "is missing")
+    records = Records(folder, manifest)
+    parts = [rows for name in manifest.solvers if len(rows := records.flown(name)[0])]
+    trials = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(COLUMNS))
+    if parts:
+        rivals = 1 if manifest.configuration.get("mission") is not None else len(parts)
+        trials = with_success(trials, _layouts(manifest), rivals)
+    planned = len(manifest.layouts) * len(manifest.solvers)
+    return Run(folder, trials, manifest.configuration, manifest.solvers, planned)
+
+
+def _layouts(manifest: Manifest) -> Layouts | None:
+    """The layouts of a study's file, for their best costs; None where they were drawn, or the file has moved."""
+    path = manifest.configuration["scenario"].get("path")
+    return Layouts.load(path) if path and Path(path).is_file() else None
+
+
+def _origin(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Configuration and settings of the solvers, as far as they are known."""
+    path = folder / MANIFEST
+    try:
+        if path.is_file():
+            manifest = read_manifest(path)
+            if manifest is not None:
+                return manifest.configuration, manifest.solvers
+            return json.loads(path.read_bytes())["configuration"], {}
+        held = OmegaConf.to_container(OmegaConf.load(folder / ".hydra" / "config.yaml"))
+    except (FileNotFoundError, ValueError, YAMLError, OmegaConfBaseException) as error:
+        if isinstance(error, InputError):
+            raise
+        return {}, {}
+    return ({str(key): value for key, value in held.items()} if isinstance(held, dict) else {}), {}

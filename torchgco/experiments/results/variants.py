@@ -1,0 +1,167 @@
+"""Differences between runs: variables swept over scenarios and vehicles, and the settings of solvers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from numbers import Real
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from torchgco.experiments.results.identity import CLOSED_LOOP, flat
+from torchgco.experiments.results.runs import Run
+from torchgco.experiments.statistics.statistics import TASK, are_missions
+
+# Prefixes of keys that define the problems and missions; `model` has keys for solvers, too.
+SWEPT = ("scenario.", "model.vehicle.", "mission.", "plant.")
+NAMES = ("scenario.name", "scenario._target_", "model.vehicle.name", "model.vehicle._target_")  # have columns
+FILE = "scenario.path"
+RUN = "hydra.run.dir"
+MOST = 3  # settings named in a label
+
+
+def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
+    """For each run the columns that its rows get: the swept variables of each row's (scenario, model).
+
+    A key is swept where all runs of a (scenario, model) have it, with different values; runs of missions are
+    compared with each other only, as others lack their keys. `scenario.path` is left out while the layouts agree. Runs
+    that differ in their layouts without such a key are distinguished by their folder.
+    """
+    tasks = [list(run.trials[TASK].drop_duplicates().itertuples(index=False, name=None)) for run in runs]
+    missions = [bool(are_missions(run.trials).all()) for run in runs]
+    chosen: dict[tuple[int, Any], dict[str, Any]] = {}
+    of_kind = [(task, kind) for found, kind in zip(tasks, missions, strict=True) for task in found]
+    for task, kind in dict.fromkeys(of_kind):
+        members = [i for i, found in enumerate(tasks) if task in found and missions[i] == kind]
+        tables = [_rows_of(runs[i].trials, task, len(tasks[i])) for i in members]
+        cells = _swept([runs[i] for i in members], tables)
+        chosen |= {(i, task): held for i, held in zip(members, cells, strict=True)}
+    columns = list(dict.fromkeys(key for held in chosen.values() for key in held))
+    kinds = {key: _kind([held[key] for held in chosen.values() if key in held]) for key in columns}
+    frames = []
+    for i, (run, found) in enumerate(zip(runs, tasks, strict=True)):
+        cells = [chosen[i, task] for task in found]
+        of_row = np.zeros(len(run.trials), dtype=int)
+        if len(found) > 1:
+            of_row = run.trials.groupby(TASK, sort=False, dropna=False, observed=True).ngroup()  # numbers `found`
+        held = {
+            key: pd.array([_cell(cell.get(key), key in cell, kinds[key]) for cell in cells], dtype=kinds[key])
+            for key in columns
+        }
+        frames.append(pd.DataFrame(held, index=range(len(cells))).take(of_row).set_axis(run.trials.index))
+    return frames
+
+
+def _rows_of(trials: pd.DataFrame, task: tuple[Any, ...], tasks: int) -> pd.DataFrame:
+    """The rows of one of the tasks that a run flew; nearly always there is only one."""
+    return trials if tasks == 1 else trials[(trials[TASK] == list(task)).all(axis=1)]
+
+
+def _swept(runs: Sequence[Run], tables: Sequence[pd.DataFrame]) -> list[dict[str, Any]]:
+    """The swept variables of each run that flew a task; none for a run whose configuration isn't known.
+
+    tables  the trials of each run in that task
+    """
+    given = [_keys(run) for run in runs]
+    known = [keys for keys in given if keys]
+    shared = [key for key in (known[0] if known else {}) if all(key in keys for keys in known)]
+    swept = [key for key in shared if key != FILE and len({_text(keys[key]) for keys in known}) > 1]
+    cells = [{key: keys[key] for key in swept if keys} for keys in given]
+    clusters = _clusters(runs, cells, tables)
+    if FILE in shared and any(clusters):
+        for cell, keys in zip(cells, given, strict=True):
+            cell |= {FILE: keys[FILE]} if keys else {}
+        clusters = _clusters(runs, cells, tables)
+    for cell, cluster in zip(cells, clusters, strict=True):
+        cell |= {RUN: cluster} if cluster else {}
+    return cells
+
+
+def _keys(run: Run) -> dict[str, Any]:
+    parts = {name: run.configuration.get(name) for name in ("scenario", "model", *CLOSED_LOOP)}
+    keys = flat({name: part for name, part in parts.items() if isinstance(part, Mapping)})
+    return {key: value for key, value in keys.items() if key.startswith(SWEPT) and key not in NAMES}
+
+
+def _clusters(
+    runs: Sequence[Run], cells: Sequence[Mapping[str, Any]], tables: Sequence[pd.DataFrame]
+) -> list[str | None]:
+    """For each run the folder of the first run that flew the same layouts; None where all did.
+
+    Runs whose swept values (`cells`) differ are not compared.
+    """
+    held: list[tuple[str, dict[Any, str], str]] = []  # folder, digest by (layout, seed), swept values
+    place = []
+    values_of = pd.factorize(np.array([_text(cell) for cell in cells], dtype=object))[0]
+    seeds = [(seed, code) for table, code in zip(tables, values_of, strict=True) for seed in table["seed"].unique()]
+    if len(set(seeds)) == len(seeds):
+        return [None] * len(runs)  # no two runs have layouts in common
+    of_run = [_digests(table).assign(cell=code) for table, code in zip(tables, values_of, strict=True)]
+    layouts = [rows for rows in of_run if len(rows)]
+    if not layouts or not pd.concat(layouts).drop_duplicates().duplicated(["layout", "seed", "cell"]).any():
+        return [None] * len(runs)  # nearly always: nothing to distinguish
+    for run, rows, cell in zip(runs, of_run, cells, strict=True):
+        digests, values = rows.set_index(["layout", "seed"])["layout_digest"].to_dict(), _text(cell)
+        for number, (_, known, theirs) in enumerate(held):
+            if values == theirs and all(known.get(key, code) == code for key, code in digests.items()):
+                known.update(digests)
+                place.append(number)
+                break
+        else:
+            place.append(len(held))
+            held.append((run.folder.as_posix(), digests, values))
+    split = [sum(theirs == values for *_, theirs in held) > 1 for *_, values in held]
+    return [held[number][0] if split[number] else None for number in place]
+
+
+def _digests(trials: pd.DataFrame) -> pd.DataFrame:
+    """The known layouts of some trials: columns layout, seed and layout_digest."""
+    names = ["layout", "seed", "layout_digest"]
+    if "layout_digest" not in trials.columns:
+        return pd.DataFrame(columns=names)
+    return trials.loc[trials["layout_digest"].notna(), names]
+
+
+def _kind(values: Sequence[Any]) -> str:
+    """Type of a column: numbers stay numbers, all else is text."""
+    if all(isinstance(value, Real) and not isinstance(value, bool) for value in values):
+        return "Int64" if all(isinstance(value, int) for value in values) else "Float64"
+    return "string"
+
+
+def _cell(value: Any, there: bool, kind: str) -> Any:
+    if not there:
+        return pd.NA
+    return (value if isinstance(value, str) else _text(value)) if kind == "string" else value
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, default=str)
+
+
+def labels(variants: Sequence[str]) -> dict[str, str]:
+    """A label for each variant of a solver (settings by key, as JSON): the settings that differ, with their values.
+
+    Where the versions alone distinguish the variants, the label is the version. Of many settings the first are named,
+    and a number makes equal labels unique.
+    """
+    held = {variant: json.loads(variant) for variant in variants}
+    keys = dict.fromkeys(key for settings in held.values() for key in settings)
+    differ = [key for key in keys if len({_text(settings.get(key)) for settings in held.values()}) > 1]
+    if "version" in differ and len({settings.get("version") for settings in held.values()}) == len(held):
+        differ = ["version"]
+    made: dict[str, str] = {}
+    for variant, settings in held.items():
+        more = f", {len(differ) - MOST} more" if len(differ) > MOST else ""
+        label = ", ".join(f"{key}={_value(settings, key)}" for key in differ[:MOST]) + more
+        alike = sum(other == label or other.startswith(f"{label} #") for other in made.values())
+        made[variant] = f"{label} #{alike + 1}" if alike else label
+    return made
+
+
+def _value(settings: Mapping[str, Any], key: str) -> str:
+    value = settings.get(key, "none")
+    text = value if isinstance(value, str) else _text(value)
+    return text if len(text) <= 24 else f"{text[:24]}..."

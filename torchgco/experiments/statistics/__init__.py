@@ -1,0 +1,1 @@
+"""Counts, intervals, pairs and sample sizes, and the tables that show them."""

@@ -1,0 +1,199 @@
+"""Two solvers compared on the trials that both flew: who attained an outcome, and at which cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from math import nan
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest, quantile_test
+
+from torchgco.base.errors import InputError
+from torchgco.experiments.statistics.statistics import (
+    CONFIDENCE,
+    OUTCOMES,
+    PAIR,
+    TASK,
+    attained,
+    check_trials,
+    grouped,
+    numbers_of,
+    task_columns,
+)
+
+Chosen = Callable[[list[str]], list[tuple[str, str]]]  # from the solvers of a task to the pairs that are compared
+
+
+@dataclass(frozen=True)
+class PairedResult:
+    """Two solvers on the same trials, counted by which of them attained the outcome.
+
+    n              trials in which both solvers flew and the outcome is defined for both
+    both, only_a, only_b, neither
+                   how many of the n trials were attained by both, by one only, by neither
+    difference     rate of a minus rate of b over the n trials, nan where n is 0
+    p_value        exact McNemar, two-sided: a fair coin for the trials that only one of the two attained
+    undefined      trials that both flew, left out because the outcome isn't defined
+    unmatched      trials that only one of the two flew
+    cost_n         trials that both reached, with finite positive costs
+    cost_ratio     median over them of the cost of a divided by that of b; nan where cost_n is 0
+    cost_low, cost_high
+                   95 % interval of this median from order statistics, which assumes no distribution; nan below 6
+                   trials, which can't give one
+    """
+
+    solver_a: str
+    solver_b: str
+    outcome: str
+    n: int
+    both: int
+    only_a: int
+    only_b: int
+    neither: int
+    difference: float
+    p_value: float
+    undefined: int
+    unmatched: int
+    cost_n: int
+    cost_ratio: float
+    cost_low: float
+    cost_high: float
+
+
+def paired(trials: pd.DataFrame, solver_a: str, solver_b: str, outcome: str = "reached") -> PairedResult:
+    """Compare two solvers on the trials both flew, matched by scenario, model, swept variables, layout and seed.
+
+    A layout is the same where its digest is, too, if the table has a column `layout_digest`.
+
+    Raises InputError for a column that is missing, a solver that isn't in `trials`, an unknown outcome, and a
+    solver that has two rows for one trial.
+    """
+    check_trials(trials)
+    if outcome not in OUTCOMES:
+        raise InputError("outcome", f"one of {', '.join(OUTCOMES)}", outcome)
+    for solver in (solver_a, solver_b):
+        _check_flown(trials, solver)
+    flights = _Flights(trials)
+    return next(flights.compared(np.arange(len(trials)), solver_a, solver_b, [outcome]))
+
+
+def paired_table(trials: pd.DataFrame, solver: str) -> pd.DataFrame:
+    """`solver` against every other solver: a row per task (scenario, model, swept variables), other solver and outcome.
+
+    Columns: those of the task and the fields of PairedResult, `solver` being a. Tasks that `solver` didn't fly
+    and tasks that nobody else flew give no row. Raises InputError as `paired` does.
+    """
+    check_trials(trials)
+    _check_flown(trials, solver)
+    flights = _Flights(trials)
+    return flights.table(
+        lambda names: [(solver, other) for other in names if other != solver] if solver in names else []
+    )
+
+
+def compare(trials: pd.DataFrame) -> pd.DataFrame:
+    """For each task the solver that comes first, the one under study, against every other.
+
+    Where it flew in several variants ("gco [...]"), each of them is compared with all that follow. Columns as
+    `paired_table` has them; no rows for a task that one solver flew.
+    """
+    check_trials(trials)
+    flights = _Flights(trials)
+    return flights.table(lambda names: [(a, b) for a, b in combinations(names, 2) if _bare(a) == _bare(names[0])])
+
+
+def _bare(solver: str) -> str:
+    """A solver's name without the label that a merge gave it."""
+    return solver.split(" [")[0]
+
+
+class _Flights:
+    """A table of trials as arrays, in which two solvers' rows of the same trial are found."""
+
+    def __init__(self, trials: pd.DataFrame) -> None:
+        self.trials = trials
+        digest = ["layout_digest"] if "layout_digest" in trials.columns else []
+        # One number per trial, the same for all solvers.
+        trial = [*task_columns(trials), *PAIR[len(TASK) :], *digest]
+        self.trial = trials.groupby(trial, sort=False, dropna=False, observed=True).ngroup().to_numpy()
+        self.solver, names = pd.factorize(trials["solver"])
+        self.names = [str(name) for name in names]
+        self.hits = attained(trials, grouped(trials, [*task_columns(trials), "solver"]))
+        self.cost = numbers_of(trials["cost"])
+
+    def table(self, chosen: Chosen) -> pd.DataFrame:
+        """A row per task, pair of solvers and outcome; `chosen` gives the pairs from the names on a task."""
+        rows = list(self._rows(chosen))
+        return pd.DataFrame(rows, columns=[*task_columns(self.trials), *PairedResult.__dataclass_fields__])
+
+    def _rows(self, chosen: Chosen) -> Iterator[dict[str, object]]:
+        names = task_columns(self.trials)
+        keys = self.trials[names]
+        for task in grouped(self.trials, names):
+            key = keys.iloc[task[0]].to_dict()
+            for a, b in chosen([self.names[code] for code in pd.unique(self.solver[task])]):
+                for result in self.compared(task, a, b, OUTCOMES):
+                    yield key | asdict(result)
+
+    def match(self, rows: np.ndarray, a: str, b: str) -> tuple[np.ndarray, np.ndarray, int]:
+        """Positions of two solvers' rows of the trials that both flew, among `rows`, and how many only one flew."""
+        rows_a, rows_b = (rows[self.solver[rows] == self.names.index(name)] for name in (a, b))
+        for name, held in ((a, rows_a), (b, rows_b)):
+            self._check_single(name, held)
+        _, in_a, in_b = np.intersect1d(self.trial[rows_a], self.trial[rows_b], assume_unique=True, return_indices=True)
+        return rows_a[in_a], rows_b[in_b], len(rows_a) + len(rows_b) - 2 * len(in_a)
+
+    def _check_single(self, solver: str, rows: np.ndarray) -> None:
+        ordered = rows[np.argsort(self.trial[rows], kind="stable")]
+        repeated = ordered[1:][np.diff(self.trial[ordered]) == 0]
+        if len(repeated):
+            row = self.trials[PAIR].iloc[repeated.min()]
+            first = ", ".join(f"{name} {value}" for name, value in row.items())
+            raise InputError("trials", f"one row of {solver} for {first}", "two")
+
+    def compared(self, rows: np.ndarray, a: str, b: str, outcomes: Sequence[str]) -> Iterator[PairedResult]:
+        """Two solvers' rows among `rows`, compared by each outcome."""
+        rows_a, rows_b, unmatched = self.match(rows, a, b)
+        arrived = (self.hits["reached"][rows_a] == 1) & (self.hits["reached"][rows_b] == 1)
+        costs = _ratio(self.cost[rows_a[arrived]], self.cost[rows_b[arrived]])
+        for outcome in outcomes:
+            counts = _counts(self.hits[outcome][rows_a], self.hits[outcome][rows_b])
+            yield PairedResult(a, b, outcome, **counts, unmatched=unmatched, **costs)
+
+
+def _counts(hit_a: np.ndarray, hit_b: np.ndarray) -> dict[str, Any]:
+    """The counts of PairedResult from the outcomes (rows,) of two solvers, NaN where undefined."""
+    total = len(hit_a)
+    defined = ~np.isnan(hit_a) & ~np.isnan(hit_b)
+    hit_a, hit_b = hit_a[defined] == 1, hit_b[defined] == 1
+    only_a, only_b = int((hit_a & ~hit_b).sum()), int((hit_b & ~hit_a).sum())
+    n, discordant = len(hit_a), only_a + only_b
+    return {
+        "n": n,
+        "both": int((hit_a & hit_b).sum()),
+        "only_a": only_a,
+        "only_b": only_b,
+        "neither": int((~hit_a & ~hit_b).sum()),
+        "difference": (only_a - only_b) / n if n else nan,
+        "p_value": float(binomtest(only_a, discordant).pvalue) if discordant else 1.0,
+        "undefined": total - n,
+    }
+
+
+def _ratio(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
+    """Median of a / b with its interval, as the fields of PairedResult."""
+    known = (a > 0) & (b > 0) & np.isfinite(a) & np.isfinite(b)
+    ratio = a[known] / b[known]
+    if not len(ratio):
+        return {"cost_n": 0, "cost_ratio": nan, "cost_low": nan, "cost_high": nan}
+    low, high = quantile_test(ratio, p=0.5).confidence_interval(confidence_level=CONFIDENCE)
+    return {"cost_n": len(ratio), "cost_ratio": float(np.median(ratio)), "cost_low": low, "cost_high": high}
+
+
+def _check_flown(trials: pd.DataFrame, solver: str) -> None:
+    if solver not in set(trials["solver"]):
+        raise InputError("solver", f"one of {', '.join(trials['solver'].unique())}", solver)

@@ -1,0 +1,207 @@
+"""Rates with their intervals, costs and effort, counted from a table of trials.
+
+A trial is one solver on one layout, a row of `trials.parquet`. Nothing is left out of a count silently: a trial
+whose start was invalid is a failure, an outcome that isn't defined is subtracted from a denominator that
+is given with the rate, and a violation that isn't a number counts as infinite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import nan
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest
+
+from torchgco.base.errors import InputError
+from torchgco.base.status import Status
+
+OUTCOMES = ("feasible", "reached", "success")
+TASK = ["scenario", "model"]
+PAIR = [*TASK, "layout", "seed"]
+EFFORT = ["iterations", "outer_iterations", "guided", "seconds"]
+COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, "violation", "cost", *EFFORT]
+NUMBERS = [*EFFORT, "violation", "cost", "best_cost", "clearance", "clearance_knots", "goal_distance"]
+INVALID = Status.INVALID_START.name
+STATUS = "status_"  # prefix of the columns that count statuses
+VIOLATION_TOLERANCE = 1e-3  # metres for lengths, inputs in their units
+CONFIDENCE = 0.95
+
+
+def task_columns(table: pd.DataFrame) -> list[str]:
+    """The columns that distinguish tasks: scenario, model, and the variables swept in a merged table.
+
+    The latter are named by their keys in the configuration, with a dot, which no column of a study has.
+    """
+    return [*TASK, *(str(name) for name in table.columns if "." in str(name))]
+
+
+def are_missions(trials: pd.DataFrame) -> pd.Series:
+    """Which rows (rows,) are missions: those with an outcome of their own."""
+    return trials["outcome"].notna() if "outcome" in trials.columns else pd.Series(False, index=trials.index)
+
+
+def grouped(table: pd.DataFrame, names: Sequence[str]) -> list[np.ndarray]:
+    """Positions of the rows with the same values in some columns, NA being a value, in order of appearance.
+
+    Positions and not tables: on large tables the many small copies would take most of a report's time.
+    """
+    groups = table.groupby(list(names), sort=False, dropna=False, observed=True)
+    code = groups.ngroup().to_numpy()
+    order = np.argsort(code, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(code[order])) + 1)
+
+
+def plain(table: pd.DataFrame) -> pd.DataFrame:
+    """The table with text in place of categories."""
+    coded = {str(name): column.cat for name, column in table.items() if isinstance(column.dtype, pd.CategoricalDtype)}
+    # `astype` takes twenty times as long.
+    text = {name: cat.categories.array.take(cat.codes.to_numpy(), allow_fill=True) for name, cat in coded.items()}
+    return table.assign(**text)
+
+
+def summarise(trials: pd.DataFrame) -> pd.DataFrame:
+    """One row per (scenario, model, solver), in order of appearance; in a merged table also per swept variable.
+
+    n                   trials; seed: their seeds, as text; invalid: those of invalid start, all failures
+    <outcome>_count, _n, _rate, _low, _high
+                        for feasible, reached and success: attained, defined, their ratio, its 95 % interval
+    violation_ok        share of all n whose violation is at most 1e-3
+    violation_median    over all n, one that isn't a number counting as infinite
+    cost_median_reached over the trials that reached the goal
+    cost_median         over the cost_n trials whose cost is finite
+    cost_ratio_median, _p90
+                        cost divided by the best known cost, over the cost_ratio_n trials that reached the goal and
+                        have a positive best cost
+    <effort>_median, _p90
+                        iterations, outer_iterations, guided and seconds over the trials with a valid start; nan if
+                        one of them lacks the number
+    status_<NAME>       trials that ended with this status; missions: with this outcome
+
+    _p90 is the 90 % quantile, interpolated linearly. Raises InputError if `trials` is empty or lacks a column.
+    """
+    check_trials(trials)
+    names = [*task_columns(trials), "solver"]
+    groups = grouped(trials, names)
+    values = _Values.of(trials, groups)
+    keys = trials[names].iloc[[rows[0] for rows in groups]].reset_index(drop=True)
+    return pd.concat([plain(keys), pd.DataFrame([values.summary(rows) for rows in groups])], axis=1)
+
+
+@dataclass(frozen=True)
+class _Values:
+    """The columns of a table as arrays of numbers."""
+
+    seed: np.ndarray
+    invalid: np.ndarray
+    hits: dict[str, np.ndarray]
+    numbers: dict[str, np.ndarray]
+    status: np.ndarray  # index into `statuses`
+    statuses: list[str]
+
+    @classmethod
+    def of(cls, trials: pd.DataFrame, groups: Sequence[np.ndarray]) -> _Values:
+        numbers = {name: numbers_of(trials[name]) for name in ("violation", "cost", *EFFORT)}
+        numbers["violation"] = np.nan_to_num(numbers["violation"], nan=np.inf, posinf=np.inf)
+        best = numbers_of(trials["best_cost"]) if "best_cost" in trials.columns else np.full(len(trials), nan)
+        numbers["cost_ratio"] = numbers["cost"] / np.where(best > 0, best, nan)
+        status, statuses = pd.factorize(trials["status"])
+        hits = attained(trials, groups)
+        invalid = (trials["status"] == INVALID).to_numpy(dtype=bool)
+        return cls(trials["seed"].to_numpy(), invalid, hits, numbers, status, [str(name) for name in statuses])
+
+    def summary(self, rows: np.ndarray) -> dict[str, object]:
+        held = {name: values[rows] for name, values in self.numbers.items()}
+        valid, reached, cost = ~self.invalid[rows], self.hits["reached"][rows] == 1, held["cost"]
+        ratio = held["cost_ratio"][reached & np.isfinite(held["cost_ratio"])]
+        row: dict[str, object] = {
+            "n": len(rows),
+            "seed": " ".join(str(seed) for seed in pd.unique(self.seed[rows])),
+            "invalid": len(rows) - int(valid.sum()),
+        }
+        for name in OUTCOMES:
+            row |= _rate(name, self.hits[name][rows])
+        row |= {
+            "violation_ok": float(np.mean(held["violation"] <= VIOLATION_TOLERANCE)),
+            "violation_median": float(np.median(held["violation"])),
+            "cost_median_reached": _quantiles("", cost[reached])["_median"],
+            "cost_median": _quantiles("", cost[np.isfinite(cost)])["_median"],
+            "cost_n": int(np.isfinite(cost).sum()),
+            "cost_ratio_n": len(ratio),
+            **_quantiles("cost_ratio", ratio),
+        }
+        for name in EFFORT:
+            row |= _quantiles(name, held[name][valid])
+        counts = np.bincount(self.status[rows], minlength=len(self.statuses)).tolist()
+        return row | {f"{STATUS}{name}": count for name, count in zip(self.statuses, counts, strict=True)}
+
+
+def attained(trials: pd.DataFrame, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """Each outcome (rows,): 1 attained, 0 not, NaN where undefined; an invalid start counts as a failure.
+
+    groups  positions of the rows of each solver on each task, see `grouped`
+
+    Where no valid trial of a group defines success (there is no best cost), it stays undefined for the invalid ones
+    too: a rate of 0 would be read as a measurement.
+    """
+    invalid = (trials["status"] == INVALID).to_numpy(dtype=bool)
+    hits = {}
+    for name in OUTCOMES:
+        values = _truth(trials[name]).to_numpy(dtype=float, na_value=nan)
+        hits[name] = np.where(invalid, 0.0, values)
+    if invalid.any():
+        for rows in groups:
+            if np.isnan(hits["success"][rows][~invalid[rows]]).all():
+                hits["success"][rows] = nan
+    return hits
+
+
+def wilson(count: int, n: int) -> tuple[float, float]:
+    """95 % Wilson interval of the rate count / n; nan where n is 0."""
+    if n == 0:
+        return nan, nan
+    interval = binomtest(count, n).proportion_ci(confidence_level=CONFIDENCE, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def check_trials(trials: pd.DataFrame, place: object = "a table") -> None:
+    """Raise InputError if a table, read from `place`, is empty, lacks a column or has text for numbers."""
+    missing = [name for name in COLUMNS if name not in trials.columns]
+    if missing:
+        raise InputError("trials", "the columns of a study", f"{place} without {', '.join(missing)}")
+    if trials.empty:
+        raise InputError("trials", "at least one row", f"{place} with none")
+    types = pd.api.types
+    for names, is_right, convert, kind in (
+        (NUMBERS, types.is_numeric_dtype, numbers_of, "numbers"),
+        (OUTCOMES, types.is_bool_dtype, _truth, "true or false"),
+    ):
+        for name in trials.columns.intersection(list(names)):
+            try:
+                if not is_right(trials[name].dtype):
+                    convert(trials[name])
+            except (TypeError, ValueError):
+                raise InputError("trials", f"{kind} in column {name}", f"{place} with others") from None
+
+
+def numbers_of(column: pd.Series) -> np.ndarray:
+    """A column as floats, NaN where it has no value."""
+    return column.to_numpy(dtype=float, na_value=nan)
+
+
+def _rate(name: str, hits: np.ndarray) -> dict[str, object]:
+    n, count = int((~np.isnan(hits)).sum()), int(np.nansum(hits))
+    low, high = wilson(count, n)
+    parts = {"count": count, "n": n, "rate": count / n if n else nan, "low": low, "high": high}
+    return {f"{name}_{part}": value for part, value in parts.items()}
+
+
+def _truth(column: pd.Series) -> pd.Series:
+    return column.astype("boolean")
+
+
+def _quantiles(name: str, values: np.ndarray) -> dict[str, float]:
+    median, p90 = np.quantile(values, [0.5, 0.9]).tolist() if values.size else (nan, nan)
+    return {f"{name}_median": median, f"{name}_p90": p90}

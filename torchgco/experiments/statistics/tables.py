@@ -1,0 +1,181 @@
+"""Summaries and comparisons as text: for a terminal, a paper or another program."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pandas as pd
+
+from torchgco.experiments.statistics.statistics import OUTCOMES, STATUS, TASK, task_columns
+
+FORMATS = ("table", "csv", "markdown", "latex", "json")
+
+
+def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
+    """The report for a terminal, some 120 columns wide: rates, effort, statuses and comparisons of each task.
+
+    summary, paired  as `summarise` and `paired_table` return them; `paired` may have no rows
+
+    A rate reads "30/32 94 % [80, 98]": attained of defined, and the 95 % Wilson interval. "-" stands for an
+    undefined value. Costs are medians, over the trials that reached the goal and over all that are finite. Effort and
+    cost ratios are medians, with the 90 % quantile in parentheses.
+    """
+    blocks = []
+    for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
+        seeds = ", ".join(dict.fromkeys(seed for held in task["seed"] for seed in held.split()))
+        blocks.append(f"{scenario} ({model}), seed {seeds}")
+        swept = swept_of(task)
+        blocks += [_rates(task, swept), _effort(task, swept), _statuses(task, swept)]
+        rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
+        if (rows["n"] > 0).any():
+            blocks.append(paired_lines(rows, swept))
+    return "\n\n".join(blocks)
+
+
+def format_frame(table: pd.DataFrame, form: str) -> str:
+    """One table in one of FORMATS, its cells as they are."""
+    if form == "csv":
+        return table.to_csv(index=False).rstrip("\n")
+    if form == "json":
+        return table.to_json(orient="records", double_precision=15, indent=1) or "[]"
+    if form == "latex":
+        return table.to_latex(index=False, escape=True).rstrip("\n")
+    text = [[str(name) for name in table.columns], *table.astype(str).to_numpy().tolist()]
+    left = sum(not pd.api.types.is_numeric_dtype(kind) for kind in table.dtypes[:1])
+    if form == "table":
+        return aligned(text, left)
+    text = [[cell.replace("|", "\\|") for cell in row] for row in text]
+    return "\n".join("| " + " | ".join(row) + " |" for row in [text[0], ["---"] * len(text[0]), *text[1:]])
+
+
+def aligned(rows: Sequence[Sequence[str]], left: int) -> str:
+    """Rows as lines of columns: the first `left` flush left, the others flush right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = list(zip(row, widths, strict=True))
+        names = [cell.ljust(width) for cell, width in cells[:left]]
+        lines.append("  ".join([*names, *(cell.rjust(width) for cell, width in cells[left:])]))
+    return "\n".join(lines)
+
+
+def swept_of(table: pd.DataFrame) -> list[str]:
+    """Swept variables that have a value somewhere in the table."""
+    return [name for name in task_columns(table)[len(TASK) :] if table[name].notna().any()]
+
+
+def headers(swept: Sequence[str]) -> list[str]:
+    """Swept variables as column heads: without the group of the key; of missions the last part alone."""
+    short = (name.removeprefix("scenario.").removeprefix("model.vehicle.") for name in swept)
+    return [name.split(".")[-1] if name.startswith(("mission.", "plant.")) else name for name in short]
+
+
+def cells(row: pd.Series, swept: Sequence[str]) -> list[str]:
+    """The values of the swept variables in a row; whole numbers that pandas holds as floats without a point."""
+    values = (row[name] for name in swept)
+    return ["-" if pd.isna(value) else f"{value:g}" if isinstance(value, float) else str(value) for value in values]
+
+
+def _rates(task: pd.DataFrame, swept: Sequence[str]) -> str:
+    rows = [[*cells(row, swept), row["solver"], *(rate(row, name) for name in OUTCOMES)] for _, row in task.iterrows()]
+    return aligned([[*headers(swept), "solver", *OUTCOMES], *rows], len(swept) + 1)
+
+
+def rate(row: pd.Series, name: str) -> str:
+    """Attained of defined, and the share with its interval in percent."""
+    if not row[f"{name}_n"]:
+        return "-"
+    share, low, high = (100 * row[f"{name}_{part}"] for part in ("rate", "low", "high"))
+    return f"{row[f'{name}_count']}/{row[f'{name}_n']} {share:.0f} % [{low:.0f}, {high:.0f}]"
+
+
+# Header in the terminal, column of the summary, column in parentheses, and how the numbers are written.
+EFFORT = (
+    ("n", "n", None, "d"),
+    ("invalid", "invalid", None, "d"),
+    ("viol. ok", "violation_ok", None, ".0%"),
+    ("violation", "violation_median", None, ".2g"),
+    ("cost reached", "cost_median_reached", None, ".1f"),
+    ("cost all", "cost_median", None, ".1f"),
+    ("cost ratio", "cost_ratio_median", "cost_ratio_p90", ".3f"),
+    ("iter.", "iterations_median", "iterations_p90", ".0f"),
+    ("outer", "outer_iterations_median", "outer_iterations_p90", ".3g"),
+    ("guided", "guided_median", "guided_p90", ".3g"),
+    ("seconds", "seconds_median", "seconds_p90", ".2g"),
+)
+PRINTED = ("n", "cost ratio", "iter.", "seconds")  # of them, in a paper's table
+
+
+def _measured(row: pd.Series, median: str, p90: str | None, form: str) -> str:
+    cells = ["-" if pd.isna(row[name]) else f"{row[name]:{form}}" for name in (median, p90) if name is not None]
+    return cells[0] if len(cells) == 1 or cells[0] == "-" else f"{cells[0]} ({cells[1]})"
+
+
+def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
+    rows = [[*headers(swept), "solver", *(header for header, *_ in EFFORT)]]
+    columns_of = [(median, p90, form) for _, median, p90, form in EFFORT]
+    for _, row in task.iterrows():
+        rows.append([*cells(row, swept), row["solver"], *(_measured(row, *columns) for columns in columns_of)])
+    return aligned(rows, len(swept) + 1)
+
+
+def _statuses(task: pd.DataFrame, swept: Sequence[str]) -> str:
+    """How many trials ended with each status that occurs."""
+    names = [name for name in task.columns if str(name).startswith(STATUS) and task[name].sum() > 0]
+    rows = [[*headers(swept), "solver", *(name.removeprefix(STATUS) for name in names)]]
+    for _, row in task.iterrows():
+        rows.append([*cells(row, swept), row["solver"], *(str(row[name]) for name in names)])
+    return aligned(rows, len(swept) + 1)
+
+
+COUNTS = {"n": "n", "both": "both", "only_a": "first", "only_b": "second", "neither": "neither"}
+PAIRED = ("paired", "outcome", *COUNTS.values(), "difference", "McNemar p", "left out", "cost ratio")
+
+
+def paired_lines(rows: pd.DataFrame, swept: Sequence[str], costs: bool = True) -> str:
+    """Comparisons for a terminal, with the swept variables `swept`; none without a trial that counts.
+
+    costs  False: without the ratio of costs
+    """
+    width = len(PAIRED) if costs else len(PAIRED) - 1
+    lines = [[*headers(swept), *PAIRED[:width]]]
+    for _, row in rows[rows["n"] > 0].iterrows():
+        lines.append([*cells(row, swept), *_pair(row)[:width]])
+    return aligned(lines, len(swept) + 1)
+
+
+def _pair(row: pd.Series) -> list[str]:
+    difference = f"{100 * row['difference']:+.0f} points" if row["n"] else "-"
+    p_value = f"{row['p_value']:.2g}" if row["n"] else "-"
+    ratio = "-"
+    if row["outcome"] == "reached" and row["cost_n"]:  # the same for every outcome
+        ends = "" if pd.isna(row["cost_low"]) else f" [{row['cost_low']:.3f}, {row['cost_high']:.3f}]"
+        ratio = f"{row['cost_ratio']:.3f}{ends}"
+    pair, left_out = f"{row['solver_a']} - {row['solver_b']}", row["undefined"] + row["unmatched"]
+    counts = [str(row[name]) for name in COUNTS]
+    return [pair, row["outcome"], *counts, difference, p_value, str(left_out), ratio]
+
+
+def printed(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:
+    """The tables that a paper prints: rates and effort, and comparisons where there are any."""
+    return [_printed_summary(summary), *([printed_pairs(paired)] if (paired["n"] > 0).any() else [])]
+
+
+def _printed_summary(summary: pd.DataFrame) -> pd.DataFrame:
+    swept = swept_of(summary)
+    columns = [(header, (median, p90, form)) for header, median, p90, form in EFFORT if header in PRINTED]
+    rows = []
+    for _, row in summary.iterrows():
+        rates = [rate(row, name) for name in OUTCOMES]
+        measured = [_measured(row, *parts) for _, parts in columns]
+        rows.append([row["scenario"], row["model"], *cells(row, swept), row["solver"], *rates, *measured])
+    heads = [*TASK, *headers(swept), "solver", *OUTCOMES, *(header for header, _ in columns)]
+    return pd.DataFrame(rows, columns=heads)
+
+
+def printed_pairs(paired: pd.DataFrame) -> pd.DataFrame:
+    """The comparisons that a paper prints: those with a trial that both flew and that defines the outcome."""
+    paired = paired[paired["n"] > 0]
+    swept = swept_of(paired)
+    rows = [[row["scenario"], row["model"], *cells(row, swept), *_pair(row)] for _, row in paired.iterrows()]
+    return pd.DataFrame(rows, columns=[*TASK, *headers(swept), *PAIRED])

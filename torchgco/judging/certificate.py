@@ -1,0 +1,258 @@
+"""Certificates of returned trajectories: whether each obeys its dynamics, clears the obstacles between the knots too,
+keeps its bounds and is a stationary point, or by how much it fails.
+
+No code is shared with the solvers: derivatives come from autograd through the model's own `step`, multipliers from a
+separate least-squares fit. docs/words.md defines the terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+from torch import Tensor
+
+from torchgco.base.autodiff import gradients
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import check_shape, check_tensor, computing_on
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.judging.distances import box_distance, box_segment_distance
+from torchgco.judging.judge import by_kind, segment_distance
+from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.problem import Problem, check_problem
+
+NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
+ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """One value per problem, (B,); NaN for problems that were not asked for, and where X or U isn't finite."""
+
+    # Largest |x_{k+1} - step(x_k, u_k)| and |X_0 - x_0| over all states, in their units. A residual of rounding size
+    # (1e-12 in float64) proves that X is the planning model's rollout of U; it says nothing about the model's quality.
+    dynamics_residual: Tensor
+    # Smallest distance to the surface of the full r_obs + r_veh (of a box: grown by r + r_veh, where r rounds it) from
+    # the first knot to the last, or a lower bound of it, m; infinite without obstacles. At 0 or more, no obstacle is
+    # touched between the knots either, under the conditions that `certify` states.
+    clearance: Tensor
+    # Largest excess over control and state bounds, in their units; 0 proves that they hold at every knot.
+    bound_violation: Tensor
+    # Largest component of the Lagrangian's gradient with respect to U, with the multipliers (inequalities: at least 0)
+    # that make it smallest in the least-squares sense, as a share of the largest terms that cancel in the gradient of
+    # J_var with respect to the same control: no unit of cost or control changes it. Near 0 it proves a stationary point
+    # to first order, not a minimum, and says nothing about rows that are violated.
+    kkt_residual: Tensor
+
+
+def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None) -> Certificate:
+    """Certify trajectories X (B, N+1, n), U (B, N, m).
+
+    The clearance includes collisions between knots that are both outside an obstacle. With Euler steps, positions and
+    obstacles move straight from knot to knot, so distances are exact (for boxes: lower bounds within 1e-9). For
+    midpoint and rk4 the path leaves the chord by at most dt^2 / 8 times the largest acceleration; this is subtracted.
+    The acceleration is sampled at both ends of the interval and at the half step, and the largest difference between
+    samples is added: this is a bound only if the acceleration varies by no more than that between them. Steps without a
+    known field (`integrator="none"`, a class that overrides `step` alone) have no path between knots; distances are
+    then those of the chord. Geometric constraints other than obstacles count at their knots only, as violations.
+
+    Rows that may have a multiplier are equalities, and inequalities with a slack of at most 1e-3 (m for obstacles).
+
+    Args:
+        problem: the planning problems, float64.
+        X, U: the trajectories that a solver returned.
+        asked: (B,) bool, the problems to certify; NaN for the others. None: all.
+
+    Raises:
+        InputError: X, U or asked don't fit the problem, or the problem isn't float64.
+    """
+    check_problem(problem)
+    problem.check_controls(U, "U")
+    check_shape(X, (problem.B, problem.N + 1, problem.n), "X")
+    if problem.x0.dtype != torch.float64 or X.dtype != torch.float64:
+        raise InputError("X", "torch.float64 for the certificate", X.dtype)
+    check_tensor(X, "X", problem.x0)
+    asked = torch.ones(problem.B, dtype=torch.bool, device=U.device) if asked is None else asked
+    check_shape(asked, (problem.B,), "asked")
+    if asked.dtype != torch.bool:
+        raise InputError("asked", "a tensor of bool", asked.dtype)
+    with computing_on(problem.x0.device):
+        return _certified(problem, X, U, asked)
+
+
+def _certified(problem: Problem, X: Tensor, U: Tensor, asked: Tensor) -> Certificate:
+    columns = torch.full((4, problem.B), torch.nan, dtype=X.dtype, device=X.device)
+    finite = torch.isfinite(X).flatten(1).all(-1) & torch.isfinite(U).flatten(1).all(-1)
+    for b in (asked & finite).nonzero().flatten():
+        # One at a time: no number depends on the other problems, and memory stays that of one problem.
+        row = b.view(1)
+        part, x, u = problem.take(row), X[row], U[row]
+        columns[:, b] = torch.stack(
+            (_dynamics_residual(part, x, u), _clearance(part, x, u), _bound_violation(part, x, u), _kkt(part, x, u))
+        )
+    return Certificate(*columns)
+
+
+def frame_columns(certificate: Certificate) -> dict[str, Any]:
+    """The certificate as arrays, by the names of a study's columns."""
+    names = {"clearance": "clearance_full"}
+    parts = vars(certificate).items()
+    return {names.get(name, name): value.cpu().numpy() for name, value in parts}
+
+
+# One problem: every tensor below has a batch of one ---------------------------------------------------------------
+
+
+def _dynamics_residual(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    gap = (X[:, 1:] - problem.dynamics.step(X[:, :-1], U)).abs().amax()
+    return torch.maximum(gap, (X[:, 0] - problem.x0).abs().amax())
+
+
+def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    worst = X.new_zeros(())
+    for bounds in problem.constraints:
+        if isinstance(bounds, (ControlBounds, StateBounds)):
+            z = (U if bounds.of == "u" else X)[:, bounds.knots]
+            excess = torch.maximum(z - bounds.upper.unsqueeze(1), bounds.lower.unsqueeze(1) - z)
+            worst = torch.maximum(worst, excess.amax())
+    return worst
+
+
+def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    nearest = X.new_full((), torch.inf)
+    for obstacles in problem.constraints:
+        if isinstance(obstacles, Obstacles) and not bool(obstacles.absent.all()):
+            path = by_kind(CHORDS, obstacles)(obstacles, X[0]) - _bulge(problem, X, U).unsqueeze(-1)
+            nearest = torch.minimum(nearest, path[:, ~obstacles.absent[0]].amin())
+    return nearest
+
+
+def _sphere_chords(spheres: BoundSpheres, X: Tensor) -> Tensor:
+    k = torch.arange(X.shape[0], dtype=X.dtype, device=X.device).view(-1, 1, 1)
+    relative = X[:, None, spheres.position] - spheres.centers[0]  # (N+1, M, d)
+    if spheres.velocities is not None:
+        relative = relative - k * spheres.dt * spheres.velocities[0]
+    return segment_distance(relative[:-1], relative[1:]) - spheres.inflated_radii[0]
+
+
+def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
+    p, radii = X[None, :, boxes.position], torch.where(boxes.absent, -torch.inf, boxes.inflated_radii).unsqueeze(1)
+    # Bounds are close up to a step's length above the smallest distance: the path hardly leaves a chord by more.
+    close = (box_distance(boxes, p) - radii).amin() + p.diff(dim=1).norm(dim=-1).amax()
+    return (box_segment_distance(boxes, p, close + radii) - radii)[0]
+
+
+# By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, or lower
+# bounds of them.
+CHORDS: dict[type[Obstacles], Callable[[Any, Tensor], Tensor]] = {
+    BoundSpheres: _sphere_chords,
+    BoundBoxes: _box_chords,
+}
+
+
+def _bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """How far the path may leave the chord of each interval, (N,), m."""
+    dynamics = problem.dynamics
+    if dynamics.integrator not in ("midpoint", "rk4"):
+        return X.new_zeros(problem.N)
+    half = X[:, :-1] + 0.5 * dynamics.dt * dynamics.field(X[:, :-1], U)
+    samples = torch.stack([_acceleration(problem, x, U) for x in (X[:, :-1], half, X[:, 1:])])  # (3, N, d)
+    change = samples.diff(dim=0).norm(dim=-1).amax(0)
+    return dynamics.dt**2 / 8.0 * (samples.norm(dim=-1).amax(0) + change)
+
+
+def _acceleration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """Second time derivative (N, d) of the position at x (1, N, n), u (1, N, m): d field_p / dx times field."""
+    at = problem.dynamics.position
+    assert at is not None  # or there would be no obstacles
+    d = at.stop - at.start
+    twins = problem.dynamics.take(torch.zeros(d, dtype=torch.int64, device=X.device))
+    u = U.repeat(d, 1, 1)
+    (slopes,) = gradients(lambda x: twins.field(x, u)[..., at].diagonal(dim1=0, dim2=2), X.repeat(d, 1, 1))
+    return (slopes * problem.dynamics.field(X, U)).sum(-1).mT
+
+
+def _kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    cost = _local(problem.cost.total, X, U)
+    active = _active_rows(problem, X, U)
+    gX, gU = (torch.cat([cost[i], *(rows[i] for _, rows in active)]) for i in (0, 1))
+    reduced, terms = _reduced(problem, X, U, gX, gU)
+    slopes = reduced.flatten(1).cpu().numpy()
+    senses = [equality for equality, (rows, _) in active for _ in rows]
+    rest = X.new_tensor(_fit(slopes[0], slopes[1:], np.array(senses, dtype=bool))).abs().view_as(U[0]).amax(0)
+    scale = terms.amax(0)
+    scale = torch.maximum(scale, NEGLIGIBLE * scale.amax())
+    return torch.where(rest > 0, rest / scale, 0.0).amax()
+
+
+def _fit(g: np.ndarray, A: np.ndarray, equality: np.ndarray) -> np.ndarray:
+    """g + A'lam with least-squares lam, at least 0 where not an equality."""
+    length = np.linalg.norm(A, axis=1)
+    moves = length > 1e-12 * max(1.0, length.max(initial=0.0))
+    A, equality = A[moves] / length[moves, None], equality[moves]
+    cone = np.concatenate((A, -A[equality]))  # an equality's multiplier may have either sign
+    rest = g
+    if len(cone):
+        try:
+            lam = nnls(cone.T, -g, maxiter=10 * len(cone))[0]
+        except RuntimeError:  # no convergence (nearly dependent rows): the clipped free fit is an upper bound too
+            lam = np.linalg.lstsq(cone.T, -g, rcond=None)[0].clip(min=0.0)
+        rest = g + lam @ cone
+    return rest
+
+
+def _active_rows(problem: Problem, X: Tensor, U: Tensor) -> list[tuple[bool, tuple[Tensor, Tensor]]]:
+    """Per constraint with rows that may be active: whether it is an equality, and the rows' gradients (`_local`)."""
+    found = []
+    for constraint in problem.constraints:
+        equality = constraint.sense == "equality"
+        spare = _spare(constraint, X, U)[0]
+        knots, columns = (spare <= (torch.inf if equality else ACTIVE_WITHIN)).nonzero(as_tuple=True)
+        q = knots.numel()
+        if q > 0:
+            twins = constraint.take(torch.zeros(q, dtype=torch.int64, device=X.device))
+            which = torch.arange(q, device=X.device), knots, columns
+            rows = lambda x, u, twins=twins, which=which: twins.value(x, u)[which]
+            found.append((equality, _local(rows, X.repeat(q, 1, 1), U.repeat(q, 1, 1))))
+    return found
+
+
+def _spare(constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
+    """Slack of each row (1, K, p): m for obstacles, else in the units of c."""
+    if isinstance(constraint, Obstacles):
+        return constraint.signed_distance(X[:, constraint.knots, constraint.position], constraint.times(X))
+    return -constraint.value(X, U)
+
+
+def _local(rows: Any, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of rows(X, U) (q,) with respect to X (q, N+1, n) and U (q, N, m), without dynamics.
+
+    Row j is computed from repetition j of the trajectory.
+    """
+    gX, gU = gradients(rows, X, U)
+    return gX, gU
+
+
+def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> tuple[Tensor, Tensor]:
+    """Total derivatives (q, N, m) with respect to U, by the adjoint recursion through the dynamics for q rows at once.
+
+    Also, for the first row, the sums (N, m) of the magnitudes of its terms.
+    """
+    n, N = problem.n, problem.N
+    twins = problem.dynamics.take(torch.zeros(n, dtype=torch.int64, device=X.device))
+    x, u = X[:, :-1].repeat(n, 1, 1), U.repeat(n, 1, 1)
+    fx, fu = gradients(lambda x, u: twins.step(x, u).diagonal(dim1=0, dim2=2), x, u)  # (n, N, n), (n, N, m)
+    total, terms = torch.empty_like(gU), torch.empty_like(gU[0])
+    adjoint = gX[:, N]
+    for k in range(N - 1, -1, -1):
+        total[:, k] = gU[:, k] + adjoint @ fu[:, k]
+        terms[k] = gU[0, k].abs() + adjoint[0].abs() @ fu[:, k].abs()
+        adjoint = gX[:, k] + adjoint @ fx[:, k]
+    return total, terms

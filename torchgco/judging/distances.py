@@ -1,0 +1,54 @@
+"""Distances from boxes as the judge and the certificate measure them: no code is shared with the solvers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.obstacles.boxes import BoundBoxes
+
+ROUNDS = 70  # each shrinks a segment by a third
+
+
+def box_distance(boxes: BoundBoxes, p: Tensor) -> Tensor:
+    """Signed distances (B, K, M) of points p (B, K, d) from the boxes before rounding, m; absent ones count too."""
+    away = p.unsqueeze(2) - boxes.centers.unsqueeze(1)
+    return _distance((boxes.axes.unsqueeze(1) @ away.unsqueeze(-1)).squeeze(-1), boxes.half_sizes.unsqueeze(1))
+
+
+def box_segment_distance(boxes: BoundBoxes, p: Tensor, within: Tensor) -> Tensor:
+    """Lower bounds (B, K-1, M) of the signed distances along the straight segments between points p (B, K, d), m.
+
+    Bounds below `within` (m, broadcast to (B, K-1, M)) are close, others may be loose: the distance changes no faster
+    than the point moves, so those at the ends bound it between them, which suffices for most pairs.
+    """
+    ends = box_distance(boxes, p)
+    along = p.diff(dim=1)
+    least = 0.5 * (ends[:, :-1] + ends[:, 1:] - along.norm(dim=-1, keepdim=True))
+    i, k, j = (least < within).nonzero(as_tuple=True)
+    least[i, k, j] = _closest(boxes.axes[i, j], boxes.centers[i, j], boxes.half_sizes[i, j], p[i, k], along[i, k])
+    return least
+
+
+def _closest(axes: Tensor, center: Tensor, half: Tensor, a: Tensor, along: Tensor) -> Tensor:
+    """Close lower bounds (P,) of the distances from boxes, one each, along the segments from a to a + along (P, d).
+
+    The signed distance from a convex body is a convex function along a segment: comparing it at two points shows which
+    third can be dropped. The returned value lies below the smallest distance by at most the length of the remaining
+    piece.
+    """
+    a, along = (axes @ (a - center).unsqueeze(-1)).squeeze(-1), (axes @ along.unsqueeze(-1)).squeeze(-1)
+    low = torch.zeros_like(a[:, :1])
+    high = torch.ones_like(low)
+    for _ in range(ROUNDS):
+        left, right = low + (high - low) / 3, high - (high - low) / 3
+        falls = (_distance(a + left * along, half) > _distance(a + right * along, half)).unsqueeze(-1)
+        low, high = torch.where(falls, left, low), torch.where(falls, high, right)
+    middle = 0.5 * (low + high)
+    return _distance(a + middle * along, half) - (high - low).squeeze(-1) * along.norm(dim=-1)
+
+
+def _distance(local: Tensor, half: Tensor) -> Tensor:
+    """Signed distances (...) of points in the axes of their boxes (..., d)."""
+    over = local.abs() - half
+    return over.clamp(min=0.0).norm(dim=-1) + over.amax(-1).clamp(max=0.0)

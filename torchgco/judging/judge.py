@@ -1,0 +1,248 @@
+"""The quality of controls: a re-simulation from U alone, in float64, that shares no code with a solver.
+
+It rolls the planning model out again, adds the cost up stage by stage, and measures distances by plain differences.
+docs/words.md defines the terms that it returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import check_shape, computing_on, tensor
+from torchgco.judging.distances import box_distance, box_segment_distance
+from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.spheres import CONTACT_FACTOR, BoundSpheres
+from torchgco.problem.goal import Goal
+from torchgco.problem.problem import Problem, check_problem
+
+OTHERS_WITHIN = 1e-3  # how far all constraints but the obstacles may be violated by a feasible trajectory
+SUCCESS_VIOLATION = 1e-3  # full radii, in metres
+SUCCESS_COST = 0.05  # by how much a success may exceed the best known cost, as a share of its amount
+BLOCK = 2**18  # numbers held at once where distances from spheres are measured: 2 MB
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One value per problem, (B,)."""
+
+    cost: Tensor  # J_var
+    violation: Tensor  # largest violation of the planning problem, full radii; lengths in metres
+    # Smallest distance, m, to a surface of 0.95 (r_obs + r_veh), of a box grown by 0.95 (r + r_veh), where r rounds it,
+    # at the knots; infinite without obstacles. A constraint given as a function has no distance: its rows count only as
+    # violations.
+    clearance_knots: Tensor
+    clearance: Tensor  # the same along the straight segments between the knots
+    goal_distance: Tensor  # m, last knot to goal, positions only
+    feasible: Tensor  # bool: clearance_knots >= 0, every other constraint within 1e-3
+    reached: Tensor  # bool: feasible, and closer to the goal than the goal radius
+    sound: Tensor  # bool: reached, violation <= 1e-3, clearance >= 0: success without its condition on the cost
+
+    def success(self, best_cost: Tensor) -> Tensor:
+        """Whether sound, and within 5 % of the best known cost (B,), (B,) bool.
+
+        Raises:
+            InputError: a best cost that isn't a number: without one, success is unknown.
+        """
+        best_cost = tensor(best_cost, "best_cost", self.cost)
+        check_shape(best_cost, () if best_cost.dim() == 0 else tuple(self.cost.shape), "best_cost")
+        if bool(best_cost.isnan().any()):
+            raise InputError("best_cost", "the best known cost of every problem", "NaN")
+        return self.sound & near_best(self.cost, best_cost)
+
+
+def near_best(cost: Any, best: Any) -> Any:
+    """Whether costs, tensors or columns of a table, exceed the best known ones by at most 5 % of their amounts."""
+    return cost - best <= SUCCESS_COST * abs(best)
+
+
+def judge(
+    problem: Problem, U: Tensor, goal: Tensor | None = None, goal_radius: Tensor | float | None = None
+) -> Verdict:
+    """Judge controls U (B, N, m) by their rollout from x0.
+
+    Args:
+        problem: the planning problems, float64.
+        U: controls; NaN where a solver returned none: such a problem is neither feasible nor reached.
+        goal: positions (B, d) or (d,), m. None: the problem's goal.
+        goal_radius: number or (B,), m, above 0. None: that of the problem's goal.
+
+    Raises:
+        InputError: U, goal or radius don't fit the problem, the problem isn't float64, the dynamics have no position,
+            no goal is given and the problem has none, or obstacles are of a kind that can't be judged.
+    """
+    check_problem(problem)
+    problem.check_controls(U, "U")
+    if problem.x0.dtype != torch.float64:
+        raise InputError("x0", "torch.float64 for the judge", problem.x0.dtype)
+    if problem.dynamics.position is None:
+        raise InputError("dynamics.position", "a model with a position", type(problem.dynamics).__name__)
+    with computing_on(problem.x0.device):
+        center, radius = _goal(problem, goal, goal_radius)
+        X = [problem.x0]
+        cost = torch.zeros_like(problem.x0[:, 0])
+        for k in range(problem.N):
+            cost = cost + problem.cost.stage(X[-1], U[:, k], k)
+            X.append(problem.dynamics.step(X[-1], U[:, k]))
+        cost = cost + problem.cost.terminal(X[-1])
+        return _verdict(problem, torch.stack(X, dim=1), U, cost, center, radius)
+
+
+def _goal(problem: Problem, center: Any, radius: Any) -> tuple[Tensor, Tensor]:
+    """Position (B, d) or (d,) and radius, () or (B,), of the goal: those given, else the problem's."""
+    if center is None:
+        center = _own_goal(problem).position
+    else:
+        center = tensor(center, "goal", problem.x0)
+        d = problem.position.stop - problem.position.start
+        check_shape(center, (d,) if center.dim() == 1 else (problem.B, d), "goal")
+        if not bool(torch.isfinite(center).all()):
+            raise InputError("goal", "finite numbers", "NaN or infinity")
+    if radius is None:
+        radius = _own_goal(problem).radius
+    else:
+        radius = tensor(radius, "goal_radius", problem.x0)
+        check_shape(radius, () if radius.dim() == 0 else (problem.B,), "goal_radius")
+        if not bool((radius > 0).all()):
+            raise InputError("goal_radius", "above 0 m", float(radius.min()))
+    return center, radius
+
+
+def _own_goal(problem: Problem) -> Goal:
+    if problem.goal is None:
+        raise InputError("goal", "a Goal in the problem, or position and radius here", "neither")
+    return problem.goal
+
+
+def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor, radius: Tensor | float) -> Verdict:
+    far = torch.full_like(cost, torch.inf)
+    clearance_knots, clearance, violation, others = far, far, torch.zeros_like(cost), torch.zeros_like(cost)
+    for constraint in problem.constraints:
+        worst = constraint.worst(X, U)
+        violation = torch.maximum(violation, worst)
+        if isinstance(constraint, Obstacles):
+            at_knots, between = by_kind(CLEARANCES, constraint)(constraint, X)
+            clearance_knots = torch.minimum(clearance_knots, at_knots)
+            clearance = torch.minimum(clearance, between)
+        else:
+            others = torch.maximum(others, worst)
+    position = X[:, -1, problem.dynamics.position]
+    goal_distance = (position - goal).square().sum(-1).sqrt()
+    finite = torch.isfinite(X).flatten(1).all(-1)
+    feasible = finite & (clearance_knots >= 0) & (others <= OTHERS_WITHIN)
+    reached = feasible & (goal_distance < radius)
+    sound = reached & (violation <= SUCCESS_VIOLATION) & (clearance >= 0)
+    return Verdict(cost, violation, clearance_knots, clearance, goal_distance, feasible, reached, sound)
+
+
+def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest distance (B,) to a surface of 0.95 (r_obs + r_veh), at the knots and along the segments between, m.
+
+    Infinite where there is no obstacle. All knots count, the given start too. With Euler steps vehicle and obstacle
+    both move straight from knot to knot, so the distance is exact; for other integrators it is that of the chord.
+    """
+    if spheres.centers.shape[1] == 0:
+        far = torch.full_like(X[:, 0, 0], torch.inf)
+        return far, far
+    rows = max(1, BLOCK // (X.shape[1] * spheres.centers[0].numel()))
+    starts = (slice(i, i + rows) for i in range(0, X.shape[0], rows))
+    at_knots, between = zip(*(_sphere_clearance(spheres.take(some), X[some]) for some in starts), strict=True)
+    return torch.cat(at_knots), torch.cat(between)
+
+
+def _sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
+    contact = torch.where(spheres.absent, -torch.inf, CONTACT_FACTOR * spheres.inflated_radii).unsqueeze(1)
+    p = X[..., spheres.position].unsqueeze(2)
+    relative, move = p - spheres.centers.unsqueeze(1), p.diff(dim=1)
+    if spheres.velocities is not None:
+        v = spheres.velocities.unsqueeze(1)
+        t = spheres.dt * torch.arange(X.shape[1], dtype=X.dtype, device=X.device).view(1, -1, 1, 1)
+        relative, move = relative - t * v, move - spheres.dt * v
+    apart = relative.norm(dim=-1)
+    at_knots = (apart - contact).flatten(1).amin(-1)
+    # A segment's closest point lies within half its length of an end: so bounded, most can't be the closest.
+    half = 0.5 * move.norm(dim=-1)
+    least = (torch.minimum(apart[:, :-1], apart[:, 1:]).square() - half.square()).clamp(min=0.0).sqrt()
+    i, k, j = (least - contact < at_knots.view(-1, 1, 1)).nonzero(as_tuple=True)
+    near = segment_distance(relative[i, k, j], relative[i, k + 1, j]) - contact[i, 0, j]
+    return at_knots, at_knots.scatter_reduce(0, i, near, "amin")
+
+
+def box_clearance(boxes: BoundBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest distance (B,) to a surface grown by 0.95 (r + r_veh), at the knots and along the segments between, m.
+
+    As for spheres: all knots count, and it is infinite where there is no obstacle.
+    """
+    p = X[..., boxes.position]
+    if boxes.centers.shape[1] == 0:
+        far = torch.full_like(p[:, 0, 0], torch.inf)
+        return far, far
+    contact = torch.where(boxes.absent, -torch.inf, CONTACT_FACTOR * boxes.inflated_radii).unsqueeze(1)
+    at_knots = (box_distance(boxes, p) - contact).flatten(1).amin(-1)
+    between = (box_segment_distance(boxes, p, at_knots.view(-1, 1, 1) + contact) - contact).flatten(1).amin(-1)
+    return at_knots, torch.minimum(between, at_knots)
+
+
+# By kind of obstacles: smallest distances (B,) from X (B, N+1, n) to where bodies touch, at the knots and between them.
+CLEARANCES: dict[type[Obstacles], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
+    BoundSpheres: sphere_clearance,
+    BoundBoxes: box_clearance,
+}
+
+
+def by_kind(measures: dict[type[Obstacles], Any], obstacles: Obstacles) -> Any:
+    """The function that measures obstacles of this kind.
+
+    Raises:
+        InputError: no function measures this kind. Without the error these obstacles would count as absent.
+    """
+    for kind, measure in measures.items():
+        if isinstance(obstacles, kind):
+            return measure
+    known = ", ".join(kind.__name__ for kind in measures)
+    raise InputError("constraints", f"obstacles that can be judged ({known})", type(obstacles).__name__)
+
+
+def segment_distance(a: Tensor, b: Tensor) -> Tensor:
+    """Distance (...) of the origin from the segment between a and b (..., d)."""
+    along = b - a
+    length = along.square().sum(-1)
+    share = (-(a * along).sum(-1) / length.clamp(min=torch.finfo(a.dtype).tiny)).clamp(0.0, 1.0)
+    return (a + share.unsqueeze(-1) * along).norm(dim=-1)
+
+
+def frame_columns(verdict: Verdict) -> dict[str, Any]:
+    """The verdict as arrays, by the names of a study's columns (`success` needs the best cost first)."""
+    names = ("feasible", "reached", "cost", "violation", "clearance", "clearance_knots", "goal_distance")
+    return {name: getattr(verdict, name).cpu().numpy() for name in names}
+
+
+def columns(problem: Problem, U: Tensor) -> dict[str, Any]:
+    """What can be judged of controls U (B, N, m) without being given more than the problem, as columns of a table.
+
+    `clearance` (m) where the problem has obstacles, `reached` where it has a goal; a problem of another precision is
+    judged in float64.
+
+    Raises:
+        InputError: as `judge`.
+    """
+    check_problem(problem)
+    if problem.dynamics.position is None:
+        return {}
+    names = ["clearance"] if any(isinstance(part, Obstacles) for part in problem.constraints) else []
+    names += ["reached"] if problem.goal is not None else []
+    if not names:
+        return {}
+    problem.check_controls(U, "U")
+    if problem.x0.dtype != torch.float64:
+        problem, U = problem.cast(torch.float64), U.double()
+    # Without a goal any will do, as only the clearance is read.
+    start, anywhere = problem.x0[:, problem.position], problem.goal is None
+    verdict = judge(problem, U, start, 1.0) if anywhere else judge(problem, U)
+    return {name: getattr(verdict, name).cpu().numpy() for name in names}

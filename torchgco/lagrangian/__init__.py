@@ -1,0 +1,1 @@
+"""The augmented Lagrangian, its expansion, rollouts, and how good a trajectory is."""

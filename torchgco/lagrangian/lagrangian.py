@@ -1,0 +1,154 @@
+"""The augmented Lagrangian: value, expansion, multiplier and penalty update, violation report (Equations 17-22)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import check_tensor
+from torchgco.base.tree import Rows, take
+from torchgco.constraints.base import Sense
+from torchgco.lagrangian.expansion import quadratise
+from torchgco.lagrangian.penalties import Penalty
+from torchgco.problem.problem import Problem
+
+
+@dataclass(frozen=True)
+class Multipliers:
+    """The state of the outer loop: one lam (B, K, p) per constraint, and one penalty per problem."""
+
+    lam: tuple[Tensor, ...]
+    mu: Tensor  # (B,)
+
+    @classmethod
+    def zero(cls, problem: Problem, mu: float) -> Multipliers:
+        """lam = 0 and the same penalty for all."""
+        # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
+        one = problem.take(slice(0, 1))
+        X, U = one.x0.new_zeros(one.B, problem.N + 1, problem.n), one.x0.new_zeros(one.B, problem.N, problem.m)
+        lam = tuple(X.new_zeros(problem.B, *c.value(X, U).shape[1:]) for c in one.constraints)
+        return cls(lam, problem.x0.new_full((problem.B,), mu))
+
+    def scaled(self, factor: Tensor) -> Multipliers:
+        """The multipliers and penalties of the same problems with their costs times `factor` (B,)."""
+        return Multipliers(tuple(factor.view(-1, 1, 1) * lam for lam in self.lam), factor * self.mu)
+
+    def shifted(self) -> Multipliers:
+        """Those of the same problems one stage later: every knot takes the values of the next one."""
+        return Multipliers(tuple(shifted(lam) for lam in self.lam), self.mu)
+
+    def check(self, problem: Problem) -> None:
+        """Raise InputError unless these multipliers belong to a problem of this form (a warm start)."""
+        if not isinstance(self.lam, tuple) or not all(isinstance(part, Tensor) for part in (*self.lam, self.mu)):
+            raise InputError("warm", "multipliers that are tensors", type(self.lam).__name__)
+        want = Multipliers.zero(problem, 0.0)
+        for mine, theirs in ((self.lam, want.lam), ((self.mu,), (want.mu,))):
+            got, expected = ([tuple(t.shape) for t in tensors] for tensors in (mine, theirs))
+            if got != expected:
+                raise InputError("warm", f"multipliers of shapes {expected}", got)
+        for part in (*self.lam, self.mu):
+            check_tensor(part, "warm", problem.x0)
+
+
+def shifted(values: Tensor) -> Tensor:
+    """Values (B, K, ...) of knots one stage later; the last knot keeps its own."""
+    return torch.cat((values[:, 1:], values[:, -1:]), dim=1)
+
+
+def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> Tensor:
+    """rho: mu where a row is active, else 0 (Equation 18).
+
+    As printed, an inequality is inactive where c < 0 and lam = 0. With `phr` (Powell, Hestenes, Rockafellar) it is
+    inactive where lam + mu c < 0: a multiplier pushes the trajectory away from an obstacle and never pulls it back.
+    """
+    rho = mu.view(-1, 1, 1)
+    if sense == "equality":
+        return rho.expand_as(c)
+    idle = (lam + rho * c < 0) if phr else ((c < 0) & (lam == 0))
+    return torch.where(idle, 0.0, rho)
+
+
+def _penalty_value(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> Tensor:
+    """The terms that a constraint's rows add to L_M, (B,)."""
+    rho = penalty_weights(sense, c, lam, mu, phr)
+    terms = (lam + 0.5 * rho * c) * c
+    if phr and sense == "inequality":
+        # Continued by its minimum over c where the row is inactive, so that L_M stays continuous.
+        terms = torch.where(rho == 0, -0.5 * lam.square() / mu.view(-1, 1, 1), terms)
+    # Two sums, knots last: one over both axes would be split among threads by batch size.
+    return terms.sum(-1).sum(-1)
+
+
+def _penalty_slopes(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> tuple[Tensor, Tensor]:
+    """First and second derivative of `_penalty_value` with respect to c, (B, K, p) each."""
+    rho = penalty_weights(sense, c, lam, mu, phr)
+    g = lam + rho * c
+    return (torch.where(rho == 0, 0.0, g) if phr and sense == "inequality" else g), rho
+
+
+@dataclass(frozen=True)
+class Lagrangian:
+    """L_M = J_var + sum_k sum_i [lam c + rho/2 c^2] + J_gco for fixed multipliers (Equations 17, 64).
+
+    With `phr` the terms of an inequality are the continuous ones of `penalty_weights`, else as printed.
+    """
+
+    problem: Problem
+    multipliers: Multipliers
+    penalty: Penalty | None
+    phr: bool
+
+    def take(self, index: Rows) -> Lagrangian:
+        """The same for the problems in `index`."""
+        return Lagrangian(self.problem.take(index), take(self.multipliers, index), take(self.penalty, index), self.phr)
+
+    def value(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+        """J_var (B,) and L_M (B,)."""
+        cost = self.problem.cost.total(X, U)
+        merit = cost
+        for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
+            merit = merit + _penalty_value(constraint.sense, constraint.value(X, U), lam, self.multipliers.mu, self.phr)
+        return cost, merit if self.penalty is None else merit + self.penalty.value(X)
+
+    def expand(self, X: Tensor, U: Tensor) -> Tensor:
+        """H (N+1, B, s, s) of L_M: first derivatives of the constraints only (Equations 31-37).
+
+        Stage first, as the backward pass reads it.
+        """
+        H = quadratise(self.problem, X, U)
+        for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
+            g, rho = _penalty_slopes(constraint.sense, constraint.value(X, U), lam, self.multipliers.mu, self.phr)
+            constraint.accumulate(X, U, g, rho, H)
+        if self.penalty is not None:
+            self.penalty.accumulate(X, H)
+        return H.transpose(0, 1)
+
+    def expand_optimality(self, X: Tensor, U: Tensor) -> Tensor:
+        """H (N+1, B, s, s) of J_var + lam'c, with the penalty's curvature on rows whose lam isn't 0."""
+        H = quadratise(self.problem, X, U)
+        for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
+            rho = torch.where(lam == 0, 0.0, self.multipliers.mu.view(-1, 1, 1))
+            constraint.accumulate(X, U, lam, rho.expand_as(lam), H)
+        return H.transpose(0, 1)
+
+    def slack(self, X: Tensor, U: Tensor) -> Tensor:
+        """Sum |lam c| (B,) over inequalities with c < 0, where complementarity asks for lam = 0."""
+        slack = X.new_zeros(X.shape[0])
+        for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
+            if constraint.sense == "inequality":
+                slack = slack - (lam * constraint.value(X, U).clamp(max=0.0)).sum(-1).sum(-1)
+        return slack
+
+
+def update(
+    problem: Problem, X: Tensor, U: Tensor, multipliers: Multipliers, growth: Tensor | float, mu_max: float
+) -> Multipliers:
+    """lam + mu c, at least 0 for inequalities; mu times `growth`, at most mu_max (Equations 21, 22)."""
+    lam = []
+    for constraint, old in zip(problem.constraints, multipliers.lam, strict=True):
+        new = old + multipliers.mu.view(-1, 1, 1) * constraint.value(X, U)
+        lam.append(new if constraint.sense == "equality" else new.clamp(min=0.0))
+    return Multipliers(tuple(lam), (multipliers.mu * growth).clamp(max=mu_max))

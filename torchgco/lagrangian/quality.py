@@ -1,0 +1,84 @@
+"""How good a trajectory is: its violation, whether it has arrived, and which of two is better."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.goal import SHARE
+from torchgco.problem.problem import Problem
+
+GOAL_TOLERANCE = SHARE  # share of the distance from start to goal
+
+
+class Rated(Protocol):
+    """A trajectory with its cost and violation, (B, ...)."""
+
+    @property
+    def X(self) -> Tensor: ...
+    @property
+    def cost(self) -> Tensor: ...
+    @property
+    def violation(self) -> Tensor: ...
+
+
+def violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The largest violation (B,): lengths in metres, all else in the units of its constraint."""
+    worst = X.new_zeros(X.shape[0])
+    for constraint in problem.constraints:
+        worst = torch.maximum(worst, constraint.worst(X, U))
+    return worst
+
+
+def chord_clearance(problem: Problem, X: Tensor) -> Tensor:
+    """The smallest distance (B,) from the straight lines between knots to where bodies touch, m; negative in contact.
+
+    Infinite where there is no obstacle.
+    """
+    least = X.new_full(X.shape[:1], torch.inf)
+    for part in problem.constraints:
+        if isinstance(part, Obstacles):
+            least = torch.minimum(least, part.chord_clearance(X))
+    return least
+
+
+def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, limit: float) -> Tensor:
+    """Whether a trajectory is better than an old one, (B,).
+
+    Feasible is better than infeasible; of two feasible ones the cheaper, of two infeasible ones the less violated.
+    """
+    fits, old_fits = worst <= limit, old_worst <= limit
+    return (fits & (~old_fits | (cost < old_cost))) | (~fits & ~old_fits & (worst < old_worst))
+
+
+def goal_tolerance(problem: Problem) -> Tensor | None:
+    """The distance from the goal within which a solver counts a trajectory as arrived, (B,), m; None without a goal.
+
+    The smaller of the goal's radius and `GOAL_TOLERANCE` times the distance from the start: a solver that stopped at
+    the edge of a large goal would return trajectories that a few more iterations make cheaper.
+    """
+    goal = problem.goal
+    if goal is None:
+        return None
+    near = GOAL_TOLERANCE * goal.distance(problem.x0[:, problem.position])
+    return near if goal.assumed else torch.minimum(goal.radius, near)
+
+
+def has_arrived(problem: Problem, X: Tensor, tolerances: float = 1.0) -> Tensor:
+    """Whether X (B, N+1, n) ends within `tolerances` goal tolerances of the goal, (B,) bool; False without a goal."""
+    near = goal_tolerance(problem)
+    if near is None or problem.goal is None:
+        return torch.zeros_like(X[:, 0, 0], dtype=torch.bool)
+    return problem.goal.distance(X[:, -1, problem.position]) <= tolerances * near
+
+
+def is_preferred(problem: Problem, new: Rated, old: Rated, limit: float, by_arrival: bool = True) -> Tensor:
+    """Whether a trajectory should replace an old one, (B,) bool: feasible arrival counts first, then `is_better`."""
+    better = is_better(new.cost, new.violation, old.cost, old.violation, limit)
+    if not by_arrival:
+        return better
+    arrived, before = ((path.violation <= limit) & has_arrived(problem, path.X) for path in (new, old))
+    return torch.where(arrived == before, better, arrived)

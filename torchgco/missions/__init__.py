@@ -1,0 +1,9 @@
+"""Missions: a planner, a tracker and a plant in closed loop."""
+
+from torchgco.missions.disturbance import Disturbance as Disturbance
+from torchgco.missions.log import MissionLog as MissionLog
+from torchgco.missions.mission import Mission as Mission
+from torchgco.missions.planner import Planner as Planner
+from torchgco.missions.plant import Plant as Plant
+from torchgco.missions.plant import RotorPlant as RotorPlant
+from torchgco.missions.tracker import Tracker as Tracker

@@ -1,0 +1,82 @@
+"""The log of missions: plans by control step, the plant's states and the tracker's commands by time step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.missions.planner import Plan
+from torchgco.missions.tracker import Tracking
+
+
+@dataclass(frozen=True)
+class MissionLog:
+    """What happened to B missions of at most K control steps with J time steps each; NaN after a mission's end."""
+
+    period: float  # s
+    x: Tensor  # (B, K, J+1, 17): states of the plant; the first of a period is the last of the one before
+    commands: Tensor  # (B, K, J, 4): rotor speeds, rpm; within the period of a mission's end, NaN after it
+    tracking_violation: Tensor  # (B, K): largest of the tracking problems, N
+    plan: Tensor  # (B, K, N+1, 3): planned positions, m
+    cost: Tensor  # (B, K): of the plan
+    violation: Tensor  # (B, K): of the plan
+    shifted: Tensor  # (B, K): 1 where the former plan was kept, else 0
+    guided: Tensor  # (B, K): outer iterations with guidance on
+    iterations: Tensor  # (B, K): of the planner's solve
+    planner_seconds: Tensor  # (B, K): of the batch's solve, divided by its missions
+    tracker_seconds: Tensor  # (B, K): of the J solves, divided likewise
+
+    @classmethod
+    def blank(cls, x: Tensor, steps: int, substeps: int, period: float, knots: int) -> MissionLog:
+        """To be filled, for plants that begin at x (B, 17)."""
+        B = x.shape[0]
+
+        def empty(*shape: int) -> Tensor:
+            return x.new_full((B, steps, *shape), torch.nan)
+
+        log = cls(
+            period, empty(substeps + 1, 17), empty(substeps, 4), empty(), empty(knots, 3),
+            *(empty() for _ in range(7)),
+        )  # fmt: skip
+        log.x[:, 0, 0] = x  # of missions, too, that end at their start
+        return log
+
+    def add_plan(self, rows: Tensor, step: int, x: Tensor, plan: Plan, seconds: float) -> None:
+        """The start of a control period: states x (b, 17) of the missions `rows`, and their plans."""
+        self.x[rows, step, 0] = x
+        self.plan[rows, step] = plan.X[..., :3]
+        for name in ("cost", "violation", "shifted", "guided", "iterations"):
+            getattr(self, name)[rows, step] = getattr(plan, name).to(x.dtype)
+        self.planner_seconds[rows, step] = seconds
+        self.tracker_seconds[rows, step] = 0.0
+        self.tracking_violation[rows, step] = 0.0
+
+    def add_sample(
+        self, rows: Tensor, step: int, j: int, x: Tensor, tracking: Tracking, seconds: float, flew: Tensor
+    ) -> None:
+        """A time step: the states after it, and the commands that led there where a vehicle still flew, (b,) bool."""
+        self.x[rows, step, j + 1] = x
+        self.commands[rows, step, j] = torch.where(flew.unsqueeze(-1), tracking.commands, torch.nan)
+        self.tracker_seconds[rows, step] += seconds
+        worst = torch.maximum(self.tracking_violation[rows, step], tracking.violation)
+        self.tracking_violation[rows, step] = worst
+
+    def samples(self) -> tuple[Tensor, Tensor]:
+        """Times (K J + 1,), s, and states (B, K J + 1, 17) of the plant at all time steps."""
+        B, K, J = self.commands.shape[:3]
+        x = torch.cat((self.x[:, :1, 0], self.x[:, :, 1:].reshape(B, K * J, 17)), dim=1)
+        t = torch.arange(K * J + 1, dtype=x.dtype) * (self.period / J)
+        return t, x
+
+    def steps(self) -> np.ndarray:
+        """Control steps that each mission made, (B,)."""
+        return (~torch.isnan(self.cost)).sum(1).numpy()
+
+    def arrays(self, plans: bool = False) -> dict[str, np.ndarray]:
+        """What a study keeps of every mission, by name (B, ...); with the planned positions where asked for."""
+        names = ("x", "commands", "tracking_violation", "cost", "violation", "shifted", "guided", "iterations")
+        names = (*names, "planner_seconds", "tracker_seconds", *(["plan"] if plans else []))
+        return {name: getattr(self, name).numpy() for name in names}

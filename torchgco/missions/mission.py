@@ -1,0 +1,220 @@
+"""The mission: planner, tracker and plant in closed loop, for a batch of vehicles in lockstep (section 5.2.2).
+
+Every control period the planner solves from the measured state; every step of the plant the tracker commands the rotors
+along the plan. A vehicle that reaches its goal, touches an obstacle or diverges leaves the batch.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
+from torchgco.base.tree import take
+from torchgco.dynamics.base import Dynamics
+from torchgco.missions.disturbance import Disturbance, measured
+from torchgco.missions.log import MissionLog
+from torchgco.missions.outcome import FARTHEST
+from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.planning_problem import check_model
+from torchgco.missions.plant import Plant, RotorPlant, hovering
+from torchgco.missions.tracker import Reference, Tracker, Tracking
+from torchgco.obstacles.base import CONTACT_FACTOR
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.problem import Problem, check_problem
+from torchgco.solvers.contracts import check_ids
+
+LONGEST = 3600.0  # s of a mission
+SEED_STEP = 7_919  # between the seeds of two control steps
+Report = Callable[[int, int], None]  # of a control step and the number of vehicles that still fly
+
+
+@dataclass(frozen=True)
+class Mission:
+    """The closed loop.
+
+    Args:
+        planner: makes a plan in every control period, which is a time step of the planning problems.
+        tracker: its time step divides the control period, and is the plant's.
+        plant: the vehicle; parameters that differ between missions are (B,).
+        disturbance: wind and noise.
+        duration: s, after which a mission ends with TIMEOUT.
+        goal_radius: m, within which the goal counts as reached; None: the problems' own.
+        latency: control periods between a measurement and the first use of the plan made from it, 0 or 1. With 1, a
+            plan starts where the former plan leads within the period, and without `first_step`.
+
+    Raises:
+        InputError: a field out of its range, or periods that don't fit each other.
+    """
+
+    planner: Planner
+    tracker: Tracker = field(default_factory=Tracker)
+    plant: Plant = field(default_factory=RotorPlant)
+    disturbance: Disturbance = field(default_factory=Disturbance)
+    duration: Annotated[float, Above(0, "s"), AtMost(LONGEST, "s")] = 15.0
+    goal_radius: Meters | None = 0.5
+    latency: Annotated[int, Within(0, 1, "control periods")] = 0
+
+    def __post_init__(self) -> None:
+        check_options(self, "mission")
+        if self.plant.dt != self.tracker.dt:
+            raise InputError("tracker.dt", f"the plant's {self.plant.dt} s", self.tracker.dt)
+
+    def check(self, dynamics: Dynamics) -> None:
+        """Raise InputError unless these dynamics of a planning problem can be flown."""
+        check_model(dynamics)
+        if self.substeps(float(dynamics.dt)) is None:
+            raise InputError("scenario.dt", f"a multiple of the plant's {self.plant.dt} s", dynamics.dt)
+
+    def substeps(self, period: float) -> int | None:
+        """Time steps of the plant in a control period, s; None where they don't fit."""
+        count = round(period / self.plant.dt)
+        return count if count >= 1 and math.isclose(count * self.plant.dt, period, rel_tol=1e-9) else None
+
+    def fly(
+        self, problem: Problem, seed: int = 0, ids: Tensor | None = None, report: Report | None = None
+    ) -> MissionLog:
+        """Fly B missions from rest at the starts of planning problems to their goals.
+
+        Args:
+            problem: the planning problems, float64, on the quadrotor's planning model.
+            seed, ids: the key of all random draws; ids (B,) int64, by default 0..B-1.
+
+        Raises:
+            InputError: another model, no goal, another precision, obstacles other than spheres, a control period that
+                isn't a multiple of the plant's time step, or an argument of another kind.
+        """
+        check_problem(problem)
+        seed = check_value(seed, Seed, "seed")
+        check_value(report, Callable | None, "report")
+        if ids is not None:
+            check_ids(ids, problem)
+        ids = torch.arange(problem.B) if ids is None else ids
+        return _Flight(self, problem, seed, ids).run(report or (lambda step, flying: None))
+
+
+class _Flight:
+    """One call of `Mission.fly`: the state of all vehicles that still fly."""
+
+    def __init__(self, mission: Mission, problem: Problem, seed: int, ids: Tensor) -> None:
+        self.mission, self.seed = mission, seed
+        # The thrusts at a plan's start are not known one period ahead.
+        self.planner = mission.planner if mission.latency == 0 else replace(mission.planner, first_step=False)
+        if problem.goal is None:
+            raise InputError("goal", "a Goal in the problem", None)
+        mission.check(problem.dynamics)
+        if problem.x0.dtype != torch.float64:
+            raise InputError("x0", "torch.float64 for a mission", problem.x0.dtype)
+        self.period = float(problem.dynamics.dt)
+        self.substeps = mission.substeps(self.period) or 1
+        self.steps = math.ceil(mission.duration / self.period - 1e-9)
+        self.spheres = _spheres(problem)
+        self.goal = problem.goal.position
+        radius = mission.goal_radius
+        self.radius = problem.goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
+        x = hovering(mission.planner.airframe, problem.x0[:, :3])
+        self.start = x[:, :3]
+        self.problem, self.planned = problem, self.planner.problem(problem, x)
+        self.force, self.noise = mission.disturbance.draw(seed, ids.tolist(), self.steps, self.period)
+        self.log = MissionLog.blank(x, self.steps, self.substeps, self.period, problem.N + 1)
+        self.plant, self.x, self.rows, self.ids = mission.plant, x, torch.arange(problem.B), ids
+
+    def run(self, report: Report) -> MissionLog:
+        """Fly until all missions have ended."""
+        plan: Plan | None = None
+        tracking: Tracking | None = None
+        self._leave(~self.problem.start_is_clear)
+        for step in range(self.steps):
+            if self.rows.numel() == 0:
+                break
+            seen, seconds = measured(self.x, self.noise[self.rows, step]), 0.0
+            if plan is None or self.mission.latency == 0:
+                plan, seconds = self._planned(step, seen, seen, plan)
+            flown = plan
+            if self.mission.latency == 1:
+                plan, more = self._planned(step + 1, self.planner.predicted(seen, flown), seen, flown)
+                seconds += more
+            self.log.add_plan(self.rows, step, self.x, flown, seconds / self.rows.numel())
+            tracking, left = self._fly_period(step, flown, tracking)
+            if bool(left.any()):
+                stay = (~left).nonzero().flatten()
+                plan, tracking = plan.take(stay), tracking.take(stay)
+                self._leave(left)
+            report(step, self.rows.numel())
+        return self.log
+
+    def _planned(self, step: int, x: Tensor, seen: Tensor, before: Plan | None) -> tuple[Plan, float]:
+        """Plans from states x (B, 17) at a control step, when `seen` is measured; and the seconds they took."""
+        seed = self.seed + SEED_STEP * step
+        plan, self.planned, seconds = self.planner.plan(
+            self.problem, self.planned, x, step, before, seed, self.ids, seen
+        )
+        return plan, seconds
+
+    def _fly_period(self, step: int, plan: Plan, tracking: Tracking | None) -> tuple[Tracking, Tensor]:
+        """One control period along a plan; and which vehicles have ended in it, (B,) bool."""
+        reference = Reference(plan.X, self.period)
+        ended = torch.zeros_like(self.rows, dtype=torch.bool)
+        for j in range(self.substeps):
+            seen = measured(self.x, self.noise[self.rows, step])
+            began = time.perf_counter()
+            tracking = self.mission.tracker.track(seen, reference, j * self.plant.dt, tracking)
+            seconds = (time.perf_counter() - began) / self.rows.numel()
+            flew, x = ~ended, self.plant.advance(self.x, tracking.commands, self.force[self.rows, step])
+            self.x = torch.where(ended.unsqueeze(-1), self.x, x)
+            ended |= self._ends((step * self.substeps + j + 1) * self.plant.dt)
+            self.log.add_sample(self.rows, step, j, self.x, tracking, seconds, flew)
+        assert tracking is not None
+        return tracking, ended
+
+    def _ends(self, t: float) -> Tensor:
+        """Whether a vehicle is at its goal, in contact, or lost, (B,)."""
+        p = self.x[:, :3]
+        finite = torch.isfinite(self.x).all(-1) & ((p - self.start[self.rows]).norm(dim=-1) <= FARTHEST)
+        there = (p - self.goal[self.rows]).norm(dim=-1) < self.radius[self.rows]
+        hit = torch.zeros_like(there)
+        for centers, velocities, contact in self.spheres:
+            o = centers[self.rows] if velocities is None else centers[self.rows] + t * velocities[self.rows]
+            hit |= ((p.unsqueeze(1) - o).norm(dim=-1) < contact[self.rows]).any(-1)
+        return ~finite | there | hit
+
+    def _leave(self, left: Tensor) -> None:
+        """Drop the vehicles where `left` (B,)."""
+        stay = (~left).nonzero().flatten()
+        if stay.numel() == left.numel():
+            return
+        self.problem, self.planned = self.problem.take(stay), self.planned.take(stay)
+        self.plant = self.plant.take(stay)
+        self.x, self.rows, self.ids = take((self.x, self.rows, self.ids), stay)
+
+
+def other_obstacles(problem: Problem) -> str:
+    """The obstacles of a problem that missions can't fly among, in words; empty where there are spheres alone."""
+    words = []
+    for part in problem.geometric:
+        if isinstance(part, BoundBoxes):
+            sides = (part.half_sizes[~part.absent] > 0).sum(-1)
+            words.append("trunks (capsules)" if bool((sides <= 1).all()) else "boxes")
+        elif not isinstance(part, BoundSpheres):
+            words.append(type(part).__name__)
+    return " and ".join(dict.fromkeys(words))
+
+
+def _spheres(problem: Problem) -> list[tuple[Tensor, Tensor | None, Tensor]]:
+    """Centres (B, M, 3), velocities and distances of contact (B, M), m, of the problems' spheres."""
+    if others := other_obstacles(problem):
+        raise InputError("constraints", "spheres alone, as missions fly among no other obstacles so far", others)
+    found = []
+    for part in problem.geometric:
+        assert isinstance(part, BoundSpheres)
+        contact = torch.where(part.absent, -torch.inf, CONTACT_FACTOR * part.inflated_radii)
+        found.append((part.centers, part.velocities, contact))
+    return found

@@ -1,0 +1,233 @@
+"""The planner: in every control period a trajectory to the goal from the vehicle's measured state (section 5.2.2)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from torchgco.base.options import NonNegative, PositiveOrInfinite, Seconds, Share, check_options
+from torchgco.base.tree import Rows, put, take
+from torchgco.constraints.base import Constraint
+from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.quadrotor import Airframe
+from torchgco.lagrangian.lagrangian import Multipliers, shifted
+from torchgco.lagrangian.quality import violation
+from torchgco.missions.planning_problem import Margin, acceleration, biased, check_model, first_step, planning_state
+from torchgco.native.dispatch import open_loop
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.problem import Problem
+from torchgco.solution import Solution
+from torchgco.solvers.contracts import Solver
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Trajectories from the states that were measured at the control step `step`, (B, ...)."""
+
+    X: Tensor  # (B, N+1, 14)
+    U: Tensor  # (B, N, 4)
+    multipliers: Multipliers
+    cost: Tensor
+    violation: Tensor
+    shifted: Tensor  # bool: the former plan one stage later, as the new one was infeasible
+    guided: Tensor  # int64: outer iterations with guidance on
+    iterations: Tensor  # int64: of all solves for this plan
+    measured: Tensor  # (B, 17): the plants' states
+    bias: Tensor  # (B, 3): estimated acceleration that the model lacks, m/s^2
+    model: Dynamics  # that was planned with
+    step: int
+
+    def take(self, index: Rows) -> Plan:
+        """The plans in `index`."""
+        parts = {name: take(getattr(self, name), index) for name in (*TRAJECTORY, *OTHERS)}
+        return replace(self, **parts, model=self.model.take(index))
+
+
+TRAJECTORY = ("X", "U", "multipliers", "cost", "violation", "shifted")
+OTHERS = ("guided", "iterations", "measured", "bias")
+CONTINUED = 4  # outer iterations at most that continue a former plan
+LEAST = 1e-4  # s, of a time limit
+
+
+@dataclass(frozen=True)
+class Planner:
+    """Solves the planning problem from every measured state.
+
+    A first plan is the solver's. Later, where the solver makes attempts around a local solver (`gco`), the local solver
+    continues from the former plan for up to four outer iterations. Where the result is infeasible, the former plan one
+    stage later is flown if it is less violated; where that is infeasible, too, the whole solver searches again.
+
+    Args:
+        solver: any solver of the library.
+        airframe: as the planner knows it.
+        multipliers: "shifted" starts from those of the former plan one stage later, "reset" from zero, as the paper.
+        max_seconds: time limit of a plan, s; None: none. With a limit, results depend on the machine.
+        tolerance: violation (m for lengths) up to which a plan is flown without a look at the former one; infinity: a
+            new plan always is, as in the paper, unless its violation is not a number.
+        margin: by which obstacles are grown, m; margin_growth: by how much more per second of the horizon, m/s, in
+            four steps.
+        first_step: the body rates of the second knot are the ones that the rotors lead to (`FirstStepRates`).
+        estimation: gain per control period of an estimated constant acceleration that the planning model lacks, for
+            wind and errors of the mass, at most 1; 0: none, as the paper.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    solver: Solver
+    airframe: Airframe = Airframe()
+    multipliers: Literal["shifted", "reset"] = "shifted"
+    max_seconds: Seconds | None = None
+    tolerance: PositiveOrInfinite = 0.01
+    margin: NonNegative = 0.01
+    margin_growth: NonNegative = 0.0
+    first_step: bool = True
+    estimation: Share = 0.2
+
+    def __post_init__(self) -> None:
+        check_options(self, "planner")
+
+    def problem(self, problem: Problem, x: Tensor) -> Problem:
+        """The planning problems of a mission at its start, from those of an open-loop study and plants x (B, 17).
+
+        Raises:
+            InputError: another model than the quadrotor's planning model.
+        """
+        check_model(problem.dynamics)
+        x0, none = planning_state(x, self.airframe), torch.zeros_like(x[:, :3])
+        constraints = self._constraints(problem, 0.0, x, none[:, 0])
+        dynamics = problem.dynamics if self.estimation == 0 else biased(problem.dynamics, none)
+        return replace(problem, dynamics=dynamics, x0=x0, constraints=constraints)
+
+    def plan(
+        self,
+        whole: Problem,
+        now: Problem,
+        x: Tensor,
+        step: int,
+        before: Plan | None,
+        seed: int,
+        ids: Tensor,
+        measured: Tensor | None = None,
+    ) -> tuple[Plan, Problem, float]:
+        """Plans from plants x (B, 17) at a control step, their problems, and the seconds that the planning took.
+
+        Args:
+            whole: the problems of the open-loop study; now: those of the plan before, at first of `problem`.
+            measured: the states that were measured last, (B, 17), where x is predicted from them; None: x.
+        """
+        measured = x if measured is None else measured
+        began = time.perf_counter()
+        t, x0 = step * float(whole.dynamics.dt), planning_state(x, self.airframe)
+        U0 = now.cost.rest_controls(x0.new_zeros(now.B, now.N, now.m)) if before is None else shifted(before.U)
+        bias = self._estimated(measured, before, float(whole.dynamics.dt))
+        dynamics = whole.dynamics if self.estimation == 0 else biased(whole.dynamics, bias)
+        depth = self._margin.unavoidable_depth(whole.started_at(x0, whole.constraints), t, U0)
+        now = now.started_at(x0, self._constraints(whole, t, x, depth), dynamics=dynamics)
+        solve = _Solve(self, now, seed, ids, began)
+        plan = solve.first(U0) if before is None else solve.next(U0, before)
+        return replace(plan, measured=measured, bias=bias, step=step), now, time.perf_counter() - began
+
+    def predicted(self, x: Tensor, plan: Plan) -> Tensor:
+        """The plants (B, 17) one period later, from x (B, 17) at the plan's first knot: as the plan's model leads."""
+        now = planning_state(x, self.airframe)
+        later = plan.model.step(now, plan.U[:, 0])
+        q = later[:, 6:10] / later[:, 6:10].square().sum(-1, keepdim=True).sqrt()
+        more = (later[:, 13:] - now[:, 13:]) * self.airframe.mass / 4.0
+        F = (x[:, 13:] + more).clamp(self.airframe.thrust_min, self.airframe.thrust_max)
+        return torch.cat((later[:, :6], q, later[:, 10:13], F), dim=-1)
+
+    @property
+    def _margin(self) -> Margin:
+        return Margin(self.margin, self.margin_growth)
+
+    def _constraints(self, whole: Problem, t: float, x: Tensor, depth: Tensor) -> list[Constraint]:
+        """The constraints of plans that start at time t from plants x (B, 17), depth (B,) m within the margin."""
+        parts: list[Constraint] = []
+        for constraint in whole.constraints:
+            later = constraint.later(t)
+            if isinstance(later, Obstacles):
+                parts += self._margin.around(later, whole.N, float(whole.dynamics.dt), depth)
+            else:
+                parts.append(later)
+        return [*parts, *([first_step(whole, x, self.airframe)] if self.first_step else [])]
+
+    def _estimated(self, x: Tensor, before: Plan | None, dt: float) -> Tensor:
+        """The acceleration (B, 3) that the planning model lacks: a low-pass of what the last period has shown."""
+        if before is None or self.estimation == 0:
+            return torch.zeros_like(x[:, :3])
+        shown = (x[:, 3:6] - before.measured[:, 3:6]) / dt
+        expected = 0.5 * (acceleration(x, self.airframe) + acceleration(before.measured, self.airframe))
+        return before.bias + self.estimation * (shown - expected - before.bias)
+
+
+class _Solve:
+    """The solves of one control step."""
+
+    def __init__(self, planner: Planner, problem: Problem, seed: int, ids: Tensor, began: float) -> None:
+        self.planner, self.problem, self.seed, self.ids, self.began = planner, problem, seed, ids, began
+        # What a limit cuts off, the next plan continues: finishing it would only make this one late.
+        solver: Any = planner.solver
+        self.solver = solver if getattr(solver, "finish", None) is None else replace(solver, finish=None)
+
+    def first(self, U0: Tensor) -> Plan:
+        """The solver's plans, from controls U0 (B, N, 4)."""
+        return self._plan(self._solved(self.solver, self.problem, U0, None, self.ids))
+
+    def next(self, U0: Tensor, before: Plan) -> Plan:
+        """Plans that continue former ones, whose controls one stage later are U0 (B, N, 4)."""
+        multipliers = before.multipliers.shifted()
+        warm = multipliers if self.planner.multipliers == "shifted" else None
+        local = getattr(self.solver, "local", None)
+        local = self.solver if local is None else replace(local, max_outer_iterations=CONTINUED)
+        plan = self._plan(self._solved(local, self.problem, U0, warm, self.ids))
+        self._keep_former(plan, U0, multipliers)
+        rows = (~(plan.violation <= self.planner.tolerance)).nonzero().flatten()
+        left = self._time_left()
+        if local is not self.solver and rows.numel() > 0 and (left is None or left > LEAST):
+            start = None if warm is None else take(warm, rows)
+            found = self._plan(self._solved(self.solver, self.problem.take(rows), U0[rows], start, self.ids[rows]))
+            self._replace(plan, rows, found)
+            for name in ("guided", "iterations"):
+                getattr(plan, name)[rows] += getattr(found, name)
+        return plan
+
+    def _solved(self, solver: Solver, problem: Problem, U0: Tensor, warm: Multipliers | None, ids: Tensor) -> Solution:
+        return solver.solve(problem, U0, seed=self.seed, ids=ids, warm=warm, max_seconds=self._time_left())
+
+    def _time_left(self) -> float | None:
+        """Seconds that are left of the limit, at least `LEAST`; None without a limit."""
+        limit = self.planner.max_seconds
+        return None if limit is None else max(LEAST, limit - (time.perf_counter() - self.began))
+
+    def _keep_former(self, plan: Plan, U: Tensor, multipliers: Multipliers) -> None:
+        """Put former plans, one stage later, in the place of new ones that are infeasible and worse."""
+        rows = (~(plan.violation <= self.planner.tolerance)).nonzero().flatten()
+        if rows.numel() == 0:
+            return
+        part = self.problem.take(rows)
+        X = open_loop(part, U[rows])
+        former = replace(
+            plan.take(rows), X=X, U=U[rows], multipliers=take(multipliers, rows), cost=part.cost.total(X, U[rows]),
+            violation=violation(part, X, U[rows]), shifted=torch.ones_like(rows, dtype=torch.bool),
+        )  # fmt: skip
+        self._replace(plan, rows, former)
+
+    @staticmethod
+    def _replace(plan: Plan, rows: Tensor, other: Plan) -> None:
+        """The less violated of two plans for `rows`, in place; NaN is worst."""
+        better = other.violation < plan.violation[rows].nan_to_num(nan=torch.inf)
+        chosen = better.nonzero().flatten()
+        for name in TRAJECTORY:
+            put(getattr(plan, name), rows[chosen], take(getattr(other, name), chosen))
+
+    def _plan(self, solution: Solution) -> Plan:
+        none = torch.zeros_like(solution.cost, dtype=torch.bool)
+        return Plan(
+            solution.X, solution.U, solution.multipliers, solution.cost, solution.violation, none, solution.guided,
+            solution.iterations, solution.X[:, 0], solution.X[:, 0, :3], self.problem.dynamics, 0,
+        )  # fmt: skip

@@ -1,0 +1,117 @@
+"""What a plan sees from a measured state: the planning model with its bias, obstacles with margins, the first step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.constraints import ControlBounds
+from torchgco.constraints.base import Constraint
+from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.quadrotor import GRAVITY, Airframe, QuadrotorPlanning, pose_rates
+from torchgco.missions.constraints import FirstStepRates
+from torchgco.native.dispatch import open_loop
+from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
+from torchgco.problem.problem import Problem
+
+PARTS = 4  # of the horizon, with a margin each, where margins grow
+BLIND = 3  # knots whose positions the controls of a plan can't change, or hardly
+EARLY = 10  # knots in which a vehicle may leave a margin that it has entered
+KEPT = 0.25  # share of the clearance from contact that an entered margin leaves
+
+
+@dataclass(frozen=True)
+class BiasedPlanning(QuadrotorPlanning):
+    """The planning model with an acceleration that is added to v'."""
+
+    bias: Tensor = torch.zeros(1, 3)  # (B, 3), m/s^2
+
+    batched: ClassVar[tuple[str, ...]] = ("bias",)
+
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        rates, bias = super().field(x, u), self.bias.view(-1, *([1] * (x.dim() - 2)), 3)
+        return torch.cat((rates[..., :3], rates[..., 3:6] + bias.to(x.dtype), rates[..., 6:]), dim=-1)
+
+
+def check_model(dynamics: Dynamics) -> None:
+    """Raise InputError unless a mission can fly on these dynamics."""
+    if not isinstance(dynamics, QuadrotorPlanning):
+        raise InputError("model", "quadrotor: a mission flies its planning model", type(dynamics).__name__)
+
+
+def biased(dynamics: Dynamics, bias: Tensor) -> BiasedPlanning:
+    """The planning model with a bias (B, 3), m/s^2."""
+    given = {f.name: getattr(dynamics, f.name) for f in fields(QuadrotorPlanning)}
+    return BiasedPlanning(**given, bias=bias)
+
+
+def planning_state(x: Tensor, airframe: Airframe) -> Tensor:
+    """States (B, 14) of the planning model for plants x (B, 17): thrusts become their acceleration."""
+    return torch.cat((x[:, :13], x[:, 13:].sum(-1, keepdim=True) / airframe.mass), dim=-1).contiguous()
+
+
+def acceleration(x: Tensor, airframe: Airframe) -> Tensor:
+    """v' (B, 3) of the planning model for plants x (B, 17), m/s^2."""
+    _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
+    lift = F.sum(-1) / airframe.mass
+    return torch.stack(pose_rates(v.unbind(-1), q.unbind(-1), w.unbind(-1), lift, GRAVITY)[3:6], dim=-1)
+
+
+@dataclass(frozen=True)
+class Margin:
+    """Distance that plans keep from obstacles in addition to their radii.
+
+    size, growth  m, and m per second of the horizon, in four steps
+    """
+
+    size: float
+    growth: float
+
+    def around(self, obstacles: Obstacles, N: int, dt: float, depth: Tensor) -> list[Constraint]:
+        """Obstacles with the margin: less by `depth` (B,) at the early knots, more at late ones where it grows."""
+        early = min(EARLY, N)
+        parts = [_at(obstacles.grown(self.size - depth), slice(1, early + 1))]
+        if early == N:
+            return parts
+        for knots in torch.arange(early + 1, N + 1).chunk(PARTS if self.growth > 0 else 1):
+            first, last = int(knots[0]), int(knots[-1]) + 1
+            by = self.size + self.growth * 0.5 * (first + last - 1) * dt
+            parts.append(_at(obstacles.grown(torch.full_like(depth, by)), slice(first, last)))
+        return parts
+
+    def unavoidable_depth(self, problem: Problem, t: float, U: Tensor) -> Tensor:
+        """How deep vehicles get into the margin before any control has an effect, (B,), m.
+
+        At most to where a quarter of the clearance from contact is left. Obstacles of `problem` are as at time 0, its
+        states as at time t, s; U are the controls (B, N, m) of the former plan.
+        """
+        p = open_loop(problem, U)[:, : BLIND + 1, problem.position]
+        times = torch.arange(p.shape[1], dtype=p.dtype) * float(problem.dynamics.dt)
+        depth = torch.zeros_like(p[:, 0, 0])
+        for part in problem.constraints:
+            if isinstance(part, Obstacles) and part.centers.shape[1] > 0:
+                distance = part.later(t).signed_distance(p, times).amin(1) - self.size  # (B, M)
+                most = self.size + (1.0 - KEPT) * (1.0 - CONTACT_FACTOR) * part.margins
+                depth = torch.maximum(depth, torch.minimum(-distance, most).clamp(min=0.0).amax(-1))
+        return depth
+
+
+def first_step(problem: Problem, x: Tensor, airframe: Airframe) -> FirstStepRates:
+    """The body rates that the rotors lead to in the first period, as far as the planning model can follow."""
+    model, reachable = problem.dynamics, None
+    assert isinstance(model, QuadrotorPlanning)
+    for bounds in problem.constraints:
+        if isinstance(bounds, ControlBounds):
+            w = x[:, 10:13]
+            share = model.dt / torch.as_tensor(model.rate_time_constant, dtype=x.dtype).reshape(-1, 1)
+            lower, upper = (w + share * (bound[:, :3] - w) for bound in (bounds.lower, bounds.upper))
+            reachable = lower, upper
+    return FirstStepRates(x[:, 13:], model.dt, airframe, reachable)
+
+
+def _at(obstacles: Any, knots: slice) -> Constraint:
+    return replace(obstacles, knots=knots)

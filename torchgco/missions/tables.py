@@ -1,0 +1,167 @@
+"""Flights of missions as tables: a row per control step, and a row per mission."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+import torch
+
+from torchgco.dynamics.quadrotor import Airframe
+from torchgco.missions.outcome import Ending, judge_flight
+from torchgco.obstacles.base import CONTACT_FACTOR
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.problem import Problem
+
+Arrays = Mapping[str, np.ndarray]
+Spheres = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # centres, distances of contact, velocities
+SCALARS = (
+    "cost", "violation", "shifted", "guided", "iterations", "planner_seconds", "tracker_seconds", "tracking_violation",
+)  # fmt: skip
+STATES, ROTORS = 17, 4
+
+
+def packed(arrays: Arrays) -> np.ndarray:
+    """The arrays of B missions as one (B, K, W), a row per control step; planned positions come last, if they do."""
+    B, K = arrays["cost"].shape
+    names = ("x", "commands", *SCALARS, *(["plan"] if "plan" in arrays else []))
+    return np.concatenate([arrays[name].reshape(B, K, -1) for name in names], axis=-1)
+
+
+def unpacked(rows: np.ndarray, substeps: int) -> dict[str, np.ndarray]:
+    """The arrays that `packed` made of logs with so many time steps per control step."""
+    B, K, J = *rows.shape[:2], substeps
+    widths = [(J + 1) * STATES, J * ROTORS, *[1] * len(SCALARS)]
+    x, commands, *scalars, plan = np.split(rows, np.cumsum(widths), axis=-1)
+    arrays = {name: part[..., 0] for name, part in zip(SCALARS, scalars, strict=True)}
+    arrays |= {"x": x.reshape(B, K, J + 1, STATES), "commands": commands.reshape(B, K, J, ROTORS)}
+    return arrays | ({"plan": plan.reshape(B, K, -1, 3)} if plan.shape[-1] else {})
+
+
+def spheres_of(problem: Problem) -> list[Spheres]:
+    """The spheres of each problem at t = 0, with the distances at which bodies touch; NaN where absent."""
+    parts = [part for part in problem.geometric if isinstance(part, BoundSpheres)]
+    found = []
+    for b in range(problem.B):
+        radii = [torch.where(part.absent, torch.nan, CONTACT_FACTOR * part.inflated_radii)[b] for part in parts]
+        moves = [torch.zeros_like(part.centers[b]) if part.velocities is None else part.velocities[b] for part in parts]
+        centers = torch.cat([part.centers[b] for part in parts]) if parts else torch.zeros(0, 3)
+        contact = torch.cat(radii) if parts else torch.zeros(0)
+        found.append((centers.numpy(), contact.numpy(), torch.cat(moves).numpy() if parts else None))
+    return found
+
+
+def clearances(arrays: Arrays, b: int, period: float, spheres: Spheres) -> np.ndarray:
+    """Distances (K,) of mission b to the nearest contact at the starts of its control steps, m."""
+    centers, contact, velocities = spheres
+    K = _steps(arrays, b)
+    here = ~np.isnan(contact)
+    if not here.any():
+        return np.full(K, np.inf)
+    t = period * np.arange(K)[:, None, None]
+    at = centers[here] + (0.0 if velocities is None else t * velocities[here])
+    return (np.linalg.norm(arrays["x"][b, :K, 0, None, :3] - at, axis=-1) - contact[here]).min(-1)
+
+
+def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances: Sequence[np.ndarray]) -> pd.DataFrame:
+    """A row per mission and control step.
+
+    Args:
+        arrays: see `MissionLog.arrays`.
+        ids: numbers of the missions; period: of a control step, s.
+        clearances: of each mission, at the starts of its control steps, m.
+
+    Commands `u1` to `u4` are the first of a control step; `u1_low` and `u1_high` the least and the largest of it.
+    """
+    frames = []
+    for b, number in enumerate(ids):
+        K = _steps(arrays, b)
+        x = arrays["x"][b, :K, 0]
+        columns = {"mission": np.full(K, number), "step": np.arange(K), "t": period * np.arange(K)}
+        columns |= {f"x{i}": x[:, i] for i in range(x.shape[1])}
+        columns |= {name: arrays[name][b, :K] for name in ("cost", "violation")}
+        columns |= {f"f{i + 1}": x[:, 13 + i] for i in range(4)}
+        columns |= _commands(arrays["commands"][b, :K])
+        columns |= {"clearance": clearances[b][:K]}
+        columns |= {name: arrays[name][b, :K] for name in ("planner_seconds", "tracker_seconds", "tracking_violation")}
+        columns |= {"guided": arrays["guided"][b, :K].astype(int)}
+        columns |= {"source": np.where(arrays["shifted"][b, :K] == 1, "shifted", "solved")}
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
+
+
+def _commands(u: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of commands (K, J, 4), rpm, NaN after a mission's end: the first of each control step and their range."""
+    parts = {"": u[:, 0], "_low": np.fmin.reduce(u, axis=1), "_high": np.fmax.reduce(u, axis=1)}
+    return {f"u{i + 1}{end}": values[:, i] for end, values in parts.items() for i in range(ROTORS)}
+
+
+def time_step_frame(arrays: Arrays, ids: Sequence[int], period: float) -> pd.DataFrame:
+    """A row per mission and time step of the plant: mission, t, states, thrusts and commands.
+
+    A command holds from its row to the next one; the last row is the mission's end and repeats the last command.
+    Arguments as `mission_frame`.
+    """
+    frames = []
+    for b, number in enumerate(ids):
+        u = arrays["commands"][b, : _steps(arrays, b)].reshape(-1, ROTORS)
+        u = u[: int((~np.isnan(u).all(-1)).sum())]  # of a control step in which the mission ends, a part is flown
+        t, x = (part[: len(u) + 1] for part in samples(arrays, b, period))
+        u = np.concatenate((u, u[-1:] if len(u) else np.full((1, ROTORS), np.nan)))
+        columns = {"mission": np.full(len(t), number), "t": t} | {f"x{i}": x[:, i] for i in range(STATES)}
+        columns |= {f"f{i + 1}": x[:, 13 + i] for i in range(ROTORS)} | {f"u{i + 1}": u[:, i] for i in range(ROTORS)}
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
+
+
+def samples(arrays: Arrays, b: int, period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times (T,), s, and states (T, 17) of the plant at all time steps of mission b; at least one."""
+    K, J = _steps(arrays, b), arrays["commands"].shape[2]
+    x = arrays["x"][b]
+    states = np.concatenate((x[0, :1], x[:K, 1:].reshape(K * J, x.shape[-1])))
+    return np.arange(K * J + 1) * (period / J), states
+
+
+def energy(t: np.ndarray, x: np.ndarray, airframe: Airframe) -> float:
+    """Shaft work of the rotors over a flight, J: torque k_r F times speed sqrt(F / b), for states x (T, 17)."""
+    F = x[:, 13:].clip(min=0.0)
+    speed = np.sqrt(F / airframe.thrust_coefficient) * 2.0 * math.pi / 60.0  # rad/s
+    return float(np.trapezoid((airframe.rotor_torque * F * speed).sum(-1), t))
+
+
+def mission_row(arrays: Arrays, b: int, period: float, end: Ending, airframe: Airframe) -> dict[str, object]:
+    """The columns of mission b that a study adds to its own."""
+    K = _steps(arrays, b)
+    planner = arrays["planner_seconds"][b, :K]
+    t, x = samples(arrays, b, period)
+    until = t <= end.flight_time + 1e-9
+    return {
+        "outcome": end.outcome.name,
+        "flight_time": end.flight_time,
+        "energy": energy(t[until], x[until], airframe),
+        "missed_deadlines": int((planner + arrays["tracker_seconds"][b, :K] > period).sum()),
+        "shifted_plans": int(np.nansum(arrays["shifted"][b, :K])),
+        "planner_seconds_median": float(np.median(planner)) if K else math.nan,
+        "planner_seconds_p99": float(np.quantile(planner, 0.99)) if K else math.nan,
+        "tracker_seconds_median": float(np.median(arrays["tracker_seconds"][b, :K])) if K else math.nan,
+        "tracking_violation": float(arrays["tracking_violation"][b, :K].max(initial=0.0)),
+    }
+
+
+def ending(
+    arrays: Arrays,
+    b: int,
+    period: float,
+    spheres: Spheres,
+    goal: np.ndarray,
+    goal_radius: float,
+) -> Ending:
+    """How mission b ended; spheres are centres, distances of contact and velocities, see `judge_flight`."""
+    t, x = samples(arrays, b, period)
+    return judge_flight(t, x[:, :3], *spheres, goal, goal_radius)
+
+
+def _steps(arrays: Arrays, b: int) -> int:
+    return int((~np.isnan(arrays["cost"][b])).sum())

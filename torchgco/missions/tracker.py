@@ -1,0 +1,140 @@
+"""The tracker: rotor speeds that make the vehicle turn and climb as the plan says (section 5.2.1)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+import torch
+from torch import Tensor
+
+from torchgco.base.options import AtLeast, Count, Positive, Seconds, check_options
+from torchgco.base.tree import Rows, take
+from torchgco.constraints import StateBounds
+from torchgco.costs import QuadraticCost
+from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.dynamics.quadrotor import GRAVITY, Airframe, RotorTracking
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted, update
+from torchgco.lagrangian.quality import violation
+from torchgco.missions.constraints import ThrustSum
+from torchgco.problem.problem import Problem
+from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
+from torchgco.solvers.ilqr import ILQR, descend
+
+RATES, THRUST = slice(10, 13), 13  # in the planning model's state: w and a
+FIRST_ROUNDS = 3  # inner solves of the first call
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A plan that is tracked: states X (B, N+1, 14) at knots `period` apart, s."""
+
+    X: Tensor
+    period: float
+
+    def at(self, times: Tensor) -> tuple[Tensor, Tensor]:
+        """Body rates (B, K, 3), rad/s, and thrust accelerations (B, K), m/s^2, at times (K,) after the first knot, s.
+
+        Interpolated between the knots; after the last knot, its values.
+        """
+        place = (times / self.period).clamp(max=self.X.shape[1] - 1)
+        left = place.floor().long().clamp(max=self.X.shape[1] - 2)
+        share = (place - left).unsqueeze(-1)
+        values = torch.lerp(self.X[:, left, RATES.start :], self.X[:, left + 1, RATES.start :], share)
+        return values[..., :3], values[..., 3]
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """The commands of the tracker, and what its next call starts from."""
+
+    problem: Problem
+    commands: Tensor  # (B, 4): rotor speeds, rpm
+    violation: Tensor  # (B,): largest violation of the tracking problem, N
+    U: Tensor  # (B, N, 4)
+    multipliers: Multipliers
+
+    def take(self, index: Rows) -> Tracking:
+        """The same for the vehicles in `index`."""
+        tensors = take((self.commands, self.violation, self.U, self.multipliers), index)
+        return Tracking(self.problem.take(index), *tensors)
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """AL-iLQR on the rotor model: rates follow the plan, thrusts sum up to its acceleration and keep their limits.
+
+    Successive tracking problems are alike, so by default the augmented Lagrangian goes on from call to call: one inner
+    solve and one update of the multipliers each, from the controls and multipliers of the call before (three at first).
+    The paper's tracker (Table 5, `mission=paper`) solves every problem from the beginning.
+
+    Args:
+        airframe: as the planner knows it.
+        inner: iLQR; with `inner.as_printed`, inequalities have the printed form, too (`lagrangian.penalty_weights`).
+        multipliers: "shifted" goes on from the call before, with a constant penalty; "reset" starts every call from
+            rotor speeds that hover, multipliers of zero and the first penalty.
+        penalty: mu, in units of the cost per N^2; the first one with "reset".
+        penalty_growth: eta, the factor of mu per outer iteration, with "reset".
+        outer_iterations: inner solves of a call, each with an update of the multipliers, with "reset".
+        dt: time between two commands, s; stages: N.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    airframe: Airframe = Airframe()
+    inner: ILQR = ILQR(tolerance=1e-4, max_iterations=10)
+    multipliers: Literal["shifted", "reset"] = "shifted"
+    penalty: Positive = 1e3
+    penalty_growth: Annotated[float, AtLeast(1)] = 2.0
+    outer_iterations: Count = 10
+    dt: Seconds = 0.01
+    stages: Count = 6
+
+    def __post_init__(self) -> None:
+        check_options(self, "tracker")
+
+    def track(self, x: Tensor, reference: Reference, offset: float, before: Tracking | None = None) -> Tracking:
+        """Commands for plants x (B, 17), `offset` s after the plan's first knot; `before` is the last result."""
+        x_ref, acceleration = self._reference(x, reference, offset)
+        x0 = x[:, RATES.start :].contiguous()
+        if before is None:
+            problem = self._problem(x0, x_ref, acceleration)
+        else:
+            cost, (thrust_sum, bounds) = before.problem.cost, before.problem.constraints
+            assert isinstance(cost, BoundQuadratic) and isinstance(thrust_sum, ThrustSum)
+            sums = replace(thrust_sum, acceleration=acceleration)
+            problem = before.problem.started_at(x0, [sums, bounds], cost.toward(x_ref))
+        reset = self.multipliers == "reset"
+        if before is None or reset:
+            U = x.new_full((problem.B, self.stages, 4), self.airframe.hover_speed)
+            multipliers, rounds = Multipliers.zero(problem, self.penalty), FIRST_ROUNDS
+        else:
+            U, multipliers, rounds = shifted(before.U), before.multipliers.shifted(), 1
+        growth, rounds = (self.penalty_growth, self.outer_iterations) if reset else (1.0, rounds)
+        for _ in range(rounds):
+            found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, not self.inner.as_printed), U)
+            U = found.U
+            multipliers = update(problem, found.X, U, multipliers, growth, PENALTY_MAX)
+        return Tracking(problem, U[:, 0], violation(problem, found.X, U), U, multipliers)
+
+    def _reference(self, x: Tensor, reference: Reference, offset: float) -> tuple[Tensor, Tensor]:
+        """The states (B, N+1, 7) and thrust accelerations (B, N) at knots 1..N that are tracked."""
+        rates, acceleration = reference.at(offset + self.dt * torch.arange(self.stages + 1, dtype=x.dtype))
+        hover = self.airframe.mass * GRAVITY / 4.0
+        thrusts = rates.new_full((*rates.shape[:2], 4), hover)
+        return torch.cat((rates, thrusts), dim=-1), acceleration[:, 1:].contiguous()
+
+    def _problem(self, x0: Tensor, x_ref: Tensor, acceleration: Tensor) -> Problem:
+        """The tracking problems of Table 5 from states x0 (B, 7)."""
+        frame = self.airframe
+        b = frame.thrust_coefficient
+        weight = [1.0] * 3 + [b * b] * 4
+        cost = QuadraticCost(weight, [1e-2 * b * b] * 4, weight, x_ref, [frame.hover_speed] * 4)
+        bounds = StateBounds(
+            [-math.inf] * 3 + [frame.thrust_min] * 4,
+            [math.inf] * 3 + [frame.thrust_max] * 4,
+        )
+        model = RotorTracking(self.dt, airframe=frame)
+        return Problem(model, cost, [ThrustSum(acceleration, frame.mass), bounds], x0, self.stages)

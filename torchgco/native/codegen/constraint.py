@@ -1,0 +1,88 @@
+"""C of a traced constraint: its rows, and the terms that they add to a quadratic model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.constraints.base import FunctionConstraint
+from torchgco.native.codegen import emit
+from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
+from torchgco.problem.problem import Problem
+from torchgco.tracing import Traced, own_tensors
+
+
+def trace_rows(problem: Problem, i: int) -> KnotSource:
+    """C of the rows c of constraint i, for the prelude of `emit`, with x (n), u (m) and a knot's own numbers p:
+
+        tgco_KEY_rows(x, u, p, c)
+        tgco_KEY_add(x, u, p, by_c, by_cc, g, H)     g += c_z' by_c,  H += c_z' diag(by_cc) c_z, its upper triangle
+
+    Raises:
+        InputError: the rows can't be traced, hold an operation without a counterpart, or join several knots.
+    """
+    return knot_source("rows", span_of_rows(problem, i), _code, __file__)
+
+
+def rows_numbers(problem: Problem, i: int, source: KnotSource) -> Tensor:
+    """The numbers (B|1, K|1, count) of constraint i."""
+    return source.numbers(problem.B, own_tensors(problem.constraints[i]), lambda: span_of_rows(problem, i))
+
+
+def span_of_rows(problem: Problem, i: int) -> Span:
+    """Constraint i, traced: at one knot where it is given as a function of one, else along whole trajectories."""
+    constraint, n, m, N = problem.constraints[i], problem.n, problem.m, problem.N
+    if type(constraint) is FunctionConstraint and not constraint.reads_knots:
+
+        def of_knot(index: Tensor, X: Tensor, U: Tensor) -> Tensor:
+            rows = constraint.function(*(X if a == "x" else U for a in constraint.of))
+            if rows.dim() != 3 or tuple(rows.shape[:2]) != (1, 1):
+                raise InputError(f"{constraint.name}.function", "rows (1, 1, p) of one problem", tuple(rows.shape))
+            return rows
+
+        X, U = problem.x0.new_zeros(1, 1, n), problem.x0.new_zeros(1, 1, m)
+        return Span(Traced(constraint.name, of_knot, X, U), (), n, m, 1, 1, [0])
+    name = f"constraints[{i}] ({type(constraint).__name__})"
+    try:
+        knots = torch.arange(N + 1)[constraint.knots].tolist()
+    except (AttributeError, IndexError, TypeError) as error:
+        raise InputError(f"{name}.knots", f"some of 0..{N}", getattr(constraint, "knots", "none")) from error
+    if not knots:
+        raise InputError(f"{name}.knots", "at least one knot", "none")
+
+    def value(index: Tensor, X: Tensor, U: Tensor) -> Tensor:
+        rows = constraint.take(index).value(X, U)
+        if rows.dim() != 3 or tuple(rows.shape[:2]) != (1, len(knots)):
+            raise InputError(f"{name}.value", f"rows (1, {len(knots)}, p)", tuple(rows.shape))
+        return rows
+
+    X, U = problem.x0.new_zeros(1, N + 1, n), problem.x0.new_zeros(1, N, m)
+    own = own_tensors(constraint)
+    return Span(Traced(name, value, X, U, own=own), own, n, m, N + 1, N, knots)
+
+
+def _code(knot: Knot, name: str) -> str:
+    import casadi as ca
+
+    inputs = [knot.x, knot.u, knot.numbers]
+    slopes = ca.sparsify(ca.jacobian(knot.rows, ca.vertcat(knot.x, knot.u), {"allow_reverse": False}))
+    rows, columns = slopes.sparsity().get_triplet()
+    nonzeros: list[Any] = slopes.nonzeros()
+    code = [
+        emit.emit(f"tgco_{name}_rows", ca.Function("rows", inputs, [knot.rows])),
+        emit.emit(f"tgco_{name}_slopes", ca.Function("slopes", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)])),
+        f"static inline void tgco_{name}_add(",
+        "    const V *x, const V *u, const V *p, const V *by_c, const V *by_cc, V *g, V *H) {",
+        f"    V e[{max(1, len(rows))}];",
+        f"    tgco_{name}_slopes(x, u, p, e);",
+    ]
+    places = sorted(zip(rows, columns, range(len(rows)), strict=True))
+    for row, column, i in places:
+        code.append(f"    g[{column}] += e[{i}] * by_c[{row}];")
+        for other, later, j in places:
+            if other == row and later >= column:
+                code.append(f"    H[{column} * (NX + NU) + {later}] += e[{i}] * by_cc[{row}] * e[{j}];")
+    return "\n".join([*code, "}"])

@@ -1,0 +1,157 @@
+"""C of a traced cost: value, gradient and Hessian of a stage and of the last knot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.costs.base import Cost, ScaledCost, ShiftedCost
+from torchgco.native.codegen import emit
+from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
+from torchgco.problem.problem import Problem
+from torchgco.tracing import Traced, own_tensors
+
+
+@dataclass(frozen=True)
+class CostSource:
+    """The generated code that traced.c describes; a problem's cost is this cost times a factor."""
+
+    stage: KnotSource
+    last: KnotSource
+
+    @property
+    def code(self) -> str:
+        return f"{self.stage.code}\n{self.last.code}"
+
+
+def unscaled(problem: Problem) -> tuple[Cost, Tensor, Tensor]:
+    """The cost of a problem without the factors of a ScaledCost, their product (B,), and the shift per stage (B,)."""
+    # A cost that overrides `scaled` may have another form once scaled, so it is always scaled here, if only by 1.
+    factor, shift = problem.x0.new_ones(problem.B), problem.x0.new_zeros(problem.B)
+    cost = problem.cost.scaled(factor)
+    while isinstance(cost, (ScaledCost, ShiftedCost)):
+        if isinstance(cost, ScaledCost):
+            cost, factor = cost.cost, factor * cost.factor
+        else:
+            cost, shift = cost.cost, shift + factor * cost.shift
+    return cost, factor, shift
+
+
+def trace_cost(problem: Problem) -> CostSource:
+    """The C of a problem's cost, taken from the cache folder if it was made before.
+
+    Derivatives are exact, or those of the cost's own `expand`.
+
+    Raises:
+        InputError: a part that can't be traced, holds an operation without a counterpart, or joins several knots.
+    """
+    cost, *_ = unscaled(problem)
+    if type(cost).total is not Cost.total:
+        raise InputError(_named("total", cost), "the sum of stage and terminal costs for native kernels", "its own")
+    own = None if type(cost).expand is Cost.expand else problem.n + 1 + problem.m
+    stage, last = spans_of_cost(problem)
+    return CostSource(
+        knot_source("stage", stage, partial(_code, "stage", own), __file__),
+        knot_source("last", last, partial(_code, "last", own), __file__),
+    )
+
+
+def cost_numbers(problem: Problem, source: CostSource) -> tuple[Tensor, Tensor, Tensor]:
+    """The arrays of traced.c: factor and shift (B, 1, 2), and the numbers (B|1, K|1, count) of stages and last knot."""
+    cost, factor, shift = unscaled(problem)
+    own = own_tensors(cost)
+    stage = source.stage.numbers(problem.B, own, lambda: spans_of_cost(problem)[0])
+    last = source.last.numbers(problem.B, own, lambda: spans_of_cost(problem)[1])
+    return torch.stack((factor, shift), dim=-1).unsqueeze(1), stage, last
+
+
+def spans_of_cost(problem: Problem) -> tuple[Span, Span]:
+    """Stages and last knot, traced: the value, followed by the block (s, s) of the cost's own `expand`, if any."""
+    (cost, *_), N, n, m = unscaled(problem), problem.N, problem.n, problem.m
+    own = own_tensors(cost)
+
+    def stage(i: Tensor, X: Tensor, U: Tensor) -> Tensor:
+        part = cost.take(i)
+        value = part.stage(X, U, torch.arange(N))
+        if tuple(value.shape) != (1, N):
+            raise InputError(_named("stage", cost), f"costs (1, {N}) of states (1, {N}, {n})", tuple(value.shape))
+        return _with_blocks(part, value, torch.cat((X, X.new_zeros(1, 1, n)), dim=1), U, slice(0, N))
+
+    def last(i: Tensor, X: Tensor, U: Tensor) -> Tensor:
+        part = cost.take(i)
+        value = part.terminal(X[:, 0])
+        if tuple(value.shape) != (1,):
+            raise InputError(_named("terminal", cost), f"costs (1,) of states (1, {n})", tuple(value.shape))
+        X = torch.cat((X.new_zeros(1, N, n), X), dim=1)
+        return _with_blocks(part, value.unsqueeze(-1), X, X.new_zeros(1, N, m), slice(N, N + 1))
+
+    def span(name: str, function: Callable[..., Tensor], states: int, controls: int) -> Span:
+        examples = problem.x0.new_zeros(1, states, n), problem.x0.new_zeros(1, controls, m)
+        traced = Traced(_named(name, cost), function, *examples, own=own)
+        return Span(traced, own, n, m, states, controls, range(states))
+
+    return span("stage", stage, N, N), span("terminal", last, 1, 0)
+
+
+def _with_blocks(part: Cost, value: Tensor, X: Tensor, U: Tensor, knots: slice) -> Tensor:
+    """Values (1, K) followed by what the cost's own `expand` writes at these knots, (1, K, 1 [+ s * s])."""
+    value = value.unsqueeze(-1)
+    if type(part).expand is Cost.expand:
+        return value
+    s = X.shape[-1] + 1 + U.shape[-1]
+    H = X.new_zeros(1, X.shape[1], s, s)
+    part.expand(X, U, H)
+    return torch.cat((value, H[:, knots].flatten(2)), dim=-1)
+
+
+def _named(method: str, cost: Cost) -> str:
+    return f"cost.{method} ({type(cost).__name__})"
+
+
+def _code(name: str, own: int | None, knot: Knot, _: str) -> str:
+    import casadi as ca
+
+    inputs, value = [knot.x, knot.u, knot.numbers], knot.rows[0]
+    gradient, hessian = _derivatives(knot) if own is None else _blocks(knot, own)
+    size = knot.x.numel() + knot.u.numel()
+    slopes = [(i, gradient[i]) for i in range(size) if not gradient[i].is_zero()]
+    curvatures = [
+        (i * size + j, hessian[i, j]) for i in range(size) for j in range(i, size) if not hessian[i, j].is_zero()
+    ]
+    places, entries = [[part[at] for part in (*slopes, *curvatures)] for at in (0, 1)]
+    column = ca.cse(ca.densify(ca.vertcat(ca.SX(0, 1), *entries)))
+    return "\n".join(
+        [
+            emit.emit(f"tgco_{name}_value", ca.Function("value", inputs, [ca.densify(value)])),
+            emit.emit(f"tgco_{name}_entries", ca.Function("entries", inputs, [column])),
+            f"static const int tgco_{name}_places[] = {{{', '.join(map(str, places or [0]))}}};",
+            f"#define {name.upper()}_SLOPES {len(slopes)}",
+            f"#define {name.upper()}_ENTRIES {len(entries)}",
+        ]
+    )
+
+
+def _derivatives(knot: Knot) -> tuple[Any, Any]:
+    """Gradient (n+m) and Hessian (n+m, n+m)."""
+    import casadi as ca
+
+    z, forward = ca.vertcat(knot.x, knot.u), {"allow_reverse": False}
+    # Forward mode only: in reverse mode, a NaN of the branch not taken would come through as 0 * NaN.
+    gradient = ca.jacobian(knot.rows[0], z, forward).T
+    return gradient, ca.jacobian(gradient, z, forward)
+
+
+def _blocks(knot: Knot, s: int) -> tuple[Any, Any]:
+    """Gradient and Hessian from a block (s, s) in the order [x, 1, u] that follows the value, row by row."""
+    import casadi as ca
+
+    n = knot.x.numel()
+    block = ca.reshape(knot.rows[1:], s, s).T
+    z = [i for i in range(s) if i != n]
+    return block[z, n], block[z, z]

@@ -1,0 +1,140 @@
+"""C of a model's step and its Jacobian, made from the model's own PyTorch code."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.dynamics import Dynamics
+from torchgco.native import store
+from torchgco.native.codegen import emit
+from torchgco.tracing import Traced, arrays, operations, own_tensors
+
+STEP, JACOBIAN = "tgco_step", "tgco_jacobian"
+
+
+@dataclass(frozen=True)
+class DynamicsSource:
+    """A model in C, for the prelude of `emit`, with x (n), u (m), and a problem's own numbers p (count) in vectors V:
+
+        static inline void tgco_step(const V *restrict x, const V *restrict u, const V *restrict p,
+                                     V *restrict x_next)       n
+        static inline void tgco_jacobian(the same three, V *restrict entries)      computed
+
+    No output may overlap an input. [fx, fu] (n, n+m) is zero except at `rows`, `columns`, listed column by column.
+    Nonzero i is `values[i]` where `places[i]` is -1, else `entries[places[i]]`.
+    """
+
+    n: int
+    m: int
+    count: int
+    code: str
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+    places: tuple[int, ...]
+    values: tuple[float, ...]  # 0.0 where the entry is computed
+    key: str  # says what `code` computes, the same in every process
+    traced: Traced = field(repr=False, compare=False)
+    own: list[Tensor] = field(repr=False, compare=False)  # the model's tensors per problem
+
+    @property
+    def computed(self) -> int:
+        """Number of the Jacobian's entries that `tgco_jacobian` writes."""
+        return sum(place >= 0 for place in self.places)
+
+    def parameters(self, index: Tensor, of: Dynamics | None = None) -> Tensor:
+        """The own numbers (B, count) float64 of the problems in `index` (B,) int64, on its device.
+
+        They belong to the traced model, or to `of`, a model with the same step such as `take` returns.
+        """
+        if of is None or self.count == 0:
+            return self.traced.parameters_of(index)
+        traced = self.traced.rebound(self.own, own_tensors(of), len(index))
+        return (traced or trace_dynamics(of, self.n, self.m, device=index.device).traced).parameters_of(index)
+
+
+def trace_dynamics(
+    dynamics: Dynamics,
+    n: int | None = None,
+    m: int | None = None,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+) -> DynamicsSource:
+    """The C of `dynamics.step`, taken from the cache folder if it was made before.
+
+    Tensors in `per_element` and `batched` are numbers of each problem; all others, including those that a function
+    closes over, become constants in the code.
+
+    Args:
+        dynamics: of the whole batch.
+        n, m: numbers of states and controls, by default the model's own.
+        dtype, device: of the problem's tensors.
+
+    Raises:
+        InputError: the step can't be traced, or holds an operation without a counterpart.
+    """
+    n, m = n or dynamics.n, m or dynamics.m
+    x, u = (torch.zeros(1, size, dtype=dtype, device=device) for size in (n, m))
+    own = own_tensors(dynamics)
+    traced = Traced("dynamics.step", lambda i, x, u: dynamics.take(i).step(x, u), x, u, own=own)
+    parts = store.made(("model", traced.fingerprint(), *makers()), lambda _: _made(traced, n, m))
+    lists = {name: tuple(parts.content[name]) for name in ("rows", "columns", "places", "values")}
+    return DynamicsSource(n, m, traced.count, parts.content["code"], **lists, key=parts.key, traced=traced, own=own)
+
+
+def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:
+    """The parts of a DynamicsSource that take CasADi to make."""
+    import casadi as ca
+
+    x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", traced.count)
+    ahead = traced(elements(p), elements(x)[None], elements(u)[None]).reshape(-1)
+    ahead = ca.densify(ca.vertcat(*ahead))
+    # Forward mode only, as `torch.func.jvp`: reverse mode would let a NaN of the branch not taken through as 0 * NaN.
+    jacobian = ca.sparsify(ca.jacobian(ahead, ca.vertcat(x, u), {"allow_reverse": False}))
+    step, jacobian = ca.cse([ahead, jacobian])
+    rows, columns = jacobian.sparsity().get_triplet()
+    entries: list[Any] = jacobian.nonzeros()
+    fixed: list[bool] = [entry.is_constant() for entry in entries]
+    places = np.where(fixed, -1, np.cumsum(np.logical_not(fixed)) - 1)
+    changing = ca.vertcat(ca.SX(0, 1), *(entry for entry, is_fixed in zip(entries, fixed, strict=True) if not is_fixed))
+    code = [
+        emit.emit(name, ca.Function(name, [x, u, p], [ca.densify(result)]))
+        for name, result in ((STEP, step), (JACOBIAN, changing))
+    ]
+    return {
+        "code": "\n".join(code),
+        "rows": list(rows),
+        "columns": list(columns),
+        "places": places.tolist(),
+        "values": [float(entry) if is_fixed else 0.0 for entry, is_fixed in zip(entries, fixed, strict=True)],
+    }
+
+
+def elements(column: Any) -> np.ndarray:
+    """The scalars of a column, (size,) objects."""
+    elements = np.empty(column.numel(), dtype=object)
+    for i in range(column.numel()):
+        elements[i] = column[i]
+    return elements
+
+
+@cache
+def makers(*more: str) -> Sequence[str]:
+    """Versions of CasADi and PyTorch and the texts of the files that generate code, which cached code depends on."""
+    files = (operations.__file__, arrays.__file__, emit.__file__, __file__, *more)
+    try:
+        casadi = version("casadi")
+    except PackageNotFoundError:
+        casadi = ""
+    try:
+        return (casadi, torch.__version__, *(Path(str(name)).read_text() for name in files))
+    except OSError:  # in an archive, say; then the package's version stands for them
+        return (casadi, torch.__version__, version("torchgco"))

@@ -1,0 +1,97 @@
+"""C over vectors whose lanes are problems, from the instructions of a CasADi function of scalar expressions.
+
+A file that holds such code defines REAL (double or float) and LANES (a power of two), then PRELUDE, then the functions.
+No operation mixes lanes: a problem's bits don't depend on the content of other lanes.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import casadi as ca
+
+PRELUDE = (Path(__file__).parents[1] / "c" / "lanes.h").read_text()
+# Functions of the prelude, on each lane.
+_OF_ONE = (
+    "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh",
+    "acosh", "atanh", "erf", "sqrt", "floor", "ceil", "fabs", "sign",
+)  # fmt: skip
+_OF_TWO = ("pow", "fmod", "atan2", "hypot", "remainder", "copysign", "fmin", "fmax")
+
+
+def emit(name: str, function: ca.Function) -> str:
+    """`static inline void NAME(const V *restrict in0, ..., V *restrict out0, ...)`, as straight-line code.
+
+    An input is an array of its entries, an output one of its nonzeros in the order of its sparsity; outputs overlap
+    nothing else. A choice ignores the branch not taken, NaN included; minimum and maximum are C's fmin and fmax.
+
+    Args:
+        name: of the C function.
+        function: of scalar expressions (SX).
+
+    Raises:
+        ValueError: `function` isn't an SX function, or holds an operation without a counterpart in C.
+    """
+    if not function.is_a("SXFunction"):
+        raise ValueError(f"{name}: expected a CasADi function of scalar expressions, got {function.class_name()}")
+    arguments = [f"const V *restrict in{i}" for i in range(function.n_in())]
+    arguments += [f"V *restrict out{i}" for i in range(function.n_out())]
+    lines = [_statement(function, k) for k in range(function.n_instructions())]
+    work = ", ".join(f"w{i}" for i in range(function.sz_w()))
+    declared = [f"V {work};"] if work else []
+    body = "\n".join(f"    {line}" for line in (*declared, *lines))
+    return f"static inline void {name}({', '.join(arguments)}) {{\n{body}\n}}\n"
+
+
+def _statement(function: ca.Function, k: int) -> str:
+    """One instruction; w are places of the work vector, each used for several values in turn."""
+    at, operation = _codes(), function.instruction_id(k)
+    read, written = function.instruction_input(k), function.instruction_output(k)
+    if operation == at["OUTPUT"]:
+        return f"out{written[0]}[{written[1]}] = w{read[0]};"
+    if operation == at["INPUT"]:
+        value = f"in{read[0]}[{read[1]}]"
+    elif operation == at["CONST"]:
+        value = f"SET({literal(function.instruction_constant(k))})"
+    elif operation in _templates():
+        value = _templates()[operation].format(*(f"w{i}" for i in read))
+    else:
+        (meant,) = (word for word, code in at.items() if code == operation)
+        raise ValueError(f"{function.name()}: no counterpart in C for CasADi's operation {meant}")
+    return f"w{written[0]} = {value};"
+
+
+def literal(value: float) -> str:
+    """A number as a literal of C, exact to the last bit."""
+    if math.isfinite(value):
+        return float(value).hex()
+    return '__builtin_nan("")' if math.isnan(value) else f"{'-' if value < 0 else ''}__builtin_inf()"
+
+
+_OPERATORS = {
+    "ASSIGN": "{0}", "LIFT": "{0}", "ADD": "{0} + {1}", "SUB": "{0} - {1}", "MUL": "{0} * {1}", "DIV": "{0} / {1}",
+    "NEG": "-{0}", "SQ": "{0} * {0}", "TWICE": "{0} + {0}", "INV": "SET(1.0) / {0}",
+    "LT": "tgco_truth({0} < {1})", "LE": "tgco_truth({0} <= {1})", "EQ": "tgco_truth({0} == {1})",
+    "NE": "tgco_truth({0} != {1})", "NOT": "tgco_truth(~tgco_is({0}))",
+    "AND": "tgco_truth(tgco_is({0}) & tgco_is({1}))", "OR": "tgco_truth(tgco_is({0}) | tgco_is({1}))",
+    "IF_ELSE_ZERO": "tgco_if(tgco_is({0}), {1})", "CONSTPOW": "tgco_pow({0}, {1})",
+    **{name.upper(): f"tgco_{name}({{0}})" for name in _OF_ONE},
+    **{name.upper(): f"tgco_{name}({{0}}, {{1}})" for name in _OF_TWO},
+}  # fmt: skip
+
+
+@cache
+def _codes() -> dict[str, int]:
+    """CasADi's numbers for operations."""
+    import casadi
+
+    return {name.removeprefix("OP_"): getattr(casadi, name) for name in dir(casadi) if name.startswith("OP_")}
+
+
+@cache
+def _templates() -> dict[Any, str]:
+    return {code: _OPERATORS[name] for name, code in _codes().items() if name in _OPERATORS}

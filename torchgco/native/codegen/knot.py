@@ -1,0 +1,172 @@
+"""The function of one knot, found in a traced function of whole trajectories: PyTorch code sees the shapes that it is
+written for, and C works knot by knot.
+
+Values that PyTorch computes from k (a reference for each knot, say) become the knot's own numbers; nothing else may
+differ from knot to knot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.native import store
+from torchgco.native.codegen.dynamics import elements, makers
+from torchgco.tracing import Traced
+
+
+@dataclass(frozen=True)
+class Span:
+    """A traced function of X (1, states, n), U (1, controls, m) whose rows (1, K[, p]) belong to K `knots`.
+
+    `own` are the tensors that may differ from problem to problem.
+    """
+
+    traced: Traced
+    own: Sequence[Tensor]
+    n: int
+    m: int
+    states: int
+    controls: int
+    knots: Sequence[int]
+
+
+@dataclass(frozen=True)
+class Knot:
+    """CasADi expressions: rows (p) of x (n), u (m) and a knot's numbers (count)."""
+
+    x: Any
+    u: Any
+    numbers: Any
+    rows: Any
+
+
+@dataclass(frozen=True)
+class KnotSource:
+    """C of one knot's rows (size), and where its numbers come from.
+
+    `places` (K|1, count) are the numbers' positions in a problem's own numbers followed by the constants of `span`.
+    """
+
+    code: str
+    key: str  # says what `code` computes, the same in every process
+    size: int
+    places: Tensor = field(compare=False)
+    span: Span = field(repr=False, compare=False)
+
+    @cached_property
+    def shared(self) -> Tensor | None:
+        """The numbers (1, K|1, count) where none differs from problem to problem."""
+        fixed = torch.from_numpy(self.span.traced.constants)
+        at = self.places - self.span.traced.count
+        return None if bool((at < 0).any()) else fixed[at].unsqueeze(0)
+
+    def numbers(self, B: int, own: Sequence[Tensor], again: Callable[[], Span]) -> Tensor:
+        """The numbers (B|1, K|1, count) of B problems of this form, whose own tensors are `own`.
+
+        Args:
+            again: traces these problems, where a new trace is needed.
+
+        Raises:
+            InputError: the problems have another function.
+        """
+        if self.shared is not None:
+            return self.shared
+        traced = self.span.traced.rebound(self.span.own, own, B)
+        if traced is None:
+            traced = again().traced
+            if traced.fingerprint() != self.span.traced.fingerprint():
+                raise InputError(traced.field, "the same operations for all subsets of a batch", "others")
+        count, fixed = traced.count, torch.from_numpy(traced.constants)
+        each = traced.parameters_of(torch.arange(B))[:, self.places.clamp(max=count - 1)]
+        return torch.where(self.places < count, each, torch.cat((fixed.new_zeros(count), fixed))[self.places])
+
+
+def knot_source(kind: str, span: Span, code_of: Callable[[Knot, str], str], *files: str) -> KnotSource:
+    """The C that `code_of` makes of a knot and a key, taken from the cache folder if it was made before.
+
+    Args:
+        kind: the word of the key that names the kind of code.
+        files: files on whose texts the code depends.
+
+    Raises:
+        InputError: an operation without a counterpart; rows that join knots, or whose operations differ between knots.
+    """
+    shape = str((span.n, span.m, span.states, span.controls, list(span.knots)))
+
+    def make(key: str) -> dict[str, Any]:
+        knot, places = _one_knot(span)
+        return {"code": code_of(knot, key[:16]), "size": knot.rows.numel(), "places": places}
+
+    key, parts = store.made((kind, shape, span.traced.fingerprint(), *makers(__file__, *files)), make)
+    places = torch.tensor(parts["places"], dtype=torch.int64).reshape(len(parts["places"]), -1)
+    return KnotSource(parts["code"], key[:16], parts["size"], places, span)
+
+
+def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
+    """The function that all knots share, and the places (K|1, count) of each knot's numbers."""
+    import casadi as ca
+
+    traced, count = span.traced, span.traced.count
+    constants = traced.constants
+    X, U = ca.SX.sym("X", span.states * span.n), ca.SX.sym("U", span.controls * span.m)
+    # Constants are symbols until it is known which ones differ: a 0 or 1 among them would change its knot's form.
+    numbers = ca.SX.sym("p", count + len(constants))
+    each = elements(numbers)
+    found = traced(
+        each[:count],
+        elements(X).reshape(1, span.states, span.n),
+        elements(U).reshape(1, span.controls, span.m),
+        constants=each[count:],
+    ).reshape(len(span.knots), -1)
+    functions, places, first = [], [], None
+    for k, row in zip(span.knots, found, strict=True):
+        x = X[k * span.n : (k + 1) * span.n]
+        u = U[k * span.m : (k + 1) * span.m] if k < span.controls else ca.SX.sym("u", span.m)
+        column = ca.densify(ca.vertcat(ca.SX(0, 1), *row))
+        functions.append(ca.Function("knot", [x, u, numbers], [column], {"allow_free": True}))
+        if functions[-1].has_free():
+            raise InputError(traced.field, "rows that read their own knot alone", f"rows of knot {k} that read others")
+        form, used = _form(functions[-1])
+        places.append(used)
+        first = first or form
+        if form != first:
+            raise InputError(traced.field, "the same operations at every knot", f"others at knot {k}")
+    differ = [len(set(column)) > 1 for column in zip(*places, strict=True)]
+    own = [i for i, place in enumerate(places[0]) if place < count or differ[i]]
+    x, u, p = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m), ca.SX.sym("p", len(own))
+    values: list[Any] = [0.0] * count + constants.tolist()
+    for i, place in enumerate(own):
+        values[places[0][place]] = p[i]
+    rows = functions[0](x, u, ca.vertcat(ca.SX(0, 1), *values))
+    chosen = [[used[i] for i in own] for used in (places if any(differ) else places[:1])]
+    return Knot(x, u, p, rows), chosen
+
+
+def _form(function: Any) -> tuple[list[tuple], list[int]]:
+    """The instructions of a function (x, u, numbers), its numbers renamed in order of first use, and that order."""
+    reads, holds = _operations()
+    turn: dict[int, int] = {}
+    form: list[tuple] = []
+    for i in range(function.n_instructions()):
+        operation, read = function.instruction_id(i), tuple(function.instruction_input(i))
+        if operation == reads and read[0] == 2:
+            read = (2, turn.setdefault(read[1], len(turn)))
+        constant = function.instruction_constant(i) if operation == holds else 0.0
+        form.append((operation, read, tuple(function.instruction_output(i)), np.float64(constant).tobytes()))
+    return form, list(turn)
+
+
+@cache
+def _operations() -> tuple[int, int]:
+    """CasADi's numbers for reading an input and for a constant."""
+    import casadi
+
+    return casadi.OP_INPUT, casadi.OP_CONST

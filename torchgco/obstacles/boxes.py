@@ -1,0 +1,297 @@
+"""Boxes as static obstacles, aligned with the axes or turned, sharp or rounded, in the plane and in space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.obstacles.base import Inflated, Obstacles, least
+from torchgco.obstacles.box_geometry import Cuboids, excess, from_quaternions, segment_distance, signed_distance
+from torchgco.obstacles.spheres import FAR, per_problem, vehicle_radius
+
+AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
+UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
+
+
+@dataclass(frozen=True)
+class Boxes(Constraint):
+    """2 s (r + r_veh - distance of p_k from box i) <= 0 for every box i, rounded by a radius r.
+
+    Distances count from the surface of the box before it is rounded, negative inside. The factor 2 s, with s = r +
+    r_veh + the smallest half side, makes c a squared length with the slope of a sphere of radius s: penalties then mean
+    the same for both kinds. Rows hold at the knots; between two knots a trajectory may cut a corner, which is rounded
+    by r + r_veh, by up to the square of its step over 8 (r + r_veh). `gco` solves such trajectories again with grown
+    boxes.
+
+    Args:
+        centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent boxes (padding); M may be 0, and an
+            empty list stands for (0, d).
+        half_sizes: as centers: half the lengths of the sides before rounding, m; NaN where the centre is. Above 0, or
+            at least 0 where the box has a radius above 0: a box with a single side above 0 is then a capsule.
+        vehicle_radius: number or (B,), m.
+        rotations: those that turn the axes of space into the box's sides. In the plane angles (M,) or (B, M), rad; in
+            space unit quaternions [w, x, y, z], (M, 4) or (B, M, 4). None: sides along the axes.
+        radii: (M,) or (B, M), m, at least 0; NaN where the centre is. The surface of a rounded box lies so far outside
+            its sides. Bodies touch at CONTACT_FACTOR (r + r_veh) from the sides. None: sharp boxes.
+        knots: default 1..N.
+
+    Raises:
+        InputError: on `Problem(...)`: wrong shapes, NaN centre with finite sides or radius, sides that aren't above 0
+            in a sharp box or are negative in a rounded one, negative radii, quaternions of another length than 1,
+            dynamics without a position in 2-D or 3-D.
+    """
+
+    centers: Any
+    half_sizes: Any
+    vehicle_radius: Any = 0.0
+    rotations: Any = None
+    radii: Any = None
+    knots: Any = None
+
+    sense: ClassVar[Sense] = "inequality"
+    geometric: ClassVar[bool] = True
+
+    def bind(self, dims: Dimensions) -> Constraint:
+        d = dimension(dims, "boxes.centers")
+        centers = tensor(self.centers, "boxes.centers", dims.like)
+        half = tensor(self.half_sizes, "boxes.half_sizes", dims.like)
+        centers, half = (z.reshape(0, d) if tuple(z.shape) == (0,) else z for z in (centers, half))
+        centers = per_problem(centers, "boxes.centers", 3, dims)
+        check_shape(centers, (dims.B, "M", d), "boxes.centers")
+        half = per_problem(half, "boxes.half_sizes", 3, dims)
+        check_shape(half, (dims.B, centers.shape[1], d), "boxes.half_sizes")
+        absent = torch.isnan(centers).all(-1)
+        if bool((absent.unsqueeze(-1) != torch.isnan(half)).any()) or not _finite(centers[~absent]):
+            raise InputError("boxes.half_sizes", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
+        radii = torch.where(absent, torch.nan, 0.0)
+        if self.radii is not None:
+            radii = own_radii(self.radii, "boxes.radii", absent, dims)
+        sized = torch.where(radii.unsqueeze(-1) > 0, half >= 0, half > 0) & torch.isfinite(half)
+        wrong = ~sized.all(-1) & ~absent
+        if bool(wrong.any()):
+            expected = "finite half sides above 0 m; 0 m too where the box is rounded"
+            raise InputError("boxes.half_sizes", expected, half[wrong][0].tolist())
+        axes = _axes(self.rotations, absent, d, dims)
+        vehicle = vehicle_radii(self.vehicle_radius, "boxes.vehicle_radius", dims)
+        knots = slice(1, dims.N + 1) if self.knots is None else self.knots
+        knots = resolve_knots(knots, dims.N, "boxes.knots", half.device)
+        return BoundBoxes.prepare(centers, half, axes, absent, radii, vehicle, knots, dims)
+
+
+@dataclass(frozen=True)
+class BoundBoxes(Obstacles):
+    """Boxes, sharp or rounded, shaped for their problem."""
+
+    centers: Tensor  # (B, M, d)
+    half_sizes: Tensor  # (B, M, d), before rounding
+    axes: Tensor  # (B, M, d, d): row i is the direction of side i
+    absent: Tensor  # (B, M) bool
+    vehicle_radius: Tensor  # (B,)
+    inflated_radii: Tensor  # (B, M): r + r_veh; 0 where absent
+    depths: Tensor  # (B, M): r + r_veh + the smallest half side; 0 where absent
+    knots: Any
+    position: slice
+    dt: float
+
+    batched: ClassVar[tuple[str, ...]] = (
+        "centers", "half_sizes", "axes", "absent", "vehicle_radius", "inflated_radii", "depths",
+    )  # fmt: skip
+
+    @classmethod
+    def prepare(
+        cls,
+        centers: Tensor,
+        half_sizes: Tensor,
+        axes: Tensor,
+        absent: Tensor,
+        radii: Tensor,
+        vehicle_radius: Tensor,
+        knots: Any,
+        dims: Dimensions,
+    ) -> BoundBoxes:
+        """Boxes of checked numbers (B, ...), whatever those of absent boxes are."""
+        assert dims.position is not None
+        half = torch.where(absent.unsqueeze(-1), 1.0, half_sizes)
+        inflated = torch.where(absent, 0.0, radii + vehicle_radius.unsqueeze(-1))
+        return cls(
+            torch.where(absent.unsqueeze(-1), 0.0, centers), half, axes, absent, vehicle_radius, inflated,
+            torch.where(absent, 0.0, inflated + half.amin(-1)), knots, dims.position, dims.dt or 0.0,
+        )  # fmt: skip
+
+    def bind(self, dims: Dimensions) -> Self:
+        return self
+
+    @property
+    def margins(self) -> Tensor:
+        return self.inflated_radii
+
+    @property
+    def sizes(self) -> Tensor:
+        return self.half_sizes.amin(-1) + self.inflated_radii
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self._rows(X[:, self.knots, self.position])
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        return self._rows(x[..., self.position])
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        n, at = X.shape[-1], self.position
+        cp = -2.0 * self.depths[:, None, :, None] * self._normals(X[:, self.knots, at])
+        gradient = (g.unsqueeze(-2) @ cp).squeeze(-2)
+        H[:, self.knots, at, n] += gradient
+        H[:, self.knots, n, at] += gradient
+        H[:, self.knots, at, at] += (h.unsqueeze(-1) * cp).mT @ cp
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """Depth beneath the full surface, (B, K, M), m."""
+        p = X[:, self.knots, self.position]
+        return (-self.signed_distance(p, self.times(X))).clamp(min=0.0)
+
+    def worst(self, X: Tensor, U: Tensor) -> Tensor:
+        parts = self._parts(X.shape[1])
+        return torch.cat([super(BoundBoxes, self.take(rows)).worst(X[rows], U[rows]) for rows in parts])
+
+    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
+        return torch.where(self.absent.unsqueeze(1), torch.inf, self._outside(p))
+
+    def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
+        parts = self._parts(a.shape[1])
+        return torch.cat([self.take(rows)._segment_clearance(a[rows], b[rows]) for rows in parts])
+
+    def _segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
+        boxes = self._cuboids()
+        begin, end, half = boxes.seen_from(a), boxes.seen_from(b), boxes.halves()
+        ends = signed_distance(begin, half), signed_distance(end, half)
+        # The distance changes no faster than the point moves. Of many pairs this shows that others are nearer.
+        radii, length = self.inflated_radii.unsqueeze(1), (b - a).square().sum(-1, keepdim=True).sqrt()
+        distance = 0.5 * (ends[0] + ends[1] - length) - radii
+        gap = (torch.minimum(*ends) - radii).masked_fill(self.absent.unsqueeze(1), torch.inf)
+        most = least(gap) + self.inflated_radii.amax(-1) if gap.numel() > 0 else least(gap)
+        i, e, j = ((distance <= most.view(-1, 1, 1)) & ~self.absent.unsqueeze(1)).nonzero(as_tuple=True)
+        start, stop = [x[i, e, j] for x in begin], [x[i, e, j] for x in end]
+        along, sides = [y - x for x, y in zip(start, stop, strict=True)], [h[i, 0, j] for h in half]
+        distance[i, e, j] = segment_distance(start, along, sides) - self.inflated_radii[i, j]
+        return distance.masked_fill(self.absent.unsqueeze(1), torch.inf)
+
+    def grown(self, by: Tensor) -> Self:
+        more = torch.where(self.absent, 0.0, by.unsqueeze(-1))
+        inflated, depths = self.inflated_radii + more, self.depths + more
+        return replace(self, vehicle_radius=self.vehicle_radius + by, inflated_radii=inflated, depths=depths)
+
+    def inflated(self) -> Inflated:
+        return Inflated(self.centers[:, :0], self.depths[:, :0], self._cuboids())
+
+    def _cuboids(self) -> Cuboids:
+        radius = torch.where(self.absent, FAR, self.inflated_radii)
+        return Cuboids(self.centers, self.axes, self.half_sizes, radius)
+
+    def _outside(self, p: Tensor) -> Tensor:
+        """Distances (B, K, M) of points p (B, K, d) from the full surfaces, as if none were absent."""
+        cuboids, distances = self._cuboids(), []
+        for rows in self._parts(p.shape[1]):
+            boxes = cuboids.rows(rows)
+            distances.append(signed_distance(boxes.seen_from(p[rows]), boxes.halves()))
+        return torch.cat(distances) - self.inflated_radii.unsqueeze(1)
+
+    def _parts(self, points: int) -> list[slice]:
+        """The problems of a batch, as many at a time as the processor's cache holds distances of `points` points."""
+        B, M = self.absent.shape
+        size = max(B, 1) if self.absent.is_cuda else max(1, AT_ONCE // max(1, points * M))
+        return [slice(first, first + size) for first in range(0, max(B, 1), size)]
+
+    def _rows(self, p: Tensor) -> Tensor:
+        """c (B, K, M) at points (B, K, d); an absent box is c = -1 everywhere."""
+        return torch.where(self.absent.unsqueeze(1), -1.0, -2.0 * self.depths.unsqueeze(1) * self._outside(p))
+
+    def _normals(self, p: Tensor) -> Tensor:
+        """Unit vectors (B, K, M, d) along which the distance grows: away from the box, inside to the nearest side.
+
+        On a box with sides of length 0, such as the axis of a capsule, to a side across which its length is 0.
+        """
+        boxes = self._cuboids()
+        local, half = boxes.seen_from(p), boxes.halves()
+        away = torch.stack(excess(local, half), dim=-1)
+        square = away.square().sum(-1, keepdim=True)
+        outside = away / torch.where(square > 0, square, 1.0).sqrt()
+        place = torch.stack(local, dim=-1)
+        inner = place.abs() - torch.stack(half, dim=-1)
+        # The first of the nearest sides; of two opposite sides at equal distance, the positive one.
+        side = torch.nn.functional.one_hot(inner.argmax(-1), place.shape[-1]).to(p.dtype)
+        inside = torch.where(place < 0, -side, side)
+        normal = torch.where(square > 0, outside, inside)
+        return (self.axes.unsqueeze(1) * normal.unsqueeze(-1)).sum(-2)
+
+
+def dimension(dims: Dimensions, name: str) -> int:
+    """d of the space that the vehicle moves in.
+
+    Raises:
+        InputError: dynamics without a position in 2-D or 3-D.
+    """
+    d = space_of(dims, name)
+    if d not in (2, 3):
+        raise InputError(name, "dynamics with a position in 2-D or 3-D", f"{d}-D")
+    return d
+
+
+def vehicle_radii(value: Any, name: str, dims: Dimensions) -> Tensor:
+    """The vehicle's radius in every problem, (B,).
+
+    Raises:
+        InputError: neither a number nor (B,), or negative.
+    """
+    vehicle = vehicle_radius(value, name, dims)[:, 0]
+    if not bool((vehicle >= 0).all()):
+        raise InputError(name, "a number of at least 0 m", float(vehicle.min()))
+    return vehicle.expand(dims.B).contiguous()
+
+
+def own_radii(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor:
+    """The obstacles' own radii (B, M), NaN where absent.
+
+    Raises:
+        InputError: another shape, NaN elsewhere or not there, infinite or negative radii.
+    """
+    radii = per_problem(value, name, 2, dims)
+    check_shape(radii, tuple(absent.shape), name)
+    if bool((torch.isnan(radii) != absent).any()):
+        raise InputError(name, "NaN exactly where the obstacle is absent", "NaN and numbers mixed")
+    wrong = ~absent & ~((radii >= 0) & torch.isfinite(radii))
+    if bool(wrong.any()):
+        raise InputError(name, "finite radii of at least 0 m", float(radii[wrong][0]))
+    return radii
+
+
+def _finite(values: Tensor) -> bool:
+    return bool(torch.isfinite(values).all())
+
+
+def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
+    """The directions (B, M, d, d) of the sides; those of absent boxes are the axes of space."""
+    straight = torch.eye(d, dtype=dims.like.dtype, device=dims.like.device).expand(*absent.shape, d, d)
+    if rotations is None:
+        return straight.contiguous()
+    if d == 2:
+        angle = per_problem(rotations, "boxes.rotations", 2, dims)
+        check_shape(angle, tuple(absent.shape), "boxes.rotations")
+        cos, sin = angle.cos(), angle.sin()
+        axes = torch.stack((torch.stack((cos, sin), dim=-1), torch.stack((-sin, cos), dim=-1)), dim=-2)
+    else:
+        turns = per_problem(rotations, "boxes.rotations", 3, dims)
+        check_shape(turns, (*absent.shape, 4), "boxes.rotations")
+        length = turns.square().sum(-1, keepdim=True).sqrt()
+        wrong = ((length - 1.0).abs() > UNIT_WITHIN).squeeze(-1) & ~absent
+        if bool(wrong.any()):
+            raise InputError("boxes.rotations", "unit quaternions [w, x, y, z]", turns[wrong][0].tolist())
+        axes = from_quaternions(turns / length)
+    axes = torch.where(absent[..., None, None], straight, axes)
+    if not _finite(axes):
+        raise InputError("boxes.rotations", "finite numbers for every box that is there", "NaN or infinity")
+    return axes.contiguous()

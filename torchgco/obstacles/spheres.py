@@ -1,0 +1,297 @@
+"""Spherical obstacles, static or moving.
+
+All obstacles of a trajectory are evaluated by one small matrix product per problem: with t = k dt and
+features q = [p, |p|^2, 1 | t p, t, t^2], the constraint c = R^2 - |p - o - t v|^2 is linear in q. Gradient and
+Gauss-Newton Hessian are products of the weights with moments of o and v in the same way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
+from torchgco.obstacles.base import Inflated, Obstacles, least
+
+FAR = -1e9  # the radius of an absent obstacle
+
+
+@dataclass(frozen=True)
+class Spheres(Constraint):
+    """(r_obs,i + r_veh)^2 - |p_obs,i(k) - p_k|^2 <= 0 for every obstacle i (Equation 52).
+
+    Args:
+        centers: (M, d), or (B, M, d) one set per problem, m. Rows of NaN are absent obstacles (padding); M may be 0,
+            and an empty list stands for (0, d).
+        radii: (M,) or (B, M), m; NaN where the centre is.
+        vehicle_radius: number or (B,), m.
+        velocities: as centers, m/s; the obstacle is at centers + velocities * k dt. None: static.
+        knots: default 1..N.
+
+    Raises:
+        InputError: on `Problem(...)`: wrong shapes, NaN centre with a finite radius, negative radius, dynamics
+            without a position of the obstacles' dimension.
+    """
+
+    centers: Any
+    radii: Any
+    vehicle_radius: Any = 0.0
+    velocities: Any = None
+    knots: Any = None
+
+    sense: ClassVar[Sense] = "inequality"
+    geometric: ClassVar[bool] = True
+
+    def bind(self, dims: Dimensions) -> Constraint:
+        centers = tensor(self.centers, "obstacles.centers", dims.like)
+        d = space_of(dims, "obstacles.centers")
+        assert dims.position is not None
+        centers = centers.reshape(0, d) if tuple(centers.shape) == (0,) else centers
+        centers = per_problem(centers, "obstacles.centers", 3, dims)
+        if centers.shape[-1] != d:
+            wanted = f"{d}-D centres, as the vehicle's position is {d}-D"
+            raise InputError("obstacles.centers", wanted, f"{centers.shape[-1]}-D centres")
+        M = centers.shape[1]
+        radii = per_problem(self.radii, "obstacles.radii", 2, dims)
+        check_shape(radii, (dims.B, M), "obstacles.radii")
+        vehicle = vehicle_radius(self.vehicle_radius, "obstacles.vehicle_radius", dims)
+        absent = torch.isnan(centers).all(-1)
+        if bool((absent != torch.isnan(radii)).any()) or bool(torch.isnan(centers[~absent]).any()):
+            raise InputError("obstacles.radii", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
+        if bool(torch.isinf(centers).any()) or bool(torch.isinf(radii).any()):
+            raise InputError("obstacles.centers", "finite centres and radii, or NaN where absent", "infinity")
+        if bool((radii < 0).any()) or bool((vehicle < 0).any()):
+            lowest = min(float(sizes.nan_to_num(0.0).min()) for sizes in (radii, vehicle) if sizes.numel() > 0)
+            raise InputError("obstacles.radii", "radii of at least 0 m", lowest)
+        velocities = None
+        if self.velocities is not None:
+            velocities = per_problem(self.velocities, "obstacles.velocities", 3, dims)
+            check_shape(velocities, (dims.B, M, d), "obstacles.velocities")
+            velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
+            if not bool(torch.isfinite(velocities).all()):
+                raise InputError("obstacles.velocities", "finite velocities of every sphere", "NaN or infinity")
+        if velocities is not None and dims.dt is None:
+            raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
+        knots = slice(1, dims.N + 1) if self.knots is None else self.knots
+        return BoundSpheres.prepare(
+            torch.where(absent.unsqueeze(-1), 0.0, centers),
+            torch.where(absent, 0.0, radii + vehicle),
+            velocities,
+            absent,
+            vehicle.expand(dims.B, 1)[:, 0].contiguous(),
+            resolve_knots(knots, dims.N, "obstacles.knots", radii.device),
+            dims.position,
+            dims.dt or 0.0,
+        )
+
+
+@dataclass(frozen=True)
+class BoundSpheres(Obstacles):
+    """Spheres shaped for their problem, with the matrices of the one-product evaluation prepared."""
+
+    centers: Tensor  # (B, M, d), at t = 0
+    inflated_radii: Tensor  # (B, M): r_obs + r_veh
+    velocities: Tensor | None  # (B, M, d)
+    absent: Tensor  # (B, M) bool
+    vehicle_radius: Tensor  # (B,)
+    knots: Any
+    position: slice
+    dt: float
+    weights: Tensor  # (B, r, M): c = q @ weights
+    first: Tensor  # (B, M, 1 + d [+ d]): 1, o, and v where they move
+    second: Tensor  # (B, M, d d [* 3]): o o', and o v' + v o', v v' where they move
+
+    batched: ClassVar[tuple[str, ...]] = (
+        "centers", "inflated_radii", "velocities", "absent", "vehicle_radius", "weights", "first", "second",
+    )  # fmt: skip
+
+    @classmethod
+    def prepare(
+        cls,
+        centers: Tensor,
+        inflated_radii: Tensor,
+        velocities: Tensor | None,
+        absent: Tensor,
+        vehicle_radius: Tensor,
+        knots: Any,
+        position: slice,
+        dt: float,
+    ) -> BoundSpheres:
+        o, one = centers, (~absent).to(centers.dtype).unsqueeze(-1)  # absent: left out of sums
+        rows = [2 * o, -one, (inflated_radii.square() - o.square().sum(-1)).unsqueeze(-1)]
+        first, second = [one, o], [_outer(o, o)]
+        if velocities is not None:
+            v = velocities
+            rows += [2 * v, -2 * (o * v).sum(-1, keepdim=True), -v.square().sum(-1, keepdim=True)]
+            first += [v]
+            second += [_outer(o, v) + _outer(v, o), _outer(v, v)]
+        weights = torch.cat(rows, dim=-1)
+        # An absent sphere is c = -1 everywhere: satisfied, with a multiplier that stays zero.
+        constant = torch.zeros_like(weights)
+        constant[..., o.shape[-1] + 1] = -1.0
+        weights = torch.where(absent.unsqueeze(-1), constant, weights).mT.contiguous()
+        return cls(
+            centers, inflated_radii, velocities, absent, vehicle_radius, knots, position, dt,
+            weights, torch.cat(first, dim=-1), torch.cat(second, dim=-1),
+        )  # fmt: skip
+
+    def bind(self, dims: Dimensions) -> Self:
+        return self
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        p = X[:, self.knots, self.position]
+        return torch.bmm(self._features(p, self._times(X)), self.weights)
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        p = x[..., self.position]
+        return torch.bmm(self._features(p, x.new_tensor(k * self.dt)), self.weights)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        # With c_p = -2 (p - o):  sum g c_p = 2 (sum g o - p sum g),  sum h c_p c_p' = 4 sum h (o - p)(o - p)'.
+        p = X[:, self.knots, self.position]
+        d, n, t = p.shape[-1], X.shape[-1], self._times(X)
+        g_sum, g_o = self._first_moments(g, t, d)
+        h_sum, h_o = self._first_moments(h, t, d)
+        h_oo = self._second_moment(h, t, d)
+        gradient = 2.0 * (g_o - p * g_sum)
+        cross = p.unsqueeze(-1) * h_o.unsqueeze(-2)
+        hessian = 4.0 * (h_oo - cross - cross.mT + h_sum.unsqueeze(-1) * _outer(p, p).unflatten(-1, (d, d)))
+        at = self.position
+        H[:, self.knots, at, n] += gradient
+        H[:, self.knots, n, at] += gradient
+        H[:, self.knots, at, at] += hessian
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """Penetration depth r_obs + r_veh - |p_obs - p|, m, by plain differences."""
+        return (self.inflated_radii.unsqueeze(1) - self.gaps(X)).clamp(min=0.0)
+
+    def gaps(self, X: Tensor) -> Tensor:
+        """Distance |p_obs,i(k) - p_k| (B, K, M), m; infinite where absent."""
+        return self._gaps(X[:, self.knots, self.position], self._times(X))
+
+    @property
+    def moving(self) -> bool:
+        return self.velocities is not None
+
+    @property
+    def margins(self) -> Tensor:
+        return self.inflated_radii
+
+    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
+        return self._gaps(p, t.unsqueeze(-1)) - self.inflated_radii.unsqueeze(1)
+
+    def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
+        o = self.centers.unsqueeze(1)
+        gap = _from_origin(a.unsqueeze(2) - o, (b - a).unsqueeze(2)) - self.inflated_radii.unsqueeze(1)
+        return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
+
+    def grown(self, by: Tensor) -> Self:
+        radii = torch.where(self.absent, self.inflated_radii, self.inflated_radii + by.unsqueeze(-1))
+        weights = self.weights.clone()
+        weights[:, self.centers.shape[-1] + 1] += radii.square() - self.inflated_radii.square()
+        return replace(self, inflated_radii=radii, vehicle_radius=self.vehicle_radius + by, weights=weights)
+
+    def later(self, t: float) -> BoundSpheres:
+        if self.velocities is None:
+            return self
+        return self.prepare(
+            self.centers + t * self.velocities, self.inflated_radii, self.velocities, self.absent, self.vehicle_radius,
+            self.knots, self.position, self.dt,
+        )  # fmt: skip
+
+    def inflated(self) -> Inflated | None:
+        if self.moving:
+            return None
+        return Inflated(self.centers, torch.where(self.absent, FAR, self.inflated_radii))
+
+    def chord_clearance(self, X: Tensor) -> Tensor:
+        o = self.centers.unsqueeze(1)
+        if self.velocities is not None:
+            t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device) * self.dt
+            o = o + t.view(1, -1, 1, 1) * self.velocities.unsqueeze(1)
+        away = X[:, :, None, self.position] - o
+        gap = _from_origin(away[:, :-1], away.diff(dim=1)) - CONTACT_FACTOR * self.inflated_radii.unsqueeze(1)
+        return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        """False where the vehicle touches an obstacle at the start, (B,)."""
+        gap = (x0[:, None, self.position] - self.centers).square().sum(-1).sqrt()
+        return ((gap >= CONTACT_FACTOR * self.inflated_radii) | self.absent).all(-1)
+
+    def _gaps(self, p: Tensor, t: Tensor) -> Tensor:
+        """Distances (B, K, M) of points p (B, K, d) from the centres at times t (K, 1); infinite where absent."""
+        o = self.centers.unsqueeze(1)
+        if self.velocities is not None:
+            o = o + t.view(1, -1, 1, 1) * self.velocities.unsqueeze(1)
+        gap = (p.unsqueeze(2) - o).square().sum(-1).sqrt()
+        return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
+
+    def _times(self, X: Tensor) -> Tensor:
+        """t = k dt at the constraint's knots, (K, 1)."""
+        return self.times(X).unsqueeze(-1)
+
+    def _features(self, p: Tensor, t: Tensor) -> Tensor:
+        q = [p, p.square().sum(-1, keepdim=True), torch.ones_like(p[..., :1])]
+        if self.velocities is not None:
+            t = t.expand(*p.shape[:-1], 1)
+            q += [t * p, t, t.square()]
+        return torch.cat(q, dim=-1)
+
+    def _first_moments(self, w: Tensor, t: Tensor, d: int) -> tuple[Tensor, Tensor]:
+        """sum w (B, K, 1) and sum w o(t) (B, K, d) over the obstacles, for weights w (B, K, M)."""
+        s = torch.bmm(w, self.first)
+        moving = 0.0 if self.velocities is None else t * s[..., 1 + d :]
+        return s[..., :1], s[..., 1 : 1 + d] + moving
+
+    def _second_moment(self, w: Tensor, t: Tensor, d: int) -> Tensor:
+        """sum w o(t) o(t)' (B, K, d, d)."""
+        s = torch.bmm(w, self.second)
+        if self.velocities is not None:
+            fixed, linear, square = s.split(d * d, dim=-1)
+            s = fixed + t * linear + t.square() * square
+        return s.unflatten(-1, (d, d))
+
+
+def _from_origin(a: Tensor, along: Tensor) -> Tensor:
+    """Distances (...) of the origin from segments that begin at a and go along, (..., d)."""
+    length = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny)
+    nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along
+    return nearest.square().sum(-1).sqrt()
+
+
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    """a b' of the last axis, flattened: (..., d * d)."""
+    return (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2)
+
+
+def vehicle_radius(value: Any, name: str, dims: Dimensions) -> Tensor:
+    """The vehicle's radius as (B, 1), or (1, 1) where all problems share it.
+
+    Raises:
+        InputError: neither a finite number nor one per problem.
+    """
+    radius = tensor(value, name, dims.like)
+    if radius.dim() > 1 or radius.numel() not in (1, dims.B) or not bool(torch.isfinite(radius).all()):
+        got = f"shape {tuple(radius.shape)}" if bool(torch.isfinite(radius).all()) else "NaN or infinity"
+        raise InputError(name, f"a number, or {dims.B} of them", got)
+    return radius.reshape(-1, 1)
+
+
+def per_problem(value: Any, name: str, dim: int, dims: Dimensions) -> Tensor:
+    """`value` with its batch axis, repeated for every problem where it came without one.
+
+    Raises:
+        InputError: not numbers, another number of axes than `dim` or `dim` - 1, or another batch.
+    """
+    given = tensor(value, name, dims.like)
+    if given.dim() == dim - 1:
+        given = given.unsqueeze(0).expand(dims.B, *given.shape)
+    if given.dim() != dim or given.shape[0] != dims.B:
+        raise InputError(name, f"one set for all, or {dims.B} sets", f"shape {tuple(given.shape)}")
+    return given.contiguous()

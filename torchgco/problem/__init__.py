@@ -1,0 +1,1 @@
+"""Problem: dynamics, cost, constraints and goal of a batch, joined and tried once."""

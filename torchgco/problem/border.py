@@ -1,0 +1,246 @@
+"""Checks of a user's code when a problem is made: shapes, rows of problems that stay apart, randomness, derivatives.
+
+A mistake that broadcasting or autodiff would hide ends here, in one line, and not as a wrong trajectory.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.autodiff import WithoutReading, gradients_at_once
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import MISTAKES, describe
+from torchgco.base.tree import is_users
+from torchgco.constraints.base import Constraint, FunctionConstraint
+from torchgco.costs.base import Cost
+from torchgco.dynamics.base import Dynamics
+
+OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
+LOST = 1e-2  # share of a derivative by which differences may disagree
+NOISE = 8.0  # times the rounding error of a difference, or its change with the step
+APART = "values of a problem that depend on its own row alone, and on values per problem in declared fields"
+
+
+def check_dynamics(dynamics: Dynamics, x0: Tensor) -> None:
+    """Check a user's model for problems that start at x0 (B, n).
+
+    Raises:
+        InputError: names the method, what was expected, and what it returned.
+    """
+    if not is_users(dynamics):
+        return
+    n, rows = dynamics.n, _ends(x0)
+    x, u = _states(x0, 3), _controls(x0, 3, dynamics.m)
+    for name in ("field", "step") if dynamics.is_integrated else ("step",):
+        method = lambda i, x, u, name=name: getattr(dynamics.take(i), name)(x, u)
+        wanted = f"{'derivatives' if name == 'field' else 'states'} (..., {n}) in {x0.dtype}, shaped as its states"
+        _check_values(f"dynamics.{name}", method, rows, (x[:, 0], u[:, 0]), (2, n), wanted)
+        _check_values(f"dynamics.{name}", method, rows, (x, u), (2, 3, n), wanted)
+    weights = 1.0 + 0.5 * _direction(x)
+    step = lambda x, u: (weights * dynamics.take(rows).step(x, u)).flatten(1).sum(-1)
+
+    def own(dx: Tensor, du: Tensor) -> Tensor:
+        fx, fu = dynamics.take(rows).jacobians(x, u)
+        ahead = (fx @ dx.unsqueeze(-1) + fu @ du.unsqueeze(-1)).squeeze(-1)
+        return (weights * ahead).flatten(1).sum(-1)
+
+    _check_slope("dynamics.step", step, x, u, None if type(dynamics).jacobians is Dynamics.jacobians else own)
+
+
+def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
+    """Check a user's cost for problems of N stages and m controls that start at x0 (B, n).
+
+    Raises:
+        InputError: as `check_dynamics`.
+    """
+    if not is_users(cost):
+        return
+    rows, X, U, k = _ends(x0), _states(x0, N + 1), _controls(x0, N, m), torch.arange(N)
+    wanted = f"a number in {x0.dtype} per state and control"
+    stage: Callable[..., Any] = lambda i, x, u, k=k: cost.take(i).stage(x, u, k)
+    _check_values("cost.stage", stage, rows, (X[:, :-1], U), (2, N), wanted)
+    _check_values("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, (X[:, 0], U[:, 0]), (2,), wanted)
+    _check_values("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, (X[:, -1],), (2,), wanted)
+
+    part = cost.take(rows)
+    if type(cost).expand is Cost.expand:
+        _check_slope("cost.stage", lambda x, u: part.stage(x, u, k).sum(-1), X[:, :-1], U)
+        _check_slope("cost.terminal", lambda x, u: part.terminal(x), X[:, -1], U[:, -1])
+        return
+
+    def own(dX: Tensor, dU: Tensor) -> Tensor:
+        H = _blocks(X, U)
+        part.expand(X, U, H)
+        return _along(H, dX, dU)
+
+    _check_slope("cost.expand", part.total, X, U, own)
+
+
+def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: int) -> None:
+    """Check a user's constraint, bound to problems of N stages and m controls that start at x0 (B, n).
+
+    Raises:
+        InputError: as `check_dynamics`.
+    """
+    if not is_users(constraint):
+        return
+    rows, X, U = _ends(x0), _states(x0, N + 1), _controls(x0, N, m)
+    value = lambda i, X, U: constraint.take(i).value(X, U)
+    K = len(torch.arange(N + 1)[constraint.knots])
+    if K == 0:
+        return
+    wanted = f"rows (2, {K}, p) in {x0.dtype} of two problems"
+    shape = _check_values(field, value, rows, (X, U), (2, K, None), wanted)
+    weights = 1.0 + 0.5 * _direction(X.new_empty(shape))
+
+    def own(dX: Tensor, dU: Tensor) -> Tensor:
+        H = _blocks(X, U)
+        constraint.take(rows).accumulate(X, U, weights, torch.zeros_like(weights), H)
+        return _along(H, dX, dU)
+
+    weighted = lambda X, U: (weights * value(rows, X, U)).flatten(1).sum(-1)
+    by_pytorch = type(constraint).accumulate in (Constraint.accumulate, FunctionConstraint.accumulate)
+    _check_slope(field, weighted, X, U, None if by_pytorch else own)
+
+
+def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint], x0: Tensor, N: int) -> None:
+    """Differentiate a user's parts as PyTorch's kernels do, for the first problem.
+
+    Raises:
+        InputError: names the part that `torch.func` can't differentiate.
+    """
+    first, wanted = slice(0, 1), "a function that torch.func can differentiate"
+    X, U = x0[first].unsqueeze(1).repeat(1, N + 1, 1), x0.new_zeros(1, N, dynamics.m)
+    if is_users(dynamics):
+        _called("dynamics.step", wanted, dynamics.take(first).jacobians, X[:, :-1], U)
+    if is_users(cost):
+        _called("cost", wanted, cost.take(first).expand, X, U, _blocks(X, U)[first])
+    for i, constraint in enumerate(constraints):
+        if is_users(constraint) and type(constraint).accumulate is not Constraint.accumulate:
+            part = constraint.take(first)
+            zero = torch.zeros_like(_called(f"constraints[{i}].value", wanted, part.value, X, U))
+            _called(f"constraints[{i}].value", wanted, part.accumulate, X, U, zero, zero, _blocks(X, U)[first])
+
+
+def _check_values(
+    field: str,
+    function: Callable[..., Any],
+    rows: Tensor,
+    arguments: tuple[Tensor, ...],
+    shape: tuple[int | None, ...],
+    wanted: str,
+) -> torch.Size:
+    """Check function(rows, *arguments) for two problems, together and each on its own; returns the values' shape."""
+    both = _called(field, wanted, function, rows, *arguments)
+    _check_tensor(field, both, shape, arguments[0].dtype, wanted)
+    again = _called(field, wanted, function, rows, *arguments)
+    if not torch.equal(both.nan_to_num(), again.nan_to_num()):
+        raise InputError(field, "the same values for the same arguments", "others at a second call: it draws at random")
+    scale = both.abs().nan_to_num(0.0, 0.0, 0.0).amax() if both.numel() > 0 else 0.0
+    near = torch.finfo(both.dtype).eps ** 0.5 * (1.0 + scale)
+    for i in (0, 1):
+        alone = _called(field, APART, function, rows[i : i + 1], *(z[i : i + 1] for z in arguments))
+        _check_tensor(field, alone, (1, *both.shape[1:]), both.dtype, APART)
+        if bool(((alone - both[i : i + 1]).abs() > near).any()):
+            raise InputError(field, APART, "other values for a problem alone than beside another one")
+    return both.shape
+
+
+def _check_tensor(field: str, value: Any, shape: tuple[int | None, ...], dtype: torch.dtype, wanted: str) -> None:
+    fits = isinstance(value, Tensor) and value.dim() == len(shape) and value.dtype == dtype
+    if not fits or any(want not in (None, got) for want, got in zip(shape, value.shape, strict=True)):
+        raise InputError(field, wanted, f"{describe(value)} where {_text(shape)} was due")
+
+
+def _text(shape: tuple[int | None, ...]) -> str:
+    return f"({', '.join('p' if size is None else str(size) for size in shape)}{',' if len(shape) == 1 else ''})"
+
+
+def _check_slope(
+    field: str,
+    function: Callable[[Tensor, Tensor], Tensor],
+    x: Tensor,
+    u: Tensor,
+    own: Callable[[Tensor, Tensor], Tensor] | None = None,
+) -> None:
+    """Compare derivatives of function(x, u) (2,) in two directions with differences, where two steps of these agree.
+
+    `own` (dx, du) is the derivative by the part's own code; None: by PyTorch, in reverse mode.
+    """
+    eps, readers = torch.finfo(x.dtype).eps, WithoutReading()
+    expected = "a function with derivatives by PyTorch, or the part's own, that agree with differences"
+    if own is None:
+        with readers, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # PyTorch's, about numbers read from tensors with gradients
+            gx, gu = _called(field, expected, gradients_at_once, function, x, u)
+        own = lambda dx, du: (gx * dx).flatten(1).sum(-1) + (gu * du).flatten(1).sum(-1)
+    # States and controls apart: the derivatives by one may be too large for a mistake in the others to be seen.
+    for dx, du in ((_steps(x), torch.zeros_like(u)), (torch.zeros_like(x), _steps(u))):
+        given, h = _called(field, expected, own, dx, du), eps ** (1.0 / 3.0)
+        along = lambda t, dx=dx, du=du: function(x + t * dx, u + t * du)
+        wide, close = ((along(t) - along(-t)) / (2.0 * t) for t in (h, 0.25 * h))
+        rounding = NOISE * eps * along(0.0).abs() / (0.25 * h)
+        unsure = NOISE * (wide - close).abs() + rounding + LOST * torch.maximum(given.abs(), close.abs())
+        wrong = ((given - close).abs() > unsure) & torch.isfinite(close)
+        if bool(wrong.any()):
+            b = wrong.nonzero()[0, 0]
+            lost = "".join(f"; Tensor.{name} may lose them" for name in sorted(readers.seen))
+            got, due = float(given[b]), float(close[b])
+            raise InputError(field, expected, f"{got:.4g} where differences give {due:.4g}{lost}")
+
+
+def _called(field: str, wanted: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return function(*arguments)
+    except InputError:
+        raise
+    except MISTAKES as error:
+        message = (str(error).splitlines() or [""])[0] or type(error).__name__
+        raise InputError(field, wanted, message) from error
+
+
+def _ends(x0: Tensor) -> Tensor:
+    """The first and the last problem, (2,) int64."""
+    return torch.tensor([0, x0.shape[0] - 1], device=x0.device)
+
+
+def _states(x0: Tensor, K: int) -> Tensor:
+    """States (2, K, n) close to the first and the last start; no two of them are equal."""
+    x = x0[_ends(x0)].unsqueeze(1).repeat(1, K, 1)
+    x = torch.where(torch.isfinite(x), x, torch.zeros_like(x))
+    return x + OFFSET * (1.0 + x.abs()) * (1.0 + 0.5 * _direction(x))
+
+
+def _controls(x0: Tensor, K: int, m: int) -> Tensor:
+    """Controls (2, K, m) close to zero; no two of them are equal."""
+    u = x0.new_zeros(2, K, m)
+    return u + OFFSET * (1.0 + 0.5 * _direction(u))
+
+
+def _direction(like: Tensor) -> Tensor:
+    """Numbers between -1 and 1 in the shape of `like`, without a pattern, the same in every process."""
+    place = torch.arange(1, like.numel() + 1, dtype=like.dtype, device=like.device)
+    return (place * 1.618).cos().reshape(like.shape)
+
+
+def _steps(z: Tensor) -> Tensor:
+    """A direction of differences, larger where the values are."""
+    return _direction(z) * (1.0 + z.abs())
+
+
+def _blocks(X: Tensor, U: Tensor) -> Tensor:
+    """Empty homogeneous blocks (2, N+1, s, s)."""
+    s = X.shape[-1] + 1 + U.shape[-1]
+    return X.new_zeros(2, X.shape[1], s, s)
+
+
+def _along(H: Tensor, dX: Tensor, dU: Tensor) -> Tensor:
+    """The derivative (2,) in a direction from the gradients in homogeneous blocks H (2, N+1, s, s)."""
+    n = dX.shape[-1]
+    by_x, by_u = H[..., :n, n], H[:, :-1, n + 1 :, n]
+    return (by_x * dX).flatten(1).sum(-1) + (by_u * dU).flatten(1).sum(-1)

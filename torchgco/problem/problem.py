@@ -1,0 +1,337 @@
+"""Problem: dynamics, cost and constraints of a batch, joined and validated once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.options import Count, Seconds, check_value
+from torchgco.base.shapes import MISTAKES, Dimensions, as_states, check_tensor, computing_on, describe
+from torchgco.base.tree import Rows, cast
+from torchgco.constraints.base import Constraint
+from torchgco.costs.base import Cost, ShiftedCost
+from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.integrators import Integrator
+from torchgco.obstacles.base import Obstacles, warn_of_small
+from torchgco.problem.border import check_constraint, check_cost, check_dynamics
+from torchgco.problem.goal import Goal
+from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
+
+
+@dataclass(frozen=True)
+class Problem:
+    """minimise J_var(X, U) subject to x_{k+1} = step(x_k, u_k), x_0 given, and the constraints: B problems at once.
+
+    Args:
+        dynamics, cost, constraints: the parts; values given per problem have the batch of x0.
+        x0: (B, n), fixes batch, device and dtype: float64 or float32, without gradients. Lists and arrays become a
+            tensor, a single state (n,) is a batch of one.
+        N: number of stages.
+        goal: where the last knot should lie. None: derived from the cost, around the position in `Cost.goal` (the
+            terminal reference of a quadratic cost) with 0.09 of the distance from the start as radius; no goal where
+            the cost names none.
+
+    Raises:
+        InputError: names the part at fault, what was expected and what was given. A start that is bad in one problem
+            (not finite, inside an obstacle) is no error: that problem ends with its own status.
+    """
+
+    dynamics: Dynamics
+    cost: Cost
+    constraints: Sequence[Constraint]
+    x0: Tensor
+    N: int
+    goal: Goal | None = None
+
+    # A cache for everything that depends only on the problems' form (native kernels, say), shared by all subsets of a
+    # batch.
+    form: ClassVar[dict[Any, Any]]
+
+    def __post_init__(self) -> None:
+        self._check_border()
+        with computing_on(self.x0.device):
+            self._bind()
+
+    def _bind(self) -> None:
+        dims = self._dimensions(self.x0)
+        object.__setattr__(self, "dynamics", self.dynamics.bind(dims))
+        self._check_dynamics()
+        object.__setattr__(self, "cost", self.cost.bind(dims))
+        object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
+        self._check_code(self.dynamics, self.cost, self.constraints)
+        for i, part in enumerate(self.constraints):
+            if isinstance(part, Obstacles):
+                warn_of_small(part, f"constraints[{i}]")
+        given = self.goal if self.goal is not None and not self.goal.assumed else None
+        goal = given.bind(dims) if given is not None else Goal.derived(self.cost.goal(self.x0), dims)
+        object.__setattr__(self, "goal", goal)
+        object.__setattr__(self, "form", {})
+
+    def _check_code(self, dynamics: Dynamics | None, cost: Cost | None, constraints: Sequence[Constraint]) -> None:
+        """Try what a user's code does; bound constraints."""
+        if dynamics is not None:
+            check_dynamics(dynamics, self.x0)
+        if cost is not None:
+            check_cost(cost, self.x0, self.N, self.m)
+        for i, constraint in enumerate(constraints):
+            name = getattr(constraint, "name", None)
+            field = f"{name}.function" if isinstance(name, str) else f"constraints[{i}].value"
+            check_constraint(constraint, field, self.x0, self.N, self.m)
+
+    def _dimensions(self, x0: Tensor, dynamics: Dynamics | None = None) -> Dimensions:
+        model = dynamics or self.dynamics
+        return Dimensions(x0.shape[0], self.N, self.n, self.m, getattr(model, "dt", None), model.position, x0)
+
+    @property
+    def B(self) -> int:
+        return self.x0.shape[0]
+
+    @property
+    def n(self) -> int:
+        return self.dynamics.n
+
+    @property
+    def m(self) -> int:
+        return self.dynamics.m
+
+    @property
+    def position(self) -> slice:
+        """The position's place in the state.
+
+        Raises:
+            InputError: dynamics without a position.
+        """
+        where = self.dynamics.position
+        if where is None:
+            raise InputError("dynamics.position", "a model with a position", type(self.dynamics).__name__)
+        return where
+
+    @property
+    def geometric(self) -> tuple[Constraint, ...]:
+        """The constraints on position that sampling and guidance consider."""
+        return tuple(c for c in self.constraints if c.geometric)
+
+    @cached_property
+    def start_is_clear(self) -> Tensor:
+        """Whether each problem starts outside its obstacles, (B,) bool."""
+        clear = torch.ones(self.B, dtype=torch.bool, device=self.x0.device)
+        for constraint in self.constraints:
+            clear &= constraint.start_is_clear(self.x0)
+        return clear
+
+    @cached_property
+    def cost_scale(self) -> CostScale:
+        """The unit of each problem's cost, above 0, and its constant; see `scale.cost_scale`."""
+        X, U = self.at_rest
+        s = self.n + 1 + self.m
+        H = self.x0.new_empty(self.B, self.N + 1, s, s)
+        self.cost.expand(X, U, H)
+        slopes, diagonal = H[..., self.n], H.diagonal(dim1=-2, dim2=-1)
+        z = [i for i in range(s) if i != self.n]
+        return self.scale_of(slopes[..., z], diagonal[..., z])
+
+    def scale_of(self, slopes: Tensor, curvatures: Tensor) -> CostScale:
+        """`cost_scale` from derivatives of the cost of staying at the start: gradients and the Hessians' diagonals.
+
+        Both are (B, N+1, n+m).
+        """
+        X, U = self.at_rest
+        total, changes = self.cost.total(X, U), None
+        if not isinstance(self.cost, BoundQuadratic):
+            goal = None if self.goal is None else self.goal.position
+            changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position)
+            changes = torch.maximum(changes, savings(slopes, curvatures))
+        return cost_scale(total, curvatures[:, :-1, self.n :], changes)
+
+    @property
+    def cost_unit(self) -> Tensor:
+        """The unit of each problem's cost, (B,)."""
+        return self.cost_scale.unit
+
+    @property
+    def at_rest(self) -> tuple[Tensor, Tensor]:
+        """States (B, N+1, n) that stay at the start, and controls (B, N, m) at rest."""
+        like = self.x0.new_zeros(self.B, self.N, self.m)
+        return self.x0.unsqueeze(1).repeat(1, self.N + 1, 1), self.cost.rest_controls(like)
+
+    def in_cost_units(self) -> Self:
+        """The same problems with costs divided by `cost_unit`, without a constant that dwarfs the rest.
+
+        No solver option then depends on the cost's scale or zero.
+        """
+        unit, constant = self.cost_scale
+        cost = self.cost.scaled(1.0 / unit)
+        if bool((constant != 0).any()):
+            cost = ShiftedCost(cost, constant / (unit * self.N))
+        return self._with({"cost": cost}, form=self.form)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The parts alone: native kernels stay in their process."""
+        return {f.name: getattr(self, f.name) for f in fields(self)} | {"form": {}}
+
+    def take(self, index: Rows) -> Self:
+        """The problems in `index` (int64, (B',), or a slice); a row may occur more than once."""
+        parts = {
+            "dynamics": self.dynamics.take(index),
+            "cost": self.cost.take(index),
+            "constraints": tuple(c.take(index) for c in self.constraints),
+            "x0": self.x0[index],
+            "goal": None if self.goal is None else self.goal.take(index),
+        }
+        return self._with(parts, form=self.form)
+
+    def renewed(self) -> Self:
+        """The same problems, with nothing kept that was computed from their parts."""
+        return self._with({})
+
+    def is_same(self, other: Problem) -> bool:
+        """Whether both have the very same parts."""
+        return all(getattr(self, f.name) is getattr(other, f.name) for f in fields(self))
+
+    def grown(self, by: Tensor) -> Self:
+        """The same problems with their obstacles grown by `by` (B,), m."""
+        return self._with({"constraints": tuple(c.grown(by) for c in self.constraints)}, form=self.form)
+
+    def started_at(
+        self,
+        x0: Tensor,
+        constraints: Sequence[Constraint],
+        cost: Cost | None = None,
+        dynamics: Dynamics | None = None,
+    ) -> Self:
+        """The same problems from other states x0 (B, n): for receding horizons.
+
+        Constraints are of the same kinds in the same order; cost and dynamics as they are where None is given.
+
+        Raises:
+            InputError: x0 of another shape, dtype or device, constraints of other kinds, or parts that don't fit.
+        """
+        x0 = as_states(x0)
+        check_tensor(x0, "x0")
+        if x0.shape != self.x0.shape or x0.dtype != self.x0.dtype or x0.device != self.x0.device:
+            raise InputError("x0", f"{self.x0.dtype} of shape {tuple(self.x0.shape)}", describe(x0))
+        _check_constraints(constraints)
+        if cost is not None and not isinstance(cost, Cost):
+            raise InputError("cost", "a Cost", _named(cost))
+        if dynamics is not None and not isinstance(dynamics, Dynamics):
+            raise InputError("dynamics", "a Dynamics", _named(dynamics))
+        if dynamics is not None and (dynamics.n, dynamics.m) != (self.n, self.m):
+            raise InputError("dynamics", f"{self.n} states and {self.m} controls", f"{dynamics.n} and {dynamics.m}")
+        with computing_on(x0.device):
+            model = self.dynamics if dynamics is None else dynamics.bind(self._dimensions(x0, dynamics))
+            dims = self._dimensions(x0, model)
+            bound = tuple(constraint.bind(dims) for constraint in constraints)
+            for i, part in enumerate(bound):
+                if not isinstance(part, Obstacles):
+                    continue
+                if part.position != dims.position or (part.moving and part.dt != dims.dt):
+                    expected = f"obstacles for steps of {dims.dt} s and the position in states {dims.position}"
+                    raise InputError(f"constraints[{i}]", expected, f"bound ones for {part.dt} s and {part.position}")
+            if [type(part) for part in bound] != [type(part) for part in self.constraints]:
+                kinds = ", ".join(type(part).__name__ for part in self.constraints)
+                raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in bound))
+            parts: dict[str, Any] = {"x0": x0, "constraints": bound}
+            if dynamics is not None:
+                parts["dynamics"] = model
+            if cost is not None:
+                parts["cost"] = cost.bind(dims)
+                if self.goal is None or self.goal.assumed:
+                    parts["goal"] = Goal.derived(parts["cost"].goal(x0), dims)
+            started = self._with(parts)
+            known = set(map(id, self.constraints))
+            new = [b for b, given in zip(bound, constraints, strict=True) if id(given) not in known]
+            started._check_code(parts.get("dynamics"), parts.get("cost"), new)
+        return started
+
+    def cast(self, dtype: torch.dtype) -> Self:
+        """The same problems in another precision."""
+        parts = {name: cast(getattr(self, name), dtype) for name in ("dynamics", "cost", "constraints", "x0", "goal")}
+        return self._with(parts)
+
+    def _with(self, parts: dict[str, object], form: dict[Any, Any] | None = None) -> Self:
+        # The parts are bound already: checking them again for every subset would cost more than a pass.
+        copy = object.__new__(type(self))
+        for f in fields(self):
+            object.__setattr__(copy, f.name, parts.get(f.name, getattr(self, f.name)))
+        object.__setattr__(copy, "form", {} if form is None else form)
+        return copy
+
+    def check_controls(self, U: Tensor, field: str = "U0") -> None:
+        """Raise InputError unless U is (B, N, m) of this problem's dtype and device."""
+        if not isinstance(U, Tensor) or tuple(U.shape) != (self.B, self.N, self.m):
+            got = tuple(U.shape) if isinstance(U, Tensor) else type(U).__name__
+            raise InputError(field, f"a tensor ({self.B}, {self.N}, {self.m})", got)
+        check_tensor(U, field, self.x0)
+
+    def _check_border(self) -> None:
+        # The bases themselves compute nothing.
+        for name, part, kind in (("dynamics", self.dynamics, Dynamics), ("cost", self.cost, Cost)):
+            if not isinstance(part, kind) or type(part) is kind:
+                raise InputError(name, f"a {kind.__name__}", _named(part))
+        for name in ("n", "m"):
+            check_value(getattr(self.dynamics, name, None), Count, f"dynamics.{name}")
+        object.__setattr__(self, "x0", as_states(self.x0))
+        if self.x0.dim() != 2 or not self.x0.is_floating_point():
+            raise InputError("x0", f"a floating tensor (B, {self.dynamics.n})", describe(self.x0))
+        if self.x0.shape[1] != self.dynamics.n or self.x0.shape[0] < 1:
+            raise InputError("x0", f"shape (B, {self.dynamics.n})", tuple(self.x0.shape))
+        check_tensor(self.x0, "x0")
+        if isinstance(self.N, bool) or not isinstance(self.N, int) or self.N < 1:
+            raise InputError("N", "at least one stage, an int", repr(self.N))
+        if not callable(self.cost.goal):
+            raise InputError("cost.goal", "a method, which no field may hide", type(self.cost.goal).__name__)
+        if self.goal is not None and not isinstance(self.goal, Goal):
+            raise InputError("goal", "a Goal, or None", type(self.goal).__name__)
+        _check_constraints(self.constraints)
+
+    def _check_dynamics(self) -> None:
+        check_value(getattr(self.dynamics, "dt", None), Seconds | None, "dynamics.dt")
+        if type(self.dynamics).step is Dynamics.step:
+            check_value(self.dynamics.integrator, Integrator, "dynamics.integrator")
+        where = self.dynamics.position
+        if where is not None and where not in [slice(i, j) for j in range(1, self.n + 1) for i in range(j)]:
+            raise InputError("dynamics.position", f"a slice of states within 0..{self.n}, or None", repr(where))
+        for name in self.dynamics.per_element:
+            value = getattr(self.dynamics, name)
+            if not isinstance(value, Tensor):
+                check_value(value, float, f"dynamics.{name}")
+            elif value.dim() > 0:
+                if tuple(value.shape) not in ((self.B,), (1,)):
+                    raise InputError(f"dynamics.{name}", f"a number or a tensor ({self.B},)", tuple(value.shape))
+                if value.dtype != self.x0.dtype or value.device != self.x0.device:
+                    wanted = f"{self.x0.dtype} on {self.x0.device} as x0"
+                    raise InputError(f"dynamics.{name}", wanted, f"{value.dtype} on {value.device}")
+                check_tensor(value, f"dynamics.{name}")
+        try:
+            after = self.dynamics.step(self.x0, self.x0.new_zeros(self.B, self.m))
+        except MISTAKES as error:
+            message = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError("dynamics.step", f"a step for states {tuple(self.x0.shape)}", message) from error
+        if not isinstance(after, Tensor) or after.shape != self.x0.shape or after.dtype != self.x0.dtype:
+            raise InputError("dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", describe(after))
+
+
+def check_problem(problem: Any) -> None:
+    """Raise InputError unless the argument is a Problem."""
+    if not isinstance(problem, Problem):
+        raise InputError("problem", "a Problem", _named(problem))
+
+
+def _check_constraints(constraints: Any) -> None:
+    # A generator is refused, too: this first look would use it up.
+    if not isinstance(constraints, Sequence) or isinstance(constraints, str):
+        raise InputError("constraints", "a list of Constraint", _named(constraints))
+    for constraint in constraints:
+        if not isinstance(constraint, Constraint):
+            raise InputError("constraints", "a list of Constraint", _named(constraint))
+
+
+def _named(part: object) -> str:
+    return f"the class {part.__name__}" if isinstance(part, type) else type(part).__name__

@@ -1,0 +1,289 @@
+/* The search for short paths between obstacles, one problem after the other: search.py in C.
+
+   Both do the same operations in the same order, and none is fused here (-ffp-contract=off): all numbers but square
+   roots, which PyTorch doesn't always round correctly, agree to the last bit. Clearance and nearness are therefore
+   compared as squares, detours and costs with a tolerance, and ties are broken by the lowest index: the paths are the
+   same. DIM is the number of coordinates. */
+
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define BLOCK 32  /* edges measured side by side */
+#define TINY 1e-12
+#define SIGNED_SQUARE(x) ((x) * fabs(x))
+#define CLAMP(x, low, high) ((x) < (low) ? (low) : (x) > (high) ? (high) : (x))
+
+typedef struct {
+    int64_t problems, spheres, spread, candidates, points, edges, neighbours, hubs, corners, directions, shells, midway;
+    double margin, least, clear, factor, tie;
+    const double *centers, *distances;  /* (B, M, DIM), (B, M) */
+    const double *start, *goal;         /* (B, DIM) */
+    const double *cube, *rays, *shell;  /* (spread, DIM) in the unit cube; directions (B, rays, DIM); (shells) */
+    double *nodes;                      /* (B, V, DIM) */
+    int32_t *ends;                      /* (B, V, K): where edges lead; blocked ones are -1 and come last */
+    double *lengths;                    /* (B, V, K), infinite for blocked ones */
+    double *price;                      /* (B, V) */
+    double *path;                       /* (B, P, DIM) */
+    double *string;                     /* (B, 2 P - 1, DIM) */
+    const double *cost;                 /* (B, 2 P - 1) */
+    uint8_t *arrives;                   /* (B) */
+    /* Read only where there are boxes: their numbers (B, boxes, BOX_NUMBERS), points around them (B, extras, DIM) and
+       whether each exists, corners (B, 2, DIM) of the region that holds start, goal and boxes, the largest size (B). */
+    const double *box, *beside;
+    const uint8_t *exists;
+    const double *reach, *largest;
+    int64_t boxes, extras;
+} Search;
+
+/* The spheres of a problem: radii, their squares with their signs, the largest; centres coordinate by coordinate. */
+typedef struct {
+    int64_t count;
+    const double *radius, *square, *at[DIM];
+    double largest;
+#if BOXES
+    int64_t boxes;
+    const double *box;
+#endif
+} Spheres;
+
+/* Memory for a search over n points with k edges each. */
+typedef struct {
+    double *edge, *cost, *before, *value, *through;
+    int32_t *first, *source, *fresh, *next, *seen;
+} Room;
+
+static Spheres spheres_of(const Search *s, int64_t b, double *room) {
+    Spheres o = {.count = s->spheres, .radius = s->distances + b * s->spheres, .largest = -INFINITY};
+    for (int i = 0; i < DIM; i++) {
+        o.at[i] = room + i * s->spheres;
+        for (int64_t m = 0; m < s->spheres; m++)
+            room[i * s->spheres + m] = s->centers[(b * s->spheres + m) * DIM + i];
+    }
+    o.square = room + DIM * s->spheres;
+    for (int64_t m = 0; m < o.count; m++) {
+        room[DIM * s->spheres + m] = SIGNED_SQUARE(o.radius[m]);
+        if (o.radius[m] > o.largest) o.largest = o.radius[m];
+    }
+#if BOXES
+    if (s->largest[b] > o.largest) o.largest = s->largest[b];
+    o.boxes = s->boxes, o.box = s->box + b * s->boxes * BOX_NUMBERS;
+#endif
+    return o;
+}
+
+static int is_free(const double *p, const Spheres *o, double gap) {
+    int all = 1;
+    for (int64_t m = 0; m < o->count; m++) {
+        double square = 0.0, least = o->radius[m] + gap;
+        for (int i = 0; i < DIM; i++) square += (p[i] - o->at[i][m]) * (p[i] - o->at[i][m]);
+        all &= square > SIGNED_SQUARE(least);
+    }
+#if BOXES
+    for (int64_t m = 0; m < o->boxes; m++) {
+        const double *box = o->box + m * BOX_NUMBERS;
+        double least = BOX_RADIUS(box) + gap;
+        all &= square_from_box(box, p) > SIGNED_SQUARE(least);
+    }
+#endif
+    return all;
+}
+
+/* Squared distance of a point from the segment from a to a + along; `inverse` is 1 / its squared length. */
+static inline double square_away(const double *p, const double *a, const double *along, double inverse) {
+    double toward[DIM], lead = 0.0, away = 0.0;
+    for (int i = 0; i < DIM; i++) {
+        toward[i] = p[i] - a[i];
+        lead += toward[i] * along[i];
+    }
+    double share = CLAMP(lead * inverse, 0.0, 1.0);
+    for (int i = 0; i < DIM; i++) {
+        double rest = toward[i] - share * along[i];
+        away += rest * rest;
+    }
+    return away;
+}
+
+/* Insert a value smaller than the last of a sorted list, after its equals; the last is dropped. */
+static inline void put(double value, int32_t index, double *values, int32_t *indices, int64_t size) {
+    int64_t at = size - 1;
+    for (; at > 0 && values[at - 1] > value; at--) {
+        values[at] = values[at - 1];
+        indices[at] = indices[at - 1];
+    }
+    values[at] = value;
+    indices[at] = index;
+}
+
+static void empty(double *values, int32_t *indices, int64_t size) {
+    for (int64_t i = 0; i < size; i++) values[i] = INFINITY, indices[i] = -1;
+}
+
+/* Points ----------------------------------------------------------------------------------------------------------- */
+
+static double square_of(const double *a, const double *b) {
+    double square = 0.0;
+    for (int i = 0; i < DIM; i++) square += (a[i] - b[i]) * (a[i] - b[i]);
+    return square;
+}
+
+/* Candidates around the spheres, midway between each and its nearest, and around boxes; returns their number. */
+static int64_t propose(const Search *s, int64_t b, double *values, int32_t *near, double *to) {
+    const double *o = s->centers + b * s->spheres * DIM, *R = s->distances + b * s->spheres;
+    const double *rays = s->rays + b * s->directions * DIM;
+    double *p = to;
+    for (int64_t shell = 0; shell < s->shells; shell++)
+        for (int64_t m = 0; m < s->spheres; m++)
+            for (int64_t r = 0; r < s->directions && R[m] > 0; r++, p += DIM)
+                for (int i = 0; i < DIM; i++) p[i] = o[m * DIM + i] + s->shell[shell] * R[m] * rays[r * DIM + i];
+    for (int64_t m = 0; m < s->spheres; m++) {
+        empty(values, near, s->midway);
+        for (int64_t n = 0; n < s->spheres && R[m] > 0; n++) {
+            double square = square_of(o + m * DIM, o + n * DIM);
+            if (n != m && R[n] > 0 && square < values[s->midway - 1])
+                put(square, (int32_t)n, values, near, s->midway);
+        }
+        for (int64_t h = 0; h < s->midway && near[h] >= 0; h++, p += DIM) {
+            double length = sqrt(values[h]);
+            double share = 0.5 + 0.5 * ((R[m] - R[near[h]]) / (length < TINY ? TINY : length));
+            for (int i = 0; i < DIM; i++)
+                p[i] = o[m * DIM + i] + share * (o[near[h] * DIM + i] - o[m * DIM + i]);
+        }
+    }
+#if BOXES
+    for (int64_t e = b * s->extras; e < (b + 1) * s->extras; e++)
+        if (s->exists[e]) memcpy(p, s->beside + e * DIM, DIM * sizeof(double)), p += DIM;
+#endif
+    return (p - to) / DIM;
+}
+
+/* Start, goal, and points spread over the region that holds start, goal and obstacles. */
+static void scatter(const Search *s, int64_t b, double *to) {
+    const double *start = s->start + b * DIM, *goal = s->goal + b * DIM, *R = s->distances + b * s->spheres;
+    for (int i = 0; i < DIM; i++) {
+        double low = start[i] < goal[i] ? start[i] : goal[i], high = start[i] > goal[i] ? start[i] : goal[i];
+        for (int64_t m = 0; m < s->spheres; m++) {
+            double o = s->centers[(b * s->spheres + m) * DIM + i], reach = 1.5 * R[m];
+            if (R[m] > 0 && o - reach < low) low = o - reach;
+            if (R[m] > 0 && o + reach > high) high = o + reach;
+        }
+#if BOXES
+        const double *reach = s->reach + b * 2 * DIM;
+        if (reach[i] < low) low = reach[i];
+        if (reach[DIM + i] > high) high = reach[DIM + i];
+#endif
+        to[i] = start[i], to[DIM + i] = goal[i];
+        for (int64_t v = 0; v < s->spread; v++) to[(2 + v) * DIM + i] = low + s->cube[v * DIM + i] * (high - low);
+    }
+}
+
+/* The points of a graph: those of `scatter`, then the candidates with the shortest detours; unused places lie at the
+   start. */
+static void choose(
+    const Search *s, int64_t b, const Spheres *o, const double *others, int64_t count, double *values,
+    int32_t *indices, uint8_t *usable
+) {
+    double gap = s->clear * o->largest, *nodes = s->nodes + b * s->points * DIM;
+    int64_t given = 2 + s->spread, most = s->points - given;
+    scatter(s, b, nodes);
+    for (int64_t v = 0; v < given; v++) usable[v] = v < 2 || is_free(nodes + v * DIM, o, gap);
+    empty(values, indices, most);
+    for (int64_t c = 0; c < count; c++) {
+        const double *p = others + c * DIM;
+        // In single precision, so that detours which differ by rounding alone are equal.
+        double detour = (float)(sqrt(square_of(p, nodes)) + sqrt(square_of(p, nodes + DIM)));
+        if (detour < values[most - 1] && is_free(p, o, gap)) put(detour, (int32_t)c, values, indices, most);
+    }
+    for (int64_t v = 0; v < most; v++) {
+        memcpy(nodes + (given + v) * DIM, indices[v] < 0 ? nodes : others + indices[v] * DIM, DIM * sizeof(double));
+        usable[given + v] = indices[v] >= 0;
+    }
+}
+
+/* Each free point's edges: to the nearest points, to the nearest of those from `scatter`, to the goal. */
+static void join(const Search *s, int64_t b, const uint8_t *usable, double *at, double *values, int32_t *found) {
+    const double *nodes = s->nodes + b * s->points * DIM;
+    int64_t n = s->points, k = s->edges, given = 2 + s->spread, near = s->neighbours, hubs = s->hubs;
+    int64_t most = near > hubs ? near : hubs;
+    double *apart = at + DIM * n;
+    for (int64_t v = 0; v < n; v++)
+        for (int i = 0; i < DIM; i++) at[i * n + v] = nodes[v * DIM + i];
+    for (int64_t v = 0; v < n; v++) {
+        int32_t *ends = s->ends + (b * n + v) * k;
+        empty(values, found, most);
+        for (int64_t w = 0; w < n; w++) {
+            double square = 0.0;
+            for (int i = 0; i < DIM; i++) square += (at[i * n + v] - at[i * n + w]) * (at[i * n + v] - at[i * n + w]);
+            apart[w] = usable[w] ? square : INFINITY;
+        }
+        apart[v] = INFINITY;
+        for (int64_t w = 0; w < n && usable[v]; w++) {
+            if (w == given) memcpy(ends + near, found, hubs * sizeof(int32_t));
+            if (apart[w] < values[most - 1]) put(apart[w], (int32_t)w, values, found, most);
+        }
+        if (n == given || !usable[v]) memcpy(ends + near, found, hubs * sizeof(int32_t));
+        memcpy(ends, found, near * sizeof(int32_t));
+        ends[k - 1] = usable[v] ? 1 : -1;
+    }
+}
+
+/* Lengths ---------------------------------------------------------------------------------------------------------- */
+
+/* Lengths of the edges of n points, k each, to `ends`: longer close to an obstacle, infinite through one. */
+static void measure(
+    const Search *s, const Spheres *o, const double *p, int64_t n, int64_t k, const int32_t *ends, double *lengths
+) {
+    double margin = s->margin * (o->largest < 1e-9 ? 1e-9 : o->largest), whole = 0.0;
+    for (int i = 0; i < DIM; i++) whole += (p[DIM + i] - p[i]) * (p[DIM + i] - p[i]);
+    double shortest = s->least * sqrt(whole);
+    int64_t from = 0, slot = 0;
+    for (int64_t first = 0; first < n * k; first += BLOCK) {
+        double a[DIM][BLOCK], along[DIM][BLOCK], square[BLOCK], inverse[BLOCK], gap[BLOCK], open[BLOCK];
+        for (int e = 0; e < BLOCK; e++) {
+            int64_t to = ends[from * k + slot] < 0 ? from : ends[from * k + slot];
+            square[e] = 0.0;
+            for (int i = 0; i < DIM; i++) {
+                a[i][e] = p[from * DIM + i];
+                along[i][e] = p[to * DIM + i] - a[i][e];
+                square[e] += along[i][e] * along[i][e];
+            }
+            inverse[e] = 1.0 / (square[e] < TINY ? TINY : square[e]);
+            gap[e] = open[e] = INFINITY;
+            if (++slot == k) slot = 0, from += from + 1 < n;  // past the last edge, the last point's again
+        }
+        for (int64_t m = 0; m < o->count; m++)
+            for (int e = 0; e < BLOCK; e++) {
+                double center[DIM], begin[DIM], step[DIM];
+                for (int i = 0; i < DIM; i++) center[i] = o->at[i][m], begin[i] = a[i][e], step[i] = along[i][e];
+                double away = square_away(center, begin, step, inverse[e]);
+                double left = sqrt(away) - o->radius[m], more = away - o->square[m];
+                gap[e] = left < gap[e] ? left : gap[e];
+                open[e] = more < open[e] ? more : open[e];
+            }
+#if BOXES
+        double least[DIM], most[DIM];
+        extent(BLOCK, a, along, least, most);
+        for (int64_t m = 0; m < o->boxes; m++)
+            measure_box(o->box + m * BOX_NUMBERS, BLOCK, a, along, least, most, margin, gap, open);
+#endif
+        for (int e = 0; e < BLOCK && first + e < n * k; e++) {
+            double close = 1.0 + CLAMP((margin - gap[e]) / margin, 0.0, 1.0);
+            lengths[first + e] = ends[first + e] >= 0 && open[e] > 0 ? (sqrt(square[e]) + shortest) * close : INFINITY;
+        }
+    }
+}
+
+/* Free edges first, then the blocked ones, marked by -1. */
+static void pack(int64_t n, int64_t k, int32_t *ends, double *lengths) {
+    for (int64_t v = 0; v < n; v++, ends += k, lengths += k) {
+        int64_t held = 0;
+        for (int64_t i = 0; i < k; i++) {
+            int32_t end = ends[i];
+            double length = lengths[i];
+            ends[held] = end, lengths[held] = length;
+            held += length < INFINITY;
+        }
+        for (int64_t i = held; i < k; i++) ends[i] = -1, lengths[i] = INFINITY;
+    }
+}

@@ -1,0 +1,142 @@
+"""The verdict on returned trajectories: feedback gains, optimality and statuses.
+
+Optimality is the share of the cost that the quadratic model could still save: the expected decrease of one full step on
+J_var + lam'c, plus the complementarity gap. It doesn't depend on the scale of cost, controls or constraints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchgco.base.status import Status
+from torchgco.base.tree import take
+from torchgco.lagrangian.expansion import linearise
+from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.native.dispatch import cost_unit, engine_of, reproducible, terms_of
+from torchgco.problem.problem import Problem
+from torchgco.solution import Solution
+from torchgco.solvers.contracts import Call
+from torchgco.solvers.riccati import BackwardPass, backward
+from torchgco.solvers.state import STALLED, STOPPED, SolveEnd
+
+if TYPE_CHECKING:
+    from torchgco.solvers.history import Recorder
+
+STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
+LEAST_COST = 1e-6  # the cost counts as at least this share of the cost of staying at the start
+FIRST, GROWTH, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
+
+
+def finished(
+    call: Call,
+    scaled: Call,
+    unit: Tensor,
+    end: SolveEnd,
+    phr: bool,
+    tolerance: float,
+    slots: int | None = None,
+    recorder: Recorder | None = None,
+) -> Solution:
+    """The best trajectories of a solve with gains and statuses, in the units of the call as it was given.
+
+    Args:
+        scaled, unit: the call in the solver's units of cost, and these units (B,).
+        phr, tolerance: of the solver, see Lagrangian and `final_status`.
+        slots: problems whose gains are computed together; None: all.
+    """
+    problem, best = scaled.problem, end.best
+    X, U = best.X.clone(), best.U.clone()
+    K, d, left = U.new_zeros(*U.shape, problem.n), torch.zeros_like(U), torch.zeros_like(best.cost)
+    for rows in torch.arange(problem.B, device=U.device).split(slots or max(1, problem.B)):
+        part = problem if rows.numel() == problem.B else problem.take(rows)
+        lagrangian = Lagrangian(part, take(best.multipliers, rows), None, phr)
+        K[rows], d[rows], left[rows] = optimality(lagrangian, X[rows], U[rows])
+        X[rows], U[rows] = reproducible(lagrangian.problem, X[rows], U[rows], K[rows])
+    limit = Status.TIME_LIMIT if call.late else Status.MAX_ITERATIONS
+    ended = torch.where(end.status == STOPPED, int(limit), end.status)
+    status = final_status(ended, left, best.violation, tolerance, bool(problem.constraints))
+    constant = call.problem.cost_scale.constant if scaled is not call else torch.zeros_like(unit)
+    return Solution(
+        X, U, K, d, best.multipliers.scaled(unit), call.problem.cost.total(X, U), best.violation, status,
+        end.iterations, end.outer, end.guided, None if recorder is None else recorder.frame(unit, constant),
+    )  # fmt: skip
+
+
+def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:
+    """The statuses (B,) of problems that can't start, with rollouts X (B, N+1, n); RUNNING for the others."""
+    status = torch.full((problem.B,), int(Status.RUNNING), device=X.device)
+    if start_is_clear is not None:
+        status[~start_is_clear] = Status.INVALID_START
+    # NaN compares as clear of every obstacle, so this test comes last.
+    finite = torch.isfinite(merit) & torch.isfinite(X).flatten(1).all(-1)
+    status[~finite] = Status.NON_FINITE
+    return status
+
+
+class Optimality(NamedTuple):
+    K: Tensor  # (B, N, m, n): u = U + K (x - X) + d
+    d: Tensor  # (B, N, m)
+    left: Tensor  # (B,): share of the cost that could still be saved; infinite where no backward pass succeeds
+
+
+def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
+    """Gains along X (B, N+1, n), U (B, N, m), and the first-order optimality of the trajectory with its multipliers."""
+    problem = lagrangian.problem
+    slack = lagrangian.slack(X, U)
+    run = _backward(lagrangian, X, U)
+    mu = torch.zeros_like(slack)
+    step = run(mu)
+    for i in range(TRIES):
+        # Where a control costs nothing, or rounding spoils the Hessian, regularisation still gives gains.
+        if not bool(step.failed.any()):
+            break
+        mu = torch.where(step.failed, FIRST * GROWTH**i * cost_unit(problem), mu)
+        step = _merged(step, run(mu))
+    saved = -step.expected_change(torch.ones_like(slack)) + slack
+    cost = problem.cost.total(X, U).abs() + LEAST_COST * problem.N * cost_unit(problem)
+    G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
+    return Optimality(G[..., :-1], G[..., -1], torch.where(step.failed, torch.inf, saved / cost))
+
+
+def _backward(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
+    """The backward pass on J_var + lam'c for regularisations mu_r (B,)."""
+    problem, engine = lagrangian.problem, engine_of(lagrangian.problem)
+    if engine is None:
+        F, H = linearise(problem, X, U), lagrangian.expand_optimality(X, U)
+        return lambda mu: backward(F, H, mu)
+
+    def native(mu: Tensor) -> BackwardPass:
+        G, linear, quadratic, failed = engine.gains(problem, X, U, terms_of(lagrangian), mu)
+        return BackwardPass(G.transpose(0, 1), linear, quadratic, failed)
+
+    return native
+
+
+def _merged(first: BackwardPass, second: BackwardPass) -> BackwardPass:
+    """The first pass where it succeeded, the second elsewhere."""
+    again = first.failed
+    gains = torch.where(again.view(1, -1, 1, 1), second.gains, first.gains)
+    linear, quadratic = (torch.where(again, b, a) for a, b in zip(first[1:3], second[1:3], strict=True))
+    return BackwardPass(gains, linear, quadratic, again & second.failed)
+
+
+def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: float, constrained: bool) -> Tensor:
+    """The status (B,) of the returned trajectories, for statuses `ended` that say why the solve stopped.
+
+    CONVERGED: stationary and feasible. FEASIBLE: feasible but not stationary, for problems with constraints.
+    INFEASIBLE: not feasible, although higher penalties were tried for as long as they gained anything. Where neither
+    holds, and where a solve failed, the reason stays.
+    """
+    stationary, fits = left <= STATIONARY, violation <= tolerance
+    reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED), int(Status.MAX_ITERATIONS), ended)
+    status = torch.where(fits & constrained, int(Status.FEASIBLE), reason)
+    status = torch.where(stationary & fits, int(Status.CONVERGED), status)
+    status = torch.where(~fits & (ended == STALLED), int(Status.INFEASIBLE), status)
+    status = torch.where(torch.isinf(left), int(Status.NOT_POSITIVE_DEFINITE), status)
+    status = torch.where((ended == Status.TIME_LIMIT) & ~fits, ended, status)  # more time might find more
+    failed = (ended == Status.NON_FINITE) | (ended == Status.NOT_POSITIVE_DEFINITE) | (ended == Status.INVALID_START)
+    return torch.where(failed, ended, status)

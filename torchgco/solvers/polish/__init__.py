@@ -1,0 +1,1 @@
+"""Newton steps on the active rows of a solution."""
