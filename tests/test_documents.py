@@ -229,6 +229,7 @@ def test_the_figures_of_the_algorithm_are_drawn(tmp_path: Path) -> None:
     assert shown == [f"figures/{path.name}" for path in sorted(tmp_path.iterdir())]
 
 
+@pytest.mark.slow
 def test_the_api_reference_opens_with_the_public_names(tmp_path: Path) -> None:
     """Without a warning of pdoc, such as one of a type that it doesn't find."""
     command = [sys.executable, str(ROOT / "docs" / "reference.py"), "--output", str(tmp_path)]
@@ -237,7 +238,7 @@ def test_the_api_reference_opens_with_the_public_names(tmp_path: Path) -> None:
     shown = set(re.findall(r'<section id="(\w+)">', (tmp_path / "torchgco.html").read_text()))
     assert set(torchgco.__all__) - {"presets", "judge"} <= shown
     assert "interrupts" not in shown and not list(tmp_path.rglob("native*"))
-    for name in ("presets", "scenarios", "simulation", "plotting"):
+    for name in ("presets", "scenarios", "missions", "plotting"):
         assert (tmp_path / "torchgco" / f"{name}.html").is_file()
 
 

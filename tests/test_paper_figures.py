@@ -50,6 +50,7 @@ def test_the_planar_figures_and_the_table_are_written(
     assert table.cost[0] == pytest.approx(_cost(runs, draws=0), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_missions_and_animations_are_written(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

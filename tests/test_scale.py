@@ -29,7 +29,7 @@ def swing_up(constant: float, B: int = 2) -> Problem:
 
 
 @pytest.mark.parametrize("native", [True, False])
-@pytest.mark.parametrize("constant", [1e5, -1e5, 1e9])
+@pytest.mark.parametrize("constant", [1e5, -1e9])
 def test_a_constant_in_the_cost_hides_nothing(constant: float, native: bool) -> None:
     kernels.use_native(native)
     try:

@@ -224,6 +224,7 @@ def test_every_key_that_help_names_exists(run) -> None:
         compose([*mission, word, *(["plant=null"] if word == "mission=null" else [])])
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_read_enough_is_no_error(tmp_path) -> None:
     for words in ("--shell-completion install=bash", "--help", "--version", "--cfg job"):
         line = [sys.executable, "-c", PIPE, *words.split()]

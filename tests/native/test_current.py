@@ -150,9 +150,11 @@ READ: dict[str, Callable[[Memory, Tensor], Tensor]] = {
 }
 
 
-@pytest.mark.parametrize("kind", READ)
-@pytest.mark.parametrize("place", ["dynamics", "cost", "constraint"])
-def test_captured_values_are_those_of_the_solve(kind: str, place: str) -> None:
+@pytest.mark.parametrize(
+    ("place", "kind"),
+    [*(("dynamics", kind) for kind in READ), ("cost", "number"), ("cost", "tensor"), ("constraint", "array")],
+)
+def test_captured_values_are_those_of_the_solve(place: str, kind: str) -> None:
     memory, read = Memory(), READ[kind]
 
     class Drags(Cost):
