@@ -26,6 +26,7 @@ def script() -> Iterator[ModuleType]:
     sys.path.remove(str(DOCS))
 
 
+@pytest.mark.slow
 def test_the_planar_figures_and_the_table_are_written(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

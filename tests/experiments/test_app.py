@@ -215,6 +215,7 @@ def test_version_and_help(run) -> None:
     assert "forest*," in out and "walls*," in run("--help", "scenario=walls")[1]
 
 
+@pytest.mark.slow
 def test_every_key_that_help_names_exists(run) -> None:
     _, out, _ = run("--help")
     words = re.findall(r"^  +([a-z_.]+=\S+)", out.split("Common keys")[1], re.MULTILINE)

@@ -226,6 +226,7 @@ def test_the_plants_agree_on_a_short_mission() -> None:
 
 
 @needs_drone_models
+@pytest.mark.slow
 def test_the_plants_agree_on_the_commands_of_a_mission_among_obstacles() -> None:
     """Measured 4e-6, and 3e-10 with a tenth of the time step."""
     problem = mission_problem(free=False)
