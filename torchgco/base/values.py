@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -110,8 +112,17 @@ def asks_for_knot(function: Callable[..., Any]) -> bool:
 
 
 def _parameters(function: Callable[..., Any]) -> tuple[inspect.Parameter, ...]:
+    with suppress(KeyError, TypeError):  # not seen before, or it can't be a key
+        return _known[function]
     called = function.forward if isinstance(function, torch.nn.Module) else function
     try:
-        return tuple(inspect.signature(called).parameters.values())
+        found = tuple(inspect.signature(called).parameters.values())
     except (TypeError, ValueError):  # a builtin without a signature
-        return ()
+        found = ()
+    with suppress(TypeError):
+        _known[function] = found
+    return found
+
+
+# A rollout by PyTorch's kernels asks at every knot; what a function captures must not outlive it for that.
+_known: WeakKeyDictionary[Callable[..., Any], tuple[inspect.Parameter, ...]] = WeakKeyDictionary()

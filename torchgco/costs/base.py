@@ -69,10 +69,22 @@ class Cost(PerElement):
 
 
 @dataclass(frozen=True)
-class ScaledCost(Cost):
-    """A cost times one positive number per problem."""
+class WrappedCost(Cost):
+    """A cost with the goal and the controls at rest of another one."""
 
     cost: Cost
+
+    def rest_controls(self, like: Tensor) -> Tensor:
+        return self.cost.rest_controls(like)
+
+    def goal(self, x0: Tensor) -> Tensor | None:
+        return self.cost.goal(x0)
+
+
+@dataclass(frozen=True)
+class ScaledCost(WrappedCost):
+    """A cost times one positive number per problem."""
+
     factor: Tensor  # (B,)
 
     batched: ClassVar[tuple[str, ...]] = ("cost", "factor")
@@ -85,22 +97,15 @@ class ScaledCost(Cost):
         value = self.cost.terminal(x)
         return lead(self.factor, value) * value
 
-    def rest_controls(self, like: Tensor) -> Tensor:
-        return self.cost.rest_controls(like)
-
-    def goal(self, x0: Tensor) -> Tensor | None:
-        return self.cost.goal(x0)
-
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         self.cost.expand(X, U, H)
         H.mul_(self.factor.view(-1, 1, 1, 1))
 
 
 @dataclass(frozen=True)
-class ShiftedCost(Cost):
+class ShiftedCost(WrappedCost):
     """A cost less one number per problem and stage."""
 
-    cost: Cost
     shift: Tensor  # (B,)
 
     batched: ClassVar[tuple[str, ...]] = ("cost", "shift")
@@ -114,12 +119,6 @@ class ShiftedCost(Cost):
 
     def terminal(self, x: Tensor) -> Tensor:
         return self.cost.terminal(x)
-
-    def rest_controls(self, like: Tensor) -> Tensor:
-        return self.cost.rest_controls(like)
-
-    def goal(self, x0: Tensor) -> Tensor | None:
-        return self.cost.goal(x0)
 
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         self.cost.expand(X, U, H)
