@@ -12,7 +12,7 @@ from torch import Tensor
 import torchgco
 from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem
 from torchgco.base import kernels
-from torchgco.native.dispatch import EagerWarning
+from torchgco.native.dispatch import EagerWarning, engine_of
 
 D = torch.float64
 B, N = 3, 20
@@ -75,6 +75,8 @@ def test_new_values_need_no_new_kernel() -> None:
     torchgco.solve(first)
     cost = FunctionCost(stage, lambda x, goal: 500.0 * (x[..., :2] - goal).square().sum(-1), {"goal": GOALS + 0.25})
     moved = first.started_at(first.x0 + 0.1, first.constraints, cost=cost)
+    engines = [engine_of(each.renewed()) for each in (first, moved)]
+    assert engines[0] is not None and engines[1] is not None and engines[0].library is engines[1].library
     assert float((torchgco.solve(moved).X[:, -1, :2] - GOALS - 0.25).norm(dim=-1).max()) < 0.4
 
 
