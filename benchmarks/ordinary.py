@@ -1,0 +1,83 @@
+"""python -m benchmarks.ordinary: ordinary constrained problems by default options, and without the finish.
+
+Twelve families, eight problems per seed. Feasible: every constraint within 1e-3 along PyTorch's own rollout of the
+returned controls. With --write the table goes into benchmarks/results/ordinary.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from time import process_time
+
+import torch
+from scipy.stats import binomtest
+
+from benchmarks.ordinary_problems import FAMILIES
+from benchmarks.page import INTERVALS, SET_UP, put_table
+from torchgco import Problem, presets, solve
+from torchgco.lagrangian.rollout import open_loop
+
+PAGE = Path(__file__).resolve().parent / "results" / "ordinary.md"
+SEEDS = (7, 21, 100)
+ADMITTED = 1e-3
+HEAD = ("family", "n", "cut off by limits", "default", "ms per problem, cut off", "ms per problem, default")
+
+
+@dataclass(frozen=True)
+class Batch:
+    """How many problems of a batch are feasible, and the processor time per problem in seconds."""
+
+    feasible: int
+    seconds: float
+
+
+def flown(problem: Problem, finished: bool) -> Batch:
+    """One batch by the default solver, or by the same without its finish."""
+    solver = presets.gco(problem) if finished else replace(presets.gco(problem), finish=None)
+    solve(problem.take(slice(0, 1)), solver=solver, max_seconds=1e-2)  # compiles
+    began = process_time()
+    U = solve(problem, solver=solver).U
+    seconds = (process_time() - began) / problem.B
+    X = open_loop(problem.dynamics, problem.x0, U)
+    worst = torch.stack([part.worst(X, U) for part in problem.constraints]).amax(0)
+    return Batch(int((worst <= ADMITTED).sum()), seconds)
+
+
+def row(name: str, seeds: Sequence[int]) -> list[str]:
+    problems = [FAMILIES[name](seed) for seed in seeds]
+    cut, whole = ([flown(problem, finished) for problem in problems] for finished in (False, True))
+    counts = [str(sum(batch.feasible for batch in batches)) for batches in (cut, whole)]
+    times = [f"{1e3 * median(batch.seconds for batch in batches):.1f}" for batches in (cut, whole)]
+    return [name, str(sum(problem.B for problem in problems)), *counts, *times]
+
+
+def share(count: int, n: int) -> str:
+    low, high = binomtest(count, n).proportion_ci(method="wilson")
+    return f"{count} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.ordinary", description="Ordinary constrained problems.")
+    parser.add_argument("--families", nargs="+", choices=FAMILIES, default=list(FAMILIES), metavar="NAME", help="which")
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS), help="of the draws")
+    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/ordinary.md")
+    asked = parser.parse_args(words)
+    torch.set_num_threads(1)
+    rows = [row(name, asked.seeds) for name in asked.families]
+    n, *counts = (sum(int(cells[i]) for cells in rows) for i in (1, 2, 3))
+    rows.append(["all", str(n), *(share(count, n) for count in counts), "", ""])
+    text = "\n".join(f"| {' | '.join(cells)} |" for cells in (HEAD, ["---"] * len(HEAD), *rows))
+    print(text)
+    if asked.write:
+        seeds = ", ".join(map(str, asked.seeds))
+        how = f"eight problems per family and seed, seeds {seeds}, processor time with one thread, median over seeds"
+        put_table(PAGE, how, text, INTERVALS, SET_UP)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
