@@ -14,10 +14,10 @@ def test_a_family_is_drawn_by_its_seed(name: str) -> None:
     one, same, other = (FAMILIES[name](seed) for seed in (7, 7, 8))
     assert one.B == B and torch.equal(one.x0, same.x0)
     X, U = (torch.full((B, one.N + k, size), 0.1, dtype=torch.float64) for k, size in ((1, one.n), (0, one.m)))
-    worst = [[part.worst(X, U) for part in problem.constraints] for problem in (one, same, other)]
-    assert all(map(torch.equal, worst[0], worst[1]))
+    rows = [[part.value(X, U) for part in problem.constraints] for problem in (one, same, other)]
+    assert all(map(torch.equal, rows[0], rows[1]))
     step = [problem.dynamics.step(problem.x0, U[:, 0]) for problem in (one, other)]
-    assert not (torch.equal(*step) and all(map(torch.equal, worst[0], worst[2])))
+    assert not (torch.equal(*step) and all(map(torch.equal, rows[0], rows[2])))
 
 
 def test_the_finish_shows_in_the_table(capsys: pytest.CaptureFixture[str]) -> None:
