@@ -21,7 +21,7 @@ from torchgco.problem.problem import Problem
 
 NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
 CURRENT = "current"  # marks the form of problems that a solve works on
-SAID = "said"  # the reasons that an EagerWarning has named for a problem
+WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
 KEPT = 64  # engines of problems without a user's code, the most recent ones
 AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
 
@@ -40,7 +40,7 @@ def current(problem: Problem) -> Problem:
         return problem
     fresh = problem.renewed()
     fresh.form[CURRENT] = True
-    fresh.form[SAID] = problem.form.setdefault(SAID, set())
+    fresh.form[WARNED] = problem.form.setdefault(WARNED, set())
     return fresh
 
 
@@ -59,9 +59,9 @@ def engine_of(problem: Problem) -> Engine | None:
             problem.form["engine"] = None
             check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
             reason = str(error).splitlines()[0]
-            said = problem.form.setdefault(SAID, set())
-            if reason not in said:
-                said.add(reason)
+            warned = problem.form.setdefault(WARNED, set())
+            if reason not in warned:
+                warned.add(reason)
                 warnings.warn(f"solved by PyTorch's kernels, many times slower: {reason}", EagerWarning, stacklevel=4)
     return problem.form["engine"]
 

@@ -23,7 +23,7 @@ from torchgco.dynamics.base import Dynamics
 OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
 LOST = 1e-2  # share of a derivative by which differences may disagree
 NOISE = 8.0  # times the rounding error of a difference, or its change with the step
-APART = "values of a problem that depend on its own row alone, and on values per problem in declared fields"
+APART = "values of a problem that depend on its own row alone; numbers per problem belong in `values` or `batched`"
 
 
 def check_dynamics(dynamics: Dynamics, x0: Tensor) -> None:
@@ -154,7 +154,7 @@ def _check_values(
 def _check_tensor(field: str, value: Any, shape: tuple[int | None, ...], dtype: torch.dtype, wanted: str) -> None:
     fits = isinstance(value, Tensor) and value.dim() == len(shape) and value.dtype == dtype
     if not fits or any(want not in (None, got) for want, got in zip(shape, value.shape, strict=True)):
-        raise InputError(field, wanted, f"{describe(value)} where {_text(shape)} was due")
+        raise InputError(field, wanted, f"{describe(value)} instead of {_text(shape)}")
 
 
 def _text(shape: tuple[int | None, ...]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -16,13 +17,14 @@ from torchgco.native.dispatch import open_loop, value
 from torchgco.problem.problem import Problem
 from torchgco.search.best import Best
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX, AugmentedLagrangian
-from torchgco.solvers.state import STALLED, STOPPED
+from torchgco.solvers.contracts import Call
+from torchgco.solvers.state import STALLED, STOPPED, Iterate
 
-AWAY = 0.1  # standard deviation of the change of stalled controls, as a share of half their range
+CHANGE = 0.1  # standard deviation of the change of stalled controls, as a share of half their range
 KNOTS = 10  # of its noise
-# Close to a stationary point a violation changes with the square of AWAY, and its penalty has to weigh more by that
+# Close to a stationary point a violation changes with the square of CHANGE, and its penalty has to weigh more by that
 # factor to outweigh the cost; ten times more to be sure.
-INSISTENCE = 10.0 / AWAY**2
+OVERWEIGHT = 10.0 / CHANGE**2
 TINY = 1e-12  # violation term that no division needs
 STREAM = 1 << 20  # outer iteration that keys the noise: no solve makes so many
 
@@ -36,36 +38,43 @@ def finish(best: Best, solver: AugmentedLagrangian) -> None:
     status = best.end.status
     limits = (Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, STOPPED)
     cut = torch.stack([status == int(limit) for limit in limits]).any(0)
-    _continue(best, solver, cut.nonzero().flatten(), away=False)
+    _attempt(best, solver, cut.nonzero().flatten(), _from_best)
     stalled = (best.end.status == STALLED) & (best.end.best.violation > solver.violation_tolerance)
-    _continue(best, solver, stalled.nonzero().flatten(), away=True)
+    _attempt(best, solver, stalled.nonzero().flatten(), _from_changed)
 
 
-def _continue(best: Best, solver: AugmentedLagrangian, rows: Tensor, away: bool) -> None:
+def _attempt(
+    best: Best, solver: AugmentedLagrangian, rows: Tensor, start: Callable[[Call, Iterate, float], Call]
+) -> None:
+    """One more solve of the problems in `rows`, from where `start` says."""
     best.next_attempt()
     if rows.numel() == 0 or best.call.late:
         return
-    start, part = take(best.end.best, rows), best.call.take(rows)
-    call = replace(part, U0=start.U, warm=start.multipliers)
-    if away:
-        key = DrawKey(call.seed, call.ids, torch.full_like(rows, STREAM))
-        U = start.U + AWAY * _half_ranges(call.problem, start.U) * smooth_normal(key, KNOTS, start.U)
-        call = replace(call, U0=U, warm=_balanced(call.problem, U, solver.initial_penalty))
+    call = start(best.call.take(rows), take(best.end.best, rows), solver.initial_penalty)
     end = best.attempt(call, solver=solver)
     best.keep(rows, end)
     # The end of this solve says more than that of the attempt whose trajectory may have been kept.
-    done = rows[end.status == STALLED]
-    best.end.status[done] = STALLED
+    best.end.status[rows[end.status == STALLED]] = STALLED
+
+
+def _from_best(call: Call, best: Iterate, least: float) -> Call:
+    return replace(call, U0=best.U, warm=best.multipliers)
+
+
+def _from_changed(call: Call, best: Iterate, least: float) -> Call:
+    key = DrawKey(call.seed, call.ids, torch.full_like(call.ids, STREAM))
+    U = best.U + CHANGE * _half_ranges(call.problem, best.U) * smooth_normal(key, KNOTS, best.U)
+    return replace(call, U0=U, warm=_balanced(call.problem, U, least))
 
 
 def _balanced(problem: Problem, U: Tensor, least: float) -> Multipliers:
-    """Multipliers of zero with penalties that weigh `INSISTENCE` times the cost of U (B, N, m), and at least `least`.
+    """Multipliers of zero with penalties that weigh `OVERWEIGHT` times the cost of U (B, N, m), and at least `least`.
 
     With less, the first step would lead back to where the cost is lowest and the violation stationary.
     """
     unit, X = Multipliers.zero(problem, 1.0), open_loop(problem, U)
     cost, merit = value(Lagrangian(problem, unit, None, True), X, U)
-    mu = INSISTENCE * (cost.abs() / (merit - cost).clamp(min=TINY)).nan_to_num(least, PENALTY_MAX, least)
+    mu = OVERWEIGHT * (cost.abs() / (merit - cost).clamp(min=TINY)).nan_to_num(least, PENALTY_MAX, least)
     return replace(unit, mu=mu.clamp(min=least, max=PENALTY_MAX))
 
 
