@@ -1,8 +1,8 @@
-"""python docs/paper_figures.py: the paper's figures from runs of our solvers, Table A4, a table of missions, and ours
-against the paper's tables line by line.
+"""python docs/paper_figures.py: the paper's figures from runs of our solvers, Table A4, a table of missions, and our
+settings against the paper's tables, line by line.
 
-Figures and animations go to `--outputs`, the tables there and into the page. The page of docs/paper is docs/paper.md;
-any other folder gets a copy of it.
+Figures, animations and tables go to `--outputs`, Table A4 and the missions also into the page. The page of docs/paper
+is docs/paper.md; any other folder gets a copy of it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ DRAWS = (0, 112)  # of the two trials: 112 is the only one of 0 to 191 that pass
 SOLVERS = ("al_ilqr", "gco_paper", "gco")  # of Figures 6 and 7
 MARKS = "<!-- table-A4 -->", "<!-- end table-A4 -->"
 MISSION_MARKS = "<!-- missions -->", "<!-- end missions -->"
-PRINTED_MARKS = "<!-- printed -->", "<!-- end printed -->"
+TABLES = "tables.csv"
 PARTS = ("tables", "planar", "quadrotor", "mission")
 
 
@@ -111,7 +111,8 @@ def main(words: Sequence[str] | None = None) -> int:
     page = asked.page or page_of(asked.outputs)
     drawings: dict[str, Callable[[], Figure]] = {}
     if "tables" in asked.parts:
-        put_between(page, *PRINTED_MARKS, paper_tables.markdown(paper_tables.tables()))
+        asked.outputs.mkdir(parents=True, exist_ok=True)
+        paper_tables.frame(paper_tables.tables()).to_csv(asked.outputs / TABLES, index=False)
     if "planar" in asked.parts:
         trials = [planar("gco_paper", number, asked.stages) for number in DRAWS]
         drawings |= planar_figures(trials, planar("al_ilqr", 0, asked.stages))

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import pandas as pd
 import paper_settings as settings
 from paper_runs import FOREST_LAYOUT
 from paper_settings import Ours
@@ -216,14 +217,10 @@ def _table_a1(ours: Ours) -> list[Line]:
     ]
 
 
-def markdown(found: dict[str, list[Line]]) -> str:
-    """All tables in Markdown."""
-    blocks = []
-    for name, lines in found.items():
-        rows = [("", "printed", "ours", "why"), ("---",) * 4]
-        rows += [(line.name, line.printed, _text(line.ours), line.why) for line in lines]
-        blocks.append(f"### {name}\n\n" + "\n".join(f"| {' | '.join(row)} |" for row in rows))
-    return "\n\n".join(blocks)
+def frame(found: dict[str, list[Line]]) -> pd.DataFrame:
+    """All tables as one, a row per line."""
+    rows = [(name, line.name, line.printed, _text(line.ours), line.why) for name, lines in found.items() for line in lines]
+    return pd.DataFrame(rows, columns=["table", "line", "printed", "ours", "why"])
 
 
 def _numbers(values: Any) -> list[float]:
