@@ -1,8 +1,8 @@
 """Certificates of returned trajectories: whether each obeys its dynamics, clears the obstacles between the knots too,
 keeps its bounds and is a stationary point, or by how much it fails.
 
-No code is shared with the solvers: derivatives come from autograd through the model's own `step`, multipliers from a
-separate least-squares fit. docs/words.md defines the terms.
+The problem's own functions (step, cost, rows) are used, and no solver code: derivatives come from autograd, multipliers
+from a separate least-squares fit. docs/words.md defines the terms.
 """
 
 from __future__ import annotations

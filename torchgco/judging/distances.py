@@ -1,4 +1,4 @@
-"""Distances from boxes as the judge and the certificate measure them: no code is shared with the solvers."""
+"""Distances from boxes as the judge and the certificate measure them, apart from those of the solvers."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The quality of controls: a re-simulation from U alone, in float64, that shares no code with a solver.
+"""The quality of controls: a simulation from U alone, in float64, with the problem's own step, cost and rows.
 
-It rolls the planning model out again, adds the cost up stage by stage, and measures distances by plain differences.
-docs/words.md defines the terms that it returns.
+No solver code is used: it rolls the planning model out, adds the cost up stage by stage, and measures distances from
+obstacles by plain differences. docs/words.md defines the terms that it returns.
 """
 
 from __future__ import annotations

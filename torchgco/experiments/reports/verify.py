@@ -1,7 +1,7 @@
 """Confirms the tables of finished studies from their stored controls, layouts and settings.
 
 The controls of every row are simulated again, open-loop, with the model of study.json, and judged by `torchgco.judge`,
-which shares no code with a solver. Missions are confirmed from the log in mission.parquet, as far as it goes. Then
+which uses no solver code. Missions are confirmed from the log in mission.parquet, as far as it goes. Then
 summary.csv and paired.csv are counted again from the table.
 """
 
