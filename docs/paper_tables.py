@@ -219,7 +219,8 @@ def _table_a1(ours: Ours) -> list[Line]:
 
 def frame(found: dict[str, list[Line]]) -> pd.DataFrame:
     """All tables as one, a row per line."""
-    rows = [(name, line.name, line.printed, _text(line.ours), line.why) for name, lines in found.items() for line in lines]
+    lines = [(name, line) for name, part in found.items() for line in part]
+    rows = [(name, line.name, line.printed, _text(line.ours), line.why) for name, line in lines]
     return pd.DataFrame(rows, columns=["table", "line", "printed", "ours", "why"])
 
 

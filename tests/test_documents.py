@@ -1,6 +1,6 @@
-"""Links lead to files and headings that exist, Python runs, and commands are accepted by the programs they call.
+"""Links and names of files lead somewhere, Python runs, and commands are accepted by the programs they call.
 
-All Python blocks of a page share one namespace and run in order; no two pages share one.
+All Python blocks of a page share one namespace and run in order; no two pages share one. The manual stays short.
 """
 
 from __future__ import annotations
@@ -147,6 +147,31 @@ def test_every_link_leads_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(target), link
 
 
+MANUAL = [page for page in PAGES if page.parent != ROOT / "benchmarks" / "results" and page.name != "CHANGELOG.md"]
+
+
+@pytest.mark.parametrize("page", MANUAL, ids=name_of)
+def test_every_file_that_is_named_exists(page: Path) -> None:
+    for name in re.findall(r"`((?:torchgco|tests|conf|docs)/[\w./-]+)`", page.read_text()):
+        assert "NAME" in name or name == "docs/api" or (ROOT / name).exists(), name
+
+
+def test_where_is_what_names_what_is_there() -> None:
+    text = (ROOT / "docs" / "extending.md").read_text()
+    rows = re.findall(r"^\| (?!question).*\|$", text[text.index("\n## Where is what\n") :], re.MULTILINE)
+    assert len(rows) > 10
+    for row in rows:
+        _, files, names = row.strip("| ").split(" | ")
+        sources = [(ROOT / name).read_text() for name in re.findall(r"`([^`]+)`", files)]
+        for name in re.findall(r"`([^`]+)`", names):
+            assert any(re.search(rf"(?:def|class) {name}\b|\b{name}(?::| =)", source) for source in sources), row
+
+
+def test_the_manual_is_read_in_an_hour() -> None:
+    pages = [page for page in PAGES if page.is_relative_to(ROOT / "docs")]
+    assert sum(len(page.read_text().split()) for page in pages) <= 15_000
+
+
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=name_of)
 def test_every_command_is_accepted(page: Path) -> None:
     for command in commands(page):
@@ -176,7 +201,8 @@ def registries() -> Iterator[None]:
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if any(language == PYTHON for language, _ in blocks(page))], ids=name_of
 )
-def test_every_python_block_runs(page: Path, registries: None) -> None:
+def test_every_python_block_runs(page: Path, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # where a page may write
     with warnings.catch_warnings():
         if find_compiler() is not None:
             warnings.simplefilter("error", EagerWarning)
@@ -209,12 +235,11 @@ def check_expansion(problem: Problem, part: Constraint) -> None:
     torch.testing.assert_close(H, product)
 
 
-def test_contributing_shows_every_addition() -> None:
-    text = (ROOT / "CONTRIBUTING.md").read_text()
-    adding = text[text.index("\n## Adding\n") : text.index("\n## Habits\n")]
-    shown = {part.splitlines()[0]: part.count("```python\n") for part in adding.split("\n### ")[1:]}
+def test_every_extension_is_shown() -> None:
+    parts = (ROOT / "docs" / "extending.md").read_text().split("\n## ")[1:]
+    shown = {part.splitlines()[0]: part.count("```python\n") for part in parts}
     kinds = ("A model", "A cost", "A constraint", "A kind of obstacle", "A guidance", "A solver", "A scenario")
-    assert shown == dict.fromkeys(kinds, 1)
+    assert shown == dict.fromkeys(kinds, 1) | {"A launcher": 0, "Where is what": 0}
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="the figures watch native kernels")

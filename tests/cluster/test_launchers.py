@@ -1,4 +1,4 @@
-"""The commands of docs/sweeps.md as printed, with smaller studies, under the launchers that need no cluster."""
+"""The commands of docs/studies.md as printed, with smaller studies, under the launchers that need no cluster."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from torchgco.experiments.reports.report import main as report_main
 
 pytestmark = pytest.mark.slow
 FEW = ["study.layouts=6", "scenario.stages=12", "study.baselines=[hold]"]
-PRINTED = [line.partition(" #")[0].strip() for line in commands(ROOT / "docs" / "sweeps.md")]
-CUT = [line for line in PRINTED if "study.jobs" in line and "slurm" not in line]
+PRINTED = [line.partition(" #")[0].strip() for line in commands(ROOT / "docs" / "studies.md")]
+CUT = [line for line in PRINTED if "launcher" in line and "study.jobs" in line and "slurm" not in line]
 SWEEP = [line for line in PRINTED if "num_obstacles" in line]
 PLUGINS = {
     "joblib": "hydra_plugins.hydra_joblib_launcher",
@@ -63,10 +63,10 @@ def test_a_sweep_in_processes_equals_a_serial_one(tmp_path, monkeypatch, capsys)
         done = launch(line, *more, cwd=tmp_path / name)
         assert done.returncode == 0, done.stderr
     same(tmp_path / "serial", tmp_path / "parallel", studies=4)
-    (report,) = (shlex.split(line)[1:] for line in PRINTED if line.startswith("torchgco-report"))
+    (report,) = (shlex.split(line)[1:] for line in PRINTED if "torchgco-report" in line and "--output" in line)
     monkeypatch.chdir(tmp_path / "parallel")
     assert report_main(report) == 0
-    assert "num_obstacles" in capsys.readouterr().out and Path("outputs/report/trials.parquet").is_file()
+    assert "num_obstacles" in capsys.readouterr().out and Path("outputs/summer/trials.parquet").is_file()
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
