@@ -111,7 +111,7 @@ def refined(paths: PathProposals, problem: Problem, count: int = PATHS) -> tuple
     rest = problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m))
     scene = seen.scene_of(scaled, rest)
     assert scene is not None
-    ways = joined(every._ways(scaled, rest, scene), every.among_more_points()._ways(scaled, rest, scene), scene)
+    ways = joined(every._ways(scaled, rest, scene), every.among_more_points()._ways(scaled, rest, scene))
     with watching() as searches:
         for proposals in (every, every.closer()):
             proposals._along(scaled, rest, ways, unwatched, TO_THE_END)

@@ -12,8 +12,10 @@ from torch import Tensor
 from tests.problems import boxed_batch, planar_batch, random_trajectory
 from tests.reference import boxes as brute_force
 from torchgco import Boxes, InputError, Problem, Spheres
+from torchgco.obstacles.base import Solids
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.roadmap.geometry import Inflated
 
 
 def boxes_of(problem: Problem) -> BoundBoxes:
@@ -77,9 +79,7 @@ def test_segments_by_hand(d: int) -> None:
     b[:, :5] = a[:, :5]  # segments of no length
     b[:, 5:10, 1:] = a[:, 5:10, 1:]  # along the first axis
     found, alone = boxes.segment_clearance(a, b), one_by_one(boxes, a, b)
-    cuboids = boxes.inflated().boxes
-    assert cuboids is not None
-    squares = cuboids.squares_from_segments(a, b)
+    squares = boxes.inflated().squares_from_segments(a, b)
     for e in range(25):
         for i in range(len(centers)):
             ends = a[0, e].numpy(), b[0, e].numpy()
@@ -176,12 +176,15 @@ def test_no_boxes_at_all() -> None:
     assert boxes.chord_clearance(X).tolist() == [torch.inf] * 2
 
 
-def test_the_bounding_box_of_points_and_boxes() -> None:
+def test_the_region_of_a_start_a_goal_and_boxes() -> None:
+    zero = torch.zeros(1, 2, dtype=torch.float64)
     boxes = Cuboids(
-        torch.zeros(1, 2, 2, dtype=torch.float64), torch.eye(2, dtype=torch.float64).expand(1, 2, 2, 2),
-        torch.tensor([[[1.0, 2.0], [9.0, 9.0]]], dtype=torch.float64), torch.tensor([[0.0, -1e9]], dtype=torch.float64),
+        torch.zeros(1, 2, 2, dtype=torch.float64), zero, torch.tensor([[False, True]]),
+        torch.eye(2, dtype=torch.float64).expand(1, 2, 2, 2),
+        torch.tensor([[[1.0, 2.0], [9.0, 9.0]]], dtype=torch.float64),
     )  # fmt: skip
-    low, high = boxes.reach(torch.tensor([[[-4.0, 0.0]]], dtype=torch.float64))
+    none = Solids(zero.unsqueeze(1), zero[:, :1], torch.tensor([[True]]))
+    low, high = Inflated(none, boxes).region(torch.tensor([[-4.0, 0.0]], dtype=torch.float64), zero)
     assert low.tolist() == [[-4.0, -3.0]] and high.tolist() == [[1.5, 3.0]]
 
 

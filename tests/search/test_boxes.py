@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -25,8 +26,9 @@ from torchgco import (
 )
 from torchgco.base.kernels import use_native
 from torchgco.native.dispatch import engine_of
+from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.roadmap.geometry import FAR, Scene
+from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.homotopy import one_per_class
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scales, scene_of
@@ -55,12 +57,14 @@ def scene(d: int, B: int = 4, seed: int = 0, spheres: int = 3, boxes: int = 5) -
     cost = QuadraticCost(Q=[1.0] * plain.n, R=[1.0] * plain.m, Qf=[1.0] * plain.n)
     problem = Problem(plain, cost, parts, x0, 5, Goal(goal, 0.1))
     seen = scene_of(problem, torch.zeros(B, 5, plain.m, dtype=torch.float64))
-    assert seen is not None and seen.boxes is not None
-    return Scene(seen.start, seen.goal, seen.centers, seen.inflated_radii, uneven, seen.boxes), [
-        centers,
-        half,
-        rotations,
-    ]
+    assert seen is not None and seen.obstacles.boxes is not None
+    return replace(seen, traversal_cost=uneven), [centers, half, rotations]
+
+
+def absent(boxes: Cuboids) -> Cuboids:
+    """The same boxes, none of them present."""
+    none = {name: torch.zeros_like(getattr(boxes, name)) for name in ("centers", "radii", "half_sizes")}
+    return replace(boxes, absent=torch.ones_like(boxes.absent), **none)
 
 
 @pytest.mark.parametrize("spheres", [0, 3])
@@ -90,13 +94,13 @@ def test_paths_are_free_and_the_same_in_c_and_in_pytorch(d: int, spheres: int) -
 
 def test_without_its_boxes_a_scene_is_that_of_spheres_alone() -> None:
     s, _ = scene(2)
-    assert s.boxes is not None
-    absent_boxes = s.boxes._replace(radius=torch.full_like(s.boxes.radius, FAR))
+    spheres, boxes = s.obstacles
+    assert boxes is not None
     for native in (True, False):
         use_native(native)
         try:
-            with_boxes = Roadmap().paths(Scene(s.start, s.goal, s.centers, s.inflated_radii, uneven, absent_boxes), 2)
-            alone = Roadmap().paths(Scene(s.start, s.goal, s.centers, s.inflated_radii, uneven), 2)
+            with_boxes = Roadmap().paths(replace(s, obstacles=Inflated(spheres, absent(boxes))), 2)
+            alone = Roadmap().paths(replace(s, obstacles=Inflated(spheres)), 2)
         finally:
             use_native(True)
         assert torch.equal(with_boxes[0], alone[0]) and torch.equal(with_boxes[1], alone[1])
@@ -104,15 +108,13 @@ def test_without_its_boxes_a_scene_is_that_of_spheres_alone() -> None:
 
 def test_paths_on_either_side_of_a_box_are_of_different_classes() -> None:
     s, _ = scene(2, B=1, boxes=1, spheres=0)
-    assert s.boxes is not None
-    boxes = s.boxes._replace(centers=torch.zeros_like(s.boxes.centers), radius=torch.full_like(s.boxes.radius, 0.05))
-    s = Scene(s.start, s.goal, s.centers, s.inflated_radii, uneven, boxes)
+    spheres, boxes = s.obstacles
+    assert boxes is not None
+    boxes = replace(boxes, centers=torch.zeros_like(boxes.centers), radii=torch.full_like(boxes.radii, 0.05))
     corners = torch.tensor([[0.0, 0.9], [0.1, 0.8], [0.0, -0.9]], dtype=torch.float64)
     paths = torch.stack([torch.stack((s.start[0], corner, s.goal[0])) for corner in corners]).unsqueeze(0)
-    assert one_per_class(paths, s).tolist() == [[True, False, True]]
-    absent = boxes._replace(radius=torch.full_like(boxes.radius, FAR))
-    s = Scene(s.start, s.goal, s.centers, s.inflated_radii, uneven, absent)
-    assert one_per_class(paths, s).tolist() == [[True, False, False]]
+    assert one_per_class(paths, Inflated(spheres, boxes)).tolist() == [[True, False, True]]
+    assert one_per_class(paths, Inflated(spheres, absent(boxes))).tolist() == [[True, False, False]]
 
 
 def wall_in_the_plane(B: int = 2) -> Problem:

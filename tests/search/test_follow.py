@@ -8,11 +8,10 @@ import torch
 
 from tests.reference import boxes as brute_force
 from tests.search.cup import GOAL, QUICK, controls, cost, cup
+from tests.search.scenes import NONE, inflated
 from tests.search.test_paths import alone
 from torchgco import AugmentedLagrangian, PathProposals, Problem, Restarts, compose, judge
 from torchgco.lagrangian.rollout import open_loop
-from torchgco.obstacles.base import Inflated
-from torchgco.roadmap.geometry import FAR, depth
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.candidates import TO_THE_END, Candidates
 from torchgco.search.tracking import CUT, followed, travel
@@ -39,7 +38,7 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
     for tube, stiffness in ((0.05, 20.0), (None, 500.0)):
         options = replace(QUICK, tube=tube, stiffness=(stiffness,), track_iterations=4)
         path = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
-        candidates = options.track(make_candidates(problem, controls(problem)[:, None]), ways(problem, path[:, None]))
+        candidates = options.track(make_candidates(problem, controls(problem)[:, None]), ways(path[:, None]))
         X = open_loop(problem.dynamics, problem.x0, candidates.U)
         torch.testing.assert_close(candidates.X, X)
         off.append(
@@ -54,12 +53,10 @@ def make_candidates(problem: Problem, U: torch.Tensor) -> Candidates:
     return Candidates.begin(problem, U, R, unit, torch.ones(1, U.shape[1], dtype=torch.bool))
 
 
-def ways(problem: Problem, paths: torch.Tensor) -> Ways:
+def ways(paths: torch.Tensor) -> Ways:
     """Paths (1, K, P, 2) that are all followed, in the units of `make_candidates`, without obstacles to cut."""
     R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
-    scene = scene_of(problem, controls(problem))
-    assert scene is not None
-    none = replace(scene, inflated_radii=torch.full_like(scene.inflated_radii, FAR)).obstacles
+    none = inflated([[[0.0, 0.0]]], [[NONE]])
     return Ways(paths, torch.ones(paths.shape[:2], dtype=torch.bool), R, unit, none)
 
 
@@ -70,7 +67,7 @@ def test_every_candidate_tracks_its_own_path_at_its_own_pace() -> None:
     ends = (-1.0, 0.0), (1.0, 0.4)
     paths = torch.tensor([[[ends[0], (0.0, y), ends[1]] for y in (-0.9, 1.2)]], dtype=torch.float64)
     starts = controls(problem)[:, None].repeat(1, 8, 1, 1)
-    found = options.track(make_candidates(problem, starts), ways(problem, paths))
+    found = options.track(make_candidates(problem, starts), ways(paths))
     for i, X in enumerate(found.X):
         apart = []
         for path in paths[0]:
@@ -151,14 +148,12 @@ def test_a_refined_candidate_that_cuts_through_an_obstacle_between_two_knots_is_
 
 def test_corners_are_averaged_less_where_the_average_would_cut_an_obstacle() -> None:
     corner = torch.tensor([[[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]]] * 2, dtype=torch.float64)
-    spheres = Inflated(
-        torch.tensor([[[0.0, 0.6]], [[0.0, -0.6]]], dtype=torch.float64), torch.full((2, 1), 0.3, dtype=torch.float64)
-    )
+    spheres = inflated([[[0.0, 0.6]], [[0.0, -0.6]]], [[0.3], [0.3]])
     options = 0.0, END.expand(2), 0.5, 100
     centers = followed(corner, *options, spheres, torch.full((2,), 0.3, dtype=torch.float64))
     plain = travel(corner, *options)
     assert torch.equal(centers[1], plain[1])
-    deepest = [float(depth(spheres, points).amax(-1)[0]) for points in (plain, centers)]
+    deepest = [float(spheres.depth(points).amax(-1)[0]) for points in (plain, centers)]
     assert deepest[1] <= CUT * 0.3 < deepest[0]
 
 
@@ -170,7 +165,7 @@ def test_the_depth_of_points_against_brute_force() -> None:
     assert scene is not None and layouts.box_centers is not None and layouts.box_half_sizes is not None
     assert layouts.box_rotations is not None
     points = np.random.default_rng(3).uniform((3.0, -4.0, -3.0), (16.0, 6.0, 3.0), (2, 40, 3))
-    found = depth(scene.obstacles, torch.as_tensor(points))
+    found = scene.obstacles.depth(torch.as_tensor(points))
     for b in range(2):
         boxes = list(zip(layouts.box_centers[b], layouts.box_half_sizes[b], layouts.box_rotations[b], strict=True))
         for i in range(40):

@@ -10,13 +10,16 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.search.scenes import NONE, inflated
 from torchgco.base import kernels
+from torchgco.base.tree import cast, take
 from torchgco.native.dispatch import EagerWarning
+from torchgco.obstacles.base import Solids
 from torchgco.roadmap import native as native
-from torchgco.roadmap.geometry import FAR, Scene
-from torchgco.roadmap.native import HOPS, Graph, NativeSearch, library_for
+from torchgco.roadmap.geometry import Inflated, Scene
+from torchgco.roadmap.native import NativeSearch, library_for
 from torchgco.roadmap.roadmap import Roadmap, halton
-from torchgco.roadmap.search import Search
+from torchgco.roadmap.search import HOPS, Graph, Search
 
 B = 3
 
@@ -40,14 +43,14 @@ def scene(centers, distances, start, goal, price=uneven) -> Scene:
     """B problems with the same start and goal, among shared spheres (M, d) or their own (B, M, d)."""
     o, R = (torch.as_tensor(np.asarray(v, dtype=float)) for v in (centers, distances))
     ends = (torch.tensor(end, dtype=torch.float64).expand(B, -1) for end in (start, goal))
-    return Scene(*ends, o.expand(B, *o.shape[-2:]), R.expand(B, R.shape[-1]), price)
+    return Scene(*ends, inflated(o.expand(B, *o.shape[-2:]), R.expand(B, R.shape[-1])), price)
 
 
 def drawn(d: int, M: int, seed: int) -> Scene:
     """Spheres of several sizes, some of them absent."""
     rng = np.random.default_rng(seed)
     R = rng.uniform(0.02, 0.7, (B, M)) * M ** (-1 / d)
-    R[rng.uniform(size=R.shape) < 0.2] = FAR
+    R[rng.uniform(size=R.shape) < 0.2] = NONE
     start, goal = (-1.0,) + (0.0,) * (d - 1), (1.0, *rng.uniform(-0.3, 0.3, d - 1))
     return scene(rng.uniform(-0.8, 0.8, (B, M, d)), R, start, goal)
 
@@ -69,9 +72,9 @@ SCENES = {
     **{f"drawn {d}-D, {M} spheres": drawn(d, M, M) for d in (2, 3) for M in (1, 2, 3, 5, 12, 100)},
     "lattice": lattice(2),
     "lattice in space": lattice(3),
-    "no spheres": scene([[0.0, 0.0]] * 3, [FAR] * 3, (-1.0, 0.0), (1.0, 0.0)),
-    "no spheres in space": scene([[0.0, 0.0, 0.0]], [FAR], (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)),
-    "one before many places": scene([[0.0, 0.0]] + [[9.0, 9.0]] * 40, [0.3] + [FAR] * 40, (-1.0, 0.0), (1.0, 0.0)),
+    "no spheres": scene([[0.0, 0.0]] * 3, [NONE] * 3, (-1.0, 0.0), (1.0, 0.0)),
+    "no spheres in space": scene([[0.0, 0.0, 0.0]], [NONE], (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)),
+    "one before many places": scene([[0.0, 0.0]] + [[9.0, 9.0]] * 40, [0.3] + [NONE] * 40, (-1.0, 0.0), (1.0, 0.0)),
     "in the middle": scene([[0.0, 0.0]], [0.4], (-1.0, 0.0), (1.0, 0.0), flat),
     "in the middle of a diagonal": scene([[0.0, 0.0]], [0.4], (-1.0, -1.0), (1.0, 1.0), flat),
     "in the middle of space": scene([[0.0, 0.0, 0.0]], [0.4], (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), flat),
@@ -81,14 +84,14 @@ SCENES = {
     "one in another": scene([[0.0, 0.0]] * 3 + [[0.1, 0.0]], [0.3, 0.3, 0.2, 0.1], (-1.0, 0.0), (1.0, 0.0), flat),
     "goal at start": scene([[0.5, 0.0]], [0.2], (0.0, 0.0), (0.0, 0.0)),
     "goal at start in space": scene([[0.5, 0.0, 0.0], [0.0, 0.4, 0.0]], [0.2, 0.1], (0.0,) * 3, (0.0,) * 3),
-    "goal at start, no spheres": scene([[0.5, 0.0]], [FAR], (0.0, 0.0), (0.0, 0.0)),
+    "goal at start, no spheres": scene([[0.5, 0.0]], [NONE], (0.0, 0.0), (0.0, 0.0)),
     "start inside": scene([[-1.0, 0.1], [0.0, 0.0]], [0.3, 0.3], (-1.0, 0.0), (1.0, 0.0)),
     "no path": ring(),
 }
 
 
 def both(roadmap: Roadmap, s: Scene, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    assert library_for(s.centers) is not None
+    assert library_for(s.start) is not None
     first = roadmap.paths(s, count)
     kernels.use_native(False)
     return first, roadmap.paths(s, count)
@@ -124,7 +127,7 @@ def test_both_make_the_same_graph(name: str) -> None:
     """
     s = SCENES[name]
     d, made = s.start.shape[1], []
-    for search in searches(s.centers, s.inflated_radii, 0.15):
+    for search in searches(s.obstacles, 0.15):
         graph = search.graph(s.start, s.goal, halton(20, d), 30, 5, 4)
         lengths = torch.full((B, graph.points.shape[1], graph.points.shape[1]), torch.inf, dtype=torch.float64)
         places = ((graph.points.unsqueeze(2) - graph.points.unsqueeze(1)).abs().amax(-1) < 1e-12).to(torch.uint8)
@@ -133,10 +136,10 @@ def test_both_make_the_same_graph(name: str) -> None:
     torch.testing.assert_close(made[0], made[1], rtol=1e-12, atol=1e-12)
 
 
-def searches(o: Tensor, R: Tensor, margin: float) -> tuple[NativeSearch, Search]:
-    library = library_for(o)
+def searches(obstacles: Inflated, margin: float) -> tuple[NativeSearch, Search]:
+    library = library_for(obstacles.middles)
     assert library is not None
-    return NativeSearch(library, o, R, margin), Search(o, R, margin)
+    return NativeSearch(library, obstacles, margin), Search(obstacles, margin)
 
 
 def chain(points: int) -> Graph:
@@ -149,14 +152,14 @@ def chain(points: int) -> Graph:
     return Graph(p, ends, torch.ones(1, points, 1, dtype=torch.float64))
 
 
-def no_spheres() -> tuple[Tensor, Tensor]:
-    return torch.zeros(1, 1, 2, dtype=torch.float64), torch.full((1, 1), FAR, dtype=torch.float64)
+def no_spheres() -> Inflated:
+    return inflated([[[0.0, 0.0]]], [[NONE]])
 
 
 @pytest.mark.parametrize("edges", [1, 2, HOPS - 1, HOPS, HOPS + 1, HOPS + 2])
 def test_a_path_has_at_most_hops_edges(edges: int) -> None:
     graph = chain(edges + 1)
-    for search in searches(*no_spheres(), 0.15):
+    for search in searches(no_spheres(), 0.15):
         path, string, arrives = search.cheapest(graph, torch.ones(1, edges + 1, dtype=torch.float64))
         assert bool(arrives) == (edges <= HOPS)
         corners = min(edges, HOPS) if edges <= HOPS else 1
@@ -172,7 +175,7 @@ def test_of_equally_cheap_paths_the_first_is_taken() -> None:
     for least, taken in ((1.0 - 1e-14, 2), (1.0 - 1e-10, 4)):
         lengths = torch.ones(1, 5, 3, dtype=torch.float64)
         lengths[0, 0] = torch.tensor([1.0, 1.0 - 1e-15, least], dtype=torch.float64)
-        for search in searches(*no_spheres(), 0.15):
+        for search in searches(no_spheres(), 0.15):
             path, _, arrives = search.cheapest(Graph(points, ends, lengths), torch.ones(1, 5, dtype=torch.float64))
             assert bool(arrives) and torch.equal(path[0, 1], points[0, taken])
 
@@ -180,42 +183,44 @@ def test_of_equally_cheap_paths_the_first_is_taken() -> None:
 def test_a_nan_price_closes_its_edges() -> None:
     price = torch.ones(1, 5, dtype=torch.float64)
     price[0, 3] = torch.nan
-    for search in searches(*no_spheres(), 0.15):
+    for search in searches(no_spheres(), 0.15):
         assert not bool(search.cheapest(chain(5), price)[2])
 
 
 def test_a_problem_has_the_same_bits_in_every_batch() -> None:
-    s = Scene(*(torch.cat([getattr(drawn(3, 12, seed), name) for seed in range(27)]) for name in (
-        "start", "goal", "centers", "inflated_radii",
-    )), uneven)  # fmt: skip
+    parts = [drawn(3, 12, seed) for seed in range(27)]
+    ends = (torch.cat([getattr(part, name) for part in parts]) for name in ("start", "goal"))
+    columns = zip(*(vars(part.obstacles.spheres).values() for part in parts), strict=True)
+    s = Scene(*ends, Inflated(Solids(*map(torch.cat, columns))), uneven)
     whole, found = Roadmap().paths(s, 3)
     assert len(whole) > native.AT_ONCE
     for rows in (torch.arange(1), torch.tensor([70]), torch.arange(81).flip(0)):
-        part = Scene(s.start[rows], s.goal[rows], s.centers[rows], s.inflated_radii[rows], uneven)
+        part = Scene(s.start[rows], s.goal[rows], take(s.obstacles, rows), uneven)
         paths, arrives = Roadmap().paths(part, 3)
         assert torch.equal(paths, whole[rows]) and torch.equal(arrives, found[rows])
 
 
 def test_no_problems_have_no_paths() -> None:
     s = SCENES["in the middle"]
-    for paths, found in both(Roadmap(), Scene(s.start[:0], s.goal[:0], s.centers[:0], s.inflated_radii[:0], flat), 2):
+    none = slice(0, 0)
+    for paths, found in both(Roadmap(), Scene(s.start[none], s.goal[none], take(s.obstacles, none), flat), 2):
         assert paths.shape == (0, 2, HOPS + 1, 2) and found.shape == (0,)
 
 
 def test_pytorch_searches_in_single_precision_and_without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     s = SCENES["in the middle"]
-    single = Scene(*(t.float() for t in (s.start, s.goal, s.centers, s.inflated_radii)), flat)
-    assert library_for(single.centers) is None
+    single = Scene(s.start.float(), s.goal.float(), Inflated(*cast(s.obstacles, torch.float32)), flat)
+    assert library_for(single.start) is None
     paths, found = Roadmap().paths(single)
     assert paths.dtype == torch.float32 and bool(found.all())
     monkeypatch.setenv("TORCHGCO_CC", "none")
-    assert library_for(s.centers) is None
+    assert library_for(s.start) is None
     paths, _ = Roadmap().paths(s)
     monkeypatch.undo()
     monkeypatch.setattr(native, "POINTS", Path(__file__))  # not C code
     native._library.cache_clear()
     with pytest.warns(EagerWarning, match=r"PyTorch's kernels where \w+ are sought"):
-        assert library_for(s.centers) is None
+        assert library_for(s.start) is None
     monkeypatch.undo()
     native._library.cache_clear()
     torch.testing.assert_close(paths, Roadmap().paths(s)[0], rtol=0, atol=1e-9)

@@ -2,16 +2,13 @@
 
 import torch
 
-from torchgco.roadmap.geometry import FAR, Scene
+from tests.search.scenes import NONE, inflated
+from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.homotopy import one_per_class
 
 
-def scene(centers: list[list[float]], distances: list[float], B: int = 1) -> Scene:
-    o, R = torch.tensor(centers, dtype=torch.float64), torch.tensor(distances, dtype=torch.float64)
-    d = o.shape[-1]
-    start, goal = torch.zeros(B, d, dtype=torch.float64), torch.zeros(B, d, dtype=torch.float64)
-    start[:, 0], goal[:, 0] = -1.0, 1.0
-    return Scene(start, goal, o.expand(B, -1, -1), R.expand(B, -1), lambda points, rows: points[..., 0])
+def balls(centers: list[list[float]], radii: list[float], B: int = 1) -> Inflated:
+    return inflated([centers] * B, [radii] * B)
 
 
 def through(*corners: list[float]) -> torch.Tensor:
@@ -28,19 +25,19 @@ def test_in_the_plane_paths_on_different_sides_differ() -> None:
         through([-0.5, 0.5], [0.0, 0.0], [0.5, -0.5]),  # over the first, under the second
         through([0.0, -2.0], [0.5, -1.0]),  # under both, from farther below
     ])  # fmt: skip
-    two = scene([[-0.5, 0.0], [0.5, 0.0]], [0.2, 0.2], B=2)
+    two = balls([[-0.5, 0.0], [0.5, 0.0]], [0.2, 0.2], B=2)
     assert one_per_class(paths.expand(2, -1, -1, -1), two).tolist() == [[True, False, True, True, False]] * 2
-    one = scene([[-0.5, 0.0], [0.5, 0.0]], [0.2, FAR])  # the second is absent
+    one = balls([[-0.5, 0.0], [0.5, 0.0]], [0.2, NONE])  # the second is absent
     assert one_per_class(paths[None], one).tolist() == [[True, False, True, False, False]]
 
 
 def test_a_loop_around_a_disc_is_another_class() -> None:
     straight = through([0.0, 0.5])
     loop = through([0.5, 0.5], [0.0, -0.5], [-0.5, 0.5])
-    assert one_per_class(torch.stack([straight, loop])[None], scene([[0.0, 0.0]], [0.2])).tolist() == [[True, True]]
+    assert one_per_class(torch.stack([straight, loop])[None], balls([[0.0, 0.0]], [0.2])).tolist() == [[True, True]]
 
 
 def test_in_space_paths_far_from_each_other_are_different() -> None:
-    ball = scene([[0.0, 0.0, 0.0]], [0.3])
+    ball = balls([[0.0, 0.0, 0.0]], [0.3])
     over, left, near = through([0.0, 0.0, 0.5]), through([0.0, 0.5, 0.0]), through([0.0, 0.1, 0.5])
     assert one_per_class(torch.stack([over, near, left, over])[None], ball).tolist() == [[True, False, True, False]]

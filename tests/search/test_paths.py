@@ -15,6 +15,7 @@ from tests.search.cup import GOAL, QUICK, controls, cost, cup, cups
 from torchgco import ControlBounds, InputError, PathProposals, Problem, Roadmap, judge
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.rollout import open_loop
+from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.homotopy import one_per_class
 from torchgco.solvers.ilqr import descend
 
@@ -54,8 +55,8 @@ def test_no_problems_have_no_proposals() -> None:
 def only(k: int) -> Iterator[None]:
     """Keep only the first path of class k."""
 
-    def one(paths: torch.Tensor, scene) -> torch.Tensor:
-        first = one_per_class(paths, scene)
+    def one(paths: torch.Tensor, obstacles: Inflated) -> torch.Tensor:
+        first = one_per_class(paths, obstacles)
         return first & (first.cumsum(-1) == k + 1)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -8,12 +8,14 @@ import pytest
 import torch
 
 from tests.reference.roadmap import cheapest_cost, path_length, point_along, segment_gap
+from tests.search.scenes import NONE, inflated
 from torchgco import InputError, compose
-from torchgco.roadmap.geometry import FAR, Scene, points_along, squares_from_segments
-from torchgco.roadmap.native import Graph, NativeSearch, library_for
+from torchgco.obstacles.base import squares_from_segments
+from torchgco.roadmap.geometry import Scene, points_along
+from torchgco.roadmap.native import NativeSearch, library_for
 from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, Roadmap, halton
 from torchgco.roadmap.scene import scene_of
-from torchgco.roadmap.search import Search
+from torchgco.roadmap.search import Graph, Search
 
 
 def flat(points, rows):
@@ -29,14 +31,21 @@ def segment_gaps(a: torch.Tensor, b: torch.Tensor, centers: torch.Tensor, radii:
 def scene(centers, distances, start=(-1.0, 0.0), goal=(1.0, 0.0), price=flat) -> Scene:
     o, R = torch.as_tensor(centers, dtype=torch.float64), torch.as_tensor(distances, dtype=torch.float64)
     ends = (torch.tensor(end, dtype=torch.float64).expand(o.shape[0], -1) for end in (start, goal))
-    return Scene(*ends, o, R, price)
+    return Scene(*ends, inflated(o, R), price)
+
+
+def present(s: Scene, b: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centres and radii of the spheres of problem b."""
+    spheres = s.obstacles.spheres
+    here = ~spheres.absent[b]
+    return spheres.centers[b, here].numpy(), spheres.radii[b, here].numpy()
 
 
 def random_scene(d: int, B: int = 5, M: int = 12, seed: int = 0) -> Scene:
     rng = np.random.default_rng(seed)
     start, goal = (-1.0,) + (0.0,) * (d - 1), (1.0,) + (0.1,) * (d - 1)
     o, R = rng.uniform(-0.7, 0.7, (B, M, d)), rng.uniform(0.1, 0.2, (B, M))
-    R[1, ::2] = FAR
+    R[1, ::2] = NONE
     return scene(o, R, start, goal)
 
 
@@ -46,7 +55,7 @@ def ring(open_at: int | None = None) -> Scene:
     o = np.stack((1.0 + 0.5 * np.cos(angle), 0.5 * np.sin(angle)), axis=-1)
     R = np.full(10, 0.17)
     if open_at is not None:
-        R[open_at] = FAR
+        R[open_at] = NONE
     return scene(o[None], R[None])
 
 
@@ -60,7 +69,7 @@ def test_paths_are_free_and_lead_from_start_to_goal(d: int) -> None:
         assert torch.equal(path[:, 0], s.start) and torch.equal(path[:, -1], s.goal)
         for b in range(s.start.shape[0]):
             for a, c in pairwise(path[b].numpy()):
-                assert segment_gap(a, c, s.centers[b].numpy(), s.inflated_radii[b].numpy(), 201) > -1e-9
+                assert segment_gap(a, c, *present(s, b), 201) > -1e-9
 
 
 def test_further_paths_differ() -> None:
@@ -116,7 +125,7 @@ def test_a_narrowly_closed_gap_is_open_with_max_overlap() -> None:
     assert not bool(Roadmap(max_overlap=0.02).paths(closed)[1].any())
     paths, found = Roadmap(max_overlap=0.12).paths(closed)
     assert bool(found.all())
-    gaps = segment_gaps(paths[:, 0, :-1], paths[:, 0, 1:], closed.centers, closed.inflated_radii)
+    gaps = segment_gaps(paths[:, 0, :-1], paths[:, 0, 1:], closed.obstacles.spheres.centers, closed.obstacles.sizes)
     assert float(gaps.min()) > -0.12 * 0.17
 
 
@@ -136,13 +145,13 @@ def test_no_path_on_the_graph_is_cheaper(native: bool) -> None:
     points = torch.cat((s.start[:, None], s.goal[:, None], torch.as_tensor(rng.uniform(-1, 1, (3, 50, 2)))), dim=1)
     near = torch.as_tensor(rng.integers(0, 52, (3, 52, 8)))
     price = torch.as_tensor(rng.uniform(0.5, 2.0, (3, 52)))
-    search = Search(s.centers, s.inflated_radii, margin)
+    search = Search(s.obstacles, margin)
     graph = Graph(points, near, search._lengths(points, near))
     if native:
-        search = NativeSearch(library_for(points), s.centers, s.inflated_radii, margin)
+        search = NativeSearch(library_for(points), s.obstacles, margin)
     path, _, found = search.cheapest(graph, price)
     for b in range(3):
-        p, o, R = points[b].numpy(), s.centers[b].numpy(), s.inflated_radii[b].numpy()
+        p, (o, R) = points[b].numpy(), present(s, b)
         edges = {}
         for i in range(52):
             edges[i] = {}

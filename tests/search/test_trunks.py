@@ -10,11 +10,14 @@ import torch
 
 from tests.problems import quick_gco
 from tests.reference import boxes as brute_force
+from tests.search.scenes import NONE, spheres
 from torchgco import Capsules, ControlBounds, Goal, Planar, Problem, QuadraticCost, QuadrotorPlanning, Spheres, judge
 from torchgco.base.kernels import use_native
-from torchgco.obstacles.box_geometry import Cuboids, beside, between
+from torchgco.base.tree import take
+from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.roadmap.geometry import FAR, Scene
+from torchgco.roadmap.geometry import Inflated, Scene
+from torchgco.roadmap.points import around_boxes, between_boxes
 from torchgco.roadmap.roadmap import Roadmap
 
 VEHICLE = 0.36  # m
@@ -35,8 +38,7 @@ def trunks(B: int, K: int, tilt: float = 0.0) -> tuple[Scene, tuple[np.ndarray, 
     parts = middle - up, middle + up, rng.uniform(0.25, 0.45, (B, K))
     boxes = bound(parts)
     start, goal = (torch.tensor(p, dtype=torch.float64).expand(B, 3) for p in (START, GOAL))
-    none = torch.full((B, 1), FAR, dtype=torch.float64)
-    return Scene(start, goal, start.unsqueeze(1), none, flat_price, boxes), parts
+    return Scene(start, goal, Inflated(spheres([[START]] * B, [[NONE]] * B), boxes), flat_price), parts
 
 
 def bound(parts: tuple[np.ndarray, ...]) -> Cuboids:
@@ -45,9 +47,7 @@ def bound(parts: tuple[np.ndarray, ...]) -> Cuboids:
     x0 = torch.zeros(len(parts[0]), model.n, dtype=torch.float64)
     cost = QuadraticCost(Q=[1.0] * model.n, R=[1.0] * model.m, Qf=[1.0] * model.n)
     (found,) = Problem(model, cost, [Capsules(*parts, VEHICLE)], x0, 3).constraints
-    boxes = found.inflated().boxes
-    assert boxes is not None
-    return boxes
+    return found.inflated()
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
@@ -76,10 +76,9 @@ def test_points_around_trunks_lie_where_the_straight_line_passes() -> None:
     foot, top = np.array([[[0, 0.3, -1.0], [0, -1.5, -1.0]]]), np.array([[[0, 0.3, 11.0], [0, -1.5, 9.0]]])
     boxes = bound((foot, top, np.full((1, 2), 0.3)))
     start, goal = torch.tensor([START], dtype=torch.float64), torch.tensor([GOAL], dtype=torch.float64)
-    none = torch.full((1, 1), FAR, dtype=torch.float64)
-    points, exists = between(boxes, start, goal, start.unsqueeze(1), none, 4)
+    points, exists = between_boxes(boxes, spheres([[[0.0] * 3]], [[NONE]]), start, goal)
     assert points[exists].tolist() == [pytest.approx([0, -0.6, 1.0])] * 2  # midway, seen from either trunk
-    points, exists = beside(boxes, start, goal, (1.15,))
+    points, exists = around_boxes(boxes, start, goal, (1.15,))
     level = points[0, (points[0, :, 2] - 1.0).abs() < 1e-9]
     assert bool(exists.all()) and len(level) == 16
     away = torch.cdist(level, torch.tensor([[0, 0.3, 1.0], [0, -1.5, 1.0]], dtype=torch.float64)).amin(-1)
@@ -88,13 +87,13 @@ def test_points_around_trunks_lie_where_the_straight_line_passes() -> None:
 
 def test_gaps_do_not_depend_on_the_other_problems() -> None:
     scene, _ = trunks(B=70, K=30, tilt=0.3)  # more than are projected at once
-    boxes = scene.boxes
+    none, boxes = scene.obstacles
     assert boxes is not None
-    parts = scene.start, scene.goal, scene.centers, scene.inflated_radii
-    points, exists = between(boxes, *parts, count=4)
+    parts = boxes, none, scene.start, scene.goal
+    points, exists = between_boxes(*parts)
     for b in (0, 36, 69):
         row = slice(b, b + 1)
-        alone = between(boxes.rows(row), *(part[row] for part in parts), count=4)
+        alone = between_boxes(*take(parts, row))
         assert torch.equal(alone[0], points[row]) and torch.equal(alone[1], exists[row])
 
 

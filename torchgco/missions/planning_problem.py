@@ -93,7 +93,7 @@ class Margin:
         times = torch.arange(p.shape[1], dtype=p.dtype) * float(problem.dynamics.dt)
         depth = torch.zeros_like(p[:, 0, 0])
         for part in problem.constraints:
-            if isinstance(part, Obstacles) and part.centers.shape[1] > 0:
+            if isinstance(part, Obstacles) and part.absent.shape[1] > 0:
                 distance = part.later(t).signed_distance(p, times).amin(1) - self.size  # (B, M)
                 most = self.size + (1.0 - KEPT) * (1.0 - CONTACT_FACTOR) * part.margins
                 depth = torch.maximum(depth, torch.minimum(-distance, most).clamp(min=0.0).amax(-1))

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.obstacles.base import marked
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
-ABSENT = -1.0  # stands for the squared inflated radius of an absent obstacle
 BOUNDS, SPHERES, FUNCTION, BOXES = range(4)
 # All other constraints, subclasses of these too, are traced.
 KINDS = {ControlBounds: BOUNDS, StateBounds: BOUNDS, BoundSpheres: SPHERES, BoundBoxes: BOXES}
@@ -95,8 +95,7 @@ def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: 
     elif isinstance(constraint, BoundSpheres):
         c.dt = constraint.dt
         c.bound = array(constraint.centers.flatten(1), keep, knots=False)
-        squares = torch.where(constraint.absent, ABSENT, constraint.inflated_radii.square())
-        c.squares = array(squares, keep, knots=False)
+        c.squares = array(marked(constraint.inflated_radii.square(), constraint.absent), keep, knots=False)
         if constraint.velocities is not None:
             c.velocities = array(constraint.velocities.flatten(1), keep, knots=False)
     elif isinstance(constraint, BoundBoxes):
@@ -104,13 +103,12 @@ def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: 
 
 
 def _box_numbers(boxes: BoundBoxes) -> Tensor:
-    """The numbers (B, ...) that boxes.c reads: bounds of all boxes, axis by axis, then all numbers of each box."""
-    radius, factor = boxes.inflated_radii.unsqueeze(-1), 2.0 * boxes.depths.unsqueeze(-1)
-    reach = (boxes.axes.abs() * boxes.half_sizes.unsqueeze(-1)).sum(-2) + radius
-    reach = torch.where(boxes.absent.unsqueeze(-1), -1.0, BOUND_SLACK * reach)
+    """The numbers (B, ...) that boxes.c reads: bounds of all boxes, axis by axis, factors, all numbers of each."""
+    absent, radius = boxes.absent.unsqueeze(-1), boxes.inflated_radii.unsqueeze(-1)
+    reach = marked(BOUND_SLACK * (boxes.inflated().extent + radius), absent)
     bounds = torch.stack((boxes.centers, reach), dim=-1).transpose(1, 2)
-    numbers = torch.cat((boxes.centers, boxes.axes.flatten(2), boxes.half_sizes, radius, factor), dim=-1)
-    return torch.cat((bounds.flatten(1), numbers.flatten(1)), dim=1)
+    numbers = torch.cat((boxes.centers, boxes.axes.flatten(2), boxes.half_sizes, marked(radius, absent)), dim=-1)
+    return torch.cat((bounds.flatten(1), 2.0 * boxes.depths, numbers.flatten(1)), dim=1)
 
 
 def array(value: Tensor | None, keep: list[Any], knots: bool) -> Array:

@@ -3,42 +3,81 @@
 from __future__ import annotations
 
 import warnings
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass
+from functools import reduce
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import ScaleWarning
 from torchgco.constraints.base import Constraint, Sense
-from torchgco.obstacles.box_geometry import Cuboids
 
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
-
-
 ADMITTED = 1e-3  # m: the violation up to which solvers and judge call a trajectory feasible, unless options say else
+ABSENT = -1.0  # in C: stands for a length of an absent obstacle, or the square of one, which are never negative
 
 
-class Inflated(NamedTuple):
-    """Static obstacles grown by the vehicle's radius, in the forms that the roadmap knows."""
+@dataclass(frozen=True)
+class Solids:
+    """M spheres at rest of each of B problems, grown by the vehicle's radius; `box_geometry.Cuboids` are boxes.
 
-    centers: Tensor  # (B, M, d) of spheres, m
-    inflated_radii: Tensor  # (B, M): r_obs + r_veh, m; negative where absent
-    boxes: Cuboids | None = None
+    What the search for paths knows of obstacles. The methods measure as if none were absent.
+    """
+
+    centers: Tensor  # (B, M, d), m
+    radii: Tensor  # (B, M): r_obs + r_veh, m; 0 where absent
+    absent: Tensor  # (B, M) bool
+
+    @property
+    def sizes(self) -> Tensor:
+        """How deep the deepest point lies beneath the grown surface, (B, M), m; 0 where absent."""
+        return self.radii
+
+    @property
+    def extent(self) -> Tensor:
+        """Half the side lengths (B, M, d) of boxes along the axes that hold the solids before they are grown, m."""
+        return torch.zeros_like(self.centers)
+
+    def squares(self, points: Tensor) -> Tensor:
+        """Squared distances (B, V, M) of points (B, V, d) from the solids before they are grown; 0 inside."""
+        return squares(points, self.centers)
+
+    def squares_from_segments(self, a: Tensor, b: Tensor) -> Tensor:
+        """Smallest squared distances (B, E, M) of the segments from a to b (B, E, d); 0 for those that enter."""
+        return squares_from_segments(self.centers, a, b)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Distances (B, V, M) of points (B, V, d) from the grown surfaces, m; negative inside."""
+        return self.squares(points).sqrt_() - self.radii.unsqueeze(1)
 
 
 class Obstacles(Constraint):
     """Obstacles that the vehicle's position keeps clear of, M per problem, once bound.
 
-    Each kind of obstacles is a subclass, which defines a constraint's methods and the abstract ones below. Distances
-    count from the full surface, the obstacle's own grown by the vehicle's radius: positive outside, negative inside,
-    infinite where an obstacle is absent. The judge and the certificate measure distances by separate code; a new kind
-    is added to it in `judge.CLEARANCES` and `certificate.CHORDS`.
+    Distances count from the full surface, the obstacle's own grown by the vehicle's radius: positive outside, negative
+    inside, infinite where an obstacle is absent. An absent one is marked in `absent`, and its numbers are 0; NaN stands
+    for it only in what users and files give.
+
+    A kind of obstacles is a subclass with the fields below. It must define
+
+        bind, value, at, accumulate           as any constraint; `grown` too, or its chords can't be mended
+        absent, margins                       which obstacles there are, and their lengths
+        signed_distance, segment_clearance    distances of points and of segments
+
+    and it may define
+
+        inflated                              its form as spheres or boxes: without it no path is sought
+        moving, chord_clearance, later        where its obstacles move
+        sizes, start_is_clear                 where the margins don't say enough
+
+    The judge and the certificate measure distances by separate code, to which a kind is added in `judge.CLEARANCES` and
+    `certificate.CHORDS`. Kernels in C are optional.
     """
 
     sense: ClassVar[Sense] = "inequality"
     geometric: ClassVar[bool] = True
 
-    centers: Tensor  # (B, M, d) at t = 0, m
     absent: Tensor  # (B, M) bool
     vehicle_radius: Tensor  # (B,), m
     position: slice
@@ -70,8 +109,8 @@ class Obstacles(Constraint):
         """
         raise NotImplementedError
 
-    def inflated(self) -> Inflated | None:
-        """The obstacles in the roadmap's form; None where it has no form for them, and no path is sought."""
+    def inflated(self) -> Solids | None:
+        """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""
         return None
 
     def chord_clearance(self, X: Tensor) -> Tensor:
@@ -108,3 +147,23 @@ def least(distances: Tensor) -> Tensor:
     if distances.shape[1] == 0 or distances.shape[2] == 0:
         return distances.new_full(distances.shape[:1], torch.inf)
     return distances.flatten(1).amin(-1)
+
+
+def marked(lengths: Tensor, absent: Tensor) -> Tensor:
+    """Lengths or squares (B, M) as C reads them: `ABSENT` stands for those of absent obstacles."""
+    return torch.where(absent, ABSENT, lengths)
+
+
+def squares(a: Tensor, b: Tensor) -> Tensor:
+    """|a_i - b_j|^2 (B, V, W) of points (B, V, d), (B, W, d)."""
+    return (a.unsqueeze(2) - b.unsqueeze(1)).square_().sum(-1)
+
+
+def squares_from_segments(points: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Squared distances (B, E, V) of points (B, V, d) from segments a to b (B, E, d)."""
+    along = b - a
+    inverse = 1.0 / along.square().sum(-1, keepdim=True).clamp(min=1e-12)
+    # Coordinate by coordinate and in place: these are the largest arrays of the search.
+    axes = [(along[..., i, None], points[:, None, :, i] - a[..., i, None]) for i in range(a.shape[-1])]
+    share = reduce(torch.add, (toward * step for step, toward in axes)).mul_(inverse).clamp_(0.0, 1.0)
+    return reduce(torch.add, (toward.sub_(share * step).square_() for step, toward in axes))

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
-from torchgco.obstacles.base import Inflated, Obstacles, least
-from torchgco.obstacles.box_geometry import Cuboids, excess, from_quaternions, segment_distance, signed_distance
-from torchgco.obstacles.spheres import FAR, per_problem, vehicle_radius
+from torchgco.obstacles.base import Obstacles, least
+from torchgco.obstacles.box_geometry import Cuboids, from_quaternions, segment_distance, signed_distance
+from torchgco.obstacles.spheres import per_problem, vehicle_radius
 
 AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
 UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
@@ -89,7 +90,7 @@ class BoundBoxes(Obstacles):
     """Boxes, sharp or rounded, shaped for their problem."""
 
     centers: Tensor  # (B, M, d)
-    half_sizes: Tensor  # (B, M, d), before rounding
+    half_sizes: Tensor  # (B, M, d), before rounding; 0 where absent
     axes: Tensor  # (B, M, d, d): row i is the direction of side i
     absent: Tensor  # (B, M) bool
     vehicle_radius: Tensor  # (B,)
@@ -117,12 +118,10 @@ class BoundBoxes(Obstacles):
     ) -> BoundBoxes:
         """Boxes of checked numbers (B, ...), whatever those of absent boxes are."""
         assert dims.position is not None
-        half = torch.where(absent.unsqueeze(-1), 1.0, half_sizes)
+        centers, half = (torch.where(absent.unsqueeze(-1), 0.0, part) for part in (centers, half_sizes))
         inflated = torch.where(absent, 0.0, radii + vehicle_radius.unsqueeze(-1))
-        return cls(
-            torch.where(absent.unsqueeze(-1), 0.0, centers), half, axes, absent, vehicle_radius, inflated,
-            torch.where(absent, 0.0, inflated + half.amin(-1)), knots, dims.position, dims.dt or 0.0,
-        )  # fmt: skip
+        depths = inflated + half.amin(-1)
+        return cls(centers, half, axes, absent, vehicle_radius, inflated, depths, knots, dims.position, dims.dt or 0.0)
 
     def bind(self, dims: Dimensions) -> Self:
         return self
@@ -133,7 +132,7 @@ class BoundBoxes(Obstacles):
 
     @property
     def sizes(self) -> Tensor:
-        return self.half_sizes.amin(-1) + self.inflated_radii
+        return self.depths
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self._rows(X[:, self.knots, self.position])
@@ -143,7 +142,7 @@ class BoundBoxes(Obstacles):
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         n, at = X.shape[-1], self.position
-        cp = -2.0 * self.depths[:, None, :, None] * self._normals(X[:, self.knots, at])
+        cp = -2.0 * self.depths[:, None, :, None] * self.inflated().normals(X[:, self.knots, at])
         gradient = (g.unsqueeze(-2) @ cp).squeeze(-2)
         H[:, self.knots, at, n] += gradient
         H[:, self.knots, n, at] += gradient
@@ -166,7 +165,7 @@ class BoundBoxes(Obstacles):
         return torch.cat([self.take(rows)._segment_clearance(a[rows], b[rows]) for rows in parts])
 
     def _segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
-        boxes = self._cuboids()
+        boxes = self.inflated()
         begin, end, half = boxes.seen_from(a), boxes.seen_from(b), boxes.halves()
         ends = signed_distance(begin, half), signed_distance(end, half)
         # The distance changes no faster than the point moves. Of many pairs this shows that others are nearer.
@@ -185,20 +184,13 @@ class BoundBoxes(Obstacles):
         inflated, depths = self.inflated_radii + more, self.depths + more
         return replace(self, vehicle_radius=self.vehicle_radius + by, inflated_radii=inflated, depths=depths)
 
-    def inflated(self) -> Inflated:
-        return Inflated(self.centers[:, :0], self.depths[:, :0], self._cuboids())
-
-    def _cuboids(self) -> Cuboids:
-        radius = torch.where(self.absent, FAR, self.inflated_radii)
-        return Cuboids(self.centers, self.axes, self.half_sizes, radius)
+    def inflated(self) -> Cuboids:
+        return Cuboids(self.centers, self.inflated_radii, self.absent, self.axes, self.half_sizes)
 
     def _outside(self, p: Tensor) -> Tensor:
         """Distances (B, K, M) of points p (B, K, d) from the full surfaces, as if none were absent."""
-        cuboids, distances = self._cuboids(), []
-        for rows in self._parts(p.shape[1]):
-            boxes = cuboids.rows(rows)
-            distances.append(signed_distance(boxes.seen_from(p[rows]), boxes.halves()))
-        return torch.cat(distances) - self.inflated_radii.unsqueeze(1)
+        boxes = self.inflated()
+        return torch.cat([take(boxes, rows).signed_distance(p[rows]) for rows in self._parts(p.shape[1])])
 
     def _parts(self, points: int) -> list[slice]:
         """The problems of a batch, as many at a time as the processor's cache holds distances of `points` points."""
@@ -209,24 +201,6 @@ class BoundBoxes(Obstacles):
     def _rows(self, p: Tensor) -> Tensor:
         """c (B, K, M) at points (B, K, d); an absent box is c = -1 everywhere."""
         return torch.where(self.absent.unsqueeze(1), -1.0, -2.0 * self.depths.unsqueeze(1) * self._outside(p))
-
-    def _normals(self, p: Tensor) -> Tensor:
-        """Unit vectors (B, K, M, d) along which the distance grows: away from the box, inside to the nearest side.
-
-        On a box with sides of length 0, such as the axis of a capsule, to a side across which its length is 0.
-        """
-        boxes = self._cuboids()
-        local, half = boxes.seen_from(p), boxes.halves()
-        away = torch.stack(excess(local, half), dim=-1)
-        square = away.square().sum(-1, keepdim=True)
-        outside = away / torch.where(square > 0, square, 1.0).sqrt()
-        place = torch.stack(local, dim=-1)
-        inner = place.abs() - torch.stack(half, dim=-1)
-        # The first of the nearest sides; of two opposite sides at equal distance, the positive one.
-        side = torch.nn.functional.one_hot(inner.argmax(-1), place.shape[-1]).to(p.dtype)
-        inside = torch.where(place < 0, -side, side)
-        normal = torch.where(square > 0, outside, inside)
-        return (self.axes.unsqueeze(1) * normal.unsqueeze(-1)).sum(-2)
 
 
 def dimension(dims: Dimensions, name: str) -> int:

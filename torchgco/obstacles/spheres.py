@@ -17,9 +17,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
-from torchgco.obstacles.base import Inflated, Obstacles, least
-
-FAR = -1e9  # the radius of an absent obstacle
+from torchgco.obstacles.base import Obstacles, Solids, least
 
 
 @dataclass(frozen=True)
@@ -205,10 +203,8 @@ class BoundSpheres(Obstacles):
             self.knots, self.position, self.dt,
         )  # fmt: skip
 
-    def inflated(self) -> Inflated | None:
-        if self.moving:
-            return None
-        return Inflated(self.centers, torch.where(self.absent, FAR, self.inflated_radii))
+    def inflated(self) -> Solids | None:
+        return None if self.moving else Solids(self.centers, self.inflated_radii, self.absent)
 
     def chord_clearance(self, X: Tensor) -> Tensor:
         o = self.centers.unsqueeze(1)

@@ -1,20 +1,70 @@
-"""The geometry that the search works on: scenes of spheres, and points along polylines."""
+"""The geometry that the search works on: obstacles by their kind, scenes of them, and points along polylines."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import reduce
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from torchgco.base.tree import take
-from torchgco.obstacles.base import Inflated
-from torchgco.obstacles.box_geometry import Cuboids, signed_distance
-from torchgco.obstacles.spheres import FAR as FAR
+from torchgco.obstacles.base import Solids
+from torchgco.obstacles.box_geometry import Cuboids
 
 AT_ONCE = 2**18  # distances between points and obstacles that are held at once
+
+
+class Inflated(NamedTuple):
+    """Obstacles at rest of B problems, grown by the vehicle's radius: at least one sphere, which may be absent."""
+
+    spheres: Solids
+    boxes: Cuboids | None = None
+
+    @property
+    def kinds(self) -> tuple[Solids, ...]:
+        """The kinds of which there are any."""
+        return (self.spheres,) if self.boxes is None else (self.spheres, self.boxes)
+
+    @property
+    def sizes(self) -> Tensor:
+        """The depth of each obstacle's deepest point beneath its surface, boxes last, (B, M'), m; 0 where absent."""
+        return torch.cat([part.sizes for part in self.kinds], dim=1)
+
+    @property
+    def middles(self) -> Tensor:
+        """The centres of all obstacles, boxes last, (B, M', d), m."""
+        return torch.cat([part.centers for part in self.kinds], dim=1)
+
+    @property
+    def largest(self) -> Tensor:
+        """The largest size, (B, 1), m."""
+        return self.sizes.amax(-1, keepdim=True)
+
+    def reduced(self, share: float) -> Self:
+        """The same obstacles with radii reduced by this share."""
+        parts = (part if part is None else replace(part, radii=(1.0 - share) * part.radii) for part in self)
+        return self._make(parts)
+
+    def region(self, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """The lower and upper corner (B, d) around start, goal, and the obstacles made larger by half."""
+        low, high = torch.minimum(start, goal), torch.maximum(start, goal)
+        for part in self.kinds:
+            wide, absent = 1.5 * (part.extent + part.radii.unsqueeze(-1)), part.absent.unsqueeze(-1)
+            low = torch.minimum(low, (part.centers - wide).masked_fill(absent, torch.inf).amin(1))
+            high = torch.maximum(high, (part.centers + wide).masked_fill(absent, -torch.inf).amax(1))
+        return low, high
+
+    def depth(self, points: Tensor) -> Tensor:
+        """How deep points (B, V, d) lie beneath the surface of an obstacle, (B, V), m; negative outside of all."""
+        B, V = points.shape[:2]
+        parts = torch.arange(B, device=points.device).split(max(1, AT_ONCE // max(1, V * self.sizes.shape[1])))
+        return torch.cat([take(self, rows)._depth(points[rows]) for rows in parts])
+
+    def _depth(self, points: Tensor) -> Tensor:
+        away = [part.signed_distance(points).masked_fill(part.absent.unsqueeze(1), torch.inf) for part in self.kinds]
+        return -torch.cat(away, dim=-1).amin(-1)
 
 
 @dataclass(frozen=True)
@@ -23,43 +73,13 @@ class Scene:
 
     start: Tensor  # (B, d)
     goal: Tensor  # (B, d)
-    centers: Tensor  # (B, M, d)
-    inflated_radii: Tensor  # (B, M): r_obs + r_veh, FAR where absent
+    obstacles: Inflated
     traversal_cost: Callable[[Tensor, Tensor], Tensor]  # per metre at points (B', V, d) of some problems, (B', V)
-    boxes: Cuboids | None = None
-
-    @property
-    def sizes(self) -> Tensor:
-        """The depth of each obstacle's deepest point beneath its surface, boxes last, (B, M'); negative: absent."""
-        return self.inflated_radii if self.boxes is None else torch.cat((self.inflated_radii, self.boxes.sizes), dim=1)
-
-    @property
-    def middles(self) -> Tensor:
-        """The centres of all obstacles, boxes last, (B, M', d)."""
-        return self.centers if self.boxes is None else torch.cat((self.centers, self.boxes.centers), dim=1)
-
-    @property
-    def obstacles(self) -> Inflated:
-        """The obstacles alone."""
-        return Inflated(self.centers, self.inflated_radii, self.boxes)
 
 
-def depth(obstacles: Inflated, points: Tensor) -> Tensor:
-    """How deep points (B, V, d) lie beneath the surface of an obstacle, (B, V), m; negative outside of all."""
-    B, V, count = *points.shape[:2], obstacles.centers.shape[1]
-    count += 0 if obstacles.boxes is None else obstacles.boxes.radius.shape[1]
-    parts = torch.arange(B, device=points.device).split(max(1, AT_ONCE // max(1, V * count)))
-    return torch.cat([_depth(take(obstacles, rows), points[rows]) for rows in parts])
-
-
-def _depth(obstacles: Inflated, points: Tensor) -> Tensor:
-    apart = squares(points, obstacles.centers).sqrt_()
-    within = (obstacles.inflated_radii.unsqueeze(1) - apart).amax(-1)
-    boxes = obstacles.boxes
-    if boxes is None:
-        return within
-    inside = boxes.radius.unsqueeze(1) - signed_distance(boxes.seen_from(points), boxes.halves())
-    return torch.maximum(within, inside.masked_fill(~boxes.here.unsqueeze(1), -torch.inf).amax(-1))
+def length(path: Tensor) -> Tensor:
+    """Lengths (B,) of paths (B, P, d)."""
+    return path.diff(dim=1).square().sum(-1).sqrt().sum(-1)
 
 
 def points_along(path: Tensor, length: Tensor) -> Tensor:
@@ -73,18 +93,3 @@ def points_along(path: Tensor, length: Tensor) -> Tensor:
         return path.gather(1, index.unsqueeze(-1).expand(-1, -1, path.shape[-1]))
 
     return torch.lerp(corner(right - 1), corner(right), share.clamp(0.0, 1.0).unsqueeze(-1))
-
-
-def squares_from_segments(points: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Squared distances (B, E, V) of points (B, V, d) from segments a to b (B, E, d)."""
-    along = b - a
-    inverse = 1.0 / along.square().sum(-1, keepdim=True).clamp(min=1e-12)
-    # Coordinate by coordinate and in place: these are the largest arrays of the search.
-    axes = [(along[..., i, None], points[:, None, :, i] - a[..., i, None]) for i in range(a.shape[-1])]
-    share = reduce(torch.add, (toward * step for step, toward in axes)).mul_(inverse).clamp_(0.0, 1.0)
-    return reduce(torch.add, (toward.sub_(share * step).square_() for step, toward in axes))
-
-
-def squares(a: Tensor, b: Tensor) -> Tensor:
-    """|a_i - b_j|^2 (B, V, W)."""
-    return (a.unsqueeze(2) - b.unsqueeze(1)).square_().sum(-1)

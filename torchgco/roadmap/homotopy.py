@@ -7,40 +7,39 @@ import math
 import torch
 from torch import Tensor
 
-from torchgco.roadmap.geometry import Scene, points_along
+from torchgco.roadmap.geometry import Inflated, length, points_along
 
 POINTS = 65  # at which two paths in space are compared
 
 
-def one_per_class(paths: Tensor, scene: Scene) -> Tensor:
+def one_per_class(paths: Tensor, obstacles: Inflated) -> Tensor:
     """The first path of every class, (B, K) bool, of polylines (B, K, P, d) that share their ends.
 
     In the plane two paths are of one class where they have equal winding angles around every obstacle. Around balls in
     space all paths are of one class: there, two paths count as one where they are nowhere farther apart than the
     largest obstacle's size.
     """
-    alike = _wind_alike(paths, scene) if paths.shape[-1] == 2 else _are_close(paths, scene)
+    alike = _wind_alike(paths, obstacles) if paths.shape[-1] == 2 else _are_close(paths, obstacles)
     first = torch.ones_like(alike[..., 0])
     for k in range(1, paths.shape[1]):
         first[:, k] = ~(alike[:, k, :k] & first[:, :k]).any(-1)
     return first
 
 
-def _wind_alike(paths: Tensor, scene: Scene) -> Tensor:
+def _wind_alike(paths: Tensor, obstacles: Inflated) -> Tensor:
     """(B, K, K): the angles that two paths sweep around each obstacle are the same, up to full turns."""
-    seen = paths.unsqueeze(2) - scene.middles[:, None, :, None]  # (B, K, M, P, 2)
+    seen = paths.unsqueeze(2) - obstacles.middles[:, None, :, None]  # (B, K, M, P, 2)
     a, b = seen[..., :-1, :], seen[..., 1:, :]
     cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     swept = torch.atan2(cross, (a * b).sum(-1)).sum(-1)
     turned = (swept.unsqueeze(2) - swept.unsqueeze(1)).abs() > math.pi
-    return ~(turned & (scene.sizes > 0)[:, None, None]).any(-1)
+    return ~(turned & (obstacles.sizes > 0)[:, None, None]).any(-1)
 
 
-def _are_close(paths: Tensor, scene: Scene) -> Tensor:
+def _are_close(paths: Tensor, obstacles: Inflated) -> Tensor:
     """(B, K, K): nowhere farther apart than the largest obstacle's size, at the same shares of their lengths."""
     flat = paths.flatten(0, 1)
-    length = (flat[:, 1:] - flat[:, :-1]).square().sum(-1).sqrt().sum(-1, keepdim=True)
     share = torch.linspace(0.0, 1.0, POINTS, dtype=flat.dtype, device=flat.device)
-    points = points_along(flat, share * length).view(*paths.shape[:2], POINTS, -1)
+    points = points_along(flat, share * length(flat).unsqueeze(-1)).view(*paths.shape[:2], POINTS, -1)
     apart = (points.unsqueeze(2) - points.unsqueeze(1)).square().sum(-1).amax(-1).sqrt()
-    return apart <= scene.sizes.amax(-1).view(-1, 1, 1)
+    return apart <= obstacles.largest.unsqueeze(-1)

@@ -2,7 +2,7 @@
 
 Points lie around every obstacle, midway between neighbours and, in a fixed low-discrepancy sequence, all over the
 scene; each is joined to a few near ones where the straight line is free. Nothing is random. The search runs in C
-(c/paths.c) or, where that can't serve, in PyTorch (search.py), with the same result.
+(c/search.c) or, where that can't serve, in PyTorch (search.py), with the same result.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import AtLeast, Below, check_options
+from torchgco.base.tree import take
 from torchgco.roadmap import native as roadmap
-from torchgco.roadmap.geometry import Scene
+from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.search import Search
 
@@ -61,7 +62,7 @@ class Roadmap:
             Corners (B, count, HOPS+1, d), m, the goal repeated at their ends, or the straight line where there is no
             path; and whether there is a path (B,).
         """
-        library = roadmap.library_for(scene.centers, scene.boxes is not None)
+        library = roadmap.library_for(scene.start, scene.obstacles.boxes is not None)
         most = AT_ONCE if library is None else roadmap.AT_ONCE
         everyone = torch.arange(scene.start.shape[0], device=scene.start.device)
         parts = [self._paths(scene, rows, count, library) for rows in everyone.split(most)]
@@ -82,11 +83,10 @@ class Roadmap:
     ) -> tuple[Tensor, Tensor, bool]:
         """Paths (B', count, HOPS+1, d) over a graph of the problems in `rows`, where there are any (B'), and whether
         there were as many points around obstacles as the graph takes."""
-        start, goal, o, R = (t[rows] for t in (scene.start, scene.goal, scene.centers, scene.inflated_radii))
-        R = torch.where(R > 0, (1.0 - self.max_overlap) * R, R)
-        boxes = None if scene.boxes is None else scene.boxes.rows(rows).cut(self.max_overlap)
-        search = Search(o, R, MARGIN, boxes) if library is None else NativeSearch(library, o, R, MARGIN, boxes)
-        cube = halton(self.num_halton, o.shape[-1]).to(o)
+        start, goal = scene.start[rows], scene.goal[rows]
+        obstacles = take(scene.obstacles, rows).reduced(self.max_overlap)
+        search = Search(obstacles, MARGIN) if library is None else NativeSearch(library, obstacles, MARGIN)
+        cube = halton(self.num_halton, start.shape[-1]).to(start)
         graph = search.graph(start, goal, cube, nodes, neighbours, HALTON_NEIGHBOURS)
         price = scene.traversal_cost(graph.points, rows)
         paths: list[Tensor] = []
@@ -100,11 +100,6 @@ class Roadmap:
             paths.append(path)
             price = search.raised(price, graph.points, path, 1.0 + DIVERSITY)
         return torch.stack(paths, dim=1), found, graph.points.shape[1] == 2 + len(cube) + nodes
-
-
-def length(path: Tensor) -> Tensor:
-    """Lengths (B,) of paths (B, P, d)."""
-    return path.diff(dim=1).square().sum(-1).sqrt().sum(-1)
 
 
 @cache

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TypeVar
+
 import torch
 from torch import Tensor
 
 from torchgco.constraints.bounds import ControlBounds
-from torchgco.obstacles.base import Obstacles, least
-from torchgco.obstacles.box_geometry import join
+from torchgco.obstacles.base import Obstacles, Solids, least
+from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.geometry import FAR, Scene
+from torchgco.roadmap.geometry import Inflated, Scene
 
 OPEN = 1e10  # a range of controls at least this wide counts as unbounded
 LITTLE = 1e-6  # in units of cost: a smaller stage cost says nothing about the goal
+S = TypeVar("S", bound=Solids)
 FALLEN_BACK = 0.25  # share of the distance from start to goal; candidates that end farther from the goal are dropped
 
 
@@ -22,28 +26,38 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     Obstacles that don't hold at the last knot are left out: only those that stay bar a path. None without a goal or
     obstacles, with obstacles that the roadmap can't take, or if space is neither 2-D nor 3-D.
     """
-    forms = [c.inflated() if isinstance(c, Obstacles) else None for c in problem.geometric if c.holds_at(problem.N)]
-    spheres = [form for form in forms if form is not None]
-    boxes = join([form.boxes for form in spheres if form.boxes is not None and form.boxes.radius.shape[1] > 0])
-    count = sum(c.inflated_radii.shape[1] for c in spheres)
-    if (count == 0 and boxes is None) or len(spheres) < len(forms) or problem.goal is None:
+    parts = [c.inflated() if isinstance(c, Obstacles) else None for c in problem.geometric if c.holds_at(problem.N)]
+    known, at = [part for part in parts if part is not None], problem.position
+    if len(known) < len(parts) or problem.goal is None or at.stop - at.start not in (2, 3):
         return None
-    at = problem.position
-    if at.stop - at.start not in (2, 3):
+    obstacles = _by_kind(problem.x0[:, at], [part for part in known if part.radii.shape[1] > 0])
+    if obstacles is None:
         return None
-
     first = _resting_cost(problem, rest, problem.x0[:, None, at]).clamp(min=1e-12)
 
     def traversal_cost(points: Tensor, rows: Tensor) -> Tensor:
         price = _resting_cost(problem, rest, points, rows)
         return price.clamp(min=0.0) / first[rows] + 0.1
 
-    centers = torch.cat([c.centers for c in spheres], dim=1)
-    inflated_radii = torch.cat([c.inflated_radii for c in spheres], dim=1)
-    if count == 0:  # one absent sphere stands for none: maxima over spheres then exist
-        centers = problem.x0[:, None, at]
-        inflated_radii = torch.full_like(centers[..., 0], FAR)
-    return Scene(problem.x0[:, at], problem.goal.position, centers, inflated_radii, traversal_cost, boxes)
+    return Scene(problem.x0[:, at], problem.goal.position, obstacles, traversal_cost)
+
+
+def _by_kind(start: Tensor, parts: Sequence[Solids]) -> Inflated | None:
+    """The spheres and the boxes among obstacles of problems with starts (B, d); None where there are none at all."""
+    boxes = _joined([part for part in parts if isinstance(part, Cuboids)])
+    spheres = _joined([part for part in parts if not isinstance(part, Cuboids)])
+    if spheres is None:
+        if boxes is None:
+            return None
+        zero = torch.zeros_like(start[:, :1])
+        spheres = Solids(start.unsqueeze(1), zero, torch.ones_like(zero, dtype=torch.bool))  # one that is absent
+    return Inflated(spheres, boxes)
+
+
+def _joined(parts: Sequence[S]) -> S | None:
+    """All obstacles of one kind; None where there are none."""
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return type(parts[0])(*(torch.cat(column, dim=1) for column in columns)) if parts else None
 
 
 def scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor]:
@@ -52,8 +66,8 @@ def scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor
     R is the mean size of the obstacles, m. q0 is the stage cost of resting at the start, or, where only the
     terminal cost depends on the goal, the mean cost per stage of staying there.
     """
-    here = scene.sizes > 0
-    R = torch.where(here, scene.sizes, 0.0).sum(-1) / here.sum(-1).clamp(min=1)
+    sizes = scene.obstacles.sizes
+    R = sizes.sum(-1) / (sizes > 0).sum(-1).clamp(min=1)
     resting = _resting_cost(problem, rest, scene.start.unsqueeze(1))[:, 0]
     ends_matter = (resting.abs() < LITTLE) & (scene.start != scene.goal).any(-1)
     return R, torch.where(ends_matter, 1.0, resting) / R.pow(4)

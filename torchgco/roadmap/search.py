@@ -8,46 +8,51 @@ are equal.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchgco.obstacles.box_geometry import Cuboids
-from torchgco.roadmap.geometry import squares, squares_from_segments
-from torchgco.roadmap.native import CLEAR, HOPS, LEAST, MIDWAY, RAYS, SHELLS, TIE, Graph, around_boxes, directions
+from torchgco.base.tree import take
+from torchgco.obstacles.base import Solids, squares, squares_from_segments
+from torchgco.roadmap.geometry import Inflated
+from torchgco.roadmap.points import around_spheres, between_spheres, of_boxes
 
+HOPS = 64  # edges of a path, at most
+CLEAR = 0.001  # smallest gap between a point and all obstacles, as a share of the largest r_obs + r_veh
+TIE = 1e-12  # share of the cost by which equally cheap paths may differ
+LEAST = 1e-6  # share of the distance from start to goal that is added to every edge: no edge may cost nothing
 CLASS = 8  # paths are drawn taut in groups: those of up to 8 edges, of up to 16, ...
+
+
+class Graph(NamedTuple):
+    """Points and the edges that lead from each to some others."""
+
+    points: Tensor  # (B, V, d): start, goal and others; m
+    ends: Tensor  # (B, V, K): the points at which edges end
+    lengths: Tensor  # (B, V, K), m: infinite where there is no edge
 
 
 @dataclass(frozen=True)
 class Search:
-    """Graphs between spheres and the cheapest paths over them, B problems.
+    """Graphs between obstacles and the cheapest paths over them, B problems.
 
     Args:
-        o: centres (B, M, d), m.
-        R: radii (B, M), m; negative where there is no sphere.
-        margin: distance from a sphere, as a share of the largest radius, below which an edge costs more.
-        boxes: further obstacles.
+        obstacles: spheres and boxes.
+        margin: distance from an obstacle, as a share of the largest size, below which an edge costs more.
     """
 
-    o: Tensor
-    R: Tensor
+    obstacles: Inflated
     margin: float
-    boxes: Cuboids | None = None
-
-    @property
-    def largest(self) -> Tensor:
-        """The largest radius, or size of a box, (B, 1)."""
-        return (self.R if self.boxes is None else torch.cat((self.R, self.boxes.sizes), dim=1)).amax(-1, keepdim=True)
 
     def graph(self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int) -> Graph:
         """Points, each joined to its nearest of all points, its nearest of the spread points, and the goal.
 
         Args:
             start, goal: points 0 and 1, (B, d).
-            cube: points (spread, d) in the unit cube, spread over the box that start, goal and spheres fill.
-            nodes: number of free points around spheres that are added, those of the shortest detours. Unused places
+            cube: points (spread, d) in the unit cube, spread over the box that start, goal and obstacles fill.
+            nodes: number of free points around obstacles that are added, those of the shortest detours. Unused places
                 lie at the start, without edges.
             neighbours, hubs: edges of a point to its nearest of all points and of the spread points.
         """
@@ -113,8 +118,8 @@ class Search:
         for most in range(CLASS, HOPS + 1, CLASS):
             part = ((edges > most - CLASS) & (edges <= most)).nonzero().flatten()
             if part.numel() > 0:
-                boxes = None if self.boxes is None else self.boxes.rows(part)
-                search, points = Search(self.o[part], self.R[part], self.margin, boxes), string[part, : 2 * most + 1]
+                search = replace(self, obstacles=take(self.obstacles, part))
+                points = string[part, : 2 * most + 1]
                 everyone = torch.arange(2 * most + 1, device=path.device).expand(*points.shape[:2], -1)
                 graph = Graph(points, everyone, search._lengths(points, everyone))
                 shorter, _, arrives = search.cheapest(graph, price[part, : 2 * most + 1])
@@ -124,74 +129,45 @@ class Search:
     def raised(self, price: Tensor, points: Tensor, path: Tensor, factor: float) -> Tensor:
         """Prices (B, V) times a factor at points that are nearer to a path than the largest radius."""
         apart = squares_from_segments(points, path[:, :-1], path[:, 1:]).amin(1)
-        return torch.where(apart < _signed_square(self.largest), factor * price, price)
+        return torch.where(apart < _signed_square(self.obstacles.largest), factor * price, price)
 
     def _spread(self, start: Tensor, goal: Tensor, cube: Tensor) -> Tensor:
-        """Points (B, spread, d) all over the box that start, goal and spheres fill."""
-        reach, here = 1.5 * self.R.unsqueeze(-1), (self.R > 0).unsqueeze(-1)
-        low, high = torch.minimum(start, goal), torch.maximum(start, goal)
-        low = torch.minimum(low, torch.where(here, self.o - reach, low.unsqueeze(1)).amin(1)).unsqueeze(1)
-        high = torch.maximum(high, torch.where(here, self.o + reach, high.unsqueeze(1)).amax(1)).unsqueeze(1)
-        if self.boxes is not None:
-            low, high = (end.unsqueeze(1) for end in self.boxes.reach(torch.cat((low, high), dim=1)))
+        """Points (B, spread, d) all over the box that start, goal and obstacles fill."""
+        low, high = (end.unsqueeze(1) for end in self.obstacles.region(start, goal))
         return low + cube * (high - low)
 
     def _beside(self, start: Tensor, goal: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
-        """Free points around the spheres and between them (B, nodes, d), and which places are taken (B, nodes)."""
-        (around, first), (midway, second) = self._around(start, goal), self._midway()
-        points, exists = torch.cat((around, midway), dim=1), torch.cat((first, second), dim=1)
-        if self.boxes is not None:
-            more, third = around_boxes(self.boxes, self.o, self.R, start, goal)
-            points, exists = torch.cat((points, more), dim=1), torch.cat((exists, third), dim=1)
+        """Free points around the obstacles and between them (B, nodes, d), and which places are taken (B, nodes)."""
+        spheres, boxes = self.obstacles
+        parts = [around_spheres(spheres, start, goal), between_spheres(spheres)]
+        if boxes is not None:
+            parts.append(of_boxes(boxes, spheres, start, goal))
+        points, exists = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))
         detour = squares(points, torch.stack((start, goal), dim=1)).sqrt_().sum(-1)
         detour = torch.where(exists & self._is_free(points), detour, torch.inf).to(torch.float32)
         best = _lowest(detour, nodes)
         taken = torch.isfinite(detour.gather(1, best))
         return torch.where(taken.unsqueeze(-1), _rows(points, best), start.unsqueeze(1)), taken
 
-    def _around(self, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Points (B, C, d) on circles around each sphere, and whether the sphere is present (B, C)."""
-        rays = directions(start, goal).unsqueeze(1)
-        shells = SHELLS[start.shape[1]]
-        points = [(self.o.unsqueeze(2) + (s * self.R)[..., None, None] * rays).flatten(1, 2) for s in shells]
-        return torch.cat(points, dim=1), (self.R > 0).repeat_interleave(RAYS, dim=1).repeat(1, len(shells))
-
-    def _midway(self) -> tuple[Tensor, Tensor]:
-        """The middles (B, C, d) of the gaps between spheres and their nearest, and whether both are present (B, C)."""
-        o, R = self.o, self.R
-        apart = squares(o, o).masked_fill(~((R > 0).unsqueeze(1) & (R > 0).unsqueeze(2)), torch.inf)
-        apart.diagonal(dim1=1, dim2=2).fill_(torch.inf)
-        near = _lowest(apart, MIDWAY)
-        step = _rows(o, near) - o.unsqueeze(2)
-        length = step.square().sum(-1).sqrt().clamp(min=1e-12)
-        share = 0.5 + 0.5 * ((R.unsqueeze(-1) - _rows(R, near)) / length)
-        points = (o.unsqueeze(2) + share.unsqueeze(-1) * step).flatten(1, 2)
-        return points, torch.isfinite(apart.gather(2, near)).flatten(1)
-
     def _is_free(self, points: Tensor) -> Tensor:
-        """Whether points (B, V, d) are clear of all spheres by CLEAR times the largest radius."""
-        least = self.R + CLEAR * self.largest
-        free = (squares(points, self.o) > _signed_square(least).unsqueeze(1)).all(-1)
-        if self.boxes is None:
-            return free
-        least = self.boxes.radius + CLEAR * self.largest
-        return free & (self.boxes.squares(points) > _signed_square(least).unsqueeze(1)).all(-1)
+        """Whether points (B, V, d) are clear of all obstacles by CLEAR times the largest size."""
+        gap = CLEAR * self.obstacles.largest
+        return torch.stack([_outside(part, part.squares(points), gap) for part in self.obstacles.kinds]).all(0)
 
     def _lengths(self, points: Tensor, ends: Tensor) -> Tensor:
         """Lengths (B, V, K) of the edges to the points `ends`, raised close to an obstacle, infinite through one."""
         a = points.unsqueeze(2).expand(-1, -1, ends.shape[2], -1).flatten(1, 2)
         b = _rows(points, ends.flatten(1))
-        away = squares_from_segments(self.o, a, b)
-        free = (away > _signed_square(self.R).unsqueeze(1)).all(-1).view(ends.shape)
-        gap = away.sqrt_().sub_(self.R.unsqueeze(1)).amin(-1).view(ends.shape)
-        if self.boxes is not None:
-            away = self.boxes.squares_from_segments(a, b)
-            free = free & (away > _signed_square(self.boxes.radius).unsqueeze(1)).all(-1).view(ends.shape)
-            gap = torch.minimum(gap, away.sqrt_().sub_(self.boxes.radius.unsqueeze(1)).amin(-1).view(ends.shape))
+        free, gap = torch.ones_like(ends, dtype=torch.bool), torch.full_like(a[..., 0], torch.inf).view(ends.shape)
+        for part in self.obstacles.kinds:
+            away = part.squares_from_segments(a, b)
+            free = free & _outside(part, away).view(ends.shape)
+            left = away.sqrt_().sub_(part.radii.unsqueeze(1)).masked_fill_(part.absent.unsqueeze(1), torch.inf)
+            gap = torch.minimum(gap, left.amin(-1).view(ends.shape))
         length = (b - a).square().sum(-1).sqrt().view(ends.shape)
         # Every edge costs something: otherwise paths could circle among points that coincide.
         length = length + LEAST * (points[:, 1] - points[:, 0]).square().sum(-1).sqrt().view(-1, 1, 1)
-        margin = self.margin * self.largest.clamp(min=1e-9).view(-1, 1, 1)
+        margin = self.margin * self.obstacles.largest.clamp(min=1e-9).view(-1, 1, 1)
         close = 1.0 + ((margin - gap) / margin).clamp(0.0, 1.0)
         return torch.where(free, length * close, torch.inf)
 
@@ -207,6 +183,11 @@ def _rows(values: Tensor, index: Tensor) -> Tensor:
     if values.dim() == 2:
         return values.gather(1, flat).view(index.shape)
     return values.gather(1, flat.unsqueeze(-1).expand(-1, -1, values.shape[-1])).view(*index.shape, values.shape[-1])
+
+
+def _outside(part: Solids, away: Tensor, gap: Tensor | float = 0.0) -> Tensor:
+    """Whether squared distances (B, V, M) from solids are over their radii and a gap (B, 1), of all of them (B, V)."""
+    return ((away > _signed_square(part.radii + gap).unsqueeze(1)) | part.absent.unsqueeze(1)).all(-1)
 
 
 def _signed_square(x: Tensor) -> Tensor:

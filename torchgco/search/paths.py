@@ -102,7 +102,7 @@ class PathProposals(PathSettings):
         paths, found = self.roadmap.paths(scene, self.num_paths)
         R, unit = seen.scales(problem, scene, rest)
         found = found & torch.isfinite(unit) & (unit > 0)
-        live = one_per_class(paths, scene) & found.unsqueeze(-1)
+        live = one_per_class(paths, scene.obstacles) & found.unsqueeze(-1)
         compared = self.pace is not None or self.max_gap is not None
         free = unconstrained(problem, rest, _inner(self.track_iterations)) if compared else None
         return Ways(paths, live, R, torch.where(found, unit, 1.0), scene.obstacles, free)
@@ -133,7 +133,7 @@ class PathProposals(PathSettings):
         scene = seen.scene_of(part, rest)
         assert scene is not None
         wide = self.wider()
-        ways = joined(wide._ways(part, rest, scene), wide.among_more_points()._ways(part, rest, scene), scene)
+        ways = joined(wide._ways(part, rest, scene), wide.among_more_points()._ways(part, rest, scene))
         assert ways.free is not None
         proposal.iterations[rows] += ways.free.iterations
         for proposals in (wide, wide.closer()):

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
-from torchgco.obstacles.base import Inflated
-from torchgco.roadmap.geometry import depth, points_along
+from torchgco.roadmap.geometry import Inflated, length, points_along
 
 CUT = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
 HALVINGS = 3  # of the share of the horizon over which they are averaged
@@ -24,8 +23,7 @@ def travel(path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int
     share = torch.arange(N + 1, dtype=path.dtype, device=path.device) / N
     share = ((share - depart) / (arrive.unsqueeze(-1) - depart)).clamp(0.0, 1.0)
     share = share.square() * (3.0 - 2.0 * share)
-    length = (path[:, 1:] - path[:, :-1]).square().sum(-1).sqrt().sum(-1, keepdim=True)
-    center = points_along(path, share * length)
+    center = points_along(path, share * length(path).unsqueeze(-1))
     reach = int(0.5 * smoothing * N)
     if reach == 0:
         return center
@@ -47,7 +45,7 @@ def followed(
     center, B = travel(path, depart, arrive, smoothing, N), R.shape[0]
     for _ in range(HALVINGS if B > 0 else 0):
         points = center[:, :: max(1, N // SAMPLES)]
-        deepest = depth(obstacles, points.reshape(B, -1, points.shape[-1])).view(B, -1, points.shape[1]).amax(-1)
+        deepest = obstacles.depth(points.reshape(B, -1, points.shape[-1])).view(B, -1, points.shape[1]).amax(-1)
         deep = deepest > CUT * R.unsqueeze(-1)
         if not bool(deep.any()):
             break

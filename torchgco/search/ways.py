@@ -9,11 +9,9 @@ import torch
 from torch import Tensor
 
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.obstacles.base import Inflated
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.geometry import Scene
+from torchgco.roadmap.geometry import Inflated, length
 from torchgco.roadmap.homotopy import one_per_class
-from torchgco.roadmap.roadmap import length
 from torchgco.solvers.ilqr import ILQR, descend
 
 NEAR = 0.1  # of the distance to the goal: the last part is approached slowly
@@ -47,11 +45,11 @@ class Ways:
         return (self.free.share.unsqueeze(-1) * stretch).nan_to_num(torch.inf)
 
 
-def joined(few: Ways, more: Ways, scene: Scene) -> Ways:
+def joined(few: Ways, more: Ways) -> Ways:
     """The paths of both searches, one per homotopy class."""
     paths = torch.cat((few.paths, more.paths), dim=1)
     found = torch.cat([ways.live.any(-1, keepdim=True).expand_as(ways.live) for ways in (few, more)], dim=1)
-    live = one_per_class(paths, scene) & found
+    live = one_per_class(paths, few.obstacles) & found
     return replace(few, paths=paths, live=live)
 
 

@@ -1,35 +1,32 @@
-/* Boxes that may be turned, as obstacles: the rows of a knot, for problems with boxes (constraints/boxes.py). */
+/* Boxes that may be turned, as obstacles: the rows of a knot, for problems with boxes (obstacles/boxes.py). */
 
 /* First come the bounds of all boxes along the first axis of space, middle and half length, then along the second, ...:
-   most boxes are too far away for more. Then the numbers of each box: its centre (DIM), the directions of its sides
-   (DIM, DIM), half their lengths (DIM), its own radius plus r_veh, and the factor that turns a distance into a squared
-   length, 0 where the box is absent. */
-#define BOX_NUMBERS (DIM * DIM + 2 * DIM + 2)
+   most boxes are too far away for more. Then the factor of each box, which turns a distance into a squared length, and
+   at last the numbers of each box (box.h). */
 
 /* Row j at a knot, and its derivatives by position (DIM) unless `slopes` is NULL; an absent box is c = -1. */
 static inline V solid(const Constraint *con, const Rows *rows, int64_t j, const V *x, V *slopes) {
-    const V *o = rows->bound + con->rows * 2 * DIM + j * BOX_NUMBERS;
-    const V *axes = o + DIM, *half = axes + DIM * DIM, *radius = half + DIM;
-    V factor = radius[1], zero = SET(0.0), local[DIM], away[DIM], square = zero, deepest = zero;
+    const V *factors = rows->bound + con->rows * 2 * DIM, *box = factors + con->rows + j * BOX_NUMBERS;
+    const V *axes = box + DIM, *half = BOX_HALF(box), radius = BOX_RADIUS(box);
+    V factor = factors[j], zero = SET(0.0), local[DIM], away[DIM], square = zero, deepest = zero;
     I nearest[DIM];
+    seen_from(box, x + POSITION, local);
     for (int i = 0; i < DIM; i++) {
-        local[i] = zero;
-        for (int a = 0; a < DIM; a++) local[i] += axes[i * DIM + a] * (x[POSITION + a] - o[a]);
         V depth = tgco_fabs(local[i]) - half[i];
-        away[i] = tgco_if(depth > zero, depth);
+        away[i] = beyond(local[i], half[i]);
         square += away[i] * away[i];
         nearest[i] = i == 0 ? zero == zero : depth > deepest; /* the first of equals */
         deepest = tgco_choose(nearest[i], depth, deepest);
         for (int a = 0; a < i; a++) nearest[a] &= ~nearest[i];
     }
-    I outside = square > zero, here = factor > zero;
+    I outside = square > zero, here = radius >= zero;
     V distance = tgco_sqrt(tgco_choose(outside, square, SET(1.0)));
-    V c = factor * (radius[0] - tgco_choose(outside, distance, deepest));
+    V c = factor * (radius - tgco_choose(outside, distance, deepest));
     if (slopes) {
         for (int a = 0; a < DIM; a++) slopes[a] = zero;
         for (int i = 0; i < DIM; i++) {
-            V side = tgco_choose(outside, away[i] / distance, tgco_truth(nearest[i]));
-            side = -factor * tgco_choose(local[i] < zero, -side, side);
+            V inside = tgco_choose(local[i] < zero, -tgco_truth(nearest[i]), tgco_truth(nearest[i]));
+            V side = -factor * tgco_choose(outside, away[i] / distance, inside);
             for (int a = 0; a < DIM; a++) slopes[a] += axes[i * DIM + a] * side;
         }
         for (int a = 0; a < DIM; a++) slopes[a] = tgco_if(here, slopes[a]);

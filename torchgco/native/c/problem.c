@@ -29,7 +29,7 @@ typedef struct {
     const int32_t *variable;       /* BOUNDS: (rows) index into [x, u] */
     const double *sign;            /* BOUNDS: (rows) +1 for an upper bound, -1 for a lower one */
     Array bound;                   /* BOUNDS: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM);
-                                      FUNCTION: p (E, knots, ...); BOXES: (E, 1, rows * (2 * DIM + BOX_NUMBERS)) */
+                                      FUNCTION: p (E, knots, ...); BOXES: (E, 1, rows * (2 * DIM + 1 + BOX_NUMBERS)) */
     Array squares;                 /* SPHERES: squared inflated radii (E, 1, rows), negative where absent */
     Array velocities;              /* SPHERES: as centres, or NULL */
     double dt;

@@ -92,7 +92,7 @@ class Form:
         if self.boxes:
             # Left out elsewhere, so that it can't change how problems without boxes are compiled.
             head += "#define WITH_BOXES 1\n"
-            solid = (C / "boxes.c").read_text()
+            solid = "\n".join((C / name).read_text() for name in ("box.h", "boxes.c"))
             texts = [text.replace(BOXES_STAND_HERE, solid) for text in texts]
         return "\n".join((head, PRELUDE, *generated, *texts))
 

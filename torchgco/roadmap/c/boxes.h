@@ -1,28 +1,7 @@
-/* Distances from boxes grown by a radius: constraints/cuboids.py in C, with the same operations in the same order.
-
-   The numbers of a box: its centre (DIM), the directions of its sides (DIM, DIM), half their lengths (DIM), and the
-   radius, which is negative where there is no box. */
+/* Squared distances of points and of segments from boxes; box.h has the numbers of a box. */
 
 #include <float.h>
 #include <math.h>
-
-#define BOX_NUMBERS (DIM * DIM + 2 * DIM + 1)
-#define BOX_HALF(box) ((box) + DIM + DIM * DIM)
-#define BOX_RADIUS(box) ((box)[BOX_NUMBERS - 1])
-
-/* Coordinates of a vector along the sides. */
-static inline void along_sides(const double *box, const double *v, double *local) {
-    const double *axes = box + DIM;
-    for (int i = 0; i < DIM; i++) {
-        local[i] = axes[i * DIM] * v[0];
-        for (int j = 1; j < DIM; j++) local[i] += axes[i * DIM + j] * v[j];
-    }
-}
-
-static inline double beyond(double x, double half) {
-    double held = x > -half ? x : -half;
-    return x - (held < half ? held : half);
-}
 
 /* Squared distance of a point, and half its slope where the point moves along a segment. */
 static inline double square_at(
@@ -38,18 +17,16 @@ static inline double square_at(
 }
 
 static double square_from_box(const double *box, const double *p) {
-    double seen[DIM], local[DIM], none[DIM] = {0.0}, slope;
-    for (int i = 0; i < DIM; i++) seen[i] = p[i] - box[i];
-    along_sides(box, seen, local);
+    double local[DIM], none[DIM] = {0.0}, slope;
+    seen_from(box, p, local);
     return square_at(BOX_HALF(box), local, none, 0.0, &slope);
 }
 
 /* Smallest squared distance of the segment from `start` to `start + step`. */
 static inline double square_of_segment(const double *box, const double *start, const double *step) {
-    double seen[DIM], begin[DIM], along[DIM], low = 0.0, high = 1.0, falls, rises, found;
+    double begin[DIM], along[DIM], low = 0.0, high = 1.0, falls, rises, found;
     const double *half = BOX_HALF(box);
-    for (int i = 0; i < DIM; i++) seen[i] = start[i] - box[i];
-    along_sides(box, seen, begin);
+    seen_from(box, start, begin);
     along_sides(box, step, along);
     square_at(half, begin, along, low, &falls);
     square_at(half, begin, along, high, &rises);
@@ -88,6 +65,7 @@ static inline void measure_box(
     const double *most, double margin, double *gap, double *open
 ) {
     const double *axes = box + DIM, *half = BOX_HALF(box), radius = BOX_RADIUS(box);
+    if (radius < 0) return;
     double low[DIM], high[DIM];
     for (int i = 0; i < DIM; i++) {
         double reach = radius + margin;
@@ -105,7 +83,7 @@ static inline void measure_box(
             near &= (start[i] <= high[i] || end <= high[i]) && (start[i] >= low[i] || end >= low[i]);
         }
         if (!near) continue;
-        double away = square_of_segment(box, start, step), left = sqrt(away) - radius, more = away - radius * fabs(radius);
+        double away = square_of_segment(box, start, step), left = sqrt(away) - radius, more = away - radius * radius;
         gap[e] = left < gap[e] ? left : gap[e];
         open[e] = more < open[e] ? more : open[e];
     }

@@ -108,10 +108,10 @@ static void lay(const double *path, int64_t corners, double *string) {
 
 int32_t tgco_graph(const Search *s) {
     int64_t n = s->points, k = s->edges, list = n + k + s->midway;
-    int64_t size = (DIM + 1) * (s->spheres + n) + DIM * s->candidates + list;
+    int64_t size = (DIM + 2) * s->spheres + (DIM + 1) * n + DIM * s->candidates + list;
     double *memory = malloc(size * sizeof(double) + list * sizeof(int32_t) + n);
     if (!memory) return 0;
-    double *at = memory + (DIM + 1) * s->spheres, *others = at + (DIM + 1) * n, *values = others + DIM * s->candidates;
+    double *at = memory + (DIM + 2) * s->spheres, *others = at + (DIM + 1) * n, *values = others + DIM * s->candidates;
     int32_t *indices = (int32_t *)(memory + size);
     uint8_t *usable = (uint8_t *)(indices + list);
     for (int64_t b = 0; b < s->problems; b++) {
@@ -149,11 +149,11 @@ int32_t tgco_cheapest(const Search *s) {
 int32_t tgco_taut(const Search *s) {
     int64_t most = 2 * s->corners - 1, size = s->corners * DIM;
     size_t lengths_size = most * most * sizeof(double), ends_size = most * most * sizeof(int32_t);
-    size_t room = room_size(most, most), spheres = (DIM + 1) * s->spheres * sizeof(double);
+    size_t room = room_size(most, most), spheres = (DIM + 2) * s->spheres * sizeof(double);
     char *memory = malloc(lengths_size + size * sizeof(double) + spheres + room + ends_size);
     if (!memory) return 0;
     double *lengths = (double *)memory, *taut = lengths + most * most, *at = taut + size;
-    void *rest = at + (DIM + 1) * s->spheres;
+    void *rest = at + (DIM + 2) * s->spheres;
     int32_t *ends = (int32_t *)((char *)rest + room);
     for (int64_t b = 0; b < s->problems; b++) {
         double *path = s->path + b * size;
@@ -177,7 +177,7 @@ int32_t tgco_raise(const Search *s) {
     if (!at) return 0;
     for (int64_t b = 0; b < s->problems; b++) {
         const double *path = s->path + b * s->corners * DIM, *R = s->distances + b * M;
-        double reach = -INFINITY;
+        double reach = 0.0;
         for (int64_t m = 0; m < M; m++) reach = R[m] > reach ? R[m] : reach;
 #if BOXES
         if (s->largest[b] > reach) reach = s->largest[b];
@@ -198,7 +198,7 @@ int32_t tgco_raise(const Search *s) {
             }
         }
         for (int64_t v = 0; v < n; v++)
-            if (nearest[v] < SIGNED_SQUARE(reach)) s->price[b * n + v] *= s->factor;
+            if (nearest[v] < reach * reach) s->price[b * n + v] *= s->factor;
     }
     free(at);
     return 1;

@@ -12,13 +12,12 @@
 
 #define BLOCK 32  /* edges measured side by side */
 #define TINY 1e-12
-#define SIGNED_SQUARE(x) ((x) * fabs(x))
 #define CLAMP(x, low, high) ((x) < (low) ? (low) : (x) > (high) ? (high) : (x))
 
 typedef struct {
     int64_t problems, spheres, spread, candidates, points, edges, neighbours, hubs, corners, directions, shells, midway;
     double margin, least, clear, factor, tie;
-    const double *centers, *distances;  /* (B, M, DIM), (B, M) */
+    const double *centers, *distances;  /* (B, M, DIM), (B, M): radii, negative where absent */
     const double *start, *goal;         /* (B, DIM) */
     const double *cube, *rays, *shell;  /* (spread, DIM) in the unit cube; directions (B, rays, DIM); (shells) */
     double *nodes;                      /* (B, V, DIM) */
@@ -30,14 +29,15 @@ typedef struct {
     const double *cost;                 /* (B, 2 P - 1) */
     uint8_t *arrives;                   /* (B) */
     /* Read only where there are boxes: their numbers (B, boxes, BOX_NUMBERS), points around them (B, extras, DIM) and
-       whether each exists, corners (B, 2, DIM) of the region that holds start, goal and boxes, the largest size (B). */
+       whether each exists, their largest size (B). */
     const double *box, *beside;
     const uint8_t *exists;
-    const double *reach, *largest;
+    const double *reach, *largest;      /* the former are corners (B, 2, DIM) of the region that holds all */
     int64_t boxes, extras;
 } Search;
 
-/* The spheres of a problem: radii, their squares with their signs, the largest; centres coordinate by coordinate. */
+/* The spheres of a problem that are present: radii, their squares, centres coordinate by coordinate; boxes, some of
+   them absent; and the largest size of all. */
 typedef struct {
     int64_t count;
     const double *radius, *square, *at[DIM];
@@ -55,16 +55,15 @@ typedef struct {
 } Room;
 
 static Spheres spheres_of(const Search *s, int64_t b, double *room) {
-    Spheres o = {.count = s->spheres, .radius = s->distances + b * s->spheres, .largest = -INFINITY};
-    for (int i = 0; i < DIM; i++) {
-        o.at[i] = room + i * s->spheres;
-        for (int64_t m = 0; m < s->spheres; m++)
-            room[i * s->spheres + m] = s->centers[(b * s->spheres + m) * DIM + i];
-    }
-    o.square = room + DIM * s->spheres;
-    for (int64_t m = 0; m < o.count; m++) {
-        room[DIM * s->spheres + m] = SIGNED_SQUARE(o.radius[m]);
-        if (o.radius[m] > o.largest) o.largest = o.radius[m];
+    const double *R = s->distances + b * s->spheres;
+    double *square = room + DIM * s->spheres, *radius = square + s->spheres;
+    Spheres o = {.radius = radius, .square = square};
+    for (int i = 0; i < DIM; i++) o.at[i] = room + i * s->spheres;
+    for (int64_t m = 0; m < s->spheres; m++) {
+        if (R[m] < 0) continue;
+        for (int i = 0; i < DIM; i++) room[i * s->spheres + o.count] = s->centers[(b * s->spheres + m) * DIM + i];
+        radius[o.count] = R[m], square[o.count++] = R[m] * R[m];
+        if (R[m] > o.largest) o.largest = R[m];
     }
 #if BOXES
     if (s->largest[b] > o.largest) o.largest = s->largest[b];
@@ -78,13 +77,13 @@ static int is_free(const double *p, const Spheres *o, double gap) {
     for (int64_t m = 0; m < o->count; m++) {
         double square = 0.0, least = o->radius[m] + gap;
         for (int i = 0; i < DIM; i++) square += (p[i] - o->at[i][m]) * (p[i] - o->at[i][m]);
-        all &= square > SIGNED_SQUARE(least);
+        all &= square > least * least;
     }
 #if BOXES
     for (int64_t m = 0; m < o->boxes; m++) {
         const double *box = o->box + m * BOX_NUMBERS;
         double least = BOX_RADIUS(box) + gap;
-        all &= square_from_box(box, p) > SIGNED_SQUARE(least);
+        if (BOX_RADIUS(box) >= 0) all &= square_from_box(box, p) > least * least;
     }
 #endif
     return all;
@@ -135,13 +134,13 @@ static int64_t propose(const Search *s, int64_t b, double *values, int32_t *near
     double *p = to;
     for (int64_t shell = 0; shell < s->shells; shell++)
         for (int64_t m = 0; m < s->spheres; m++)
-            for (int64_t r = 0; r < s->directions && R[m] > 0; r++, p += DIM)
+            for (int64_t r = 0; r < s->directions && R[m] >= 0; r++, p += DIM)
                 for (int i = 0; i < DIM; i++) p[i] = o[m * DIM + i] + s->shell[shell] * R[m] * rays[r * DIM + i];
     for (int64_t m = 0; m < s->spheres; m++) {
         empty(values, near, s->midway);
-        for (int64_t n = 0; n < s->spheres && R[m] > 0; n++) {
+        for (int64_t n = 0; n < s->spheres && R[m] >= 0; n++) {
             double square = square_of(o + m * DIM, o + n * DIM);
-            if (n != m && R[n] > 0 && square < values[s->midway - 1])
+            if (n != m && R[n] >= 0 && square < values[s->midway - 1])
                 put(square, (int32_t)n, values, near, s->midway);
         }
         for (int64_t h = 0; h < s->midway && near[h] >= 0; h++, p += DIM) {
@@ -160,19 +159,9 @@ static int64_t propose(const Search *s, int64_t b, double *values, int32_t *near
 
 /* Start, goal, and points spread over the region that holds start, goal and obstacles. */
 static void scatter(const Search *s, int64_t b, double *to) {
-    const double *start = s->start + b * DIM, *goal = s->goal + b * DIM, *R = s->distances + b * s->spheres;
+    const double *start = s->start + b * DIM, *goal = s->goal + b * DIM, *reach = s->reach + b * 2 * DIM;
     for (int i = 0; i < DIM; i++) {
-        double low = start[i] < goal[i] ? start[i] : goal[i], high = start[i] > goal[i] ? start[i] : goal[i];
-        for (int64_t m = 0; m < s->spheres; m++) {
-            double o = s->centers[(b * s->spheres + m) * DIM + i], reach = 1.5 * R[m];
-            if (R[m] > 0 && o - reach < low) low = o - reach;
-            if (R[m] > 0 && o + reach > high) high = o + reach;
-        }
-#if BOXES
-        const double *reach = s->reach + b * 2 * DIM;
-        if (reach[i] < low) low = reach[i];
-        if (reach[DIM + i] > high) high = reach[DIM + i];
-#endif
+        double low = reach[i], high = reach[DIM + i];
         to[i] = start[i], to[DIM + i] = goal[i];
         for (int64_t v = 0; v < s->spread; v++) to[(2 + v) * DIM + i] = low + s->cube[v * DIM + i] * (high - low);
     }
