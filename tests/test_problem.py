@@ -59,11 +59,11 @@ class Aimed(Cost):
         (lambda: planar(constraints=[ControlBounds([-1, nan], [1, 1])]), "control_bounds.lower"),
         (lambda: planar(constraints=[ControlBounds([-1], [1])]), "control_bounds.lower"),
         (lambda: planar(constraints=[StateBounds([-inf] * 6, [inf] * 6)]), "state_bounds: expected at least one"),
-        (lambda: planar(constraints=[Spheres([[0.0, 0, 0]], [0.1])]), "obstacles.centers: expected 2-D centres"),
+        (lambda: planar(constraints=[Spheres([[0.0, 0, 0]], [0.1])]), "obstacles.centers: expected 2-D points"),
         (lambda: nowhere(Spheres([[0.0, 0]], [0.1])), "obstacles.centers: expected dynamics with a position"),
         (lambda: nowhere(Spheres([], [])), "obstacles.centers: expected dynamics with a position: set `position = sli"),
         (lambda: planar(constraints=[Spheres([[nan, nan]], [0.1])]), "obstacles.radii: expected NaN exactly where"),
-        (lambda: planar(constraints=[Spheres([[0.0, 1.0]], [-0.1])]), "obstacles.radii: expected radii of at least 0"),
+        (lambda: planar(constraints=[Spheres([[0.0, 1.0]], [-0.1])]), "obstacles.radii: expected finite radii of"),
         (lambda: planar(constraints=[Spheres([[0.0, 1.0]], [0.1, 0.2])]), "obstacles.radii"),
         (lambda: planar(constraints=[Spheres([[0.0, 1.0]], [0.1], 0.0, [[1.0, 1.0]] * 2)]), "obstacles.velocities"),
         (lambda: planar(constraints=[FunctionConstraint(lambda x: x[..., 0])]), "constraint.function"),
@@ -104,6 +104,21 @@ def test_knots_of_a_constraint() -> None:
     assert problem.constraints[0].value(X, U)[0, :, 0].tolist() == [1.0, 4.0]
     assert problem.constraints[1].value(-X, U)[0, :, 0].tolist() == [0.5, 1.5, 2.5, 3.5, 4.5]
     assert [problem.constraints[0].holds_at(k) for k in range(6)] == [False, False, True, False, False, True]
+
+
+def test_a_missing_bound_is_infinite_and_its_rows_hold() -> None:
+    """Also where other problems of the batch have that bound."""
+    problem = planar(constraints=[ControlBounds([[-1.0, -inf], [-inf, -inf]], [2.0, 3.0])])
+    (bounds,), D = problem.constraints, torch.float64
+    assert problem.control_bounds is bounds
+    assert bounds.lower.tolist() == [[-1.0, -inf], [-inf, -inf]] and bounds.range.tolist() == [[3.0, inf], [inf, inf]]
+    rest, signs = torch.zeros(2, 1, 2, dtype=D), torch.tensor([[1.0, -1.0], [-1.0, 1.0]], dtype=D)
+    reach = bounds.range_from(rest, signs)
+    assert reach.tolist() == [[[2.0, inf], [1.0, 3.0]], [[2.0, inf], [inf, 3.0]]]
+    assert bounds.middle(rest).tolist() == [[[0.5, 0.0]], [[0.0, 0.0]]]
+    rows = bounds.value(torch.zeros(2, problem.N + 1, 6, dtype=D), torch.full((2, problem.N, 2), -9.0, dtype=D))
+    assert rows.shape[-1] == 3 and bool(torch.isfinite(rows).all())
+    assert (rows > 0).any(1).tolist() == [[False, False, True], [False, False, False]]
 
 
 def test_moving_spheres_are_at_their_positions() -> None:

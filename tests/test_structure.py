@@ -86,6 +86,11 @@ def test_solvers_import_no_guidance_and_problems_no_solver() -> None:
             assert not any(name.startswith(("solvers", "lagrangian", "guidance")) for name in imports_of(path)), path
 
 
+def test_the_interface_of_obstacles_knows_no_kind_of_them() -> None:
+    names = imports_of(PACKAGE / "obstacles" / "base.py")
+    assert names and not any(name.startswith("obstacles") for name in names)
+
+
 def test_only_experiments_import_hydra() -> None:
     for path in PACKAGE.rglob("*.py"):
         if "experiments" not in path.relative_to(PACKAGE).parts:

@@ -197,7 +197,7 @@ CASES: dict[str, list[Callable[[], object]]] = {
     ],
     "obstacles.centers": [lambda c=c: held(Spheres(c, [0.1])) for c in ("a", None, 1.0, [[inf, 0.0]])],
     "obstacles.vehicle_radius": [
-        lambda r=r: held(Spheres([[5.0, 0.0]], [0.1], r)) for r in ("a", None, nan, inf, [0.1] * 3, [[0.1, 0.2]])
+        lambda r=r: held(Spheres([[5.0, 0.0]], [0.1], r)) for r in ("a", None, nan, inf, [0.1] * 3, [[0.1, 0.2]], -1.0)
     ],
     "obstacles.velocities": [
         lambda v=v: held(Spheres([[5.0, 0.0]], [0.1], 0.0, v)) for v in ("a", [[nan, 0.0]], [[inf, 0.0]], [1.0, 2.0])

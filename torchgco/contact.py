@@ -10,7 +10,6 @@ from torch import Tensor
 from torchgco.base.errors import ContactWarning
 from torchgco.base.status import Status
 from torchgco.judging.judge import CLEARANCES, by_kind
-from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 
@@ -42,8 +41,8 @@ def touches(problem: Problem, solution: Solution) -> Tensor:
     if rows.numel() == 0:
         return found
     nearest = torch.full_like(solution.cost[rows], torch.inf)
-    for part in problem.constraints:
-        if isinstance(part, Obstacles) and isinstance(part, tuple(CLEARANCES)):
+    for part in problem.obstacles:
+        if isinstance(part, tuple(CLEARANCES)):
             nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(part.take(rows), solution.X[rows])[1])
     found[rows] = nearest < 0
     return found

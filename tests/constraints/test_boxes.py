@@ -12,7 +12,7 @@ from torch import Tensor
 from tests.problems import boxed_batch, planar_batch, random_trajectory
 from tests.reference import boxes as brute_force
 from torchgco import Boxes, InputError, Problem, Spheres
-from torchgco.obstacles.base import Solids
+from torchgco.obstacles.base import ABSENT, Solids, marked
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.roadmap.geometry import Inflated
@@ -167,6 +167,19 @@ def test_a_start_within_touching_distance_is_refused() -> None:
     assert problem.start_is_clear.tolist() == [True, False, True]
 
 
+def test_of_an_absent_obstacle_only_the_mark_is_left() -> None:
+    plain, _ = planar_batch(B=1, N=4)
+    absent = [np.nan, np.nan]
+    spheres = Spheres([absent, [3.0, 0.0]], [np.nan, 0.1], 0.05)
+    parts = [spheres, Boxes([absent, [3.0, 3.0]], [absent, [0.2, 0.1]], 0.05)]
+    for part in Problem(plain.dynamics, plain.cost, parts, plain.x0, 4).obstacles:
+        solids = part.inflated()
+        assert solids is not None and solids.absent.tolist() == [[True, False]]
+        numbers = [value[0, 0] for name, value in vars(solids).items() if name not in ("absent", "axes")]
+        assert not any(bool(value.any()) for value in numbers) and solids.sizes[0, 0] == 0
+        assert marked(solids.radii, solids.absent).tolist() == [[ABSENT, float(solids.radii[0, 1])]]
+
+
 def test_no_boxes_at_all() -> None:
     plain, U = planar_batch(B=2, N=4)
     problem = Problem(plain.dynamics, plain.cost, [Boxes([], [], 0.1)], plain.x0, 4)
@@ -189,14 +202,14 @@ def test_the_region_of_a_start_a_goal_and_boxes() -> None:
 
 
 BAD = {
-    "shape": (dict(centers=[[0.0, 0.0, 0.0]]), r"boxes.centers: expected shape \(2, M, 2\), got \(2, 1, 3\)"),
+    "shape": (dict(centers=[[0.0, 0.0, 0.0]]), "boxes.centers: expected 2-D points, .* got 3-D"),
     "sides": (dict(half_sizes=[[0.1, 0.1]] * 2), r"boxes.half_sizes: expected shape \(2, 1, 2\), got \(2, 2, 2\)"),
     "side of length 0": (
         dict(half_sizes=[[0.1, 0.0]]),
         "boxes.half_sizes: expected finite half sides above 0 m",
     ),
     "mixed": (dict(half_sizes=[[0.1, np.nan]]), "boxes.half_sizes: expected NaN exactly where the centre is NaN"),
-    "infinite": (dict(centers=[[np.inf, 0.0]]), "boxes.half_sizes: expected NaN exactly where the centre is NaN"),
+    "infinite": (dict(centers=[[np.inf, 0.0]]), "boxes.centers: expected finite points, or rows of NaN"),
     "vehicle": (dict(vehicle_radius=-1.0), "boxes.vehicle_radius: expected a number of at least 0 m"),
     "turn": (
         dict(rotations=[[1.0, 0, 0, 0]]),

@@ -23,7 +23,7 @@ def test_the_form_of_the_maze() -> None:
     assert bool((discs.inflated_radii == 2.2).all())
     assert isinstance(controls, ControlBounds) and isinstance(states, StateBounds)
     assert controls.lower.unique().tolist() == [0.0] and controls.upper.unique().tolist() == [50.0]
-    assert states.upper[0, :3].tolist() == [25.0, 1e20, 20.0] and states.upper[0, 7:10].tolist() == [30.0] * 3
+    assert states.upper[0, :3].tolist() == [25.0, np.inf, 20.0] and states.upper[0, 7:10].tolist() == [30.0] * 3
     assert goal.sense == "equality" and goal.knots == slice(100, 101)
     assert goal.value(problem.x0.new_zeros(3, 101, 13), problem.x0.new_zeros(3, 100, 4)).shape == (3, 1, 9)
     assert problem.x0[0, :3].tolist() == list(START) and len(problem.x0.unique(dim=0)) == 3

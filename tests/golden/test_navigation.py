@@ -25,7 +25,7 @@ def test_the_form_of_the_problem() -> None:
     assert cylinders.value(X, U).shape == (5, 28, 4)
     np.testing.assert_allclose(controls.lower[0] * HOVER, SLOWEST)
     np.testing.assert_allclose(controls.upper[0] * HOVER, FASTEST)
-    assert states.upper[0].tolist() == [10.0] * 3 + [1e20] * 4 + [10.0] * 6
+    assert states.upper[0].tolist() == [10.0] * 3 + [np.inf] * 4 + [10.0] * 6
     np.testing.assert_allclose(problem.x0[:, :2].norm(dim=-1), 32**0.5)
     np.testing.assert_allclose(problem.x0[2, :3], [4.0, 4.0, 0.0], atol=1e-12)
 

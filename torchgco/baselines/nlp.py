@@ -17,10 +17,9 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
+from torchgco.constraints.bounds import LOOSE
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
-
-UNBOUNDED = 1e19  # and above: no bound for this problem; others of the batch have one
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class _Limits:
         rising = self.slope > 0
         np.minimum.at(upper, self.variable[rising], at[rising])
         np.maximum.at(lower, self.variable[~rising], at[~rising])
-        lower[lower <= -UNBOUNDED], upper[upper >= UNBOUNDED] = -np.inf, np.inf
+        lower[lower <= -LOOSE], upper[upper >= LOOSE] = -np.inf, np.inf
         return lower, upper
 
 

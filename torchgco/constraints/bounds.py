@@ -12,7 +12,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, tensor
 from torchgco.constraints.base import Constraint, resolve_knots
 
-UNBOUNDED = 1e20  # stands for infinity in bound constraints
+LOOSE = 1e20  # stands for infinity in rows: a component may be bounded in one problem of a batch and free in another
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class _Bounds(Constraint):
     of: ClassVar[Literal["x", "u"]]
 
     def bind(self, dims: Dimensions) -> Self:
-        if self.above is not None:  # bound already: infinite bounds are large numbers by now
+        if self.above is not None:  # bound already
             return self
         name, size = ("control_bounds", dims.m) if self.of == "u" else ("state_bounds", dims.n)
         last = dims.N - 1 if self.of == "u" else dims.N
@@ -48,21 +48,30 @@ class _Bounds(Constraint):
         above, below = (torch.isfinite(bound).any(dim=0).nonzero().flatten() for bound in (upper, lower))
         if above.numel() + below.numel() == 0:
             raise InputError(name, "at least one finite bound", "none")
-        # A component may be bounded in one problem and free in another, where 0 * infinity would give NaN.
-        lower, upper = lower.nan_to_num(neginf=-UNBOUNDED), upper.nan_to_num(posinf=UNBOUNDED)
         knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", lower.device)
         return replace(self, lower=lower, upper=upper, knots=knots, above=_range(above), below=_range(below))
 
     @property
-    def half_range(self) -> Tensor:
-        """Half the distance between the bounds, (B|1, size); infinite where one is missing."""
-        both = (self.lower > -UNBOUNDED) & (self.upper < UNBOUNDED)
-        return torch.where(both, 0.5 * (self.upper - self.lower), torch.inf)
+    def range(self) -> Tensor:
+        """The distance between the bounds, (B|1, size); infinite where one is missing."""
+        return self.upper - self.lower
+
+    def range_from(self, z: Tensor, signs: Tensor) -> Tensor:
+        """Distances (B, P, size) from z (B, 1, size) to the bounds that signs (P, size) point to, at least 0."""
+        upper, lower = self.upper.unsqueeze(1), self.lower.unsqueeze(1)
+        return torch.where(signs > 0, upper - z, z - lower).clamp(min=0.0)
 
     def middle(self, z: Tensor) -> Tensor:
         """The middle of the bounds in the shape of z (B, K, size); z within them where one is missing."""
-        lower, upper, half = (part.unsqueeze(1) for part in (self.lower, self.upper, self.half_range))
-        return torch.where(torch.isfinite(half), 0.5 * (lower + upper), torch.clamp(z, lower, upper))
+        lower, upper, both = self.lower.unsqueeze(1), self.upper.unsqueeze(1), torch.isfinite(self.range).unsqueeze(1)
+        return torch.where(both, 0.5 * (lower + upper), torch.clamp(z, lower, upper))
+
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """The upper and the lower bounds of the rows, (B|1, rows above) and (B|1, rows below), as finite numbers.
+
+        A row of minus infinity, times a multiplier of 0, would be NaN.
+        """
+        return self.upper[:, self.above].clamp(max=LOOSE), self.lower[:, self.below].clamp(min=-LOOSE)
 
     def _checked(self, value: Any, name: str, size: int, dims: Dimensions, refused: float) -> Tensor:
         bound = tensor(value, name, dims.like)
@@ -76,7 +85,7 @@ class _Bounds(Constraint):
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         z = (U if self.of == "u" else X)[:, self.knots]
-        upper, lower = self.upper[:, None, self.above], self.lower[:, None, self.below]
+        upper, lower = (bound.unsqueeze(1) for bound in self.limits())
         return torch.cat((z[..., self.above] - upper, lower - z[..., self.below]), dim=-1)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:

@@ -17,7 +17,6 @@ from torchgco.guidance.region import guide_along
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.native.dispatch import cost_unit
-from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.solvers.contracts import Advice
 
@@ -96,9 +95,8 @@ class GCO:
 
 def _radius(problem: Problem, X: Tensor) -> Tensor:
     """r_guide (B,), m."""
-    for constraint in problem.geometric:
-        if isinstance(constraint, Obstacles):
-            return constraint.vehicle_radius
+    if problem.obstacles:
+        return problem.obstacles[0].vehicle_radius
     at = problem.position
     ends = X[:, 1:, at] if problem.goal is None else problem.goal.position.unsqueeze(1)
     return REACH * (ends - problem.x0[:, None, at]).square().sum(-1).sqrt().amax(-1)

@@ -13,7 +13,6 @@ from torchgco.base.draws import DrawKey, standard_normal, words
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Count, Natural, NonNegative, Positive, check_options
 from torchgco.base.shapes import check_shape, tensor
-from torchgco.constraints.bounds import ControlBounds
 from torchgco.guidance.samples import Flight, Noise, average, draw, fly
 from torchgco.native.dispatch import open_loop, sampler_of
 from torchgco.native.sampler import Rounds
@@ -21,7 +20,6 @@ from torchgco.problem.problem import Problem
 
 CHUNK = 8192  # samples rolled out together: memory stays bounded
 COLLISION_PENALTY = 1e8  # rho_mp, per knot and obstacle touched
-OPEN = 1e10  # a range of controls at least this wide counts as unbounded
 
 
 @dataclass(frozen=True)
@@ -159,13 +157,11 @@ class MPPI:
 
     def _bounds(self, problem: Problem) -> tuple[Tensor, Tensor] | None:
         """Limits of the samples as `saturation` says (Algorithm 3, line 7): two tensors (B|1, 1, m)."""
-        if self.saturation is None:
+        bounds = problem.control_bounds
+        if self.saturation is None or bounds is None:
             return None
-        for constraint in problem.constraints:
-            if isinstance(constraint, ControlBounds):
-                upper = constraint.upper.unsqueeze(1)
-                return (constraint.lower.unsqueeze(1) if self.saturation == "bounds" else -upper), upper
-        return None
+        upper = bounds.upper.unsqueeze(1)
+        return (bounds.lower.unsqueeze(1) if self.saturation == "bounds" else -upper), upper
 
     def _sigma(self, problem: Problem) -> Tensor:
         """Diagonal of Sigma, (B|1, 1, m)."""
@@ -179,8 +175,7 @@ class MPPI:
         return sigma.view(1, 1, -1)
 
     def _from_bounds(self, problem: Problem) -> Tensor:
-        for constraint in problem.constraints:
-            if isinstance(constraint, ControlBounds):
-                deviation = self.spread * (constraint.upper - constraint.lower)
-                return torch.where(deviation < OPEN, deviation.square(), 1.0).unsqueeze(1)
-        return problem.x0.new_ones(1, 1, problem.m)
+        if problem.control_bounds is None:
+            return problem.x0.new_ones(1, 1, problem.m)
+        deviation = self.spread * problem.control_bounds.range
+        return torch.where(torch.isfinite(deviation), deviation.square(), 1.0).unsqueeze(1)

@@ -127,8 +127,8 @@ def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     nearest = X.new_full((), torch.inf)
-    for obstacles in problem.constraints:
-        if isinstance(obstacles, Obstacles) and not bool(obstacles.absent.all()):
+    for obstacles in problem.obstacles:
+        if not bool(obstacles.absent.all()):
             path = by_kind(CHORDS, obstacles)(obstacles, X[0]) - _bulge(problem, X, U).unsqueeze(-1)
             nearest = torch.minimum(nearest, path[:, ~obstacles.absent[0]].amin())
     return nearest

@@ -235,7 +235,7 @@ def columns(problem: Problem, U: Tensor) -> dict[str, Any]:
     check_problem(problem)
     if problem.dynamics.position is None:
         return {}
-    names = ["clearance"] if any(isinstance(part, Obstacles) for part in problem.constraints) else []
+    names = ["clearance"] if problem.obstacles else []
     names += ["reached"] if problem.goal is not None else []
     if not names:
         return {}

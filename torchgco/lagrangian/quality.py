@@ -7,7 +7,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchgco.obstacles.base import Obstacles
 from torchgco.problem.goal import SHARE
 from torchgco.problem.problem import Problem
 
@@ -39,9 +38,8 @@ def chord_clearance(problem: Problem, X: Tensor) -> Tensor:
     Infinite where there is no obstacle.
     """
     least = X.new_full(X.shape[:1], torch.inf)
-    for part in problem.constraints:
-        if isinstance(part, Obstacles):
-            least = torch.minimum(least, part.chord_clearance(X))
+    for part in problem.obstacles:
+        least = torch.minimum(least, part.chord_clearance(X))
     return least
 
 

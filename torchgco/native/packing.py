@@ -87,8 +87,9 @@ def pack_rows(c: Rows, constraint: Constraint, numbers: Tensor | None, problem: 
         above, below = variables[constraint.above], variables[constraint.below]
         variable = torch.cat((above, below))
         sign = torch.cat((torch.ones(above.numel()), -torch.ones(below.numel()))).double()
-        upper, lower = torch.broadcast_tensors(constraint.upper, constraint.lower)  # one may be shared by all problems
-        bound = torch.cat((upper[:, constraint.above], lower[:, constraint.below]), dim=1)
+        upper, lower = constraint.limits()
+        B = max(len(upper), len(lower))  # one may be shared by all problems
+        bound = torch.cat((upper.expand(B, -1), lower.expand(B, -1)), dim=1)
         keep += [variable, sign]
         c.variable, c.sign = variable.data_ptr(), sign.data_ptr()
         c.bound = array(bound, keep, knots=False)

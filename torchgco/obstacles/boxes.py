@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.obstacles.base import Obstacles, least
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions, segment_distance, signed_distance
-from torchgco.obstacles.spheres import per_problem, vehicle_radius
+from torchgco.obstacles.inputs import dimension, own_radii, per_problem, points, rows, vehicle_radii
 
 AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
 UNIT_WITHIN = 1e-3  # by which the length of a quaternion may differ from 1
@@ -60,17 +60,12 @@ class Boxes(Constraint):
 
     def bind(self, dims: Dimensions) -> Constraint:
         d = dimension(dims, "boxes.centers")
-        centers = tensor(self.centers, "boxes.centers", dims.like)
-        half = tensor(self.half_sizes, "boxes.half_sizes", dims.like)
-        centers, half = (z.reshape(0, d) if tuple(z.shape) == (0,) else z for z in (centers, half))
-        centers = per_problem(centers, "boxes.centers", 3, dims)
-        check_shape(centers, (dims.B, "M", d), "boxes.centers")
-        half = per_problem(half, "boxes.half_sizes", 3, dims)
-        check_shape(half, (dims.B, centers.shape[1], d), "boxes.half_sizes")
-        absent = torch.isnan(centers).all(-1)
-        if bool((absent.unsqueeze(-1) != torch.isnan(half)).any()) or not _finite(centers[~absent]):
+        centers, absent = points(self.centers, "boxes.centers", d, dims)
+        half = rows(self.half_sizes, "boxes.half_sizes", d, dims)
+        check_shape(half, tuple(centers.shape), "boxes.half_sizes")
+        if bool((absent.unsqueeze(-1) != torch.isnan(half)).any()):
             raise InputError("boxes.half_sizes", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
-        radii = torch.where(absent, torch.nan, 0.0)
+        radii = torch.zeros_like(half[..., 0])
         if self.radii is not None:
             radii = own_radii(self.radii, "boxes.radii", absent, dims)
         sized = torch.where(radii.unsqueeze(-1) > 0, half >= 0, half > 0) & torch.isfinite(half)
@@ -203,50 +198,6 @@ class BoundBoxes(Obstacles):
         return torch.where(self.absent.unsqueeze(1), -1.0, -2.0 * self.depths.unsqueeze(1) * self._outside(p))
 
 
-def dimension(dims: Dimensions, name: str) -> int:
-    """d of the space that the vehicle moves in.
-
-    Raises:
-        InputError: dynamics without a position in 2-D or 3-D.
-    """
-    d = space_of(dims, name)
-    if d not in (2, 3):
-        raise InputError(name, "dynamics with a position in 2-D or 3-D", f"{d}-D")
-    return d
-
-
-def vehicle_radii(value: Any, name: str, dims: Dimensions) -> Tensor:
-    """The vehicle's radius in every problem, (B,).
-
-    Raises:
-        InputError: neither a number nor (B,), or negative.
-    """
-    vehicle = vehicle_radius(value, name, dims)[:, 0]
-    if not bool((vehicle >= 0).all()):
-        raise InputError(name, "a number of at least 0 m", float(vehicle.min()))
-    return vehicle.expand(dims.B).contiguous()
-
-
-def own_radii(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor:
-    """The obstacles' own radii (B, M), NaN where absent.
-
-    Raises:
-        InputError: another shape, NaN elsewhere or not there, infinite or negative radii.
-    """
-    radii = per_problem(value, name, 2, dims)
-    check_shape(radii, tuple(absent.shape), name)
-    if bool((torch.isnan(radii) != absent).any()):
-        raise InputError(name, "NaN exactly where the obstacle is absent", "NaN and numbers mixed")
-    wrong = ~absent & ~((radii >= 0) & torch.isfinite(radii))
-    if bool(wrong.any()):
-        raise InputError(name, "finite radii of at least 0 m", float(radii[wrong][0]))
-    return radii
-
-
-def _finite(values: Tensor) -> bool:
-    return bool(torch.isfinite(values).all())
-
-
 def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
     """The directions (B, M, d, d) of the sides; those of absent boxes are the axes of space."""
     straight = torch.eye(d, dtype=dims.like.dtype, device=dims.like.device).expand(*absent.shape, d, d)
@@ -266,6 +217,6 @@ def _axes(rotations: Any, absent: Tensor, d: int, dims: Dimensions) -> Tensor:
             raise InputError("boxes.rotations", "unit quaternions [w, x, y, z]", turns[wrong][0].tolist())
         axes = from_quaternions(turns / length)
     axes = torch.where(absent[..., None, None], straight, axes)
-    if not _finite(axes):
+    if not bool(torch.isfinite(axes).all()):
         raise InputError("boxes.rotations", "finite numbers for every box that is there", "NaN or infinity")
     return axes.contiguous()

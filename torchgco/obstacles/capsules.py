@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape, tensor
+from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.obstacles.box_geometry import from_quaternions
-from torchgco.obstacles.boxes import BoundBoxes, dimension, own_radii, vehicle_radii
-from torchgco.obstacles.spheres import per_problem
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.inputs import dimension, own_radii, points, vehicle_radii
 
 
 @dataclass(frozen=True)
@@ -46,31 +46,19 @@ class Capsules(Constraint):
 
     def bind(self, dims: Dimensions) -> Constraint:
         d = dimension(dims, "capsules.starts")
-        starts = self._points("starts", (dims.B, "M", d), dims)
-        ends = self._points("ends", tuple(starts.shape), dims)
-        absent = torch.isnan(starts).all(-1)
-        if bool((torch.isnan(ends).all(-1) != absent).any()):
+        starts, absent = points(self.starts, "capsules.starts", d, dims)
+        ends, gone = points(self.ends, "capsules.ends", d, dims)
+        check_shape(ends, tuple(starts.shape), "capsules.ends")
+        if bool((gone != absent).any()):
             raise InputError("capsules.ends", "NaN exactly where the start is NaN", "NaN and numbers mixed")
-        for name, points in (("starts", starts), ("ends", ends)):
-            wrong = ~torch.isfinite(points).all(-1) & ~absent
-            if bool(wrong.any()):
-                raise InputError(f"capsules.{name}", "finite points, or rows of NaN", points[wrong][0].tolist())
         radii = own_radii(self.radii, "capsules.radii", absent, dims)
-        if bool((radii == 0).any()):
+        if bool((radii[~absent] == 0).any()):
             raise InputError("capsules.radii", "radii above 0 m", 0.0)
         half, axes = _single_side(ends - starts, absent)
         vehicle = vehicle_radii(self.vehicle_radius, "capsules.vehicle_radius", dims)
         knots = slice(1, dims.N + 1) if self.knots is None else self.knots
         knots = resolve_knots(knots, dims.N, "capsules.knots", starts.device)
         return BoundBoxes.prepare(0.5 * (starts + ends), half, axes, absent, radii, vehicle, knots, dims)
-
-    def _points(self, name: str, shape: tuple[int | str, ...], dims: Dimensions) -> Tensor:
-        """One of the two fields of points, (B, M, d)."""
-        points = tensor(getattr(self, name), f"capsules.{name}", dims.like)
-        points = points.reshape(0, int(shape[2])) if tuple(points.shape) == (0,) else points
-        points = per_problem(points, f"capsules.{name}", 3, dims)
-        check_shape(points, shape, f"capsules.{name}")
-        return points
 
 
 def _single_side(along: Tensor, absent: Tensor) -> tuple[Tensor, Tensor]:

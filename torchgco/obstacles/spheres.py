@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+from torchgco.base.shapes import Dimensions, check_shape, space_of
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.obstacles.base import Obstacles, Solids, least
+from torchgco.obstacles.inputs import own_radii, per_problem, points, vehicle_radii
 
 
 @dataclass(frozen=True)
@@ -47,30 +48,15 @@ class Spheres(Constraint):
     geometric: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Constraint:
-        centers = tensor(self.centers, "obstacles.centers", dims.like)
         d = space_of(dims, "obstacles.centers")
         assert dims.position is not None
-        centers = centers.reshape(0, d) if tuple(centers.shape) == (0,) else centers
-        centers = per_problem(centers, "obstacles.centers", 3, dims)
-        if centers.shape[-1] != d:
-            wanted = f"{d}-D centres, as the vehicle's position is {d}-D"
-            raise InputError("obstacles.centers", wanted, f"{centers.shape[-1]}-D centres")
-        M = centers.shape[1]
-        radii = per_problem(self.radii, "obstacles.radii", 2, dims)
-        check_shape(radii, (dims.B, M), "obstacles.radii")
-        vehicle = vehicle_radius(self.vehicle_radius, "obstacles.vehicle_radius", dims)
-        absent = torch.isnan(centers).all(-1)
-        if bool((absent != torch.isnan(radii)).any()) or bool(torch.isnan(centers[~absent]).any()):
-            raise InputError("obstacles.radii", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
-        if bool(torch.isinf(centers).any()) or bool(torch.isinf(radii).any()):
-            raise InputError("obstacles.centers", "finite centres and radii, or NaN where absent", "infinity")
-        if bool((radii < 0).any()) or bool((vehicle < 0).any()):
-            lowest = min(float(sizes.nan_to_num(0.0).min()) for sizes in (radii, vehicle) if sizes.numel() > 0)
-            raise InputError("obstacles.radii", "radii of at least 0 m", lowest)
+        centers, absent = points(self.centers, "obstacles.centers", d, dims)
+        radii = own_radii(self.radii, "obstacles.radii", absent, dims)
+        vehicle = vehicle_radii(self.vehicle_radius, "obstacles.vehicle_radius", dims)
         velocities = None
         if self.velocities is not None:
             velocities = per_problem(self.velocities, "obstacles.velocities", 3, dims)
-            check_shape(velocities, (dims.B, M, d), "obstacles.velocities")
+            check_shape(velocities, tuple(centers.shape), "obstacles.velocities")
             velocities = torch.where(absent.unsqueeze(-1), 0.0, velocities)
             if not bool(torch.isfinite(velocities).all()):
                 raise InputError("obstacles.velocities", "finite velocities of every sphere", "NaN or infinity")
@@ -79,10 +65,10 @@ class Spheres(Constraint):
         knots = slice(1, dims.N + 1) if self.knots is None else self.knots
         return BoundSpheres.prepare(
             torch.where(absent.unsqueeze(-1), 0.0, centers),
-            torch.where(absent, 0.0, radii + vehicle),
+            torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1)),
             velocities,
             absent,
-            vehicle.expand(dims.B, 1)[:, 0].contiguous(),
+            vehicle,
             resolve_knots(knots, dims.N, "obstacles.knots", radii.device),
             dims.position,
             dims.dt or 0.0,
@@ -215,11 +201,6 @@ class BoundSpheres(Obstacles):
         gap = _from_origin(away[:, :-1], away.diff(dim=1)) - CONTACT_FACTOR * self.inflated_radii.unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
 
-    def start_is_clear(self, x0: Tensor) -> Tensor:
-        """False where the vehicle touches an obstacle at the start, (B,)."""
-        gap = (x0[:, None, self.position] - self.centers).square().sum(-1).sqrt()
-        return ((gap >= CONTACT_FACTOR * self.inflated_radii) | self.absent).all(-1)
-
     def _gaps(self, p: Tensor, t: Tensor) -> Tensor:
         """Distances (B, K, M) of points p (B, K, d) from the centres at times t (K, 1); infinite where absent."""
         o = self.centers.unsqueeze(1)
@@ -264,30 +245,3 @@ def _from_origin(a: Tensor, along: Tensor) -> Tensor:
 def _outer(a: Tensor, b: Tensor) -> Tensor:
     """a b' of the last axis, flattened: (..., d * d)."""
     return (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2)
-
-
-def vehicle_radius(value: Any, name: str, dims: Dimensions) -> Tensor:
-    """The vehicle's radius as (B, 1), or (1, 1) where all problems share it.
-
-    Raises:
-        InputError: neither a finite number nor one per problem.
-    """
-    radius = tensor(value, name, dims.like)
-    if radius.dim() > 1 or radius.numel() not in (1, dims.B) or not bool(torch.isfinite(radius).all()):
-        got = f"shape {tuple(radius.shape)}" if bool(torch.isfinite(radius).all()) else "NaN or infinity"
-        raise InputError(name, f"a number, or {dims.B} of them", got)
-    return radius.reshape(-1, 1)
-
-
-def per_problem(value: Any, name: str, dim: int, dims: Dimensions) -> Tensor:
-    """`value` with its batch axis, repeated for every problem where it came without one.
-
-    Raises:
-        InputError: not numbers, another number of axes than `dim` or `dim` - 1, or another batch.
-    """
-    given = tensor(value, name, dims.like)
-    if given.dim() == dim - 1:
-        given = given.unsqueeze(0).expand(dims.B, *given.shape)
-    if given.dim() != dim or given.shape[0] != dims.B:
-        raise InputError(name, f"one set for all, or {dims.B} sets", f"shape {tuple(given.shape)}")
-    return given.contiguous()

@@ -15,6 +15,7 @@ from torchgco.base.options import Count, Seconds, check_value
 from torchgco.base.shapes import MISTAKES, Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, cast
 from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import ControlBounds
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
@@ -117,6 +118,16 @@ class Problem:
     def geometric(self) -> tuple[Constraint, ...]:
         """The constraints on position that sampling and guidance consider."""
         return tuple(c for c in self.constraints if c.geometric)
+
+    @property
+    def obstacles(self) -> tuple[Obstacles, ...]:
+        """The constraints that are obstacles, of whatever kind."""
+        return tuple(c for c in self.constraints if isinstance(c, Obstacles))
+
+    @property
+    def control_bounds(self) -> ControlBounds | None:
+        """The first bounds on controls; None where there are none."""
+        return next((c for c in self.constraints if isinstance(c, ControlBounds)), None)
 
     @cached_property
     def start_is_clear(self) -> Tensor:

@@ -8,13 +8,11 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from torchgco.constraints.bounds import ControlBounds
 from torchgco.obstacles.base import Obstacles, Solids, least
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Inflated, Scene
 
-OPEN = 1e10  # a range of controls at least this wide counts as unbounded
 LITTLE = 1e-6  # in units of cost: a smaller stage cost says nothing about the goal
 S = TypeVar("S", bound=Solids)
 FALLEN_BACK = 0.25  # share of the distance from start to goal; candidates that end farther from the goal are dropped
@@ -93,8 +91,7 @@ def chord_penetration(problem: Problem, X: Tensor, share: float = 0.0) -> Tensor
     Counted from a `share` of an obstacle's margin beneath its surface; at most 0 where no segment lies deeper.
     """
     p = X[..., problem.position]
-    obstacles = [c for c in problem.geometric if isinstance(c, Obstacles)]
-    gaps = [c.segment_clearance(p[:, :-1], p[:, 1:]) + share * c.margins.unsqueeze(1) for c in obstacles]
+    gaps = [c.segment_clearance(p[:, :-1], p[:, 1:]) + share * c.margins.unsqueeze(1) for c in problem.obstacles]
     return -torch.stack([least(gap) for gap in gaps]).amin(0)
 
 
@@ -103,12 +100,10 @@ def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:
 
     Where there is no bound, 1.
     """
-    first = rest[:, :1]
-    for constraint in problem.constraints:
-        if isinstance(constraint, ControlBounds):
-            reach = torch.where(signs > 0, constraint.upper.unsqueeze(1) - first, first - constraint.lower.unsqueeze(1))
-            return torch.where(reach < OPEN, reach.clamp(min=0.0), 1.0)
-    return torch.ones_like(signs).expand(first.shape[0], *signs.shape)
+    if problem.control_bounds is None:
+        return torch.ones_like(signs).expand(rest.shape[0], *signs.shape)
+    reach = problem.control_bounds.range_from(rest[:, :1], signs)
+    return torch.where(torch.isfinite(reach), reach, 1.0)
 
 
 def _resting_cost(problem: Problem, rest: Tensor, points: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:

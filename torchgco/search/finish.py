@@ -83,6 +83,6 @@ def _half_ranges(problem: Problem, U: Tensor) -> Tensor:
     half = U.abs().amax(1, keepdim=True).clamp(min=1.0)
     for bounds in problem.constraints:
         if isinstance(bounds, ControlBounds):
-            own = bounds.half_range.unsqueeze(1)
+            own = 0.5 * bounds.range.unsqueeze(1)
             half = torch.where(torch.isfinite(own), own, half)
     return half

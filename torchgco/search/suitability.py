@@ -10,7 +10,6 @@ from torchgco.guidance.suitability import check_form, failure
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import engine_of
-from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.paths import PathProposals
@@ -28,9 +27,9 @@ def suited_paths(paths: PathProposals | None, problem: Problem) -> tuple[PathPro
     if position is None:
         return None, "the dynamics have no position"
     d = position.stop - position.start
-    if d not in (2, 3) and any(isinstance(c, Obstacles) for c in problem.geometric):
+    if d not in (2, 3) and problem.obstacles:
         return None, f"no path is sought around obstacles in {d}-D, as the roadmap knows only 2-D and 3-D"
-    if problem.goal is None and any(isinstance(c, Obstacles) for c in problem.geometric):
+    if problem.goal is None and problem.obstacles:
         return None, "no path is sought around obstacles without a goal: Problem(..., goal=Goal(position, radius))"
     if any(len(offset) != problem.m for offset in paths.initial_offsets):
         paths = replace(paths, initial_offsets=())

@@ -1,0 +1,96 @@
+"""What all kinds of obstacles check and shape of a user's numbers: points, radii, and the vehicle's radius."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
+
+
+def dimension(dims: Dimensions, name: str) -> int:
+    """d of the space that the vehicle moves in.
+
+    Raises:
+        InputError: dynamics without a position in 2-D or 3-D.
+    """
+    d = space_of(dims, name)
+    if d not in (2, 3):
+        raise InputError(name, "dynamics with a position in 2-D or 3-D", f"{d}-D")
+    return d
+
+
+def points(value: Any, name: str, d: int, dims: Dimensions) -> tuple[Tensor, Tensor]:
+    """Points (B, M, d) and which of them are absent (B, M): rows of NaN, which stay so.
+
+    Raises:
+        InputError: not numbers, points of another space, another batch, infinity, NaN among numbers.
+    """
+    given = rows(value, name, d, dims)
+    if given.shape[-1] != d:
+        raise InputError(name, f"{d}-D points, as the vehicle's position is {d}-D", f"{given.shape[-1]}-D points")
+    absent = torch.isnan(given).all(-1)
+    wrong = ~torch.isfinite(given).all(-1) & ~absent
+    if bool(wrong.any()):
+        raise InputError(name, "finite points, or rows of NaN", given[wrong][0].tolist())
+    return given, absent
+
+
+def rows(value: Any, name: str, d: int, dims: Dimensions) -> Tensor:
+    """Numbers per obstacle and coordinate, (B, M, ...); an empty list stands for none of d coordinates.
+
+    Raises:
+        InputError: as `per_problem`.
+    """
+    given = tensor(value, name, dims.like)
+    return per_problem(given.reshape(0, d) if tuple(given.shape) == (0,) else given, name, 3, dims)
+
+
+def own_radii(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor:
+    """The obstacles' own radii (B, M), 0 where absent.
+
+    Raises:
+        InputError: another shape, NaN elsewhere or not there, infinite or negative radii.
+    """
+    radii = per_problem(value, name, 2, dims)
+    check_shape(radii, tuple(absent.shape), name)
+    if bool((torch.isnan(radii) != absent).any()):
+        raise InputError(name, "NaN exactly where the obstacle is absent", "NaN and numbers mixed")
+    wrong = ~absent & ~((radii >= 0) & torch.isfinite(radii))
+    if bool(wrong.any()):
+        raise InputError(name, "finite radii of at least 0 m", float(radii[wrong][0]))
+    return torch.where(absent, 0.0, radii)
+
+
+def vehicle_radii(value: Any, name: str, dims: Dimensions) -> Tensor:
+    """The vehicle's radius in every problem, (B,).
+
+    Raises:
+        InputError: neither a finite number nor one per problem, or negative.
+    """
+    radius = tensor(value, name, dims.like)
+    finite = bool(torch.isfinite(radius).all())
+    if radius.dim() > 1 or radius.numel() not in (1, dims.B) or not finite:
+        raise InputError(
+            name, f"a number, or {dims.B} of them", f"shape {tuple(radius.shape)}" if finite else "NaN or infinity"
+        )
+    if not bool((radius >= 0).all()):
+        raise InputError(name, "a number of at least 0 m", float(radius.min()))
+    return radius.reshape(-1).expand(dims.B).contiguous()
+
+
+def per_problem(value: Any, name: str, dim: int, dims: Dimensions) -> Tensor:
+    """`value` with its batch axis, repeated for every problem where it came without one.
+
+    Raises:
+        InputError: not numbers, another number of axes than `dim` or `dim` - 1, or another batch.
+    """
+    given = tensor(value, name, dims.like)
+    if given.dim() == dim - 1:
+        given = given.unsqueeze(0).expand(dims.B, *given.shape)
+    if given.dim() != dim or given.shape[0] != dims.B:
+        raise InputError(name, f"one set for all, or {dims.B} sets", f"shape {tuple(given.shape)}")
+    return given.contiguous()
