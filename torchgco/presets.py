@@ -15,9 +15,19 @@ from torchgco.guidance.gco import GCO
 from torchgco.guidance.mppi import MPPI
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.search.multistart import MultiStart
-from torchgco.search.paths import PathProposals
-from torchgco.search.restarts import Restarts
+from torchgco.search import (
+    ClearChords,
+    Finish,
+    Follow,
+    FromProposal,
+    FromSamples,
+    IntoGoal,
+    MultiStart,
+    PathProposals,
+    Refine,
+    Restarts,
+    Solve,
+)
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Solver
 from torchgco.solvers.ilqr import ILQR
@@ -32,59 +42,77 @@ OFFSETS = (
 
 def gco(space: Space) -> Restarts:
     """The default: AL-iLQR with restarts along paths of several homotopy classes, and from samples."""
-    if _in_the_plane(space):
-        return Restarts(
-            local=_local(space),
-            paths=PathProposals(
-                roadmap=Roadmap(max_overlap=0.02), num_paths=12, initial_offsets=OFFSETS, depart=0.1,
-                arrive=(0.8, 0.6), relax_iterations=40, refine_top=8,
-            ),
-            sampling=GCO(
-                MPPI(
-                    samples=256, covariance=None, spread=0.35, temperature=0.01, rounds=20, noise_knots=8, decay=0.93,
-                    dwell_cost=1.0, elite=5, dtype="float32",
-                ),
-                initial_penalty=2.0, start_from_sample=True, sample_from_rest=True, single_contact_after=3,
-            ),
-            attempts=3,
-            finish=_finish(space),
-        )  # fmt: skip
-    return Restarts(
-        local=_local(space),
-        paths=PathProposals(
-            roadmap=Roadmap(num_halton=128), num_paths=6, relax_top=3, arrive=(0.9,), smoothing=0.16, tube=None,
-            stiffness=(200.0,), track_iterations=10, pace=1.75, max_gap=0.15,
-        ),
-        sampling=GCO(
-            MPPI(
-                samples=128, covariance=None, spread=0.1, temperature=0.01, rounds=12, noise_knots=10, decay=0.9,
-                elite=5, dtype="float32",
-            ),
-            initial_penalty=0.09, start_from_sample=True, single_contact_after=6,
-        ),
-        attempts=4,
-        finish=_finish(space),
+    solve, proposals, samples = _parts(space)
+    more = 2 * proposals.num_paths
+    closer, longer = _closer(proposals.follow[0]), _longer(proposals.follow[0])
+    known = replace(proposals, when="unproposed", roadmaps=(), relax_top=None)
+    rough = Refine(top=4, rounds=4, violation=1e-2, cut=0.3, needed=True)
+    plane = _in_the_plane(space)
+    followed_closer = replace(known, follow=(closer,))
+    if not plane:  # a costly problem: repairing candidates that cut deep into an obstacle is worth its time
+        followed_closer = replace(followed_closer, refine=rough, max_penetration=0.5)
+    costly = replace(
+        proposals, when="costly", roadmaps=_denser(proposals.roadmaps), num_paths=more,
+        follow=(proposals.follow[0], closer), relax_top=None if plane else 12, refine=rough, max_penetration=0.5,
+        max_gap=None if plane else 0.15,
     )  # fmt: skip
+    thorough = replace(proposals, when="far", num_paths=more, follow=(longer,), relax_top=None, refine=Refine(top=more))
+    return Restarts(
+        local=replace(_local(space), guidance=_guidance(space)),
+        passes=(
+            replace(solve, until="end", when="pathless"),
+            solve,
+            proposals,
+            costly,
+            followed_closer,
+            FromProposal(),
+            IntoGoal(),
+            thorough,
+            replace(known, follow=(_closer(longer),), refine=thorough.refine),
+            FromProposal(),
+            FromSamples("unproposed"),
+            samples,
+            IntoGoal(),
+            _finish(space),
+            ClearChords(),
+        ),
+    )
 
 
 def gco_fast(space: Space) -> Restarts:
     """One attempt along the shortest path, tracked from rest."""
     solver = gco(space)
-    assert solver.paths is not None and solver.sampling is not None
-    paths = replace(
-        solver.paths, num_paths=1, initial_offsets=(), arrive=solver.paths.paces[:1], track_iterations=10,
-        relax_iterations=0, relax_top=None, refine_top=1, max_gap=None,
-    )  # fmt: skip
-    sampling = replace(solver.sampling, sampler=replace(solver.sampling.sampler, samples=64, rounds=10))
-    return replace(solver, paths=paths, sampling=sampling, attempts=1)
+    solve, proposals, _ = _parts(space)
+    guidance = _guidance(space)
+    follow = replace(proposals.follow[0], initial_offsets=(), arrive=proposals.follow[0].paces[:1], iterations=10)
+    one = replace(proposals, num_paths=1, follow=(follow,), relax_iterations=0, relax_top=None, refine=Refine())
+    closer = replace(one, when="unproposed", roadmaps=(), follow=(_closer(follow),))
+    guidance = replace(guidance, sampler=replace(guidance.sampler, samples=64, rounds=10))
+    return Restarts(
+        local=replace(solver.local, guidance=guidance),
+        passes=(
+            replace(solve, until="end", when="pathless"),
+            solve,
+            one,
+            closer,
+            FromProposal(),
+            IntoGoal(),
+            FromSamples("unproposed"),
+            IntoGoal(),
+            _finish(space),
+            ClearChords(),
+        ),
+    )
 
 
 def gco_max(space: Space) -> Restarts:
-    """Up to sixteen paths, the sixteen best candidates refined, then sampled attempts; the cheapest result is kept."""
+    """The passes of `gco`, then more for every caught problem: sixteen refined candidates, and more samples."""
     solver = gco(space)
-    assert solver.paths is not None
-    paths = replace(solver.paths, num_paths=16, relax_top=None, refine_top=16, max_gap=None)
-    return replace(solver, paths=paths, attempts=4, all_attempts=True)
+    *_, proposals, samples = _parts(space)
+    many = replace(proposals, when="caught", num_paths=16, relax_top=None, refine=Refine(top=16))
+    closer = replace(many, when="unproposed", roadmaps=(), follow=(_closer(many.follow[0]),))
+    more = (many, closer, FromProposal(), IntoGoal(), replace(samples, when="caught"), IntoGoal())
+    return replace(solver, passes=(*solver.passes[:-2], *more, *solver.passes[-2:]))
 
 
 def gco_paper(space: Space) -> AugmentedLagrangian:
@@ -134,14 +162,15 @@ def fatrop(space: Space) -> CasADiSolver:
 
 def fatrop_guided(space: Space) -> GuidedCasADi:
     """FATROP from the cheapest of four tracked candidates; guesses that penetrate an obstacle are accepted."""
-    paths = gco(space).paths
-    assert paths is not None
+    _, proposals, _ = _parts(space)
     relaxed = 0 if _in_the_plane(space) else 20  # in the plane, relaxed candidates fall back into the trap
-    paths = replace(
-        paths, num_paths=4, initial_offsets=(), arrive=paths.paces[:1], relax_iterations=relaxed, relax_top=None,
-        refine_top=1, max_penetration=1.0, pace=None, max_gap=None,
+    follow = replace(proposals.follow[0], initial_offsets=(), arrive=proposals.follow[0].paces[:1], pace=None)
+    first = replace(
+        proposals, num_paths=4, follow=(follow,), relax_iterations=relaxed, relax_top=None, refine=Refine(),
+        max_penetration=1.0,
     )  # fmt: skip
-    return GuidedCasADi(fatrop(space), paths)
+    closer = replace(first, when="unproposed", roadmaps=(), follow=(_closer(follow),))
+    return GuidedCasADi(fatrop(space), (first, closer))
 
 
 PRESETS: dict[str, Callable[[Space], Solver]] = {
@@ -170,6 +199,58 @@ def named(name: str, space: Space) -> Solver:
     return PRESETS[name](space)
 
 
+def _parts(space: Space) -> tuple[Solve, PathProposals, FromSamples]:
+    """The passes of `gco` that the others are made of: the first solve, the first proposals, and samples."""
+    if _in_the_plane(space):
+        follow = Follow(initial_offsets=OFFSETS, depart=0.1, arrive=(0.8, 0.6))
+        roadmaps = (Roadmap(max_overlap=0.02),)
+        proposals = PathProposals(
+            roadmaps=roadmaps, num_paths=12, follow=(follow,), relax_iterations=40, refine=Refine(top=8)
+        )
+        return Solve(single_contact_after=3), proposals, FromSamples(redraws=2)
+    follow = Follow(arrive=0.9, pace=1.75, smoothing=0.16, tube=None, stiffness=(200.0,), iterations=10)
+    proposals = PathProposals(roadmaps=(Roadmap(num_halton=128),), num_paths=6, follow=(follow,), relax_top=3)
+    return Solve(single_contact_after=6), proposals, FromSamples(redraws=3)
+
+
+def _closer(follow: Follow) -> Follow:
+    """Follows the same paths closer, where candidates leave them for a trap.
+
+    A spring gives way to the cost: it gets stiffer, and then takes more iterations to reach the path. So does a tube
+    around sharper corners.
+    """
+    spring = follow.tube is None
+    return replace(
+        follow, smoothing=follow.smoothing / 4.0, iterations=(3 if spring else 2) * follow.iterations,
+        stiffness=(10.0 * follow.stiffness[-1],) if spring else follow.stiffness,
+    )  # fmt: skip
+
+
+def _longer(follow: Follow) -> Follow:
+    """Follows paths to the end of the horizon, with more iterations, where the attempt along the best one failed."""
+    return replace(follow, iterations=3 * follow.iterations, pace=None)
+
+
+def _denser(roadmaps: tuple[Roadmap, ...]) -> tuple[Roadmap, ...]:
+    """The searches, and the same with twice the points: other paths, but not always better ones."""
+    return *roadmaps, *(replace(roadmap, num_halton=2 * roadmap.num_halton) for roadmap in roadmaps)
+
+
+def _guidance(space: Space) -> GCO:
+    """The samples of `gco`."""
+    if _in_the_plane(space):
+        sampler = MPPI(
+            samples=256, covariance=None, spread=0.35, temperature=0.01, rounds=20, noise_knots=8, decay=0.93,
+            dwell_cost=1.0, elite=5, dtype="float32",
+        )  # fmt: skip
+        return GCO(sampler, 2.0, start_from_sample=True, sample_from_rest=True, single_contact_after=3)
+    sampler = MPPI(
+        samples=128, covariance=None, spread=0.1, temperature=0.01, rounds=12, noise_knots=10, decay=0.9, elite=5,
+        dtype="float32",
+    )  # fmt: skip
+    return GCO(sampler, 0.09, start_from_sample=True, single_contact_after=6)
+
+
 def _local(space: Space) -> AugmentedLagrangian:
     """AL-iLQR in short inner solves; penalties in units of `Problem.cost_unit`."""
     penalty, iterations = (2.0, 20) if _in_the_plane(space) else (0.09, 10)
@@ -177,7 +258,7 @@ def _local(space: Space) -> AugmentedLagrangian:
     return AugmentedLagrangian(inner, initial_penalty=penalty, max_outer_iterations=20)
 
 
-def _finish(space: Space) -> AugmentedLagrangian:
+def _finish(space: Space) -> Finish:
     """The local solver with limits that only the slowest of ordinary problems reach, and an end where nothing changes.
 
     Penalties grow tenfold where the violation doesn't fall by half: costs without states, whose unit is small, begin
@@ -185,7 +266,7 @@ def _finish(space: Space) -> AugmentedLagrangian:
     """
     local = _local(space)
     inner = replace(local.inner, max_iterations=200, damp_below=0.125)
-    return replace(local, inner=inner, max_outer_iterations=100, stalled_growth=10.0, patience=8)
+    return Finish(replace(local, inner=inner, max_outer_iterations=100, stalled_growth=10.0, patience=8))
 
 
 def _printed_sampler(space: Space) -> MPPI:

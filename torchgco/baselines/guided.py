@@ -8,11 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
 from torchgco.base.options import check_options
 from torchgco.baselines.casadi import CasADiSolver
 from torchgco.native.dispatch import engine_of
 from torchgco.problem.problem import Problem
-from torchgco.search.paths import PathProposals
+from torchgco.search.proposals import PathProposals, propose
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 
@@ -33,17 +34,20 @@ class GuidedCasADi(Solver):
 
     Args:
         solver: solves each problem from that guess.
-        paths: makes the proposals, for all problems at once.
+        passes: make the proposals, for all problems at once.
 
     Raises:
         InputError: a field of another kind.
     """
 
     solver: CasADiSolver = CasADiSolver("fatrop")
-    paths: PathProposals = PathProposals(num_paths=4, relax_iterations=0, max_penetration=1.0)
+    passes: tuple[PathProposals, ...] = (PathProposals(num_paths=4, relax_iterations=0, max_penetration=1.0),)
 
     def __post_init__(self) -> None:
         check_options(self, "solver")
+        object.__setattr__(self, "passes", tuple(self.passes))
+        if not self.passes or self.passes[0].continues:
+            raise InputError("solver.passes", "path proposals, the first for problems without any", self.passes)
 
     def prepare(self, problem: Problem) -> Solver:
         """As `CasADiSolver.prepare`; the guess is part of the solve.
@@ -51,7 +55,9 @@ class GuidedCasADi(Solver):
         Raises:
             InputError: as from `CasADiSolver.prepare`; no position, or initial offsets that don't fit the controls.
         """
-        self.paths.starts(problem, problem.at_rest[1])
+        for proposals in self.passes:
+            for follow in proposals.follow:
+                follow.starts(problem, problem.at_rest[1])
         engine_of(problem)  # compiled now, so that no solve waits for it
         return PreparedGuided(self, self.solver.prepare(problem))
 
@@ -65,7 +71,7 @@ class GuidedCasADi(Solver):
         guess = Guess(U0.clone(), torch.zeros_like(zero, dtype=torch.bool), zero)
         rows = (problem.start_is_clear & torch.isfinite(problem.x0).all(-1)).nonzero().flatten()
         if rows.numel() > 0:
-            plan = self.paths.propose(problem.take(rows))
+            plan = propose(self.passes, problem.take(rows))
             guess.found[rows], guess.iterations[rows] = plan.found, plan.iterations
             guess.U[rows[plan.found]] = plan.U[plan.found]
         return guess

@@ -1,5 +1,13 @@
-"""Search above the local solver: restarts from paths of several homotopy classes, from samples, or at random."""
+"""Search above the local solver: passes along paths and from samples, or restarts from random guesses."""
 
+from torchgco.search.candidates import Refine as Refine
+from torchgco.search.chords import ClearChords as ClearChords
+from torchgco.search.finish import Finish as Finish
+from torchgco.search.following import Follow as Follow
 from torchgco.search.multistart import MultiStart as MultiStart
-from torchgco.search.paths import PathProposals as PathProposals
+from torchgco.search.passes import FromProposal as FromProposal
+from torchgco.search.passes import FromSamples as FromSamples
+from torchgco.search.passes import IntoGoal as IntoGoal
+from torchgco.search.passes import Solve as Solve
+from torchgco.search.proposals import PathProposals as PathProposals
 from torchgco.search.restarts import Restarts as Restarts

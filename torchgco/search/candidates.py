@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.tree import put, take
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import Penalty
@@ -17,23 +18,45 @@ from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR, descend
+from torchgco.solvers.line_search import LineSearch
 
 AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
 PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4
+TOLERANCE = 5e-5  # of tracking and relaxing, as a share of L_M; refining takes a tenth of it
+LINE_SEARCH = LineSearch(back=2)
 Watch = Callable[[int, int], None]  # is called with the candidates solved so far, and of how many
 
 
-class Refining(NamedTuple):
-    """How far candidates are refined."""
+@dataclass(frozen=True)
+class Refine:
+    """How the best candidates are solved by AL-iLQR before the cheapest is chosen.
 
-    rounds: int  # outer iterations, at most
-    violation: float  # m for lengths: the most at which a refined candidate counts
-    cut: float  # the deepest that it may lie in an obstacle between two knots, as a share of the obstacle's margin
-    needed: bool  # whether candidates count only as refined
+    Args:
+        top: candidates per problem, of the relaxed ones that differ; 1: the best is proposed as it is.
+        rounds: outer iterations, at most.
+        violation: the most at which a refined candidate counts, m for lengths.
+        cut: the deepest that it may lie in an obstacle between two knots, as a share of the obstacle's margin; the
+            judge accepts 0.05.
+        needed: whether candidates count only as refined; otherwise the best relaxed one is proposed where no refined
+            one counts.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    top: Count = 1
+    rounds: Count = 20
+    violation: Positive = 1e-3
+    cut: Positive = 0.049
+    needed: bool = False
+
+    def __post_init__(self) -> None:
+        check_options(self, "refine")
 
 
-TO_THE_END = Refining(20, 1e-3, 0.049, needed=False)  # the judge accepts a cut of 0.05
-ROUGH = Refining(4, 1e-2, 0.3, needed=True)  # shows the costs to a few percent; the solver removes what is left
+def inner_solver(iterations: int, tolerance: float = TOLERANCE) -> ILQR:
+    """The inner solver of candidates."""
+    return ILQR(tolerance=tolerance, max_iterations=iterations, line_search=LINE_SEARCH)
 
 
 def unwatched(done: int, total: int) -> None:
@@ -120,35 +143,35 @@ class Candidates:
             self.watch(done, total)
         return replace(self, X=X, U=U, iterations=iterations)
 
-    def refined(
-        self, inner: ILQR | None, sound: Tensor, refining: Refining
-    ) -> tuple[Candidates, Multipliers, Tensor, Tensor]:
-        """The candidates with those in `sound` solved by AL-iLQR around `inner`, or as they are without one.
+    def refined(self, sound: Tensor, refine: Refine, iterations: int) -> Refined:
+        """The candidates with those in `sound` solved by AL-iLQR, or as they are where only one is wanted.
 
-        A solve counts where it ends near the goal and violates no more than `refining` says, at knots and between them.
+        A solve counts where it ends near the goal and violates no more than `refine` says, at knots and between them.
 
-        Returns the candidates, the multipliers for each to continue with, the rows (B,) of the cheapest, and its cost
-        (B,): of problems where no solve counts, the first row, and infinite.
+        Args:
+            sound: (B * count,) bool.
+            iterations: of an inner solve, at most.
         """
         everyone = torch.arange(self.live.numel(), device=sound.device)
         multipliers, rows = self.multipliers(everyone, PENALTY), sound.nonzero().flatten()
-        if inner is None or rows.numel() == 0:
-            return self, multipliers, everyone[:: self.count], torch.full_like(self.unit[:: self.count], torch.inf)
-        part = self.of(rows)
-        solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=refining.rounds)
+        if refine.top == 1 or rows.numel() == 0:
+            worst = torch.full_like(self.unit[:: self.count], torch.inf)
+            return Refined(self, multipliers, everyone[:: self.count], worst)
+        part, inner = self.of(rows), inner_solver(iterations, 0.1 * TOLERANCE)
+        solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=refine.rounds)
         end = solver.solve(
             part, self.U[rows], warm=take(multipliers, rows),
             callback=lambda progress: self.watch(progress.finished, progress.total),
         )  # fmt: skip
-        good = (end.violation <= refining.violation) & seen.arrives(part, end.X)
-        good &= seen.chord_penetration(part, end.X, refining.cut) <= 0.0
+        good = (end.violation <= refine.violation) & seen.arrives(part, end.X)
+        good &= seen.chord_penetration(part, end.X, refine.cut) <= 0.0
         won = rows[good]
         X, U, cost = self.X.clone(), self.U.clone(), torch.full_like(self.unit, torch.inf)
         X[won], U[won], cost[won] = end.X[good], end.U[good], end.cost[good]
-        iterations = self.iterations.index_add(0, rows // self.count, end.iterations)
+        made = self.iterations.index_add(0, rows // self.count, end.iterations)
         put(multipliers, won, take(end.multipliers, good.nonzero().flatten()))
         best = self.rows(cost.view(-1, self.count).argsort(dim=-1, stable=True)[:, :1])[:, 0]
-        return replace(self, X=X, U=U, iterations=iterations), multipliers, best, cost[best]
+        return Refined(replace(self, X=X, U=U, iterations=made), multipliers, best, cost[best])
 
     def order(self, first: Tensor, alike: float | None = None) -> Tensor:
         """Places (B, count) of each problem's candidates, the best first.
@@ -169,3 +192,12 @@ class Candidates:
             later[:, 1:] += same & (later[:, 1:] == 0)
             order = order.gather(1, later.argsort(dim=-1, stable=True))
         return order
+
+
+class Refined(NamedTuple):
+    """Candidates after refining."""
+
+    candidates: Candidates
+    multipliers: Multipliers  # of each candidate, to continue with
+    best: Tensor  # (B,): row of each problem's cheapest; the first where no solve counts
+    cost: Tensor  # (B,): its cost; infinite where no solve counts

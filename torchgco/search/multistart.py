@@ -13,7 +13,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import AtLeast, Count, check_options
 from torchgco.base.shapes import check_shape, tensor
 from torchgco.problem.problem import Problem
-from torchgco.search.best import Best
+from torchgco.search.attempts import Best
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Solver

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -12,31 +13,41 @@ from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import engine_of
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import scene_of
-from torchgco.search.paths import PathProposals
+from torchgco.search.passes import Pass
+from torchgco.search.proposals import PathProposals
 
 
-def suited_paths(paths: PathProposals | None, problem: Problem) -> tuple[PathProposals | None, str | None]:
-    """The usable proposals, or None; and a sentence on what is lost, or None.
+def suited_paths(passes: Sequence[Pass], problem: Problem) -> tuple[list[Pass], str | None]:
+    """The passes without proposals along paths that can't serve; and a sentence on what is lost, or None.
 
     Obstacles that the roadmap doesn't know by design, such as moving ones, are no loss. Initial offsets for another
     number of controls are left out.
     """
-    if paths is None:
-        return None, None
+    others: list[Pass] = [one for one in passes if not isinstance(one, PathProposals)]
+    if len(others) == len(passes):
+        return others, None
     position = problem.dynamics.position
     if position is None:
-        return None, "the dynamics have no position"
+        return others, "the dynamics have no position"
     d = position.stop - position.start
     if d not in (2, 3) and problem.obstacles:
-        return None, f"no path is sought around obstacles in {d}-D, as the roadmap knows only 2-D and 3-D"
+        return others, f"no path is sought around obstacles in {d}-D, as the roadmap knows only 2-D and 3-D"
     if problem.goal is None and problem.obstacles:
-        return None, "no path is sought around obstacles without a goal: Problem(..., goal=Goal(position, radius))"
-    if any(len(offset) != problem.m for offset in paths.initial_offsets):
-        paths = replace(paths, initial_offsets=())
+        return others, "no path is sought around obstacles without a goal: Problem(..., goal=Goal(position, radius))"
+    suited: list[Pass] = [
+        _with_fitting_offsets(one, problem.m) if isinstance(one, PathProposals) else one for one in passes
+    ]
     if not has_paths(problem):
-        return None, None
+        return others, None
     why = None if engine_of(problem) is not None else failure(_expand, problem, problem.x0.dtype)
-    return (paths, None) if why is None else (None, f"no path can be followed ({why})")
+    return (suited, None) if why is None else (others, f"no path can be followed ({why})")
+
+
+def _with_fitting_offsets(proposals: PathProposals, m: int) -> PathProposals:
+    """The same pass, without initial offsets that have another number of controls than m."""
+    fits = (all(len(offset) == m for offset in follow.initial_offsets) for follow in proposals.follow)
+    follow = (f if fit else replace(f, initial_offsets=()) for f, fit in zip(proposals.follow, fits, strict=True))
+    return replace(proposals, follow=tuple(follow))
 
 
 def has_paths(problem: Problem) -> bool:

@@ -50,6 +50,10 @@ def _joined(plane: Any, space: Any) -> Any:
     """One tree for both: equal values as they are, others as interpolations."""
     if isinstance(plane, dict) and isinstance(space, dict) and list(plane) == list(space):
         return {key: _joined(plane[key], space[key]) for key in plane}
+    if isinstance(plane, list) and isinstance(space, list) and len(plane) == len(space):
+        pairs = [_joined(a, b) for a, b in zip(plane, space, strict=True)]
+        if all(isinstance(item, dict) for item in plane):
+            return pairs
     if plane == space:
         return plane
     return f"${{{BY_DIMENSION}:${{model.dimension}},{_literal(plane)},{_literal(space)}}}"

@@ -1,0 +1,185 @@
+"""The best of several attempts at each problem of a call, and the state that the passes of a search share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from torchgco.base.tree import copied, put, take
+from torchgco.lagrangian.penalties import Penalty
+from torchgco.lagrangian.quality import has_arrived, is_preferred
+from torchgco.search.proposals import PathProposals, Round
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
+from torchgco.solvers.contracts import Call, Callback, Guidance, Progress
+from torchgco.solvers.history import Recorder
+from torchgco.solvers.state import STOPPED, Iterate, SolveEnd
+
+CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal
+
+
+class Best:
+    """Keeps the best trajectory of each problem and the sums of all counts, during one solve."""
+
+    def __init__(
+        self, call: Call, first: SolveEnd, solver: AugmentedLagrangian, recorder: Recorder | None = None
+    ) -> None:
+        self.call, self.solver, self.recorder = call, solver, recorder
+        self.end = copied(first)
+        self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
+
+    def arrived(self, tolerances: float = 1.0) -> Tensor:
+        """Whether each problem's best trajectory is feasible and ends within `tolerances` goal tolerances, (B,)."""
+        best = self.end.best
+        fits = best.violation <= self.solver.violation_tolerance
+        return fits & has_arrived(self.call.problem, best.X, tolerances)
+
+    def next_attempt(self) -> None:
+        """Count attempts in the trace, also those that no problem of this batch needs."""
+        if self.recorder is not None:
+            self.recorder.attempt += 1
+
+    def improve(
+        self,
+        rows: Tensor,
+        call: Call,
+        guidance: Guidance | None = None,
+        penalty: Penalty | None = None,
+        guide_first: bool = False,
+    ) -> None:
+        """One more attempt at the problems in `rows`, by a call for them; the better trajectory is kept."""
+        if rows.numel() > 0:
+            self.keep(rows, self.attempt(call, guidance, penalty, guide_first))
+
+    def attempt(
+        self,
+        call: Call,
+        guidance: Guidance | None = None,
+        penalty: Penalty | None = None,
+        guide_first: bool = False,
+        solver: AugmentedLagrangian | None = None,
+    ) -> SolveEnd:
+        """A solve with progress and trace of the whole; see `AugmentedLagrangian.iterate`. None: by the own solver."""
+        call = replace(call, callback=self._callback(call))
+        return (solver or self.solver).iterate(call, guidance, penalty, self.recorder, guide_first, by_arrival=True)
+
+    def keep(self, rows: Tensor, new: SolveEnd) -> None:
+        """Keep the better of the old and the new trajectories of `rows`: arrived, then feasible, then cheapest."""
+        problem, limit = self.call.problem.take(rows), self.solver.violation_tolerance
+        old = take(self.end.best, rows)
+        self.replace(rows, is_preferred(problem, new.best, old, limit), new.best, new)
+
+    def replace(self, rows: Tensor, where: Tensor, trajectories: Iterate, new: SolveEnd) -> None:
+        """New trajectories of `rows` where a mask (b,) says so, and the counts of their solves."""
+        chosen = where.nonzero().flatten()
+        put(self.end.best, rows[chosen], take(trajectories, chosen))
+        self.end.status[rows[chosen]] = new.status[chosen]
+        for name in ("iterations", "outer", "guided"):
+            getattr(self.end, name)[rows] += getattr(new, name)
+
+    def _callback(self, call: Call) -> Callback | None:
+        """Reports an attempt's progress as the batch's, where all other problems have finished; it never falls."""
+        if call.callback is None:
+            return None
+        report, total = call.callback, self.call.problem.B
+
+        def onward(now: Progress) -> None:
+            self.finished = max(self.finished, total - now.total + now.finished)
+            report(replace(now, finished=self.finished, total=total))
+
+        return onward
+
+
+class Late(Exception):
+    """The time limit has passed during the search for paths."""
+
+
+class Search:
+    """The state of one solve by passes.
+
+    Attributes:
+        call: in the units that the solver works in.
+        guidance: of attempts from samples; None: none can serve.
+        has_paths: whether there is a goal, and obstacles among which paths can be sought.
+        guided: whether there is anything to do where a trajectory is caught.
+    """
+
+    def __init__(
+        self,
+        call: Call,
+        solver: AugmentedLagrangian,
+        guidance: Guidance | None,
+        has_paths: bool,
+        guided: bool,
+        recorder: Recorder | None = None,
+    ) -> None:
+        self.call, self.solver, self.recorder = call, solver, recorder
+        self.guidance, self.has_paths, self.guided = guidance, has_paths, guided
+        self._best: Best | None = None
+        self._caught: SolveEnd | None = None
+        self._round: tuple[Tensor, Round] | None = None
+        self.proposed = torch.zeros_like(call.ids, dtype=torch.bool)  # (B,): whether there was ever a proposal
+        self.rejected = torch.full_like(call.U0[:, 0, 0], torch.nan)  # (B,): mu of the proposals rejected so far
+
+    @property
+    def begun(self) -> bool:
+        """Whether a first solve has been made."""
+        return self._best is not None
+
+    @property
+    def best(self) -> Best:
+        """The best trajectories so far."""
+        assert self._best is not None
+        return self._best
+
+    @property
+    def caught(self) -> SolveEnd:
+        """The solves that were stopped where their trajectories were caught, and of other problems the first solve."""
+        assert self._caught is not None
+        return self._caught
+
+    def begin(self, first: SolveEnd) -> None:
+        """Keep the first solve of every problem."""
+        self._best, self._caught = Best(self.call, first, self.solver, self.recorder), copied(first)
+
+    def rows(self, when: str) -> Tensor:
+        """The problems (b,) that a word describes, all among those that were caught.
+
+        "caught": all of them; "unarrived": no attempt has arrived yet; "far": none ends close to the goal either;
+        "close": the best one does, but has not arrived; "unproposed": not arrived, and there was never a proposal.
+        """
+        stopped = self.caught.status == STOPPED
+        if when != "caught":
+            stopped = stopped & ~self.best.arrived()
+        if when == "far":
+            stopped = stopped & ~self.best.arrived(CLOSE)
+        elif when == "close":
+            stopped = stopped & self.best.arrived(CLOSE)
+        elif when == "unproposed":
+            stopped = stopped & ~self.proposed
+        return stopped.nonzero().flatten()
+
+    def propose(self, proposals: PathProposals) -> None:
+        """A pass of proposals: of a new round, or of the one that has begun."""
+        if not proposals.continues:
+            rows = self.rows(proposals.when)
+            watch = partial(self._watched, rows)
+            self._round = (rows, Round(self.call.problem.take(rows), proposals.at_once, watch)) if len(rows) else None
+        if self._round is not None:
+            self._round[1].improve(proposals)
+
+    def take_round(self) -> tuple[Tensor, Round] | None:
+        """The problems of the round of proposals, and the round; it is over."""
+        found, self._round = self._round, None
+        return found
+
+    def _watched(self, rows: Tensor, done: int, total: int) -> None:
+        """Report that `done` of `total` candidates for `rows` are solved; raises Late after the deadline."""
+        if self.call.late:
+            raise Late
+        if self.call.callback is not None:
+            best, B = self.best, self.call.problem.B
+            best.finished = max(best.finished, B - rows.numel())
+            self.call.callback(Progress(0, self.call.rows[rows], best.finished, B, candidates=(done, total)))

@@ -1,0 +1,218 @@
+"""How a path is followed: from which controls, at which pace, and by which penalty the trajectory is drawn to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.options import AtLeast, Below, Count, Positive, check_options
+from torchgco.base.shapes import check_shape, tensor
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
+from torchgco.problem.problem import Problem
+from torchgco.roadmap import scene as seen
+from torchgco.roadmap.geometry import Inflated, length, points_along
+from torchgco.search.candidates import Candidates, inner_solver
+from torchgco.solvers.ilqr import descend
+
+OFFSET_LASTS = 0.1  # share of the horizon that an initial offset lasts
+TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
+SHORTEST = 0.05  # share of the horizon between departure and arrival
+NEAR = 0.1  # of the distance to the goal: the last part is approached slowly
+CUT = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
+HALVINGS = 3  # of the share of the horizon over which they are averaged
+SAMPLES = 64  # points of a path at which its depth is measured, about
+
+
+class Free(NamedTuple):
+    """The trajectories without constraints of B problems."""
+
+    cost: Tensor  # (B,)
+    share: Tensor  # (B,): of the horizon, until a tenth of the distance to the goal is left; infinite where never
+    iterations: Tensor  # (B,) int64
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Paths of B problems, K each, and the units to follow them in."""
+
+    corners: Tensor  # (B, K, P, d), m
+    live: Tensor  # (B, K) bool: one per homotopy class
+    R: Tensor  # (B,): mean inflated radius, m
+    unit: Tensor  # (B,): q0 / R^4
+    obstacles: Inflated
+
+    def stretch(self) -> Tensor:
+        """The length (B, K) of each path, in distances between its ends."""
+        ends = self.corners[:, :, 0] - self.corners[:, :, -1]
+        lengths = length(self.corners.flatten(0, 1)).view(self.corners.shape[:2])
+        return lengths / ends.square().sum(-1).sqrt().clamp(min=1e-12)
+
+
+@dataclass(frozen=True)
+class Follow:
+    """How candidates follow a path: from rest and from each initial offset, at each pace.
+
+    Args:
+        initial_offsets: offsets (m,) of the controls over the first tenth of the horizon, as shares of the range from
+            rest to the control bounds; every path is tracked from rest and once from each offset. An initial turn lets
+            a vehicle that turns slowly find reversing and three-point turns. `Restarts` leaves them out where they
+            don't fit the number of controls.
+        depart, arrive: shares of the horizon at which the vehicle leaves the start and reaches the goal. Several
+            values of `arrive`: every path is tracked at each pace.
+        pace: times the time that the vehicle takes without constraints, per length of the path: no path is followed
+            more slowly than this, whatever `arrive` says. None: no such limit.
+        smoothing: share of the horizon over which the corners of a path are averaged, at most (see `followed`).
+        tube: radius of the tube that a candidate is kept in, as a share of the mean inflated radius; None: a spring to
+            the path instead. A spring takes half the iterations; a vehicle that can't move sideways ends closer to the
+            path in a tube.
+        stiffness: of tube or spring, one solve per value, in units of the cost of resting at the start per squared
+            distance to the goal.
+        iterations: of iLQR in each of these solves, at most.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    initial_offsets: tuple[tuple[float, ...], ...] = ()
+    depart: float = 0.0
+    arrive: float | tuple[float, ...] = 0.9
+    pace: Positive | None = None
+    smoothing: Annotated[float, AtLeast(0), Below(1)] = 0.08
+    tube: Positive | None = 0.05
+    stiffness: tuple[Positive, ...] = (20.0, 200.0)
+    iterations: Count = 20
+
+    def __post_init__(self) -> None:
+        check_options(self, "follow")
+        for name in ("arrive", "stiffness", "initial_offsets"):  # lists of a configuration file equal tuples
+            if isinstance(value := getattr(self, name), Sequence):
+                rows = (tuple(row) if isinstance(row, list) else row for row in value)
+                object.__setattr__(self, name, tuple(rows))
+        if not self.paces or not all(0 <= self.depart < arrive <= 1 for arrive in self.paces):
+            raise InputError("follow.depart", f"at least 0 and below arrive, {self.arrive}", self.depart)
+        if not self.stiffness:
+            raise InputError("follow.stiffness", "one or more numbers above 0", self.stiffness)
+
+    @property
+    def paces(self) -> tuple[float, ...]:
+        """The values of `arrive`, as a tuple."""
+        return tuple(self.arrive) if isinstance(self.arrive, Sequence) else (self.arrive,)
+
+    def starts(self, problem: Problem, rest: Tensor) -> Tensor:
+        """Initial controls of the candidates of each path, (B, 1 + offsets, N, m): rest, and rest after each offset.
+
+        Raises:
+            InputError: initial offsets that don't fit the controls.
+        """
+        _, N, m = rest.shape
+        starts = rest.unsqueeze(1).repeat(1, 1 + len(self.initial_offsets), 1, 1)
+        if self.initial_offsets:
+            offsets = tensor(self.initial_offsets, "follow.initial_offsets", rest)
+            check_shape(offsets, (len(self.initial_offsets), m), "follow.initial_offsets")
+            reach = seen.control_reach(problem, rest, offsets)
+            starts[:, 1:, : math.ceil(OFFSET_LASTS * N)] += (reach * offsets).unsqueeze(2)
+        return starts
+
+    def track(self, candidates: Candidates, paths: Paths, free: Free | None) -> Candidates:
+        """The candidates, tracked along their paths from their initial controls at their paces."""
+        paces, K = len(self.paces), paths.corners.shape[1]
+        path = paths.corners.flatten(0, 1).repeat_interleave(paces, dim=0)
+        arrive = path.new_tensor(self.paces).repeat(path.shape[0] // paces)
+        if self.pace is not None:
+            assert free is not None
+            shares = (free.share.unsqueeze(-1) * paths.stretch()).nan_to_num(torch.inf)
+            latest = self.pace * shares.flatten().repeat_interleave(paces)
+            arrive = torch.minimum(arrive, latest.clamp(min=self.depart + SHORTEST))
+        center = followed(path, self.depart, arrive, self.smoothing, candidates.problem.N, paths.obstacles, paths.R)
+        problem = torch.arange(candidates.problem.B, device=path.device).repeat_interleave(K * paces) * candidates.count
+        number = torch.arange(candidates.live.numel(), device=path.device)
+        place = number // (candidates.count // K) * paces + number % paces  # of each candidate's path and pace
+        at = candidates.problem.position
+        for stiffness in self.stiffness:
+            weight = stiffness * candidates.unit[problem]
+            penalty = attraction(center, path, at, candidates.R[problem], weight, self.tube)
+            candidates = candidates.solved(inner_solver(self.iterations), TRACK_PENALTY, penalty, place)
+        return candidates
+
+
+def unconstrained(problem: Problem, rest: Tensor, iterations: int) -> Free:
+    """The trajectories without constraints, from the controls `rest` (B, N, m)."""
+    end, _ = descend(inner_solver(iterations), plain(problem), rest)
+    assert problem.goal is not None
+    left = problem.goal.distance(end.X[..., problem.position])
+    near = left <= NEAR * left[:, :1]
+    share = near.to(torch.int8).argmax(-1).to(left) / problem.N
+    return Free(end.cost, torch.where(near.any(-1), share, torch.inf), end.iterations)
+
+
+def plain(problem: Problem) -> Lagrangian:
+    """The cost alone: the constraints with multipliers and penalties of zero."""
+    return Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True)
+
+
+def travel(path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int) -> Tensor:
+    """Positions on paths (B, P, d) at every knot, (B, N+1, d): smooth start and stop, corners averaged.
+
+    Args:
+        depart, arrive: shares of the horizon at which the start is left and the goal is reached; arrive (B,).
+        smoothing: share of the horizon over which corners are averaged.
+    """
+    share = torch.arange(N + 1, dtype=path.dtype, device=path.device) / N
+    share = ((share - depart) / (arrive.unsqueeze(-1) - depart)).clamp(0.0, 1.0)
+    share = share.square() * (3.0 - 2.0 * share)
+    center = points_along(path, share * length(path).unsqueeze(-1))
+    reach = int(0.5 * smoothing * N)
+    if reach == 0:
+        return center
+    padded = torch.cat((center[:, :1].expand(-1, reach, -1), center, center[:, -1:].expand(-1, reach, -1)), dim=1)
+    return padded.unfold(1, 2 * reach + 1, 1).mean(-1)
+
+
+def followed(
+    path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int, obstacles: Inflated, R: Tensor
+) -> Tensor:
+    """As `travel`, but corners are averaged less where the average would cut deep into an obstacle.
+
+    Between the trunks of a dense wood, a path that is averaged over seconds leads through the trunks.
+
+    Args:
+        path: those of B problems one after the other, (B K, P, d).
+        R: mean inflated radius (B,), m.
+    """
+    center, B = travel(path, depart, arrive, smoothing, N), R.shape[0]
+    for _ in range(HALVINGS if B > 0 else 0):
+        points = center[:, :: max(1, N // SAMPLES)]
+        deepest = obstacles.depth(points.reshape(B, -1, points.shape[-1])).view(B, -1, points.shape[1]).amax(-1)
+        deep = deepest > CUT * R.unsqueeze(-1)
+        if not bool(deep.any()):
+            break
+        smoothing *= 0.5
+        center = torch.where(deep.view(-1, 1, 1), travel(path, depart, arrive, smoothing, N), center)
+    return center
+
+
+def attraction(
+    center: Tensor, path: Tensor, position: slice, R: Tensor, stiffness: Tensor, tube: float | None
+) -> Penalty:
+    """The penalty that attracts knots to `center` (B, N+1, d) on paths (B, P, d): a tube, or without one a spring.
+
+    Args:
+        R: mean inflated radius (B,), m.
+        stiffness: (B,) in q0 / (R^4 L^2), with L the distance from start to goal.
+        tube: radius as a share of R.
+    """
+    length2 = (path[:, -1] - path[:, 0]).square().sum(-1)
+    spring = stiffness * R.pow(4) / length2.clamp(min=1e-12)
+    if tube is None:
+        return GuidePath(center, spring, position)
+    radius = tube * R
+    # Near its surface the tube is as stiff as a spring of 4 weight radius^2.
+    weight = spring / (4.0 * radius.square()).clamp(min=1e-12)
+    return GuideRegion(center, radius.unsqueeze(-1).repeat(1, center.shape[1]), weight, position)

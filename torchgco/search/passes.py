@@ -1,0 +1,186 @@
+"""The passes of the search: each row of a solver's table is one of these, or a `PathProposals`.
+
+A pass says which problems it looks at and what it does with them. The best trajectory of all passes is kept: one that
+arrives at the goal before one that is feasible, then the cheapest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import torch
+
+from torchgco.base.draws import DrawKey
+from torchgco.base.options import Natural, check_options
+from torchgco.base.status import Status
+from torchgco.base.tree import put, take
+from torchgco.guidance.detection import caught_knots
+from torchgco.lagrangian.penalties import GuideRegion
+from torchgco.lagrangian.quality import goal_tolerance
+from torchgco.native.dispatch import cost_unit
+from torchgco.problem.problem import Problem
+from torchgco.search.attempts import Search
+from torchgco.search.chords import ClearChords
+from torchgco.search.finish import Finish
+from torchgco.search.proposals import PathProposals
+from torchgco.solvers.contracts import Advice
+from torchgco.solvers.state import SolveEnd
+
+WITHIN = 0.95  # share of the goal tolerance to which trajectories are attracted
+STIFF = 1e3  # weight of that attraction, in units of cost per radius^4
+SEED_STEP = 1_000_003  # between the seeds of two attempts
+
+
+@dataclass(frozen=True)
+class Solve:
+    """A solve from the given guess.
+
+    Args:
+        until: "caught": a solve is stopped where its trajectory is caught between obstacles; "end": it isn't.
+        when: "pathless": where no path can be sought, as among moving obstacles, where waiting is often enough;
+            "unarrived": where no solve has been made, or has not arrived. Problems that converge are not solved again
+            where the goal is assumed: it may lie beyond the horizon. "all": always.
+        single_contact_after: from this outer iteration on, a knot inside one obstacle counts as caught, too; None: only
+            knots inside two.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    until: Literal["caught", "end"] = "caught"
+    when: Literal["pathless", "unarrived", "all"] = "unarrived"
+    single_contact_after: int | None = None
+
+    def __post_init__(self) -> None:
+        check_options(self, "solve")
+
+    def run(self, search: Search) -> None:
+        """Solve; see the class."""
+        if self.when == "pathless" and search.guided and search.has_paths:
+            return
+        stop = StopWhenCaught(self.single_contact_after) if self.until == "caught" and search.guided else None
+        if not search.begun:
+            search.begin(search.solver.iterate(search.call, stop, recorder=search.recorder, by_arrival=True))
+        elif search.guided:
+            self._again(search, stop)
+
+    def _again(self, search: Search, stop: StopWhenCaught | None) -> None:
+        best, caught = search.best, search.caught
+        goal, done = search.call.problem.goal, best.arrived()
+        if goal is not None and goal.assumed:
+            done = done | (caught.status == Status.CONVERGED)
+        rows = (torch.ones_like(done) if self.when == "all" else ~done).nonzero().flatten()
+        if rows.numel() > 0:
+            again: SolveEnd = best.attempt(search.call.take(rows), stop)
+            best.keep(rows, again)
+            put(caught, rows, again)
+
+
+@dataclass(frozen=True)
+class FromProposal:
+    """An attempt from every proposal of the passes before.
+
+    The penalty of a rejected proposal is kept: it keeps the solver from returning to the caught trajectory.
+    """
+
+    def run(self, search: Search) -> None:
+        """Solve; see the class."""
+        over = search.take_round()
+        if over is None:
+            return
+        rows, proposal, best = over[0], over[1].result(), search.best
+        best.end.iterations[rows] += proposal.iterations
+        mu = torch.fmax(search.caught.last.multipliers.mu[rows], proposal.multipliers.mu)
+        found, others = proposal.found.nonzero().flatten(), (~proposal.found).nonzero().flatten()
+        best.end.guided[rows[found]] += 1
+        search.proposed[rows[found]] = True
+        search.rejected[rows[others]] = torch.fmax(search.rejected[rows[others]], mu[others])
+        warm = replace(take(proposal.multipliers, found), mu=mu[found])
+        best.improve(rows[found], replace(search.call.take(rows[found]), U0=proposal.U[found], warm=warm))
+
+
+@dataclass(frozen=True)
+class IntoGoal:
+    """An attempt from the best trajectories that end close to the goal, their ends attracted to it."""
+
+    def run(self, search: Search) -> None:
+        """Solve; see the class."""
+        rows, best = search.rows("close"), search.best
+        start = take(best.end.best, rows)
+        if rows.numel() > 0:
+            call = replace(search.call.take(rows), U0=start.U, warm=start.multipliers)
+            best.improve(rows, call, penalty=_goal_region(call.problem))
+
+
+@dataclass(frozen=True)
+class FromSamples:
+    """Attempts from the caught trajectory, guided by samples from the start: the guidance of the local solver.
+
+    Args:
+        when: as of `PathProposals`; "unproposed": there was never a proposal.
+        redraws: how many attempts start again, each with other random draws; 0: the solve that was stopped goes on,
+            without guidance where none can serve.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    when: Literal["caught", "unarrived", "unproposed"] = "unarrived"
+    redraws: Natural = 0
+
+    def __post_init__(self) -> None:
+        check_options(self, "samples")
+
+    def run(self, search: Search) -> None:
+        """Solve; see the class."""
+        for draw in range(1, self.redraws + 1) if self.redraws > 0 else (0,):
+            rows = search.rows(self.when)
+            if draw > 1:
+                search.best.next_attempt()
+            if not search.call.late and rows.numel() > 0 and (search.guidance is not None or draw == 0):
+                self._attempt(search, rows, draw)
+
+    def _attempt(self, search: Search, rows: torch.Tensor, draw: int) -> None:
+        start = take(search.caught.last, rows)
+        call = replace(search.call.take(rows), U0=start.U, warm=start.multipliers)
+        if draw == 0:
+            warm = replace(start.multipliers, mu=torch.fmax(start.multipliers.mu, search.rejected[rows]))
+            call = replace(call, warm=warm, outer=search.caught.outer[rows])
+        else:
+            call = replace(call, seed=call.seed + SEED_STEP * draw)
+        search.best.improve(rows, call, guidance=search.guidance, guide_first=True)
+
+
+Pass: TypeAlias = Solve | PathProposals | FromProposal | IntoGoal | FromSamples | Finish | ClearChords
+
+
+class StopWhenCaught:
+    """Guidance that ends the solve of a problem whose trajectory is caught between obstacles."""
+
+    def __init__(self, single_contact_after: int | None) -> None:
+        self.single_contact_after = single_contact_after
+
+    def suited(self, problem: Problem) -> StopWhenCaught:
+        """This guidance, which serves any problem."""
+        return self
+
+    def start(self, problem: Problem, X: torch.Tensor) -> None:
+        """No penalty."""
+
+    def update(
+        self, problem: Problem, X: torch.Tensor, U: torch.Tensor, penalty: GuideRegion | None, key: DrawKey
+    ) -> Advice:
+        """Stop where a knot is caught."""
+        return Advice(None, stop=caught_knots(problem, X, U, key.outer, self.single_contact_after).any(-1))
+
+
+def _goal_region(problem: Problem) -> GuideRegion:
+    """A ball around the goal for the last knot, slightly smaller than the goal tolerance."""
+    near = goal_tolerance(problem)
+    assert near is not None and problem.goal is not None
+    size = WITHIN * near
+    radius = problem.x0.new_full((problem.B, problem.N + 1), torch.inf)
+    radius[:, -1] = size
+    center = problem.goal.position.unsqueeze(1).expand(-1, problem.N + 1, -1).contiguous()
+    return GuideRegion(center, radius, STIFF * cost_unit(problem) / size.pow(4), problem.position)

@@ -1,0 +1,252 @@
+"""Proposals along paths: for each problem, the best of several trajectories that follow short paths past obstacles.
+
+A pass finds paths, one per homotopy class, or takes those that are known, and has candidates follow them. The
+candidates are relaxed: solved further without a guide, while a penalty keeps them out of the obstacles. The best are
+refined by AL-iLQR, and the cheapest is proposed, with the multipliers to continue with.
+
+A proposal may touch obstacles slightly: the solver removes that. Candidates that penetrate deeper are rejected, since
+removing it would use up a whole attempt, or must first be refined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.options import Count, Natural, Positive, check_options
+from torchgco.base.tree import put, take
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.native.dispatch import cost_unit, open_loop, value
+from torchgco.problem.problem import Problem
+from torchgco.roadmap import scene as seen
+from torchgco.roadmap.geometry import Scene
+from torchgco.roadmap.homotopy import one_per_class
+from torchgco.roadmap.roadmap import Roadmap
+from torchgco.search.candidates import PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
+from torchgco.search.following import Follow, Free, Paths, plain, unconstrained
+
+AT_ONCE = 1536  # paths of all problems that are compared and tracked together: bounds the memory
+ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a share, count as the same
+
+
+class Proposal(NamedTuple):
+    """Trajectories to continue from."""
+
+    U: Tensor  # (B, N, m)
+    found: Tensor  # (B,) bool: whether there is a proposal; elsewhere U is not to be used
+    multipliers: Multipliers  # to continue with; mu keeps the solver from leaving the path, NaN where there is none
+    iterations: Tensor  # (B,) int64: of all solves of all candidates, also where none is found
+    cost: Tensor  # (B,): as refined; infinite where no candidate was refined with success
+
+    @classmethod
+    def none(cls, problem: Problem, rest: Tensor) -> Proposal:
+        """No proposal for any problem; controls like rest (B, N, m)."""
+        count = torch.zeros(problem.B, dtype=torch.int64, device=rest.device)
+        cost = torch.full_like(problem.x0[:, 0], torch.inf)
+        return cls(rest.clone(), count.bool(), Multipliers.zero(problem, torch.nan), count, cost)
+
+
+class Rounds(Protocol):
+    """A search that keeps the round of proposals from pass to pass."""
+
+    def propose(self, proposals: PathProposals) -> None: ...
+
+
+@dataclass(frozen=True)
+class PathProposals:
+    """A pass that follows short paths between static obstacles, and proposes the candidate that is cheapest to fly.
+
+    Args:
+        when: the problems that it looks at. Among those that were caught: all ("caught"), those that have not arrived
+            since ("unarrived"), and those that don't end close to the goal either ("far"). Among those that the pass
+            before has looked at: those with a path but no proposal ("unproposed"), and those with a proposal that costs
+            far more than the trajectory without constraints ("costly").
+        roadmaps: find the paths, one search each; none: the paths that the pass before has found.
+        num_paths: paths of each search, before those of one homotopy class are merged.
+        follow: how each path is followed; candidates of several ways to do it are compared one after the other.
+        relax_iterations: iLQR iterations of relaxing, at most; 0 compares the candidates as tracked.
+        relax_top: candidates per problem that are relaxed, the cheapest as tracked; None: all.
+        refine: how the best are refined.
+        max_penetration: largest accepted penetration of a relaxed candidate into an obstacle, as a share of the mean
+            inflated radius.
+        max_gap: for "costly": how much more than without constraints a proposal may cost, as a share; None: anything.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    when: Literal["caught", "unarrived", "far", "unproposed", "costly"] = "unarrived"
+    roadmaps: tuple[Roadmap, ...] = (Roadmap(),)
+    num_paths: Count = 1
+    follow: tuple[Follow, ...] = (Follow(),)
+    relax_iterations: Natural = 20
+    relax_top: Count | None = None
+    refine: Refine = Refine()
+    max_penetration: Positive = 0.1
+    max_gap: Positive | None = None
+
+    def __post_init__(self) -> None:
+        check_options(self, "proposals")
+        for name in ("roadmaps", "follow"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        if not self.follow:
+            raise InputError("proposals.follow", "one or more ways to follow a path", self.follow)
+        if not self.roadmaps and not self.continues:
+            raise InputError("proposals.roadmaps", f"one or more, for the problems that are {self.when}", ())
+
+    @property
+    def continues(self) -> bool:
+        """Whether this pass improves the proposals of the one before."""
+        return self.when in ("unproposed", "costly")
+
+    def run(self, search: Rounds) -> None:
+        """A pass of a search; see the class."""
+        search.propose(self)
+
+    @property
+    def at_once(self) -> int:
+        """How many problems are looked at together."""
+        return max(1, AT_ONCE // (self.num_paths * max(1, len(self.roadmaps))))
+
+    def improve(self, part: Part, watch: Watch) -> None:
+        """Better proposals for the problems of `part` that this pass looks at, in place."""
+        rows = self._rows(part)
+        for some in rows.split(self.at_once if self.roadmaps else max(1, rows.numel())):
+            self._improve(part, some, watch)
+
+    def _rows(self, part: Part) -> Tensor:
+        """The problems (b,) of `part` that this pass looks at."""
+        if part.scene is None:
+            return part.proposal.found.new_empty(0, dtype=torch.int64)
+        if self.when == "unproposed":
+            assert part.paths is not None
+            return (part.paths.live.any(-1) & ~part.proposal.found).nonzero().flatten()
+        if self.when != "costly":
+            return torch.arange(part.problem.B, device=part.rest.device)
+        if self.max_gap is None:
+            return part.proposal.found.new_empty(0, dtype=torch.int64)
+        free, U = part.free(self.follow[0].iterations), part.proposal.U
+        cost, _ = value(plain(part.problem), open_loop(part.problem, U), U)
+        return (part.proposal.found & (cost > free.cost + self.max_gap * free.cost.abs())).nonzero().flatten()
+
+    def _improve(self, whole: Part, rows: Tensor, watch: Watch) -> None:
+        """As `improve`, for the problems in `rows`."""
+        if rows.numel() == 0:
+            return
+        every = rows.numel() == whole.problem.B
+        problem, rest = (whole.problem, whole.rest) if every else (whole.problem.take(rows), whole.rest[rows])
+        scene = whole.scene if every else seen.scene_of(problem, rest)
+        assert scene is not None
+        paths = self._paths(problem, rest, scene) if self.roadmaps else take(whole.paths, rows)
+        if not self.continues:
+            whole.paths = paths
+        for follow in self.follow:
+            free = None if follow.pace is None else take(whole.free(follow.iterations), rows)
+            new, old = self._along(problem, rest, paths, follow, free, watch), take(whole.proposal, rows)
+            better = (~old.found | (new.found & (new.cost < old.cost))).nonzero().flatten()
+            put(whole.proposal, rows[better], take(new, better))
+            whole.proposal.iterations[rows] = old.iterations + new.iterations
+
+    def _paths(self, problem: Problem, rest: Tensor, scene: Scene) -> Paths:
+        """The paths of all searches, one per homotopy class."""
+        R, unit = seen.scales(problem, scene, rest)
+        usable, known = torch.isfinite(unit) & (unit > 0), []
+        found = torch.zeros_like(usable)
+        for roadmap in self.roadmaps:
+            corners, arrives = roadmap.paths(scene, self.num_paths)
+            known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, self.num_paths)))
+            found = found | (arrives & usable)
+        corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
+        return Paths(corners, one_per_class(corners, scene.obstacles) & live, R, torch.where(found, unit, 1.0), scene.obstacles)
+
+    def _along(
+        self, problem: Problem, rest: Tensor, paths: Paths, follow: Follow, free: Free | None, watch: Watch
+    ) -> Proposal:
+        """Proposals along paths that are known, followed in one way."""
+        K = paths.corners.shape[1]
+        starts = follow.starts(problem, rest).repeat_interleave(len(follow.paces), dim=1)
+        live = paths.live.repeat_interleave(starts.shape[1], dim=1)
+        candidates = Candidates.begin(problem, starts.repeat(1, K, 1, 1), paths.R, paths.unit, live, watch)
+        candidates = follow.track(candidates, paths, free)
+        candidates = candidates.pick(candidates.order(candidates.arrive())[:, : self.relax_top])
+        candidates, sound = self.relax(candidates)
+        order = candidates.order(sound, ALIKE)[:, : self.refine.top]
+        sound = sound[candidates.rows(order).flatten()]
+        refined = candidates.pick(order).refined(sound, self.refine, follow.iterations)
+        multipliers, found = take(refined.multipliers, refined.best), paths.live.any(-1)
+        multipliers = replace(multipliers, mu=torch.where(found, multipliers.mu, torch.nan))
+        found &= refined.cost.isfinite() if self.refine.needed else sound[refined.best]
+        candidates = refined.candidates
+        return Proposal(candidates.U[refined.best], found, multipliers, candidates.iterations, refined.cost)
+
+    def relax(self, candidates: Candidates) -> tuple[Candidates, Tensor]:
+        """The candidates, solved further without a guide, and whether they are sound, (B * count,)."""
+        if self.relax_iterations > 0:
+            relaxed = candidates.solved(inner_solver(self.relax_iterations), PENALTY)
+            # A candidate that falls back into the trap, where waiting is cheaper, stays as tracked.
+            keeps = (relaxed.arrive() | ~candidates.arrive()).view(-1, 1, 1)
+            X, U = torch.where(keeps, relaxed.X, candidates.X), torch.where(keeps, relaxed.U, candidates.U)
+            candidates = replace(relaxed, X=X, U=U)
+        shallow = candidates.penetration() <= self.max_penetration * candidates.R
+        return candidates, candidates.live & candidates.arrive() & shallow
+
+
+class Part:
+    """Some problems of a round, in units of cost: their paths, and the proposals so far."""
+
+    def __init__(self, problem: Problem, rest: Tensor) -> None:
+        self.problem, self.rest = problem, rest
+        self.scene: Scene | None = seen.scene_of(problem, rest)
+        self.paths: Paths | None = None
+        self.proposal = Proposal.none(problem, rest)
+        self._free: Free | None = None
+
+    def free(self, iterations: int) -> Free:
+        """The trajectories without constraints, solved at the first call; their iterations count as the proposals'."""
+        if self._free is None:
+            self._free = unconstrained(self.problem, self.rest, iterations)
+            self.proposal.iterations.add_(self._free.iterations)
+        return self._free
+
+
+class Round:
+    """Proposals for some problems, which one pass after another improves."""
+
+    def __init__(self, problem: Problem, at_once: int, watch: Watch = unwatched) -> None:
+        self.watch, self.unit = watch, cost_unit(problem)
+        self.problem, scaled = problem, problem.in_cost_units()
+        self.rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
+        self.rows = torch.arange(problem.B, device=problem.x0.device).split(at_once)
+        self.parts = [Part(scaled.take(rows), self.rest[rows]) for rows in self.rows]
+
+    def improve(self, proposals: PathProposals) -> None:
+        """One more pass."""
+        for part in self.parts:
+            proposals.improve(part, self.watch)
+
+    def result(self) -> Proposal:
+        """The proposals so far, in the problem's own units."""
+        whole = Proposal.none(self.problem, self.rest)
+        for rows, part in zip(self.rows, self.parts, strict=True):
+            put(whole, rows, part.proposal)
+        return whole._replace(multipliers=whole.multipliers.scaled(self.unit), cost=whole.cost * self.unit)
+
+
+def propose(passes: Sequence[PathProposals], problem: Problem, watch: Watch = unwatched) -> Proposal:
+    """Proposals for every problem, from the vehicle at rest, by some passes.
+
+    `watch` is called with how many candidates of the current step are solved, and of how many; an exception that it
+    raises ends the search.
+
+    Raises:
+        InputError: initial offsets that don't fit the controls.
+    """
+    found = Round(problem, passes[0].at_once, watch)
+    for proposals in passes:
+        found.improve(proposals)
+    return found.result()
