@@ -1,11 +1,12 @@
-"""Solution: what a solver returns for every problem of the batch."""
+"""What a solver returns for every problem of the batch, and on request the record of how it was found."""
 
 from __future__ import annotations
 
 import os
 import tempfile
 from collections import Counter
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,49 @@ if TYPE_CHECKING:
     from torchgco.problem.problem import Problem
 
 
+class Fate(IntEnum):
+    """What became of a candidate trajectory along a path."""
+
+    ABSENT = 0  # its path is of the same homotopy class as a shorter one, or there is none
+    TRACKED = 1  # dropped as tracked: others were cheaper
+    UNSOUND = 2  # relaxed, but too deep in an obstacle, or away from the goal
+    RELAXED = 3  # dropped as relaxed: others were cheaper
+    FAILED = 4  # refined, but without a good end
+    REFINED = 5  # refined, but not the cheapest
+    PROPOSED = 6
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One comparison of candidates along paths for b problems, K paths and C candidates each."""
+
+    number: int  # of the pass in the solver's table, from 1
+    rows: Tensor  # (b,) int64: places in the batch
+    paths: Tensor  # (b, K, P, d): corners, m
+    classes: Tensor  # (b, K) int64: the first path of the same homotopy class
+    path: Tensor  # (b, C) int64: which path each candidate follows
+    fate: Tensor  # (b, C) int64, see Fate
+    tracked: Tensor  # (b, C, N+1, n): states after tracking
+    relaxed: Tensor  # (b, C, N+1, n): after relaxing; NaN for candidates dropped before
+    refined: Tensor  # (b, C, N+1, n): after refining; NaN for candidates dropped before
+    cost: Tensor  # (b, C): as refined, infinite without a good end; NaN for candidates that weren't refined
+
+
+@dataclass
+class SearchRecord:
+    """What the passes of a search did, kept where the local solver records.
+
+    Attributes:
+        passes: (number of the pass, its name, places in the batch of the problems that it worked on), in their order.
+        caught: places in the batch (b,), and states (b, N+1, n) of the trajectories that were caught.
+        comparisons: of candidates along paths.
+    """
+
+    passes: list[tuple[int, str, list[int]]] = field(default_factory=list)
+    caught: tuple[Tensor, Tensor] | None = None
+    comparisons: list[Comparison] = field(default_factory=list)
+
+
 @dataclass(frozen=True)
 class Solution:
     """Trajectories, feedback gains, multipliers and how each problem ended. Saved and loaded as npz."""
@@ -45,6 +89,7 @@ class Solution:
     outer_iterations: Tensor  # (B,) int64: of the outermost solver, over all its starts
     guided: Tensor  # (B,) int64, outer iterations with guidance on
     trace: pd.DataFrame | None = None  # a row per problem and iteration, where the solver records
+    search: SearchRecord | None = None  # paths, candidates and passes, where a solver with passes records
 
     @property
     def statuses(self) -> list[Status]:
@@ -52,8 +97,8 @@ class Solution:
         return [Status(s) for s in self.status.tolist()]
 
     def take(self, index: Tensor) -> Solution:
-        """The problems in `index` (the trace is left behind)."""
-        return take(replace(self, trace=None), index)
+        """The problems in `index` (records are left behind)."""
+        return take(replace(self, trace=None, search=None), index)
 
     def __repr__(self) -> str:
         B, N, m = self.U.shape
@@ -114,9 +159,9 @@ class Solution:
         ranks = {"X": 3, "U": 3, "K": 4, "d": 3}
         if any(arrays[name].ndim != ranks.get(name, 3 if name.startswith("lam") else 1) for name in names):
             raise InputError("path", "a solution file", f"{path}, whose arrays have other shapes")
-        tensors = {name: torch.from_numpy(arrays[name]).to(where) for name in names}
+        tensors: dict[str, Any] = {name: torch.from_numpy(arrays[name]).to(where) for name in names}
         lam = tuple(tensors[f"lam{i}"] for i in range(count))
         return cls(multipliers=Multipliers(lam, tensors["mu"]), **{name: tensors[name] for name in _TENSORS})
 
 
-_TENSORS = tuple(f.name for f in fields(Solution) if f.name not in ("multipliers", "trace"))
+_TENSORS = tuple(f.name for f in fields(Solution) if f.name not in ("multipliers", "trace", "search"))

@@ -114,7 +114,7 @@ class Tracker:
             U, multipliers, rounds = shifted(before.U), before.multipliers.shifted(), 1
         growth, rounds = (self.penalty_growth, self.outer_iterations) if reset else (1.0, rounds)
         for _ in range(rounds):
-            found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, not self.inner.as_printed), U)
+            found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, self.inner.rules.phr), U)
             U = found.U
             multipliers = update(problem, found.X, U, multipliers, growth, PENALTY_MAX)
         return Tracking(problem, U[:, 0], violation(problem, found.X, U), U, multipliers)

@@ -12,8 +12,8 @@ from torchgco.roadmap.geometry import Inflated, length, points_along
 POINTS = 65  # at which two paths in space are compared
 
 
-def one_per_class(paths: Tensor, obstacles: Inflated) -> Tensor:
-    """The first path of every class, (B, K) bool, of polylines (B, K, P, d) that share their ends.
+def classes(paths: Tensor, obstacles: Inflated) -> Tensor:
+    """The first path of the class of each path, (B, K) int64, of polylines (B, K, P, d) that share their ends.
 
     In the plane two paths are of one class where they have equal winding angles around every obstacle. Around balls in
     space all paths are of one class: there, two paths count as one where they are nowhere farther apart than the
@@ -21,9 +21,12 @@ def one_per_class(paths: Tensor, obstacles: Inflated) -> Tensor:
     """
     alike = _wind_alike(paths, obstacles) if paths.shape[-1] == 2 else _are_close(paths, obstacles)
     first = torch.ones_like(alike[..., 0])
+    label = torch.arange(paths.shape[1], device=paths.device).repeat(paths.shape[0], 1)
     for k in range(1, paths.shape[1]):
-        first[:, k] = ~(alike[:, k, :k] & first[:, :k]).any(-1)
-    return first
+        same = alike[:, k, :k] & first[:, :k]
+        first[:, k] = ~same.any(-1)
+        label[:, k] = torch.where(first[:, k], k, same.to(torch.int8).argmax(-1))
+    return label
 
 
 def _wind_alike(paths: Tensor, obstacles: Inflated) -> Tensor:

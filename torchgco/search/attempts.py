@@ -12,6 +12,7 @@ from torchgco.base.tree import copied, put, take
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import has_arrived, is_preferred
 from torchgco.search.proposals import PathProposals, Round
+from torchgco.solution import SearchRecord
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress
 from torchgco.solvers.history import Recorder
@@ -24,9 +25,14 @@ class Best:
     """Keeps the best trajectory of each problem and the sums of all counts, during one solve."""
 
     def __init__(
-        self, call: Call, first: SolveEnd, solver: AugmentedLagrangian, recorder: Recorder | None = None
+        self,
+        call: Call,
+        first: SolveEnd,
+        solver: AugmentedLagrangian,
+        recorder: Recorder | None = None,
+        record: SearchRecord | None = None,
     ) -> None:
-        self.call, self.solver, self.recorder = call, solver, recorder
+        self.call, self.solver, self.recorder, self.record = call, solver, recorder, record
         self.end = copied(first)
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
 
@@ -73,6 +79,8 @@ class Best:
 
     def replace(self, rows: Tensor, where: Tensor, trajectories: Iterate, new: SolveEnd) -> None:
         """New trajectories of `rows` where a mask (b,) says so, and the counts of their solves."""
+        if self.record is not None:
+            self.record.passes[-1][2].extend(self.call.rows[rows].tolist())
         chosen = where.nonzero().flatten()
         put(self.end.best, rows[chosen], take(trajectories, chosen))
         self.end.status[rows[chosen]] = new.status[chosen]
@@ -117,6 +125,7 @@ class Search:
     ) -> None:
         self.call, self.solver, self.recorder = call, solver, recorder
         self.guidance, self.has_paths, self.guided = guidance, has_paths, guided
+        self.record = None if recorder is None else SearchRecord()
         self._best: Best | None = None
         self._caught: SolveEnd | None = None
         self._round: tuple[Tensor, Round] | None = None
@@ -142,7 +151,22 @@ class Search:
 
     def begin(self, first: SolveEnd) -> None:
         """Keep the first solve of every problem."""
-        self._best, self._caught = Best(self.call, first, self.solver, self.recorder), copied(first)
+        self._best = Best(self.call, first, self.solver, self.recorder, self.record)
+        self._caught = copied(first)
+
+    def next_pass(self, number: int, name: str) -> None:
+        """Count the passes in the records."""
+        if self.recorder is not None and self.record is not None:
+            self.recorder.attempt += number > 1
+            self.record.passes.append((number, name, []))
+
+    def finish_record(self) -> SearchRecord | None:
+        """The record, at the end of the search."""
+        if self.record is not None:
+            rows = (self.caught.status == STOPPED).nonzero().flatten()
+            self.record.caught = self.call.rows[rows], self.caught.last.X[rows]
+            self.record.passes = [(number, name, sorted(set(worked))) for number, name, worked in self.record.passes]
+        return self.record
 
     def rows(self, when: str) -> Tensor:
         """The problems (b,) that a word describes, all among those that were caught.
@@ -166,7 +190,9 @@ class Search:
         if not proposals.continues:
             rows = self.rows(proposals.when)
             watch = partial(self._watched, rows)
-            self._round = (rows, Round(self.call.problem.take(rows), proposals.at_once, watch)) if len(rows) else None
+            problem, places = self.call.problem.take(rows), self.call.rows[rows]
+            begun = Round(problem, proposals.at_once, watch, places, self.record) if rows.numel() > 0 else None
+            self._round = None if begun is None else (rows, begun)
         if self._round is not None:
             self._round[1].improve(proposals)
 

@@ -76,6 +76,7 @@ class Candidates:
     R: Tensor  # (B * count,): mean inflated radius, m
     unit: Tensor  # (B * count,): q0 / R^4
     live: Tensor  # bool: the others are never solved, and come last
+    number: Tensor  # (B * count,) int64: place among the candidates of its problem at the beginning
     count: int  # candidates of each problem
     iterations: Tensor  # (B,) int64: of all solves so far, those of dropped candidates included
     watch: Watch
@@ -89,13 +90,14 @@ class Candidates:
         R, unit = (t.repeat_interleave(count) for t in (R, unit))
         X = U.new_zeros(U.shape[0] * count, problem.N + 1, problem.n)
         none = torch.zeros(problem.B, dtype=torch.int64, device=U.device)
-        return cls(problem, X, U.flatten(0, 1), R, unit, live.flatten(), count, none, watch)
+        number = torch.arange(count, device=U.device).repeat(problem.B)
+        return cls(problem, X, U.flatten(0, 1), R, unit, live.flatten(), number, count, none, watch)
 
     def pick(self, order: Tensor) -> Candidates:
         """The candidates at the places `order` (B, c) among those of their problem."""
         rows = self.rows(order).flatten()
-        X, U, R, unit, live = (t[rows] for t in (self.X, self.U, self.R, self.unit, self.live))
-        return Candidates(self.problem, X, U, R, unit, live, order.shape[1], self.iterations, self.watch)
+        X, U, R, unit, live, number = (t[rows] for t in (self.X, self.U, self.R, self.unit, self.live, self.number))
+        return Candidates(self.problem, X, U, R, unit, live, number, order.shape[1], self.iterations, self.watch)
 
     def rows(self, order: Tensor) -> Tensor:
         """Rows (B, c) of the candidates at the places `order` (B, c)."""
@@ -155,8 +157,7 @@ class Candidates:
         everyone = torch.arange(self.live.numel(), device=sound.device)
         multipliers, rows = self.multipliers(everyone, PENALTY), sound.nonzero().flatten()
         if refine.top == 1 or rows.numel() == 0:
-            worst = torch.full_like(self.unit[:: self.count], torch.inf)
-            return Refined(self, multipliers, everyone[:: self.count], worst)
+            return Refined(self, multipliers, everyone[:: self.count], torch.full_like(self.unit, torch.inf))
         part, inner = self.of(rows), inner_solver(iterations, 0.1 * TOLERANCE)
         solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=refine.rounds)
         end = solver.solve(
@@ -171,7 +172,7 @@ class Candidates:
         made = self.iterations.index_add(0, rows // self.count, end.iterations)
         put(multipliers, won, take(end.multipliers, good.nonzero().flatten()))
         best = self.rows(cost.view(-1, self.count).argsort(dim=-1, stable=True)[:, :1])[:, 0]
-        return Refined(replace(self, X=X, U=U, iterations=made), multipliers, best, cost[best])
+        return Refined(replace(self, X=X, U=U, iterations=made), multipliers, best, cost)
 
     def order(self, first: Tensor, alike: float | None = None) -> Tensor:
         """Places (B, count) of each problem's candidates, the best first.
@@ -200,4 +201,4 @@ class Refined(NamedTuple):
     candidates: Candidates
     multipliers: Multipliers  # of each candidate, to continue with
     best: Tensor  # (B,): row of each problem's cheapest; the first where no solve counts
-    cost: Tensor  # (B,): its cost; infinite where no solve counts
+    cost: Tensor  # (B * count,): infinite where no solve was made or counts

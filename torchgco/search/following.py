@@ -43,6 +43,7 @@ class Paths:
     """Paths of B problems, K each, and the units to follow them in."""
 
     corners: Tensor  # (B, K, P, d), m
+    classes: Tensor  # (B, K) int64: the first path of the same homotopy class
     live: Tensor  # (B, K) bool: one per homotopy class
     R: Tensor  # (B,): mean inflated radius, m
     unit: Tensor  # (B,): q0 / R^4

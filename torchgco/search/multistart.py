@@ -17,7 +17,7 @@ from torchgco.search.attempts import Best
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Solver
-from torchgco.solvers.ending import finished
+from torchgco.solvers.session import Session
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ class MultiStart(Solver):
     def run(self, call: Call) -> Solution:
         """Solve a checked call; guesses are keyed by (seed, id, start), and the warm start serves the first."""
         solver, sigma = self.local, self._sigma(call.problem)
-        scaled, unit = solver.inner.in_units(call)
+        session = Session(call, solver.inner.rules)
+        scaled = session.call
         guidance = None if solver.guidance is None else solver.guidance.suited(scaled.problem)
         best = Best(scaled, solver.iterate(scaled, guidance), solver)
         left = call.problem.start_is_clear & torch.isfinite(call.problem.x0).all(-1)  # no guess helps an invalid start
@@ -68,8 +69,7 @@ class MultiStart(Solver):
             key = DrawKey(call.seed, part.ids, torch.full_like(rows, start))
             noise = sigma.sqrt() * smooth_normal(key, self.noise_knots, part.U0)
             best.improve(rows, replace(part, U0=part.U0 + noise, warm=None), guidance)
-        phr = not solver.inner.as_printed
-        return finished(call, scaled, unit, best.end, phr, solver.violation_tolerance, solver.slots)
+        return session.finished(best.end, solver.violation_tolerance, solver.slots)
 
     def _sigma(self, problem: Problem) -> Tensor:
         sigma = tensor(self.covariance, "multistart.covariance", problem.x0)

@@ -62,6 +62,8 @@ class Solve:
         stop = StopWhenCaught(self.single_contact_after) if self.until == "caught" and search.guided else None
         if not search.begun:
             search.begin(search.solver.iterate(search.call, stop, recorder=search.recorder, by_arrival=True))
+            if search.record is not None:
+                search.record.passes[-1][2].extend(search.call.rows.tolist())
         elif search.guided:
             self._again(search, stop)
 

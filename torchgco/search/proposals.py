@@ -10,9 +10,10 @@ removing it would use up a whole attempt, or must first be refined.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol
+from functools import partial
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -25,10 +26,12 @@ from torchgco.native.dispatch import cost_unit, open_loop, value
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.roadmap.geometry import Scene
-from torchgco.roadmap.homotopy import one_per_class
+from torchgco.roadmap.homotopy import classes
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
 from torchgco.search.following import Follow, Free, Paths, plain, unconstrained
+from torchgco.search.record import comparison
+from torchgco.solution import SearchRecord
 
 AT_ONCE = 1536  # paths of all problems that are compared and tracked together: bounds the memory
 ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a share, count as the same
@@ -145,9 +148,10 @@ class PathProposals:
         paths = self._paths(problem, rest, scene) if self.roadmaps else take(whole.paths, rows)
         if not self.continues:
             whole.paths = paths
+        note = None if whole.record is None else partial(whole.note, rows, paths, self.refine)
         for follow in self.follow:
             free = None if follow.pace is None else take(whole.free(follow.iterations), rows)
-            new, old = self._along(problem, rest, paths, follow, free, watch), take(whole.proposal, rows)
+            new, old = self._along(problem, rest, paths, follow, free, watch, note), take(whole.proposal, rows)
             better = (~old.found | (new.found & (new.cost < old.cost))).nonzero().flatten()
             put(whole.proposal, rows[better], take(new, better))
             whole.proposal.iterations[rows] = old.iterations + new.iterations
@@ -162,27 +166,37 @@ class PathProposals:
             known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, self.num_paths)))
             found = found | (arrives & usable)
         corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
-        return Paths(corners, one_per_class(corners, scene.obstacles) & live, R, torch.where(found, unit, 1.0), scene.obstacles)
+        label = classes(corners, scene.obstacles)
+        first = label == torch.arange(label.shape[1], device=label.device)
+        return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), scene.obstacles)
 
     def _along(
-        self, problem: Problem, rest: Tensor, paths: Paths, follow: Follow, free: Free | None, watch: Watch
+        self,
+        problem: Problem,
+        rest: Tensor,
+        paths: Paths,
+        follow: Follow,
+        free: Free | None,
+        watch: Watch,
+        note: Callable[..., None] | None,
     ) -> Proposal:
-        """Proposals along paths that are known, followed in one way."""
+        """Proposals along paths that are known, followed in one way; `note` is called with the steps."""
         K = paths.corners.shape[1]
         starts = follow.starts(problem, rest).repeat_interleave(len(follow.paces), dim=1)
         live = paths.live.repeat_interleave(starts.shape[1], dim=1)
         candidates = Candidates.begin(problem, starts.repeat(1, K, 1, 1), paths.R, paths.unit, live, watch)
-        candidates = follow.track(candidates, paths, free)
-        candidates = candidates.pick(candidates.order(candidates.arrive())[:, : self.relax_top])
-        candidates, sound = self.relax(candidates)
-        order = candidates.order(sound, ALIKE)[:, : self.refine.top]
-        sound = sound[candidates.rows(order).flatten()]
-        refined = candidates.pick(order).refined(sound, self.refine, follow.iterations)
-        multipliers, found = take(refined.multipliers, refined.best), paths.live.any(-1)
-        multipliers = replace(multipliers, mu=torch.where(found, multipliers.mu, torch.nan))
-        found &= refined.cost.isfinite() if self.refine.needed else sound[refined.best]
-        candidates = refined.candidates
-        return Proposal(candidates.U[refined.best], found, multipliers, candidates.iterations, refined.cost)
+        tracked = follow.track(candidates, paths, free)
+        relaxed, sound = self.relax(tracked.pick(tracked.order(tracked.arrive())[:, : self.relax_top]))
+        order = relaxed.order(sound, ALIKE)[:, : self.refine.top]
+        picked = sound[relaxed.rows(order).flatten()]
+        refined = relaxed.pick(order).refined(picked, self.refine, follow.iterations)
+        best, some = refined.best, paths.live.any(-1)
+        multipliers, cost = take(refined.multipliers, best), refined.cost[best]
+        multipliers = replace(multipliers, mu=torch.where(some, multipliers.mu, torch.nan))
+        found = some & (cost.isfinite() if self.refine.needed else picked[best])
+        if note is not None:
+            note(tracked, relaxed, sound, refined, found)
+        return Proposal(refined.candidates.U[best], found, multipliers, refined.candidates.iterations, cost)
 
     def relax(self, candidates: Candidates) -> tuple[Candidates, Tensor]:
         """The candidates, solved further without a guide, and whether they are sound, (B * count,)."""
@@ -197,14 +211,26 @@ class PathProposals:
 
 
 class Part:
-    """Some problems of a round, in units of cost: their paths, and the proposals so far."""
+    """Some problems of a round, in units of cost: their paths, and the proposals so far.
 
-    def __init__(self, problem: Problem, rest: Tensor) -> None:
-        self.problem, self.rest = problem, rest
+    Args:
+        rest: controls (B, N, m) at rest.
+        places: (B,) in the batch, for the record.
+    """
+
+    def __init__(self, problem: Problem, rest: Tensor, places: Tensor, record: SearchRecord | None) -> None:
+        self.problem, self.rest, self.places, self.record = problem, rest, places, record
         self.scene: Scene | None = seen.scene_of(problem, rest)
         self.paths: Paths | None = None
         self.proposal = Proposal.none(problem, rest)
         self._free: Free | None = None
+
+    def note(self, rows: Tensor, paths: Paths, refine: Refine, *steps: Any) -> None:
+        """Record a comparison for the problems in `rows`; see `record.comparison`."""
+        assert self.record is not None
+        number, _, noted = self.record.passes[-1]
+        noted.extend(self.places[rows].tolist())
+        self.record.comparisons.append(comparison(number, self.places[rows], paths, refine, *steps))
 
     def free(self, iterations: int) -> Free:
         """The trajectories without constraints, solved at the first call; their iterations count as the proposals'."""
@@ -217,12 +243,21 @@ class Part:
 class Round:
     """Proposals for some problems, which one pass after another improves."""
 
-    def __init__(self, problem: Problem, at_once: int, watch: Watch = unwatched) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        at_once: int,
+        watch: Watch = unwatched,
+        places: Tensor | None = None,
+        record: SearchRecord | None = None,
+    ) -> None:
         self.watch, self.unit = watch, cost_unit(problem)
         self.problem, scaled = problem, problem.in_cost_units()
         self.rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-        self.rows = torch.arange(problem.B, device=problem.x0.device).split(at_once)
-        self.parts = [Part(scaled.take(rows), self.rest[rows]) for rows in self.rows]
+        everyone = torch.arange(problem.B, device=problem.x0.device)
+        places = everyone if places is None else places
+        self.rows = everyone.split(at_once)
+        self.parts = [Part(scaled.take(rows), self.rest[rows], places[rows], record) for rows in self.rows]
 
     def improve(self, proposals: PathProposals) -> None:
         """One more pass."""

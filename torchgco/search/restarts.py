@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -19,8 +20,7 @@ from torchgco.search.table import rows_of
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Guidance, Solver
-from torchgco.solvers.ending import finished
-from torchgco.solvers.history import Recorder
+from torchgco.solvers.session import Session
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -66,32 +66,34 @@ class Restarts(Solver):
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
         solver = self.local
-        scaled, unit = solver.inner.in_units(call)
-        recorder = Recorder() if solver.record else None
-        passes, guidance = self._suited(scaled.problem)
+        session = Session(call, solver.inner.rules, solver.record)
+        passes, guidance = self._suited(session.call.problem)
         guided = guidance is not None or any(isinstance(one, PathProposals) for one in passes)
-        search = Search(scaled, solver, guidance, guided and has_paths(scaled.problem), guided, recorder)
+        possible = guided and has_paths(session.call.problem)
+        search = Search(session.call, solver, guidance, possible, guided, session.recorder)
         self._run(search, passes)
-        phr, end = not solver.inner.as_printed, search.best.end
-        return finished(call, scaled, unit, end, phr, solver.violation_tolerance, solver.slots, recorder)
+        solution = session.finished(search.best.end, solver.violation_tolerance, solver.slots)
+        return replace(solution, search=search.finish_record())
 
-    def _run(self, search: Search, passes: list[Pass]) -> None:
+    def _run(self, search: Search, passes: Sequence[Pass | None]) -> None:
         """All passes, until the time is over."""
         try:
-            for number, one in enumerate(passes):
+            for number, one in enumerate(passes, start=1):
                 if search.begun and search.call.late:
                     return
-                if number > 0 and search.recorder is not None:
-                    search.recorder.attempt += 1
-                one.run(search)
+                search.next_pass(number, type(self.passes[number - 1]).__name__)
+                if one is not None:
+                    one.run(search)
         except Late:
             return
 
-    def _suited(self, problem: Problem) -> tuple[list[Pass], Guidance | None]:
-        """The passes and the guidance that can serve these problems; a GuidanceWarning names the others."""
-        others: list[Pass] = [one for one in self.passes if not isinstance(one, PathProposals)]
+    def _suited(self, problem: Problem) -> tuple[list[Pass | None], Guidance | None]:
+        """The passes, None for those that can't serve these problems, and the guidance, None where it can't.
+
+        A GuidanceWarning names what can't.
+        """
         if not problem.geometric:
-            return others, None
+            return [None if isinstance(one, PathProposals) else one for one in self.passes], None
         guidance, losses = self.local.guidance, list[str]()
         if isinstance(guidance, GCO):
             sampler, unsampled = suited_guide(guidance.sampler, problem)
@@ -101,6 +103,5 @@ class Restarts(Solver):
             guidance = guidance.suited(problem)
         passes, unsought = suited_paths(self.passes, problem)
         losses += [] if unsought is None else [unsought]
-        served = guidance is not None or len(passes) > len(others)
-        warn_of_losses(losses, not served)
+        warn_of_losses(losses, guidance is None and not any(isinstance(one, PathProposals) for one in passes))
         return passes, guidance

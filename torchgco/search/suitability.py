@@ -17,30 +17,29 @@ from torchgco.search.passes import Pass
 from torchgco.search.proposals import PathProposals
 
 
-def suited_paths(passes: Sequence[Pass], problem: Problem) -> tuple[list[Pass], str | None]:
-    """The passes without proposals along paths that can't serve; and a sentence on what is lost, or None.
+def suited_paths(passes: Sequence[Pass], problem: Problem) -> tuple[list[Pass | None], str | None]:
+    """The passes, with None for proposals along paths that can't serve; and a sentence on what is lost, or None.
 
     Obstacles that the roadmap doesn't know by design, such as moving ones, are no loss. Initial offsets for another
     number of controls are left out.
     """
-    others: list[Pass] = [one for one in passes if not isinstance(one, PathProposals)]
-    if len(others) == len(passes):
+    others = [None if isinstance(one, PathProposals) else one for one in passes]
+    if None not in others:
         return others, None
-    position = problem.dynamics.position
+    position, bodies = problem.dynamics.position, bool(problem.obstacles)
     if position is None:
         return others, "the dynamics have no position"
     d = position.stop - position.start
-    if d not in (2, 3) and problem.obstacles:
+    if d not in (2, 3) and bodies:
         return others, f"no path is sought around obstacles in {d}-D, as the roadmap knows only 2-D and 3-D"
-    if problem.goal is None and problem.obstacles:
+    if problem.goal is None and bodies:
         return others, "no path is sought around obstacles without a goal: Problem(..., goal=Goal(position, radius))"
-    suited: list[Pass] = [
-        _with_fitting_offsets(one, problem.m) if isinstance(one, PathProposals) else one for one in passes
-    ]
     if not has_paths(problem):
         return others, None
     why = None if engine_of(problem) is not None else failure(_expand, problem, problem.x0.dtype)
-    return (suited, None) if why is None else (others, f"no path can be followed ({why})")
+    if why is not None:
+        return others, f"no path can be followed ({why})"
+    return [_with_fitting_offsets(one, problem.m) if isinstance(one, PathProposals) else one for one in passes], None
 
 
 def _with_fitting_offsets(proposals: PathProposals, m: int) -> PathProposals:

@@ -20,10 +20,10 @@ from torchgco.native.dispatch import open_loop, value
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Advice, Call, Guidance, Progress, Solver
-from torchgco.solvers.ending import finished, start_status
+from torchgco.solvers.ending import start_status
 from torchgco.solvers.history import Recorder
 from torchgco.solvers.ilqr import ILQR, advance
-from torchgco.solvers.scheduler import run_all
+from torchgco.solvers.session import Session
 from torchgco.solvers.state import STALLED, STOPPED, Iterate, PassEnd, SolveEnd, State
 
 PENALTY_MAX = 1e12  # ceiling of mu
@@ -79,12 +79,10 @@ class AugmentedLagrangian(Solver):
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
-        scaled, unit = self.inner.in_units(call)
-        recorder = Recorder() if self.record else None
-        guidance = None if self.guidance is None else self.guidance.suited(scaled.problem)
-        end = self.iterate(scaled, guidance, recorder=recorder)
-        phr = not self.inner.as_printed
-        return finished(call, scaled, unit, end, phr, self.violation_tolerance, self.slots, recorder)
+        session = Session(call, self.inner.rules, self.record)
+        guidance = None if self.guidance is None else self.guidance.suited(session.call.problem)
+        end = self.iterate(session.call, guidance, recorder=session.recorder)
+        return session.finished(end, self.violation_tolerance, self.slots)
 
     def iterate(
         self,
@@ -104,12 +102,12 @@ class AugmentedLagrangian(Solver):
         loop = OuterLoop(self, call, guidance, penalty, recorder, guide_first, by_arrival)
         B = call.problem.B
         every = torch.arange(B, device=call.rows.device)
-        run_all(loop, every, max(1, B if self.slots is None else self.slots), loop.report)
+        run_all(loop, every, max(1, B if self.slots is None else self.slots))
         return loop.result
 
 
 class OuterLoop:
-    """The outer loops of one call (Algorithm 4), as the scheduler takes them."""
+    """The outer loops of one call (Algorithm 4); statuses are (b,) int64, RUNNING until a problem ends."""
 
     def __init__(
         self,
@@ -123,7 +121,7 @@ class OuterLoop:
     ) -> None:
         self.solver, self.call, self.guidance, self.penalty, self.recorder = solver, call, guidance, penalty, recorder
         self.guide_first, self.by_arrival = guide_first, by_arrival
-        self.phr = not solver.inner.as_printed
+        self.rules = solver.inner.rules
         self.result = SolveEnd.blank(call.problem, call.U0)
         self.stopped = 0  # problems that guidance has stopped
         self.limit = 1 if recorder is not None else solver.inner.max_iterations
@@ -137,7 +135,7 @@ class OuterLoop:
         else:
             multipliers = take(self.call.warm, rows)
         penalty = take(self.penalty, rows) if self.guidance is None else self.guidance.start(problem, X)
-        cost, merit = value(Lagrangian(problem, multipliers, penalty, self.phr), X, U)
+        cost, merit = value(Lagrangian(problem, multipliers, penalty, self.rules.phr), X, U)
         none, worst = torch.zeros_like(rows), torch.full_like(cost, torch.inf)
         state = State(
             rows=rows.clone(),
@@ -166,7 +164,7 @@ class OuterLoop:
 
     def advance(self, s: State) -> Tensor:
         """One inner solve of every running problem (one iteration by PyTorch or if recorded), then the outer update."""
-        lagrangian = Lagrangian(self.problem, s.multipliers, s.penalty, self.phr)
+        lagrangian = Lagrangian(self.problem, s.multipliers, s.penalty, self.rules.phr)
         end = advance(self.solver.inner, s, lagrangian, self.limit)
         if self.recorder is not None:
             self.recorder.add(self.problem, self.call.rows[s.rows], s, end)
@@ -184,7 +182,7 @@ class OuterLoop:
         growth = torch.full_like(worst, solver.penalty_growth)
         if solver.stalled_growth is not None:
             growth = growth.masked_fill(worst > HALVED * s.last_violation[rows], solver.stalled_growth)
-        if self.phr:
+        if self.rules.ends:
             growth = growth.masked_fill(worst <= solver.violation_tolerance, 1.0)
         multipliers = update(problem, X, U, take(s.multipliers, rows), growth, PENALTY_MAX)
         self._keep_best(s, rows, problem, Iterate(X, U, multipliers, s.cost[rows], worst))
@@ -207,7 +205,7 @@ class OuterLoop:
         status[over & ~end.stuck[rows]] = Status.MAX_ITERATIONS
         if self.solver.patience is not None:
             status[s.waited[rows] >= self.solver.patience] = STALLED
-        if self.phr:
+        if self.rules.ends:
             settled = (s.cost[rows] - s.last_cost[rows]).abs() <= SETTLED * s.cost[rows].abs()
             status[end.converged[rows] & settled & (worst <= self.solver.violation_tolerance)] = Status.CONVERGED
         return status
@@ -230,7 +228,7 @@ class OuterLoop:
         """The next inner solve of `rows` of the running problems: L_M with its new multipliers and penalty."""
         s.regularisation[rows] = 0.0
         penalty = None if s.penalty is None else take(s.penalty, rows)
-        lagrangian = Lagrangian(running.take(rows), take(s.multipliers, rows), penalty, self.phr)
+        lagrangian = Lagrangian(running.take(rows), take(s.multipliers, rows), penalty, self.rules.phr)
         s.cost[rows], s.merit[rows] = value(lagrangian, s.X[rows], s.U[rows])
         s.inner[rows] = s.rung[rows] = 0
 
@@ -293,3 +291,44 @@ class OuterLoop:
         if self.call.callback is not None:
             total = self.call.problem.B
             self.call.callback(Progress(passes, self.call.rows[rows], total - left - self.stopped, total, state))
+
+
+def run_all(work: OuterLoop, rows: Tensor, slots: int) -> None:
+    """Run the problems `rows` to their end, at most `slots` at a time.
+
+    Nested loops would wait for the slowest problem of the batch at three levels. Here every problem is at its own place
+    in the loops. A problem that ends frees its slot for a waiting one; if none waits, the running batch shrinks.
+    """
+    waiting = rows[slots:]
+    state, status = work.begin(rows[:slots])
+    work.regroup(state.rows)
+    state, waiting = _replaced(work, state, status, waiting)
+    passes = 0
+    while state.rows.numel() > 0:
+        worked = state.rows.clone()  # a copy: slots are refilled in place
+        state, waiting = _replaced(work, state, work.advance(state), waiting)
+        passes += 1
+        work.report(passes, worked, state.rows.numel() + waiting.numel(), state)
+
+
+def _replaced(work: OuterLoop, state: State, status: Tensor, waiting: Tensor) -> tuple[State, Tensor]:
+    """The state with ended problems replaced by waiting ones, or removed; and the rows still waiting."""
+    while True:
+        ended = (status != Status.RUNNING).nonzero().flatten()
+        if ended.numel() == 0:
+            return state, waiting
+        work.end(state, ended, status[ended])
+        status = status.clone()
+        status[ended] = Status.RUNNING
+        news = min(ended.numel(), waiting.numel())
+        if news > 0:
+            begun, refused = work.begin(waiting[:news])
+            waiting = waiting[news:]
+            put(state, ended[:news], begun)
+            status[ended[:news]] = refused
+        if ended.numel() > news:
+            stays = torch.ones_like(status, dtype=torch.bool)
+            stays[ended[news:]] = False
+            stay = stays.nonzero().flatten()
+            state, status = take(state, stay), status[stay]
+        work.regroup(state.rows)

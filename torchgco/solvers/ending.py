@@ -7,63 +7,22 @@ J_var + lam'c, plus the complementarity gap. It doesn't depend on the scale of c
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchgco.base.status import Status
-from torchgco.base.tree import take
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.native.dispatch import cost_unit, engine_of, reproducible, terms_of
+from torchgco.native.dispatch import cost_unit, engine_of, terms_of
 from torchgco.problem.problem import Problem
-from torchgco.solution import Solution
-from torchgco.solvers.contracts import Call
 from torchgco.solvers.riccati import BackwardPass, backward
-from torchgco.solvers.state import STALLED, STOPPED, SolveEnd
-
-if TYPE_CHECKING:
-    from torchgco.solvers.history import Recorder
+from torchgco.solvers.state import STALLED
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 LEAST_COST = 1e-6  # the cost counts as at least this share of the cost of staying at the start
 FIRST, GROWTH, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
-
-
-def finished(
-    call: Call,
-    scaled: Call,
-    unit: Tensor,
-    end: SolveEnd,
-    phr: bool,
-    tolerance: float,
-    slots: int | None = None,
-    recorder: Recorder | None = None,
-) -> Solution:
-    """The best trajectories of a solve with gains and statuses, in the units of the call as it was given.
-
-    Args:
-        scaled, unit: the call in the solver's units of cost, and these units (B,).
-        phr, tolerance: of the solver, see Lagrangian and `final_status`.
-        slots: problems whose gains are computed together; None: all.
-    """
-    problem, best = scaled.problem, end.best
-    X, U = best.X.clone(), best.U.clone()
-    K, d, left = U.new_zeros(*U.shape, problem.n), torch.zeros_like(U), torch.zeros_like(best.cost)
-    for rows in torch.arange(problem.B, device=U.device).split(slots or max(1, problem.B)):
-        part = problem if rows.numel() == problem.B else problem.take(rows)
-        lagrangian = Lagrangian(part, take(best.multipliers, rows), None, phr)
-        K[rows], d[rows], left[rows] = optimality(lagrangian, X[rows], U[rows])
-        X[rows], U[rows] = reproducible(lagrangian.problem, X[rows], U[rows], K[rows])
-    limit = Status.TIME_LIMIT if call.late else Status.MAX_ITERATIONS
-    ended = torch.where(end.status == STOPPED, int(limit), end.status)
-    status = final_status(ended, left, best.violation, tolerance, bool(problem.constraints))
-    constant = call.problem.cost_scale.constant if scaled is not call else torch.zeros_like(unit)
-    return Solution(
-        X, U, K, d, best.multipliers.scaled(unit), call.problem.cost.total(X, U), best.violation, status,
-        end.iterations, end.outer, end.guided, None if recorder is None else recorder.frame(unit, constant),
-    )  # fmt: skip
 
 
 def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:

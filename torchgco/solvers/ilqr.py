@@ -17,10 +17,12 @@ from torchgco.native.dispatch import engine_of, open_loop, terms_of, value
 from torchgco.native.engine import Options
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
-from torchgco.solvers.ending import finished, start_status
+from torchgco.solvers.ending import start_status
 from torchgco.solvers.lifted import LOST, diverges, lifted_search, native_lifted_search
 from torchgco.solvers.line_search import LineSearch
 from torchgco.solvers.riccati import BackwardPass, backward
+from torchgco.solvers.rules import PRINTED, STANDARD, Rules
+from torchgco.solvers.session import Session
 from torchgco.solvers.state import STALLED, InnerState, Iterate, PassEnd, SolveEnd
 
 ROUNDING = 1e-14  # share of L_M: a smaller expected change is rounding error
@@ -63,24 +65,25 @@ class ILQR(Solver):
     def __post_init__(self) -> None:
         check_options(self, "ilqr")
 
-    def in_units(self, call: Call) -> tuple[Call, Tensor]:
-        """The call in the units of cost that the solver works in, and these units (B,)."""
-        return (call, torch.ones_like(call.problem.x0[:, 0])) if self.as_printed else call.in_cost_units()
+    @property
+    def rules(self) -> Rules:
+        """The form of the algorithm."""
+        return PRINTED if self.as_printed else STANDARD
 
     def run(self, call: Call) -> Solution:
         """One inner solve of a checked call."""
-        scaled, unit = self.in_units(call)
-        problem = scaled.problem
-        fixed = Multipliers.zero(problem, 0.0) if scaled.warm is None else scaled.warm
+        session = Session(call, self.rules)
+        problem, warm = session.call.problem, session.call.warm
+        fixed = Multipliers.zero(problem, 0.0) if warm is None else warm
         lagrangian = Lagrangian(problem, fixed, None, phr=False)
-        s, status = descend(self, lagrangian, scaled.U0, start_is_clear=problem.start_is_clear)
+        s, status = descend(self, lagrangian, session.call.U0, start_is_clear=problem.start_is_clear)
         end = Iterate(s.X, s.U, fixed, s.cost, violation(problem, s.X, s.U))
         # Multipliers are fixed: a trajectory that has converged and isn't feasible stays so.
         done = (status == Status.MAX_ITERATIONS) & (s.inner < self.max_iterations)
         status = torch.where(done, STALLED, status)
         none = torch.zeros_like(status)
         ended = SolveEnd(end, end, status, s.iterations, (s.iterations > 0).long(), none)
-        return finished(call, scaled, unit, ended, False, VIOLATION_TOLERANCE)
+        return session.finished(ended, VIOLATION_TOLERANCE)
 
     def iterate(self, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
         """One iteration of every running problem, in place, by PyTorch's kernels; `advance` prefers native ones."""
@@ -99,10 +102,9 @@ class ILQR(Solver):
         hard = refused | (moving & (alpha < self.damp_below))
         s.regularisation = torch.where(step.failed, used, self._damping(used, hard))
         stuck = refused & (s.regularisation == 0)
-        if self.as_printed:
-            flat = change < self.tolerance
-        else:
-            flat = (torch.maximum(change, expected) <= self.tolerance * s.merit.abs()) & (used <= DAMPING)
+        flat = self.rules.is_flat(change, expected, s.merit, self.tolerance)
+        if self.rules.damped:
+            flat = flat & (used <= DAMPING)
         converged = settled | (moving & ~refused & flat)
         ended = ~step.failed & (converged | stuck | (s.inner >= self.max_iterations))
         return PassEnd(ended, converged, stuck, status, alpha, used, step.failed)
@@ -120,21 +122,21 @@ class ILQR(Solver):
             step = BackwardPass(step.gains[:, rows], *(t[rows] for t in step[1:]))
             lagrangian = lagrangian.take(rows)
         found = self.line_search.search(
-            lagrangian, s.X[rows], s.U[rows], s.merit[rows], step, s.rung[rows], self.as_printed
+            lagrangian, s.X[rows], s.U[rows], s.merit[rows], step, s.rung[rows], self.rules.accept_last
         )
         won = rows[found.accepted]
         for name in ("X", "U", "cost", "merit"):
             values = getattr(s, name).clone()
             values[won] = getattr(found, name)[found.accepted]
             setattr(s, name, values)
-        s.rung = s.rung.index_copy(0, rows, self.line_search.next_rung(found, self.as_printed))
+        s.rung = s.rung.index_copy(0, rows, self.line_search.next_rung(found, self.rules.accept_last))
         alpha[rows] = found.alpha
         refused[rows] = ~found.accepted
         return old_merit, alpha, refused
 
     def _damping(self, now: Tensor, hard: Tensor) -> Tensor:
         """mu_r (B,) of the next iteration: 0 as printed; otherwise raised where the search was hard, else lowered."""
-        if self.as_printed:
+        if not self.rules.damped:
             return torch.zeros_like(now)
         up, down = (DAMPING_GROWTH * now).clamp(min=DAMPING), now / DAMPING_DECAY
         up = torch.where(up > REGULARISATION_MAX, 0.0, up)
@@ -146,7 +148,7 @@ class ILQR(Solver):
         Only in the first iteration of an inner solve: later iterates come from gains that kept the states bounded.
         """
         rows = (refused & (s.inner == 0)).nonzero().flatten()
-        if self.as_printed or rows.numel() == 0:
+        if not self.rules.damped or rows.numel() == 0:
             return refused
         part, X, U, merit = lagrangian.take(rows), s.X[rows], s.U[rows], s.merit[rows]
         lost = diverges(part, X, U, merit, step.gains[:, rows], self.line_search.smallest).nonzero().flatten()

@@ -89,7 +89,7 @@ class Polish:
             return self._refined(current(problem), solution)
 
     def _refined(self, problem: Problem, solution: Solution) -> Solution:
-        result = copied(replace(solution, trace=None))
+        result = copied(replace(solution, trace=None, search=None))
         near = (violation(problem, solution.X, solution.U) <= self.reach) & torch.isfinite(solution.cost)
         for b in (near & problem.start_is_clear).nonzero().flatten():
             rows = b.view(1)
@@ -98,7 +98,7 @@ class Polish:
             if after is not before:
                 put(result, rows, after)
             result.iterations[rows] = before.iterations + steps
-        return replace(result, trace=solution.trace)
+        return replace(result, trace=solution.trace, search=solution.search)
 
     def check(self, problem: Problem) -> None:
         """Raise InputError for a problem that isn't float64: its rounding exceeds any useful tolerance."""

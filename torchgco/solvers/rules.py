@@ -1,0 +1,46 @@
+"""The two forms of the algorithm: as the paper prints it, and as it runs by default. All that differs is here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchgco.solvers.contracts import Call
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What differs between the two forms.
+
+    Attributes:
+        in_cost_units: costs are in units of `Problem.cost_unit`, so that scaling all weights changes no iterate; else
+            in their own.
+        phr: the terms of an inequality are those of Powell, Hestenes and Rockafellar; else as printed (see
+            `lagrangian.penalty_weights`).
+        accept_last: the last step of a line search is accepted even if L_M rises; else it is refused.
+        damped: a failed line search raises mu_r (Levenberg-Marquardt); else it ends the inner solve.
+        ends: a solve ends where it has converged, and mu grows only while the violation is over its tolerance; else
+            only the outer limit ends it, and mu always grows.
+    """
+
+    in_cost_units: bool
+    phr: bool
+    accept_last: bool
+    damped: bool
+    ends: bool
+
+    def in_units(self, call: Call) -> tuple[Call, Tensor]:
+        """The call in the units of cost that the solver works in, and these units (B,)."""
+        return call.in_cost_units() if self.in_cost_units else (call, torch.ones_like(call.problem.x0[:, 0]))
+
+    def is_flat(self, change: Tensor, expected: Tensor, merit: Tensor, tolerance: float) -> Tensor:
+        """Whether L_M = merit (B,) changes too little to go on: as a share of it, or as printed in units of cost."""
+        if not self.in_cost_units:
+            return change < tolerance
+        return torch.maximum(change, expected) <= tolerance * merit.abs()
+
+
+PRINTED = Rules(in_cost_units=False, phr=False, accept_last=True, damped=False, ends=False)
+STANDARD = Rules(in_cost_units=True, phr=True, accept_last=False, damped=True, ends=True)

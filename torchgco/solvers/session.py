@@ -1,0 +1,57 @@
+"""One solve from the call to the solution: units of cost, the record, and the verdict."""
+
+from __future__ import annotations
+
+import torch
+
+from torchgco.base.status import Status
+from torchgco.base.tree import take
+from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.native.dispatch import reproducible
+from torchgco.solution import Solution
+from torchgco.solvers.contracts import Call
+from torchgco.solvers.ending import final_status, optimality
+from torchgco.solvers.history import Recorder
+from torchgco.solvers.rules import Rules
+from torchgco.solvers.state import STOPPED, SolveEnd
+
+
+class Session:
+    """One solve of a call.
+
+    Args:
+        given: the call in the user's units.
+        rules: of the solver; `call` is in their units of cost, `unit` (B,).
+        record: keep the history of every problem in `recorder`.
+    """
+
+    def __init__(self, given: Call, rules: Rules, record: bool = False) -> None:
+        self.given, self.rules = given, rules
+        self.call, self.unit = rules.in_units(given)
+        self.recorder = Recorder() if record else None
+
+    def finished(self, end: SolveEnd, tolerance: float, slots: int | None = None) -> Solution:
+        """The best trajectories with gains and statuses, in the user's units.
+
+        Args:
+            tolerance: violation up to which a trajectory is feasible.
+            slots: problems whose gains are computed together; None: all.
+        """
+        problem, best = self.call.problem, end.best
+        X, U = best.X.clone(), best.U.clone()
+        K, d, left = U.new_zeros(*U.shape, problem.n), torch.zeros_like(U), torch.zeros_like(best.cost)
+        for rows in torch.arange(problem.B, device=U.device).split(slots or max(1, problem.B)):
+            part = problem if rows.numel() == problem.B else problem.take(rows)
+            lagrangian = Lagrangian(part, take(best.multipliers, rows), None, self.rules.phr)
+            K[rows], d[rows], left[rows] = optimality(lagrangian, X[rows], U[rows])
+            X[rows], U[rows] = reproducible(lagrangian.problem, X[rows], U[rows], K[rows])
+        limit = Status.TIME_LIMIT if self.given.late else Status.MAX_ITERATIONS
+        ended = torch.where(end.status == STOPPED, int(limit), end.status)
+        status = final_status(ended, left, best.violation, tolerance, bool(problem.constraints))
+        scaled, user = self.call is not self.given, self.given.problem
+        constant = user.cost_scale.constant if scaled else torch.zeros_like(self.unit)
+        return Solution(
+            X, U, K, d, best.multipliers.scaled(self.unit), user.cost.total(X, U), best.violation, status,
+            end.iterations, end.outer, end.guided,
+            None if self.recorder is None else self.recorder.frame(self.unit, constant),
+        )  # fmt: skip
