@@ -1,16 +1,14 @@
-"""python docs/figures.py: the figures of docs/algorithm.md, from one solve of `gco` on a public layout.
+"""python docs/figures.py: the figures and tables of docs/algorithm.md.
 
-The solver runs unchanged; arguments and results of the functions named in WATCHED are recorded and drawn.
+The figures show the record of one solve of `gco` on a public layout; the tables list the passes of the preset.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
+import re
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import wraps
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,109 +19,89 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from torch import Tensor
 
-from torchgco import compose
+from torchgco import Problem, Solution, compose, presets
 from torchgco.plotting.style import INK, PALETTE, save, tidy
+from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, MARGIN, NEIGHBOURS, NODES, Roadmap, halton
+from torchgco.roadmap.scene import scene_of
+from torchgco.roadmap.search import Search
 from torchgco.scenarios import Layouts
+from torchgco.solution import Fate
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "algorithm.md"
 FAMILY, LAYOUT = "planar_trap", 0
 STONE, EDGE, PALE = "#CFC8BA", "#A39B8B", "#C8C8C8"
 SIZE, DPI = (4.6, 3.7), 110
 
-# All that these figures use of the package's internals: module:attributes of the function of each step.
-WATCHED = {
-    "caught": "torchgco.search.restarts:StopWhenCaught.update",  # (guidance, problem, X, ...) -> Advice
-    "graph": "torchgco.roadmap.native:NativeSearch.graph",  # -> Graph
-    "classes": "torchgco.roadmap.homotopy:_wind_alike",  # (paths, scene) -> which paths share a class
-    "tracked": "torchgco.search.paths:PathProposals.track",  # -> Candidates
-    "relaxed": "torchgco.search.paths:PathProposals.relax",  # -> Candidates, which of them are sound
-    "refined": "torchgco.search.candidates:Candidates.refined",  # (self, inner, sound, ...) -> Candidates, _, best, _
-}
-Calls = dict[str, list[tuple[tuple[Any, ...], Any]]]
 
-
-@contextmanager
-def watching() -> Iterator[Calls]:
-    """Arguments and results of the functions in WATCHED, call by call."""
-    calls: Calls = {name: [] for name in WATCHED}
-    originals = []
-    for name, place in WATCHED.items():
-        module, path = place.split(":")
-        holder: Any = importlib.import_module(module)
-        *holders, attribute = path.split(".")
-        for part in holders:
-            holder = getattr(holder, part)
-        originals.append((holder, attribute, getattr(holder, attribute)))
-        setattr(holder, attribute, _noting(originals[-1][2], calls[name]))
-    try:
-        yield calls
-    finally:
-        for holder, attribute, original in originals:
-            setattr(holder, attribute, original)
-
-
-def _noting(function: Any, notes: list[tuple[tuple[Any, ...], Any]]) -> Any:
-    @wraps(function)
-    def noting(*words: Any, **named: Any) -> Any:
-        result = function(*words, **named)
-        notes.append((words, result))
-        return result
-
-    return noting
-
-
-def solve(layout: int) -> tuple[Calls, Layouts, np.ndarray]:
-    """Solve one layout by `gco`: the recorded calls, the layout, and the positions (N+1, 2) of the result, m."""
+def solve(layout: int) -> tuple[Problem, Solution, Layouts]:
+    """Solve one layout by `gco`, which records its search."""
     data = ROOT / "benchmarks" / "data" / f"{FAMILY}.npz"
-    setup = compose(["scenario=layouts", f"scenario.path={data}", "model=planar", "device.threads=1"])
+    words = ["scenario=layouts", f"scenario.path={data}", "model=planar", "device.threads=1"]
+    setup = compose([*words, "solver.local.record=true"])
     layouts = setup.layouts().take([layout])
     task = setup.task(layouts)
-    with watching() as calls:
-        ids = torch.as_tensor(layouts.ids)
-        solution = setup.solver.solve(task.problem, task.U0, seed=setup.seed, ids=ids)
-    return calls, layouts, solution.X[0, :, :2].numpy()
+    solution = setup.solver.solve(task.problem, task.U0, seed=setup.seed, ids=torch.as_tensor(layouts.ids))
+    return task.problem, solution, layouts
 
 
-def draw(calls: Calls, layouts: Layouts, final: np.ndarray) -> dict[str, Figure]:
+def draw(problem: Problem, solution: Solution, layouts: Layouts) -> dict[str, Figure]:
     """A figure per step."""
-    figures = {}
-    caught = next(words[2] for words, advice in calls["caught"] if bool(advice.stop.any()))
-    (paths, _), alike = calls["classes"][0]
-    label = alike[0].to(torch.int8).argmax(-1).numpy()  # per path: the first path of its class
-    classes = list(dict.fromkeys(label.tolist()))
+    assert solution.search is not None and solution.search.caught is not None
+    figures, first = {}, solution.search.comparisons[0]
+    label = first.classes[0].tolist()
+    classes = list(dict.fromkeys(label))
     colour = {number: PALETTE[i % len(PALETTE)] for i, number in enumerate(classes)}
+    fate, cost = first.fate[0], first.cost[0]
 
     figures["1-caught"], ax = _scene(layouts, "1  The first inner solves end caught")
-    ax.plot(*_xy(caught[0]), color=PALETTE[1])
+    ax.plot(*_xy(solution.search.caught[1][0]), color=PALETTE[1])
 
-    figures["2-paths"], ax = _scene(layouts, f"2  Roadmap, {paths.shape[1]} paths, {len(classes)} homotopy classes")
-    _, graph = calls["graph"][0]
-    ax.add_collection(LineCollection(_edges(graph), colors=PALE, linewidths=0.3))
-    for path, number in reversed(list(zip(paths[0], label, strict=True))):
+    figures["2-paths"], ax = _scene(layouts, f"2  Roadmap, {len(label)} paths, {len(classes)} homotopy classes")
+    ax.add_collection(LineCollection(_edges(problem), colors=PALE, linewidths=0.3))
+    for path, number in reversed(list(zip(first.paths[0], label, strict=True))):
         ax.plot(*path.T.numpy(), color=colour[number], linewidth=1.6)
 
-    tracked = calls["tracked"][0][1]
-    live = tracked.live.nonzero().flatten().tolist()
+    live = (fate != Fate.ABSENT).nonzero().flatten().tolist()
     figures["3-tracked"], ax = _scene(layouts, f"3  {len(live)} candidates track the first path of each class")
     for row in live:
-        ax.plot(*_xy(tracked.X[row]), color=colour[label[row // (tracked.count // len(label))]], linewidth=0.6)
+        ax.plot(*_xy(first.tracked[0, row]), color=colour[label[int(first.path[0, row])]], linewidth=0.6)
 
-    relaxed, sound = calls["relaxed"][0][1]
-    figures["4-relaxed"], ax = _scene(layouts, f"4  Relaxed: {int(sound.sum())} are sound, darker is cheaper")
-    for row in (relaxed.live & ~sound).nonzero().flatten().tolist():
-        ax.plot(*_xy(relaxed.X[row]), color=PALE, linewidth=0.6)
-    _shaded(ax, relaxed, sound.nonzero().flatten().tolist(), 0.8)
+    sound = (fate >= Fate.RELAXED).nonzero().flatten().tolist()
+    figures["4-relaxed"], ax = _scene(layouts, f"4  Relaxed: {len(sound)} are sound, darker reached the next step")
+    for row in (fate == Fate.UNSOUND).nonzero().flatten().tolist():
+        ax.plot(*_xy(first.relaxed[0, row]), color=PALE, linewidth=0.6)
+    for row in sound:
+        kept = int(fate[row]) > Fate.RELAXED
+        ax.plot(*_xy(first.relaxed[0, row]), color=colormaps["viridis_r"](0.9 if kept else 0.3), linewidth=0.8)
 
-    (before, _, kept, _), (refined, _, best, _) = calls["refined"][0]
-    rows = [row for row in kept.nonzero().flatten().tolist() if not torch.equal(before.U[row], refined.U[row])]
-    figures["5-refined"], ax = _scene(layouts, f"5  Refined: {len(rows)} end feasible, darker is cheaper")
-    _shaded(ax, refined, rows, 1.2)
+    good = [row for row in cost.isfinite().nonzero().flatten().tolist() if row in sound]
+    figures["5-refined"], ax = _scene(layouts, f"5  Refined: {len(good)} end feasible, darker is cheaper")
+    for rank, row in enumerate(sorted(good, key=lambda row: -float(cost[row])), start=1):
+        ax.plot(*_xy(first.refined[0, row]), color=colormaps["viridis_r"](rank / len(good)), linewidth=1.2)
 
     figures["6-final"], ax = _scene(layouts, "6  Result, over the proposal")
-    ax.plot(*_xy(refined.X[int(best[0])]), color=PALE, linewidth=3)
-    ax.plot(*final.T, color=PALETTE[0])
+    proposal = int((fate == Fate.PROPOSED).nonzero().flatten()[0])
+    ax.plot(*_xy(first.refined[0, proposal]), color=PALE, linewidth=3)
+    ax.plot(*_xy(solution.X[0]), color=PALETTE[0])
     return figures
+
+
+def tables() -> str:
+    """The passes of `gco` in the plane and in space, as Markdown."""
+    parts = []
+    for name, dimension in (("In the plane", 2), ("In space", 3)):
+        table = presets.gco(dimension).table().reset_index()
+        lines = [table.columns.tolist(), ["---"] * len(table.columns), *table.values.tolist()]
+        parts += [f"{name}:", "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)]
+    return "\n\n".join(parts)
+
+
+def with_tables(text: str) -> str:
+    """The page with the tables between its marks."""
+    return re.sub(r"(?s)(<!-- passes -->\n).*(\n<!-- end -->)", lambda m: f"{m[1]}\n{tables()}\n{m[2]}", text)
 
 
 def _scene(layouts: Layouts, title: str) -> tuple[Figure, Axes]:
@@ -149,21 +127,18 @@ def _scene(layouts: Layouts, title: str) -> tuple[Figure, Axes]:
     return figure, ax
 
 
-def _shaded(ax: Axes, candidates: Any, rows: Sequence[int], width: float) -> None:
-    """Draw trajectories in shades by the rank of their cost, the cheapest last."""
-    problem = candidates.of(torch.tensor(rows))
-    X, U = candidates.X[list(rows)], candidates.U[list(rows)]
-    for rank, i in enumerate(problem.cost.total(X, U).argsort(descending=True).tolist()):
-        shade = colormaps["viridis_r"]((rank + 1) / len(rows))
-        ax.plot(*_xy(X[i]), color=shade, linewidth=width)
-
-
-def _xy(X: torch.Tensor) -> np.ndarray:
+def _xy(X: Tensor) -> np.ndarray:
     return X[:, :2].T.numpy()
 
 
-def _edges(graph: Any) -> list[np.ndarray]:
-    """Segments of the graph's edges."""
+def _edges(problem: Problem) -> list[np.ndarray]:
+    """Segments of the edges of the roadmap."""
+    scene = scene_of(problem.in_cost_units(), problem.at_rest[1])
+    roadmap: Roadmap = presets.gco(problem).passes[2].roadmaps[0]  # type: ignore[union-attr]
+    assert scene is not None
+    search = Search(scene.obstacles.reduced(roadmap.max_overlap), MARGIN)
+    cube = halton(roadmap.num_halton, 2).to(scene.start)
+    graph: Any = search.graph(scene.start, scene.goal, cube, NODES, NEIGHBOURS, HALTON_NEIGHBOURS)
     points, free = graph.points[0].numpy(), torch.isfinite(graph.lengths[0]).nonzero().tolist()
     return [points[[a, int(graph.ends[0, a, k])]] for a, k in free]
 
@@ -175,6 +150,7 @@ def main(words: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(words)
     for name, figure in draw(*solve(asked.layout)).items():
         save(figure, asked.output / f"{name}.png", DPI)
+    PAGE.write_text(with_tables(PAGE.read_text()))
     return 0
 
 

@@ -87,7 +87,7 @@ class Restarts(Solver):
         except Late:
             return
 
-    def _suited(self, problem: Problem) -> tuple[list[Pass | None], Guidance | None]:
+    def _suited(self, problem: Problem) -> tuple[Sequence[Pass | None], Guidance | None]:
         """The passes, None for those that can't serve these problems, and the guidance, None where it can't.
 
         A GuidanceWarning names what can't.

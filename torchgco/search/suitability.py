@@ -17,7 +17,7 @@ from torchgco.search.passes import Pass
 from torchgco.search.proposals import PathProposals
 
 
-def suited_paths(passes: Sequence[Pass], problem: Problem) -> tuple[list[Pass | None], str | None]:
+def suited_paths(passes: Sequence[Pass], problem: Problem) -> tuple[Sequence[Pass | None], str | None]:
     """The passes, with None for proposals along paths that can't serve; and a sentence on what is lost, or None.
 
     Obstacles that the roadmap doesn't know by design, such as moving ones, are no loss. Initial offsets for another

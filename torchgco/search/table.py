@@ -29,7 +29,7 @@ def rows_of(passes: Sequence[Pass]) -> list[dict[str, str]]:
 def _described(one: Pass) -> dict[str, str]:
     match one:
         case Solve():
-            unsolved = "not yet solved, or not arrived" if one.when == "unarrived" else PROBLEMS[one.when]
+            unsolved = "all, or those that have not arrived" if one.when == "unarrived" else PROBLEMS[one.when]
             after = (
                 "" if one.single_contact_after is None else f" (of one from outer iteration {one.single_contact_after})"
             )
