@@ -11,8 +11,10 @@ from torch import Tensor
 from tests.reference import models
 from tests.reference.problem import ReferenceProblem
 from torchgco import (
+    GCO,
     Boxes,
     ControlBounds,
+    PathProposals,
     Planar,
     Problem,
     QuadraticCost,
@@ -99,13 +101,21 @@ def boxed_batch(
 def quick_gco(problem: Problem) -> Restarts:
     """The default solver with few paths, offsets and samples: it solves in tenths of a second."""
     solver = presets.gco(problem)
-    assert solver.paths is not None and solver.sampling is not None
-    paths = replace(
-        solver.paths, num_paths=2, initial_offsets=solver.paths.initial_offsets[:2], refine_top=2,
-        relax_iterations=20, relax_top=None,
-    )  # fmt: skip
-    sampler = replace(solver.sampling.sampler, samples=48, rounds=4)
-    return replace(solver, paths=paths, sampling=replace(solver.sampling, sampler=sampler))
+    usual = next(one for one in solver.passes if isinstance(one, PathProposals))
+
+    def quick(one: PathProposals) -> PathProposals:
+        follow = tuple(replace(way, initial_offsets=way.initial_offsets[:2]) for way in one.follow)
+        top = 2 if one.refine == usual.refine else 4
+        return replace(
+            one, num_paths=2 if one.num_paths == usual.num_paths else 4, follow=follow, relax_iterations=20,
+            relax_top=None, refine=replace(one.refine, top=top),
+        )  # fmt: skip
+
+    guidance = solver.local.guidance
+    assert isinstance(guidance, GCO)
+    guidance = replace(guidance, sampler=replace(guidance.sampler, samples=48, rounds=4))
+    passes = tuple(quick(one) if isinstance(one, PathProposals) else one for one in solver.passes)
+    return replace(solver, local=replace(solver.local, guidance=guidance), passes=passes)
 
 
 def random_trajectory(problem: Problem, seed: int = 0, spread: float = 0.3) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.search.gates import CLOSED, PASSES, SHORT, SOLVER, Solve, gates
 from torchgco import AugmentedLagrangian, Solution
-from torchgco.search.paths import SEARCH
+from torchgco.search.candidates import LINE_SEARCH
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def solves(monkeypatch) -> Iterator[list[Solve]]:
 
     def noted(self, call, guidance=None, penalty=None, *rest, **options):
         end = iterate(self, call, guidance, penalty, *rest, **options)
-        if self.inner.line_search != SEARCH:
+        if self.inner.line_search != LINE_SEARCH:
             made.append(Solve(call, guidance, penalty, end))
         return end
 

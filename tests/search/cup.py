@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchgco import ControlBounds, PathProposals, Planar, Problem, QuadraticCost, Spheres
+from torchgco.search import Follow
 
-QUICK = PathProposals(depart=0.1, arrive=0.8, track_iterations=8, max_penetration=1.0)
+QUICK = PathProposals(follow=(Follow(depart=0.1, arrive=0.8, iterations=8),), max_penetration=1.0)
 GOAL = torch.tensor([1.0, 0.4], dtype=torch.float64)
 WEIGHTS = [5, 5, 1e-8, 1, 1, 1e-8]
 

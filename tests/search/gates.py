@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from tests.search.cup import controls
+from tests.search.rows import restarts
 from torchgco import (
     GCO,
     ILQR,
@@ -20,9 +21,9 @@ from torchgco import (
     PathProposals,
     Problem,
     QuadraticCost,
-    Restarts,
     Spheres,
 )
+from torchgco.search import Follow
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.state import SolveEnd
 
@@ -32,8 +33,8 @@ SAMPLER = MPPI(
     elite=5,
 )  # fmt: skip
 SAMPLING = GCO(SAMPLER, 2.0, start_from_sample=True, sample_from_rest=True, single_contact_after=3)
-PATHS = PathProposals(track_iterations=8, max_penetration=0.5)
-SOLVER = Restarts(LOCAL, PATHS, SAMPLING, attempts=2)
+PATHS = PathProposals(follow=(Follow(iterations=8),), max_penetration=0.5)
+SOLVER = restarts(LOCAL, PATHS, SAMPLING, attempts=2)
 FREE, PASSES, SHORT, CLOSED = range(4)
 
 

@@ -9,9 +9,10 @@ import torch
 
 from tests.problems import planar_batch
 from tests.search.gates import LOCAL, Solve
-from torchgco import GCO, ILQR, AugmentedLagrangian, LineSearch, Problem, QuadraticCost, Restarts, Solution
-from torchgco.search.best import Best
-from torchgco.search.restarts import SEED_STEP
+from tests.search.rows import restarts
+from torchgco import GCO, ILQR, AugmentedLagrangian, LineSearch, Problem, QuadraticCost, Solution
+from torchgco.search.attempts import Best
+from torchgco.search.passes import SEED_STEP
 from torchgco.solvers.contracts import Advice, Call
 from torchgco.solvers.state import SolveEnd
 
@@ -44,9 +45,9 @@ def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> S
     """The choice among given trajectories, all caught, none improved; `share` is the goal tolerance."""
     problem, U0, local = given(monkeypatch)
     monkeypatch.setattr("torchgco.lagrangian.quality.GOAL_TOLERANCE", share)
-    monkeypatch.setattr("torchgco.search.restarts.caught_knots", lambda problem, X, *_: torch.ones_like(X[..., 0]) > 0)
-    monkeypatch.setattr("torchgco.search.restarts.clear_chords", lambda *_: None)  # trajectories here do collide
-    return Restarts(local, None, Given(levels=levels), attempts=len(levels), **options).solve(problem, U0)
+    monkeypatch.setattr("torchgco.search.passes.caught_knots", lambda problem, X, *_: torch.ones_like(X[..., 0]) > 0)
+    last = ()  # no clearing of chords: trajectories here do collide
+    return restarts(local, None, Given(levels=levels), len(levels), last=last, **options).solve(problem, U0)
 
 
 @pytest.mark.parametrize(
@@ -55,9 +56,9 @@ def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> S
         ((ARRIVES, STAYS), 1e-9, {}, 2, STAYS),
         ((ARRIVES, STAYS), 0.5, {}, 1, ARRIVES),
         ((STAYS, ARRIVES), 0.5, {}, 2, ARRIVES),
-        ((STAYS, ARRIVES), 0.5, dict(all_attempts=True), 2, ARRIVES),
-        ((ARRIVES, STAYS), 0.5, dict(all_attempts=True), 2, ARRIVES),
-        ((ARRIVES, ARRIVES), 0.5, dict(all_attempts=True), 2, ARRIVES),
+        ((STAYS, ARRIVES), 0.5, dict(every=True), 2, ARRIVES),
+        ((ARRIVES, STAYS), 0.5, dict(every=True), 2, ARRIVES),
+        ((ARRIVES, ARRIVES), 0.5, dict(every=True), 2, ARRIVES),
     ],
 )
 def test_an_arrived_trajectory_is_preferred_to_a_cheaper_one(

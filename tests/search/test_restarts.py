@@ -1,4 +1,4 @@
-"""Restarts: a caught trajectory starts further attempts, the best is kept, and all are counted."""
+"""Restarts: where a trajectory is caught further passes follow, the best is kept, and all are counted."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from tests.search.gates import (
     Solve,
     gates,
 )
+from tests.search.rows import proposed, restarts, thorough
 from torchgco import (
     GCO,
     ILQR,
     AugmentedLagrangian,
-    InputError,
     PathProposals,
     Problem,
     Restarts,
@@ -37,7 +37,9 @@ from torchgco import (
 )
 from torchgco.guidance.region import GuideRegion
 from torchgco.lagrangian.quality import has_arrived
-from torchgco.search.restarts import SEED_STEP, StopWhenCaught
+from torchgco.search import Follow, FromSamples
+from torchgco.search.passes import SEED_STEP, StopWhenCaught
+from torchgco.search.proposals import Round
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.state import STOPPED
 
@@ -55,7 +57,7 @@ def rank(solve: Solve, place: int) -> tuple:
 
 def test_sampled_attempts_start_from_the_caught_trajectory_and_the_best_is_kept(solves: list[Solve]) -> None:
     problem, U0 = gates()
-    solution = Restarts(LOCAL, None, SAMPLING, attempts=3, all_attempts=True).solve(problem, U0, seed=5)
+    solution = restarts(LOCAL, None, SAMPLING, attempts=3, every=True).solve(problem, U0, seed=5)
     first, attempts = solves[0], solves[1:4]
     assert isinstance(first.guidance, StopWhenCaught) and torch.equal(first.call.U0, U0)
     assert (first.end.status == STOPPED).tolist() == [False, True, True, True]
@@ -70,24 +72,22 @@ def test_sampled_attempts_start_from_the_caught_trajectory_and_the_best_is_kept(
         assert torch.equal(solution.U[b], best[1]) and len({key for key, _ in found}) > 2
 
 
-@pytest.mark.parametrize("all_attempts", [False, True])
-def test_arriving_ends_the_attempts_unless_all_are_wanted(all_attempts: bool, solves: list[Solve]) -> None:
+@pytest.mark.parametrize("every", [False, True])
+def test_arriving_ends_the_attempts_unless_all_are_wanted(every: bool, solves: list[Solve]) -> None:
     problem, U0 = gates()
-    Restarts(LOCAL, None, SAMPLING, attempts=3, all_attempts=all_attempts).solve(problem, U0)
+    restarts(LOCAL, None, SAMPLING, attempts=3, every=every).solve(problem, U0)
     expected = [PASSES, SHORT, CLOSED]
     for attempt in solves[1:4]:
         assert attempt.rows == expected
-        expected = [
-            b for b, there in zip(expected, arrived(attempt).tolist(), strict=True) if all_attempts or not there
-        ]
-    assert (PASSES in expected) == all_attempts
+        expected = [b for b, there in zip(expected, arrived(attempt).tolist(), strict=True) if every or not there]
+    assert (PASSES in expected) == every
 
 
 def test_the_first_attempt_is_along_a_path_without_guidance(solves: list[Solve]) -> None:
     problem, U0 = gates()
     SOLVER.solve(problem, U0, seed=3)
     caught, along, attracted, sampled, again = solves
-    proposal = PATHS.propose(problem.in_cost_units())
+    proposal = proposed(PATHS, problem.in_cost_units())
     assert proposal.found.tolist() == [True, True, True, False]
     assert along.rows == [PASSES, SHORT] and along.guidance is along.penalty is None
     assert torch.equal(along.call.U0, proposal.U[1:3])
@@ -105,14 +105,14 @@ def test_where_the_first_path_fails_the_best_of_more_candidates_is_proposed(solv
     """The optimum of SHORT ends far from the goal for this weight; CLOSED has no path."""
     problem, U0 = gates(1.0)
     SOLVER.solve(problem, U0, seed=3)
-    caught, along, thorough, sampled, again = solves
-    assert (along.rows, thorough.rows, sampled.rows) == ([PASSES, SHORT], [SHORT], [CLOSED])
+    caught, along, better, sampled, again = solves
+    assert (along.rows, better.rows, sampled.rows) == ([PASSES, SHORT], [SHORT], [CLOSED])
     assert again.rows == [SHORT, CLOSED] and torch.equal(again.call.U0, caught.end.last.U[[SHORT, CLOSED]])
-    more = PATHS.thorough().propose(problem.in_cost_units().take(torch.tensor([SHORT, CLOSED])))
+    more = proposed(thorough(PATHS), problem.in_cost_units().take(torch.tensor([SHORT, CLOSED])))
     assert more.found.tolist() == [True, False]
-    assert torch.equal(thorough.call.U0, more.U[:1]) and thorough.guidance is thorough.penalty is None
+    assert torch.equal(better.call.U0, more.U[:1]) and better.guidance is better.penalty is None
     solves.clear()
-    replace(SOLVER, attempts=1).solve(problem, U0, seed=3)
+    restarts(LOCAL, PATHS, SAMPLING, attempts=1).solve(problem, U0, seed=3)
     assert [s.rows for s in solves[1:]] == [[PASSES, SHORT], [CLOSED]]
 
 
@@ -122,8 +122,8 @@ def test_without_a_path_and_without_samples_the_stopped_solve_continues(solves: 
     problem, U0 = problem.take(torch.tensor([PASSES])), U0[:1]
     caught = LOCAL.iterate(Call.checked(problem, U0).in_cost_units()[0], StopWhenCaught(None))
     shallow = replace(PATHS, max_penetration=1e-9)
-    proposal, more = shallow.propose(problem), shallow.thorough().propose(problem)
-    solution = Restarts(LOCAL, shallow, sampling=None).solve(problem, U0)
+    proposal, more = proposed(shallow, problem), proposed(thorough(shallow), problem)
+    solution = restarts(LOCAL, shallow).solve(problem, U0)
     assert caught.status.tolist() == [STOPPED] and not bool(proposal.found | more.found)
     assert int(solution.guided) == 0
     assert torch.equal(solves[-1].call.U0, caught.last.U)
@@ -140,7 +140,7 @@ def test_a_trajectory_that_ends_close_to_the_goal_is_finally_attracted_to_it(
     solution = SOLVER.solve(problem, U0)
     pulled = [s for s in solves if s.penalty is not None]
     assert len(pulled) == attracted
-    monkeypatch.setattr("torchgco.search.restarts.CLOSE", 0.0)
+    monkeypatch.setattr("torchgco.search.attempts.CLOSE", 0.0)
     plain = SOLVER.solve(problem, U0)
     away, optimal = ((s.X[:, -1, :2] - torch.tensor([10.0, 0.0])).norm(dim=-1) for s in (solution, plain))
     assert bool(away[SHORT] < 0.9 < optimal[SHORT]) == attracted
@@ -164,8 +164,8 @@ def test_a_problem_that_is_never_caught_has_the_bits_of_the_local_solve() -> Non
 
 
 def test_counts_are_those_of_all_attempts_and_candidates(solves: list[Solve], monkeypatch) -> None:
-    made, propose = [], PathProposals.propose
-    monkeypatch.setattr(PathProposals, "propose", lambda self, *given: made.append(propose(self, *given)) or made[-1])
+    made, result = [], Round.result
+    monkeypatch.setattr(Round, "result", lambda self: made.append(result(self)) or made[-1])
     problem, U0 = gates()
     solution = SOLVER.solve(problem, U0)
     expected = torch.zeros(3, 4, dtype=torch.int64)
@@ -183,15 +183,15 @@ def test_counts_are_those_of_all_attempts_and_candidates(solves: list[Solve], mo
 def test_restarts_lead_around_a_trap_that_catches_the_solver() -> None:
     problem = cup(B=1, N=120)
     local = AugmentedLagrangian(ILQR(tolerance=1e-2, max_iterations=20), max_outer_iterations=12)
-    solver = Restarts(local, PathProposals(depart=0.1, arrive=0.8), SAMPLING, attempts=1)
+    solver = restarts(local, PathProposals(follow=(Follow(depart=0.1, arrive=0.8),)), SAMPLING, attempts=1)
     stays, passes = (judge(problem, s.solve(problem, controls(problem)).U, GOAL, 0.3) for s in (local, solver))
     assert not bool(stays.reached) and bool(passes.sound)
 
 
 CHANGES = dict(
-    local=replace(LOCAL, initial_penalty=1.0), paths=None, sampling=replace(SAMPLING, initial_penalty=9.0), attempts=1,
-    all_attempts=True,
-)  # fmt: skip
+    local=replace(SOLVER.local, initial_penalty=1.0),
+    passes=SOLVER.passes[:2],
+)
 
 
 @pytest.mark.parametrize("name", CHANGES)
@@ -201,7 +201,7 @@ def test_every_option_is_read(name: str, whole: Solution) -> None:
 
 
 def test_no_option_is_forgotten_above() -> None:
-    assert {f.name for f in fields(Restarts)} == {*CHANGES, "finish"}  # for `finish` see test_finish
+    assert {f.name for f in fields(Restarts)} == set(CHANGES)  # for the fields of passes see test_passes
 
 
 def test_a_single_contact_counts_as_caught_from_the_given_iteration(solves: list[Solve]) -> None:
@@ -210,17 +210,20 @@ def test_a_single_contact_counts_as_caught_from_the_given_iteration(solves: list
     counts = []
     for after in (1, 2, None):
         solves.clear()
-        Restarts(LOCAL, None, replace(SAMPLING, single_contact_after=after), attempts=1).solve(problem, U0)
+        restarts(LOCAL, None, replace(SAMPLING, single_contact_after=after), attempts=1).solve(problem, U0)
         counts.append((int(solves[0].end.status) == STOPPED, int(solves[0].end.outer), len(solves)))
     assert counts[:2] == [(True, 1, 2), (True, 2, 2)] and counts[2][0] is False and counts[2][2] == 1
 
 
-def test_options_out_of_range_are_named() -> None:
-    with pytest.raises(InputError, match=r"^solver\.attempts"):
-        Restarts(attempts=0)
-    with pytest.raises(InputError, match=r"^solver\.local\.guidance: .*`sampling`") as caught:
-        Restarts(replace(LOCAL, guidance=SAMPLING), None, None)
-    assert len(str(caught.value).splitlines()) == 1
+@pytest.mark.parametrize("every", [False, True])
+def test_the_guidance_of_the_local_solver_serves_passes_from_samples_alone(every: bool, solves: list[Solve]) -> None:
+    restarts(LOCAL, PATHS, SAMPLING, attempts=3, every=every).solve(*gates())
+    guides = [type(s.guidance) for s in solves]
+    assert guides[0] is StopWhenCaught and guides.count(StopWhenCaught) == 1 and guides.count(GCO) == 3
+    other = replace(SAMPLING, initial_penalty=9.0)
+    no_samples = tuple(one for one in SOLVER.passes if not isinstance(one, FromSamples))
+    with_it, without = (Restarts(replace(LOCAL, guidance=g), no_samples).solve(*gates()) for g in (other, None))
+    assert_same_bits(with_it, without)
 
 
 def test_a_caught_problem_without_a_path_or_samples_is_solved_to_its_end() -> None:
@@ -235,7 +238,7 @@ def test_a_caught_problem_without_a_path_or_samples_is_solved_to_its_end() -> No
     scaled, _ = Call.checked(problem, U0).in_cost_units()
     stopped, reports = local.iterate(scaled, StopWhenCaught(None)), []
     assert bool((stopped.status == STOPPED).any())
-    end = Restarts(local, sampling=None).solve(problem, U0, callback=reports.append)
+    end = restarts(local, PathProposals()).solve(problem, U0, callback=reports.append)
     assert reports[-1].finished == problem.B
     caught = stopped.status == STOPPED
     assert bool((end.iterations[caught] > stopped.iterations[caught]).all())

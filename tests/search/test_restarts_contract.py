@@ -15,11 +15,14 @@ from tests.search.gates import (
     FREE,
     LOCAL,
     PASSES,
+    PATHS,
+    SAMPLING,
     SHORT,
     SOLVER,
     Solve,
     gates,
 )
+from tests.search.rows import restarts
 from torchgco import Problem, Restarts, Solution, Status
 from torchgco.search.candidates import Candidates
 from torchgco.solvers import contracts
@@ -32,9 +35,10 @@ def reports(solver: Restarts, problem: Problem, U0: Tensor, **options) -> list[P
     return seen
 
 
-@pytest.mark.parametrize("change", [{}, dict(paths=None), dict(all_attempts=True), dict(sampling=None)])
-def test_progress_never_decreases_and_ends_at_the_total(change: dict, solves: list[Solve]) -> None:
-    seen = reports(replace(SOLVER, **change), *gates())
+@pytest.mark.parametrize("options", [{}, dict(proposals=None), dict(every=True), dict(guidance=None)])
+def test_progress_never_decreases_and_ends_at_the_total(options: dict, solves: list[Solve]) -> None:
+    whole = dict(proposals=PATHS, guidance=SAMPLING, attempts=2)
+    seen = reports(restarts(LOCAL, **whole | options), *gates())
     finished = [now.finished for now in seen]
     assert finished == sorted(finished) and finished[-1] == 4 and {now.total for now in seen} == {4}
     first = next(now for now in seen if now.passes == 1)
@@ -99,17 +103,18 @@ def test_a_problem_that_cannot_start_is_not_attempted_and_disturbs_no_other(
 
 
 def test_the_trace_names_the_attempt() -> None:
-    """Counted from 1 per problem in any batch: the first solve, the attempts, the attraction to the goal."""
+    """It is the row of the table, counted from 1 in any batch."""
     problem, U0 = gates()
-    solver = replace(SOLVER, local=replace(LOCAL, record=True))
+    solver = replace(SOLVER, local=replace(SOLVER.local, record=True))
     solution = solver.solve(problem, U0, seed=3)
     attempts = solution.trace.groupby("element")["attempt"].unique()
     assert {b: list(attempts[b]) for b in range(4)} == {
-        FREE: [1],
-        PASSES: [1, 2],
-        SHORT: [1, 2, 3],
-        CLOSED: [1, 4, 5],
+        FREE: [2],
+        PASSES: [2, 5],
+        SHORT: [2, 5, 6],
+        CLOSED: [2, 10, 11],
     }
+    assert list(solver.table()["pass"][[2, 5, 6, 10, 11]]) == ["Solve", "FromProposal", "IntoGoal", *["FromSamples"] * 2]
     for b in (SHORT, CLOSED):
         index = torch.tensor([b])
         alone = solver.solve(problem.take(index), U0[index], seed=3, ids=index).trace.drop(columns="element")
