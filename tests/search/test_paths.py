@@ -12,16 +12,18 @@ import torch
 
 from tests.problems import quadrotor_batch
 from tests.search.cup import GOAL, QUICK, controls, cost, cup, cups
+from tests.search.rows import proposed, varied
 from torchgco import ControlBounds, InputError, PathProposals, Problem, Roadmap, judge
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.rollout import open_loop
 from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.homotopy import one_per_class
+from torchgco.search import Follow, Refine
 from torchgco.solvers.ilqr import descend
 
 
 def test_a_proposal_ends_near_the_goal_and_has_a_penalty() -> None:
-    U, found, multipliers, *_ = replace(QUICK, track_iterations=20, max_penetration=0.5).propose(cup())
+    U, found, multipliers, *_ = proposed(varied(QUICK, iterations=20, max_penetration=0.5), cup())
     assert bool(found.all()) and bool((multipliers.mu > 0).all()) and bool(torch.isfinite(U).all())
     assert float(judge(cup(), U, GOAL, 0.3).goal_distance.max()) < 0.3
 
@@ -30,7 +32,7 @@ def test_a_proposal_scales_with_the_unit_of_cost() -> None:
     """With 100 times the cost a problem has the same proposal, and 100 times the penalty."""
     problem = cup(B=1)
     cents = replace(problem, cost=cost(unit=100.0))
-    one, hundred = (replace(QUICK, track_iterations=1, relax_iterations=0).propose(p) for p in (problem, cents))
+    one, hundred = (proposed(varied(QUICK, iterations=1, relax_iterations=0), p) for p in (problem, cents))
     torch.testing.assert_close(hundred.multipliers.mu, 100 * one.multipliers.mu)
     torch.testing.assert_close(hundred.U, one.U, rtol=1e-6, atol=1e-6)
 
@@ -41,13 +43,13 @@ def test_a_proposal_scales_with_the_unit_of_cost() -> None:
     ids=["no path", "moving", "no obstacles"],
 )
 def test_where_there_is_no_path_nothing_is_proposed(problem: Problem) -> None:
-    U, found, multipliers, iterations, cost = QUICK.propose(problem)
+    U, found, multipliers, iterations, cost = proposed(QUICK, problem)
     assert not bool(found.any()) and U.shape == (2, 100, 2) and iterations.tolist() == [0, 0]
     assert bool(multipliers.mu.isnan().all()) and cost.tolist() == [math.inf] * 2
 
 
 def test_no_problems_have_no_proposals() -> None:
-    U, found, _, iterations, _ = QUICK.propose(cup().take(torch.arange(0)))
+    U, found, _, iterations, _ = proposed(QUICK, cup().take(torch.arange(0)))
     assert U.shape == (0, 100, 2) and found.shape == iterations.shape == (0,)
 
 
@@ -60,13 +62,13 @@ def only(k: int) -> Iterator[None]:
         return first & (first.cumsum(-1) == k + 1)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("torchgco.search.paths.one_per_class", one)
+        patch.setattr("torchgco.search.proposals.one_per_class", one)
         yield
 
 
 def alone(options: PathProposals, problem: Problem, k: int):
     with only(k):
-        return options.propose(problem)
+        return proposed(options, problem)
 
 
 def test_the_cheapest_relaxed_candidate_is_proposed() -> None:
@@ -74,7 +76,7 @@ def test_the_cheapest_relaxed_candidate_is_proposed() -> None:
     problem, many = cup(B=1), replace(QUICK, num_paths=3)
     left, right, neither = (alone(many, problem, k) for k in range(3))
     assert [bool(p.found) for p in (left, right, neither)] == [True, True, False]
-    both, merits = many.propose(problem), []
+    both, merits = proposed(many, problem), []
     for proposal in (left, right, both):
         X = open_loop(problem.dynamics, problem.x0, proposal.U)
         assert float((X[0, -1, :2] - GOAL).norm()) < 0.5
@@ -83,21 +85,21 @@ def test_the_cheapest_relaxed_candidate_is_proposed() -> None:
 
 
 def test_chunks_change_no_result(monkeypatch) -> None:
-    problem, two = cups(N=40), replace(QUICK, num_paths=2, track_iterations=2, relax_iterations=1)
-    whole = two.propose(problem)
-    for size in ("paths.MOST", "candidates.AT_ONCE"):
+    problem, two = cups(N=40), varied(QUICK, num_paths=2, iterations=2, relax_iterations=1)
+    whole = proposed(two, problem)
+    for size in ("proposals.AT_ONCE", "candidates.AT_ONCE"):
         monkeypatch.setattr(f"torchgco.search.{size}", 4)
-    parts = two.propose(problem)
+    parts = proposed(two, problem)
     assert torch.equal(whole.U, parts.U) and torch.equal(whole.found, parts.found)
     assert torch.equal(whole.multipliers.mu, parts.multipliers.mu) and torch.equal(whole.iterations, parts.iterations)
 
 
 def test_a_proposal_is_the_same_in_every_batch() -> None:
-    problem, two = cups(), replace(QUICK, num_paths=2, refine_top=2)
-    whole = two.propose(problem)
+    problem, two = cups(), varied(QUICK, num_paths=2, top=2)
+    whole = proposed(two, problem)
     assert bool(whole.found.all())
     for rows in ([1], [2, 0], [2, 1, 0]):
-        part, index = two.propose(problem.take(torch.tensor(rows))), torch.tensor(rows)
+        part, index = proposed(two, problem.take(torch.tensor(rows))), torch.tensor(rows)
         assert torch.equal(part.U, whole.U[index]) and torch.equal(part.iterations, whole.iterations[index])
         for lam, expected in zip(part.multipliers.lam, whole.multipliers.lam, strict=True):
             assert torch.equal(lam, expected[index])
@@ -117,13 +119,13 @@ def test_the_iterations_of_every_candidate_are_counted(monkeypatch) -> None:
 
     for place in ("torchgco.search.candidates.descend", "torchgco.search.candidates.AugmentedLagrangian.solve"):
         monkeypatch.setattr(place, noted(resolve_name(place)))
-    options = replace(QUICK, num_paths=3, initial_offsets=((0.7, -0.7),), relax_top=3, relax_iterations=4, refine_top=2)
+    options = varied(QUICK, num_paths=3, initial_offsets=((0.7, -0.7),), relax_top=3, relax_iterations=4, top=2)
     problem = cups()
-    together = options.propose(problem)
+    together = proposed(options, problem)
     assert len(made) == 4 and int(together.iterations.sum()) == sum(made) and bool(together.found.any())
     for b in range(3):
         made.clear()
-        single = options.propose(problem.take(torch.tensor([b])))
+        single = proposed(options, problem.take(torch.tensor([b])))
         assert int(single.iterations) == int(together.iterations[b]) == sum(made) > 0
 
 
@@ -134,20 +136,20 @@ def test_paths_of_one_class_are_tracked_once(monkeypatch) -> None:
         "torchgco.search.candidates.descend",
         lambda inner, lagrangian, U: counts.append(lagrangian.problem.B) or descend(inner, lagrangian, U),
     )
-    five = replace(QUICK, num_paths=5, stiffness=(20.0,), track_iterations=1, relax_iterations=1)
+    five = varied(QUICK, num_paths=5, stiffness=(20.0,), iterations=1, relax_iterations=1)
     for offsets, arrive, rows in (
         ((), 0.8, 2),
         (((0.7, -0.7), (-0.7, 0.7)), 0.8, 6),
         (((0.7, -0.7),), (0.8, 0.6, 0.7), 12),
     ):
         counts.clear()
-        replace(five, initial_offsets=offsets, arrive=arrive).propose(cup(B=1, N=60))
+        proposed(varied(five, initial_offsets=offsets, arrive=arrive), cup(B=1, N=60))
         assert counts[:2] == [rows, rows]
 
 
 def test_an_offset_turns_the_vehicle_before_it_departs() -> None:
     """Offsets are shares of the distance from rest to the bound on their side, or of 1 where there is none."""
-    problem, starts_of = cup(B=3, N=40), replace(QUICK, initial_offsets=((0.75, -0.5), (0.0, 0.25))).starts
+    problem, starts_of = cup(B=3, N=40), Follow(initial_offsets=((0.75, -0.5), (0.0, 0.25))).starts
     limits = ControlBounds([[-10.0, -4.0], [-10.0, -4.0], [-10.0, -torch.inf]], [10.0, 10.0])
     problem = Problem(problem.dynamics, problem.cost, [problem.constraints[0], limits], problem.x0, problem.N)
     starts = starts_of(problem, controls(problem))
@@ -158,79 +160,113 @@ def test_an_offset_turns_the_vehicle_before_it_departs() -> None:
     assert off_centre[0, 1, 3].tolist() == [8.0, -1.0]
     free = Problem(problem.dynamics, problem.cost, [problem.constraints[0]], problem.x0, problem.N)
     assert starts_of(free, controls(free))[0, 1, 3].tolist() == [0.75, -0.5]
-    with pytest.raises(InputError, match=r"paths\.initial_offsets: expected shape \(1, 2\)"):
-        replace(QUICK, initial_offsets=((1.0,),)).propose(cup())
+    with pytest.raises(InputError, match=r"follow\.initial_offsets: expected shape \(1, 2\)"):
+        proposed(varied(QUICK, initial_offsets=((1.0,),)), cup())
 
 
-# Another value for every option.
-CHANGES = dict(
-    roadmap=Roadmap(num_halton=8), num_paths=1, initial_offsets=((0.7, -0.7),), depart=0.2, arrive=(0.7,),
-    smoothing=0.2, tube=None, stiffness=(50.0,), track_iterations=2, relax_iterations=2, relax_top=1, refine_top=2,
-    max_penetration=1e-3, pace=0.5, max_gap=1e-3,
-)  # fmt: skip
-CONSTANTS = {
-    "paths.TOLERANCE": 0.5, "paths.TRACK_PENALTY": 50.0, "paths.PENALTY": 5.0,
-    "paths.OFFSET_LASTS": 0.3,
-}  # fmt: skip
 BASE = PathProposals(
-    num_paths=2, depart=0.1, arrive=0.8, track_iterations=3, initial_offsets=((-0.7, 0.7),), max_penetration=1.0
-)
+    num_paths=2, follow=(Follow(depart=0.1, arrive=0.8, iterations=8, initial_offsets=((-0.7, 0.7),)),),
+    max_penetration=1.0, refine=Refine(top=2, rounds=3, violation=0.1),
+)  # fmt: skip
+# Another value for every field; for `when` and `max_gap`, which say where rows apply, see test_passes.
+PASS = dict(
+    roadmaps=(Roadmap(num_halton=8),), num_paths=1, follow=(Follow(),), relax_iterations=2, relax_top=1,
+    refine=Refine(), max_penetration=1e-3,
+)  # fmt: skip
+FOLLOW = dict(
+    initial_offsets=((0.7, -0.7),), depart=0.2, arrive=(0.7,), smoothing=0.2, tube=None, stiffness=(50.0,),
+    iterations=2, pace=0.5,
+)  # fmt: skip
+REFINE = dict(top=1, rounds=1, violation=1e-9, cut=1e-9, needed=True)
+CONSTANTS = {
+    "candidates.TOLERANCE": 0.5, "following.TRACK_PENALTY": 50.0, "proposals.PENALTY": 5.0,
+    "following.OFFSET_LASTS": 0.3,
+}  # fmt: skip
 
 
-def outcome(options: PathProposals) -> tuple:
-    proposal = options.propose(cup(B=1))
-    return proposal.U.tolist(), proposal.found.tolist(), proposal.multipliers.mu.tolist(), int(proposal.iterations)
+def outcome(options: PathProposals) -> list[tuple]:
+    """In 100 steps no refined candidate counts, in 120 one does."""
+    found = [proposed(options, cup(B=1, N=N)) for N in (100, 120)]
+    return [(p.U.tolist(), p.found.tolist(), p.multipliers.mu.tolist(), int(p.iterations)) for p in found]
 
 
 @pytest.fixture(scope="module")
-def usual() -> tuple:
+def usual() -> list[tuple]:
     return outcome(BASE)
 
 
-@pytest.mark.parametrize("name", CHANGES)
-def test_every_option_is_read(name: str, usual: tuple) -> None:
-    assert outcome(replace(BASE, **{name: CHANGES[name]})) != usual
+@pytest.mark.parametrize("name", PASS)
+def test_every_option_is_read(name: str, usual: list[tuple]) -> None:
+    assert outcome(replace(BASE, **{name: PASS[name]})) != usual
+
+
+@pytest.mark.parametrize("name", FOLLOW)
+def test_every_option_of_following_is_read(name: str, usual: list[tuple]) -> None:
+    assert outcome(varied(BASE, **{name: FOLLOW[name]})) != usual
+
+
+@pytest.mark.parametrize("name", REFINE)
+def test_every_option_of_refining_is_read(name: str, usual: list[tuple]) -> None:
+    assert outcome(replace(BASE, refine=replace(BASE.refine, **{name: REFINE[name]}))) != usual
 
 
 def test_no_option_is_forgotten_above() -> None:
-    assert {f.name for f in fields(PathProposals)} == set(CHANGES)
+    assert {f.name for f in fields(PathProposals)} == {*PASS, "when", "max_gap"}
+    assert {f.name for f in fields(Follow)} == set(FOLLOW)
+    assert {f.name for f in fields(Refine)} == set(REFINE)
 
 
 @pytest.mark.parametrize("name", CONSTANTS)
-def test_every_constant_is_read(name: str, usual: tuple, monkeypatch) -> None:
+def test_every_constant_is_read(name: str, usual: list[tuple], monkeypatch) -> None:
     monkeypatch.setattr(f"torchgco.search.{name}", CONSTANTS[name])
     assert outcome(BASE) != usual
 
 
 def test_a_quadrotor_is_guided_too() -> None:
     problem, _ = quadrotor_batch(B=2, N=60)
-    U = PathProposals(smoothing=0.16).propose(problem).U
+    U = proposed(PathProposals(follow=(Follow(smoothing=0.16),)), problem).U
     verdict = judge(problem, U, problem.cost.goal(problem.x0)[:, :3], 2.0)
     assert float(verdict.goal_distance.max()) < 2.0
 
 
 def test_lists_of_a_configuration_equal_tuples() -> None:
-    lists = PathProposals(arrive=[0.8, 0.6], stiffness=[20.0], initial_offsets=[[0.7, -0.7]])
-    assert lists == PathProposals(arrive=(0.8, 0.6), stiffness=(20.0,), initial_offsets=((0.7, -0.7),))
-    assert hash(lists) == hash(replace(lists)) and lists.paces == (0.8, 0.6) and QUICK.paces == (0.8,)
+    lists = Follow(arrive=[0.8, 0.6], stiffness=[20.0], initial_offsets=[[0.7, -0.7]])
+    assert lists == Follow(arrive=(0.8, 0.6), stiffness=(20.0,), initial_offsets=((0.7, -0.7),))
+    assert hash(lists) == hash(replace(lists)) and lists.paces == (0.8, 0.6) and QUICK.follow[0].paces == (0.8,)
+    rows = PathProposals(roadmaps=[Roadmap()], follow=[lists])
+    assert rows == PathProposals(roadmaps=(Roadmap(),), follow=(lists,)) and hash(rows) == hash(replace(rows))
 
 
 @pytest.mark.parametrize(
-    ("change", "field"),
+    ("make", "change", "field"),
     [
-        (dict(roadmap={"num_halton": 64}), "paths.roadmap"),
-        (dict(depart=0.9), "paths.depart"), (dict(depart=-0.1), "paths.depart"), (dict(arrive=1.1), "paths.depart"),
-        (dict(arrive=(0.5, 1.1)), "paths.depart"), (dict(arrive=()), "paths.depart"),
-        (dict(smoothing=1.0), "paths.smoothing"), (dict(smoothing=-0.1), "paths.smoothing"),
-        (dict(tube=0.0), "paths.tube"), (dict(max_penetration=0.0), "paths.max_penetration"),
-        (dict(max_gap=0.0), "paths.max_gap"), (dict(pace=0.0), "paths.pace"), (dict(stiffness=()), "paths.stiffness"),
-        (dict(stiffness=(0.0,)), "paths.stiffness"),
-        (dict(num_paths=0), "paths.num_paths"), (dict(track_iterations=0), "paths.track_iterations"),
-        (dict(relax_iterations=-1), "paths.relax_iterations"), (dict(relax_top=0), "paths.relax_top"),
-        (dict(refine_top=0), "paths.refine_top"), (dict(initial_offsets=7), "paths.initial_offsets"),
-        (dict(initial_offsets=[["left", "right"]]), "paths.initial_offsets"), (dict(arrive="late"), "paths.arrive"),
+        (PathProposals, dict(when="late"), "proposals.when"),
+        (PathProposals, dict(roadmaps={"num_halton": 64}), "proposals.roadmaps"),
+        (PathProposals, dict(roadmaps=({"num_halton": 64},)), "proposals.roadmaps"),
+        (PathProposals, dict(roadmaps=()), "proposals.roadmaps"),
+        (PathProposals, dict(roadmaps=(), when="far"), "proposals.roadmaps"),
+        (PathProposals, dict(follow=()), "proposals.follow"), (PathProposals, dict(follow=(0.9,)), "proposals.follow"),
+        (PathProposals, dict(max_penetration=0.0), "proposals.max_penetration"),
+        (PathProposals, dict(max_gap=0.0), "proposals.max_gap"),
+        (PathProposals, dict(num_paths=0), "proposals.num_paths"),
+        (PathProposals, dict(relax_iterations=-1), "proposals.relax_iterations"),
+        (PathProposals, dict(relax_top=0), "proposals.relax_top"),
+        (PathProposals, dict(refine=8), "proposals.refine"),
+        (Follow, dict(depart=0.9), "follow.depart"), (Follow, dict(depart=-0.1), "follow.depart"),
+        (Follow, dict(arrive=1.1), "follow.depart"), (Follow, dict(arrive=(0.5, 1.1)), "follow.depart"),
+        (Follow, dict(arrive=()), "follow.depart"), (Follow, dict(arrive="late"), "follow.arrive"),
+        (Follow, dict(smoothing=1.0), "follow.smoothing"), (Follow, dict(smoothing=-0.1), "follow.smoothing"),
+        (Follow, dict(tube=0.0), "follow.tube"), (Follow, dict(pace=0.0), "follow.pace"),
+        (Follow, dict(stiffness=()), "follow.stiffness"), (Follow, dict(stiffness=(0.0,)), "follow.stiffness"),
+        (Follow, dict(iterations=0), "follow.iterations"),
+        (Follow, dict(initial_offsets=7), "follow.initial_offsets"),
+        (Follow, dict(initial_offsets=[["left", "right"]]), "follow.initial_offsets"),
+        (Refine, dict(top=0), "refine.top"), (Refine, dict(rounds=0), "refine.rounds"),
+        (Refine, dict(violation=0.0), "refine.violation"), (Refine, dict(cut=0.0), "refine.cut"),
+        (Refine, dict(needed="no"), "refine.needed"),
     ],
 )  # fmt: skip
-def test_options_out_of_range_are_named(change: dict, field: str) -> None:
-    with pytest.raises(InputError, match=field.replace(".", r"\.")):
-        PathProposals(**change)
+def test_options_out_of_range_are_named(make: type, change: dict, field: str) -> None:
+    with pytest.raises(InputError, match=field.replace(".", r"\.")) as caught:
+        make(**change)
+    assert len(str(caught.value).splitlines()) == 1

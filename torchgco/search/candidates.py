@@ -54,9 +54,9 @@ class Refine:
         check_options(self, "refine")
 
 
-def inner_solver(iterations: int, tolerance: float = TOLERANCE) -> ILQR:
-    """The inner solver of candidates."""
-    return ILQR(tolerance=tolerance, max_iterations=iterations, line_search=LINE_SEARCH)
+def inner_solver(iterations: int, share: float = 1.0) -> ILQR:
+    """The inner solver of candidates, with a share of their tolerance."""
+    return ILQR(tolerance=share * TOLERANCE, max_iterations=iterations, line_search=LINE_SEARCH)
 
 
 def unwatched(done: int, total: int) -> None:
@@ -158,7 +158,7 @@ class Candidates:
         multipliers, rows = self.multipliers(everyone, PENALTY), sound.nonzero().flatten()
         if refine.top == 1 or rows.numel() == 0:
             return Refined(self, multipliers, everyone[:: self.count], torch.full_like(self.unit, torch.inf))
-        part, inner = self.of(rows), inner_solver(iterations, 0.1 * TOLERANCE)
+        part, inner = self.of(rows), inner_solver(iterations, 0.1)
         solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=refine.rounds)
         end = solver.solve(
             part, self.U[rows], warm=take(multipliers, rows),

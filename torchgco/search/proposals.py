@@ -124,7 +124,7 @@ class PathProposals:
 
     def _rows(self, part: Part) -> Tensor:
         """The problems (b,) of `part` that this pass looks at."""
-        if part.scene is None:
+        if part.scene is None or part.problem.B == 0:
             return part.proposal.found.new_empty(0, dtype=torch.int64)
         if self.when == "unproposed":
             assert part.paths is not None
