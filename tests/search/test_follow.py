@@ -8,14 +8,15 @@ import torch
 
 from tests.reference import boxes as brute_force
 from tests.search.cup import GOAL, QUICK, controls, cost, cup
+from tests.search.rows import proposed, restarts, varied
 from tests.search.scenes import NONE, inflated
 from tests.search.test_paths import alone
-from torchgco import AugmentedLagrangian, PathProposals, Problem, Restarts, compose, judge
+from torchgco import AugmentedLagrangian, PathProposals, Problem, compose, judge
 from torchgco.lagrangian.rollout import open_loop
 from torchgco.roadmap.scene import scene_of
-from torchgco.search.candidates import TO_THE_END, Candidates
-from torchgco.search.tracking import CUT, followed, travel
-from torchgco.search.ways import Ways
+from torchgco.search.candidates import Candidates
+from torchgco.search.following import CUT, Paths, followed, travel
+from torchgco.search.proposals import propose
 from torchgco.solvers.ilqr import ILQR
 
 END = torch.tensor([0.7], dtype=torch.float64)
@@ -36,14 +37,14 @@ def test_the_vehicle_rests_first_and_last() -> None:
 def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
     problem, off = cup(B=1, N=120), []
     for tube, stiffness in ((0.05, 20.0), (None, 500.0)):
-        options = replace(QUICK, tube=tube, stiffness=(stiffness,), track_iterations=4)
+        follow = replace(QUICK.follow[0], tube=tube, stiffness=(stiffness,), iterations=4)
         path = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64)
-        candidates = options.track(make_candidates(problem, controls(problem)[:, None]), ways(path[:, None]))
+        at_rest = make_candidates(problem, controls(problem)[:, None])
+        candidates = follow.track(at_rest, known(problem, path[:, None]), None)
         X = open_loop(problem.dynamics, problem.x0, candidates.U)
         torch.testing.assert_close(candidates.X, X)
-        off.append(
-            float((X[..., :2] - travel(path, options.depart, END + 0.1, options.smoothing, 120)).norm(dim=-1).mean())
-        )
+        center = travel(path, follow.depart, END + 0.1, follow.smoothing, 120)
+        off.append(float((X[..., :2] - center).norm(dim=-1).mean()))
     assert off[1] < 0.5 * off[0]
 
 
@@ -53,27 +54,28 @@ def make_candidates(problem: Problem, U: torch.Tensor) -> Candidates:
     return Candidates.begin(problem, U, R, unit, torch.ones(1, U.shape[1], dtype=torch.bool))
 
 
-def ways(paths: torch.Tensor) -> Ways:
+def known(problem: Problem, paths: torch.Tensor) -> Paths:
     """Paths (1, K, P, 2) that are all followed, in the units of `make_candidates`, without obstacles to cut."""
     R, unit = torch.full((1,), 0.2, dtype=torch.float64), torch.full((1,), 1e4, dtype=torch.float64)
     none = inflated([[[0.0, 0.0]]], [[NONE]])
-    return Ways(paths, torch.ones(paths.shape[:2], dtype=torch.bool), R, unit, none)
+    every = torch.arange(paths.shape[1]).expand(paths.shape[:2])
+    return Paths(paths, every, torch.ones(paths.shape[:2], dtype=torch.bool), R, unit, none)
 
 
 def test_every_candidate_tracks_its_own_path_at_its_own_pace() -> None:
     """Two paths, each from two starts at two paces: eight candidates; paces vary fastest."""
     problem = cup(B=1, N=120)
-    options = replace(QUICK, arrive=(0.9, 0.5), tube=None, stiffness=(1e4,), track_iterations=20)
+    follow = replace(QUICK.follow[0], arrive=(0.9, 0.5), tube=None, stiffness=(1e4,), iterations=20)
     ends = (-1.0, 0.0), (1.0, 0.4)
     paths = torch.tensor([[[ends[0], (0.0, y), ends[1]] for y in (-0.9, 1.2)]], dtype=torch.float64)
     starts = controls(problem)[:, None].repeat(1, 8, 1, 1)
-    found = options.track(make_candidates(problem, starts), ways(paths))
+    found = follow.track(make_candidates(problem, starts), known(problem, paths), None)
     for i, X in enumerate(found.X):
         apart = []
         for path in paths[0]:
-            for pace in options.paces:
+            for pace in follow.paces:
                 arrive = torch.full_like(END, pace)
-                center = travel(path[None], options.depart, arrive, options.smoothing, 120)[0]
+                center = travel(path[None], follow.depart, arrive, follow.smoothing, 120)[0]
                 apart.append(float((X[:, :2] - center).norm(dim=-1).mean()))
         assert apart.index(min(apart)) == i // 4 * 2 + i % 2
 
@@ -86,32 +88,32 @@ def test_candidates_that_are_not_among_the_first_are_not_relaxed(monkeypatch) ->
         return relax(self, candidates)
 
     monkeypatch.setattr(PathProposals, "relax", noted)
-    monkeypatch.setattr(PathProposals, "_closer", lambda self, *more: None)
     problem = cup(B=2, N=60)
-    three = replace(QUICK, num_paths=3, track_iterations=2, relax_iterations=1, max_penetration=9.0)
-    proposals = [replace(three, relax_top=top).propose(problem) for top in (None, 9, 2)]
+    three = varied(QUICK, num_paths=3, iterations=2, relax_iterations=1, max_penetration=9.0)
+    proposals = [propose([replace(three, relax_top=top)], problem) for top in (None, 9, 2)]
     assert relaxed == [6, 6, 4] and torch.equal(proposals[0].U, proposals[1].U)
-    tracked = [replace(three, relax_top=top, relax_iterations=0).propose(problem).U for top in (None, 1)]
+    tracked = [propose([replace(three, relax_top=top, relax_iterations=0)], problem).U for top in (None, 1)]
     assert torch.equal(*tracked)
 
 
 def test_a_candidate_that_falls_back_into_the_trap_is_not_relaxed() -> None:
     """With such expensive controls, waiting is cheaper: the candidate stays as it was tracked."""
     problem = replace(cup(B=1), cost=cost(controls=20.0))
-    tracked, relaxed = (PathProposals(depart=0.1, arrive=0.8, relax_iterations=n).propose(problem).U for n in (0, 20))
+    long = varied(QUICK, iterations=20, max_penetration=0.1)
+    tracked, relaxed = (proposed(replace(long, relax_iterations=n), problem).U for n in (0, 20))
     assert torch.equal(tracked, relaxed)
     assert float(judge(problem, relaxed, GOAL, 0.3).goal_distance) < 0.3
 
 
 def test_a_relaxed_candidate_is_cheaper() -> None:
     problem = cup(N=120)
-    costs = [judge(problem, replace(QUICK, relax_iterations=n).propose(problem).U, GOAL, 0.3).cost for n in (0, 3)]
+    costs = [judge(problem, proposed(replace(QUICK, relax_iterations=n), problem).U, GOAL, 0.3).cost for n in (0, 3)]
     assert bool((costs[0] > costs[1]).all())
 
 
 def test_a_candidate_deep_within_an_obstacle_is_rejected() -> None:
     problem = cup(B=1)
-    proposals = [replace(QUICK, max_penetration=depth).propose(problem) for depth in (1e-4, 1.0)]
+    proposals = [proposed(replace(QUICK, max_penetration=depth), problem) for depth in (1e-4, 1.0)]
     assert [bool(p.found) for p in proposals] == [False, True]
     assert not bool(proposals[0].multipliers.mu.isnan().any()) and int(proposals[0].iterations) > 0
     X = open_loop(problem.dynamics, problem.x0, proposals[1].U)
@@ -119,30 +121,29 @@ def test_a_candidate_deep_within_an_obstacle_is_rejected() -> None:
 
 
 def test_the_cheapest_refined_candidate_is_proposed_and_saves_the_solver_work() -> None:
-    problem, four = cup(B=2, N=120), replace(QUICK, num_paths=4, track_iterations=20)
-    relaxed, refined = (replace(four, refine_top=n).propose(problem) for n in (1, 3))
+    problem, four = cup(B=2, N=120), varied(QUICK, num_paths=4, iterations=20)
+    relaxed, refined = (proposed(varied(four, top=n), problem) for n in (1, 3))
     verdicts = [judge(problem, proposal.U, GOAL, 0.3) for proposal in (relaxed, refined)]
     assert not bool(verdicts[0].sound.any()) and bool(verdicts[1].sound.all())
     for k in range(2):  # with paths on one side only
-        other = judge(problem, alone(replace(four, refine_top=3), problem, k).U, GOAL, 0.3)
+        other = judge(problem, alone(varied(four, top=3), problem, k).U, GOAL, 0.3)
         assert bool(other.sound.all()) and bool((verdicts[1].cost <= other.cost).all())
     assert not any(bool(lam.any()) for lam in relaxed.multipliers.lam) and bool(refined.multipliers.lam[0].any())
     local = AugmentedLagrangian(ILQR(tolerance=1e-2, max_iterations=20), max_outer_iterations=20)
     counts = []
     for top in (1, 3):
-        solver = Restarts(local, replace(four, refine_top=top), sampling=None, attempts=1)
+        solver = restarts(local, varied(four, top=top), attempts=1)
         counts.append(int(solver.solve(problem, controls(problem)).outer_iterations.sum()))
     assert counts[1] < counts[0]
 
 
-def test_a_refined_candidate_that_cuts_through_an_obstacle_between_two_knots_is_rejected(monkeypatch) -> None:
+def test_a_refined_candidate_that_cuts_through_an_obstacle_between_two_knots_is_rejected() -> None:
     """If all refined candidates are rejected, the best relaxed one is proposed."""
-    problem, one = cup(B=1, N=120), replace(QUICK, num_paths=2, track_iterations=20, refine_top=2)
-    refined = one.propose(problem)
+    problem, one = cup(B=1, N=120), varied(QUICK, num_paths=2, iterations=20, top=2)
+    refined = proposed(one, problem)
     assert bool(refined.found) and bool(refined.multipliers.lam[0].any())
-    monkeypatch.setattr("torchgco.search.paths.TO_THE_END", TO_THE_END._replace(cut=-9.0))
-    rejected = one.propose(problem)
-    assert torch.equal(rejected.U, replace(one, refine_top=1).propose(problem).U)
+    rejected = proposed(replace(one, refine=replace(one.refine, cut=1e-9)), problem)
+    assert torch.equal(rejected.U, proposed(varied(one, top=1), problem).U)
     assert not torch.equal(refined.U, rejected.U) and not any(bool(lam.any()) for lam in rejected.multipliers.lam)
 
 
@@ -173,12 +174,10 @@ def test_the_depth_of_points_against_brute_force() -> None:
             assert float(found[b, i]) == pytest.approx(-nearest, abs=1e-9)
 
 
-def test_a_path_through_doors_is_followed_closer_where_no_candidate_arrives(monkeypatch) -> None:
+def test_a_path_through_doors_is_followed_closer_where_no_candidate_arrives() -> None:
     setup = compose(["scenario=mazes", "scenario.walls=2", "solver=gco", "study.layouts=4"])
     problem = setup.task(setup.layouts()).problem
-    assert isinstance(setup.solver, Restarts) and setup.solver.paths is not None
-    close = setup.solver.paths.propose(problem)
-    monkeypatch.setattr(PathProposals, "_closer", lambda self, *more: None)
-    once = setup.solver.paths.propose(problem)
+    first, _, closer = [one for one in setup.solver.passes[:5] if isinstance(one, PathProposals)]
+    close, once = propose([first, closer], problem), propose([first], problem)
     assert int(once.found.sum()) < int(close.found.sum())
     assert torch.equal(close.U[once.found], once.U[once.found])
