@@ -52,26 +52,26 @@ test-slurm: $(DEV)
 	$(BIN)/python -m pytest -m slurm $(ARGS)
 
 robustness: $(DEV)
-	$(BIN)/python -m benchmarks.robustness --write -n auto $(ARGS)
+	$(BIN)/python -m benchmarks.endurance.robustness --write -n auto $(ARGS)
 
 versions:
 	$(PYTHON) .ci/versions $(ARGS)
 
 ladder: $(RUNTIME)
-	$(BIN)/python -m benchmarks.quality --write \
+	$(BIN)/python -m benchmarks.families.quality --write \
 	    --solvers gco_fast gco gco_max multistart gco_paper al_ilqr mppi $(ARGS)
 
 quality: $(RUNTIME)
-	$(BIN)/python -m benchmarks.quality --write $(ARGS)
+	$(BIN)/python -m benchmarks.families.quality --write $(ARGS)
 
 oracle: $(RUNTIME)
-	$(BIN)/python -m benchmarks.oracle $(ARGS)
+	$(BIN)/python -m benchmarks.families.oracle $(ARGS)
 
 worlds: $(PEERS)
-	$(BIN)/python -m benchmarks.worlds --write $(ARGS)
-	$(BIN)/python -m benchmarks.barn --write
-	$(BIN)/python -m benchmarks.maze --write --fatrop 8
-	$(BIN)/python -m benchmarks.navigation --write
+	$(BIN)/python -m benchmarks.families.worlds --write $(ARGS)
+	$(BIN)/python -m benchmarks.outside.barn --write
+	$(BIN)/python -m benchmarks.outside.maze --write --fatrop 8
+	$(BIN)/python -m benchmarks.outside.navigation --write
 
 benchmark: $(PEERS)
 	$(MAKE) $(ACADOS)/.ready || echo "acados can't be installed here: the tables will say so."

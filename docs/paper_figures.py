@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 from paper_runs import Solve, planar, quadrotor
 from PIL import Image
 
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
 from torchgco.plotting.style import save
 
 ROOT = Path(__file__).resolve().parents[1]

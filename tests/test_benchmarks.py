@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import oracle, quality
-from benchmarks.families import FAMILIES
-from benchmarks.page import SET_UP, put_table
+from benchmarks.families import oracle, quality
+from benchmarks.lib import acados
+from benchmarks.lib.families import FAMILIES
+from benchmarks.lib.page import SET_UP, put_table
+from benchmarks.lib.provenance import provenance
 from benchmarks.speed import (
-    acados_peer,
     batch,
     families,
     first_solve,
@@ -33,7 +34,6 @@ from benchmarks.speed import (
 )
 from benchmarks.speed.__main__ import main
 from benchmarks.speed.bench import Bench
-from benchmarks.speed.provenance import provenance
 from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
@@ -68,7 +68,7 @@ def few_processes(monkeypatch) -> None:
 @pytest.fixture(autouse=True)
 def without_acados(monkeypatch, tmp_path: Path) -> None:
     """Hide an installed acados: it compiles for seconds, and tests/test_speed_peers.py tests it."""
-    monkeypatch.setattr(acados_peer, "ENVIRONMENT", tmp_path)
+    monkeypatch.setattr(acados, "ENVIRONMENT", tmp_path)
 
 
 @pytest.fixture
@@ -251,7 +251,7 @@ def test_the_oracle_only_ever_lowers_a_cost(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("studies_here")
 def test_the_oracle_keeps_drawn_layouts_and_success_is_judged_for_them(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr("benchmarks.families.DATA", tmp_path)
+    monkeypatch.setattr("benchmarks.lib.families.DATA", tmp_path)
     monkeypatch.setattr(oracle, "SEARCH", {"hold": ["solver=hold"]})
     words = ["--families", "planar_random", "--fresh", "2", "--seed", "7"]
     for _ in range(2):  # the second call finds the file
@@ -284,7 +284,7 @@ def test_the_quality_of_one_family(tmp_path: Path, capsys) -> None:
 
 @pytest.mark.usefixtures("studies_here")
 def test_success_is_judged_with_the_current_best_cost(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("benchmarks.families.DATA", tmp_path)
+    monkeypatch.setattr("benchmarks.lib.families.DATA", tmp_path)
     family = FAMILIES["planar_trap"]
     layouts = Layouts.load(ROOT / "benchmarks/data/planar_trap.npz").take([0, 1])
     layouts.save(family.file())

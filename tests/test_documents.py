@@ -23,7 +23,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from torch import Tensor
 
 import torchgco
-from benchmarks import oracle, quality
+from benchmarks.families import oracle, quality
 from benchmarks.speed import __main__ as speed
 from torchgco import Problem
 from torchgco.constraints import Constraint

@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import endurance
-from benchmarks.endurance_memory import Sampler, draw, group_of, summary
+from benchmarks.endurance import study as endurance
+from benchmarks.endurance.memory import Sampler, draw, group_of, summary
 
 TRIALS = pd.DataFrame({"layout": [0, 1], "cost": [1.5, np.nan], "status": ["CONVERGED", "LIMIT"], "seconds": [1.0, 2]})
 

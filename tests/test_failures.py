@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks import failures
-from benchmarks.failures import CAUSES, Witness, cause
+from benchmarks.causes import failures
+from benchmarks.causes.failures import CAUSES, Witness, cause
 from tests.problems import planar_batch
 from torchgco import GCO, ILQR, MPPI, AugmentedLagrangian
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from benchmarks import ordinary
-from benchmarks.ordinary_problems import FAMILIES, B
+from benchmarks.families import ordinary
+from benchmarks.families.ordinary_problems import FAMILIES, B
 
 
 @pytest.mark.parametrize("name", FAMILIES)

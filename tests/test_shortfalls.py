@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks import shortfalls
-from benchmarks.families import WORLDS
-from benchmarks.shortfalls import CAUSES, cause, listed, refined, study, write
-from benchmarks.shortfalls_watch import Search, watching
+from benchmarks.causes import shortfalls
+from benchmarks.causes.shortfalls import CAUSES, cause, listed, refined, study, write
+from benchmarks.causes.shortfalls_watch import Search, watching
+from benchmarks.lib.families import WORLDS
 from torchgco import compose
 from torchgco.judging.judge import box_clearance
 from torchgco.roadmap.scene import scene_of

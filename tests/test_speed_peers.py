@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.speed import acados_peer, acados_worker, families
+from benchmarks.lib import acados, acados_worker
+from benchmarks.lib.provenance import provenance
+from benchmarks.speed import families
 from benchmarks.speed.bench import Bench
 from benchmarks.speed.peers import AcadosPeer
-from benchmarks.speed.provenance import provenance
 from benchmarks.speed.results import Results
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from tests.test_benchmarks import TINY
@@ -21,7 +22,7 @@ from torchgco import ControlBounds, InputError, Problem, QuadraticCost, Spheres,
 from torchgco.baselines import CasADiSolver
 from torchgco.lagrangian.rollout import open_loop
 
-needs_acados = pytest.mark.skipif(not acados_peer.installed(), reason="acados isn't installed: `make benchmark` does")
+needs_acados = pytest.mark.skipif(not acados.installed(), reason="acados isn't installed: `make benchmark` does")
 
 
 def read_problem(folder: Path) -> tuple[dict, dict[str, np.ndarray]]:
@@ -41,7 +42,7 @@ def test_instructions_compute_the_function() -> None:
         ca.fmin(x[0], ca.atan2(x[1], p[0])),
         7.0,
     )
-    plain = json.loads(json.dumps(acados_peer.instructions("f", ([x, p], result))))
+    plain = json.loads(json.dumps(acados.instructions("f", ([x, p], result))))
     again = ca.Function("f", [x, p], [acados_worker.replay(plain, x, p)])
     for point in np.random.default_rng(0).normal(size=(5, 5)):
         expected = ca.Function("f", [x, p], [result])(point[:3], point[3:])
@@ -52,7 +53,7 @@ def test_instructions_compute_the_function() -> None:
 def test_the_worker_gets_the_problem(batch, tmp_path: Path) -> None:
     """Step, rows, cost and bounds at random points equal those of the problem in PyTorch."""
     problem, U0 = batch(B=2, N=10)
-    acados_peer.write(problem, *guess(problem, U0), tmp_path)
+    acados.write(problem, *guess(problem, U0), tmp_path)
     form, numbers = read_problem(tmp_path)
     n, m = problem.n, problem.m
     draw = torch.Generator().manual_seed(1)
@@ -109,7 +110,7 @@ def test_the_worker_gets_the_rows_of_every_knot(kind: str, tmp_path: Path) -> No
     problem = moving_spheres() if kind == "moving" else boxed_batch(3, B=2, N=14, rounded=kind == "rounded")[0]
     B, N, m = problem.B, problem.N, problem.m
     U0 = torch.zeros(B, N, m, dtype=torch.float64)
-    acados_peer.write(problem, *guess(problem, U0), tmp_path)
+    acados.write(problem, *guess(problem, U0), tmp_path)
     X = torch.randn(B, N + 1, problem.n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     obstacles = [c for c in problem.constraints if c.geometric]
     values = np.concatenate([c.value(X, U0).numpy() for c in obstacles], axis=-1)
@@ -118,7 +119,7 @@ def test_the_worker_gets_the_rows_of_every_knot(kind: str, tmp_path: Path) -> No
 
 
 def write_problem(problem: Problem, U0: torch.Tensor, folder: Path) -> None:
-    acados_peer.write(problem, *guess(problem, U0), folder)
+    acados.write(problem, *guess(problem, U0), folder)
 
 
 def test_problems_without_a_form_for_acados_are_named(tmp_path: Path) -> None:
@@ -138,8 +139,8 @@ def test_problems_without_a_form_for_acados_are_named(tmp_path: Path) -> None:
 
 def test_a_failed_worker_gives_a_row_and_stops_nothing(tmp_path: Path, monkeypatch) -> None:
     """The other peers still run; the failed ones leave one row each, with the error."""
-    monkeypatch.setattr(acados_peer, "installed", lambda: True)
-    monkeypatch.setattr(acados_peer, "ENVIRONMENT", tmp_path)
+    monkeypatch.setattr(acados, "installed", lambda: True)
+    monkeypatch.setattr(acados, "ENVIRONMENT", tmp_path)
     (tmp_path / "bin").mkdir()
     python = tmp_path / "bin" / "python"
     python.write_text("#!/bin/sh\necho no such library >&2\nexit 3\n")
@@ -156,16 +157,16 @@ def test_acados_agrees_with_fatrop(tmp_path: Path) -> None:
     """Twice, the second time without compiling; no number of one problem carries over to the next."""
     problem, U0 = planar_batch(B=3, N=30, obstacles=3, seed=2)
     rows = torch.tensor([1, 2])  # the first has two paths around its obstacles
-    first = acados_peer.fly(problem, *guess(problem, U0), tmp_path)
+    first = acados.fly(problem, *guess(problem, U0), tmp_path)
     solution = CasADiSolver("fatrop").solve(problem, U0)
     X = open_loop(problem.dynamics, problem.x0, first.U)
     cost = problem.cost.total(X, first.U)
     torch.testing.assert_close(cost[rows], solution.cost[rows], rtol=1e-2, atol=0)
     assert (first.status == 0).all() and (first.iterations > 1).all() and (first.processor >= 0).all()
-    again = acados_peer.fly(problem, *guess(problem, U0), tmp_path)
+    again = acados.fly(problem, *guess(problem, U0), tmp_path)
     assert torch.equal(again.U, first.U) and again.setup < first.setup
     part = problem.take(rows)
-    alone = acados_peer.fly(part, *guess(part, U0[rows]), tmp_path)
+    alone = acados.fly(part, *guess(part, U0[rows]), tmp_path)
     torch.testing.assert_close(alone.U, first.U[rows], rtol=1e-9, atol=1e-9)
 
 
@@ -173,10 +174,10 @@ def test_acados_agrees_with_fatrop(tmp_path: Path) -> None:
 def test_acados_ends_at_its_limit(tmp_path: Path) -> None:
     """A limit below 0 s is exceeded by any solve."""
     problem, U0 = planar_batch(B=1, N=30, obstacles=3, seed=2)
-    program = acados_peer.program_of(problem)
+    program = acados.program_of(problem)
     with pytest.raises(TimeoutError, match="longer than -1 s"):
-        acados_peer.fly(problem, *guess(problem, U0), tmp_path, program, limit=-1)
-    assert int(acados_peer.fly(problem, *guess(problem, U0), tmp_path, program, limit=60).status[0]) == 0
+        acados.fly(problem, *guess(problem, U0), tmp_path, program, limit=-1)
+    assert int(acados.fly(problem, *guess(problem, U0), tmp_path, program, limit=60).status[0]) == 0
 
 
 @needs_acados

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks import worlds, worlds_peers
-from benchmarks.families import WORLDS
-from benchmarks.speed import acados_peer
+from benchmarks.families import worlds, worlds_peers
+from benchmarks.lib import acados
+from benchmarks.lib.families import WORLDS
 from tests.problems import quadrotor_batch
 from torchgco import Problem, judge
 from torchgco.baselines import CasADiSolver, Hold
@@ -21,7 +21,7 @@ from torchgco.scenarios import Layouts, Task
 @pytest.fixture(autouse=True)
 def without_acados(monkeypatch, tmp_path: Path) -> None:
     """Hide an installed acados: tests/test_speed_peers.py tests it."""
-    monkeypatch.setattr(acados_peer, "ENVIRONMENT", tmp_path)
+    monkeypatch.setattr(acados, "ENVIRONMENT", tmp_path)
 
 
 def tiny(folder: Path) -> worlds_peers.World:

@@ -56,8 +56,8 @@ def _one_core() -> None:
 def _measure(asked: argparse.Namespace) -> int:
     from importlib import import_module
 
+    from benchmarks.lib.provenance import provenance
     from benchmarks.speed.bench import Bench
-    from benchmarks.speed.provenance import provenance
     from benchmarks.speed.results import Results, read_rows
     from benchmarks.speed.sizes import QUICK, Sizes
     from benchmarks.speed.tables import rewrite, section_table

@@ -7,8 +7,8 @@ import subprocess
 import sys
 from dataclasses import asdict
 
+from benchmarks.lib.provenance import ROOT
 from benchmarks.speed.bench import Bench
-from benchmarks.speed.provenance import ROOT
 
 SECTION, SOLVER = "batch", "gco"
 START = 10.0  # seconds that a process takes before it solves anything

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.speed import acados_peer
+from benchmarks.lib import acados
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.peers import GUIDED, AcadosPeer, CasADiPeer, Peer, first
 from torchgco.base.errors import InputError
@@ -69,7 +69,7 @@ def _peers(bench: Bench, name: str, setup: Setup, folder: Path) -> list[Peer]:
     sizes = bench.sizes
     task = setup.task(setup.layouts(sizes.slow_layouts if name in sizes.slow_families else sizes.layouts))
     peers: list[Peer] = [CasADiPeer.ready(bench, solver, task) for solver in ("fatrop", GUIDED)]
-    if acados_peer.installed():
+    if acados.installed():
         peers += [AcadosPeer.ready(bench, solver, task, folder) for solver in ("acados", "acados_guided")]
     else:
         bench.row(SECTION, name, "acados", "not installed", "")

@@ -9,9 +9,9 @@ import sys
 import tempfile
 from statistics import median
 
+from benchmarks.lib.provenance import ROOT
 from benchmarks.speed.bench import Bench
 from benchmarks.speed.first_solve import MODELS
-from benchmarks.speed.provenance import ROOT
 
 SECTION = "first_use"
 IMPORTS = 5  # number; their median counts

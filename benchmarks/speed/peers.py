@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.speed import acados_peer
+from benchmarks.lib import acados
 from benchmarks.speed.bench import Bench, Took
 from torchgco.baselines import GuidedCasADi
 from torchgco.judging.judge import Verdict, judge
@@ -122,7 +122,7 @@ class AcadosPeer(Peer):
             U = guess.U
         X = open_loop(problem.dynamics, problem.x0, U)
         X = torch.where(torch.isfinite(X), X, problem.x0.unsqueeze(1))
-        answer = acados_peer.fly(problem, X, U, self.folder)
+        answer = acados.fly(problem, X, U, self.folder)
         self.setup = self.setup or answer.setup
         own = Took(float(answer.processor.sum()), float(answer.wall.sum()))
         return answer.U, float(answer.iterations.mean()), took + own

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from benchmarks.lib.page import put_between
 from benchmarks.speed.results import Row
 
 TARGETS = "<!-- targets -->", "<!-- end targets -->"  # in README.md
@@ -103,17 +104,3 @@ def rewrite(folder: Path, rows: list[Row]) -> None:
     """Put the tables between their marks in the folder's README.md and results/speed.md."""
     put_between(folder / "README.md", *TARGETS, targets_text(rows))
     put_between(folder / "results" / "speed.md", *SPEED, speed_text(rows))
-
-
-def put_between(file: Path, begin: str, end: str, new: str) -> None:
-    """Put text between two marks; the rest of the file stays unchanged.
-
-    Raises:
-        ValueError: the file doesn't contain each mark once, in order.
-    """
-    text = file.read_text()
-    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise ValueError(f"{file} has no part between {begin} and {end}")
-    head, rest = text.split(begin)
-    tail = rest.split(end)[1]
-    file.write_text(f"{head}{begin}\n{new}\n\n{end}{tail}")

@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.spatial import Delaunay
 
-from benchmarks.barn import BODY, VEHICLE, Drives, drive, gap, main, problems, worlds
-from benchmarks.barn_data import GOAL, RADIUS, START, cylinders, path_length
+from benchmarks.outside.barn import BODY, VEHICLE, Drives, drive, gap, main, problems, worlds
+from benchmarks.outside.barn_data import GOAL, RADIUS, START, cylinders, path_length
 from torchgco import Unicycle
 
 MODEL = """<model name='{name}'><static>1</static><pose frame=''>{x} {y} 0 0 0 0</pose><link name='link'><collision

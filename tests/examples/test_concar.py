@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from benchmarks.concar import EXACT, GOAL, GOAL_RADIUS, main, own_model, read_layouts, zero_controls
+from benchmarks.outside.concar import EXACT, GOAL, GOAL_RADIUS, main, own_model, read_layouts, zero_controls
 from torchgco import judge
 from torchgco.obstacles.spheres import BoundSpheres
 

@@ -1,7 +1,7 @@
 """Settings of the random tests, and the counts of what they tried.
 
 Every run draws the same examples; `--hypothesis-profile=search` draws new ones, ten times as many. With the variable
-TORCHGCO_TALLY set to a path, the counts are added to that file at the end (benchmarks/robustness.py reads them).
+TORCHGCO_TALLY set to a path, the counts are added to that file at the end, for `make robustness`.
 """
 
 import json

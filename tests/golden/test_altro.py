@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks.golden import IPOPT, main
-from benchmarks.golden_problems import GOLDEN
+from benchmarks.outside.golden import IPOPT, main
+from benchmarks.outside.golden_problems import GOLDEN
 from torchgco import Polish, Problem, Solution, Status, certify
 from torchgco.lagrangian.rollout import open_loop
 

@@ -7,8 +7,20 @@ import pytest
 import torch
 
 import torchgco
-from benchmarks.maze import TOLERANCE, Flight, main, precise
-from benchmarks.maze_problem import DT, GOAL, HOVER, START, THRUST, R, cylinders, maze, recount, starts, waypoint_guess
+from benchmarks.outside.maze import TOLERANCE, Flight, main, precise
+from benchmarks.outside.maze_problem import (
+    DT,
+    GOAL,
+    HOVER,
+    START,
+    THRUST,
+    R,
+    cylinders,
+    maze,
+    recount,
+    starts,
+    waypoint_guess,
+)
 from torchgco import ControlBounds, StateBounds
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.rollout import open_loop

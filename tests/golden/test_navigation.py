@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.navigation import TOLERANCE, Flight, cells, local, main
-from benchmarks.navigation_problem import FASTEST, HOVER, SLOWEST, fan, line_guess, navigation, recount
+from benchmarks.outside.navigation import TOLERANCE, Flight, cells, local, main
+from benchmarks.outside.navigation_problem import FASTEST, HOVER, SLOWEST, fan, line_guess, navigation, recount
 from torchgco import ControlBounds, StateBounds
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.rollout import open_loop

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.families import WORLDS
+from benchmarks.lib.families import WORLDS
 from torchgco import compose
 from torchgco.base.errors import InputError
 from torchgco.scenarios import Crossing, Layouts, Mazes, Woods

@@ -1,4 +1,4 @@
-"""python -m benchmarks.robustness: what was tried against the library, and how often.
+"""python -m benchmarks.endurance.robustness: what was tried against the library, and how often.
 
 Runs the tests of wrong input, damaged files, killed processes, batches and known answers, the slow ones too, and counts
 the cases and the random examples in them (some minutes on two cores). With --write the tables go into
@@ -18,11 +18,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.lib import RESULTS, ROOT
+from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "benchmarks" / "results" / "robustness.md"
+PAGE = RESULTS / "robustness.md"
 # Kinds of trials, and the tests that make them: files, folders, or parts of a test's name after "::".
 KINDS: dict[str, tuple[str, ...]] = {
     "wrong options and arguments from Python": (
@@ -82,7 +82,9 @@ def example_table(examples: Mapping[tuple[str, str], int]) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.robustness", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.endurance.robustness", description=(__doc__ or "").split("\n")[0]
+    )
     parser.add_argument("--write", action="store_true", help="put the tables into results/robustness.md")
     options, more = parser.parse_known_args(arguments)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,8 +1,8 @@
-"""python -m benchmarks.worlds: woods, mazes and crossing spheres, by `gco` and its peers.
+"""python -m benchmarks.families.worlds: woods, mazes and crossing spheres, by `gco` and its peers.
 
 Every world and solver is a separate study below outputs/worlds, so that a run that was stopped resumes where it was.
 The peers take up to minutes per problem among so many obstacles: their rows on the public layouts are read from the
-file that `benchmarks.worlds_peers` keeps. With --write the table goes into benchmarks/results/worlds.md, with date and
+file that `worlds_peers` keeps. With --write the table goes into benchmarks/results/worlds.md, with date and
 commit.
 """
 
@@ -15,17 +15,17 @@ from pathlib import Path
 
 import pandas as pd
 
-from benchmarks.families import WORLDS
-from benchmarks.quality import study, succeeded
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
-from benchmarks.worlds_peers import FILE, NAMES, rows_of
+from benchmarks.families.quality import study, succeeded
+from benchmarks.families.worlds_peers import FILE, NAMES, rows_of
+from benchmarks.lib import RESULTS, ROOT
+from benchmarks.lib.families import WORLDS
+from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
 from torchgco.experiments.results.success import sound
 from torchgco.experiments.statistics.statistics import summarise, wilson
 from torchgco.scenarios import Layouts
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "benchmarks" / "results" / "worlds.md"
+PAGE = RESULTS / "worlds.md"
 SOLVERS = ("gco", "al_ilqr")
 HEAD = (
     "world", "solver", "n", "reached", "reached, of solved layouts", "success", "cost / best known, median",
@@ -52,9 +52,11 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.worlds", description="Fly the worlds, and count.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.families.worlds", description="Fly the worlds, and count."
+    )
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
-    parser.add_argument("--peers", type=Path, default=FILE, metavar="FILE", help="rows of benchmarks.worlds_peers")
+    parser.add_argument("--peers", type=Path, default=FILE, metavar="FILE", help="rows of worlds_peers")
     parser.add_argument("--fresh", type=int, default=0, metavar="N", help="N drawn layouts per world, not the 32")
     parser.add_argument("--seed", type=int, default=0, help="of the drawn layouts")
     parser.add_argument("--write", action="store_true", help=f"put the table into {PAGE.relative_to(ROOT)}")
@@ -67,7 +69,7 @@ def with_peers(name: str, trials: pd.DataFrame, peers: pd.DataFrame) -> pd.DataF
     """The trials of a world, and behind them those of its peers on the same layouts, solver by solver.
 
     trials  of a study
-    peers   rows of `benchmarks.worlds_peers`; rows of other worlds and of layouts that have changed are left out
+    peers   rows of `worlds_peers`; rows of other worlds and of layouts that have changed are left out
     """
     same = ["layout", "layout_digest"]
     flown = peers[peers["world"] == name].merge(trials[[*same, "model", "seed"]].drop_duplicates(), on=same)

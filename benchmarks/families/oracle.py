@@ -1,4 +1,4 @@
-"""python -m benchmarks.oracle: the best known cost of every layout.
+"""python -m benchmarks.families.oracle: the best known cost of every layout.
 
 Minutes per layout, offline. It flies the solvers of SEARCH and takes the cheapest sound trajectory of any: at the
 goal, violations of at most 1 mm, clear of the obstacles between the knots. The peers' costs on the public layouts
@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from benchmarks.families import DATA, EVERY, FAMILIES, Family
+from benchmarks.lib.families import DATA, EVERY, FAMILIES, Family
 from torchgco import compose, judge
 from torchgco.base.errors import InputError
 from torchgco.judging.judge import near_best
@@ -57,7 +57,9 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.oracle", description="Seek the best known costs.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.families.oracle", description="Seek the best known costs."
+    )
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--search", nargs="+", choices=list(SEARCH), metavar="NAME", help="some of the searches only")
     parser.add_argument("--draws", type=int, nargs="+", default=[0], metavar="SEED", help="seeds of the solvers' draws")

@@ -1,4 +1,4 @@
-"""python -m benchmarks.concar: a car among four hard circles, 100 problems, compared with IPOPT.
+"""python -m benchmarks.outside.concar: a car among four hard circles, 100 problems, compared with IPOPT.
 
 torchgco solves all problems as one batch, IPOPT one by one, both from zero controls, with one thread; `judge` judges
 both. With --write the table goes into benchmarks/results/concar.md. Model, problems and solver are those of
@@ -11,7 +11,6 @@ import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 from types import SimpleNamespace
 from typing import Any
@@ -20,13 +19,12 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from benchmarks.page import SET_UP, put_table
+from benchmarks.lib import DATA, RESULTS, ROOT
+from benchmarks.lib.page import SET_UP, put_table
 from torchgco import Problem, Solution, Status, judge
 from torchgco.baselines import CasADiSolver
 
-ROOT = Path(__file__).resolve().parents[1]
-DATA = ROOT / "benchmarks" / "data"
-PAGE = ROOT / "benchmarks" / "results" / "concar.md"
+PAGE = RESULTS / "concar.md"
 GOAL, GOAL_RADIUS = torch.ones(2, dtype=torch.float64), 0.1  # m
 FEASIBLE, EXACT = 1e-3, 1e-6  # violation of the full radii, m
 NOTABLE = 1.01  # the cost ratio beyond which one trajectory counts as cheaper than another
@@ -124,7 +122,9 @@ def median(values: Tensor) -> float:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.concar", description="A car among four hard circles.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.outside.concar", description="A car among four hard circles."
+    )
     parser.add_argument("--first", type=int, default=100, help="only the first problems, this many")
     parser.add_argument("--seed", type=int, default=0, help="of the random draws of guidance")
     parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/concar.md")

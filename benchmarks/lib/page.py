@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.lib.provenance import provenance
 
 INTERVALS = "95 % Wilson intervals in percent"
 SET_UP = "set-up excluded"
@@ -26,3 +25,17 @@ def put_table(page: Path, how: str, table: str, *notes: str) -> None:
     more = [f"CasADi {origin['casadi']}" if note == "CasADi" else note for note in notes]
     text = "; ".join([first, *more])
     put_between(page, f"<!-- {page.stem} -->", f"<!-- end {page.stem} -->", f"{text}.\n\n{table}")
+
+
+def put_between(file: Path, begin: str, end: str, new: str) -> None:
+    """Put text between two marks; the rest of the file stays unchanged.
+
+    Raises:
+        ValueError: the file doesn't contain each mark once, in order.
+    """
+    text = file.read_text()
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise ValueError(f"{file} has no part between {begin} and {end}")
+    head, rest = text.split(begin)
+    tail = rest.split(end)[1]
+    file.write_text(f"{head}{begin}\n{new}\n\n{end}{tail}")

@@ -8,7 +8,8 @@ from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from benchmarks.lib import ROOT
+
 # Files that a benchmark, or `make paper`, itself changes.
 WRITTEN = (
     ":!benchmarks/README.md", ":!benchmarks/results", ":!benchmarks/data/worlds/peers.csv",
@@ -20,7 +21,7 @@ def provenance(device: str) -> dict[str, str]:
     """The columns that all rows of a run share, with their values."""
     import torch
 
-    from benchmarks.speed import acados_peer
+    from benchmarks.lib import acados
 
     graphics = torch.cuda.get_device_name() if device == "cuda" else ""
     return {
@@ -30,7 +31,7 @@ def provenance(device: str) -> dict[str, str]:
         "torch": torch.__version__,
         "casadi": _version("casadi"),
         "pytorch_mppi": _version("pytorch-mppi"),
-        "acados": acados_peer.version(),
+        "acados": acados.version(),
         "threads": str(torch.get_num_threads()),
         "device": device,
     }

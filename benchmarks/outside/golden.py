@@ -1,4 +1,4 @@
-"""python -m benchmarks.golden: the problems of the ALTRO solver, compared with IPOPT on the same discretised problems.
+"""python -m benchmarks.outside.golden: the problems of the ALTRO solver, compared with IPOPT.
 
 torchgco solves the published start and seven drawn around it as one batch, then polishes; IPOPT solves them one by one
 from the same initial controls. Seconds are processor time with one thread. With --write the table goes into
@@ -10,17 +10,17 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from time import process_time
 
 import torch
 
-from benchmarks.golden_problems import GOLDEN, Golden
-from benchmarks.page import SET_UP, put_table
+from benchmarks.lib import RESULTS
+from benchmarks.lib.page import SET_UP, put_table
+from benchmarks.outside.golden_problems import GOLDEN, Golden
 from torchgco import Certificate, Polish, Problem, Solution, certify, solve
 from torchgco.baselines import CasADiSolver
 
-PAGE = Path(__file__).resolve().parent / "results" / "golden.md"
+PAGE = RESULTS / "golden.md"
 STARTS = 8
 # At its own tolerance of 1e-8 and with relaxed bounds, a rollout of IPOPT's controls can miss a goal by 5e-5.
 IPOPT = CasADiSolver("ipopt", tolerance=1e-10, violation_tolerance=1e-6, options={"bound_relax_factor": 0.0})
@@ -86,7 +86,9 @@ def rows(task: Golden, starts: int, seed: int) -> list[list[str]]:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.golden", description="Problems of the ALTRO solver.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.outside.golden", description="Problems of the ALTRO solver."
+    )
     parser.add_argument("--problems", nargs="+", choices=GOLDEN, default=list(GOLDEN), metavar="NAME", help="which")
     parser.add_argument("--starts", type=int, default=STARTS, help="starts per problem")
     parser.add_argument("--seed", type=int, default=0, help="of the starts")

@@ -1,7 +1,7 @@
 """acados on the problems in a folder: `python acados_worker.py FOLDER [LIMIT]`, in a separate environment.
 
 That environment has only acados' wheel and NumPy, as the wheel contains a CasADi that would shadow torchgco's.
-So nothing of torchgco is imported here; `acados_peer.py` writes the folder and reads the answer.
+So nothing of torchgco is imported here; `acados.py` writes the folder and reads the answer.
 
     form.json      N, n, m; step, rows, last_rows: functions of (x, u, p) by instructions; equality, last_equality
     problems.npz   p (B, K, P), K = N+1 or 1 for all knots, x0 (B, n), lower, upper (B, N, m), weight,
@@ -141,7 +141,7 @@ def _fly(solver: Any, form: dict[str, Any], problems: SimpleNamespace, b: int, l
 
 
 def replay(function: dict[str, Any], *inputs: Any) -> Any:
-    """The expression of a function, as a column, from its instructions (`acados_peer.instructions`)."""
+    """The expression of a function, as a column, from its instructions (`acados.instructions`)."""
     import casadi as ca
 
     codes = {name: getattr(ca, name) for name in dir(ca) if name.startswith("OP_")}

@@ -1,4 +1,4 @@
-"""python -m benchmarks.navigation: the navigation problems of jaxipm, in problems per second beside IPOPT.
+"""python -m benchmarks.outside.navigation: the navigation problems of jaxipm, in problems per second beside IPOPT.
 
 Both solvers run in worker processes with one thread each, one worker, then two that share the starts. IPOPT has the
 published guess and options. All results are judged by `recount`, in NumPy. With --write the table goes into
@@ -12,7 +12,6 @@ import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from time import process_time
 
 import numpy as np
@@ -20,13 +19,14 @@ import torch
 from torch import Tensor
 
 import torchgco
-from benchmarks.navigation_problem import fan, line_guess, navigation, recount
-from benchmarks.page import INTERVALS, put_table
+from benchmarks.lib import RESULTS
+from benchmarks.lib.page import INTERVALS, put_table
+from benchmarks.outside.navigation_problem import fan, line_guess, navigation, recount
 from torchgco import Problem, Solution, presets
 from torchgco.baselines import CasADiSolver
 from torchgco.experiments.statistics.statistics import wilson
 
-PAGE = Path(__file__).resolve().parent / "results" / "navigation.md"
+PAGE = RESULTS / "navigation.md"
 STARTS, SECTORS = 500, (90.0, 180.0)  # the published batch, and the published widths of the fan in degrees
 TOLERANCE = 1e-6  # the published one of IPOPT; here the largest violation of torchgco's results, too
 JUDGED = 1e-4  # IPOPT's own limit on violations, m, m/s and rad/s: its states meet it, a rollout may differ slightly
@@ -149,7 +149,9 @@ def table(count: int, sectors: Sequence[float]) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.navigation", description="Navigation of jaxipm.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.outside.navigation", description="Navigation of jaxipm."
+    )
     parser.add_argument("--starts", type=int, default=STARTS, help="starts per fan")
     parser.add_argument("--sectors", type=float, nargs="+", default=SECTORS, help="widths of the fans, degrees")
     parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/navigation.md")

@@ -1,8 +1,8 @@
-"""python -m benchmarks.worlds_data: draw the public layouts of the worlds.
+"""python -m benchmarks.families.worlds_data: draw the public layouts of the worlds.
 
 Of the layouts 0, 1, 2, ... of seed 0, the first 32 are kept on which a way through is proven. Among resting obstacles
 the proof is a path of the roadmap that isn't long, measured again by the judge's own distances; among moving ones it
-is a sound trajectory of `gco_max`. Best costs are sought by `python -m benchmarks.oracle --families NAME ...`.
+is a sound trajectory of `gco_max`. Best costs are sought by `python -m benchmarks.families.oracle --families NAME ...`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.families import WORLDS, Family
+from benchmarks.lib.families import WORLDS, Family
 from torchgco import compose, judge
 from torchgco.judging.distances import box_segment_distance
 from torchgco.obstacles.boxes import BoundBoxes

@@ -1,4 +1,4 @@
-"""python -m benchmarks.unicycle: a user's model without tuning, compared with the best of twelve IPOPT starts.
+"""python -m benchmarks.outside.unicycle: a user's model without tuning, compared with the best of twelve IPOPT starts.
 
 A unicycle given as a Python function drives among discs; `torchgco.solve` runs without options. IPOPT solves every
 problem from rest and from eleven random guesses, and its cheapest feasible result counts. `judge` judges both. With
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -17,13 +16,14 @@ import torch
 from torch import Tensor
 
 import torchgco
-from benchmarks.page import INTERVALS, put_table
+from benchmarks.lib import RESULTS
+from benchmarks.lib.page import INTERVALS, put_table
 from torchgco.baselines import CasADiSolver
 from torchgco.experiments.statistics.statistics import wilson
 from torchgco.judging.judge import Verdict, judge
 from torchgco.problem.problem import Problem
 
-PAGE = Path(__file__).resolve().parent / "results" / "unicycle.md"
+PAGE = RESULTS / "unicycle.md"
 STAGES, STARTS = 100, 12
 VEHICLE, LIMIT = 0.15, 3.0  # m; m/s^2 and rad/s
 WITHIN = 1.05  # times the best cost of IPOPT
@@ -113,7 +113,9 @@ def _share(hits: int, n: int) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.unicycle", description="A user's model, untuned.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.outside.unicycle", description="A user's model, untuned."
+    )
     parser.add_argument("--count", type=int, default=64, help="problems")
     parser.add_argument("--seed", type=int, default=0, help="of problems and guesses")
     parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/unicycle.md")

@@ -1,7 +1,7 @@
-"""python -m benchmarks.worlds_peers: FATROP, IPOPT and acados in the worlds, from rest and from the roadmap's path.
+"""python -m benchmarks.families.worlds_peers: FATROP, IPOPT and acados in the worlds, from rest and from a path.
 
 They take seconds to minutes per problem, so they aren't flown with `gco`: every flight is kept as a row of
-benchmarks/data/worlds/peers.csv, which `benchmarks.worlds` reads. Rows that are there aren't flown again, so that a
+benchmarks/data/worlds/peers.csv, which `worlds` reads. Rows that are there aren't flown again, so that a
 stopped run resumes. Every flight is a process of its own, which ends at a limit of processor time; building the program
 and compiling it isn't counted, computing the guess is. Among moving obstacles there is no path, and nothing guided.
 """
@@ -26,9 +26,9 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from benchmarks.families import DATA, WORLDS, Family
-from benchmarks.speed import acados_peer
-from benchmarks.speed.provenance import provenance
+from benchmarks.lib import acados
+from benchmarks.lib.families import DATA, WORLDS, Family
+from benchmarks.lib.provenance import provenance
 from torchgco import Problem, compose, judge, presets
 from torchgco.base.status import Status
 from torchgco.baselines import CasADiSolver, GuidedCasADi
@@ -71,7 +71,9 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.worlds_peers", description="Fly the worlds' peers.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.families.worlds_peers", description="Fly the worlds' peers."
+    )
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
     parser.add_argument("--solvers", nargs="+", default=list(NAMES), choices=NAMES, metavar="NAME")
     parser.add_argument("--layouts", type=int, default=32, metavar="N", help="the first N of each world")
@@ -135,7 +137,7 @@ def flights(
             if name in solvers
             and (world.name, name, layout, world.digests[layout]) not in known
             and not (name.endswith("guided") and world.moving)
-            and not (name.startswith("acados") and not acados_peer.installed())
+            and not (name.startswith("acados") and not acados.installed())
         ]
         if not lacking:
             continue
@@ -163,7 +165,7 @@ def _judged(world: World, name: str, layout: int, flight: Flight) -> dict[str, o
         "world": world.name, "solver": name, "guess": "path" if flight.follows else "rest", "layout": layout,
         "layout_digest": world.digests[layout], "status": flight.status, "reached": False, "sound": False,
         "seconds": f"{flight.seconds:.4g}", "iterations": flight.iterations,
-        "version": f"acados {acados_peer.version()}" if name.startswith("acados") else f"CasADi {version('casadi')}",
+        "version": f"acados {acados.version()}" if name.startswith("acados") else f"CasADi {version('casadi')}",
     }  # fmt: skip
     if flight.U is not None:
         verdict = judge(world.problem(layout), flight.U, task.goal[rows], task.goal_radius)
@@ -194,7 +196,7 @@ class Peers:
             prepared = solver.prepare(first)
         if any(name.startswith("acados") for name in names):
             shared = None if prepared is None or world.moving else prepared.program
-            program = acados_peer.program_of(first) if shared is None else shared
+            program = acados.program_of(first) if shared is None else shared
         guided = presets.fatrop_guided(first)
         if any(name.endswith("guided") for name in names):
             guided.guess(first, world.task.U0[:1])  # compiles
@@ -216,7 +218,7 @@ class Peers:
         X = open_loop(problem.dynamics, problem.x0, U)
         X = torch.where(torch.isfinite(X), X, problem.x0.unsqueeze(1))
         try:
-            answer = acados_peer.fly(problem, X, U, self.world.folder, self.program, limit)
+            answer = acados.fly(problem, X, U, self.world.folder, self.program, limit)
         except TimeoutError:
             return _late(limit, follows)
         status = int(answer.status[0])

@@ -1,4 +1,4 @@
-"""python -m benchmarks.barn: the worlds of the BARN challenge, planned from a known map.
+"""python -m benchmarks.outside.barn: the worlds of the BARN challenge, planned from a known map.
 
 A unicycle with the limits of the challenge's robot drives 10 m through walls and clusters of cylinders; the challenge's
 score rewards short times. `gco` plans the 50 test worlds as one batch, and then the 250 others, on which no option was
@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -19,13 +18,14 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from benchmarks.barn_data import DATA, GOAL, GOAL_RADIUS, RADIUS, TEST
-from benchmarks.page import INTERVALS, SET_UP, put_table
+from benchmarks.lib import RESULTS
+from benchmarks.lib.page import INTERVALS, SET_UP, put_table
+from benchmarks.outside.barn_data import DATA, GOAL, GOAL_RADIUS, RADIUS, TEST
 from torchgco import ControlBounds, Goal, Problem, QuadraticCost, Spheres, StateBounds, Unicycle, judge, solve
 from torchgco.experiments.statistics.statistics import wilson
 from torchgco.scenarios import Layouts
 
-PAGE = Path(__file__).resolve().parent / "results" / "barn.md"
+PAGE = RESULTS / "barn.md"
 STAGES, DT = 100, 0.1  # 10 s in every world; the challenge, too, looks every 0.1 s whether a run has arrived
 SPEED = 2.0  # m/s: the challenge's shortest time is the length of its path over this
 BACKWARDS = -0.5  # m/s: these limits are those of the challenge's planner (base_local_planner_params.yaml)
@@ -152,7 +152,7 @@ def table(first: int | None, seed: int) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.barn", description="The worlds of BARN.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.outside.barn", description="The worlds of BARN.")
     parser.add_argument("--first", type=int, default=None, help="only the first worlds of each kind, this many")
     parser.add_argument("--seed", type=int, default=0, help="of the random draws of guidance")
     parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/barn.md")

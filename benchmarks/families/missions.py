@@ -1,4 +1,4 @@
-"""python -m benchmarks.missions: how often missions reach their goal, by planner, and how long planning takes.
+"""python -m benchmarks.families.missions: how often missions reach their goal, by planner, and how long planning takes.
 
 Every case is a study of missions below outputs/missions, so that a run that was stopped resumes where it was. With
 --write the tables are put into results/missions.md, with date and commit.
@@ -16,13 +16,13 @@ import numpy as np
 import pandas as pd
 import torch
 
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.lib import RESULTS, ROOT
+from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
 from torchgco import compose
 from torchgco.experiments.statistics.statistics import wilson
 from torchgco.missions.outcome import Outcome
 
-ROOT = Path(__file__).resolve().parents[1]
 START = "scenario.start=[1,1,0]"
 CASES = {
     "forest, 30 spheres": [],
@@ -100,7 +100,9 @@ def timing(outputs: Path, alone: int, together: int) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.missions", description="Fly missions, and count.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.families.missions", description="Fly missions, and count."
+    )
     parser.add_argument("--cases", type=int, default=len(CASES), help="so many of the cases")
     parser.add_argument("--planners", nargs="+", default=list(PLANNERS), choices=list(PLANNERS), metavar="NAME")
     parser.add_argument("--share", type=float, default=1.0, help="of the number of missions")
@@ -124,7 +126,7 @@ def main(words: Sequence[str] | None = None) -> int:
     print(text)
     if asked.write:
         marks = "<!-- missions -->", "<!-- end missions -->"
-        put_between(ROOT / "benchmarks" / "results" / "missions.md", *marks, text)
+        put_between(RESULTS / "missions.md", *marks, text)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""python -m benchmarks.barn_data CLONE: the 300 worlds of the BARN challenge as arrays.
+"""python -m benchmarks.outside.barn_data CLONE: the 300 worlds of the BARN challenge as arrays.
 
 Reads a local clone of github.com/Daffan/the-barn-challenge (MIT, Copyright (c) 2022 Zifan Xu) and writes two files of
 benchmarks/data: barn.npz, a layout file with the cylinders, start and goal of each world, and barn.csv with the length
@@ -15,9 +15,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 
+from benchmarks.lib import DATA
 from torchgco.scenarios import Layouts
 
-DATA = Path(__file__).resolve().parent / "data"
 WORLDS, TEST = range(300), range(0, 300, 6)  # test.sh there
 RADIUS = 0.075  # of the cylinders, m: the worlds' only size
 START, GOAL = (-2.25, 3.0), (-2.25, 13.0)  # m; run.py there
@@ -47,7 +47,9 @@ def path_length(cells: np.ndarray) -> float:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.barn_data", description="The worlds of BARN as arrays.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.outside.barn_data", description="The worlds of BARN as arrays."
+    )
     parser.add_argument("clone", type=Path, help="folder of the repository Daffan/the-barn-challenge")
     asked = parser.parse_args(words)
     folder = asked.clone / "jackal_helper" / "worlds" / "BARN"

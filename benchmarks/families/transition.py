@@ -1,4 +1,4 @@
-"""python -m benchmarks.transition: how often the goal is reached in woods, by density and speed, as one figure.
+"""python -m benchmarks.families.transition: how often the goal is reached in woods, by density and speed.
 
 A Hydra sweep of density against horizon: the faster the vehicle must fly, the sparser the woods that it can cross.
 With --write the figure and the table go into benchmarks/results.
@@ -17,15 +17,14 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.lib import RESULTS, ROOT
+from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.plotting.style import INK, SMALL, legend, panels, save, solver_colours, tidy
 from torchgco.scenarios import Woods
 
-ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
 DENSITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 STAGES = (80, 120, 160, 240)
 SOLVERS = ("gco", "gco_paper", "al_ilqr")
@@ -71,7 +70,9 @@ def sweep(solver: str, asked: argparse.Namespace) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.transition", description="Sweep density and speed.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.families.transition", description="Sweep density and speed."
+    )
     parser.add_argument("--layouts", type=int, default=32, metavar="N", help="per density and speed")
     parser.add_argument(
         "--solvers", nargs="*", default=[*SOLVERS, *PEERS], metavar="NAME", help="to fly; none: only table and figure"

@@ -1,4 +1,4 @@
-"""python -m benchmarks.failures: why the paper's guidance fails where it does, counted, with one picture per cause.
+"""python -m benchmarks.causes.failures: why the paper's guidance fails where it does, with one picture per cause.
 
 `gco_paper` flies the public layouts while a witness records, after every inner solve, the state that guidance got and
 its answer. Every layout whose goal isn't reached gets one cause, derived from its last outer iterations; the table and
@@ -19,10 +19,11 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from benchmarks.failures_picture import Example, picture
-from benchmarks.families import FAMILIES, Family
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.causes.picture import Example, picture
+from benchmarks.lib import ROOT
+from benchmarks.lib.families import FAMILIES, Family
+from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
 from torchgco import compose, judge
 from torchgco.base.draws import DrawKey
 from torchgco.guidance.detection import active_counts, caught_knots
@@ -31,7 +32,6 @@ from torchgco.guidance.mppi import MPPI
 from torchgco.lagrangian.quality import violation
 from torchgco.problem.problem import Problem
 
-HERE = Path(__file__).resolve().parent
 LAST = 3  # outer iterations that decide the cause
 CAUSES = {
     "diverged": "the penalty has outgrown the model: the last iterate costs over five times the first",
@@ -178,12 +178,12 @@ def table(trials: pd.DataFrame, causes: dict[str, str] = CAUSES, missed: str = "
 
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.failures", description="Sort the failures of gco_paper."
+        prog="python -m benchmarks.causes.failures", description="Sort the failures of gco_paper."
     )
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(FAMILIES), metavar="NAME")
     parser.add_argument("--first", type=int, default=32, help="layouts per family, the first ones")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--outputs", type=Path, default=HERE)
+    parser.add_argument("--outputs", type=Path, default=ROOT / "benchmarks")
     asked = parser.parse_args(words)
     parts, examples = [], {}
     for name in asked.families:

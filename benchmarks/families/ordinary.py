@@ -1,4 +1,4 @@
-"""python -m benchmarks.ordinary: ordinary constrained problems by default options, and without the finish.
+"""python -m benchmarks.families.ordinary: ordinary constrained problems by default options, and without the finish.
 
 Twelve families, eight problems per seed. Feasible: every constraint within 1e-3 along PyTorch's own rollout of the
 returned controls. With --write the table goes into benchmarks/results/ordinary.md.
@@ -9,19 +9,19 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from statistics import median
 from time import process_time
 
 import torch
 from scipy.stats import binomtest
 
-from benchmarks.ordinary_problems import FAMILIES
-from benchmarks.page import INTERVALS, SET_UP, put_table
+from benchmarks.families.ordinary_problems import FAMILIES
+from benchmarks.lib import RESULTS
+from benchmarks.lib.page import INTERVALS, SET_UP, put_table
 from torchgco import Problem, presets, solve
 from torchgco.lagrangian.rollout import open_loop
 
-PAGE = Path(__file__).resolve().parent / "results" / "ordinary.md"
+PAGE = RESULTS / "ordinary.md"
 SEEDS = (7, 21, 100)
 ADMITTED = 1e-3
 HEAD = ("family", "n", "cut off by limits", "default", "ms per problem, cut off", "ms per problem, default")
@@ -61,7 +61,9 @@ def share(count: int, n: int) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.ordinary", description="Ordinary constrained problems.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.families.ordinary", description="Ordinary constrained problems."
+    )
     parser.add_argument("--families", nargs="+", choices=FAMILIES, default=list(FAMILIES), metavar="NAME", help="which")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS), help="of the draws")
     parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/ordinary.md")

@@ -1,4 +1,4 @@
-"""python -m benchmarks.quality: how often the goal is reached, and how well, on the public families.
+"""python -m benchmarks.families.quality: how often the goal is reached, and how well, on the public families.
 
 Every family and solver is a separate study below outputs/quality, so that a run that was stopped resumes where it
 was. The table is printed. With --write, and where all families flew, it is put into its page with date and commit: the
@@ -16,15 +16,15 @@ from pathlib import Path
 
 import pandas as pd
 
-from benchmarks.families import EVERY, FAMILIES, Family
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.lib import ROOT
+from benchmarks.lib.families import EVERY, FAMILIES, Family
+from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.judging.judge import SUCCESS_VIOLATION
 from torchgco.scenarios import Layouts
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGES = {
     "quality": "README.md",
     "ladder": "results/ladder.md",
@@ -56,7 +56,9 @@ def page(asked: argparse.Namespace) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.quality", description="Fly the families, and count.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.families.quality", description="Fly the families, and count."
+    )
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--solvers", nargs="+", default=["gco"], metavar="NAME", help="configs; default: gco")
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""python -m benchmarks.endurance: a long study, its memory, and the same study killed three times.
+"""python -m benchmarks.endurance.study: a long study, its memory, and the same study killed three times.
 
 Two workers fly forests; the memory of all their processes is sampled each second. The same study in another folder is
 killed at three random times (SIGKILL to all of its processes) and started again each time; its table must equal that of
@@ -25,13 +25,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from benchmarks.endurance_memory import Sampler, draw, group_of, summary
-from benchmarks.endurance_overhead import FLIGHT, PHASES, REPORT, REST
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.endurance.memory import Sampler, draw, group_of, summary
+from benchmarks.endurance.overhead import FLIGHT, PHASES, REPORT, REST
+from benchmarks.lib import RESULTS, ROOT
+from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
 
-ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
 KILLS = 3
 TIMING = ["seconds", "batch_size", "threads"]  # columns that describe how a trial was flown
 SHARDS, LARGEST = 8, 512  # at least so many shards, of at most so many layouts
@@ -151,7 +150,7 @@ def _same(a: pd.Series, b: pd.Series) -> bool:
 
 def overhead(folder: Path, layouts: int) -> dict[str, dict[str, float]]:
     """Processor seconds by phase of a study and of direct calls, in one process."""
-    words = [sys.executable, "-m", "benchmarks.endurance_overhead", str(folder), str(layouts), str(shard_size(layouts))]
+    words = [sys.executable, "-m", "benchmarks.endurance.overhead", str(folder), str(layouts), str(shard_size(layouts))]
     return json.loads(subprocess.run(words, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout)
 
 
@@ -219,7 +218,9 @@ def overhead_table(seconds: dict[str, dict[str, float]]) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.endurance", description="Fly long, kill, compare.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.endurance.study", description="Fly long, kill, compare."
+    )
     parser.add_argument("--layouts", type=int, default=10_000, help="default: %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="of the times of the kills")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "endurance", help="its folders are emptied")

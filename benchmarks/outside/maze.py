@@ -1,4 +1,4 @@
-"""python -m benchmarks.maze: ALTRO's quadrotor maze, solved without waypoints, compared with IPOPT and FATROP.
+"""python -m benchmarks.outside.maze: ALTRO's quadrotor maze, solved without waypoints, compared with IPOPT and FATROP.
 
 The peers start from the five published waypoints, `torchgco` from hovering. All are judged by `recount`, in NumPy, and
 run in one thread. With --write the table goes into benchmarks/results/maze.md.
@@ -11,7 +11,6 @@ import multiprocessing
 import resource
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from time import process_time
 
 import numpy as np
@@ -19,15 +18,16 @@ import torch
 from torch import Tensor
 
 import torchgco
-from benchmarks.golden import IPOPT
-from benchmarks.maze_problem import maze, recount, starts, waypoint_guess
-from benchmarks.page import INTERVALS, SET_UP, put_table
+from benchmarks.lib import RESULTS
+from benchmarks.lib.page import INTERVALS, SET_UP, put_table
+from benchmarks.outside.golden import IPOPT
+from benchmarks.outside.maze_problem import maze, recount, starts, waypoint_guess
 from torchgco import Problem, presets
 from torchgco.baselines import CasADiSolver
 from torchgco.experiments.statistics.statistics import wilson
 from torchgco.search.restarts import Restarts
 
-PAGE = Path(__file__).resolve().parent / "results" / "maze.md"
+PAGE = RESULTS / "maze.md"
 STARTS, FATROP_STARTS = 64, 16
 TOLERANCE = 1e-6  # violation of a solved problem: m, m/s, rad/s, N
 FATROP = CasADiSolver("fatrop", tolerance=1e-10)
@@ -155,7 +155,7 @@ def table(count: int, seed: int, fatrop_count: int) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.maze", description="ALTRO's quadrotor maze.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.outside.maze", description="ALTRO's quadrotor maze.")
     parser.add_argument("--starts", type=int, default=STARTS, help="the published start and others around it")
     parser.add_argument("--fatrop", type=int, default=FATROP_STARTS, help="of these, starts that FATROP flies")
     parser.add_argument("--seed", type=int, default=0, help="of the starts")

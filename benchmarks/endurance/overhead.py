@@ -1,4 +1,4 @@
-"""python -m benchmarks.endurance_overhead FOLDER LAYOUTS SHARD_SIZE: what a study costs besides its solves.
+"""python -m benchmarks.endurance.overhead FOLDER LAYOUTS SHARD_SIZE: what a study costs besides its solves.
 
 In one process with one thread, a study of one worker flies all layouts into FOLDER, and then direct calls fly the same
 layouts, a batch per shard, without files. Prints processor seconds by phase as JSON: {"study": {...}, "direct": {...}}.

@@ -1,4 +1,4 @@
-"""python -m benchmarks.shortfalls: why `gco` misses the best known solution in the worlds, counted, with pictures.
+"""python -m benchmarks.causes.shortfalls: why `gco` misses the best known solution in the worlds.
 
 `gco` flies the public layouts of each world. Every layout where it isn't a success is solved again alone, and its
 search is watched; then candidates along 24 paths are all refined to their end. Where the good ones among them were
@@ -20,12 +20,13 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from benchmarks.failures import table
-from benchmarks.failures_picture import Example, picture
-from benchmarks.families import WORLDS, Family
-from benchmarks.shortfalls_watch import Search, watching
-from benchmarks.speed.provenance import provenance
-from benchmarks.speed.tables import put_between
+from benchmarks.causes.failures import table
+from benchmarks.causes.picture import Example, picture
+from benchmarks.causes.shortfalls_watch import Search, watching
+from benchmarks.lib import RESULTS
+from benchmarks.lib.families import WORLDS, Family
+from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
 from torchgco import compose, judge, presets
 from torchgco.judging.judge import near_best
 from torchgco.plotting.bodies import Box, bodies
@@ -38,8 +39,7 @@ from torchgco.search.settings import MORE
 from torchgco.search.suitability import has_paths
 from torchgco.search.ways import joined
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "benchmarks" / "results" / "shortfalls.md"
+PAGE = RESULTS / "shortfalls.md"
 MARKS = "<!-- shortfalls -->", "<!-- end shortfalls -->"
 PATHS = MORE * presets.gco(3).paths.num_paths  # of each of the two searches where the best candidate is costly
 CAUSES = {
@@ -201,7 +201,8 @@ def _line(row: dict[Any, Any]) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.shortfalls", description="Sort the layouts of the worlds where gco isn't a success."
+        prog="python -m benchmarks.causes.shortfalls",
+        description="Sort the layouts of the worlds where gco isn't a success.",
     )
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
     parser.add_argument("--first", type=int, metavar="N", help="the first N layouts of each world; default: all")

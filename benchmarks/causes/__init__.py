@@ -1,0 +1,1 @@
+"""Why a solver misses where it misses."""

@@ -1,0 +1,1 @@
+"""Long studies, kills, wrong input: what the library bears."""

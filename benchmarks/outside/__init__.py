@@ -1,0 +1,1 @@
+"""Problems of others, solved by torchgco and by peers: one judge, one table each."""
