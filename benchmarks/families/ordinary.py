@@ -6,22 +6,20 @@ returned controls. With --write the table goes into benchmarks/results/ordinary.
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import median
-from time import process_time
 
 import torch
-from scipy.stats import binomtest
 
 from benchmarks.families.ordinary_problems import FAMILIES
-from benchmarks.lib import RESULTS
-from benchmarks.lib.page import INTERVALS, SET_UP, put_table
+from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.comparison import timed
+from benchmarks.lib.page import INTERVALS, SET_UP, interval, markdown
 from torchgco import Problem, presets, solve
 from torchgco.lagrangian.rollout import open_loop
 
-PAGE = RESULTS / "ordinary.md"
 SEEDS = (7, 21, 100)
 ADMITTED = 1e-3
 HEAD = ("family", "n", "cut off by limits", "default", "ms per problem, cut off", "ms per problem, default")
@@ -39,12 +37,10 @@ def flown(problem: Problem, finished: bool) -> Batch:
     """One batch by the default solver, or by the same without its finish."""
     solver = presets.gco(problem) if finished else replace(presets.gco(problem), finish=None)
     solve(problem.take(slice(0, 1)), solver=solver, max_seconds=1e-2)  # compiles
-    began = process_time()
-    U = solve(problem, solver=solver).U
-    seconds = (process_time() - began) / problem.B
-    X = open_loop(problem.dynamics, problem.x0, U)
-    worst = torch.stack([part.worst(X, U) for part in problem.constraints]).amax(0)
-    return Batch(int((worst <= ADMITTED).sum()), seconds)
+    solution, seconds = timed(lambda: solve(problem, solver=solver))
+    X = open_loop(problem.dynamics, problem.x0, solution.U)
+    worst = torch.stack([part.worst(X, solution.U) for part in problem.constraints]).amax(0)
+    return Batch(int((worst <= ADMITTED).sum()), seconds / problem.B)
 
 
 def row(name: str, seeds: Sequence[int]) -> list[str]:
@@ -55,30 +51,22 @@ def row(name: str, seeds: Sequence[int]) -> list[str]:
     return [name, str(sum(problem.B for problem in problems)), *counts, *times]
 
 
-def share(count: int, n: int) -> str:
-    low, high = binomtest(count, n).proportion_ci(method="wilson")
-    return f"{count} [{100 * low:.0f}, {100 * high:.0f}]"
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__, "results/ordinary.md")
+    parser.add_argument("--families", nargs="+", choices=FAMILIES, default=list(FAMILIES), metavar="NAME", help="which")
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS), help="of the draws")
+    return parser
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.families.ordinary", description="Ordinary constrained problems."
-    )
-    parser.add_argument("--families", nargs="+", choices=FAMILIES, default=list(FAMILIES), metavar="NAME", help="which")
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS), help="of the draws")
-    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/ordinary.md")
-    asked = parser.parse_args(words)
-    torch.set_num_threads(1)
+    asked = _parser().parse_args(words)
+    one_thread()
     rows = [row(name, asked.seeds) for name in asked.families]
     n, *counts = (sum(int(cells[i]) for cells in rows) for i in (1, 2, 3))
-    rows.append(["all", str(n), *(share(count, n) for count in counts), "", ""])
-    text = "\n".join(f"| {' | '.join(cells)} |" for cells in (HEAD, ["---"] * len(HEAD), *rows))
-    print(text)
-    if asked.write:
-        seeds = ", ".join(map(str, asked.seeds))
-        how = f"eight problems per family and seed, seeds {seeds}, processor time with one thread, median over seeds"
-        put_table(PAGE, how, text, INTERVALS, SET_UP)
-    return 0
+    rows.append(["all", str(n), *(f"{count} {interval(count, n)}" for count in counts), "", ""])
+    seeds = ", ".join(map(str, asked.seeds))
+    how = f"eight problems per family and seed, seeds {seeds}, processor time with one thread, median over seeds"
+    return show(asked, "ordinary", markdown(HEAD, rows), how, INTERVALS, SET_UP)
 
 
 if __name__ == "__main__":

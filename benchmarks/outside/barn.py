@@ -8,24 +8,23 @@ benchmarks/results/barn.md.
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import dataclass
-from time import perf_counter
 
 import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
-from benchmarks.lib import RESULTS
-from benchmarks.lib.page import INTERVALS, SET_UP, put_table
-from benchmarks.outside.barn_data import DATA, GOAL, GOAL_RADIUS, RADIUS, TEST
+from benchmarks.lib import DATA
+from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.comparison import timed
+from benchmarks.lib.page import INTERVALS, SET_UP, markdown, share
+from benchmarks.outside.barn_data import GOAL, GOAL_RADIUS, RADIUS, TEST
 from torchgco import ControlBounds, Goal, Problem, QuadraticCost, Spheres, StateBounds, Unicycle, judge, solve
-from torchgco.experiments.statistics.statistics import wilson
 from torchgco.scenarios import Layouts
 
-PAGE = RESULTS / "barn.md"
 STAGES, DT = 100, 0.1  # 10 s in every world; the challenge, too, looks every 0.1 s whether a run has arrived
 SPEED = 2.0  # m/s: the challenge's shortest time is the length of its path over this
 BACKWARDS = -0.5  # m/s: these limits are those of the challenge's planner (base_local_planner_params.yaml)
@@ -112,11 +111,10 @@ def gap(path: np.ndarray, centers: np.ndarray) -> float:
 
 def cells(drives: Drives, optimal: np.ndarray) -> list[str]:
     """The cells of a row that tell how good the drives are; all but the first two are of successes."""
-    hits, count, score = int(drives.sound.sum()), len(optimal), f"{drives.score(optimal).mean():.3f}"
-    low, high = (100 * bound for bound in wilson(hits, count))
-    success = f"{hits} of {count} [{low:.0f}, {high:.0f}] %"
-    if hits == 0:
-        return [success, score, *["-"] * 4]
+    success = f"{share(drives.sound.sum(), len(optimal))} %"
+    score = f"{drives.score(optimal).mean():.3f}"
+    if not drives.sound.any():
+        return [success, score, *"----"]
     seconds, clearance, change = (z[drives.sound] for z in (drives.seconds, drives.clearance, drives.turn_change))
     ratio = seconds / optimal[drives.sound]
     return [
@@ -130,39 +128,36 @@ HEAD = (
     "change of turn rate, rad/s^2", "seconds per world",
 )  # fmt: skip
 # README of Daffan/the-barn-challenge: 50 worlds, ten runs each, "Avg Success: 0.8800".
-DWA = ["DWA, as published", "test", "0.88 of 500 runs", "0.169", "33.47", *["-"] * 4]
+DWA = ["DWA, as published", "test", "0.88 of 500 runs", "0.169", "33.47", *"----"]
 
 
 def table(first: int | None, seed: int) -> str:
     """The results of the solvers, in Markdown."""
-    lines, notes = [list(HEAD), ["---"] * len(HEAD)], []
-    for test in (True, False):
+    rows, notes = [], []
+    for test, kind in ((True, "test"), (False, "others")):
         layouts, known = worlds(test, first)
-        problem, optimal = problems(layouts), known["optimal"].to_numpy()
+        problem = problems(layouts)
         solve(problem.take(slice(0, 1)))  # compiles
-        began = perf_counter()
-        U = solve(problem, seed=seed).U
-        seconds = (perf_counter() - began) / problem.B
-        drives, kind = Drives.of(problem, layouts, U), "test" if test else "others"
-        lines.append(["`gco`", kind, *cells(drives, optimal), f"{seconds:.2f}"])
-        missed = ", ".join(str(world) for world in known["world"][~drives.sound]) or "none"
+        solution, seconds = timed(lambda p=problem: solve(p, seed=seed))
+        drives = Drives.of(problem, layouts, solution.U)
+        rows.append(["`gco`", kind, *cells(drives, known["optimal"].to_numpy()), f"{seconds / problem.B:.2f}"])
+        missed = ", ".join(map(str, known["world"][~drives.sound])) or "none"
         notes.append(f"Worlds without success, {kind}: {missed}.")
-    lines.append(DWA)
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n\n" + "\n\n".join(notes)
+    return "\n\n".join([markdown(HEAD, [*rows, DWA]), *notes])
+
+
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__, "results/barn.md")
+    parser.add_argument("--first", type=int, default=None, help="only the first worlds of each kind, this many")
+    parser.add_argument("--seed", type=int, default=0, help="of the random draws of guidance")
+    return parser
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.outside.barn", description="The worlds of BARN.")
-    parser.add_argument("--first", type=int, default=None, help="only the first worlds of each kind, this many")
-    parser.add_argument("--seed", type=int, default=0, help="of the random draws of guidance")
-    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/barn.md")
-    asked = parser.parse_args(words)
-    torch.set_num_threads(1)
-    text = table(asked.first, asked.seed)
-    print(text)
-    if asked.write:
-        put_table(PAGE, f"seed {asked.seed}, one batch each, one thread on one core", text, SET_UP, INTERVALS)
-    return 0
+    asked = _parser().parse_args(words)
+    one_thread()
+    how = f"seed {asked.seed}, one batch each, processor time with one thread"
+    return show(asked, "barn", table(asked.first, asked.seed), how, SET_UP, INTERVALS)
 
 
 if __name__ == "__main__":

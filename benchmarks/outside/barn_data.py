@@ -7,7 +7,6 @@ of the challenge's own path through it.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -16,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.lib import DATA
+from benchmarks.lib.command import parser_of
 from torchgco.scenarios import Layouts
 
 WORLDS, TEST = range(300), range(0, 300, 6)  # test.sh there
@@ -47,9 +47,7 @@ def path_length(cells: np.ndarray) -> float:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.outside.barn_data", description="The worlds of BARN as arrays."
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("clone", type=Path, help="folder of the repository Daffan/the-barn-challenge")
     asked = parser.parse_args(words)
     folder = asked.clone / "jackal_helper" / "worlds" / "BARN"

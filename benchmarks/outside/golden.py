@@ -7,102 +7,85 @@ benchmarks/results/golden.md.
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentParser
 from collections.abc import Sequence
-from dataclasses import dataclass
-from time import process_time
+from typing import Any
 
-import torch
+import pandas as pd
+from torch import Tensor
 
-from benchmarks.lib import RESULTS
-from benchmarks.lib.page import SET_UP, put_table
+from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.comparison import Comparison, cost_ratios, named, timed, within, worst
+from benchmarks.lib.page import SET_UP
 from benchmarks.outside.golden_problems import GOLDEN, Golden
-from torchgco import Certificate, Polish, Problem, Solution, certify, solve
+from torchgco import Polish, Problem, certify, solve
 from torchgco.baselines import CasADiSolver
+from torchgco.lagrangian.quality import violation
+from torchgco.lagrangian.rollout import open_loop
 
-PAGE = RESULTS / "golden.md"
 STARTS = 8
+TOLERANCE = 1e-6
 # At its own tolerance of 1e-8 and with relaxed bounds, a rollout of IPOPT's controls can miss a goal by 5e-5.
-IPOPT = CasADiSolver("ipopt", tolerance=1e-10, violation_tolerance=1e-6, options={"bound_relax_factor": 0.0})
-HEAD = (
-    "problem", "N", "solver", "violation <= 1e-6", "cost", "largest violation", "largest KKT residual", "iterations",
-    "seconds per problem", "cost ratio: least, median, largest",
-)  # fmt: skip
+IPOPT = CasADiSolver("ipopt", tolerance=1e-10, violation_tolerance=TOLERANCE, options={"bound_relax_factor": 0.0})
 
 
-@dataclass(frozen=True)
-class Flight:
-    """Trajectories of one solver, and the processor time in seconds per problem."""
-
-    solution: Solution
-    certificate: Certificate
-    seconds: float
-
-    @classmethod
-    def timed(cls, problem: Problem, solution: Solution, began: float) -> Flight:
-        seconds = (process_time() - began) / problem.B
-        return cls(solution, certify(problem, solution.X, solution.U), seconds)
-
-    def cells(self) -> list[str]:
-        """The columns from `violation <= 1e-6` to the seconds; cost and iterations are those of the first problem."""
-        violation = self.solution.violation
-        return [
-            f"{int((violation <= 1e-6).sum())} of {len(violation)}", f"{float(self.solution.cost[0]):.6g}",
-            f"{float(violation.max()):.0e}", f"{float(self.certificate.kkt_residual.max()):.0e}",
-            str(int(self.solution.iterations[0])), f"{self.seconds:.3f}",
-        ]  # fmt: skip
+def counted(problem: Problem, U: Tensor) -> dict[str, Tensor]:
+    """Cost, violation and KKT residual (B,) along a rollout."""
+    X = open_loop(problem.dynamics, problem.x0, U)
+    residual = certify(problem, X, U).kkt_residual
+    return {"cost": problem.cost.total(X, U), "violation": violation(problem, X, U), "residual": residual}
 
 
-def ours(task: Golden, problem: Problem) -> tuple[Flight, Flight]:
-    """The default solver as it is, and with its result polished."""
-    U0 = task.U0.expand(problem.B, *task.U0.shape).clone()
+def ratios(own: pd.DataFrame, peer: pd.DataFrame) -> str:
+    """Of the polished costs to IPOPT's."""
+    return {"default": "-", "IPOPT": "1"}.get(own.solver[0]) or cost_ratios(TOLERANCE)(own, peer)
+
+
+# Cost and iterations are those of the published start, the first.
+COMPARISON = Comparison(counted, [
+    ("problem", named("task")),
+    ("N", named("N")),
+    ("solver", named("solver")),
+    ("violation <= 1e-6", within(TOLERANCE)),
+    ("cost", lambda own, _: f"{own.cost[0]:.6g}"),
+    ("largest violation", worst("violation")),
+    ("largest KKT residual", worst("residual")),
+    ("iterations", named("iterations")),
+    ("seconds per problem", lambda own, _: f"{own.seconds[0]:.3f}"),
+    ("cost ratio: least, median, largest", ratios),
+])  # fmt: skip
+
+
+def rows(task: Golden, starts: int, seed: int) -> list[list[Any]]:
+    """The default solver as it is, and with its result polished; and IPOPT, from the same controls."""
+    problem, U0 = task.batch(starts, seed)
+    more = {"task": task.name, "N": problem.N}
     solve(problem.take(slice(0, 1)), max_seconds=1e-3)  # compiles
-    began = process_time()
-    rough = Flight.timed(problem, task.solve(problem, U0), began)
-    began = process_time() - rough.seconds * problem.B
-    return rough, Flight.timed(problem, Polish().refine(problem, rough.solution), began)
-
-
-def ipopt(task: Golden, problem: Problem) -> Flight:
-    """IPOPT from the task's initial controls; building the program isn't timed."""
-    solver = IPOPT.prepare(problem)
-    began = process_time()
-    solution = solver.solve(problem, task.U0.expand(problem.B, *task.U0.shape).clone())
-    return Flight.timed(problem, solution, began)
-
-
-def rows(task: Golden, starts: int, seed: int) -> list[list[str]]:
-    """Three rows of the table."""
-    problem, _ = task.batch(starts, seed)
-    rough, polished = ours(task, problem)
-    peer = ipopt(task, problem)
-    ratio = (polished.solution.cost / peer.solution.cost)[peer.solution.violation <= 1e-6]
-    share = ", ".join(f"{float(ratio.quantile(q)):.4f}" for q in (0.0, 0.5, 1.0)) if len(ratio) else "-"
-    return [
-        [task.name, str(problem.N), "default", *rough.cells(), "-"],
-        [task.name, str(problem.N), "default, polished", *polished.cells(), share],
-        [task.name, str(problem.N), "IPOPT", *peer.cells(), "1"],
+    rough, first = timed(lambda: task.solve(problem, U0))
+    fine, second = timed(lambda: Polish().refine(problem, rough))
+    prepared = IPOPT.prepare(problem)
+    flights = [
+        COMPARISON.judged("default", problem, rough.U, rough.iterations, first / starts, **more),
+        COMPARISON.judged("default, polished", problem, fine.U, fine.iterations, (first + second) / starts, **more),
+        COMPARISON.fly("IPOPT", problem, lambda: prepared.solve(problem, U0), **more),
     ]
+    return COMPARISON.rows(flights, flights[-1])
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.outside.golden", description="Problems of the ALTRO solver."
-    )
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__, "results/golden.md")
     parser.add_argument("--problems", nargs="+", choices=GOLDEN, default=list(GOLDEN), metavar="NAME", help="which")
     parser.add_argument("--starts", type=int, default=STARTS, help="starts per problem")
     parser.add_argument("--seed", type=int, default=0, help="of the starts")
-    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/golden.md")
-    asked = parser.parse_args(words)
-    torch.set_num_threads(1)
-    lines = [list(HEAD), ["---"] * len(HEAD)]
-    for name in asked.problems:
-        lines += rows(GOLDEN[name], asked.starts, asked.seed)
-    text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    print(text)
-    if asked.write:
-        put_table(PAGE, f"{asked.starts} starts, seed {asked.seed}, processor time with one thread", text, SET_UP)
-    return 0
+    return parser
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    asked = _parser().parse_args(words)
+    one_thread()
+    text = COMPARISON.table([row for name in asked.problems for row in rows(GOLDEN[name], asked.starts, asked.seed)])
+    how = f"{asked.starts} starts, seed {asked.seed}, processor time with one thread"
+    return show(asked, "golden", text, how, SET_UP)
 
 
 if __name__ == "__main__":

@@ -7,36 +7,56 @@ benchmarks/results/navigation.md.
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
+from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
-from time import process_time
+from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
 import torchgco
-from benchmarks.lib import RESULTS
-from benchmarks.lib.page import INTERVALS, put_table
+from benchmarks.lib import comparison as lib
+from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.page import INTERVALS
 from benchmarks.outside.navigation_problem import fan, line_guess, navigation, recount
 from torchgco import Problem, Solution, presets
 from torchgco.baselines import CasADiSolver
-from torchgco.experiments.statistics.statistics import wilson
 
-PAGE = RESULTS / "navigation.md"
 STARTS, SECTORS = 500, (90.0, 180.0)  # the published batch, and the published widths of the fan in degrees
 TOLERANCE = 1e-6  # the published one of IPOPT; here the largest violation of torchgco's results, too
 JUDGED = 1e-4  # IPOPT's own limit on violations, m, m/s and rad/s: its states meet it, a rollout may differ slightly
 REPEATS = {"local": 5}  # of the timing of a solver that takes less than a second; the median counts
 IPOPT = CasADiSolver("ipopt", tolerance=TOLERANCE, options={"warm_start_init_point": "yes"})
-HEAD = (
-    "fan", "solver", "n", "violation <= 1e-4", "violation <= 1e-3", "largest violation",
-    "cost, share of IPOPT's: least, median, largest", "iterations, mean", "problems per second, one core", "two cores",
-    "times IPOPT, one core", "two cores",
-)  # fmt: skip
+
+
+def counted(problem: Problem, U: Tensor) -> dict[str, np.ndarray]:
+    """Cost and violation (B,), by `recount`."""
+    return dict(zip(("cost", "violation"), recount(problem.x0.numpy(), U.numpy()), strict=False))
+
+
+def times(name: str) -> lib.Column:
+    """How many times the peer's rate."""
+    return lambda own, peer: f"{own[name][0] / peer[name][0]:.1f}"
+
+
+COMPARISON = lib.Comparison(counted, [
+    ("fan", lib.named("fan")),
+    ("solver", lib.named("solver")),
+    ("n", lib.count),
+    ("violation <= 1e-4", lib.share_within(JUDGED, 1)),
+    ("violation <= 1e-3", lib.within(1e-3)),
+    ("largest violation", lib.worst("violation")),
+    ("cost, share of IPOPT's: least, median, largest", lib.cost_ratios(JUDGED)),
+    ("iterations, mean", lib.mean("iterations", 0)),
+    ("problems per second, one core", lib.mean("alone", 0)),
+    ("two cores", lib.mean("shared", 0)),
+    ("times IPOPT, one core", times("alone")),
+    ("two cores", times("shared")),
+])  # fmt: skip
 
 
 def default(problem: Problem, ids: Tensor) -> Callable[[], Solution]:
@@ -57,18 +77,6 @@ def ipopt(problem: Problem, ids: Tensor) -> Callable[[], Solution]:
 
 
 SOLVERS = {"`torchgco.solve`, default options": default, "`torchgco`, AL-iLQR, tolerance 1e-6": local, "IPOPT": ipopt}
-NAMES = list(SOLVERS)
-
-
-@dataclass(frozen=True)
-class Flight:
-    """What one solver made of one fan, as `recount` counts."""
-
-    cost: np.ndarray  # (B,)
-    violation: np.ndarray
-    iterations: np.ndarray
-    rates: tuple[float, float]  # problems per second of one worker, and of two
-
 
 # In a worker: the solve that it was prepared for.
 _solve: Callable[[], Solution]
@@ -84,9 +92,8 @@ def _prepare(solver: str, sector: float, count: int, rows: slice) -> None:
 
 
 def _run() -> tuple[np.ndarray, np.ndarray, float]:
-    began = process_time()
-    solution = _solve()
-    return solution.U.numpy(), solution.iterations.numpy(), process_time() - began
+    solution, seconds = lib.timed(_solve)
+    return solution.U.numpy(), solution.iterations.numpy(), seconds
 
 
 def flown(solver: str, sector: float, count: int, workers: int, repeats: int) -> tuple[np.ndarray, np.ndarray, float]:
@@ -115,54 +122,38 @@ def flown(solver: str, sector: float, count: int, workers: int, repeats: int) ->
     return U, iterations, float(np.median(seconds))
 
 
-def fly(solver: str, sector: float, count: int) -> Flight:
-    """One fan by one solver, on one core and then on two."""
+def fly(solver: str, sector: float, count: int) -> pd.DataFrame:
+    """One fan by one solver, on one core and then on two; with the rates, problems per second."""
     repeats = REPEATS.get(SOLVERS[solver].__name__, 1)
     U, iterations, alone = flown(solver, sector, count, 1, repeats)
     again, _, shared = flown(solver, sector, count, 2, repeats)
     assert solver == "IPOPT" or np.array_equal(U, again)  # a result does not depend on the batch
-    cost, violation, _ = recount(fan(count, sector).numpy(), U)
-    return Flight(cost, violation, iterations, (count / alone, count / shared))
-
-
-def cells(sector: float, name: str, flight: Flight, peer: Flight) -> list[str]:
-    """A row of the table; costs are compared where both solve the problem."""
-    n, good = len(flight.cost), flight.violation <= JUDGED
-    ratio = (flight.cost / peer.cost)[good & (peer.violation <= JUDGED)]
-    low, high = (100 * bound for bound in wilson(int(good.sum()), n))
-    return [
-        f"{sector:.0f} degrees", name, str(n), f"{good.sum()} of {n} [{low:.1f}, {high:.1f}] %",
-        f"{(flight.violation <= 1e-3).sum()} of {n}", f"{flight.violation.max():.0e}",
-        ", ".join(f"{x:.4f}" for x in np.quantile(ratio, (0, 0.5, 1))) if len(ratio) else "-",
-        f"{flight.iterations.mean():.0f}", *(f"{rate:.0f}" for rate in flight.rates),
-        *(f"{own / other:.1f}" for own, other in zip(flight.rates, peer.rates, strict=True)),
-    ]  # fmt: skip
+    more = {"fan": f"{sector:.0f} degrees", "alone": count / alone, "shared": count / shared}
+    problem = navigation(fan(count, sector))
+    return COMPARISON.judged(solver, problem, torch.from_numpy(U), iterations, alone / count, **more)
 
 
 def table(count: int, sectors: Sequence[float]) -> str:
     """The results of all solvers on all fans, in Markdown."""
-    rows = [list(HEAD), ["---"] * len(HEAD)]
+    rows = []
     for sector in sectors:
-        flights = {name: fly(name, sector, count) for name in NAMES}
-        rows += [cells(sector, name, flight, flights["IPOPT"]) for name, flight in flights.items()]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        flights = [fly(name, sector, count) for name in SOLVERS]
+        rows += COMPARISON.rows(flights, flights[-1])
+    return COMPARISON.table(rows)
+
+
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__, "results/navigation.md")
+    parser.add_argument("--starts", type=int, default=STARTS, help="starts per fan")
+    parser.add_argument("--sectors", type=float, nargs="+", default=SECTORS, help="widths of the fans, degrees")
+    return parser
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.outside.navigation", description="Navigation of jaxipm."
-    )
-    parser.add_argument("--starts", type=int, default=STARTS, help="starts per fan")
-    parser.add_argument("--sectors", type=float, nargs="+", default=SECTORS, help="widths of the fans, degrees")
-    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/navigation.md")
-    asked = parser.parse_args(words)
-    torch.set_num_threads(1)
-    text = table(asked.starts, asked.sectors)
-    print(text)
-    if asked.write:
-        how = f"{asked.starts} starts per fan, processor time without set-up, one thread per process"
-        put_table(PAGE, how, text, "CasADi", INTERVALS)
-    return 0
+    asked = _parser().parse_args(words)
+    one_thread()
+    how = f"{asked.starts} starts per fan, processor time without set-up, one thread per process"
+    return show(asked, "navigation", table(asked.starts, asked.sectors), how, "CasADi", INTERVALS)
 
 
 if __name__ == "__main__":

@@ -7,23 +7,22 @@ problem from rest and from eleven random guesses, and its cheapest feasible resu
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentParser
 from collections.abc import Sequence
-from time import perf_counter
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
 import torchgco
-from benchmarks.lib import RESULTS
-from benchmarks.lib.page import INTERVALS, put_table
+from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.comparison import Comparison, count, named
+from benchmarks.lib.page import INTERVALS, share
 from torchgco.baselines import CasADiSolver
-from torchgco.experiments.statistics.statistics import wilson
-from torchgco.judging.judge import Verdict, judge
+from torchgco.judging.judge import judge
 from torchgco.problem.problem import Problem
 
-PAGE = RESULTS / "unicycle.md"
 STAGES, STARTS = 100, 12
 VEHICLE, LIMIT = 0.15, 3.0  # m; m/s^2 and rad/s
 WITHIN = 1.05  # times the best cost of IPOPT
@@ -59,73 +58,77 @@ def problems(count: int, seed: int) -> Problem:
     )
 
 
-def ipopt(problem: Problem, seed: int) -> Tensor:
-    """The least cost (B,) of a feasible result among all starts; infinite where there is none."""
+def counted(problem: Problem, U: Tensor) -> dict[str, Tensor]:
+    """Cost and violation (B,), and whether the result is feasible at full radii."""
+    verdict = judge(problem, U)
+    sound = verdict.feasible & (verdict.violation <= 1e-3)
+    return {"cost": verdict.cost, "violation": verdict.violation, "sound": sound}
+
+
+def ratio(own: pd.DataFrame, peer: pd.DataFrame) -> pd.Series:
+    """Costs as shares of the best start's, where both are feasible."""
+    return (own.cost / peer.cost)[own.sound & peer.sound]
+
+
+def close(own: pd.DataFrame, peer: pd.DataFrame) -> str:
+    """How many are within 5 % of the best start; nothing is compared with itself."""
+    return "-" if own is peer else f"{share((ratio(own, peer) <= WITHIN).sum(), peer.sound.sum())} %"
+
+
+def ratios(own: pd.DataFrame, peer: pd.DataFrame) -> str:
+    return "-" if own is peer else ", ".join(f"{ratio(own, peer).quantile(q):.3f}" for q in (0.5, 0.9, 1.0))
+
+
+COMPARISON = Comparison(counted, [
+    ("solver", named("solver")),
+    ("n", count),
+    ("feasible", lambda own, _: f"{share(own.sound.sum(), len(own))} %"),
+    ("within 5 % of the best start", close),
+    ("cost ratio: median, 90 %, largest", ratios),
+    ("seconds", lambda own, _: f"{own.seconds[0]:.3g}"),
+])  # fmt: skip
+
+
+def ipopt(problem: Problem, seed: int) -> pd.DataFrame:
+    """The cheapest feasible result among all starts, the first from rest, and the time of all of them."""
     solver = CasADiSolver("ipopt").prepare(problem)
     generator = torch.Generator().manual_seed(seed)
-    best = torch.full_like(problem.x0[:, 0], torch.inf)
+    flights = []
     for start in range(STARTS):
         U0 = problem.x0.new_zeros(problem.B, STAGES, problem.m)
         if start > 0:  # linear between ten random points in time
             knots = torch.randn(problem.B, problem.m, 10, generator=generator, dtype=torch.float64)
             U0 = torch.nn.functional.interpolate(knots, STAGES, mode="linear", align_corners=True).mT.contiguous()
-        verdict = judge(problem, solver.solve(problem, U0).U)
-        best = torch.where(sound(verdict), torch.minimum(best, verdict.cost), best)
-    return best
-
-
-def sound(verdict: Verdict) -> Tensor:
-    """Feasible at full radii, (B,)."""
-    return verdict.feasible & (verdict.violation <= 1e-3)
+        flights.append(COMPARISON.fly(f"IPOPT, {STARTS} starts", problem, lambda U=U0: solver.solve(problem, U)))
+    every = pd.concat(flights)
+    best = every.assign(dear=~every.sound).sort_values(["dear", "cost"], kind="stable")
+    best = best[~best.index.duplicated()].sort_index()
+    return best.assign(seconds=sum(flight.seconds for flight in flights))
 
 
 def table(problem: Problem, seed: int) -> str:
     """The results of both solvers, in Markdown."""
     torchgco.solve(problem.take(slice(0, 1)))  # compiles
-    began = perf_counter()
-    solution = torchgco.solve(problem)
-    seconds = (perf_counter() - began) / problem.B
-    verdict = judge(problem, solution.U)
-    began = perf_counter()
+    own = COMPARISON.fly("`torchgco.solve`", problem, lambda: torchgco.solve(problem))
     best = ipopt(problem, seed)
-    peer = (perf_counter() - began) / problem.B
-    known, fits = torch.isfinite(best), sound(verdict)
-    ratio = (verdict.cost / best)[known & fits]
-    close = int((ratio <= WITHIN).sum())
-    lines = [
-        ["solver", "n", "feasible", "within 5 % of the best start", "cost ratio: median, 90 %, largest", "seconds"],
-        ["---"] * 6,
-        [
-            "`torchgco.solve`", str(problem.B), _share(int(fits.sum()), problem.B), _share(close, int(known.sum())),
-            ", ".join(f"{float(ratio.quantile(q)):.3f}" for q in (0.5, 0.9, 1.0)), f"{seconds:.3f}",
-        ],
-        [f"IPOPT, {STARTS} starts", str(problem.B), _share(int(known.sum()), problem.B), "-", "-", f"{peer:.2f}"],
-    ]  # fmt: skip
-    cheaper = int((ratio < 1 / 1.01).sum())
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + (
+    cheaper = (ratio(own, best) < 1 / 1.01).sum()
+    return COMPARISON.table(COMPARISON.rows([own, best], best)) + (
         f"\n\n`torchgco.solve` is more than 1 % cheaper than all {STARTS} starts on {cheaper} problems."
     )
 
 
-def _share(hits: int, n: int) -> str:
-    low, high = (100 * bound for bound in wilson(hits, n))
-    return f"{hits} of {n} [{low:.0f}, {high:.0f}] %"
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__, "results/unicycle.md")
+    parser.add_argument("--count", type=int, default=64, help="problems")
+    parser.add_argument("--seed", type=int, default=0, help="of problems and guesses")
+    return parser
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.outside.unicycle", description="A user's model, untuned."
-    )
-    parser.add_argument("--count", type=int, default=64, help="problems")
-    parser.add_argument("--seed", type=int, default=0, help="of problems and guesses")
-    parser.add_argument("--write", action="store_true", help="put the table into benchmarks/results/unicycle.md")
-    asked = parser.parse_args(words)
-    torch.set_num_threads(1)
+    asked = _parser().parse_args(words)
+    one_thread()
     text = table(problems(asked.count, asked.seed), asked.seed)
-    print(text)
-    if asked.write:
-        put_table(PAGE, f"seed {asked.seed}, one thread on one core", text, INTERVALS)
-    return 0
+    return show(asked, "unicycle", text, f"seed {asked.seed}, processor time with one thread", INTERVALS)
 
 
 if __name__ == "__main__":

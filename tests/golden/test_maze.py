@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import torchgco
-from benchmarks.outside.maze import TOLERANCE, Flight, main, precise
+from benchmarks.outside.maze import TOLERANCE, main, precise
 from benchmarks.outside.maze_problem import (
     DT,
     GOAL,
@@ -81,18 +81,6 @@ def test_four_starts_are_solved_without_waypoints() -> None:
     cost, worst, _ = recount(problem.x0.numpy(), solution.U.numpy())
     assert worst.max() <= TOLERANCE
     assert cost[0] <= 0.6111  # IPOPT's from the waypoints
-
-
-def test_a_row_counts_starts_without_a_result_as_failures() -> None:
-    peer = Flight("IPOPT", "waypoints", np.full(5, 2.0), np.zeros(5), np.full(5, 9.0), np.ones(5))
-    nan = np.nan
-    lost = Flight(
-        "FATROP", "waypoints", np.array([2.2, 1.0, 2.0, nan]), np.array([1e-7, 0.5, 1e-4, nan]),
-        np.array([10, 20, 30, nan]), np.array([1.0, 2.0, 3.0, nan]),
-    )  # fmt: skip
-    cells = lost.cells(peer)
-    assert cells[2:6] == ["4", "1 of 4 [5, 70] %", "2 of 4", "2.1000"]
-    assert cells[6:] == ["1.0000, 1.0500, 1.1000", "20", "2.000"]
 
 
 @pytest.mark.slow

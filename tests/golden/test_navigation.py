@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
-from benchmarks.outside.navigation import TOLERANCE, Flight, cells, local, main
+from benchmarks.outside.navigation import COMPARISON, TOLERANCE, local, main
 from benchmarks.outside.navigation_problem import FASTEST, HOVER, SLOWEST, fan, line_guess, navigation, recount
 from torchgco import ControlBounds, StateBounds
 from torchgco.lagrangian.quality import violation
@@ -80,10 +81,16 @@ def test_a_few_starts_reach_the_known_costs() -> None:
 
 
 def test_a_row_compares_costs_where_both_solve_and_rates_core_by_core() -> None:
-    peer = Flight(np.array([1.0, 2.0, 4.0]), np.array([0.0, 0.0, 1.0]), np.full(3, 9), (10.0, 20.0))
-    own = Flight(np.array([1.5, 2.0, 8.0]), np.array([1e-7, 5e-4, 0.0]), np.array([3, 4, 5]), (200.0, 300.0))
-    row = cells(90.0, "AL-iLQR", own, peer)
-    assert row[:6] == ["90 degrees", "AL-iLQR", "3", "2 of 3 [20.8, 93.9] %", "3 of 3", "5e-04"]
+    flight = pd.DataFrame(
+        {"fan": "90 degrees", "solver": "IPOPT", "cost": [1.0, 2.0, 4.0], "violation": [0.0, 0.0, 1.0]}
+    )
+    peer = flight.assign(iterations=9, alone=10.0, shared=20.0)
+    own = peer.assign(
+        solver="AL-iLQR", cost=[1.5, 2.0, 8.0], violation=[1e-7, 5e-4, 0.0], iterations=[3, 4, 5], alone=200.0,
+        shared=300.0,
+    )  # fmt: skip
+    (row,) = COMPARISON.rows([own], peer)
+    assert row[:6] == ["90 degrees", "AL-iLQR", 3, "2 of 3 [20.8, 93.9] %", "3 of 3", "5e-04"]
     assert row[6:] == ["1.5000, 1.5000, 1.5000", "4", "200", "300", "20.0", "15.0"]
 
 

@@ -20,7 +20,7 @@ from torchgco.scenarios import Layouts, Task
 
 @pytest.fixture(autouse=True)
 def without_acados(monkeypatch, tmp_path: Path) -> None:
-    """Hide an installed acados: tests/test_speed_peers.py tests it."""
+    """Hide an installed acados: tests/benchmarks/test_acados.py tests it."""
     monkeypatch.setattr(acados, "ENVIRONMENT", tmp_path)
 
 

@@ -16,8 +16,8 @@ from benchmarks.speed import families
 from benchmarks.speed.bench import Bench
 from benchmarks.speed.peers import AcadosPeer
 from benchmarks.speed.results import Results
+from tests.benchmarks.test_speed import TINY
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
-from tests.test_benchmarks import TINY
 from torchgco import ControlBounds, InputError, Problem, QuadraticCost, Spheres, StateBounds
 from torchgco.baselines import CasADiSolver
 from torchgco.lagrangian.rollout import open_loop

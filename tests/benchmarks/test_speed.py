@@ -1,23 +1,15 @@
-"""The smallest benchmarks: every section gives complete rows, and the tables are rewritten in place."""
+"""The smallest benchmarks of speed: every section gives complete rows, and the tables are rewritten in place."""
 
 from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
-from benchmarks.families import oracle, quality
-from benchmarks.lib import acados
-from benchmarks.lib.families import FAMILIES
-from benchmarks.lib.page import SET_UP, put_table
+from benchmarks.lib import ROOT, acados
 from benchmarks.lib.provenance import provenance
 from benchmarks.speed import (
     batch,
@@ -38,14 +30,8 @@ from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
 from benchmarks.speed.tables import SPEED, TARGETS, rewrite, section_table
-from torchgco import compose
-from torchgco.base.errors import InputError
-from torchgco.experiments import app
-from torchgco.experiments.flying import study
 from torchgco.native import engine as native_engine
-from torchgco.scenarios import Layouts
 
-ROOT = Path(__file__).resolve().parents[1]
 TINY = Sizes(
     families=("forest30",), family_batch=2, large_batch=None, layouts=1, ipopt_layouts=1, ipopt_families=("forest30",),
     latency_layouts=1, own_layouts=1, paper_layouts=1, models=1,
@@ -67,22 +53,8 @@ def few_processes(monkeypatch) -> None:
 
 @pytest.fixture(autouse=True)
 def without_acados(monkeypatch, tmp_path: Path) -> None:
-    """Hide an installed acados: it compiles for seconds, and tests/test_speed_peers.py tests it."""
+    """Hide an installed acados: it compiles for seconds, and tests/benchmarks/test_acados.py tests it."""
     monkeypatch.setattr(acados, "ENVIRONMENT", tmp_path)
-
-
-@pytest.fixture
-def studies_here(monkeypatch) -> None:
-    """Run the studies of `quality` in this process, without figures."""
-
-    def started(command: list[str], cwd: Path, **_: object) -> None:
-        assert command[:3] == [sys.executable, "-m", "torchgco"]
-        monkeypatch.chdir(cwd)
-        monkeypatch.setattr(sys, "argv", command[2:])
-        assert app.main() == 0
-
-    monkeypatch.setattr(quality, "subprocess", SimpleNamespace(run=started, DEVNULL=subprocess.DEVNULL))
-    monkeypatch.setattr(study, "write_report", lambda folder, trajectories, figures: "")
 
 
 def tiny(folder: Path) -> Bench:
@@ -230,101 +202,3 @@ def test_without_a_gpu_nothing_is_measured(monkeypatch, capsys, tmp_path: Path) 
     monkeypatch.setattr("benchmarks.speed.__main__._one_core", lambda: None)
     assert main(["--device", "cuda", "--results", str(tmp_path / "results.csv")]) == 0
     assert "No CUDA device" in capsys.readouterr().out and not (tmp_path / "results.csv").exists()
-
-
-@pytest.mark.parametrize("search", oracle.SEARCH)
-def test_every_search_of_the_oracle_is_a_solver(search: str) -> None:
-    compose(oracle.SEARCH[search])
-
-
-def test_the_oracle_only_ever_lowers_a_cost(tmp_path: Path) -> None:
-    path, nan = tmp_path / "layouts.npz", float("nan")
-    replace(Layouts.load(ROOT / "benchmarks/data/planar_random.npz").take([0, 1, 2]), best_cost=None).save(path)
-    for costs, best in (
-        ([500.0, nan, nan], [500.0, nan, nan]),
-        ([600.0, 300.0, nan], [500.0, 300.0, nan]),
-        ([400.0, nan, nan], [400.0, 300.0, nan]),
-    ):
-        oracle.keep(path, np.array(costs), "here")
-        np.testing.assert_array_equal(Layouts.load(path).best_cost, best)
-
-
-@pytest.mark.usefixtures("studies_here")
-def test_the_oracle_keeps_drawn_layouts_and_success_is_judged_for_them(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr("benchmarks.lib.families.DATA", tmp_path)
-    monkeypatch.setattr(oracle, "SEARCH", {"hold": ["solver=hold"]})
-    words = ["--families", "planar_random", "--fresh", "2", "--seed", "7"]
-    for _ in range(2):  # the second call finds the file
-        assert oracle.main([*words, "--search", "hold"]) == 0
-    family = FAMILIES["planar_random"]
-    drawn = Layouts.load(family.file(2, 7))
-    np.testing.assert_array_equal(drawn.centers, compose(family.overrides(3, 7)).layouts(2).centers)
-    assert drawn.best_cost is None  # a vehicle that holds still never arrives
-    with pytest.raises(InputError, match="fresh: expected the layouts that"):
-        oracle.held(family, 3, 7)
-    oracle.keep(family.file(2, 7), np.array([100.0, np.nan]), "here")
-    flown = ["--solvers", "hold", "--outputs", str(tmp_path / "quality"), "study.workers=1"]
-    assert quality.main(["--families", "planar_random", "--fresh", "3", "--seed", "7", *flown]) == 0
-    assert "| 0 of 1 [0, 79] |" in capsys.readouterr().out
-
-
-def test_no_best_cost_is_above_a_peers() -> None:
-    for family in FAMILIES.values():
-        best, theirs = Layouts.load(family.file()).best_cost, oracle.reference(family)
-        assert best is not None and not bool((best > theirs).any())
-
-
-@pytest.mark.slow
-def test_the_quality_of_one_family(tmp_path: Path, capsys) -> None:
-    words = ["--families", "planar_trap", "--solvers", "hold", "--fresh", "3", "--outputs", str(tmp_path)]
-    assert quality.main([*words, "study.workers=1"]) == 0
-    row = capsys.readouterr().out.splitlines()[-1].split(" | ")
-    assert row[0] == "| planar_trap" and row[1:4] == ["`hold`", "3", "3 [44, 100]"] and row[4] == "0 [0, 56]"
-
-
-@pytest.mark.usefixtures("studies_here")
-def test_success_is_judged_with_the_current_best_cost(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("benchmarks.lib.families.DATA", tmp_path)
-    family = FAMILIES["planar_trap"]
-    layouts = Layouts.load(ROOT / "benchmarks/data/planar_trap.npz").take([0, 1])
-    layouts.save(family.file())
-    arguments = quality._parser().parse_args(["--solvers", "hold", "--outputs", str(tmp_path / "quality")])
-    arguments.overrides = ["study.layouts=2", "study.workers=1"]
-    flown = quality.fly(family, arguments)
-    assert flown["solver"].unique().tolist() == ["hold"] and not flown["success"].any()
-    lower = replace(layouts, best_cost=0.9 * layouts.best_cost)
-    lower.save(family.file())
-    again = quality.fly(family, arguments)  # a finished study may be judged again
-    np.testing.assert_array_equal(again["best_cost"], lower.best_cost)
-    there = flown.assign(reached=True, violation=[0.0, 2e-3], clearance=0.1, cost=flown["best_cost"])
-    assert quality.succeeded(there, layouts)["success"].tolist() == [True, False]
-    assert quality.succeeded(there, lower)["success"].tolist() == [False, False]
-
-
-def test_the_generators_draw_the_families_of_the_files() -> None:
-    """Fresh layouts have as many obstacles as the files' layouts, of the same size, and the same start and goal."""
-    for family in FAMILIES.values():
-        drawn, held = compose(family.overrides(fresh=2)).layouts(), Layouts.load(family.file())
-        task, other = (compose(family.overrides(fresh=f)).task(layouts) for f, layouts in ((2, drawn), (0, held)))
-        assert (task.problem.N, task.goal_radius) == (other.problem.N, other.goal_radius)
-        torch.testing.assert_close(task.problem.x0[0], other.problem.x0[0])
-        np.testing.assert_allclose(np.nanmax(drawn.radii), np.nanmax(held.radii))
-        if family.name != "walls":
-            assert drawn.centers.shape[1:] == held.centers.shape[1:]
-
-
-def test_a_table_replaces_the_one_between_the_marks_of_its_page(tmp_path: Path) -> None:
-    page = tmp_path / "maze.md"
-    page.write_text("before\n<!-- maze -->\nold\n<!-- end maze -->\nafter\n")
-    put_table(page, "64 starts, seed 0", "| new |", "CasADi", SET_UP)
-    text = page.read_text()
-    origin = provenance("cpu")
-    first = (
-        f"Measured on {origin['date']} at commit {origin['commit']}, 64 starts, seed 0, {origin['processor']}, shared"
-    )
-    assert f"<!-- maze -->\n{first}; CasADi {origin['casadi']}; set-up excluded.\n\n| new |\n" in text
-    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
-    empty = tmp_path / "barn.md"
-    empty.write_text("no marks\n")
-    with pytest.raises(ValueError, match="no part between"):
-        put_table(empty, "", "")

@@ -1,0 +1,92 @@
+"""Pages of results, the columns of comparisons, and work with a limit of time."""
+
+from __future__ import annotations
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from benchmarks.lib import page
+from benchmarks.lib.command import parser_of, show
+from benchmarks.lib.comparison import Comparison, cost_ratios, count, mean, median, named, share_within, within, worst
+from benchmarks.lib.limited import limited
+from benchmarks.lib.provenance import provenance
+from tests.problems import planar_batch
+from torchgco import solve
+
+
+def test_a_table_replaces_the_one_between_the_marks_of_its_page(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(page, "RESULTS", tmp_path)
+    file = tmp_path / "maze.md"
+    file.write_text("before\n<!-- maze -->\nold\n<!-- end maze -->\nafter\n")
+    how = "64 starts, seed 0", "CasADi", page.SET_UP
+    assert show(Namespace(write=False), "maze", "| new |", *how) == 0 and "old" in file.read_text()
+    assert show(Namespace(write=True), "maze", "| new |", *how) == 0 and "| new |" in capsys.readouterr().out
+    text, origin = file.read_text(), provenance("cpu")
+    first = (
+        f"Measured on {origin['date']} at commit {origin['commit']}, 64 starts, seed 0, {origin['processor']}, shared"
+    )
+    assert f"<!-- maze -->\n{first}; CasADi {origin['casadi']}; set-up excluded.\n\n| new |\n" in text
+    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    with pytest.raises(ValueError, match="no part between"):
+        page.put(file, "barn", "")
+
+
+def test_numbers_are_shown_with_their_intervals() -> None:
+    assert page.share(64, 64) == "64 of 64 [94, 100]" and page.share(1, 3, 1) == "1 of 3 [6.1, 79.2]"
+    assert page.share(0, 0) == "-" and page.shown(float("nan"), ".2f") == "-" and page.shown(1.0, ".2f") == "1.00"
+    assert page.markdown(["a", "b"], [[1, "x"]]) == "| a | b |\n|---|---|\n| 1 | x |"
+
+
+def test_the_docstring_names_the_command() -> None:
+    parser = parser_of("python -m benchmarks.outside.maze: a maze, flown.\n\nMore.", "results/maze.md")
+    assert (parser.prog, parser.description) == ("python -m benchmarks.outside.maze", "a maze, flown.")
+    assert parser.parse_args(["--write"]).write and not parser.parse_args([]).write
+    assert not hasattr(parser_of("python -m x: y.").parse_args([]), "write")
+
+
+def test_columns_count_problems_without_a_result_as_failures() -> None:
+    nan = np.nan
+    peer = pd.DataFrame({"solver": "IPOPT", "cost": 2.0, "violation": 0.0, "iterations": 9, "seconds": [1.0] * 5})
+    lost = pd.DataFrame({
+        "solver": "FATROP", "cost": [2.2, 1.0, 2.0, nan], "violation": [1e-7, 0.5, 1e-4, nan],
+        "iterations": [10, 20, 30, nan], "seconds": [1.0, 2.0, 3.0, nan],
+    })  # fmt: skip
+    columns = [
+        named("solver"), count, within(1e-3), share_within(1e-6), worst("violation"), cost_ratios(1e-3),
+        median("iterations", 0), mean("seconds", 3),
+    ]  # fmt: skip
+    (row,) = Comparison(lambda *_: {}, [("", column) for column in columns]).rows([lost], peer)
+    assert row[:5] == ["FATROP", 4, "2 of 4", "1 of 4 [5, 70] %", "5e-01"]
+    assert row[5:] == ["1.0000, 1.0500, 1.1000", "20", "2.000"]
+    none = lost.assign(violation=nan, iterations=nan)
+    assert cost_ratios(1e-3)(none, peer) == "-" == median("iterations", 0)(none, peer)
+
+
+def test_a_flight_is_what_the_judge_counts() -> None:
+    problem, _ = planar_batch(B=2, N=10)
+    judged = lambda problem, U: {"cost": U.square().sum((1, 2)), "violation": U.new_zeros(len(U))}
+    comparison = Comparison(judged, [("solver", named("solver")), ("cost", median("cost", 3))])
+    flight = comparison.fly("gco", problem, lambda: solve(problem), guess="rest")
+    U = solve(problem).U
+    assert flight.cost.tolist() == U.square().sum((1, 2)).tolist() and set(flight.guess) == {"rest"}
+    assert flight.seconds.nunique() == 1 and flight.seconds[0] > 0 and len(flight.iterations) == 2
+    text = comparison.table(comparison.rows([flight], flight))
+    assert text.splitlines()[2] == f"| gco | {float(U.square().sum((1, 2)).mean()):.3f} |"
+
+
+def test_work_ends_at_its_limit_and_says_how_it_ended() -> None:
+    def endless() -> None:
+        while True:
+            pass
+
+    assert limited(lambda: torch.ones(2).sum().item(), 60) == 2.0
+    with pytest.raises(TimeoutError, match="longer than 1 s"):
+        limited(endless, 1)
+    with pytest.raises(RuntimeError, match="ended with 3"):
+        limited(lambda: sys.exit(3), 60)
