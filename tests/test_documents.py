@@ -24,6 +24,7 @@ from torch import Tensor
 
 import torchgco
 from benchmarks.families import oracle, quality
+from benchmarks.lib.command import Command
 from benchmarks.speed import __main__ as speed
 from torchgco import Problem
 from torchgco.constraints import Constraint
@@ -129,8 +130,11 @@ def accept_python(words: list[str]) -> None:
         return
     module = importlib.util.find_spec(words[1])
     assert module is not None and module.origin is not None
-    if hasattr(importlib.import_module(words[1]), "_parser"):
-        importlib.import_module(words[1])._parser().parse_args(words[2:])
+    imported = importlib.import_module(words[1])
+    if isinstance(getattr(imported, "main", None), Command):
+        imported.main.parser.parse_args(words[2:])
+    elif hasattr(imported, "_parser"):
+        imported._parser().parse_args(words[2:])
     else:
         text = Path(module.origin).read_text()
         assert all(f'"{word}"' in text for word in words[2:] if word.startswith("--"))

@@ -6,7 +6,6 @@ returned controls. With --write the table goes into benchmarks/results/ordinary.
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import median
@@ -14,13 +13,12 @@ from statistics import median
 import torch
 
 from benchmarks.families.ordinary_problems import FAMILIES
-from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import timed
 from benchmarks.lib.page import INTERVALS, SET_UP, interval, markdown
 from torchgco import Problem, presets, solve
 from torchgco.lagrangian.rollout import open_loop
 
-SEEDS = (7, 21, 100)
 ADMITTED = 1e-3
 HEAD = ("family", "n", "cut off by limits", "default", "ms per problem, cut off", "ms per problem, default")
 
@@ -51,22 +49,18 @@ def row(name: str, seeds: Sequence[int]) -> list[str]:
     return [name, str(sum(problem.B for problem in problems)), *counts, *times]
 
 
-def _parser() -> ArgumentParser:
-    parser = parser_of(__doc__, "results/ordinary.md")
-    parser.add_argument("--families", nargs="+", choices=FAMILIES, default=list(FAMILIES), metavar="NAME", help="which")
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS), help="of the draws")
-    return parser
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    asked = _parser().parse_args(words)
-    one_thread()
-    rows = [row(name, asked.seeds) for name in asked.families]
+def table(families: Sequence[str], seeds: Sequence[int]) -> str:
+    """A row per family and one of all, in Markdown."""
+    rows = [row(name, seeds) for name in families]
     n, *counts = (sum(int(cells[i]) for cells in rows) for i in (1, 2, 3))
-    rows.append(["all", str(n), *(f"{count} {interval(count, n)}" for count in counts), "", ""])
-    seeds = ", ".join(map(str, asked.seeds))
-    how = f"eight problems per family and seed, seeds {seeds}, processor time with one thread, median over seeds"
-    return show(asked, "ordinary", markdown(HEAD, rows), how, INTERVALS, SET_UP)
+    return markdown(HEAD, [*rows, ["all", n, *(f"{count} {interval(count, n)}" for count in counts), "", ""]])
+
+
+main = Command(
+    __doc__, "ordinary", table,
+    "eight problems per family and seed, seeds {seeds}, processor time with one thread, median over seeds",
+    INTERVALS, SET_UP, families=(list(FAMILIES), "which", FAMILIES), seeds=([7, 21, 100], "of the draws"),
+)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ benchmarks/results/barn.md.
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +16,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.lib import DATA
-from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import timed
 from benchmarks.lib.page import INTERVALS, SET_UP, markdown, share
 from benchmarks.outside.barn_data import GOAL, GOAL_RADIUS, RADIUS, TEST
@@ -146,18 +144,10 @@ def table(first: int | None, seed: int) -> str:
     return "\n\n".join([markdown(HEAD, [*rows, DWA]), *notes])
 
 
-def _parser() -> ArgumentParser:
-    parser = parser_of(__doc__, "results/barn.md")
-    parser.add_argument("--first", type=int, default=None, help="only the first worlds of each kind, this many")
-    parser.add_argument("--seed", type=int, default=0, help="of the random draws of guidance")
-    return parser
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    asked = _parser().parse_args(words)
-    one_thread()
-    how = f"seed {asked.seed}, one batch each, processor time with one thread"
-    return show(asked, "barn", table(asked.first, asked.seed), how, SET_UP, INTERVALS)
+main = Command(
+    __doc__, "barn", table, "seed {seed}, one batch each, processor time with one thread", SET_UP, INTERVALS,
+    first=(None, "only the first worlds of each kind, this many"), seed=(0, "of the random draws of guidance"),
+)  # fmt: skip
 
 
 if __name__ == "__main__":

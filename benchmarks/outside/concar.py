@@ -8,8 +8,6 @@ both. With --write the table goes into benchmarks/results/concar.md. Model, prob
 from __future__ import annotations
 
 import json
-from argparse import ArgumentParser
-from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +16,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.lib import DATA, ROOT
-from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import Comparison, count, mean, median, named, timed
 from benchmarks.lib.page import SET_UP
 from torchgco import Problem, Solution, Status, judge
@@ -107,21 +105,18 @@ def compared(ours: pd.DataFrame, peer: pd.DataFrame) -> str:
     )
 
 
-def _parser() -> ArgumentParser:
-    parser = parser_of(__doc__, "results/concar.md")
-    parser.add_argument("--first", type=int, default=100, help="only the first problems, this many")
-    parser.add_argument("--seed", type=int, default=0, help="of the random draws of guidance")
-    return parser
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    asked = _parser().parse_args(words)
-    one_thread()
-    layouts = read_layouts().head(asked.first)
-    flights = fly(layouts, asked.seed)
+def table(first: int, seed: int) -> str:
+    """All solvers on the first layouts, in Markdown."""
+    layouts = read_layouts().head(first)
+    flights = fly(layouts, seed)
     rows = COMPARISON.rows(flights, flights[1]) + published(layouts["seed"])
-    text = f"{COMPARISON.table(rows)}\n\n{compared(*flights)}"
-    return show(asked, "concar", text, f"seed {asked.seed}, processor time with one thread", SET_UP)
+    return f"{COMPARISON.table(rows)}\n\n{compared(*flights)}"
+
+
+main = Command(
+    __doc__, "concar", table, "seed {seed}, processor time with one thread", SET_UP,
+    first=(100, "only the first problems, this many"), seed=(0, "of the random draws of guidance"),
+)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -7,14 +7,13 @@ benchmarks/results/golden.md.
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
 from collections.abc import Sequence
 from typing import Any
 
 import pandas as pd
 from torch import Tensor
 
-from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import Comparison, cost_ratios, named, timed, within, worst
 from benchmarks.lib.page import SET_UP
 from benchmarks.outside.golden_problems import GOLDEN, Golden
@@ -23,7 +22,6 @@ from torchgco.baselines import CasADiSolver
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.rollout import open_loop
 
-STARTS = 8
 TOLERANCE = 1e-6
 # At its own tolerance of 1e-8 and with relaxed bounds, a rollout of IPOPT's controls can miss a goal by 5e-5.
 IPOPT = CasADiSolver("ipopt", tolerance=1e-10, violation_tolerance=TOLERANCE, options={"bound_relax_factor": 0.0})
@@ -72,20 +70,15 @@ def rows(task: Golden, starts: int, seed: int) -> list[list[Any]]:
     return COMPARISON.rows(flights, flights[-1])
 
 
-def _parser() -> ArgumentParser:
-    parser = parser_of(__doc__, "results/golden.md")
-    parser.add_argument("--problems", nargs="+", choices=GOLDEN, default=list(GOLDEN), metavar="NAME", help="which")
-    parser.add_argument("--starts", type=int, default=STARTS, help="starts per problem")
-    parser.add_argument("--seed", type=int, default=0, help="of the starts")
-    return parser
+def table(problems: Sequence[str], starts: int, seed: int) -> str:
+    """The results of both solvers, in Markdown."""
+    return COMPARISON.table([row for name in problems for row in rows(GOLDEN[name], starts, seed)])
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    asked = _parser().parse_args(words)
-    one_thread()
-    text = COMPARISON.table([row for name in asked.problems for row in rows(GOLDEN[name], asked.starts, asked.seed)])
-    how = f"{asked.starts} starts, seed {asked.seed}, processor time with one thread"
-    return show(asked, "golden", text, how, SET_UP)
+main = Command(
+    __doc__, "golden", table, "{starts} starts, seed {seed}, processor time with one thread", SET_UP,
+    problems=(list(GOLDEN), "which", GOLDEN), starts=(8, "starts per problem"), seed=(0, "of the starts"),
+)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -6,8 +6,6 @@ run in one thread. With --write the table goes into benchmarks/results/maze.md.
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,17 +14,16 @@ import torch
 from torch import Tensor
 
 import torchgco
-from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import Comparison, cost_ratios, count, mean, median, named, share_within, timed, within
 from benchmarks.lib.limited import limited
 from benchmarks.lib.page import INTERVALS, SET_UP
 from benchmarks.outside.golden import IPOPT
-from benchmarks.outside.maze_problem import maze, recount, starts, waypoint_guess
+from benchmarks.outside.maze_problem import drawn, maze, recount, waypoint_guess
 from torchgco import Problem, presets
 from torchgco.baselines import CasADiSolver
 from torchgco.search.restarts import Restarts
 
-STARTS, FATROP_STARTS = 64, 16
 TOLERANCE = 1e-6  # violation of a solved problem: m, m/s, rad/s, N
 FATROP = CasADiSolver("fatrop", tolerance=1e-10)
 FATROP_LIMIT = 20  # s of processor time per problem: on some FATROP does not return
@@ -75,7 +72,7 @@ def ipopt(problem: Problem) -> pd.DataFrame:
     return COMPARISON.fly("IPOPT", problem, lambda: solver.run_from(*waypoint_guess(problem.x0)), guess=WAYPOINTS)
 
 
-def fatrop(problem: Problem) -> pd.DataFrame:
+def alone(problem: Problem) -> pd.DataFrame:
     """FATROP from the waypoints, each start in a process of its own that ends after `FATROP_LIMIT` seconds."""
     U = torch.full((problem.B, problem.N, problem.m), torch.nan, dtype=torch.float64)
     iterations, seconds = torch.full((2, problem.B), torch.nan, dtype=torch.float64)
@@ -94,17 +91,17 @@ def fatrop(problem: Problem) -> pd.DataFrame:
     return COMPARISON.judged("FATROP", problem, U, iterations, seconds, guess=WAYPOINTS)
 
 
-def table(count: int, seed: int, fatrop_count: int) -> str:
+def table(starts: int, fatrop: int, seed: int) -> str:
     """The results of all solvers, in Markdown."""
-    problem = maze(starts(count, seed))
+    problem = maze(drawn(starts, seed))
     default = ours("`torchgco.solve`, default options", problem, presets.gco(problem))
     tight = ours("the same with `violation_tolerance=1e-6`", problem, precise(problem))
     peer = ipopt(problem)
     flights, note = [default, tight, peer], ""
-    if fatrop_count > 0:
-        flights.append(fatrop(problem.take(slice(0, fatrop_count))))
+    if fatrop > 0:
+        flights.append(alone(problem.take(slice(0, fatrop))))
         note = (
-            f" FATROP did not return within {FATROP_LIMIT} s on {flights[-1].seconds.isna().sum()} of {fatrop_count} "
+            f" FATROP did not return within {FATROP_LIMIT} s on {flights[-1].seconds.isna().sum()} of {fatrop} "
             "starts; its iterations and seconds leave these out."
         )
     known = (tight.violation <= TOLERANCE) & (peer.violation <= 1e-3)
@@ -115,19 +112,11 @@ def table(count: int, seed: int, fatrop_count: int) -> str:
     )
 
 
-def _parser() -> ArgumentParser:
-    parser = parser_of(__doc__, "results/maze.md")
-    parser.add_argument("--starts", type=int, default=STARTS, help="the published start and others around it")
-    parser.add_argument("--fatrop", type=int, default=FATROP_STARTS, help="of these, starts that FATROP flies")
-    parser.add_argument("--seed", type=int, default=0, help="of the starts")
-    return parser
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    asked = _parser().parse_args(words)
-    one_thread()
-    how = f"{asked.starts} starts, seed {asked.seed}, processor time with one thread"
-    return show(asked, "maze", table(asked.starts, asked.seed, asked.fatrop), how, "CasADi", SET_UP, INTERVALS)
+main = Command(
+    __doc__, "maze", table, "{starts} starts, seed {seed}, processor time with one thread", "CasADi", SET_UP, INTERVALS,
+    starts=(64, "the published start and others around it"), fatrop=(16, "of these, starts that FATROP flies"),
+    seed=(0, "of the starts"),
+)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -67,7 +67,7 @@ def rest(p: Sequence[float]) -> list[float]:
     return [*p, 1.0] + [0.0] * 9
 
 
-def starts(count: int, seed: int) -> Tensor:
+def drawn(count: int, seed: int) -> Tensor:
     """The published start and count - 1 drawn around it, (count, 13): normal, by `SPREAD`."""
     x0 = torch.tensor([rest(START)], dtype=torch.float64).repeat(count, 1)
     draws = torch.randn(count - 1, 13, generator=torch.Generator().manual_seed(seed), dtype=x0.dtype)

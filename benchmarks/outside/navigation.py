@@ -8,7 +8,6 @@ benchmarks/results/navigation.md.
 from __future__ import annotations
 
 import multiprocessing
-from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -20,13 +19,12 @@ from torch import Tensor
 
 import torchgco
 from benchmarks.lib import comparison as lib
-from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.command import Command
 from benchmarks.lib.page import INTERVALS
 from benchmarks.outside.navigation_problem import fan, line_guess, navigation, recount
 from torchgco import Problem, Solution, presets
 from torchgco.baselines import CasADiSolver
 
-STARTS, SECTORS = 500, (90.0, 180.0)  # the published batch, and the published widths of the fan in degrees
 TOLERANCE = 1e-6  # the published one of IPOPT; here the largest violation of torchgco's results, too
 JUDGED = 1e-4  # IPOPT's own limit on violations, m, m/s and rad/s: its states meet it, a rollout may differ slightly
 REPEATS = {"local": 5}  # of the timing of a solver that takes less than a second; the median counts
@@ -133,27 +131,20 @@ def fly(solver: str, sector: float, count: int) -> pd.DataFrame:
     return COMPARISON.judged(solver, problem, torch.from_numpy(U), iterations, alone / count, **more)
 
 
-def table(count: int, sectors: Sequence[float]) -> str:
+def table(starts: int, sectors: Sequence[float]) -> str:
     """The results of all solvers on all fans, in Markdown."""
     rows = []
     for sector in sectors:
-        flights = [fly(name, sector, count) for name in SOLVERS]
+        flights = [fly(name, sector, starts) for name in SOLVERS]
         rows += COMPARISON.rows(flights, flights[-1])
     return COMPARISON.table(rows)
 
 
-def _parser() -> ArgumentParser:
-    parser = parser_of(__doc__, "results/navigation.md")
-    parser.add_argument("--starts", type=int, default=STARTS, help="starts per fan")
-    parser.add_argument("--sectors", type=float, nargs="+", default=SECTORS, help="widths of the fans, degrees")
-    return parser
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    asked = _parser().parse_args(words)
-    one_thread()
-    how = f"{asked.starts} starts per fan, processor time without set-up, one thread per process"
-    return show(asked, "navigation", table(asked.starts, asked.sectors), how, "CasADi", INTERVALS)
+main = Command(
+    __doc__, "navigation", table,
+    "{starts} starts per fan, processor time without set-up, one thread per process", "CasADi", INTERVALS,
+    starts=(500, "starts per fan"), sectors=([90.0, 180.0], "widths of the fans, degrees"),  # as published
+)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -7,16 +7,13 @@ problem from rest and from eleven random guesses, and its cheapest feasible resu
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
-from collections.abc import Sequence
-
 import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
 import torchgco
-from benchmarks.lib.command import one_thread, parser_of, show
+from benchmarks.lib.command import Command
 from benchmarks.lib.comparison import Comparison, count, named
 from benchmarks.lib.page import INTERVALS, share
 from torchgco.baselines import CasADiSolver
@@ -106,8 +103,9 @@ def ipopt(problem: Problem, seed: int) -> pd.DataFrame:
     return best.assign(seconds=sum(flight.seconds for flight in flights))
 
 
-def table(problem: Problem, seed: int) -> str:
+def table(count: int, seed: int) -> str:
     """The results of both solvers, in Markdown."""
+    problem = problems(count, seed)
     torchgco.solve(problem.take(slice(0, 1)))  # compiles
     own = COMPARISON.fly("`torchgco.solve`", problem, lambda: torchgco.solve(problem))
     best = ipopt(problem, seed)
@@ -117,18 +115,10 @@ def table(problem: Problem, seed: int) -> str:
     )
 
 
-def _parser() -> ArgumentParser:
-    parser = parser_of(__doc__, "results/unicycle.md")
-    parser.add_argument("--count", type=int, default=64, help="problems")
-    parser.add_argument("--seed", type=int, default=0, help="of problems and guesses")
-    return parser
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    asked = _parser().parse_args(words)
-    one_thread()
-    text = table(problems(asked.count, asked.seed), asked.seed)
-    return show(asked, "unicycle", text, f"seed {asked.seed}, processor time with one thread", INTERVALS)
+main = Command(
+    __doc__, "unicycle", table, "seed {seed}, processor time with one thread", INTERVALS,
+    count=(64, "problems"), seed=(0, "of problems and guesses"),
+)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks.lib import page
-from benchmarks.lib.command import parser_of, show
+from benchmarks.lib.command import Command, parser_of
 from benchmarks.lib.comparison import Comparison, cost_ratios, count, mean, median, named, share_within, within, worst
 from benchmarks.lib.limited import limited
 from benchmarks.lib.provenance import provenance
@@ -24,14 +23,17 @@ def test_a_table_replaces_the_one_between_the_marks_of_its_page(tmp_path: Path, 
     monkeypatch.setattr(page, "RESULTS", tmp_path)
     file = tmp_path / "maze.md"
     file.write_text("before\n<!-- maze -->\nold\n<!-- end maze -->\nafter\n")
-    how = "64 starts, seed 0", "CasADi", page.SET_UP
-    assert show(Namespace(write=False), "maze", "| new |", *how) == 0 and "old" in file.read_text()
-    assert show(Namespace(write=True), "maze", "| new |", *how) == 0 and "| new |" in capsys.readouterr().out
+    main = Command(
+        "python -m x: y.", "maze", lambda starts, names: f"| {starts + 1}, {names[0]} |", "{starts} starts of {names}",
+        "CasADi", page.SET_UP, starts=(64, "number"), names=(["a", "b"], "which", ("a", "b")),
+    )  # fmt: skip
+    assert main([]) == 0 and "old" in file.read_text()
+    assert main(["--write"]) == 0 and capsys.readouterr().out == "| 65, a |\n" * 2
     text, origin = file.read_text(), provenance("cpu")
     first = (
-        f"Measured on {origin['date']} at commit {origin['commit']}, 64 starts, seed 0, {origin['processor']}, shared"
+        f"Measured on {origin['date']} at commit {origin['commit']}, 64 starts of a, b, {origin['processor']}, shared"
     )
-    assert f"<!-- maze -->\n{first}; CasADi {origin['casadi']}; set-up excluded.\n\n| new |\n" in text
+    assert f"<!-- maze -->\n{first}; CasADi {origin['casadi']}; set-up excluded.\n\n| 65, a |\n" in text
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
     with pytest.raises(ValueError, match="no part between"):
         page.put(file, "barn", "")

@@ -16,9 +16,9 @@ from benchmarks.outside.maze_problem import (
     THRUST,
     R,
     cylinders,
+    drawn,
     maze,
     recount,
-    starts,
     waypoint_guess,
 )
 from torchgco import ControlBounds, StateBounds
@@ -28,7 +28,7 @@ from torchgco.obstacles.spheres import BoundSpheres
 
 
 def test_the_form_of_the_maze() -> None:
-    problem = maze(starts(3, 0))
+    problem = maze(drawn(3, 0))
     assert (problem.n, problem.m, problem.N, problem.dynamics.dt) == (13, 4, 100, 0.05)
     discs, controls, states, goal = problem.constraints
     assert isinstance(discs, BoundSpheres) and discs.centers.shape == (3, 47, 2)
@@ -56,7 +56,7 @@ def test_the_walls_leave_doors_but_no_straight_way() -> None:
 
 
 def test_the_problem_is_the_one_that_is_judged() -> None:
-    problem = maze(starts(4, 1))
+    problem = maze(drawn(4, 1))
     U = HOVER + 0.02 * torch.randn(4, 100, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     U[1] += THRUST  # beyond the bounds, and fast
     X = open_loop(problem.dynamics, problem.x0, U)
@@ -69,14 +69,14 @@ def test_the_problem_is_the_one_that_is_judged() -> None:
 
 
 def test_the_guess_passes_the_waypoints() -> None:
-    X0, U0 = waypoint_guess(starts(2, 0))
+    X0, U0 = waypoint_guess(drawn(2, 0))
     assert X0.shape == (2, 101, 13) and U0.unique().tolist() == [HOVER]
     assert X0[0, 50, :3].tolist() == [7.0, 0.0, 1.0]
-    assert X0[:, 0].equal(starts(2, 0)) and X0[1, -1, :3].tolist() == list(GOAL)
+    assert X0[:, 0].equal(drawn(2, 0)) and X0[1, -1, :3].tolist() == list(GOAL)
 
 
 def test_four_starts_are_solved_without_waypoints() -> None:
-    problem = maze(starts(4, 0))
+    problem = maze(drawn(4, 0))
     solution = torchgco.solve(problem, solver=precise(problem))
     cost, worst, _ = recount(problem.x0.numpy(), solution.U.numpy())
     assert worst.max() <= TOLERANCE
