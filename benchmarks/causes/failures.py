@@ -7,7 +7,6 @@ the pictures go to benchmarks/failures.md and failures.png.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -19,11 +18,11 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from benchmarks.causes.picture import Example, picture
+from benchmarks.causes.picture import Example, picture, table
 from benchmarks.lib import ROOT
+from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import FAMILIES, Family
-from benchmarks.lib.page import put_between
-from benchmarks.lib.provenance import provenance
+from benchmarks.lib.page import origin, put
 from torchgco import compose, judge
 from torchgco.base.draws import DrawKey
 from torchgco.guidance.detection import active_counts, caught_knots
@@ -163,23 +162,8 @@ def fly(family: Family, count: int, seed: int) -> tuple[pd.DataFrame, dict[str, 
     return pd.DataFrame(rows), examples
 
 
-def table(trials: pd.DataFrame, causes: dict[str, str] = CAUSES, missed: str = "not reached") -> str:
-    """Markdown: one row per cause, with its count in every family; `missed` names the sum."""
-    families = list(dict.fromkeys(trials.family))
-    counts = pd.crosstab(trials.cause, trials.family).reindex(list(causes), fill_value=0)
-    lines = [f"| cause | what it means | {' | '.join(families)} |", "|---" * (2 + len(families)) + "|"]
-    for name, meaning in causes.items():
-        cells = " | ".join(str(counts.loc[name].get(family, 0)) for family in families)
-        lines.append(f"| {name} | {meaning} | {cells} |")
-    flown = trials.groupby("family").cause
-    sums = " | ".join(f"{flown.get_group(f).notna().sum()} of {flown.get_group(f).size}" for f in families)
-    return "\n".join([*lines, f"| **{missed}** | | {sums} |"])
-
-
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.causes.failures", description="Sort the failures of gco_paper."
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(FAMILIES), metavar="NAME")
     parser.add_argument("--first", type=int, default=32, help="layouts per family, the first ones")
     parser.add_argument("--seed", type=int, default=0)
@@ -190,14 +174,9 @@ def main(words: Sequence[str] | None = None) -> int:
         trials, found = fly(FAMILIES[name], asked.first, asked.seed)
         parts.append(trials)
         examples = {**found, **examples}
-        print(table(pd.concat(parts)), flush=True)
-    origin = provenance("cpu")
-    head = (
-        f"`gco_paper` on {origin['date']} at commit {origin['commit']}, seed {asked.seed}, the first {asked.first} "
-        "layouts of each family."
-    )
-    marks = "<!-- failures -->", "<!-- end failures -->"
-    put_between(asked.outputs / "failures.md", *marks, f"{head}\n\n{table(pd.concat(parts))}")
+        print(table(pd.concat(parts), CAUSES, "not reached"), flush=True)
+    head = f"{origin('`gco_paper`')}, seed {asked.seed}, the first {asked.first} layouts of each family."
+    put(asked.outputs / "failures.md", "failures", f"{head}\n\n{table(pd.concat(parts), CAUSES, 'not reached')}")
     picture({name: examples[name] for name in CAUSES if name in examples}, asked.outputs / "failures.png")
     return 0
 

@@ -1,4 +1,4 @@
-"""The picture of failures.md and results/shortfalls.md: one layout per cause, seen from above."""
+"""What failures.md and results/shortfalls.md show: the causes, counted, and one layout for each, seen from above."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from torch import Tensor
 
+from benchmarks.lib.page import markdown
 from torchgco.plotting.style import FAINT, INK, PALETTE, legend, panels, save, tidy
 
 PATH, PLAN = PALETTE[0], PALETTE[1]
@@ -29,6 +31,16 @@ class Example:
     plan: Tensor | None  # (N+1, d): another trajectory; None: there is none
     goal: Tensor  # (d,)
     boxes: tuple[np.ndarray, ...] = ()  # (P, 2) each: outlines from above, inflated
+
+
+def table(trials: pd.DataFrame, causes: dict[str, str], missed: str) -> str:
+    """Markdown: one row per cause, with its count in every family; `missed` names the sum."""
+    families = list(dict.fromkeys(trials.family))
+    counts = pd.crosstab(trials.cause, trials.family).reindex(index=list(causes), columns=families, fill_value=0)
+    rows = [[name, meaning, *counts.loc[name]] for name, meaning in causes.items()]
+    flown = trials.groupby("family").cause
+    sums = [f"{flown.get_group(f).notna().sum()} of {flown.get_group(f).size}" for f in families]
+    return markdown(["cause", "what it means", *families], [*rows, [f"**{missed}**", "", *sums]])
 
 
 def _frame(ax: Axes, example: Example) -> None:

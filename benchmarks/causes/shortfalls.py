@@ -7,8 +7,8 @@ dropped is the cause. With --write, table, list and pictures go to benchmarks/re
 
 from __future__ import annotations
 
-import argparse
 import sys
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf, isnan
@@ -20,13 +20,12 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from benchmarks.causes.failures import table
-from benchmarks.causes.picture import Example, picture
+from benchmarks.causes.picture import Example, picture, table
 from benchmarks.causes.shortfalls_watch import Search, watching
 from benchmarks.lib import RESULTS
+from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import WORLDS, Family
-from benchmarks.lib.page import put_between
-from benchmarks.lib.provenance import provenance
+from benchmarks.lib.page import markdown, origin, put
 from torchgco import compose, judge, presets
 from torchgco.judging.judge import near_best
 from torchgco.plotting.bodies import Box, bodies
@@ -40,7 +39,6 @@ from torchgco.search.suitability import has_paths
 from torchgco.search.ways import joined
 
 PAGE = RESULTS / "shortfalls.md"
-MARKS = "<!-- shortfalls -->", "<!-- end shortfalls -->"
 PATHS = MORE * presets.gco(3).paths.num_paths  # of each of the two searches where the best candidate is costly
 CAUSES = {
     "no solution known": "neither `gco` nor any other search has found a way",
@@ -63,10 +61,11 @@ HEAD = (
 def cause(best: float, sound: bool, costs: Sequence[float], searches: Sequence[Search]) -> str:
     """The cause for one layout on which `gco` isn't a success; of several good candidates the one that got farthest.
 
-    best      the best known cost, NaN where no solution is known
-    sound     whether the result of `gco` is
-    costs     of a refined candidate along each path, infinite where it has no good end; none: no paths can be sought
-    searches  those that `gco` made
+    Args:
+        best: the best known cost, NaN where no solution is known.
+        sound: whether the result of `gco` is.
+        costs: of a refined candidate along each path, infinite where it has no good end; none: no paths can be sought.
+        searches: those that `gco` made.
     """
     if isnan(best) and not sound:
         return "no solution known"
@@ -141,7 +140,7 @@ def fly(family: Family, first: int | None, seed: int) -> tuple[pd.DataFrame, dic
             found, example = study(setup.solver, task, layouts, i, seed, cost)
             row |= found
             examples.setdefault(row["cause"], example)
-            print(_line(row), flush=True)
+            print(*_cells(row), sep=" | ", flush=True)
         rows.append(row)
     return pd.DataFrame(rows), examples
 
@@ -151,8 +150,10 @@ def study(
 ) -> tuple[dict[str, Any], Example]:
     """The cause for layout i, on which `gco` isn't a success, with the figures that led to it.
 
-    cost   of the result of `gco`, infinite where it isn't sound
-    count  paths whose candidates are refined
+    Args:
+        solver, task, layouts, i, seed: the solver, the layouts and their problems, the number of one, the draws.
+        cost: of the result of `gco`, infinite where it isn't sound.
+        count: paths whose candidates are refined.
     """
     assert layouts.best_cost is not None
     best, part = float(layouts.best_cost[i]), task.problem.take(torch.tensor([i]))
@@ -188,26 +189,21 @@ def _example(layouts: Layouts, i: int, path: Tensor, plan: Tensor | None, proble
 
 def listed(trials: pd.DataFrame) -> str:
     """Markdown: a row per layout on which `gco` isn't a success."""
-    rows = trials[trials.cause.notna()].to_dict(orient="records")
-    return "\n".join(["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|", *map(_line, rows)])
+    return markdown(HEAD, map(_cells, trials[trials.cause.notna()].to_dict(orient="records")))
 
 
-def _line(row: dict[Any, Any]) -> str:
+def _cells(row: dict[Any, Any]) -> list[Any]:
     ratio = "not sound" if not np.isfinite(row["ratio"]) else f"{row['ratio']:.3f}"
     cheapest = f"{row['cheapest']:.3f}" if np.isfinite(row["cheapest"]) else "-"
     path, sought = ("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name in ("path", "sought"))
-    return f"| {row['family']} | {row['layout']} | {ratio} | {cheapest} | {path} | {sought} | {row['cause']} |"
+    return [row["family"], row["layout"], ratio, cheapest, path, sought, row["cause"]]
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.causes.shortfalls",
-        description="Sort the layouts of the worlds where gco isn't a success.",
-    )
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__, "results/shortfalls.md")
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
     parser.add_argument("--first", type=int, metavar="N", help="the first N layouts of each world; default: all")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", action="store_true", help="put a whole run into benchmarks/results/shortfalls.md")
     return parser
 
 
@@ -236,13 +232,12 @@ def _table(trials: pd.DataFrame) -> str:
 
 def write(page: Path, trials: pd.DataFrame, examples: dict[str, Example], seed: int) -> None:
     """Put table and list between the marks of the page, and the picture next to it."""
-    origin = provenance("cpu")
-    head = f"`gco` on {origin['date']} at commit {origin['commit']}, seed {seed}, the public layouts."
+    head = f"{origin('`gco`')}, seed {seed}, the public layouts."
     blocks = [head, _table(trials), listed(trials)]
     if examples:
         file = picture(examples, page.with_suffix(".png"), "cheapest candidate")
         blocks.append(f"![One layout for every cause]({file.name})")
-    put_between(page, *MARKS, "\n\n".join(blocks))
+    put(page, "shortfalls", "\n\n".join(blocks))
 
 
 if __name__ == "__main__":

@@ -11,16 +11,11 @@ import contextlib
 import json
 import os
 import sys
-import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator
-from functools import wraps
 from pathlib import Path
-from pkgutil import resolve_name
-from typing import Any
 
 import torch
 
+from benchmarks.lib.timers import Timers
 from torchgco import compose
 from torchgco.experiments import app
 from torchgco.experiments.flying import flight
@@ -47,50 +42,6 @@ PHASES = {
     "report": ["torchgco.experiments.flying.study.write_report"],
 }  # fmt: skip
 FLIGHT, REPORT, REST = ("solve", "judge"), "report", "rest"
-
-
-class Phases:
-    """Processor seconds by phase."""
-
-    def __init__(self) -> None:
-        self.seconds: defaultdict[str, float] = defaultdict(float)
-        self.open = [REST]
-        self.since = 0.0
-
-    def book(self) -> None:
-        now = time.process_time()
-        self.seconds[self.open[-1]] += now - self.since
-        self.since = now
-
-    @contextlib.contextmanager
-    def running(self) -> Iterator[None]:
-        """Wrap all functions of PHASES in timers; restored at the end."""
-        originals = []
-        for phase, places in PHASES.items():
-            for holder, _, name in (place.rpartition(".") for place in places):
-                owner = resolve_name(holder)
-                originals.append((owner, name, getattr(owner, name)))
-                setattr(owner, name, self._around(originals[-1][-1], phase))
-        self.since = time.process_time()
-        try:
-            yield
-            self.book()
-        finally:
-            for owner, name, work in originals:
-                setattr(owner, name, work)
-
-    def _around(self, work: Callable[..., Any], phase: str) -> Callable[..., Any]:
-        @wraps(work)
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            self.book()
-            self.open.append(phase)
-            try:
-                return work(*args, **kwargs)
-            finally:
-                self.book()
-                self.open.pop()
-
-        return timed
 
 
 def direct(count: int, shard_size: int) -> None:
@@ -120,12 +71,13 @@ def main() -> int:
     folder, count, shard_size = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
     direct(2, 2)  # imports, and kernels compiled or loaded
     timed = {}
+    named = {place: lambda _, __, phase=phase: phase for phase, places in PHASES.items() for place in places}
     works = {"study": lambda: sharded(folder, count, shard_size), "direct": lambda: direct(count, shard_size)}
     for name, work in works.items():
-        phases = Phases()
-        with phases.running():
+        timers = Timers(REST)
+        with timers.running(named):
             work()
-        timed[name] = dict(phases.seconds)
+        timed[name] = dict(timers.seconds)
     print(json.dumps(timed))
     return 0
 

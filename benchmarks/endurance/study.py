@@ -8,7 +8,6 @@ tables and the figure are put into results/endurance.md, with date and commit. L
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import resource
@@ -17,6 +16,7 @@ import signal
 import subprocess
 import sys
 import time
+from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,12 +24,13 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 
 from benchmarks.endurance.memory import Sampler, draw, group_of, summary
 from benchmarks.endurance.overhead import FLIGHT, PHASES, REPORT, REST
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import put_between
-from benchmarks.lib.provenance import provenance
+from benchmarks.lib.command import parser_of
+from benchmarks.lib.page import machine, markdown, origin, put
 
 KILLS = 3
 TIMING = ["seconds", "batch_size", "threads"]  # columns that describe how a trial was flown
@@ -42,8 +43,9 @@ POLL = 0.05  # s
 class Undisturbed:
     """Measurements of the undisturbed study; times in seconds.
 
-    first, last  when its first and last shard were written, since its start
-    processor    of all its processes
+    Args:
+        first, last: when its first and last shard were written, since its start.
+        processor: of all its processes.
     """
 
     wall: float
@@ -166,9 +168,9 @@ def page(
     layouts: int, whole: Undisturbed, kills: Sequence[tuple[float, int]], found: Sequence[str], seconds: dict
 ) -> str:
     """Markdown: origin, the undisturbed study with its figure, the comparison, the overhead."""
-    origin, size = provenance("cpu"), shard_size(layouts)
+    size = shard_size(layouts)
     head = [
-        f"Flown on {origin['date']} at commit {origin['commit']}, torch {origin['torch']}, {origin['processor']},",
+        f"{origin('Flown')}, torch {torch.__version__}, {machine()},",
         f"shared: {layouts:,} forests of 30 spheres, seed 0, `gco`, two workers of one thread, "
         f"{-(-layouts // size)} shards of at",
         f"most {size} layouts.",
@@ -180,12 +182,12 @@ def page(
         "The same command started it again each time.",
         f"There are differences in {', '.join(found)}." if found else same,
     ]
-    parts = (head, undisturbed_table(layouts, whole), ["![Memory over time](endurance.png)"], compared,
-             overhead_table(seconds))  # fmt: skip
-    return "\n\n".join("\n".join(lines) for lines in parts)
+    figure = "![Memory over time](endurance.png)"
+    parts = "\n".join(head), undisturbed_table(layouts, whole), figure, "\n".join(compared), overhead_table(seconds)
+    return "\n\n".join(parts)
 
 
-def undisturbed_table(layouts: int, whole: Undisturbed) -> list[str]:
+def undisturbed_table(layouts: int, whole: Undisturbed) -> str:
     memory = summary(whole.memory, whole.first, whole.last)
     rows = {
         "wall time": f"{whole.wall:.0f} s; last flight after {whole.last:.0f} s",
@@ -200,31 +202,26 @@ def undisturbed_table(layouts: int, whole: Undisturbed) -> list[str]:
             "in the last quarter": f"{memory['last']:.0f} MiB ({growth:+.1f} %)",
             "slope during the flights": f"{memory['slope']:+.1f} MiB per minute",
         }
-    return ["| undisturbed | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())]
+    return markdown(["undisturbed", ""], rows.items())
 
 
-def overhead_table(seconds: dict[str, dict[str, float]]) -> list[str]:
-    lines = ["| processor seconds in one process | study | direct calls |", "|---|---|---|"]
-    for phase in (*PHASES, REST):
-        lines.append(f"| {phase} | " + " | ".join(f"{held.get(phase, 0.0):.2f}" for held in seconds.values()) + " |")
-    lines.append("| all | " + " | ".join(f"{sum(held.values()):.2f}" for held in seconds.values()) + " |")
+def overhead_table(seconds: dict[str, dict[str, float]]) -> str:
+    rows = [[phase, *(f"{held.get(phase, 0.0):.2f}" for held in seconds.values())] for phase in (*PHASES, REST)]
+    rows.append(["all", *(f"{sum(held.values()):.2f}" for held in seconds.values())])
     report = seconds["study"].get(REPORT, 0.0) / sum(seconds["direct"].values())
-    return [
-        *lines, "",
+    return (
+        f"{markdown(['processor seconds in one process', 'study', 'direct calls'], rows)}\n\n"
         "The study took more than the direct calls, solves, judging and report left out, by "
-        f"{100 * share(seconds):.1f} % of these",
-        f"(wanted: under {100 * LIMIT:.0f} %); the report took {100 * report:.1f} %.",
-    ]  # fmt: skip
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.endurance.study", description="Fly long, kill, compare."
+        f"{100 * share(seconds):.1f} % of these\n"
+        f"(wanted: under {100 * LIMIT:.0f} %); the report took {100 * report:.1f} %."
     )
+
+
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__, "results/endurance.md")
     parser.add_argument("--layouts", type=int, default=10_000, help="default: %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="of the times of the kills")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "endurance", help="its folders are emptied")
-    parser.add_argument("--write", action="store_true", help="put tables and figure into results/endurance.md")
     return parser
 
 
@@ -242,7 +239,7 @@ def main(words: Sequence[str] | None = None) -> int:
     figure = (RESULTS if asked.write else outputs) / "endurance.png"
     draw(whole.memory, whole.first, whole.last, figure)
     if asked.write:
-        put_between(RESULTS / "endurance.md", "<!-- endurance -->", "<!-- end endurance -->", text)
+        put(RESULTS / "endurance.md", "endurance", text)
     return int(bool(found))
 
 

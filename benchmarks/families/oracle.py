@@ -9,8 +9,8 @@ With `--fresh N` the layouts are the first N drawn under `--seed`, kept with the
 
 from __future__ import annotations
 
-import argparse
 import sys
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import DATA, EVERY, FAMILIES, Family
 from torchgco import compose, judge
 from torchgco.base.errors import InputError
@@ -56,10 +57,8 @@ def main(words: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.families.oracle", description="Seek the best known costs."
-    )
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__)
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--search", nargs="+", choices=list(SEARCH), metavar="NAME", help="some of the searches only")
     parser.add_argument("--draws", type=int, nargs="+", default=[0], metavar="SEED", help="seeds of the solvers' draws")

@@ -8,18 +8,18 @@ results/ladder.md, unless --page names another page.
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
 
 from benchmarks.lib import ROOT
+from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY, FAMILIES, Family
-from benchmarks.lib.page import put_between
-from benchmarks.lib.provenance import provenance
+from benchmarks.lib.page import INTERVALS, interval, machine, markdown, origin, put, share, shown
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.judging.judge import SUCCESS_VIOLATION
@@ -42,42 +42,38 @@ def main(words: Sequence[str] | None = None) -> int:
     text = table(trials)
     print(text)
     if set(asked.families) == set(FAMILIES) and asked.write:
-        name = page(asked)
-        marks = f"<!-- {name} -->", f"<!-- end {name} -->"
-        put_between(ROOT / "benchmarks" / PAGES[name], *marks, f"{_source(asked)}\n\n{text}")
+        name, head = page_of(asked), f"{source(asked, 'family')}, {machine()}, shared and busy."
+        put(ROOT / "benchmarks" / PAGES[name], name, f"{head}\n\n{text}")
     return 0
 
 
-def page(asked: argparse.Namespace) -> str:
+def page_of(asked: Namespace) -> str:
     """The name of the page that a run's table belongs to."""
     if asked.page is not None:
         return asked.page
     return "drawn" if asked.fresh else "quality" if asked.solvers == ["gco"] else "ladder"
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.families.quality", description="Fly the families, and count."
-    )
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__, "README.md or a page of results")
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--solvers", nargs="+", default=["gco"], metavar="NAME", help="configs; default: gco")
     parser.add_argument(
         "--fresh", type=int, default=0, metavar="N", help="N drawn layouts per family, not the public 32"
     )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", action="store_true", help="put the table into its page")
     parser.add_argument("--page", choices=list(PAGES), metavar="NAME", help=", ".join(PAGES) + "; default: by content")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "quality")
     parser.add_argument("overrides", nargs="*", help="of the configuration, for all studies")
     return parser
 
 
-def fly(family: Family, asked: argparse.Namespace) -> pd.DataFrame:
+def fly(family: Family, asked: Namespace) -> pd.DataFrame:
     """The trials of every solver, with the family's name as scenario."""
     return pd.concat([study(family, solver, asked) for solver in asked.solvers], ignore_index=True)
 
 
-def study(family: Family, solver: str, asked: argparse.Namespace) -> pd.DataFrame:
+def study(family: Family, solver: str, asked: Namespace) -> pd.DataFrame:
     """The trials of one solver, with the family's name as scenario, and success by the best costs known now."""
     folder = asked.outputs / f"{family.name}-{asked.fresh}-{asked.seed}-{solver}"
     command = [
@@ -101,39 +97,26 @@ def succeeded(trials: pd.DataFrame, layouts: Layouts) -> pd.DataFrame:
 
 def table(trials: pd.DataFrame) -> str:
     """Markdown: a row per family and solver, rates with 95 % Wilson intervals in percent."""
-    lines = ["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|"]
-    for row in summarise(trials).to_dict(orient="records"):
-        rates = (_rate(row, name) for name in ("feasible", "reached", "success"))
-        cells = [
-            row["scenario"], f"`{row['solver']}`", row["n"], *rates,
-            round(row["violation_ok"] * row["n"]), _number(row["cost_median_reached"], ",.0f"),
-            _number(row["iterations_median"], ".0f"), _number(row["seconds_median"], ".2f"),
-        ]  # fmt: skip
-        lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
-    return "\n".join(lines)
+    return markdown(HEAD, [
+        [
+            row["scenario"], f"`{row['solver']}`", row["n"],
+            *(_rate(row, name) for name in ("feasible", "reached", "success")),
+            round(row["violation_ok"] * row["n"]), shown(row["cost_median_reached"], ",.0f"),
+            shown(row["iterations_median"], ".0f"), shown(row["seconds_median"], ".2f"),
+        ]
+        for row in summarise(trials).to_dict(orient="records")
+    ])  # fmt: skip
 
 
 def _rate(row: dict[str, float], name: str) -> str:
-    if row[f"{name}_n"] == 0:
-        return "-"
-    low, high = (100 * row[f"{name}_{end}"] for end in ("low", "high"))
-    of = "" if row[f"{name}_n"] == row["n"] else f" of {row[f'{name}_n']:.0f}"
-    return f"{row[f'{name}_count']:.0f}{of} [{low:.0f}, {high:.0f}]"
+    count, n = int(row[f"{name}_count"]), int(row[f"{name}_n"])
+    return share(count, n) if n == 0 or n != row["n"] else f"{count} {interval(count, n)}"
 
 
-def _number(value: float, form: str) -> str:
-    return "-" if value != value else format(value, form)
-
-
-def _source(asked: argparse.Namespace) -> str:
-    origin, layouts = (
-        provenance("cpu"),
-        f"{asked.fresh} drawn layouts per family" if asked.fresh else "the public layouts",
-    )
-    return (
-        f"Flown on {origin['date']} at commit {origin['commit']}, {layouts}, seed {asked.seed}, 95 % Wilson intervals "
-        f"in percent; one thread per process, {origin['processor']}, shared and busy."
-    )
+def source(asked: Namespace, group: str) -> str:
+    """How a run flew, as the beginning of the line above its table; `group` is what layouts are drawn for."""
+    layouts = f"{asked.fresh} drawn layouts per {group}" if asked.fresh else "the public layouts"
+    return f"{origin('Flown')}, {layouts}, seed {asked.seed}, {INTERVALS}; one thread per process"
 
 
 if __name__ == "__main__":

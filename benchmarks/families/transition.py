@@ -6,10 +6,10 @@ With --write the figure and the table go into benchmarks/results.
 
 from __future__ import annotations
 
-import argparse
 import math
 import subprocess
 import sys
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import put_between
-from benchmarks.lib.provenance import provenance
+from benchmarks.lib.command import parser_of
+from benchmarks.lib.page import machine, markdown, origin, put
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.plotting.style import INK, SMALL, legend, panels, save, solver_colours, tidy
@@ -47,17 +47,15 @@ def main(words: Sequence[str] | None = None) -> int:
     print(table(summary))
     if asked.write:
         save(figure(summary), RESULTS / "transition.png")
-        origin = provenance("cpu")
         head = (
-            f"Flown on {origin['date']} at commit {origin['commit']}, n layouts per point, seed {asked.seed}; "
-            f"95 % Wilson intervals in the figure; {origin['processor']}, shared."
+            f"{origin('Flown')}, n layouts per point, seed {asked.seed}; 95 % Wilson intervals in the figure; "
+            f"{machine()}, shared."
         )
-        marks = "<!-- transition -->", "<!-- end transition -->"
-        put_between(RESULTS / "transition.md", *marks, f"{head}\n\n![Rates](transition.png)\n\n{table(summary)}")
+        put(RESULTS / "transition.md", "transition", f"{head}\n\n![Rates](transition.png)\n\n{table(summary)}")
     return 0
 
 
-def sweep(solver: str, asked: argparse.Namespace) -> None:
+def sweep(solver: str, asked: Namespace) -> None:
     """Fly one solver at all densities and speeds, in a folder of its own; what is there already isn't flown again."""
     peer = solver in PEERS
     densities, layouts = (PEER_DENSITIES, PEER_LAYOUTS) if peer else (DENSITIES, asked.layouts)
@@ -69,16 +67,13 @@ def sweep(solver: str, asked: argparse.Namespace) -> None:
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.families.transition", description="Sweep density and speed."
-    )
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__, "results")
     parser.add_argument("--layouts", type=int, default=32, metavar="N", help="per density and speed")
     parser.add_argument(
         "--solvers", nargs="*", default=[*SOLVERS, *PEERS], metavar="NAME", help="to fly; none: only table and figure"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the layouts")
-    parser.add_argument("--write", action="store_true", help="put table and figure into benchmarks/results")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "transition")
     return parser
 
@@ -119,12 +114,12 @@ def figure(summary: pd.DataFrame) -> Figure:
 
 def table(summary: pd.DataFrame) -> str:
     """Markdown: reached, of n, by density; a row per speed and solver."""
-    lines = [f"| speed | solver | n | {' | '.join(f'{d:g}' for d in DENSITIES)} |", "|---" * (3 + len(DENSITIES)) + "|"]
-    for (stages, solver), rows in summary.groupby([HORIZON, "solver"], sort=False):
-        found = rows.set_index(DENSITY)["reached_count"]
-        cells = [str(found.get(density, "-")) for density in DENSITIES]
-        lines.append(f"| {speed(stages):.1f} m/s | `{solver}` | {rows['n'].iloc[0]} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    rows = []
+    for (stages, solver), own in summary.groupby([HORIZON, "solver"], sort=False):
+        found = own.set_index(DENSITY)["reached_count"]
+        counts = (found.get(density, "-") for density in DENSITIES)
+        rows.append([f"{speed(stages):.1f} m/s", f"`{solver}`", own["n"].iloc[0], *counts])
+    return markdown(["speed", "solver", "n", *(f"{density:g}" for density in DENSITIES)], rows)
 
 
 if __name__ == "__main__":

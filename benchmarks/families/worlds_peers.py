@@ -8,18 +8,15 @@ and compiling it isn't counted, computing the guess is. Among moving obstacles t
 
 from __future__ import annotations
 
-import argparse
 import csv
-import multiprocessing
-import resource
-import signal
 import sys
 import tempfile
+from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from time import process_time
+from typing import Any
 
 import pandas as pd
 import torch
@@ -27,7 +24,10 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from benchmarks.lib import acados
+from benchmarks.lib.command import parser_of
+from benchmarks.lib.comparison import timed
 from benchmarks.lib.families import DATA, WORLDS, Family
+from benchmarks.lib.limited import limited
 from benchmarks.lib.provenance import provenance
 from torchgco import Problem, compose, judge, presets
 from torchgco.base.status import Status
@@ -35,7 +35,6 @@ from torchgco.baselines import CasADiSolver, GuidedCasADi
 from torchgco.baselines.casadi import PreparedCasADi
 from torchgco.baselines.nlp import Program
 from torchgco.experiments.results.identity import layout_digests
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.obstacles import Obstacles
 from torchgco.scenarios import Task
 
@@ -70,10 +69,8 @@ def main(words: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.families.worlds_peers", description="Fly the worlds' peers."
-    )
+def _parser() -> ArgumentParser:
+    parser = parser_of(__doc__)
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS), metavar="NAME")
     parser.add_argument("--solvers", nargs="+", default=list(NAMES), choices=NAMES, metavar="NAME")
     parser.add_argument("--layouts", type=int, default=32, metavar="N", help="the first N of each world")
@@ -141,9 +138,9 @@ def flights(
         ]
         if not lacking:
             continue
-        began = process_time()
-        peers = Peers.ready(world, plugin, {name for name, _ in lacking})
-        print(f"{world.name}: set-up of {plugin} took {process_time() - began:.0f} s", flush=True)
+        names = {name for name, _ in lacking}
+        peers, took = timed(lambda plugin=plugin, names=names: Peers.ready(world, plugin, names))
+        print(f"{world.name}: set-up of {plugin} took {took:.0f} s", flush=True)
         for name, layout in lacking:
             yield _judged(world, name, layout, peers.fly(name, layout, limit)) | {"limit": limit}
 
@@ -203,69 +200,37 @@ class Peers:
         return cls(world, prepared, guided, program)
 
     def fly(self, name: str, layout: int, limit: int) -> Flight:
-        """One flight, in a process of its own."""
-        problem, U0 = self.world.problem(layout), self.world.task.U0[layout : layout + 1]
-        guided = self.guided if name.endswith("guided") else None
-        if name.startswith("acados"):
-            return self._acados(problem, U0, guided, limit)
-        assert self.prepared is not None
-        return _limited(self.prepared.of(problem), U0, guided, limit)
-
-    def _acados(self, problem: Problem, U0: Tensor, guided: GuidedCasADi | None, limit: int) -> Flight:
-        began = process_time()
-        U, follows = _guess(problem, U0, guided)
-        seconds = process_time() - began
-        X = open_loop(problem.dynamics, problem.x0, U)
-        X = torch.where(torch.isfinite(X), X, problem.x0.unsqueeze(1))
+        """One flight, in a process of its own; computing the guess counts."""
+        problem, U = self.world.problem(layout), self.world.task.U0[layout : layout + 1]
+        follows, took = False, 0.0
+        if name.endswith("guided"):
+            guess, took = timed(lambda: self.guided.guess(problem, U))
+            U, follows = guess.U, bool(guess.found)
         try:
-            answer = acados.fly(problem, X, U, self.world.folder, self.program, limit)
+            flight = self._acados(problem, U, limit) if name.startswith("acados") else self._casadi(problem, U, limit)
         except TimeoutError:
-            return _late(limit, follows)
+            return Flight(None, Status.TIME_LIMIT.name, limit, None, follows)
+        except ChildProcessError as fault:  # of the solver
+            return Flight(None, str(fault), limit, None, follows)
+        return replace(flight, seconds=flight.seconds + took, follows=follows)
+
+    def _acados(self, problem: Problem, U: Tensor, limit: int) -> Flight:
+        answer = acados.fly(problem, U, self.world.folder, self.program, limit)
         status = int(answer.status[0])
         ended = ACADOS_STATUS.get(status, f"acados {status}")
-        return Flight(answer.U, ended, seconds + float(answer.processor[0]), int(answer.iterations[0]), follows)
+        return Flight(answer.U, ended, float(answer.processor[0]), int(answer.iterations[0]))
 
+    def _casadi(self, problem: Problem, U: Tensor, limit: int) -> Flight:
+        """The child shares the program that was built here."""
+        assert self.prepared is not None
+        prepared = self.prepared.of(problem)
 
-def _guess(problem: Problem, U0: Tensor, guided: GuidedCasADi | None) -> tuple[Tensor, bool]:
-    """Controls along the cheapest path, where there is one, else U0."""
-    if guided is None:
-        return U0, False
-    guess = guided.guess(problem, U0)
-    return guess.U, bool(guess.found)
+        def solve() -> tuple[Any, ...]:
+            solution, took = timed(lambda: prepared.solve(problem, U))
+            return solution.U.numpy(), solution.statuses[0].name, took, int(solution.iterations)
 
-
-def _late(limit: int, follows: bool) -> Flight:
-    return Flight(None, Status.TIME_LIMIT.name, limit, None, follows)
-
-
-def _limited(prepared: PreparedCasADi, U0: Tensor, guided: GuidedCasADi | None, limit: int) -> Flight:
-    """A solve in a child, which shares the program that was built here: FATROP may hang within an iteration."""
-    context = multiprocessing.get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
-
-    def solve() -> None:
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
-        began = process_time()
-        U, follows = _guess(prepared.problem, U0, guided)
-        sender.send(follows)
-        solution = prepared.solve(prepared.problem, U)
-        sender.send((solution.U.numpy(), solution.statuses[0].name, process_time() - began, int(solution.iterations)))
-
-    child = context.Process(target=solve)
-    child.start()
-    sender.close()
-    follows = False
-    try:
-        follows = receiver.recv()
-        U, status, seconds, iterations = receiver.recv()
-        return Flight(torch.from_numpy(U), status, seconds, iterations, follows)
-    except EOFError:  # ended by its limit, or by a fault of the solver
-        child.join()
-        late = child.exitcode in (-signal.SIGXCPU, -signal.SIGKILL)
-        return _late(limit, follows) if late else Flight(None, f"ended with {child.exitcode}", limit, None, follows)
-    finally:
-        child.join()
+        controls, *rest = limited(solve, limit)
+        return Flight(torch.from_numpy(controls), *rest)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from torchgco.base.errors import InputError
 from torchgco.baselines.nlp import Program, transcribe
 from torchgco.constraints.base import Constraint
 from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.lagrangian.rollout import open_loop
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
@@ -54,16 +55,15 @@ def installed() -> bool:
 
 def fly(
     problem: Problem,
-    X: Tensor,
     U: Tensor,
     folder: Path,
     program: Program | None = None,
     limit: int | None = None,
 ) -> Answer:
-    """Solve all problems, one after the other, from the guesses X (B, N+1, n) and U (B, N, m).
+    """Solve all problems, one after the other, from guesses U (B, N, m) and their rollout.
 
     Args:
-        problem, X, U: the problems and their guesses.
+        problem, U: the problems and their guesses.
         folder: where files are written and code is compiled; a form that was compiled there isn't compiled again.
         program: as for `write`.
         limit: s of processor time per problem. None: no limit.
@@ -73,7 +73,8 @@ def fly(
         TimeoutError: a problem took longer than `limit`.
         RuntimeError: acados failed; the message holds the end of its output.
     """
-    write(problem, X, U, folder, program)
+    X = open_loop(problem.dynamics, problem.x0, U)
+    write(problem, torch.where(torch.isfinite(X), X, problem.x0.unsqueeze(1)), U, folder, program)
     command = [str(ENVIRONMENT / "bin" / "python"), str(WORKER), str(folder)]
     done = subprocess.run(command + ([] if limit is None else [str(limit)]), capture_output=True, text=True)
     if done.returncode == -signal.SIGXCPU:

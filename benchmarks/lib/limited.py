@@ -16,7 +16,7 @@ def limited(work: Callable[[], T], seconds: int) -> T:
 
     Raises:
         TimeoutError: the limit of processor time was over.
-        RuntimeError: the child ended otherwise.
+        ChildProcessError: the child ended otherwise.
     """
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
@@ -35,6 +35,6 @@ def limited(work: Callable[[], T], seconds: int) -> T:
         child.join()
         if child.exitcode in (-signal.SIGXCPU, -signal.SIGKILL):
             raise TimeoutError(f"took longer than {seconds} s") from None
-        raise RuntimeError(f"ended with {child.exitcode}") from None
+        raise ChildProcessError(f"ended with {child.exitcode}") from None
     finally:
         child.join()

@@ -86,7 +86,7 @@ def alone(problem: Problem) -> pd.DataFrame:
         try:
             controls, iterations[b], seconds[b] = limited(solve, FATROP_LIMIT)
             U[b] = torch.from_numpy(controls)
-        except (TimeoutError, RuntimeError):
+        except (TimeoutError, ChildProcessError):
             pass
     return COMPARISON.judged("FATROP", problem, U, iterations, seconds, guess=WAYPOINTS)
 

@@ -18,7 +18,6 @@ from benchmarks.lib import acados
 from benchmarks.speed.bench import Bench, Took
 from torchgco.baselines import GuidedCasADi
 from torchgco.judging.judge import Verdict, judge
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.scenarios import Task
 
 GUIDED = "fatrop_guided"
@@ -120,9 +119,7 @@ class AcadosPeer(Peer):
             guided = self.guided
             guess, took = bench.timed(lambda: guided.guess(problem, self.task.U0))
             U = guess.U
-        X = open_loop(problem.dynamics, problem.x0, U)
-        X = torch.where(torch.isfinite(X), X, problem.x0.unsqueeze(1))
-        answer = acados.fly(problem, X, U, self.folder)
+        answer = acados.fly(problem, U, self.folder)
         self.setup = self.setup or answer.setup
         own = Took(float(answer.processor.sum()), float(answer.wall.sum()))
         return answer.U, float(answer.iterations.mean()), took + own

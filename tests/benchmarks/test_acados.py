@@ -157,16 +157,16 @@ def test_acados_agrees_with_fatrop(tmp_path: Path) -> None:
     """Twice, the second time without compiling; no number of one problem carries over to the next."""
     problem, U0 = planar_batch(B=3, N=30, obstacles=3, seed=2)
     rows = torch.tensor([1, 2])  # the first has two paths around its obstacles
-    first = acados.fly(problem, *guess(problem, U0), tmp_path)
+    first = acados.fly(problem, U0, tmp_path)
     solution = CasADiSolver("fatrop").solve(problem, U0)
     X = open_loop(problem.dynamics, problem.x0, first.U)
     cost = problem.cost.total(X, first.U)
     torch.testing.assert_close(cost[rows], solution.cost[rows], rtol=1e-2, atol=0)
     assert (first.status == 0).all() and (first.iterations > 1).all() and (first.processor >= 0).all()
-    again = acados.fly(problem, *guess(problem, U0), tmp_path)
+    again = acados.fly(problem, U0, tmp_path)
     assert torch.equal(again.U, first.U) and again.setup < first.setup
     part = problem.take(rows)
-    alone = acados.fly(part, *guess(part, U0[rows]), tmp_path)
+    alone = acados.fly(part, U0[rows], tmp_path)
     torch.testing.assert_close(alone.U, first.U[rows], rtol=1e-9, atol=1e-9)
 
 
@@ -176,8 +176,8 @@ def test_acados_ends_at_its_limit(tmp_path: Path) -> None:
     problem, U0 = planar_batch(B=1, N=30, obstacles=3, seed=2)
     program = acados.program_of(problem)
     with pytest.raises(TimeoutError, match="longer than -1 s"):
-        acados.fly(problem, *guess(problem, U0), tmp_path, program, limit=-1)
-    assert int(acados.fly(problem, *guess(problem, U0), tmp_path, program, limit=60).status[0]) == 0
+        acados.fly(problem, U0, tmp_path, program, limit=-1)
+    assert int(acados.fly(problem, U0, tmp_path, program, limit=60).status[0]) == 0
 
 
 @needs_acados

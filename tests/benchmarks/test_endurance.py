@@ -78,7 +78,7 @@ def test_the_overhead_is_what_the_study_has_besides_its_flights() -> None:
     study = {"solve": 61.0, "judge": 45.0, "report": 9.0, "write shards": 3.0, "rest": 1.0}
     direct = {"solve": 60.0, "judge": 38.0, "rest": 2.0}
     assert endurance.share({"study": study, "direct": direct}) == pytest.approx(0.02)
-    text = "\n".join(endurance.overhead_table({"study": study, "direct": direct}))
+    text = endurance.overhead_table({"study": study, "direct": direct})
     assert "| write shards | 3.00 | 0.00 |" in text and "2.0 %" in text and "the report took 9.0 %" in text
 
 

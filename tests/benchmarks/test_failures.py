@@ -65,4 +65,4 @@ def test_the_whole_run_at_its_smallest(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(failures, "compose", lambda words: whole([*words, *quick]))
     assert failures.main(["--families", "planar_trap", "--first", "2", "--outputs", str(tmp_path)]) == 0
     text = (tmp_path / "failures.md").read_text()
-    assert "| **not reached** | | 2 of 2 |" in text and (tmp_path / "failures.png").stat().st_size > 5000
+    assert "| **not reached** |  | 2 of 2 |" in text and (tmp_path / "failures.png").stat().st_size > 5000

@@ -90,5 +90,5 @@ def test_work_ends_at_its_limit_and_says_how_it_ended() -> None:
     assert limited(lambda: torch.ones(2).sum().item(), 60) == 2.0
     with pytest.raises(TimeoutError, match="longer than 1 s"):
         limited(endless, 1)
-    with pytest.raises(RuntimeError, match="ended with 3"):
+    with pytest.raises(ChildProcessError, match="ended with 3"):
         limited(lambda: sys.exit(3), 60)

@@ -14,7 +14,6 @@ from benchmarks.lib.provenance import provenance
 from benchmarks.speed import (
     batch,
     families,
-    first_solve,
     first_use,
     growth,
     latency,
@@ -46,7 +45,7 @@ def few_processes(monkeypatch) -> None:
     """Run the measurements of `first_use` in this process: a fixed number per import, a first solve per model."""
 
     def started(words: list[str], environment: dict[str, str]) -> str:
-        return "1.5" if words[0] == "-c" else json.dumps(first_solve.measure(words[-1]))
+        return "1.5" if words[0] == "-c" else json.dumps(first_use.measure(words[-1]))
 
     monkeypatch.setattr(first_use, "_started", started)
 

@@ -13,7 +13,7 @@ from benchmarks.families import worlds, worlds_peers
 from benchmarks.lib import acados
 from benchmarks.lib.families import WORLDS
 from tests.problems import quadrotor_batch
-from torchgco import Problem, judge
+from torchgco import Problem, judge, presets
 from torchgco.baselines import CasADiSolver, Hold
 from torchgco.scenarios import Layouts, Task
 
@@ -59,17 +59,19 @@ def test_a_stopped_run_resumes(tmp_path: Path) -> None:
     assert bool(rows["reached"][0]) == bool(verdict.reached) and rows["status"][0] == solution.statuses[0].name
 
 
-def test_a_flight_beyond_its_limit_is_a_row(tmp_path: Path, monkeypatch) -> None:
+def test_a_flight_beyond_its_limit_is_a_row(tmp_path: Path) -> None:
     world = tiny(tmp_path)
 
     class Endless:
-        problem = world.problem(0)
+        def of(self, problem: Problem) -> Endless:
+            return self
 
         def solve(self, problem: Problem, U: torch.Tensor) -> None:
             while True:
                 pass
 
-    flight = worlds_peers._limited(Endless(), world.task.U0[:1], None, 1)  # type: ignore[arg-type]
+    peers = worlds_peers.Peers(world, Endless(), presets.fatrop_guided(world.problem(0)), None)  # type: ignore[arg-type]
+    flight = peers.fly("fatrop", 0, 1)
     row = worlds_peers._judged(world, "fatrop", 0, flight)
     assert (row["status"], row["seconds"], row["reached"], row["sound"]) == ("TIME_LIMIT", "1", False, False)
 
@@ -100,8 +102,8 @@ def test_the_table_counts_the_peers() -> None:
         "seconds": [1.0, 3.0, 9.0, 120.0, 5.0],
     })  # fmt: skip
     trials = worlds.with_peers("woods20", ours, peers)
-    line = worlds.table(trials, {0, 1})[1].strip("| ").split(" | ")
-    assert line[:2] == ["woods20", "`fatrop`"] and line[2] == "3"
+    line = worlds.table(trials, {0, 1})[1]
+    assert line[:3] == ["woods20", "`fatrop`", 3]
     assert [cell.split(" [")[0] for cell in line[3:6]] == ["2 of 3", "2 of 2", "1 of 3"]
     assert line[6:] == ["1.050", "3"]
     assert worlds.with_peers("woods60", ours, peers) is ours
