@@ -32,7 +32,7 @@ def kept(family: Family, count: int = COUNT, seed: int = 0) -> tuple[Layouts, in
     """The first `count` layouts with a proven way through, and how many were drawn for them."""
     parts, held, drawn = [], 0, 0
     while held < count:
-        setup = compose([*family.drawn, f"model={family.model}", f"seed={seed}", "solver=gco_max"])
+        setup = compose([*family.generated, f"seed={seed}", "solver=gco_max"])
         layouts = setup.scenario.draw(range(drawn, drawn + AT_ONCE), seed)
         task = setup.task(layouts)
         moving = layouts.velocities is not None

@@ -8,7 +8,6 @@ and compiling it isn't counted, computing the guess is. Among moving obstacles t
 
 from __future__ import annotations
 
-import csv
 import sys
 import tempfile
 from argparse import ArgumentParser
@@ -87,12 +86,7 @@ def rows_of(file: Path) -> pd.DataFrame:
 
 def append(file: Path, row: dict[str, object]) -> None:
     """Add a row to the file, which is complete again when this returns."""
-    new = not file.is_file()
-    with file.open("a", newline="") as handle:
-        writer = csv.DictWriter(handle, COLUMNS)
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
+    pd.DataFrame([row], columns=list(COLUMNS)).to_csv(file, mode="a", header=not file.is_file(), index=False)
 
 
 @dataclass

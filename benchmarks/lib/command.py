@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.lib import page
+from benchmarks.lib import RESULTS, page
 
 
 def parser_of(doc: str | None, goal: str | None = None) -> ArgumentParser:
@@ -60,5 +60,5 @@ class Command:
         if write:
             said = {key: ", ".join(map(str, v)) if isinstance(v, (list, tuple)) else v for key, v in asked.items()}
             head = page.measured(self.how.format(**said), *self.notes)
-            page.put(page.RESULTS / f"{self.name}.md", self.name, f"{head}\n\n{text}")
+            page.put(RESULTS / f"{self.name}.md", self.name, f"{head}\n\n{text}")
         return 0

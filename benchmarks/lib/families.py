@@ -21,6 +21,11 @@ class Family:
         """The file of the public layouts, or of the first layouts drawn under a seed, with the best known costs."""
         return DATA / "drawn" / f"{self.name}-seed{seed}.npz" if fresh else DATA / self.folder / f"{self.name}.npz"
 
+    @property
+    def generated(self) -> list[str]:
+        """Overrides that compose the model and the generator."""
+        return [*self.drawn, f"model={self.model}"]
+
     def overrides(self, fresh: int = 0, seed: int = 0) -> list[str]:
         """Overrides for `torchgco`: the file's layouts, or `fresh` new layouts drawn under a seed."""
         if fresh == 0:

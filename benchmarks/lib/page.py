@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from benchmarks.lib import RESULTS
 from benchmarks.lib.provenance import provenance
 from torchgco.experiments.statistics.statistics import wilson
 
-__all__ = ["INTERVALS", "RESULTS", "SET_UP", "interval", "markdown", "measured", "put", "put_between", "share", "shown"]
 INTERVALS = "95 % Wilson intervals in percent"
 SET_UP = "set-up excluded"
 

@@ -13,6 +13,7 @@ import torch
 from benchmarks.speed.results import MEASURED, Results
 from benchmarks.speed.sizes import Sizes
 from torchgco.experiments.config.build import Setup, compose
+from torchgco.judging.judge import Verdict
 from torchgco.native.dispatch import engine_of
 from torchgco.scenarios import Task
 
@@ -67,6 +68,18 @@ class Bench:
         if self.results is not None:
             self.results.add({**row, **self.source})
         self.say(f"  {section}: {case}, {solver}: {quantity} {shown} {unit}".rstrip())
+
+    def times(self, section: str, case: str, solver: str, took: Took) -> None:
+        """Rows of the time per problem."""
+        self.row(section, case, solver, "seconds per problem", took.seconds, "s")
+        self.row(section, case, solver, "wall", took.wall, "s")
+
+    def counts(self, section: str, case: str, solver: str, verdict: Verdict) -> None:
+        """Rows of what the judge counts."""
+        for quantity, hits in (("feasible", verdict.feasible), ("reached", verdict.reached)):
+            self.row(section, case, solver, quantity, f"{int(hits.sum())}/{hits.numel()}")
+        cost = verdict.cost[verdict.reached]
+        self.row(section, case, solver, "median cost", float(cost.quantile(0.5)) if cost.numel() else "")
 
     def left(self) -> float:
         """Seconds until the deadline."""

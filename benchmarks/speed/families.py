@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.lib import acados
+from benchmarks.lib.families import FAMILIES
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.peers import GUIDED, AcadosPeer, CasADiPeer, Peer, first
 from torchgco.base.errors import InputError
@@ -16,13 +17,6 @@ from torchgco.experiments.config.build import Setup
 from torchgco.judging.judge import Verdict, judge
 
 SECTION = "families"
-FAMILIES = {
-    "forest30": ("scenario=forest", "scenario.num_obstacles=30"),
-    "forest60": ("scenario=forest", "scenario.num_obstacles=60"),
-    "walls": ("scenario=walls",),
-    "planar_trap": ("scenario=planar_trap", "model=planar"),
-    "planar_random": ("scenario=planar_random", "model=planar"),
-}
 
 
 @dataclass
@@ -50,7 +44,7 @@ def _family(bench: Bench, name: str, share: float) -> None:
 
     `share` of the time left may be used for this family.
     """
-    setup = bench.setup(*FAMILIES[name])
+    setup = bench.setup(*FAMILIES[name].generated)
     with tempfile.TemporaryDirectory() as folder:
         peers = [peer for peer in _peers(bench, name, setup, Path(folder)) if _flown(bench, name, peer)]
         flights = _fly(bench, name, setup, share)
@@ -113,14 +107,9 @@ def _flight(bench: Bench, name: str, setup: Setup, batch: int) -> Ours:
 
 
 def _say(bench: Bench, case: str, solver: str, took: Took, verdict: Verdict, per_reached: float) -> None:
-    bench.row(SECTION, case, solver, "seconds per problem", took.seconds, "s")
-    bench.row(SECTION, case, solver, "wall", took.wall, "s")
+    bench.times(SECTION, case, solver, took)
     bench.row(SECTION, case, solver, "per layout reached", per_reached, "s")
-    count = verdict.feasible.numel()
-    for quantity, hits in (("feasible", verdict.feasible), ("reached", verdict.reached)):
-        bench.row(SECTION, case, solver, quantity, f"{int(hits.sum())}/{count}")
-    cost = verdict.cost[verdict.reached]
-    bench.row(SECTION, case, solver, "median cost", float(cost.quantile(0.5)) if cost.numel() else "")
+    bench.counts(SECTION, case, solver, verdict)
 
 
 def _say_peer(bench: Bench, name: str, peer: Peer) -> None:

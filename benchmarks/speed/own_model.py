@@ -74,9 +74,5 @@ def _judged(problem: Problem, U: Tensor) -> Verdict:
 
 
 def _say(bench: Bench, case: str, solver: str, took: Took, verdict: Verdict) -> None:
-    bench.row(SECTION, case, solver, "seconds per problem", took.seconds, "s")
-    bench.row(SECTION, case, solver, "wall", took.wall, "s")
-    for quantity, hits in (("feasible", verdict.feasible), ("reached", verdict.reached)):
-        bench.row(SECTION, case, solver, quantity, f"{int(hits.sum())}/{hits.numel()}")
-    cost = verdict.cost[verdict.reached]
-    bench.row(SECTION, case, solver, "median cost", float(cost.quantile(0.5)) if cost.numel() else "")
+    bench.times(SECTION, case, solver, took)
+    bench.counts(SECTION, case, solver, verdict)

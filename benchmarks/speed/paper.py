@@ -23,6 +23,4 @@ def run(bench: Bench) -> None:
     bench.row(SECTION, case, SOLVER, "wall", took.wall, "s")
     bench.row(SECTION, case, SOLVER, "seconds per problem", took.seconds / count, "s")
     bench.row(SECTION, case, SOLVER, "iterations", float(solution.iterations.double().mean()))
-    for quantity, hits in (("feasible", verdict.feasible), ("reached", verdict.reached)):
-        bench.row(SECTION, case, SOLVER, quantity, f"{int(hits.sum())}/{count}")
-    bench.row(SECTION, case, SOLVER, "median cost", float(verdict.cost.quantile(0.5)))
+    bench.counts(SECTION, case, SOLVER, verdict)

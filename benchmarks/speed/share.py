@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from benchmarks.lib.families import FAMILIES
 from benchmarks.lib.timers import Timers
 from benchmarks.speed.bench import Bench
-from benchmarks.speed.families import FAMILIES
 
 SECTION = "share"
 
@@ -44,7 +44,7 @@ def run(bench: Bench) -> None:
 
 def _measure(bench: Bench, name: str, batch: int) -> None:
     """Time one solve of new problems, in a process that has solved other problems."""
-    setup = bench.setup(*FAMILIES[name])
+    setup = bench.setup(*FAMILIES[name].generated)
     bench.warm(setup, setup.task(setup.scenario.draw([batch, batch + 1], setup.seed)))
     task = setup.task(setup.layouts(batch))
     timers = Timers((OUTER, PYTHON), bench.wait)

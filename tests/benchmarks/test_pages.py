@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks.lib import page
+from benchmarks.lib import command, page
 from benchmarks.lib.command import Command, parser_of
 from benchmarks.lib.comparison import Comparison, cost_ratios, count, mean, median, named, share_within, within, worst
 from benchmarks.lib.limited import limited
@@ -20,7 +20,7 @@ from torchgco import solve
 
 
 def test_a_table_replaces_the_one_between_the_marks_of_its_page(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(page, "RESULTS", tmp_path)
+    monkeypatch.setattr(command, "RESULTS", tmp_path)
     file = tmp_path / "maze.md"
     file.write_text("before\n<!-- maze -->\nold\n<!-- end maze -->\nafter\n")
     main = Command(
