@@ -6,6 +6,8 @@ from typing import Any
 
 import pandas as pd
 
+from torchgco.experiments.results.identity import Manifest
+
 PLAIN = {
     "scenario": "forest",
     "layout": 0,
@@ -35,6 +37,9 @@ PLAIN = {
     "device": "cpu",
     "dtype": "float64",
     "version": "0.1.0",
+    "best_from": "file",
+    "layout_digest": "one",
+    "settings_digest": "one",
 }
 
 
@@ -50,6 +55,12 @@ def flights(solver: str, reached: Iterable[bool], **more: Any) -> list[dict[str,
         {"solver": solver, "layout": i, "feasible": hit, "reached": hit, "success": hit, **more}
         for i, hit in zip(count(), reached, strict=False)
     ]
+
+
+def manifest(**configuration: Any) -> bytes:
+    """The study.json of a finished study without solvers and layouts, with these keys in its configuration."""
+    given = {"version": "0.1.0", "seed": 0, "device": {"name": "cpu", "dtype": "float64"}}
+    return Manifest(given | configuration, {}, {}).to_json()
 
 
 ENDS = {"R": "REACHED", "C": "COLLISION", "T": "TIMEOUT", "D": "DIVERGED"}

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.trials import flights, missions, trials
+from tests.trials import flights, manifest, missions, trials
 from torchgco.base.errors import InputError
 from torchgco.experiments.reports.report import main, write_report
 from torchgco.experiments.results.kinds import joined, parts_of
@@ -19,13 +19,12 @@ from torchgco.scenarios.layouts import Layouts
 HITS = [i < 30 for i in range(32)]
 
 
-def study(folder: Path, *rows: dict[str, Any], config: str | None = None) -> Path:
+def study(folder: Path, *rows: dict[str, Any], **configuration: Any) -> Path:
     """A study's folder with a table of trials, and with a configuration if one is given."""
     folder.mkdir(parents=True, exist_ok=True)
     trials(*rows).to_parquet(folder / "trials.parquet", index=False)
-    if config is not None:
-        (folder / ".hydra").mkdir()
-        (folder / ".hydra" / "config.yaml").write_text(config)
+    if configuration:
+        (folder / "study.json").write_bytes(manifest(**configuration))
     return folder
 
 
@@ -129,18 +128,9 @@ def test_the_same_result_in_two_runs_counts_once_with_its_first_time(tmp_path: P
     assert merged.attrs["repeated"] == 32
 
 
-CONFLICTS = {
-    "unknown": (None, None),
-    "one unknown": ("limit: 1", None),
-    "same": ("limit: 1", "limit: 1"),
-}
-
-
-@pytest.mark.parametrize("configs", CONFLICTS.values(), ids=CONFLICTS.keys())
-def test_different_results_under_one_name_are_refused(tmp_path: Path, configs: tuple) -> None:
-    first, second = configs
-    study(tmp_path / "a", *flights("gco", HITS), config=first)
-    study(tmp_path / "b", *flights("gco", HITS, cost=7.0), config=second)
+def test_different_results_under_one_name_are_refused(tmp_path: Path) -> None:
+    study(tmp_path / "a", *flights("gco", HITS))
+    study(tmp_path / "b", *flights("gco", HITS, cost=7.0))
     with pytest.raises(InputError) as error:
         merge([tmp_path])
     message = str(error.value)
@@ -148,14 +138,11 @@ def test_different_results_under_one_name_are_refused(tmp_path: Path, configs: t
     assert str(tmp_path / "a") in message and str(tmp_path / "b") in message
 
 
-def test_different_configurations_get_a_label_where_their_results_differ(tmp_path: Path) -> None:
-    steady = flights("fatrop", HITS)
-    more = [{"solver": "gco", "layout": 40}]
-    study(tmp_path / "a", *flights("gco", HITS), *more, *steady, config="limit: 1")
-    study(tmp_path / "sub" / "b", *flights("gco", HITS[::-1]), *steady, config="limit: 2")
-    merged = merge([tmp_path])
-    assert merged["solver"].value_counts().to_dict() == {"gco [a]": 33, "gco [sub/b]": 32, "fatrop": 32}
-    assert set(merged.loc[merged["layout"] == 40, "solver"]) == {"gco [a]"}, "all rows of a run, shared or not"
+def test_a_table_that_names_no_layouts_is_refused(tmp_path: Path) -> None:
+    table = pd.read_parquet(study(tmp_path / "a", *flights("gco", HITS)) / "trials.parquet")
+    table.drop(columns="layout_digest").to_parquet(tmp_path / "a" / "trials.parquet")
+    with pytest.raises(InputError, match="without layout_digest"):
+        merge([tmp_path])
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
@@ -256,13 +243,13 @@ def test_missions_are_in_every_format(form: str) -> None:
 
 def test_missions_keep_their_columns_next_to_a_study(tmp_path: Path, capsys) -> None:
     """Without keys of missions in the other study, rows were named by their folders."""
-    base = "scenario: {{name: forest, num_obstacles: 10}}\nmodel: {{vehicle: {{name: quadrotor}}}}\n{}"
+    base = {"scenario": {"name": "forest", "num_obstacles": 10}, "model": {"vehicle": {"name": "quadrotor"}}}
     for wind in (0.0, 2.0):
-        config = base.format(f"mission: {{disturbance: {{wind: {wind}}}}}\nplant: {{mass_error: 0.0}}")
+        loop = {"mission": {"disturbance": {"wind": wind}}, "plant": {"mass_error": 0.0}}
         digests = {"layout_digest": f"mission {wind}", "settings_digest": "one", "success": pd.NA}
-        study(tmp_path / f"wind{wind}", *missions("gco", "RRC", **digests), config=config)
+        study(tmp_path / f"wind{wind}", *missions("gco", "RRC", **digests), **base, **loop)
     digests = {"layout_digest": "single", "settings_digest": "one"}
-    study(tmp_path / "single", *flights("gco", HITS, **digests), config=base.format(""))
+    study(tmp_path / "single", *flights("gco", HITS, **digests), **base)
     merged = merge([tmp_path])
     assert [name for name in merged.columns if "." in name] == ["mission.disturbance.wind"]
     assert merged.groupby("mission.disturbance.wind", dropna=False).size().to_dict() == {0.0: 3, 2.0: 3, pd.NA: 32}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -71,16 +70,6 @@ def test_a_refused_command_leaves_the_folder_as_it_is(words, run, run_until, tmp
     code, _, err = run(*HOLD, *words, "hydra.run.dir=out")
     assert code == 2 and problem_line(err)
     assert contents(tmp_path / "out") == before
-
-
-@pytest.mark.usefixtures("without_report")
-def test_the_folder_of_an_older_version_is_refused(run, tmp_path) -> None:
-    (tmp_path / "out").mkdir()
-    held = json.dumps({"configuration": {"version": "0.1.0", "seed": 0}, "layouts": "1f"})
-    (tmp_path / "out" / "study.json").write_text(held)
-    code, _, err = run(*HOLD, "hydra.run.dir=out")
-    assert code == 2 and "written by an older version of torchgco" in problem_line(err)
-    assert (tmp_path / "out" / "study.json").read_text() == held
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from tests.experiments.commands import TINY
-from tests.trials import PLAIN, trials
+from tests.trials import trials
 from torchgco.experiments.reports.report import main
 from torchgco.experiments.results.identity import Manifest, digest, layout_digests
 from torchgco.experiments.results.merge import merge
@@ -227,29 +227,6 @@ def test_a_best_cost_from_a_file_is_kept(tmp_path) -> None:
     assert set(table["best_cost"]) == {98.0} and table["success"].all()
 
 
-def test_the_manifest_is_read_not_the_hydra_folder(tmp_path) -> None:
-    for number in (10, 30):
-        folder = study(tmp_path / str(number), {"gco": [HIT]}, obstacles=number)
-        (folder / ".hydra").mkdir()
-        (folder / ".hydra" / "config.yaml").write_text("scenario: {name: forest, num_obstacles: 77}")
-    assert list(counts(merge([tmp_path]), OBSTACLES)) == [(10, "gco"), (30, "gco")]
-
-
-def test_runs_of_an_older_version_are_named_and_never_paired_with_new_ones(tmp_path, capsys) -> None:
-    study(tmp_path / "new", {"gco": [HIT] * 2})
-    old = tmp_path / "old"
-    old.mkdir()
-    trials(*({"solver": name, "layout": i} for name in ("gco", "al_ilqr") for i in range(2))).to_parquet(
-        old / "trials.parquet"
-    )
-    table = merge([tmp_path])
-    assert counts(table) == {"gco": (2, 2), "gco [old]": (2, 2), "al_ilqr": (2, 2)}
-    assert main([str(tmp_path)]) == 0
-    text = capsys.readouterr().out
-    assert f"of an older version, distinguished by configuration and results alone: {old}" in text
-    assert [row[2] for row in pairs(table) if "al_ilqr" in row and "gco" in row] == [0]
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_sweep_from_the_command_line(run, tmp_path, capsys) -> None:
@@ -310,7 +287,3 @@ def test_every_input_of_a_flight_changes_the_digest(field: str) -> None:
 def test_another_model_makes_another_layout() -> None:
     one, other = (layout_digests(scene(), PLANE | {"dynamics": {"drag": drag}}) for drag in (1, 2))
     assert not set(one.values()) & set(other.values())
-
-
-def test_the_plain_table_has_no_digests() -> None:
-    assert "layout_digest" not in PLAIN, "tests of tables of older versions count on it"

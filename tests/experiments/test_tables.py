@@ -11,13 +11,13 @@ import pandas as pd
 import pytest
 
 from tests.experiments.commands import HOLD, problem_line
-from tests.trials import flights, trials
+from tests.trials import flights, manifest, trials
 from torchgco.experiments.reports import report
 from torchgco.experiments.reports.report import main
 from torchgco.experiments.results.kinds import parts_of
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.formats import format_report
-from torchgco.experiments.statistics.paired import paired
+from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import plain, summarise
 from torchgco.experiments.statistics.tables import FORMATS
 
@@ -28,9 +28,8 @@ def study(folder: Path, *rows: dict, number: int | None = None) -> Path:
     folder.mkdir(parents=True)
     trials(*rows).to_parquet(folder / "trials.parquet", index=False)
     if number is not None:
-        (folder / ".hydra").mkdir()
-        config = f"scenario: {{num_obstacles: {number}}}\nmodel: {{vehicle: {{name: quadrotor}}}}"
-        (folder / ".hydra" / "config.yaml").write_text(config)
+        given = manifest(scenario={"num_obstacles": number}, model={"vehicle": {"name": "quadrotor"}})
+        (folder / "study.json").write_bytes(given)
     return folder
 
 
@@ -120,11 +119,11 @@ def test_paired_costs_are_compared_where_both_arrived() -> None:
     rows = [*flights("a", hits), *flights("b", [True] * 10)]
     for i, row in enumerate(rows):
         row["cost"] = 100.0 + row["layout"] if i < 10 else 50.0
-    result = paired(trials(*rows), "a", "b")
+    result = compare(trials(*rows)).iloc[0]
     assert (result.cost_n, result.cost_ratio) == (9, pytest.approx(2.08))
     # Order statistics 2 and 8 of 9: a fair coin falls outside with probability 2 (1 + 9) / 2^9 = 0.039.
     assert (result.cost_low, result.cost_high) == pytest.approx((2.02, 2.14))
-    assert np.isnan(paired(trials(*rows[:3], *rows[10:13]), "a", "b").cost_low), "too few for an interval"
+    assert np.isnan(compare(trials(*rows[:3], *rows[10:13])).iloc[0].cost_low), "too few for an interval"
 
 
 @pytest.mark.usefixtures("without_report", "without_figures")

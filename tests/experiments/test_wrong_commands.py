@@ -290,7 +290,7 @@ def test_wrong_words_of_a_report_get_one_line(table, tmp_path, capsys, monkeypat
         assert report(words) == 2
         assert problem_line(capsys.readouterr().err).startswith(f"torchgco-report: {field}: expected ")
     assert report([]) == 2 and problem_line(capsys.readouterr().err).startswith("torchgco-report: DIR: expected ")
-    for words in ([str(table), "--nope"], ["--power", "0.5", "high"], [str(table), "--format", "xml"]):
+    for words in ([str(table), "--nope"], [str(table), "--power", "0.5"], [str(table), "--format", "xml"]):
         with pytest.raises(SystemExit) as stop:
             report(words)
         assert stop.value.code == 2 and problem_line(capsys.readouterr().err).startswith("torchgco-report: ")

@@ -120,7 +120,7 @@ class _Flown:
 
     @classmethod
     def read(cls, folder: Path) -> _Flown | None:
-        """None where a study has many missions, or where an older version flew them."""
+        """None where a study has many missions."""
         if not all((folder / name).is_file() for name in (PLANS, TIME_STEPS)):
             return None
         with np.load(folder / PLANS, allow_pickle=False) as held:

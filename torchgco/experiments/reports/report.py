@@ -26,11 +26,10 @@ from torchgco.experiments.reports.verify import verify
 from torchgco.experiments.reports.verify_text import confirmed_frame, confirmed_text, difference_texts
 from torchgco.experiments.results.files import say, write
 from torchgco.experiments.results.kinds import Part, parts_of, write_tables
-from torchgco.experiments.results.merge import OLDER, REPEATED, UNFINISHED, merge
+from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.records import MANIFEST, TRIALS
 from torchgco.experiments.results.runs import is_merged, read_trials
 from torchgco.experiments.statistics.formats import format_report
-from torchgco.experiments.statistics.power import power_table
 from torchgco.experiments.statistics.statistics import plain
 from torchgco.experiments.statistics.tables import FORMATS, format_frame
 from torchgco.plotting.layouts import layout_grid
@@ -96,16 +95,6 @@ def _solutions(path: Path) -> Arrays:
         return dict(held)
 
 
-def _notes(trials: pd.DataFrame) -> list[str]:
-    """What a reader of a merged table should know."""
-    notes = []
-    if repeated := trials.attrs.get(REPEATED, 0):
-        notes.append(f"{repeated} rows left out: another run has the same flight, and each counts once")
-    if older := trials.attrs.get(OLDER, []):
-        notes.append(f"of an older version, distinguished by configuration and results alone: {', '.join(older)}")
-    return notes
-
-
 class _Parser(argparse.ArgumentParser):
     """Without the usage before an error: one line for every mistake."""
 
@@ -119,13 +108,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("folders", nargs="*", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     parser.add_argument("--format", choices=FORMATS, default="table", help="of the tables on stdout; default: table")
-    other = parser.add_mutually_exclusive_group()
-    other.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
-    other.add_argument(
-        "--power", nargs=2, type=float, metavar="RATE", help="instead: layouts that tell two success rates apart"
-    )
-    parser.add_argument("--level", type=float, default=0.05, metavar="P", help="of --power's test; default: 0.05")
-    parser.add_argument("--power-target", type=float, default=0.8, metavar="P", help="of --power; default: 0.8")
+    parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
     return parser
 
 
@@ -133,11 +116,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """`torchgco-report`. Returns the exit code: 2 for malformed input, 1 where rows can't be confirmed."""
     options = _parser().parse_args(arguments)
     try:
-        if not options.folders and options.power is None:
+        if not options.folders:
             raise InputError("DIR", "a study, or a folder of studies", "none")
         with raised():
-            if options.power is not None:
-                return _power(options)
             return _verify(options) if options.verify else _report(options)
     except InputError as error:
         print(f"torchgco-report: {error}", file=sys.stderr)
@@ -160,26 +141,15 @@ def _report(options: argparse.Namespace) -> int:
     trials = merged.copy(deep=False)
     trials.attrs = {}  # pandas copies them for every table that it makes from this one
     say(_written(output, trials, None, options.format))
-    for note in [*_notes(merged), f"written to {output}"]:
+    repeated = merged.attrs[REPEATED]
+    notes = [f"{repeated} rows left out: another run has the same flight, and each counts once"] if repeated else []
+    for note in [*notes, f"written to {output}"]:
         if options.format == "table":
             say(f"\n{note}")
         else:
             print(note, file=sys.stderr)
     for note in merged.attrs[UNFINISHED]:
         print(f"unfinished: {note}", file=sys.stderr)
-    return 0
-
-
-def _power(options: argparse.Namespace) -> int:
-    trials = merge(options.folders) if options.folders else None
-    rate_a, rate_b = options.power
-    table = power_table(rate_a, rate_b, options.level, options.power_target, trials)
-    if options.format not in ("csv", "json"):
-        table = table.assign(
-            discordant=table["discordant"].map(lambda share: "-" if np.isnan(share) else f"{share:.1%}"),
-            power=table["power"].map("{:.3f}".format),
-        )
-    say(format_frame(table, options.format))
     return 0
 
 

@@ -105,8 +105,6 @@ def verify(folders: Iterable[str | os.PathLike[str]]) -> tuple[list[Verification
 def verify_study(folder: Path) -> Verification:
     """Confirm the table of one finished study. Raises InputError as `verify` does."""
     manifest = read_manifest(folder / MANIFEST)
-    if manifest is None:
-        raise InputError("folders", "studies whose study.json holds digests", f"{folder}, of an older version")
     missions = manifest.configuration.get("mission") is not None
     layouts = _read(folder / LAYOUTS, Layouts.load)
     held = _read(folder / TRIALS, pd.read_parquet)

@@ -100,15 +100,13 @@ class Manifest:
         return json.dumps({**held, "checksum": digest(held)}, indent=1, default=str).encode()
 
     @classmethod
-    def from_json(cls, text: bytes) -> Self | None:
-        """The manifest that `to_json` wrote, or None for the study.json of an older version.
+    def from_json(cls, text: bytes) -> Self:
+        """The manifest that `to_json` wrote.
 
         Raises:
-            ValueError, TypeError, KeyError, AttributeError: the text is neither.
+            ValueError, TypeError, KeyError, AttributeError: the text is none.
         """
         held = json.loads(text.decode())
-        if "solvers" not in held and isinstance(held["configuration"], dict) and isinstance(held["layouts"], str):
-            return None
         layouts = {int(number): str(code) for number, code in held["layouts"].items()}
         made = cls(held["configuration"], held["solvers"], layouts)
         if held.pop("checksum") != digest(held):

@@ -80,8 +80,6 @@ class Records:
             if not self.repair:
                 raise
             return False
-        if held is None:
-            raise self._another("(written by an older version of torchgco)")
         if held.identity() != self.manifest.identity():
             raise self._another(f"({difference(held.identity(), self.manifest.identity())})")
         return True
@@ -239,8 +237,8 @@ class Records:
         )
 
 
-def read_manifest(path: Path) -> Manifest | None:
-    """The manifest in a study.json, None for that of an older version; InputError where it is damaged."""
+def read_manifest(path: Path) -> Manifest:
+    """The manifest in a study.json; InputError where it is damaged."""
     try:
         return Manifest.from_json(path.read_bytes())
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
@@ -248,10 +246,9 @@ def read_manifest(path: Path) -> Manifest | None:
 
 
 def read_checksums(path: Path) -> dict[str, list[str]]:
-    """The valid checksums of each file; an empty dict for a study of an older version, whose mark is empty."""
+    """The valid checksums of each file of a finished study; InputError where its mark is damaged."""
     try:
-        text = path.read_bytes()
-        sums = json.loads(text) if text else {}
+        sums = json.loads(path.read_bytes())
         if not all(isinstance(held, list) for held in sums.values()):
             raise ValueError("no checksums")
         return sums

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -10,9 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.results.files import checksum, damaged
@@ -32,14 +28,16 @@ from torchgco.scenarios import Layouts
 
 MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
 ROW = [*PAIR, "solver"]
+DIGESTS = ("layout_digest", "settings_digest")
+NEEDED = (*ROW, *DIGESTS, "best_from")  # columns that tell trials apart, and how they were judged
 
 
 @dataclass(frozen=True)
 class Run:
     """One table of trials with its known origin.
 
-    configuration  of the study, from its study.json, else from `.hydra/`; empty where there is neither
-    solvers        resolved settings by name; empty for a run of an older version
+    configuration  of the study; empty for a table alone, without study.json
+    solvers        resolved settings by name; empty likewise
     planned        trials of the whole study where it isn't finished; None where it is
     """
 
@@ -78,9 +76,9 @@ def read_trials(path: str | os.PathLike[str]) -> pd.DataFrame:
     if sums and Path(path).is_file() and checksum(Path(path)) not in sums:
         raise damaged(Path(path), "isn't as the study wrote it")
     trials = _read(path)
-    missing = [name for name in ROW if name not in trials.columns]
+    missing = [name for name in NEEDED if name not in trials.columns]
     if missing:
-        raise InputError("trials", f"columns {', '.join(ROW)}", f"{path} without {', '.join(missing)}")
+        raise InputError("trials", f"columns {', '.join(NEEDED)}", f"{path} without {', '.join(missing)}")
     return trials
 
 
@@ -110,9 +108,14 @@ def _run(folder: Path, given: bool) -> Run | None:
     if (folder / TRIALS).is_file():
         trials = read_trials(folder / TRIALS)
         check_trials(trials, folder / TRIALS)
-        return Run(folder, trials, *_origin(folder)) if given or MERGED not in trials.attrs else None
+        if MERGED in trials.attrs and not given:
+            return None
+        if not (folder / MANIFEST).is_file():
+            return Run(folder, trials, {}, {})
+        manifest = read_manifest(folder / MANIFEST)
+        return Run(folder, trials, manifest.configuration, manifest.solvers)
     manifest = read_manifest(folder / MANIFEST)
-    if manifest is None or (folder / DONE).is_file():
+    if (folder / DONE).is_file():
         raise damaged(folder / TRIALS, "is missing")
     records = Records(folder, manifest)
     parts = [rows for name in manifest.solvers if len(rows := records.flown(name)[0])]
@@ -128,20 +131,3 @@ def _layouts(manifest: Manifest) -> Layouts | None:
     """The layouts of a study's file, for their best costs; None where they were drawn, or the file has moved."""
     path = manifest.configuration["scenario"].get("path")
     return Layouts.load(path) if path and Path(path).is_file() else None
-
-
-def _origin(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Configuration and settings of the solvers, as far as they are known."""
-    path = folder / MANIFEST
-    try:
-        if path.is_file():
-            manifest = read_manifest(path)
-            if manifest is not None:
-                return manifest.configuration, manifest.solvers
-            return json.loads(path.read_bytes())["configuration"], {}
-        held = OmegaConf.to_container(OmegaConf.load(folder / ".hydra" / "config.yaml"))
-    except (FileNotFoundError, ValueError, YAMLError, OmegaConfBaseException) as error:
-        if isinstance(error, InputError):
-            raise
-        return {}, {}
-    return ({str(key): value for key, value in held.items()} if isinstance(held, dict) else {}), {}

@@ -119,8 +119,6 @@ def _clusters(
 def _digests(trials: pd.DataFrame) -> pd.DataFrame:
     """The known layouts of some trials: columns layout, seed and layout_digest."""
     names = ["layout", "seed", "layout_digest"]
-    if "layout_digest" not in trials.columns:
-        return pd.DataFrame(columns=names)
     return trials.loc[trials["layout_digest"].notna(), names]
 
 

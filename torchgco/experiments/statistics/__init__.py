@@ -1,1 +1,1 @@
-"""Counts, intervals, pairs and sample sizes, and the tables that show them."""
+"""Counts, intervals and pairs, and the tables that show them."""

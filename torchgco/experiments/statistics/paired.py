@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from math import nan
@@ -24,8 +24,6 @@ from torchgco.experiments.statistics.statistics import (
     numbers_of,
     task_columns,
 )
-
-Chosen = Callable[[list[str]], list[tuple[str, str]]]  # from the solvers of a task to the pairs that are compared
 
 
 @dataclass(frozen=True)
@@ -64,46 +62,22 @@ class PairedResult:
     cost_high: float
 
 
-def paired(trials: pd.DataFrame, solver_a: str, solver_b: str, outcome: str = "reached") -> PairedResult:
-    """Compare two solvers on the trials both flew, matched by scenario, model, swept variables, layout and seed.
-
-    A layout is the same where its digest is, too, if the table has a column `layout_digest`.
-
-    Raises InputError for a column that is missing, a solver that isn't in `trials`, an unknown outcome, and a
-    solver that has two rows for one trial.
-    """
-    check_trials(trials)
-    if outcome not in OUTCOMES:
-        raise InputError("outcome", f"one of {', '.join(OUTCOMES)}", outcome)
-    for solver in (solver_a, solver_b):
-        _check_flown(trials, solver)
-    flights = _Flights(trials)
-    return next(flights.compared(np.arange(len(trials)), solver_a, solver_b, [outcome]))
-
-
-def paired_table(trials: pd.DataFrame, solver: str) -> pd.DataFrame:
-    """`solver` against every other solver: a row per task (scenario, model, swept variables), other solver and outcome.
-
-    Columns: those of the task and the fields of PairedResult, `solver` being a. Tasks that `solver` didn't fly
-    and tasks that nobody else flew give no row. Raises InputError as `paired` does.
-    """
-    check_trials(trials)
-    _check_flown(trials, solver)
-    flights = _Flights(trials)
-    return flights.table(
-        lambda names: [(solver, other) for other in names if other != solver] if solver in names else []
-    )
-
-
 def compare(trials: pd.DataFrame) -> pd.DataFrame:
     """For each task the solver that comes first, the one under study, against every other.
 
-    Where it flew in several variants ("gco [...]"), each of them is compared with all that follow. Columns as
-    `paired_table` has them; no rows for a task that one solver flew.
+    Trials are matched by scenario, model, swept variables, layout, seed, and the layout's digest where the table has
+    it. Where the first solver flew in several variants ("gco [...]"), each of them is compared with all that follow.
+
+    Returns:
+        A row per task (scenario, model, swept variables), pair of solvers and outcome: the columns of the task, and
+        the fields of PairedResult. No rows for a task that one solver flew.
+
+    Raises:
+        InputError: a column that is missing, or a solver that has two rows for one trial.
     """
     check_trials(trials)
-    flights = _Flights(trials)
-    return flights.table(lambda names: [(a, b) for a, b in combinations(names, 2) if _bare(a) == _bare(names[0])])
+    flights, columns = _Flights(trials), task_columns(trials)
+    return pd.DataFrame(list(flights.rows()), columns=[*columns, *PairedResult.__dataclass_fields__])
 
 
 def _bare(solver: str) -> str:
@@ -125,18 +99,15 @@ class _Flights:
         self.hits = attained(trials, grouped(trials, [*task_columns(trials), "solver"]))
         self.cost = numbers_of(trials["cost"])
 
-    def table(self, chosen: Chosen) -> pd.DataFrame:
-        """A row per task, pair of solvers and outcome; `chosen` gives the pairs from the names on a task."""
-        rows = list(self._rows(chosen))
-        return pd.DataFrame(rows, columns=[*task_columns(self.trials), *PairedResult.__dataclass_fields__])
-
-    def _rows(self, chosen: Chosen) -> Iterator[dict[str, object]]:
+    def rows(self) -> Iterator[dict[str, object]]:
+        """The rows of `compare`."""
         names = task_columns(self.trials)
         keys = self.trials[names]
         for task in grouped(self.trials, names):
             key = keys.iloc[task[0]].to_dict()
-            for a, b in chosen([self.names[code] for code in pd.unique(self.solver[task])]):
-                for result in self.compared(task, a, b, OUTCOMES):
+            flown = [self.names[code] for code in pd.unique(self.solver[task])]
+            for a, b in combinations(flown, 2):
+                for result in self.compared(task, a, b) if _bare(a) == _bare(flown[0]) else ():
                     yield key | asdict(result)
 
     def match(self, rows: np.ndarray, a: str, b: str) -> tuple[np.ndarray, np.ndarray, int]:
@@ -155,12 +126,12 @@ class _Flights:
             first = ", ".join(f"{name} {value}" for name, value in row.items())
             raise InputError("trials", f"one row of {solver} for {first}", "two")
 
-    def compared(self, rows: np.ndarray, a: str, b: str, outcomes: Sequence[str]) -> Iterator[PairedResult]:
+    def compared(self, rows: np.ndarray, a: str, b: str) -> Iterator[PairedResult]:
         """Two solvers' rows among `rows`, compared by each outcome."""
         rows_a, rows_b, unmatched = self.match(rows, a, b)
         arrived = (self.hits["reached"][rows_a] == 1) & (self.hits["reached"][rows_b] == 1)
         costs = _ratio(self.cost[rows_a[arrived]], self.cost[rows_b[arrived]])
-        for outcome in outcomes:
+        for outcome in OUTCOMES:
             counts = _counts(self.hits[outcome][rows_a], self.hits[outcome][rows_b])
             yield PairedResult(a, b, outcome, **counts, unmatched=unmatched, **costs)
 
@@ -192,8 +163,3 @@ def _ratio(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
         return {"cost_n": 0, "cost_ratio": nan, "cost_low": nan, "cost_high": nan}
     low, high = quantile_test(ratio, p=0.5).confidence_interval(confidence_level=CONFIDENCE)
     return {"cost_n": len(ratio), "cost_ratio": float(np.median(ratio)), "cost_low": low, "cost_high": high}
-
-
-def _check_flown(trials: pd.DataFrame, solver: str) -> None:
-    if solver not in set(trials["solver"]):
-        raise InputError("solver", f"one of {', '.join(trials['solver'].unique())}", solver)

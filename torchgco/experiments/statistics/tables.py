@@ -14,7 +14,7 @@ FORMATS = ("table", "csv", "markdown", "latex", "json")
 def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
     """The report for a terminal, some 120 columns wide: rates, effort, statuses and comparisons of each task.
 
-    summary, paired  as `summarise` and `paired_table` return them; `paired` may have no rows
+    summary, paired  as `summarise` and `compare` return them; `paired` may have no rows
 
     A rate reads "30/32 94 % [80, 98]": attained of defined, and the 95 % Wilson interval. "-" stands for an
     undefined value. Costs are medians, over the trials that reached the goal and over all that are finite. Effort and
