@@ -1,8 +1,6 @@
-"""YAML, API and preset hold the same settings for every solver, and `torchgco.solve` uses those of `solver=gco`."""
+"""Commands, API and presets have the same settings for every solver, and `solve` uses those of `solver=gco`."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import pytest
 import torch
@@ -10,7 +8,6 @@ import torch
 import torchgco
 from tests.problems import planar_batch
 from torchgco import InputError, Problem, QuadraticCost, presets, solve
-from torchgco.experiments.config.build import config_dir
 from torchgco.presets import PRESETS
 
 MODELS = {"planar": (2, "planar_trap"), "quadrotor": (3, "forest"), "unicycle": (2, "yard")}
@@ -23,10 +20,6 @@ def test_the_configuration_of_a_solver_is_its_preset(model: str, name: str) -> N
     words = [f"model={model}", f"scenario={scenario}", "scenario.stages=5"]
     setup = torchgco.compose([*words, f"solver={name}"])
     assert setup.solver == PRESETS[name](space) == PRESETS[name](setup.task(setup.layouts(1)).problem)
-
-
-def test_every_preset_has_a_configuration_and_every_configuration_a_preset() -> None:
-    assert {path.stem for path in Path(config_dir(), "solver").glob("*.yaml")} == set(PRESETS)
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -1,7 +1,7 @@
 """Every solver by name, with its settings.
 
-Each preset is a function of the space that the problems live in: a Problem, or the dimension 2 or 3. The configurations
-in conf/solver name these presets, `torchgco.solve` uses `gco`, and `dataclasses.replace` changes an option.
+Each preset is a function of the space that the problems live in: a Problem, or the dimension 2 or 3. Commands
+name these presets (`solver=NAME`), `torchgco.solve` uses `gco`, and `dataclasses.replace` changes an option.
 """
 
 from __future__ import annotations

@@ -15,9 +15,9 @@ from tqdm import tqdm
 
 import torchgco
 from tests.experiments.commands import ENVIRONMENT, ROOT, TINY, command, problem_line
-from torchgco import InputError
 from torchgco.base import kernels
-from torchgco.experiments.config.build import compose, config_dir
+from torchgco.experiments.config.build import compose
+from torchgco.experiments.config.groups import options_of
 from torchgco.experiments.flying import study
 from torchgco.experiments.results.identity import decisive, plain
 from torchgco.experiments.results.records import COLUMNS
@@ -26,7 +26,6 @@ from torchgco.solvers.augmented_lagrangian import OuterLoop
 
 DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
-SCENARIOS = sorted(p.stem for p in (ROOT / "conf" / "scenario").glob("*.yaml"))
 # Runs the command with a standard output that nobody reads.
 PIPE = """
 import os, sys
@@ -37,10 +36,6 @@ sys.stdout.reconfigure(line_buffering=True)
 from torchgco.experiments.app import main
 sys.exit(main())
 """
-SOLVERS = sorted(p.stem for p in (ROOT / "conf" / "solver").glob("*.yaml"))
-FLOWN_IN = {"planar": "planar_random", "quadrotor": "walls", "unicycle": "yard"}  # every model in one scenario
-VARIANTS = ("layouts", "forest_mission", "planar_trap_paper")  # with other values than the class, or none
-EXPERIMENTS = sorted(p.stem for p in (ROOT / "conf" / "experiment").glob("*.yaml"))
 
 
 def test_a_study_writes_all_its_files(run, tmp_path) -> None:
@@ -206,12 +201,11 @@ def test_version_and_help(run) -> None:
     code, out, _ = run("--version")
     assert code == 0 and out.strip() == f"torchgco {torchgco.__version__}"
     code, out, _ = run("--help")
-    assert code == 0 and "torchgco -m solver=al_ilqr,gco" in out and "preset " not in out.split("Groups")[1]
+    assert code == 0 and "torchgco -m solver=al_ilqr,gco" in out and "planar_random" in out.split("Groups")[1]
     assert len(out.splitlines()) < 75 and max(map(len, out.splitlines())) <= 110
-    for folder in (ROOT / "conf").iterdir():
-        options = [path.stem for path in folder.glob("*.yaml")]
-        (listed,) = re.findall(rf"^  {folder.name} +((?:.*\n {{18}})*.*)", out, re.MULTILINE) if options else [""]
-        assert set(re.findall(r"\w+", listed)) == set(options)
+    for group in ("device", "experiment", "mission", "model", "plant", "scenario", "solver"):
+        (listed,) = re.findall(rf"^  {group} +((?:.*\n {{18}})*.*)", out, re.MULTILINE)
+        assert set(re.findall(r"\w+", listed)) == set(options_of(group))
     assert "forest*," in out and "walls*," in run("--help", "scenario=walls")[1]
 
 
@@ -231,61 +225,3 @@ def test_a_reader_that_has_read_enough_is_no_error(tmp_path) -> None:
         line = [sys.executable, "-c", PIPE, *words.split()]
         done = subprocess.run(line, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0 and not done.stderr, (words, done.stderr)
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("model", FLOWN_IN)
-def test_every_solver_fits_every_model(model: str, solver: str) -> None:
-    scenario = FLOWN_IN[model]
-    setup = compose([f"model={model}", f"scenario={scenario}", f"solver={solver}"])
-    task = setup.task(setup.layouts(1))
-    assert setup.solver_name == solver and task.problem.B == 1
-
-
-@pytest.mark.parametrize("scenario", [s for s in SCENARIOS if s not in VARIANTS])
-def test_scenario_configs_hold_the_defaults_of_the_code(scenario: str) -> None:
-    """The numbers in YAML, which users read and override, are the defaults of the class."""
-    made = compose([f"scenario={scenario}"]).scenario
-    assert made == type(made)(name=scenario)
-
-
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_experiment_composes(experiment: str) -> None:
-    setup = compose([f"experiment={experiment}"])
-    assert setup.task(setup.layouts(1)).problem.B == 1
-
-
-@pytest.mark.parametrize("scenario", [s for s in SCENARIOS if s != "layouts"])
-def test_a_scenario_picks_its_model(scenario: str) -> None:
-    setup = compose([f"scenario={scenario}"])
-    assert setup.task(setup.layouts(1)).problem.B == 1
-    with pytest.raises(InputError, match=r"^model: expected model=.*, got model="):
-        compose([f"scenario={scenario}", f"model={'planar' if setup.scenario.dimension == 3 else 'quadrotor'}"])
-
-
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_experiment_flies_another_scenario(experiment: str) -> None:
-    """A preset sets no key that only its own scenario has, and asks no more layouts than a file holds."""
-    data = [f"scenario.path={DATA / 'forest30.npz'}", "model=quadrotor"]
-    for scenario, words in (("layouts", data), ("walls", []), ("planar_random", ["mission=null", "plant=null"])):
-        setup = compose([f"experiment={experiment}", f"scenario={scenario}", *words])
-        assert setup.task(setup.layouts().take([0])).problem.B == 1
-    assert compose([f"experiment={experiment}", "scenario=walls"]).layouts().count == setup.config.study.layouts
-
-
-def test_a_preset_flies_all_layouts_of_a_file() -> None:
-    words = ["experiment=mission_study", "scenario=layouts", WALLS]
-    assert compose(words).config.study.layouts is None and compose(words).layouts().count == 32
-    assert compose([*words, "study.layouts=3"]).layouts().count == 3
-    assert compose(["experiment=mission_study", "scenario=walls"]).config.study.layouts == 32
-
-
-def test_null_leaves_a_group_out() -> None:
-    plain_setup, words = compose([]), ["mission=null", "plant=null", "experiment=null"]
-    assert compose(words).config == plain_setup.config
-    without = compose(["experiment=mission", "mission=null", "plant=null"])
-    assert without.mission is None and compose(["experiment=mission"]).mission is not None
-
-
-def test_the_wheel_and_the_checkout_find_their_configs() -> None:
-    assert (config_dir() / "config.yaml").is_file() and config_dir().is_absolute()

@@ -14,11 +14,9 @@ from tqdm import tqdm
 from tests.experiments.commands import problem_line
 from tests.trials import missions
 from tests.trials import trials as hand_made
-from torchgco import compose, presets
 from torchgco.experiments.flying import study
 from torchgco.experiments.reports import report
 from torchgco.experiments.statistics.mission_tables import mission_lines
-from torchgco.missions import Mission, Planner
 from torchgco.plotting import missions as draw
 
 SHORT = ["mission.duration=0.2", "scenario.num_obstacles=3", "study.workers=1", "hydra.run.dir=out"]
@@ -176,7 +174,3 @@ def test_a_sweep_over_missions_becomes_columns_of_one_report(run, tmp_path, caps
     both = capsys.readouterr().out
     assert text.split("written to")[0].rstrip() in both, "the missions are reported as without the trajectories"
     assert "hydra.run.dir" not in both and "forest (quadrotor), seed 0" in both
-
-
-def test_the_configuration_has_the_defaults_of_the_classes() -> None:
-    assert compose(["experiment=mission"]).mission == Mission(Planner(presets.gco(3)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import traceback
 import warnings
@@ -20,10 +21,9 @@ from omegaconf.errors import OmegaConfBaseException
 import torchgco
 from torchgco.base.errors import InputError
 from torchgco.base.interrupts import farewell, raised
-from torchgco.experiments.config import help_page
-from torchgco.experiments.config.build import config_dir, forget_composed, recomposer
-from torchgco.experiments.config.checks import as_input_error, check, check_once, hydra_words
-from torchgco.experiments.config.hydra_versions import ENTRY, register_resolver
+from torchgco.experiments.config.build import forget_composed, recomposer
+from torchgco.experiments.config.checks import as_input_error, check_once, hydra_words
+from torchgco.experiments.config.groups import ENTRY, config_dir, register_resolver
 from torchgco.experiments.flying.jobs import Report
 from torchgco.experiments.results.files import say, silence, write
 from torchgco.experiments.results.identity import decisive, digest, plain, settings_of
@@ -41,14 +41,13 @@ def study_folder(_root_: Any) -> str:
     A malformed configuration gets a name, too: the study refuses it, and the other jobs of a sweep go on.
     """
     try:
-        return _described(_root_)
-    except InputError:
+        return re.sub(r"[^\w.-]", "_", _described(_root_))
+    except (InputError, AttributeError, KeyError, TypeError):
         return REFUSED
 
 
 def _described(_root_: Any) -> str:
     held = plain(OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"]))
-    check(held, config_dir())
     solvers = {held["solver"]["name"]: {key: value for key, value in held["solver"].items() if key != "name"}}
     recompose = recomposer(_root_.hydra.overrides.task, _root_.hydra.runtime.config_sources)
     for name in held["study"]["baselines"] or ():
@@ -60,7 +59,6 @@ def _described(_root_: Any) -> str:
 
 
 register_resolver("torchgco.folder", study_folder)
-help_page.register()
 
 
 def _task(config: DictConfig) -> Report:
@@ -139,7 +137,7 @@ def main() -> int:
     try:
         words = parser.parse_args().overrides
         check_once(words)
-        typed = dict(zip(words, hydra_words(words, config_dir()), strict=True))
+        typed = dict(zip(words, hydra_words(words), strict=True))
         sys.argv[1:] = [typed.get(word, word) for word in sys.argv[1:]]  # Hydra's own main reads them
         _run()
     except (InputError, HydraException, OmegaConfBaseException) as error:

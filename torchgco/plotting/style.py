@@ -25,7 +25,7 @@ Dash = str | tuple[float, tuple[float, ...]]
 DASHES: tuple[Dash, ...] = (
     "-", (0, (5, 1.5)), (0, (6, 1.5, 1.5, 1.5)), (0, (1.5, 1.5)), (0, (3, 3)), (0, (8, 1.5, 1.5, 1.5, 1.5, 1.5)),
 )  # fmt: skip
-# Colour and dash of the solvers of conf/solver. Those after the first seven have colours of Paul Tol's.
+# Colour and dash of the presets. Those after the first seven have colours of Paul Tol's.
 KNOWN: dict[str, tuple[str, Dash]] = {
     "gco": (PALETTE[0], DASHES[0]), "al_ilqr": (PALETTE[1], DASHES[1]), "gco_paper": (PALETTE[3], DASHES[2]),
     "fatrop": (PALETTE[2], DASHES[3]), "mppi": (PALETTE[4], DASHES[3]), "ilqr": (PALETTE[5], DASHES[4]),

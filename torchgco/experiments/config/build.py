@@ -5,25 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.singleton import Singleton
 from hydra.errors import HydraException, InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import torchgco
 from torchgco.base.errors import InputError
 from torchgco.base.kernels import use_native
 from torchgco.base.options import check_value
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
-from torchgco.experiments.config.hydra_versions import ANY_CLASS, ENTRY
+from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register
 from torchgco.experiments.config.launching import allotted_cores
-from torchgco.experiments.config.preset_nodes import register
 from torchgco.experiments.results.identity import plain
 from torchgco.missions import Mission
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
@@ -34,15 +30,6 @@ DEFAULT_LAYOUTS = 64
 FLOWN = "spheres in space for a mission: crossing, forest, forest_moving, forest_mission, walls, or a layout file"
 MOST = 1024  # threads or processes: PyTorch ends with an error of the system long before the system's own limit
 register()
-
-
-def config_dir() -> Path:
-    """Absolute path of conf/: next to the package in a checkout, inside it in a wheel."""
-    package = Path(torchgco.__file__).resolve().parent
-    for candidate in (package / "conf", package.parent / "conf"):
-        if (candidate / "config.yaml").is_file():
-            return candidate
-    raise FileNotFoundError(f"no conf/config.yaml in or next to {package}")
 
 
 @dataclass(frozen=True)
@@ -105,8 +92,8 @@ def compose(overrides: Sequence[str] = ()) -> Setup:
 def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> DictConfig:
     """The configuration alone; `searchpath` names further folders of configs."""
     extra = [f"hydra.searchpath=[{','.join(searchpath)}]"] if searchpath else []
-    words = hydra_words(overrides, config_dir())
-    running = Singleton.get_state()  # a study composes its baselines while Hydra's own main runs
+    words = hydra_words(overrides)
+    running = GlobalHydra.instance().hydra  # a study composes its baselines while Hydra's own main runs
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(config_dir()), **ENTRY):
@@ -114,7 +101,7 @@ def compose_config(overrides: Sequence[str], searchpath: Sequence[str] = ()) -> 
     except (HydraException, OmegaConfBaseException) as error:
         raise as_input_error(error) from None
     finally:
-        Singleton.set_state(running)
+        GlobalHydra.instance().hydra = running
 
 
 def recomposer(overrides: Sequence[str], sources: Iterable[Any]) -> Callable[[str | None], DictConfig]:
@@ -153,7 +140,7 @@ def build(config: DictConfig) -> Setup:
     Raises:
         InputError: a value that a part refuses, or parts that don't fit each other.
     """
-    check(plain(config), config_dir())
+    check(plain(config))
     if OmegaConf.is_missing(config.scenario, "path"):
         raise InputError("scenario.path", "the layout file: add scenario.path=FILE.npz", "none")
     device, dtype = _device(config.device)
@@ -200,16 +187,12 @@ def _mission(setup: Setup) -> Mission | None:
         raise InputError("device", "device=cpu in float64 for missions", f"{setup.device.type}, {setup.dtype}")
     if setup.scenario.dimension != 3:
         raise InputError("scenario", FLOWN, setup.scenario.name)
-    parts = {name: _instantiate(node[name], f"mission.{name}") for name in ("planner", "tracker", "disturbance")}
-    held = OmegaConf.to_container(node, resolve=True)
-    assert isinstance(held, dict)
-    others: dict[str, Any] = {str(key): value for key, value in held.items() if key not in parts}
-    plant = _instantiate(setup.config.plant, "plant")
+    made, plant = _instantiate(node, "mission"), _instantiate(setup.config.plant, "plant")
     field = "mission.planner"
     try:
-        planner = parts.pop("planner")(solver=setup.solver)
+        planner = made.keywords["planner"](solver=setup.solver)
         field = "mission"
-        mission = Mission(planner=planner, plant=plant, **parts, **others)
+        mission = made(planner=planner, plant=plant)
     except TypeError as error:
         raise as_input_error(error, field) from None
     mission.check(setup.vehicle.dynamics)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
-from pathlib import Path
 from typing import Any
 
 from hydra.errors import MissingConfigException, OverrideParseException
@@ -13,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import Seed, check_value
+from torchgco.experiments.config.groups import config_dir, options_of
 
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")  # part of the names of files and folders
 MODEL = ("dimension", "vehicle")
@@ -20,22 +20,21 @@ NO_CHOICES = ("null", "true", "false", "")  # values that Hydra reads as no name
 CLOSED_LOOP = ("mission", "plant")  # groups that only missions have
 
 
-def hydra_words(words: Iterable[str], conf: Path) -> list[str]:
+def hydra_words(words: Iterable[str]) -> list[str]:
     """The words of a command line as Hydra takes them: `~mission` for `mission=null`.
 
     Raises:
         InputError: a value that is no name, where the word chooses an option of a group: Hydra fails there.
     """
-    return [_hydra_word(word, conf) for word in words]
+    return [_hydra_word(word) for word in words]
 
 
-def _hydra_word(word: str, conf: Path) -> str:
+def _hydra_word(word: str) -> str:
     key, equals, value = word.lstrip("+").partition("=")
     group = key.split("@")[0]
-    if equals and re.fullmatch(r"[\w/]+", group) and (conf / group).is_dir():
-        if value.lower() == "null" and _default_options(conf).get(key, "") is None:
+    if equals and re.fullmatch(r"[\w/]+", group) and (options := options_of(group)):
+        if value.lower() == "null" and _default_options().get(key, "") is None:
             return f"~{key}"
-        options = sorted(path.stem for path in (conf / group).glob("*.yaml"))
         if value.lower() in NO_CHOICES or re.fullmatch(r"[-+]?[\d.]+|\{.*\}", value):
             raise InputError(group, f"one of {', '.join(options)}", value or "nothing")
     return word
@@ -55,20 +54,21 @@ def check_once(words: Iterable[str]) -> None:
         given[key] = word
 
 
-def _default_options(conf: Path) -> dict[str, str | None]:
+def _default_options() -> dict[str, str | None]:
     """The option of every group in the defaults list of config.yaml; None where the group is left out by default."""
-    base: Any = OmegaConf.to_container(OmegaConf.load(conf / "config.yaml"))
+    base: Any = OmegaConf.to_container(OmegaConf.load(config_dir() / "config.yaml"))
     return {key: option for entry in base["defaults"] if isinstance(entry, dict) for key, option in entry.items()}
 
 
-def check(held: Mapping[str, Any], conf: Path) -> None:
+def check(held: Mapping[str, Any]) -> None:
     """Check the groups, keys and names of a resolved configuration, without its node `hydra`.
 
     Raises:
         InputError: a group or key that is missing or unknown, a malformed seed, name or list of baselines.
     """
+    conf = config_dir()
     base: Any = OmegaConf.to_container(OmegaConf.load(conf / "config.yaml"))
-    chosen = _default_options(conf).items()
+    chosen = _default_options().items()
     groups = {key: option for key, option in chosen if key.isidentifier() and key != "experiment"}
     own = [key for key in base if key not in ("defaults", "hydra")]
     needed = [*own, *(key for key, option in groups.items() if option is not None)]

@@ -158,7 +158,7 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
     layouts = setup.layouts()
     task = setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
     if setup.mission is not None:
-        _check_mission(setup.mission, task)
+        check_mission(setup.mission, task)
     configs = _rivals(config, recompose)
     solvers = {name: setup.solver if held is config else solver_of(held) for name, held in configs.items()}
     configuration = {"version": torchgco.__version__, **plain(config)}
@@ -170,7 +170,7 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
     return _Study(setup, plan_of(setup), layouts, solvers, manifest)
 
 
-def _check_mission(mission: Mission, task: Task) -> None:
+def check_mission(mission: Mission, task: Task) -> None:
     dynamics = task.problem.dynamics
     mission.check(dynamics)
     if others := other_obstacles(task.problem):

@@ -1,0 +1,152 @@
+"""Presets, groups and a user's own files compose: every experiment with all that can serve it, or one line says what to
+choose."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from itertools import cycle
+from pathlib import Path
+
+import pytest
+
+from tests.experiments.commands import HOLD, ROOT
+from torchgco import InputError, compose, presets
+from torchgco.experiments.config.build import Setup, config_dir
+from torchgco.experiments.config.groups import FAMILIES, options_of
+from torchgco.experiments.flying.flight import plan_of
+from torchgco.experiments.flying.study import check_mission
+from torchgco.missions import Mission, Planner
+
+DATA = ROOT / "benchmarks" / "data"
+WALLS = f"scenario.path={DATA / 'walls.npz'}"
+EXPERIMENTS = options_of("experiment")
+MISSIONS = ("mission", "mission_study")
+BOXED = ("woods", "mazes")  # missions fly among spheres alone
+OF_MODEL = {
+    "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": ("yard",),
+    "quadrotor": ("crossing", "forest", "forest_mission", "forest_moving", "mazes", "walls", "woods"),
+}  # fmt: skip
+MODEL = {scenario: model for model, scenarios in OF_MODEL.items() for scenario in scenarios}
+FILES = {"forest30": "quadrotor", "planar_trap": "planar"}
+
+
+def checked(*words: str) -> Setup:
+    """All that a study checks before it flies."""
+    setup = compose(words)
+    plan_of(setup)
+    task = setup.task(setup.layouts(1))
+    if setup.mission is not None:
+        check_mission(setup.mission, task)
+    return setup
+
+
+def refused(*words: str) -> str:
+    with pytest.raises(InputError) as caught:
+        checked(*words)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def scenes() -> dict[str, tuple[str, list[str]]]:
+    """The model that flies a scenario or file, and its words, by name."""
+    drawn = {name: (model, [f"scenario={name}"]) for name, model in MODEL.items()}
+    files = {f"{name}.npz": (model, [f"scenario.path={DATA / name}.npz"]) for name, model in FILES.items()}
+    return drawn | {
+        name: (model, ["scenario=layouts", *words, f"model={model}"]) for name, (model, words) in files.items()
+    }
+
+
+def test_every_scenario_has_a_model_that_the_matrix_names() -> None:
+    assert set(MODEL) | {"layouts"} == set(options_of("scenario")) and set(OF_MODEL) == set(options_of("model"))
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_composes_with_every_scenario_model_and_solver(experiment: str) -> None:
+    """As it is, and on every scenario and file; models are named or left to the scenario, solvers take turns."""
+    setup = checked(f"experiment={experiment}")
+    assert setup.layouts().count == (setup.config.study.layouts or 64)
+    solvers, named = cycle(options_of("solver")), cycle((True, False))
+    for name, (model, words) in scenes().items():
+        given = [f"experiment={experiment}", *words, f"solver={next(solvers)}"]
+        given += [f"model={model}"] if next(named) and f"model={model}" not in words else []
+        if experiment in MISSIONS and model != "quadrotor":
+            assert "scenario: expected spheres in space for a mission: crossing, forest" in refused(*given)
+        elif experiment in MISSIONS and name in BOXED:
+            assert "scenario: expected one with spheres alone" in refused(*given)
+        else:
+            setup = checked(*given)
+            assert setup.vehicle.name == model and (setup.mission is not None) == (experiment in MISSIONS)
+
+
+@pytest.mark.parametrize("experiment", MISSIONS)
+def test_every_loop_and_plant_composes_and_a_mission_can_be_left_out(experiment: str) -> None:
+    for mission in options_of("mission"):
+        setup = checked(f"experiment={experiment}", f"mission={mission}", "scenario=walls", "solver=al_ilqr")
+        assert setup.mission is not None and setup.mission.planner.solver == presets.al_ilqr(3)
+    if find_spec("drone_models") is None:
+        assert "plant: " in refused(f"experiment={experiment}", "plant=drone_models", "solver=al_ilqr")
+    else:
+        assert checked(f"experiment={experiment}", "plant=drone_models", "solver=al_ilqr").mission is not None
+    for scenario in ("planar_random", "woods"):
+        words = [f"experiment={experiment}", "mission=null", "plant=null", f"scenario={scenario}", "solver=hold"]
+        assert checked(*words).mission is None
+
+
+@pytest.mark.parametrize("scenario", MODEL)
+def test_a_model_that_cannot_fly_a_scenario_is_refused_with_one_that_can(scenario: str) -> None:
+    model = MODEL[scenario]
+    for other in options_of("model"):
+        if other != model:
+            line = refused(f"scenario={scenario}", f"model={other}", "solver=hold")
+            assert line.startswith(f"model: expected model={model}, as") and line.endswith(f"got model={other}")
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_registered_scenario_is_its_class(family: type) -> None:
+    assert compose([f"scenario={family().name}", "solver=hold"]).scenario == family()
+
+
+def test_a_registered_mission_is_its_class() -> None:
+    assert compose(["experiment=mission"]).mission == Mission(Planner(presets.gco(3)))
+
+
+def test_a_preset_flies_all_layouts_of_a_file() -> None:
+    words = ["experiment=mission_study", "scenario=layouts", WALLS, "solver=hold"]
+    assert compose(words).config.study.layouts is None and compose(words).layouts().count == 32
+    assert compose([*words, "study.layouts=3"]).layouts().count == 3
+    assert compose(["experiment=mission_study", "scenario=walls", "solver=hold"]).config.study.layouts == 32
+
+
+def test_null_leaves_a_group_out() -> None:
+    plain_setup, words = compose([]), ["mission=null", "plant=null", "experiment=null"]
+    assert compose(words).config == plain_setup.config
+    without = compose(["experiment=mission", "mission=null", "plant=null"])
+    assert without.mission is None and compose(["experiment=mission"]).mission is not None
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> list[str]:
+    """A user's folder of configurations that extend those of the package by name, and the words that add it."""
+    texts = {
+        "scenario/sparse": "defaults: [forest]\nname: sparse\nnum_obstacles: 3\n",
+        "solver/patient": "defaults: [gco]\nname: patient\nattempts: 9\n",
+        "experiment/mine": "# @package _global_\ndefaults: [override /scenario: sparse, override /solver: patient]\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.yaml").parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.yaml").write_text(text)
+    return ["--config-dir", str(tmp_path)]
+
+
+@pytest.mark.usefixtures("without_report")
+def test_files_of_a_user_extend_what_is_registered(run, own: list[str]) -> None:
+    _, out, _ = run(*own, "--help")
+    assert "sparse" in out and "patient" in out and "mine" in out
+    code, out, err = run(*own, "--cfg", "job", "experiment=mine")
+    assert code == 0 and "num_obstacles: 3" in out and "attempts: 9" in out and "vehicle_radius: 0.36" in out, err
+    code, _, err = run(*own, "scenario=sparse", *HOLD, "hydra.run.dir=out")
+    assert code == 0, err
+
+
+def test_the_wheel_and_the_checkout_find_their_configs() -> None:
+    assert (config_dir() / "config.yaml").is_file() and config_dir().is_absolute()

@@ -1,0 +1,165 @@
+"""What Hydra is given before it composes: options of groups made from classes, functions in interpolations, versions.
+
+Scenarios, solvers, missions and plants need no file in conf/: their options are the fields of their classes, with the
+defaults as values. A solver's option that differs between the plane and space becomes an interpolation that chooses by
+`model.dimension`. Files, of conf/ or of a user, add to them or extend them by name.
+"""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Callable
+from dataclasses import MISSING, Field, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+import omegaconf
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
+from omegaconf import OmegaConf
+
+import torchgco
+from torchgco.missions import Disturbance, Mission, Planner, RotorPlant, Tracker
+from torchgco.presets import PRESETS
+from torchgco.scenarios import (
+    Crossing,
+    Forest,
+    ForestMoving,
+    LayoutFile,
+    Mazes,
+    PlanarRandom,
+    PlanarTrap,
+    Walls,
+    Woods,
+    Yard,
+)
+from torchgco.scenarios.vehicle import BUILT_IN
+
+FAMILIES: tuple[type[Any], ...] = (
+    Forest, ForestMoving, Walls, Woods, Mazes, Crossing, PlanarTrap, PlanarRandom, Yard,
+)  # fmt: skip
+BY_DIMENSION = "torchgco.by_dimension"
+ALIKE = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each
+WIDTH = 100  # of the help page
+
+
+def _version(package: Any) -> tuple[int, ...]:
+    return tuple(map(int, package.__version__.split(".")[:2]))
+
+
+OLDER = _version(hydra) < (1, 4)
+# Arguments of Hydra's entry points. Without them Hydra 1.3 would behave as 1.1 did; 1.4 warns of them.
+ENTRY: dict[str, Any] = {"version_base": "1.3"} if OLDER else {}
+# Arguments of `instantiate`. A configuration may name any class, such as a user's own solver; 1.4 wants that said.
+ANY_CLASS: dict[str, Any] = (
+    {} if OLDER else {"_execution_whitelist_": vars(hydra.utils)["UNSAFE_DISABLE_EXECUTION_CHECKS"]}
+)
+
+
+def register_resolver(name: str, resolver: Callable[..., Any]) -> None:
+    """Let configurations call `resolver` as ${name:...}, also where that name has been registered before."""
+    # OmegaConf 2.4 warns of the name that was the only one until then, and uses a name that was another function's.
+    method = "register_resolver" if _version(omegaconf) >= (2, 4) else "register_new_resolver"
+    getattr(OmegaConf, method)(name, resolver, replace=True)
+
+
+def config_dir() -> Path:
+    """Absolute path of conf/: next to the package in a checkout, inside it in a wheel."""
+    package = Path(torchgco.__file__).resolve().parent
+    for candidate in (package / "conf", package.parent / "conf"):
+        if (candidate / "config.yaml").is_file():
+            return candidate
+    raise FileNotFoundError(f"no conf/config.yaml in or next to {package}")
+
+
+def options_of(group: str) -> list[str]:
+    """The names in a group, of files in conf/ and of what is registered; none for a word that is no group."""
+    store = ConfigStore.instance()
+    stored = store.list(group) if store.get_type(group) is ObjectType.GROUP else []
+    return sorted({Path(name).stem for name in (*stored, *(config_dir() / group).glob("*.yaml"))})
+
+
+def register() -> None:
+    """Store the options of all groups; to be called before Hydra composes anything."""
+    register_resolver(BY_DIMENSION, lambda dimension, plane, space: space if dimension == 3 else plane)
+    register_resolver("torchgco.drawn", _drawn)
+    register_resolver("torchgco.options", _help)
+    _store("scenario", "layouts", _fields_of(LayoutFile))
+    for family in FAMILIES:
+        made = family()
+        (model,) = (name for name, space in BUILT_IN.items() if space == (made.dimension, made.states))
+        picked = {"defaults": [{"override /model@_global_.model": model}, "_self_"]}  # unless a command names another
+        _store("scenario", made.name, picked | _fields_of(family))
+    for name, make in PRESETS.items():
+        _store("solver", name, {"name": name} | _joined(_tree(make(2)), _tree(make(3))))
+    _store("plant", "rotors", _fields_of(RotorPlant, *ALIKE))
+    planner = {"_partial_": True} | _fields_of(Planner, "solver", *ALIKE)  # its solver is the one under study
+    parts = {"planner": planner, "tracker": _fields_of(Tracker, *ALIKE), "disturbance": _fields_of(Disturbance)}
+    _store("mission", "default", {"_partial_": True} | _fields_of(Mission, "plant", *parts) | parts)
+
+
+def _store(group: str, name: str, node: dict[str, Any]) -> None:
+    ConfigStore.instance().store(group=group, name=name, node=node)
+
+
+def _drawn(count: int, _root_: Any) -> int | None:
+    """A number of layouts where they are drawn; None, all of them, where they come from a file."""
+    scenario = _root_.get("scenario")
+    return None if OmegaConf.is_dict(scenario) and "path" in scenario else count
+
+
+def _fields_of(kind: type, *left_out: str) -> dict[str, Any]:
+    """The fields of a class with their defaults, as containers that Hydra instantiates; ??? where there is none."""
+    named = [field for field in fields(kind) if field.init and field.name not in left_out]
+    return {"_target_": _path(kind)} | {field.name: _default(field) for field in named}
+
+
+def _path(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def _default(field: Field[Any]) -> Any:
+    if field.default_factory is not MISSING:
+        return _tree(field.default_factory())
+    return "???" if field.default is MISSING else _tree(field.default)
+
+
+def _tree(value: Any) -> Any:
+    """An object as nested containers that Hydra instantiates."""
+    if is_dataclass(value) and not isinstance(value, type):
+        own = {field.name: _tree(getattr(value, field.name)) for field in fields(value) if field.init}
+        return {"_target_": _path(type(value))} | own
+    return [_tree(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def _joined(plane: Any, space: Any) -> Any:
+    """One tree for both: equal values as they are, others as interpolations."""
+    if isinstance(plane, dict) and isinstance(space, dict) and list(plane) == list(space):
+        return {key: _joined(plane[key], space[key]) for key in plane}
+    if isinstance(plane, list) and isinstance(space, list) and len(plane) == len(space):
+        if all(isinstance(item, dict) for item in plane):  # rows of a table: each option can be changed by itself
+            return [_joined(a, b) for a, b in zip(plane, space, strict=True)]
+    if plane == space:
+        return plane
+    return f"${{{BY_DIMENSION}:${{model.dimension}},{_literal(plane)},{_literal(space)}}}"
+
+
+def _literal(value: Any) -> str:
+    """A value in the grammar of interpolations."""
+    if isinstance(value, dict):
+        return f"{{{','.join(f'{key}:{_literal(held)}' for key, held in value.items())}}}"
+    return f"[{','.join(map(_literal, value))}]" if isinstance(value, list) else json.dumps(value)
+
+
+def _help(_root_: Any) -> str:
+    """A line, or several, per group: its name and options, `*` behind the one that the command has chosen."""
+    loader, chosen = GlobalHydra.instance().config_loader(), _root_.hydra.runtime.choices
+    lines = []
+    for group in [*sorted(name for name in loader.list_groups("") if name != "hydra"), "hydra/launcher"]:
+        names = sorted(loader.get_group_options(group))
+        shown = ", ".join(f"{name}*" if name == chosen.get(group) else name for name in names)
+        lines += textwrap.wrap(f"{group:<16}{shown}", WIDTH, initial_indent="  ", subsequent_indent=" " * 18)
+    return "\n".join(lines)
