@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.simulation.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
+from tests.missions.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
 from torchgco import Airframe, Boxes, Cost, Goal, InputError, Planar, Problem, QuadraticCost, QuadrotorPlanning
 from torchgco.missions.disturbance import Disturbance
 from torchgco.missions.log import MissionLog

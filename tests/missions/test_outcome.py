@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 import torch
 
-from tests.simulation.missions import DT, mission
-from tests.simulation.test_mission import NAMES, RADII, ends, six
+from tests.missions.missions import DT, mission
+from tests.missions.test_mission import NAMES, RADII, ends, six
 from torchgco import Airframe
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import Ending, Outcome, judge_flight

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.missions.missions import DOUBLE
 from tests.problems import assert_same_bits, planar_batch, quadrotor_batch
-from tests.simulation.missions import DOUBLE
 from torchgco import (
     ILQR,
     AugmentedLagrangian,

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.missions.missions import DOUBLE
 from tests.reference import models, tracking
-from tests.simulation.missions import DOUBLE
 from torchgco import Airframe, InputError, compose
 from torchgco.missions.plant import RotorPlant, hovering
 from torchgco.missions.tracker import Reference, Tracker, Tracking

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.missions.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
 from tests.reference import models
-from tests.simulation.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
 from torchgco import Airframe, ControlBounds, FirstStepRates, InputError, Planar, Problem, QuadraticCost, Restarts
 from torchgco.base import kernels
 from torchgco.lagrangian.rollout import open_loop
