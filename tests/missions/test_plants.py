@@ -70,10 +70,22 @@ def test_the_quaternion_keeps_its_length_and_thrusts_their_limits(make) -> None:
     x, _, _ = random_states(5)
     generator = torch.Generator().manual_seed(1)
     commands = 12_000.0 * torch.rand(10, 5, 4, generator=generator, dtype=DOUBLE).round().repeat_interleave(30, dim=0)
-    flown = fly(make(), x, commands)[1:]
+    errors = torch.tensor([0.0, 0.1, -0.1, 0.2, -0.2], dtype=DOUBLE)  # better rotors could lift more, worse ones less
+    flown = fly(make(thrust_error=errors), x, commands)[1:]
     assert (flown[..., 6:10].norm(dim=-1) - 1).abs().max() < 2e-15
     F = flown[..., 13:]
     assert F.min() == FRAME.thrust_min and F.max() == FRAME.thrust_max
+
+
+@each_plant
+def test_no_rotor_turns_slower_or_faster_than_its_thrust_limits_ask_for(make) -> None:
+    x, _, force = random_states(3)
+    low, high = FRAME.rotor_speeds
+    assert FRAME.thrust_coefficient * high**2 == pytest.approx(FRAME.thrust_max)
+    beyond = torch.tensor([[-399.0, 8398.0, low - 1.0, 5000.0]], dtype=DOUBLE).expand(3, 4)
+    within = torch.tensor([[low, high, low, 5000.0]], dtype=DOUBLE).expand(3, 4)
+    assert torch.equal(make().advance(x, beyond, force), make().advance(x, within, force))
+    assert not torch.equal(make().advance(x, within - 1.0, force)[:, 14], make().advance(x, within, force)[:, 14])
 
 
 @each_plant

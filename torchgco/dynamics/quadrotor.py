@@ -61,6 +61,16 @@ class Airframe:
         """
         return self.mass * GRAVITY / (4.0 * self.hover_speed**2)
 
+    @property
+    def rotor_speeds(self) -> tuple[float, float]:
+        """The speeds, rpm, that hold a rotor's thrust at its limits: none turns slower or faster."""
+        low, high = (math.sqrt(limit / self.thrust_coefficient) for limit in (self.thrust_min, self.thrust_max))
+        return low, high
+
+    def reachable(self, speed: Tensor) -> Tensor:
+        """Commanded rotor speeds, rpm, cut off at those that a rotor can turn at."""
+        return speed.clamp(*self.rotor_speeds)
+
     def allocation(self, like: Tensor) -> Tensor:
         """T (3, 4): body torques of the four thrusts, X configuration."""
         h, k = self.arm / math.sqrt(2.0), self.rotor_torque

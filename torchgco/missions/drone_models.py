@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,10 +15,9 @@ from scipy.spatial.transform import Rotation  # before drone_models, which would
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import Seconds, check_options
-from torchgco.base.tree import PerElement
-from torchgco.dynamics.quadrotor import GRAVITY, Airframe
-from torchgco.missions.plant import check_vehicle
+from torchgco.dynamics.integrators import rk4
+from torchgco.dynamics.quadrotor import GRAVITY, within_limits
+from torchgco.missions.plant import RotorPlant, column
 
 # Body torques of the four rotors about x, y and z, in units of arm / sqrt(2) and of the rotors' own torque.
 MIXING = np.array([[1.0, -1.0, -1.0, 1.0], [-1.0, -1.0, 1.0, 1.0], [1.0, -1.0, 1.0, -1.0]])
@@ -27,53 +26,39 @@ XYZW, WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]  # the package's order of a quaternion f
 
 
 @dataclass(frozen=True)
-class DroneModelsPlant(PerElement):
+class DroneModelsPlant(RotorPlant):
     """The vehicle of `RotorPlant` in the equations of drone-models, Runge-Kutta steps of the rotors' speeds in rpm.
 
     Forces, torques and rotors are the package's, float64 in NumPy; of its rates we don't take the quaternion's: version
-    0.1.0 evaluates it for another order of the components than the one that it takes. As in `RotorPlant`, every step
-    ends with limited thrusts and a renormalised quaternion.
+    0.1.0 evaluates it for another order of the components than the one that it takes. As in `RotorPlant`, commands are
+    cut off, and every step ends with limited thrusts and a renormalised quaternion.
 
     Args:
-        airframe: as the planner knows it.
-        mass_error, thrust_error: share by which mass and thrust coefficient differ from the airframe's, number or (B,).
-        drag: force against the velocity, N s/m, a number or (B,).
+        airframe, mass_error, thrust_error, drag: as of `RotorPlant`.
 
     Raises:
-        InputError: drone-models isn't installed, non-positive dt, a mass or thrust coefficient that isn't above 0, a
-            negative drag, a parameter that is neither a finite number nor (B,).
+        InputError: as `RotorPlant`, and where drone-models isn't installed.
     """
 
-    airframe: Airframe = Airframe()
-    dt: Seconds = 0.01
-    mass_error: float | Tensor = 0.0
-    thrust_error: float | Tensor = 0.0
-    drag: float | Tensor = 0.0
-
-    per_element: ClassVar[tuple[str, ...]] = ("mass_error", "thrust_error", "drag")
-
     def __post_init__(self) -> None:
-        check_options(self, "plant")
-        check_vehicle(self.mass_error, self.thrust_error, self.drag)
+        super().__post_init__()
         _dynamics()
 
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """See `Plant`."""
-        b = self.airframe.thrust_coefficient * (1.0 + _column(self.thrust_error))
-        states, command, push = (part.detach().cpu().double().numpy() for part in (x, u, force))
-        parameters = self._parameters(b)
+        states, command, push = (part.detach().cpu().double() for part in (x, self.airframe.reachable(u), force))
+        b = self.airframe.thrust_coefficient * (1.0 + column(self.thrust_error, states))
+        parameters = self._parameters(b.numpy(), states)
 
-        def rates(z: np.ndarray) -> np.ndarray:
-            return self._rates(z, command, push, parameters)
+        def rates(z: Tensor) -> Tensor:
+            return torch.from_numpy(self._rates(z.numpy(), command.numpy(), push.numpy(), parameters))
 
         with np.errstate(all="ignore"):  # vehicles that have diverged stay in the batch until the control period ends
-            pose, q, w, F = np.split(states, (6, 10, 13), axis=-1)
-            speed = np.sqrt(np.maximum(F, 0.0) / b)
-            z = _rk4(rates, np.concatenate((pose, q[:, XYZW], w, speed), axis=-1), self.dt)
-            pose, q, w, speed = np.split(z, (6, 10, 13), axis=-1)
-            F = np.clip(b * speed * np.abs(speed), self.airframe.thrust_min, self.airframe.thrust_max)
-            x_next = np.concatenate((pose, _unit(q)[:, WXYZ], w, F), axis=-1)
-        return torch.from_numpy(x_next).to(x)
+            pose, q, w, F = states.split((6, 4, 3, 4), dim=-1)
+            speed = (F.clamp(min=0.0) / b).sqrt()
+            z = rk4(rates, torch.cat((pose, q[:, XYZW], w, speed), dim=-1), self.dt)
+        pose, q, w, speed = z.split((6, 4, 3, 4), dim=-1)
+        return within_limits(torch.cat((pose, q[:, WXYZ], w, b * speed * speed.abs()), dim=-1), self.airframe).to(x)
 
     def _rates(self, z: np.ndarray, command: np.ndarray, push: np.ndarray, parameters: dict[str, Any]) -> np.ndarray:
         """z' of z = [p, v, q (xyzw), w, rotor speeds (rpm)] (B, 17)."""
@@ -90,12 +75,13 @@ class DroneModelsPlant(PerElement):
         turning = scalar * w + np.cross(vector, w), -(vector * w).sum(axis=-1, keepdims=True)
         return np.concatenate((p_dot, v_dot, 0.5 * turning[0], 0.5 * turning[1], w_dot, speed_dot), axis=-1)
 
-    def _parameters(self, b: np.ndarray) -> dict[str, Any]:
+    def _parameters(self, b: np.ndarray, like: Tensor) -> dict[str, Any]:
         """The package's parameters for thrust coefficients b (B or 1, 1), N/rpm^2."""
         frame = self.airframe
+        mass_error, drag = (column(part, like).numpy() for part in (self.mass_error, self.drag))
         J, none = np.array(frame.inertia), np.zeros_like(b)
         return {
-            "mass": frame.mass * (1.0 + _column(self.mass_error)),
+            "mass": frame.mass * (1.0 + mass_error),
             "L": frame.arm / math.sqrt(2.0),
             "prop_inertia": 0.0,
             "gravity_vec": np.array([0.0, 0.0, -GRAVITY]),
@@ -104,28 +90,15 @@ class DroneModelsPlant(PerElement):
             "rpm2thrust": np.stack((none, none, b)),
             "rpm2torque": np.stack((none, none, frame.rotor_torque * b)),
             "mixing_matrix": MIXING,
-            "drag_matrix": -_column(self.drag)[..., None] * np.eye(3),
+            "drag_matrix": -drag[..., None] * np.eye(3),
             "rotor_dyn_coef": np.array([1.0, 0.0, 1.0, 0.0]) / frame.rotor_time_constant,
         }
-
-
-def _column(value: float | Tensor) -> np.ndarray:
-    """A number or (B,) as (1 or B, 1)."""
-    return torch.as_tensor(value, dtype=torch.float64).detach().cpu().reshape(-1, 1).numpy()
 
 
 def _unit(q: np.ndarray) -> np.ndarray:
     """Quaternions of length 1; NaN for those without a finite length above 0."""
     length = np.sqrt((q**2).sum(axis=-1, keepdims=True))
     return q / np.where((length > 0) & (length < np.inf), length, np.nan)
-
-
-def _rk4(rates: Callable[[np.ndarray], np.ndarray], z: np.ndarray, dt: float) -> np.ndarray:
-    k1 = rates(z)
-    k2 = rates(z + 0.5 * dt * k1)
-    k3 = rates(z + 0.5 * dt * k2)
-    k4 = rates(z + dt * k3)
-    return z + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
 @cache

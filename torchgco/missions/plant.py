@@ -12,7 +12,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Seconds, check_options
 from torchgco.base.tree import PerElement, Rows
 from torchgco.dynamics.integrators import rk4
-from torchgco.dynamics.quadrotor import GRAVITY, Airframe, pose_rates, within_limits
+from torchgco.dynamics.quadrotor import GRAVITY, Airframe, QuadrotorPlant, within_limits
 
 
 @runtime_checkable
@@ -35,7 +35,9 @@ class Plant(Protocol):
 
 @dataclass(frozen=True)
 class RotorPlant(PerElement):
-    """The paper's full quadrotor (section 2), Runge-Kutta steps with limited thrusts and a renormalised quaternion.
+    """The paper's full quadrotor (`QuadrotorPlant`), with wind, and with errors of the planner's model.
+
+    Rotors turn no slower and no faster than the airframe's limits of thrust ask for: commands beyond are cut off.
 
     Args:
         airframe: as the planner knows it.
@@ -61,17 +63,18 @@ class RotorPlant(PerElement):
 
     def advance(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
         """See `Plant`."""
-        return within_limits(rk4(lambda at: self._rates(at, u, force), x, self.dt), self.airframe)
+        model = QuadrotorPlant(self.dt, airframe=self.airframe)
+        mass_error, thrust_error, drag = (column(part, x) for part in (self.mass_error, self.thrust_error, self.drag))
+        speed = (1.0 + thrust_error).sqrt() * self.airframe.reachable(u)
 
-    def _rates(self, x: Tensor, u: Tensor, force: Tensor) -> Tensor:
-        _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
-        mass = self.airframe.mass * (1.0 + self.mass_error)
-        motion = pose_rates(v.unbind(-1), q.unbind(-1), w.unbind(-1), F.sum(-1) / mass, GRAVITY)
-        pose = torch.stack(motion, dim=-1)
-        pushed = (force - _column(self.drag) * v) / _column(mass)
-        pose = torch.cat((pose[..., :3], pose[..., 3:6] + pushed, pose[..., 6:]), dim=-1)
-        speed = (1.0 + _column(self.thrust_error)) ** 0.5 * u
-        return torch.cat((pose, self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, speed)), dim=-1)
+        def rates(x: Tensor) -> Tensor:
+            planned = model.field(x, speed)
+            lift = planned[:, 3:6] + planned.new_tensor([0.0, 0.0, model.gravity])
+            push = (force - drag * x[:, 3:6]) / self.airframe.mass
+            error = (push - mass_error * lift) / (1.0 + mass_error)
+            return torch.cat((planned[:, :3], planned[:, 3:6] + error, planned[:, 6:]), dim=-1)
+
+        return within_limits(rk4(rates, x, self.dt), self.airframe)
 
 
 def check_vehicle(mass_error: float | Tensor, thrust_error: float | Tensor, drag: float | Tensor) -> None:
@@ -92,8 +95,9 @@ def check_vehicle(mass_error: float | Tensor, thrust_error: float | Tensor, drag
         raise InputError("plant.drag", "at least 0 N s/m", drag)
 
 
-def _column(value: float | Tensor) -> float | Tensor:
-    return value.unsqueeze(-1) if isinstance(value, Tensor) and value.dim() == 1 else value
+def column(value: float | Tensor, like: Tensor) -> Tensor:
+    """A number or (B,) as (1 or B, 1)."""
+    return torch.as_tensor(value).to(like).reshape(-1, 1)
 
 
 def hovering(airframe: Airframe, position: Tensor) -> Tensor:

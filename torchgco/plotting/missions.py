@@ -145,8 +145,7 @@ def commands_figure(frame: pd.DataFrame, airframe: Airframe | None = None) -> Fi
     a rotor answers with a lag. Raises InputError as `compute_figure`.
     """
     body = Airframe() if airframe is None else airframe
-    limits = np.array([body.thrust_min, body.thrust_max])
-    rows = {"u": ("rotor speed [rpm]", np.sqrt(limits / body.thrust_coefficient)), "f": ("thrust [N]", limits)}
+    rows = {"u": ("rotor speed [rpm]", body.rotor_speeds), "f": ("thrust [N]", (body.thrust_min, body.thrust_max))}
     t = flight(frame, "t")["t"]
     figure, axes = panels(2, 1, (7.6, 2.5), share=False)
     for ax, (kind, (label, marks)) in zip(axes, rows.items(), strict=True):
