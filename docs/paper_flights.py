@@ -14,15 +14,16 @@ from paper_runs import FOREST, FOREST_LAYOUT, PAPERS_LOOP, Sampling, Witness
 
 from torchgco import compose
 from torchgco.dynamics.quadrotor import Airframe
+from torchgco.missions.contact import Contact
 from torchgco.missions.mission import Mission
-from torchgco.missions.outcome import Ending, judge_flight
+from torchgco.missions.outcome import Ending
 from torchgco.missions.planner import Plan, Planner
-from torchgco.missions.tables import mission_frame, mission_row, samples
+from torchgco.missions.tables import clearances, ending, mission_frame, mission_row, samples
 from torchgco.missions.tracker import Tracker, Tracking
-from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.plotting.bodies import bodies
 from torchgco.plotting.course import Course
-from torchgco.plotting.missions import CONTACT
 from torchgco.problem.problem import Problem
+from torchgco.scenarios import Task
 
 SOLVERS = ("al_ilqr", "gco_paper", "gco")
 REPEATS = 5  # flights with each planner: alike in all but their times
@@ -45,13 +46,13 @@ class Flight:
     sampled: Sequence[Sampling | None]  # the last call of MPPI in each control step; empty with gco
 
 
-def mission_of(name: str, duration: float) -> tuple[Mission, Problem]:
-    """The paper's closed loop with al_ilqr or gco_paper, the library's with gco; and the problem of Figure 6."""
+def mission_of(name: str, duration: float) -> tuple[Mission, Task]:
+    """The paper's closed loop with al_ilqr or gco_paper, the library's with gco; and the task of Figure 6."""
     loop = OWN_LOOP if name == "gco" else PAPERS_LOOP
     setup = compose([*FOREST, *loop, f"solver={name}", f"mission.duration={duration}", "device.threads=1"])
     task = setup.task(setup.scenario.draw([FOREST_LAYOUT], setup.seed))
     assert setup.mission is not None
-    return setup.mission, task.problem
+    return setup.mission, task
 
 
 @dataclass(frozen=True)
@@ -86,28 +87,27 @@ def fly(names: Sequence[str] = SOLVERS, duration: float = 15.0) -> list[Flight]:
     sampled: dict[str, list[Sampling | None]] = {}
     for _ in range(REPEATS):
         for name in names:
-            arrays, sampled[name] = _flown(*mission_of(name, duration))
+            mission, task = mission_of(name, duration)
+            arrays, sampled[name] = _flown(mission, task.problem)
             logs[name].append(arrays)
     return [_flight(name, logs[name], sampled[name], *mission_of(name, duration)) for name in names]
 
 
 def _flight(
-    name: str, logs: Sequence[dict[str, np.ndarray]], sampled: list[Sampling | None], mission: Mission, problem: Problem
+    name: str, logs: Sequence[dict[str, np.ndarray]], sampled: list[Sampling | None], mission: Mission, task: Task
 ) -> Flight:
     """One of several flights, which differ in their times alone, with the least of these."""
     arrays = dict(logs[0])
     assert all(np.array_equal(arrays["x"], other["x"], equal_nan=True) for other in logs)
     for part in ("planner_seconds", "tracker_seconds"):
         arrays[part] = np.min([other[part] for other in logs], axis=0)
-    spheres, goal, radius, period = problem.geometric[0], problem.goal, mission.goal_radius, float(problem.dynamics.dt)
-    assert goal is not None and isinstance(spheres, BoundSpheres) and spheres.velocities is None and radius is not None
-    place = goal.position[0].numpy()
-    course = Course(spheres.centers[0].numpy(), spheres.inflated_radii[0].numpy(), place, radius)
-    contact = CONTACT * course.inflated_radii
+    radius, period = mission.goal_radius, float(task.problem.dynamics.dt)
+    assert radius is not None
+    contact, place = Contact.among(task.problem), task.goal[0].numpy()
+    course = Course(bodies(task.layouts.arrays(), 0), place, radius)
     t, x = samples(arrays, 0, period)
-    end = judge_flight(t, x[:, :3], course.centers, contact, None, place, radius)
-    gaps = np.linalg.norm(arrays["x"][0, :, 0, None, :3] - course.centers, axis=-1) - contact
-    frame = mission_frame(arrays, [FOREST_LAYOUT], period, [gaps.min(axis=-1)])
+    end = ending(arrays, 0, period, contact, place, radius)
+    frame = mission_frame(arrays, [FOREST_LAYOUT], period, clearances(arrays, period, contact))
     row, fine = mission_row(arrays, 0, period, end, Airframe()), _fine(t, x, arrays["commands"][0])
     tolerance = mission.planner.tolerance
     return Flight(name, course, period, frame, fine, arrays["plan"][0], end, row, tolerance, sampled)

@@ -47,6 +47,7 @@ from torchgco import (
 )
 from torchgco.baselines import CasADiSolver
 from torchgco.missions import Mission, Planner, RotorPlant
+from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import judge_flight
 
 D, GOAL = torch.float64, torch.tensor([1.0, 0.4], dtype=torch.float64)
@@ -97,10 +98,7 @@ def call(**change: Any) -> Solution:
 
 
 def flight(**change: Any) -> object:
-    parts = dict(
-        t=np.zeros(3), position=np.zeros((3, 3)), centers=np.zeros((1, 3)), contact=np.ones(1), velocities=None,
-        goal=np.zeros(3), goal_radius=0.1,
-    )  # fmt: skip
+    parts = dict(position=np.zeros((3, 3)), dt=0.01, contact=Contact(()), goal=np.zeros(3), goal_radius=0.1)
     return judge_flight(**{**parts, **change})
 
 
@@ -245,9 +243,10 @@ CASES: dict[str, list[Callable[[], object]]] = {
     "asked": [
         lambda a=a: certify(solved()[0], solved()[2].X, solved()[2].U, a) for a in ([True] * 2, torch.ones(2).long())
     ],
-    "t": [lambda t=t: flight(t=t) for t in ("a", None)] + [lambda: flight(t=[], position=np.zeros((0, 3)))],
-    "position": [lambda p=p: flight(position=p) for p in (np.zeros((3, 2)), [[0.0] * 3], [[0], [0, 1], [2]])],
-    "velocities": [lambda: flight(velocities=np.zeros(3))],
+    "dt": [lambda: flight(dt=0.0), lambda: flight(dt=None)],
+    "position": [
+        lambda p=p: flight(position=p) for p in (np.zeros((3, 2)), np.zeros((0, 3)), "a", [[0], [0, 1], [2]])
+    ],
     "device": [
         lambda: plan_batch(solved()[0], "nowhere"), lambda: plan_batch(solved()[0], 1.5),  # type: ignore[arg-type]
         lambda: plan_batch(solved()[0], "cuda:99"), lambda: Solution.load("none.npz", "nowhere"),

@@ -8,8 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.constraints.test_obstacles import HalfPlane
 from tests.missions.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
-from torchgco import Airframe, Boxes, Cost, Goal, InputError, Planar, Problem, QuadraticCost, QuadrotorPlanning
+from torchgco import Airframe, Cost, Goal, InputError, Planar, Problem, QuadraticCost, QuadrotorPlanning
+from torchgco.missions.contact import Contact
 from torchgco.missions.disturbance import Disturbance
 from torchgco.missions.log import MissionLog
 from torchgco.missions.mission import Mission
@@ -18,7 +20,6 @@ from torchgco.missions.planning_problem import planning_state
 from torchgco.missions.plant import RotorPlant, hovering
 from torchgco.missions.tables import ending
 from torchgco.missions.tracker import Reference, Tracker
-from torchgco.obstacles.spheres import BoundSpheres
 
 TIMES = ("planner_seconds", "tracker_seconds")
 
@@ -41,16 +42,10 @@ class Faulty(RotorPlant):
 
 
 def ends(log: MissionLog, problem: Problem, radius: Tensor) -> list[Ending]:
-    """How the judge says that missions among the first group of spheres ended."""
-    spheres, arrays = problem.constraints[0], log.arrays()
-    assert isinstance(spheres, BoundSpheres) and problem.goal is not None
-    found = []
-    for b in range(problem.B):
-        contact = torch.where(spheres.absent[b], torch.nan, 0.95 * spheres.inflated_radii[b]).numpy()
-        v = None if spheres.velocities is None else spheres.velocities[b].numpy()
-        around = spheres.centers[b].numpy(), contact, v
-        found.append(ending(arrays, b, log.period, around, problem.goal.position[b].numpy(), float(radius[b])))
-    return found
+    """How the judge says that missions ended."""
+    assert problem.goal is not None
+    contact, arrays, goals = Contact.among(problem), log.arrays(), problem.goal.position.numpy()
+    return [ending(arrays, b, log.period, contact, goals[b], float(radius[b])) for b in range(problem.B)]
 
 
 def assert_same_flights(part: MissionLog, whole: MissionLog, rows: Sequence[int]) -> None:
@@ -218,14 +213,15 @@ class Effort(Cost):
         return 0.0 * x.square().sum(-1)
 
 
-def boxed() -> Problem:
-    plain = far()
-    return replace(plain, constraints=[Boxes([[5.0, 5.0, 5.0]], [[1.0, 1.0, 1.0]], 0.2)])
-
-
 def planar() -> Problem:
     cost = QuadraticCost([1.0] * 6, [1.0, 1.0], [1.0] * 6)
     return Problem(Planar(dt=DT), cost, [], torch.zeros(1, 6, **DOUBLE), 5)
+
+
+def unknown() -> Problem:
+    """With obstacles of a kind that the judge doesn't know."""
+    plain = far()
+    return Problem(plain.dynamics, plain.cost, [HalfPlane(9.0)], plain.x0, plain.N, plain.goal)
 
 
 def coarse() -> Problem:
@@ -236,7 +232,7 @@ def coarse() -> Problem:
 PROBLEMS = {
     "scenario.dt": coarse,
     "model": planar,
-    "constraints": boxed,
+    "constraints": unknown,
     "goal": lambda: replace(far(), cost=Effort(), goal=None),
     "x0": lambda: far().cast(torch.float32),
 }

@@ -7,9 +7,10 @@ import pandas as pd
 import pytest
 import torch
 
-from tests.missions.missions import DT, mission
+from tests.missions.missions import DT, REST, mission
 from tests.missions.test_mission import NAMES, RADII, ends, six
-from torchgco import Airframe
+from torchgco import Airframe, Problem, QuadraticCost, QuadrotorPlanning, Spheres
+from torchgco.missions.contact import Contact
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import Ending, Outcome, judge_flight
 from torchgco.missions.tables import energy, mission_frame, mission_row, samples, time_step_frame
@@ -60,19 +61,41 @@ def drawn(seed: int) -> Flight:
     return t, position, centers, contact, velocities, np.array([2.6, 3.0 * (seed % 4 == 1), 0.0]), 0.5
 
 
+def among(centers: np.ndarray, contact: np.ndarray, velocities: np.ndarray | None) -> Contact:
+    """The obstacles of a flight among spheres that are touched at distances `contact` (M,) from their centres, m."""
+    centers, radii, moves = (
+        None if part is None else torch.from_numpy(part)[None] for part in (centers, contact / 0.95, velocities)
+    )
+    rest = torch.tensor([REST], dtype=torch.float64)
+    cost = QuadraticCost([1.0] * 14, [1.0] * 4, [1.0] * 14)
+    return Contact.among(Problem(QuadrotorPlanning(dt=0.1), cost, [Spheres(centers, radii, 0.0, moves)], rest, 5))
+
+
+def judged(
+    t: np.ndarray,
+    position: np.ndarray,
+    centers: np.ndarray,
+    contact: np.ndarray,
+    velocities: np.ndarray | None,
+    goal: np.ndarray,
+    radius: float,
+) -> Ending:
+    return judge_flight(position, float(t[1] - t[0]), among(centers, contact, velocities), goal, radius)
+
+
 def test_random_flights_are_judged_as_by_dense_sampling() -> None:
     seen = []
     for seed in range(80):
         flight = drawn(seed)
         outcome, time, clearance = dense(*flight)
-        end = judge_flight(*flight)
+        end = judged(*flight)
         if abs(clearance) < 2e-4 or abs(end.clearance) < 2e-4:  # dense sampling can't tell
             continue
         assert (end.outcome, end.flight_time) == (outcome, pytest.approx(time)), seed
         assert clearance - 2e-3 <= end.clearance <= clearance + 1e-12
         if seed % 2 == 0:  # at rest: without velocities, too
             t, position, centers, contact, _, goal, radius = flight
-            assert judge_flight(t, position, centers, contact, None, goal, radius).clearance == end.clearance
+            assert judged(t, position, centers, contact, None, goal, radius).clearance == end.clearance
         if outcome != Outcome.DIVERGED:
             last = int(np.searchsorted(flight[0], time - 1e-9))
             assert end.goal_distance == pytest.approx(math.dist(flight[1][last], flight[5]))
@@ -88,13 +111,13 @@ def straight(speed: float, steps: int = 10) -> tuple[np.ndarray, np.ndarray]:
 def test_contact_between_samples_is_seen() -> None:
     t, position = straight(2.0)  # samples at 0.4 m and 0.6 m
     center, far = np.array([[0.5, 0.0, 0.0]]), np.array([9.0, 0.0, 0.0])
-    end = judge_flight(t, position, center, np.array([0.05]), None, far, 0.1)
+    end = judged(t, position, center, np.array([0.05]), None, far, 0.1)
     assert (end.outcome, end.flight_time) == (Outcome.COLLISION, pytest.approx(0.3))
     assert end.clearance == pytest.approx(-0.05)
-    beside = judge_flight(t, position, center + np.array([0.0, 0.06, 0.0]), np.array([0.05]), None, far, 0.1)
+    beside = judged(t, position, center + np.array([0.0, 0.06, 0.0]), np.array([0.05]), None, far, 0.1)
     assert (beside.outcome, beside.clearance) == (Outcome.TIMEOUT, pytest.approx(0.01))
     falling = np.array([[0.0, -0.75, 0.0]])
-    moving = judge_flight(t, position, center + np.array([0.3, 0.3, 0.0]), np.array([0.05]), falling, far, 0.1)
+    moving = judged(t, position, center + np.array([0.3, 0.3, 0.0]), np.array([0.05]), falling, far, 0.1)
     assert moving.outcome == Outcome.COLLISION and moving.flight_time == pytest.approx(0.4)
 
 
@@ -102,10 +125,10 @@ def test_contact_comes_before_the_goal() -> None:
     t, position = straight(1.0)
     goal, center = np.array([0.5, 0.0, 0.0]), np.array([[0.45, 0.0, 0.0]])
     none = np.zeros((0, 3)), np.zeros(0)
-    free = judge_flight(t, position, *none, None, goal, 0.15)
+    free = judged(t, position, *none, None, goal, 0.15)
     assert (free.outcome, free.flight_time) == (Outcome.REACHED, pytest.approx(0.4))
     assert free.clearance == math.inf and free.goal_distance == pytest.approx(0.1)
-    end = judge_flight(t, position, center, np.array([0.06]), None, goal, 0.11)
+    end = judged(t, position, center, np.array([0.06]), None, goal, 0.11)
     assert end.outcome == Outcome.COLLISION  # at 0.39 m, before the sample at 0.4 m is near enough to the goal
     assert all(outcome.sentence.endswith(".") for outcome in Outcome)
 
@@ -158,7 +181,7 @@ def flights() -> tuple[MissionLog, list[Ending]]:
 
 def test_a_row_per_mission_and_control_step(flights: tuple[MissionLog, list[Ending]]) -> None:
     log, _ = flights
-    clearances = [np.arange(K) + 0.5 for K in log.steps()]
+    clearances = np.arange(6) + 0.5 + np.zeros((6, 1))
     table = mission_frame(log.arrays(), [10, 11, 12, 13, 14, 15], DT, clearances)
     assert list(table.columns) == [
         "mission", "step", "t", *(f"x{i}" for i in range(17)), "cost", "violation", "f1", "f2", "f3", "f4",
@@ -182,7 +205,7 @@ def test_a_row_per_mission_and_control_step(flights: tuple[MissionLog, list[Endi
 def test_a_control_step_shows_all_of_its_commands(flights: tuple[MissionLog, list[Ending]]) -> None:
     log, _ = flights
     arrays = log.arrays()
-    clearances = [np.zeros(K) for K in log.steps()]
+    clearances = np.zeros((6, 6))
     table = mission_frame(arrays, range(6), DT, clearances).set_index(["mission", "step"])
     for (b, k), row in table.iterrows():  # type: ignore[misc]
         u = arrays["commands"][b, k]
@@ -194,7 +217,7 @@ def test_a_control_step_shows_all_of_its_commands(flights: tuple[MissionLog, lis
 
 def test_a_row_per_time_step_until_a_mission_ends(flights: tuple[MissionLog, list[Ending]]) -> None:
     log, found = flights
-    table = time_step_frame(log.arrays(), range(6), DT)
+    table = time_step_frame(log.arrays(), range(6), DT, FRAME)
     for b, end in enumerate(found):
         rows = table[table["mission"] == b]
         assert len(rows) == round(100 * end.flight_time) + 1 and rows["t"].iloc[-1] == pytest.approx(end.flight_time)
@@ -204,6 +227,8 @@ def test_a_row_per_time_step_until_a_mission_ends(flights: tuple[MissionLog, lis
         np.testing.assert_array_equal(rows[["f1", "f2", "f3", "f4"]].to_numpy(), x[:, 13:])
         u = log.commands[b].flatten(0, 1)[:steps].numpy()
         np.testing.assert_array_equal(rows[["u1", "u2", "u3", "u4"]].to_numpy()[:-1], u)
+        applied = FRAME.reachable(torch.from_numpy(u)).numpy()
+        np.testing.assert_array_equal(rows[["r1", "r2", "r3", "r4"]].to_numpy()[:-1], applied)
         assert np.isfinite(u).all()
 
 

@@ -9,14 +9,15 @@ from PIL import Image
 from torchgco.base.errors import InputError
 from torchgco.plotting import animation
 from torchgco.plotting.animation import Picture, mission_animation, planar_animation
+from torchgco.plotting.bodies import Ball
 from torchgco.plotting.course import Course
 
 PERIOD = 0.05
 
 
 def course(speed: float) -> Course:
-    goal, velocities = np.array([6.0, 0.0, 0.0]), np.array([[0.0, speed, 0.0]])
-    return Course(np.array([[3.0, 1.5, 0.0]]), np.array([0.6]), goal, 0.5, velocities)
+    ball = Ball(np.array([3.0, 1.5, 0.0]), 0.24, np.array([0.0, speed, 0.0]))
+    return Course((ball,), np.array([6.0, 0.0, 0.0]), 0.5)
 
 
 def flown(steps: int) -> tuple[pd.DataFrame, np.ndarray]:

@@ -12,6 +12,7 @@ from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.outcome import Outcome
 from torchgco.plotting import missions
+from torchgco.plotting.bodies import Ball, Box
 from torchgco.plotting.course import Course
 
 STEPS, KNOTS, PERIOD = 12, 6, 0.05
@@ -39,10 +40,9 @@ def plans() -> np.ndarray:
 
 
 def course(speed: float = 0.0) -> Course:
-    """A sphere 1 m beside the track at x = 2, which comes toward it at `speed`, m/s, and an absent one."""
-    centers = np.array([[2.0, 1.0, 0.0], [np.nan] * 3])
-    velocities = np.array([[0.0, -speed, 0.0], [np.nan] * 3]) if speed else None
-    return Course(centers, np.array([0.5, np.nan]), np.array([6.0, 0.0, 0.0]), 0.5, velocities, vehicle_radius=0.2)
+    """A sphere 1 m beside the track at x = 2, which comes toward it at `speed`, m/s."""
+    ball = Ball(np.array([2.0, 1.0, 0.0]), 0.3, np.array([0.0, -speed, 0.0]))
+    return Course((ball,), np.array([6.0, 0.0, 0.0]), 0.5, vehicle_radius=0.2)
 
 
 def panels_of(figure: Figure) -> list[Axes]:
@@ -77,8 +77,8 @@ def test_distances_are_shares_of_both_radii_and_follow_moving_spheres(frame: pd.
     assert ends.tolist() == [pytest.approx([t[-1], expected[-1]])]
 
 
-def test_nothing_is_near_without_spheres(frame: pd.DataFrame) -> None:
-    empty = Course(np.zeros((0, 3)), np.zeros(0), np.zeros(3), 0.5)
+def test_nothing_is_near_without_obstacles(frame: pd.DataFrame) -> None:
+    empty = Course((), np.zeros(3), 0.5)
     assert np.isinf(empty.nearness(np.zeros((2, 3)), np.zeros(2))).all()
     assert missions.distance_figure({"gco": frame}, empty).axes
 
@@ -96,6 +96,21 @@ def test_snapshots_show_plan_track_and_obstacles_of_their_own_time(frame: pd.Dat
     flown = [line for line in above.lines if len(np.asarray(line.get_xdata())) == 7]
     assert np.asarray(flown[0].get_xdata()).tolist() == (0.5 * np.arange(7)).tolist()
     assert {ax.get_ylabel() for ax in panels_of(figure)} == {"y [m]", "z [m]"}
+
+
+def test_a_wall_is_cut_where_the_vehicle_is(frame: pd.DataFrame, plans: np.ndarray) -> None:
+    """Distances count from its sides; from the side its opening is seen while the vehicle is in front of it."""
+    half, sides = np.array([0.2, 4.0, 1.0]), np.eye(3)
+    over, under = (Box(np.array([4.0, 0.0, z]), half, sides) for z in (-1.5, 1.5))
+    beyond = Box(np.array([4.0, 9.0, 0.0]), np.array([0.2, 5.0, 2.0]), sides)
+    wall = Course((over, under, beyond), np.array([6.0, 0.0, 0.0]), 0.5, vehicle_radius=0.2)
+    near = wall.nearness(np.array([[4.0, 0.0, 0.3], [3.5, 0.0, 0.6]]), np.zeros(2))
+    assert near == pytest.approx([0.2 / 0.2, 0.3 / 0.2])
+    above, side = panels_of(missions.snapshots_figure(frame, plans, wall, [3], PERIOD))
+    heights = [path.get_extents().bounds for path in side.collections[0].get_paths()]
+    assert heights == [pytest.approx((3.8, z, 0.4, 2.0)) for z in (-2.5, 0.5)]
+    (left,) = above.collections[0].get_paths()
+    assert left.get_extents().bounds == pytest.approx((3.8, 4.0, 0.4, 10.0)), "at its height only the wall beyond"
 
 
 @pytest.mark.parametrize(("speed", "expected"), [(0.0, []), (5.0, [2.0])])
@@ -179,7 +194,7 @@ def test_wrong_input_is_refused(frame: pd.DataFrame, plans: np.ndarray) -> None:
         "steps": lambda: missions.snapshots_figure(frame, plans, course(), [STEPS], PERIOD),
         "plans": lambda: missions.snapshots_figure(frame, plans[:3], course(), [0], PERIOD),
         "outcome": lambda: missions.outcomes_figure(pd.DataFrame({"outcome": ["LOST"], "solver": ["gco"]})),
-        "course.goal": lambda: Course(np.zeros((1, 3)), np.ones(1), np.zeros(2), 0.5),
+        "course.goal": lambda: Course((), np.zeros(2), 0.5),
     }
     for word, call in calls.items():
         with pytest.raises(InputError, match=word):

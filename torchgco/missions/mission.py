@@ -19,6 +19,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
 from torchgco.base.tree import take
 from torchgco.dynamics.base import Dynamics
+from torchgco.missions.contact import Contact
 from torchgco.missions.disturbance import Disturbance, measured
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import FARTHEST
@@ -26,9 +27,6 @@ from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import check_model
 from torchgco.missions.plant import Plant, RotorPlant, hovering
 from torchgco.missions.tracker import Reference, Tracker, Tracking
-from torchgco.obstacles.base import CONTACT_FACTOR
-from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solvers.contracts import check_ids
 
@@ -89,8 +87,8 @@ class Mission:
             seed, ids: the key of all random draws; ids (B,) int64, by default 0..B-1.
 
         Raises:
-            InputError: another model, no goal, another precision, obstacles other than spheres, a control period that
-                isn't a multiple of the plant's time step, or an argument of another kind.
+            InputError: another model, no goal, another precision, obstacles of a kind that can't be judged, a control
+                period that isn't a multiple of the plant's time step, or an argument of another kind.
         """
         check_problem(problem)
         seed = check_value(seed, Seed, "seed")
@@ -116,7 +114,7 @@ class _Flight:
         self.period = float(problem.dynamics.dt)
         self.substeps = mission.substeps(self.period) or 1
         self.steps = math.ceil(mission.duration / self.period - 1e-9)
-        self.spheres = _spheres(problem)
+        self.contact = Contact.among(problem)
         self.goal = problem.goal.position
         radius = mission.goal_radius
         self.radius = problem.goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
@@ -180,11 +178,7 @@ class _Flight:
         p = self.x[:, :3]
         finite = torch.isfinite(self.x).all(-1) & ((p - self.start[self.rows]).norm(dim=-1) <= FARTHEST)
         there = (p - self.goal[self.rows]).norm(dim=-1) < self.radius[self.rows]
-        hit = torch.zeros_like(there)
-        for centers, velocities, contact in self.spheres:
-            o = centers[self.rows] if velocities is None else centers[self.rows] + t * velocities[self.rows]
-            hit |= ((p.unsqueeze(1) - o).norm(dim=-1) < contact[self.rows]).any(-1)
-        return ~finite | there | hit
+        return ~finite | there | (self.contact.distance(p, t) < 0)
 
     def _leave(self, left: Tensor) -> None:
         """Drop the vehicles where `left` (B,)."""
@@ -192,29 +186,5 @@ class _Flight:
         if stay.numel() == left.numel():
             return
         self.problem, self.planned = self.problem.take(stay), self.planned.take(stay)
-        self.plant = self.plant.take(stay)
+        self.plant, self.contact = self.plant.take(stay), self.contact.take(stay)
         self.x, self.rows, self.ids = take((self.x, self.rows, self.ids), stay)
-
-
-def other_obstacles(problem: Problem) -> str:
-    """The obstacles of a problem that missions can't fly among, in words; empty where there are spheres alone."""
-    words = []
-    for part in problem.geometric:
-        if isinstance(part, BoundBoxes):
-            sides = (part.half_sizes[~part.absent] > 0).sum(-1)
-            words.append("trunks (capsules)" if bool((sides <= 1).all()) else "boxes")
-        elif not isinstance(part, BoundSpheres):
-            words.append(type(part).__name__)
-    return " and ".join(dict.fromkeys(words))
-
-
-def _spheres(problem: Problem) -> list[tuple[Tensor, Tensor | None, Tensor]]:
-    """Centres (B, M, 3), velocities and distances of contact (B, M), m, of the problems' spheres."""
-    if others := other_obstacles(problem):
-        raise InputError("constraints", "spheres alone, as missions fly among no other obstacles so far", others)
-    found = []
-    for part in problem.geometric:
-        assert isinstance(part, BoundSpheres)
-        contact = torch.where(part.absent, -torch.inf, CONTACT_FACTOR * part.inflated_radii)
-        found.append((part.centers, part.velocities, contact))
-    return found

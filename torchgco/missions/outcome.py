@@ -1,4 +1,4 @@
-"""How a flight ended, judged from the log of the plant alone: no code is shared with the simulation.
+"""How a flight ended, judged from the log of the plant alone.
 
 A flight ends with the first of three events: the vehicle touches an obstacle (COLLISION), its state is no longer finite
 or leaves all reason (DIVERGED), or it comes within the goal's radius (REACHED). Without any it ends with TIMEOUT.
@@ -6,14 +6,17 @@ or leaves all reason (DIVERGED), or it comes within the goal's radius (REACHED).
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
+import torch
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import Meters, check_value
+from torchgco.base.options import Meters, Seconds, check_value
+from torchgco.missions.contact import Contact
 
 FARTHEST = 1e3  # m from the start: a vehicle beyond has diverged
 
@@ -49,53 +52,39 @@ class Ending:
     goal_distance: float  # m, at the end
 
 
-def judge_flight(
-    t: np.ndarray,
-    position: np.ndarray,
-    centers: np.ndarray,
-    contact: np.ndarray,
-    velocities: np.ndarray | None,
-    goal: np.ndarray,
-    goal_radius: float,
-) -> Ending:
-    """Judge one flight among spheres.
+def judge_flight(position: Any, dt: float, contact: Contact, goal: Any, goal_radius: float) -> Ending:
+    """Judge one flight.
 
     Args:
-        t, position: samples (T,), s, and (T, 3), m, of the plant; after the flight's end NaN.
-        centers, contact, velocities: spheres at t = 0, (M, 3), m, with the distances (M,) at which bodies touch, m, and
-            (M, 3), m/s, or None where they are at rest; NaN rows are absent.
+        position: samples (T, 3), m, of the plant, one every dt, s; after the flight's end NaN.
+        contact: of a single problem.
         goal, goal_radius: (3,) and a number above 0, m.
 
     Raises:
-        InputError: arrays of other shapes, without a sample, or of anything but numbers; a radius that isn't above 0.
+        InputError: arrays of other shapes, without a sample, or of anything but numbers; a radius or a time step that
+            isn't above 0.
     """
-    t = _numbers(t, "t", (None,))
-    position, goal = _numbers(position, "position", (len(t), 3)), _numbers(goal, "goal", (3,))
-    contact = _numbers(contact, "contact", (None,))
-    centers = _numbers(centers, "centers", (len(contact), 3))
-    velocities = None if velocities is None else _numbers(velocities, "velocities", (len(contact), 3))
+    position, goal = _numbers(position, "position", (None, 3)), _numbers(goal, "goal", (3,))
     check_value(goal_radius, Meters, "goal_radius")
-    if len(t) == 0:
-        raise InputError("t", "at least one sample", "none")
-    here = ~np.isnan(contact)
-    centers, contact = centers[here], contact[here]
-    moves = np.zeros_like(centers) if velocities is None else velocities[here]
-    clearance, before = np.inf, None
-    for k in range(len(t)):
-        p = position[k]
-        if not np.isfinite(p).all() or np.linalg.norm(p - position[0]) > FARTHEST:
-            return Ending(Outcome.DIVERGED, float(t[k]), float(clearance), float("nan"))
-        away = p - (centers + t[k] * moves)
-        if len(away):
-            nearest = _distance(away if before is None else before, away) - contact
-            clearance = min(clearance, float(nearest.min()))
-        before = away
-        distance = float(np.linalg.norm(p - goal))
-        if clearance < 0:
-            return Ending(Outcome.COLLISION, float(t[k]), clearance, distance)
-        if distance < goal_radius:
-            return Ending(Outcome.REACHED, float(t[k]), clearance, distance)
-    return Ending(Outcome.TIMEOUT, float(t[-1]), clearance, distance)
+    check_value(dt, Seconds, "dt")
+    if len(position) == 0:
+        raise InputError("position", "at least one sample", "none")
+    with np.errstate(invalid="ignore"):
+        lost = ~(np.linalg.norm(position - position[0], axis=-1) <= FARTHEST)
+    there = np.linalg.norm(position - goal, axis=-1) < goal_radius
+    last = int(np.argmax(lost | there)) if (lost | there).any() else len(position) - 1
+    way = torch.from_numpy(position[None, : last + (not lost[last])].astype(float))
+
+    def clearance(samples: int) -> float:
+        return float(contact.along(way[:, :samples], dt)) if samples else np.inf
+
+    outcome = Outcome.DIVERGED if lost[last] else Outcome.REACHED if there[last] else Outcome.TIMEOUT
+    samples = way.shape[1]
+    if clearance(samples) < 0:  # the first sample by which there was contact
+        samples = 1 + bisect_left(range(1, samples), True, key=lambda count: clearance(count) < 0)
+        outcome, last = Outcome.COLLISION, samples - 1
+    distance = float("nan") if outcome is Outcome.DIVERGED else float(np.linalg.norm(position[last] - goal))
+    return Ending(outcome, last * dt, clearance(samples), distance)
 
 
 def _numbers(value: Any, field: str, shape: tuple[int | None, ...]) -> np.ndarray:
@@ -109,11 +98,3 @@ def _numbers(value: Any, field: str, shape: tuple[int | None, ...]) -> np.ndarra
         wanted = ", ".join("any" if length is None else str(length) for length in shape)
         raise InputError(field, f"numbers of shape ({wanted})", f"{array.dtype} of shape {array.shape}")
     return array
-
-
-def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Distances (M,) of the origin from the segments between a and b (M, 3)."""
-    along = b - a
-    length = (along**2).sum(-1)
-    share = np.clip(-(a * along).sum(-1) / np.maximum(length, np.finfo(float).tiny), 0.0, 1.0)
-    return np.linalg.norm(a + share[:, None] * along, axis=-1)

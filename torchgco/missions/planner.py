@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from torchgco.dynamics.quadrotor import Airframe
 from torchgco.lagrangian.lagrangian import Multipliers, shifted
 from torchgco.lagrangian.quality import violation
 from torchgco.missions.planning_problem import Margin, acceleration, biased, check_model, first_step, planning_state
-from torchgco.native.dispatch import open_loop
+from torchgco.native.dispatch import followed, open_loop
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
@@ -30,7 +30,9 @@ class Plan:
 
     X: Tensor  # (B, N+1, 14)
     U: Tensor  # (B, N, 4)
+    K: Tensor  # (B, N, 4, 14): feedback gains
     multipliers: Multipliers
+    penalty: Tensor  # (B,): mu of the search that found the plan, which the plans that continue it start from
     cost: Tensor
     violation: Tensor
     shifted: Tensor  # bool: the former plan one stage later, as the new one was infeasible
@@ -47,7 +49,7 @@ class Plan:
         return replace(self, **parts, model=self.model.take(index))
 
 
-TRAJECTORY = ("X", "U", "multipliers", "cost", "violation", "shifted")
+TRAJECTORY = ("X", "U", "K", "multipliers", "penalty", "cost", "violation", "shifted")
 OTHERS = ("guided", "iterations", "measured", "bias")
 CONTINUED = 4  # outer iterations at most that continue a former plan
 LEAST = 1e-4  # s, of a time limit
@@ -64,6 +66,9 @@ class Planner:
     Args:
         solver: any solver of the library.
         airframe: as the planner knows it.
+        feedback: a former plan is continued by its controls and their feedback gains, which bring the measured state
+            back to it. Without, by its controls alone, as in the paper: over a long horizon a small difference of the
+            state then leads metres away.
         multipliers: "shifted" starts from those of the former plan one stage later, "reset" from zero, as the paper.
         max_seconds: time limit of a plan, s; None: none. With a limit, results depend on the machine.
         tolerance: violation (m for lengths) up to which a plan is flown without a look at the former one; infinity: a
@@ -80,6 +85,7 @@ class Planner:
 
     solver: Solver
     airframe: Airframe = Airframe()
+    feedback: bool = True
     multipliers: Literal["shifted", "reset"] = "shifted"
     max_seconds: Seconds | None = None
     tolerance: PositiveOrInfinite = 0.01
@@ -129,6 +135,8 @@ class Planner:
         depth = self._margin.unavoidable_depth(whole.started_at(x0, whole.constraints), t, U0)
         now = now.started_at(x0, self._constraints(whole, t, x, depth), dynamics=dynamics)
         solve = _Solve(self, now, seed, ids, began)
+        if before is not None and self.feedback:
+            U0 = followed(now, shifted(before.X), U0, shifted(before.K))
         plan = solve.first(U0) if before is None else solve.next(U0, before)
         return replace(plan, measured=measured, bias=bias, step=step), now, time.perf_counter() - began
 
@@ -170,27 +178,24 @@ class _Solve:
 
     def __init__(self, planner: Planner, problem: Problem, seed: int, ids: Tensor, began: float) -> None:
         self.planner, self.problem, self.seed, self.ids, self.began = planner, problem, seed, ids, began
-        # What a limit cuts off, the next plan continues: finishing it would only make this one late.
-        solver: Any = planner.solver
-        self.solver = solver if getattr(solver, "finish", None) is None else replace(solver, finish=None)
+        self.solver, self.local = planner.solver.in_closed_loop(CONTINUED)
 
     def first(self, U0: Tensor) -> Plan:
         """The solver's plans, from controls U0 (B, N, 4)."""
         return self._plan(self._solved(self.solver, self.problem, U0, None, self.ids))
 
     def next(self, U0: Tensor, before: Plan) -> Plan:
-        """Plans that continue former ones, whose controls one stage later are U0 (B, N, 4)."""
-        multipliers = before.multipliers.shifted()
+        """Plans that continue former ones, which are flown one stage later by U0 (B, N, 4)."""
+        # What one continuation raises the penalty by must not stay: over a mission it would grow beyond all measure.
+        multipliers = replace(before.multipliers.shifted(), mu=before.penalty)
         warm = multipliers if self.planner.multipliers == "shifted" else None
-        local = getattr(self.solver, "local", None)
-        local = self.solver if local is None else replace(local, max_outer_iterations=CONTINUED)
-        plan = self._plan(self._solved(local, self.problem, U0, warm, self.ids))
-        self._keep_former(plan, U0, multipliers)
+        plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids))
+        plan.penalty.copy_(before.penalty)
+        self._keep_former(plan, before, U0, multipliers)
         rows = (~(plan.violation <= self.planner.tolerance)).nonzero().flatten()
         left = self._time_left()
-        if local is not self.solver and rows.numel() > 0 and (left is None or left > LEAST):
-            start = None if warm is None else take(warm, rows)
-            found = self._plan(self._solved(self.solver, self.problem.take(rows), U0[rows], start, self.ids[rows]))
+        if self.local is not self.solver and rows.numel() > 0 and (left is None or left > LEAST):
+            found = self._plan(self._solved(self.solver, self.problem.take(rows), U0[rows], None, self.ids[rows]))
             self._replace(plan, rows, found)
             for name in ("guided", "iterations"):
                 getattr(plan, name)[rows] += getattr(found, name)
@@ -204,16 +209,17 @@ class _Solve:
         limit = self.planner.max_seconds
         return None if limit is None else max(LEAST, limit - (time.perf_counter() - self.began))
 
-    def _keep_former(self, plan: Plan, U: Tensor, multipliers: Multipliers) -> None:
-        """Put former plans, one stage later, in the place of new ones that are infeasible and worse."""
+    def _keep_former(self, plan: Plan, before: Plan, U: Tensor, multipliers: Multipliers) -> None:
+        """Put former plans, flown one stage later by U, in the place of new ones that are infeasible and worse."""
         rows = (~(plan.violation <= self.planner.tolerance)).nonzero().flatten()
         if rows.numel() == 0:
             return
         part = self.problem.take(rows)
         X = open_loop(part, U[rows])
         former = replace(
-            plan.take(rows), X=X, U=U[rows], multipliers=take(multipliers, rows), cost=part.cost.total(X, U[rows]),
-            violation=violation(part, X, U[rows]), shifted=torch.ones_like(rows, dtype=torch.bool),
+            plan.take(rows), X=X, U=U[rows], K=shifted(before.K[rows]), multipliers=take(multipliers, rows),
+            cost=part.cost.total(X, U[rows]), violation=violation(part, X, U[rows]),
+            shifted=torch.ones_like(rows, dtype=torch.bool),
         )  # fmt: skip
         self._replace(plan, rows, former)
 
@@ -228,6 +234,6 @@ class _Solve:
     def _plan(self, solution: Solution) -> Plan:
         none = torch.zeros_like(solution.cost, dtype=torch.bool)
         return Plan(
-            solution.X, solution.U, solution.multipliers, solution.cost, solution.violation, none, solution.guided,
-            solution.iterations, solution.X[:, 0], solution.X[:, 0, :3], self.problem.dynamics, 0,
+            solution.X, solution.U, solution.K, solution.multipliers, solution.multipliers.mu.clone(), solution.cost,
+            solution.violation, none, solution.guided, solution.iterations, solution.X[:, 0], solution.X[:, 0, :3], self.problem.dynamics, 0,
         )  # fmt: skip

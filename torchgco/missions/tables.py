@@ -10,13 +10,10 @@ import pandas as pd
 import torch
 
 from torchgco.dynamics.quadrotor import Airframe
+from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Ending, judge_flight
-from torchgco.obstacles.base import CONTACT_FACTOR
-from torchgco.obstacles.spheres import BoundSpheres
-from torchgco.problem.problem import Problem
 
 Arrays = Mapping[str, np.ndarray]
-Spheres = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # centres, distances of contact, velocities
 SCALARS = (
     "cost", "violation", "shifted", "guided", "iterations", "planner_seconds", "tracker_seconds", "tracking_violation",
 )  # fmt: skip
@@ -40,38 +37,20 @@ def unpacked(rows: np.ndarray, substeps: int) -> dict[str, np.ndarray]:
     return arrays | ({"plan": plan.reshape(B, K, -1, 3)} if plan.shape[-1] else {})
 
 
-def spheres_of(problem: Problem) -> list[Spheres]:
-    """The spheres of each problem at t = 0, with the distances at which bodies touch; NaN where absent."""
-    parts = [part for part in problem.geometric if isinstance(part, BoundSpheres)]
-    found = []
-    for b in range(problem.B):
-        radii = [torch.where(part.absent, torch.nan, CONTACT_FACTOR * part.inflated_radii)[b] for part in parts]
-        moves = [torch.zeros_like(part.centers[b]) if part.velocities is None else part.velocities[b] for part in parts]
-        centers = torch.cat([part.centers[b] for part in parts]) if parts else torch.zeros(0, 3)
-        contact = torch.cat(radii) if parts else torch.zeros(0)
-        found.append((centers.numpy(), contact.numpy(), torch.cat(moves).numpy() if parts else None))
-    return found
+def clearances(arrays: Arrays, period: float, contact: Contact) -> np.ndarray:
+    """Distances (B, K) of missions from contact at the starts of their control steps, m; NaN after their ends."""
+    start = arrays["x"][:, :, 0, :3]
+    found = contact.distances(torch.from_numpy(start), period).numpy()
+    return np.where(np.isnan(arrays["cost"]), np.nan, found)
 
 
-def clearances(arrays: Arrays, b: int, period: float, spheres: Spheres) -> np.ndarray:
-    """Distances (K,) of mission b to the nearest contact at the starts of its control steps, m."""
-    centers, contact, velocities = spheres
-    K = _steps(arrays, b)
-    here = ~np.isnan(contact)
-    if not here.any():
-        return np.full(K, np.inf)
-    t = period * np.arange(K)[:, None, None]
-    at = centers[here] + (0.0 if velocities is None else t * velocities[here])
-    return (np.linalg.norm(arrays["x"][b, :K, 0, None, :3] - at, axis=-1) - contact[here]).min(-1)
-
-
-def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances: Sequence[np.ndarray]) -> pd.DataFrame:
+def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances: np.ndarray) -> pd.DataFrame:
     """A row per mission and control step.
 
     Args:
         arrays: see `MissionLog.arrays`.
         ids: numbers of the missions; period: of a control step, s.
-        clearances: of each mission, at the starts of its control steps, m.
+        clearances: (B, K), at the starts of control steps, m.
 
     Commands `u1` to `u4` are the first of a control step; `u1_low` and `u1_high` the least and the largest of it.
     """
@@ -98,12 +77,13 @@ def _commands(u: np.ndarray) -> dict[str, np.ndarray]:
     return {f"u{i + 1}{end}": values[:, i] for end, values in parts.items() for i in range(ROTORS)}
 
 
-def time_step_frame(arrays: Arrays, ids: Sequence[int], period: float) -> pd.DataFrame:
-    """A row per mission and time step of the plant: mission, t, states, thrusts and commands.
+def time_step_frame(arrays: Arrays, ids: Sequence[int], period: float, airframe: Airframe) -> pd.DataFrame:
+    """A row per mission and time step of the plant: mission, t, states, thrusts, commands, and the speeds they make.
 
     A command holds from its row to the next one; the last row is the mission's end and repeats the last command.
     Arguments as `mission_frame`.
     """
+    low, high = airframe.rotor_speeds
     frames = []
     for b, number in enumerate(ids):
         u = arrays["commands"][b, : _steps(arrays, b)].reshape(-1, ROTORS)
@@ -111,7 +91,8 @@ def time_step_frame(arrays: Arrays, ids: Sequence[int], period: float) -> pd.Dat
         t, x = (part[: len(u) + 1] for part in samples(arrays, b, period))
         u = np.concatenate((u, u[-1:] if len(u) else np.full((1, ROTORS), np.nan)))
         columns = {"mission": np.full(len(t), number), "t": t} | {f"x{i}": x[:, i] for i in range(STATES)}
-        columns |= {f"f{i + 1}": x[:, 13 + i] for i in range(ROTORS)} | {f"u{i + 1}": u[:, i] for i in range(ROTORS)}
+        parts = {"f": x[:, 13:], "u": u, "r": u.clip(low, high)}
+        columns |= {f"{name}{i + 1}": part[:, i] for name, part in parts.items() for i in range(ROTORS)}
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
 
@@ -132,35 +113,49 @@ def energy(t: np.ndarray, x: np.ndarray, airframe: Airframe) -> float:
 
 
 def mission_row(arrays: Arrays, b: int, period: float, end: Ending, airframe: Airframe) -> dict[str, object]:
-    """The columns of mission b that a study adds to its own."""
-    K = _steps(arrays, b)
-    planner = arrays["planner_seconds"][b, :K]
+    """The columns of mission b that its log decides, but for its clearance at the starts of control steps."""
     t, x = samples(arrays, b, period)
     until = t <= end.flight_time + 1e-9
+    steps = {name: arrays[name][b, : _steps(arrays, b)] for name in SCALARS}
     return {
         "outcome": end.outcome.name,
         "flight_time": end.flight_time,
+        "clearance": end.clearance,
+        "goal_distance": end.goal_distance,
         "energy": energy(t[until], x[until], airframe),
-        "missed_deadlines": int((planner + arrays["tracker_seconds"][b, :K] > period).sum()),
-        "shifted_plans": int(np.nansum(arrays["shifted"][b, :K])),
-        "planner_seconds_median": float(np.median(planner)) if K else math.nan,
-        "planner_seconds_p99": float(np.quantile(planner, 0.99)) if K else math.nan,
-        "tracker_seconds_median": float(np.median(arrays["tracker_seconds"][b, :K])) if K else math.nan,
-        "tracking_violation": float(arrays["tracking_violation"][b, :K].max(initial=0.0)),
+        "iterations": int(steps["iterations"].sum()),
+        **step_columns(steps, period),
     }
 
 
-def ending(
-    arrays: Arrays,
-    b: int,
-    period: float,
-    spheres: Spheres,
-    goal: np.ndarray,
-    goal_radius: float,
-) -> Ending:
-    """How mission b ended; spheres are centres, distances of contact and velocities, see `judge_flight`."""
-    t, x = samples(arrays, b, period)
-    return judge_flight(t, x[:, :3], *spheres, goal, goal_radius)
+def step_columns(steps: Arrays, period: float) -> dict[str, float]:
+    """The columns of a mission that are counts, sums and quantiles over its control steps.
+
+    Args:
+        steps: violation, guided, shifted, planner_seconds, tracker_seconds and tracking_violation, (K,) each.
+        period: of a control step, s.
+    """
+    planner, tracker = steps["planner_seconds"], steps["tracker_seconds"]
+    flew = len(planner) > 0
+    return {
+        "violation": float(steps["violation"].max(initial=0.0)),
+        "outer_iterations": len(planner),
+        "guided": int((steps["guided"] > 0).sum()),
+        "seconds": float((planner + tracker).sum()),
+        "missed_deadlines": int((planner + tracker > period).sum()),
+        "shifted_plans": int(steps["shifted"].sum()),
+        "planner_seconds_median": float(np.median(planner)) if flew else math.nan,
+        "planner_seconds_p99": float(np.quantile(planner, 0.99)) if flew else math.nan,
+        "tracker_seconds_median": float(np.median(tracker)) if flew else math.nan,
+        "tracking_violation": float(steps["tracking_violation"].max(initial=0.0)),
+    }
+
+
+def ending(arrays: Arrays, b: int, period: float, contact: Contact, goal: np.ndarray, goal_radius: float) -> Ending:
+    """How mission b ended; `contact` is that of all missions, the goal (3,) its own. See `judge_flight`."""
+    _, x = samples(arrays, b, period)
+    dt = period / arrays["commands"].shape[2]
+    return judge_flight(x[:, :3], dt, contact.take(slice(b, b + 1)), goal, goal_radius)
 
 
 def _steps(arrays: Arrays, b: int) -> int:

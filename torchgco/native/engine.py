@@ -89,6 +89,12 @@ class Engine:
         self._run("tgco_open_loop", problem, self.packed(problem, {"X": X, "U": U.contiguous()}))
         return X
 
+    def closed_loop(self, problem: Problem, X: Tensor, U: Tensor, G: Tensor) -> tuple[Tensor, Tensor]:
+        """X and U of a rollout of U + K (x - X) from the first knots of X; G = [K d] (B, N, m, n+1), d isn't used."""
+        tensors = {"X": X.clone(), "U": U.clone(), "gains": G.contiguous()}
+        self._run("tgco_closed_loop", problem, self.packed(problem, tensors))
+        return tensors["X"], tensors["U"]
+
     def value(self, problem: Problem, X: Tensor, U: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
         """J_var (B,) and L_M (B,) of trajectories."""
         tensors = {"X": X.contiguous(), "U": U.contiguous(), "cost": X.new_empty(problem.B)}

@@ -3,75 +3,72 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.patches import Circle
 
 from torchgco.base.errors import InputError
 from torchgco.plotting import trajectory as draw
+from torchgco.plotting.bodies import Ball, Body
+from torchgco.plotting.scene import Scene, view
 from torchgco.plotting.style import INK, PALETTE
 
 VEHICLE = PALETTE[5]
 VIEWS: tuple[draw.Plane, draw.Plane] = (draw.ABOVE, draw.SIDE)
 POSITION = ("x0", "x1", "x2")
-SPACE = 0.3  # m around what a view shows
+INSIDE = 1e-3  # m: knots deeper in an obstacle are crossed
 
 
 @dataclass(frozen=True)
 class Course:
-    """Spheres, at rest or moving, and the goal; lengths in metres.
+    """The obstacles of one layout, and the goal; lengths in metres.
 
     Args:
-        centers: at t = 0, (M, 3); nan where a sphere is absent.
-        inflated_radii: r_obs + r_veh, (M,); nan where a sphere is absent.
+        bodies: see `bodies.bodies`.
         goal: (3,).
         goal_radius: within which the goal counts as reached.
-        velocities: (M, 3), m/s; None: at rest.
         vehicle_radius: r_veh.
 
     Raises:
-        InputError: shapes that don't fit.
+        InputError: a goal of another shape.
     """
 
-    centers: np.ndarray
-    inflated_radii: np.ndarray
+    bodies: tuple[Body, ...]
     goal: np.ndarray
     goal_radius: float
-    velocities: np.ndarray | None = None
     vehicle_radius: float = 0.36
 
     def __post_init__(self) -> None:
-        M = len(self.inflated_radii)
-        shapes = {"centers": (M, 3), "inflated_radii": (M,), "goal": (3,)}
-        shapes |= {} if self.velocities is None else {"velocities": (M, 3)}
-        for name, shape in shapes.items():
-            if np.shape(getattr(self, name)) != shape:
-                raise InputError(f"course.{name}", f"shape {shape}", np.shape(getattr(self, name)))
+        if np.shape(self.goal) != (3,):
+            raise InputError("course.goal", "shape (3,)", np.shape(self.goal))
 
-    def at(self, t: np.ndarray | float) -> np.ndarray:
-        """Centres (..., M, 3) at times t (...), s."""
-        moves = np.zeros_like(self.centers) if self.velocities is None else self.velocities
-        return self.centers + np.asarray(t)[..., None, None] * moves
+    @property
+    def reaches(self) -> np.ndarray:
+        """r_obs + r_veh of each obstacle, (M,); of a box, r_obs is the radius that rounds it."""
+        return np.array([body.radius + self.vehicle_radius for body in self.bodies])
+
+    def distances(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Distances (M, T) of positions (T, 3) at times t (T,), s, from centres, and from the sides of boxes."""
+        return np.array([body.distance(positions, t) for body in self.bodies]).reshape(len(self.bodies), len(t))
 
     def infeasible(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Which positions (T, 3) at times t (T,), s, lie more than a millimetre inside an inflated sphere."""
-        return draw.inside(positions, self.at(t), self.inflated_radii)
+        """Which positions (T, 3) at times t (T,), s, lie more than a millimetre inside an obstacle grown by r_veh."""
+        return np.any(self.distances(positions, t) < self.reaches[:, None] - INSIDE, axis=0)
 
     def nearness(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Smallest distance from a centre as a share of r_obs + r_veh, (T,), at times t (T,), s; inf without any."""
-        shares = np.linalg.norm(positions[:, None] - self.at(t), axis=-1) / self.inflated_radii
-        return np.where(np.isfinite(shares), shares, np.inf).min(axis=1, initial=np.inf)
+        """Smallest of `distances` as a share of r_obs + r_veh, (T,), at times t (T,), s; inf without obstacles."""
+        return (self.distances(positions, t) / self.reaches[:, None]).min(axis=0, initial=np.inf)
 
-    def limits(self, *points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner (3,) of a box around spheres at t = 0, goal and vehicles at points (T, 3)."""
-        here = np.isfinite(self.inflated_radii)
-        o, r = self.centers[here], self.inflated_radii[here, None]
-        ends = self.goal + self.goal_radius * np.array([[-1.0], [1.0]])
-        around = [p + side * self.vehicle_radius for p in points for side in (-1.0, 1.0)]
-        shown = np.concatenate((o - r, o + r, ends, *around))
-        return np.nanmin(shown, axis=0) - SPACE, np.nanmax(shown, axis=0) + SPACE
+    def limits(self, track: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner (3,) of a box around goal and track (T, 3), a little wider where obstacles are."""
+        ends = track[:1], self.goal[None]
+        scene = Scene((self.bodies,), *ends, self.vehicle_radius, self.goal_radius, 0.0, np.zeros(1))
+        low, high = view(scene, [0], [track + side * self.vehicle_radius for side in (-1.0, 1.0)], [])
+        return low, high
 
 
 def draw_instant(
@@ -79,16 +76,31 @@ def draw_instant(
 ) -> None:
     """Obstacles at time t, s, the track flown so far (T, 3) with the vehicle at its end, and the plan (N+1, 3).
 
+    Spheres are shown whole; boxes and capsules are cut where the vehicle is, as they may be higher or wider than the
+    view.
+
     period  of the plan's knots, s; knots inside an obstacle at their own time are crossed
     """
-    own = course.inflated_radii - course.vehicle_radius
-    draw.draw_obstacles(ax, course.at(t), own, course.vehicle_radius, plane, opacity=0.6)
+    _draw_bodies(ax, course, t, float(np.delete(track[-1], plane)[0]), plane)
     draw.draw_ends(ax, track[0], course.goal, course.goal_radius, plane)
     ax.plot(*track[:, plane].T, color=INK, linewidth=1.4, zorder=3)
     infeasible = course.infeasible(plan, t + period * np.arange(len(plan)))
     draw.draw_trajectory(ax, plan, infeasible, plane, every=2, size=7.0)
     at = (float(track[-1, plane[0]]), float(track[-1, plane[1]]))
     ax.add_patch(Circle(at, course.vehicle_radius, facecolor=VEHICLE, edgecolor=INK, linewidth=0.8, zorder=6))
+
+
+def _draw_bodies(ax: Axes, course: Course, t: float, at: float, plane: draw.Plane) -> None:
+    """The obstacles at time t, s, filled, and outlined at the vehicle's radius; `at` is its hidden coordinate, m."""
+    full: dict[str, Any] = {"facecolor": draw.STONE, "linewidth": 0.5, "alpha": 0.6}
+    grown: dict[str, Any] = {"facecolor": "none", "linewidth": 0.7, "linestyle": "--"}
+    for margin, look in ((0.0, full), (course.vehicle_radius, grown)):
+        shapes = [
+            body.outline(margin, plane, t) if isinstance(body, Ball) else body.section(plane, at, margin, t)
+            for body in course.bodies
+        ]
+        seen = PolyCollection([shape for shape in shapes if shape is not None], edgecolor=draw.EDGE, zorder=0, **look)
+        ax.add_collection(seen, autolim=False)
 
 
 def flight(frame: pd.DataFrame, *columns: str) -> dict[str, np.ndarray]:

@@ -20,12 +20,12 @@ from matplotlib.ticker import PercentFormatter
 from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.outcome import Outcome
+from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.course import POSITION, VEHICLE, VIEWS, Course, draw_instant, flight, positions
 from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, legend, panels, solver_colours, tasks_of, tidy
 
 Frames = Mapping[str, pd.DataFrame]  # by solver
-CONTACT = 0.95  # share of r_obs + r_veh at which bodies touch
 CLOSE = (0.93, 1.12)  # shares shown near the boundaries
 LIMIT, GUIDED = "#C62828", "#C9E0F4"
 ENDS = {
@@ -70,10 +70,12 @@ def compute_figure(frames: Frames, period: float) -> Figure:
 def distance_figure(frames: Frames, course: Course) -> Figure:
     """Smallest distance from an obstacle's centre over time, as a share of r_obs + r_veh, a line per solver.
 
+    Of a box or a capsule it is the distance from its sides or its axis, and r_obs the radius that rounds it.
+
     frames  with columns t and x0 to x2; a row per time step shows contacts between control steps, too
 
     Planners keep to the line at 1, bodies touch at 0.95; the lower panel shows these closer. A dot marks the end of a
-    mission. If all spheres are alike, the right axes have metres.
+    mission. If all radii are alike, the right axes have metres.
     Raises InputError as `compute_figure`.
     """
     figure, axes = panels(2, 1, (7.6, 2.6))
@@ -85,14 +87,14 @@ def distance_figure(frames: Frames, course: Course) -> Figure:
             ax.plot(t, near, color=colours[solver], linewidth=1.4)
             ax.plot(t[-1:], near[-1:], color=colours[solver], marker="o", markersize=5, clip_on=title != "")
         ax.axhline(1.0, color=INK, linestyle=":", linewidth=1.2)
-        ax.axhline(CONTACT, color=LIMIT, linestyle="--", linewidth=1.0)
+        ax.axhline(CONTACT_FACTOR, color=LIMIT, linestyle="--", linewidth=1.0)
         ax.set_ylabel("distance / ($r_{obs} + r_{veh}$) [-]")
         tidy(ax, title)
         _metres(ax, course)
     axes[1].set(ylim=CLOSE, xlim=axes[0].get_xlim(), xlabel="time in the mission [s]")
     marks = [
         Line2D([], [], color=INK, linestyle=":", linewidth=1.2, label="planner's boundary, 1.0"),
-        Line2D([], [], color=LIMIT, linestyle="--", linewidth=1.0, label=f"contact, {CONTACT}"),
+        Line2D([], [], color=LIMIT, linestyle="--", linewidth=1.0, label=f"contact, {CONTACT_FACTOR}"),
     ]
     legend(figure, [*(Line2D([], [], color=c, label=solver) for solver, c in colours.items()), *marks])
     return figure
@@ -261,8 +263,8 @@ def check_plans(plans: np.ndarray, rows: int) -> None:
 
 
 def _metres(ax: Axes, course: Course) -> None:
-    """A right axis in metres, if all spheres have the same radius."""
-    radii = np.unique(course.inflated_radii[np.isfinite(course.inflated_radii)].round(9))
+    """A right axis in metres, if all obstacles have the same radius."""
+    radii = np.unique(course.reaches.round(9))
     if len(radii) == 1:
         r = float(radii[0])
         there, back = (lambda share: np.asarray(share) * r), (lambda length: np.asarray(length) / r)

@@ -49,6 +49,10 @@ class MultiStart(Solver):
     def __post_init__(self) -> None:
         check_options(self, "multistart")
 
+    def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
+        """The solver itself, and the local solver."""
+        return self, replace(self.local, max_outer_iterations=rounds)
+
     def in_slots(self, slots: int) -> MultiStart:
         """The same solver with at most `slots` problems at a time."""
         return replace(self, local=self.local.in_slots(slots))

@@ -59,6 +59,10 @@ class Restarts(Solver):
 
         return pd.DataFrame(rows_of(self.passes), index=pd.RangeIndex(1, len(self.passes) + 1, name="row"))
 
+    def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
+        """The solver without `finish`, as the next plan continues what a limit cuts off; and the local solver."""
+        return replace(self, finish=None), replace(self.local, max_outer_iterations=rounds)
+
     def in_slots(self, slots: int) -> Restarts:
         """The same solver with at most `slots` problems at a time."""
         return replace(self, local=self.local.in_slots(slots))

@@ -152,6 +152,14 @@ class Solver:
         """The solver with everything built that this batch needs, so that a caller can time the solve alone."""
         return self
 
+    def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
+        """For a planner that solves again and again: what it asks for a new plan, and what continues a former one.
+
+        The first is this solver, without what only a last answer is worth. The second improves a plan where it is, in
+        at most `rounds` outer iterations where a solver makes attempts around a local one; else it is the first again.
+        """
+        return self, self
+
     def in_slots(self, slots: int) -> Solver | None:
         """The same solver with at most `slots` problems at a time; None where it takes all of them at once."""
         return None

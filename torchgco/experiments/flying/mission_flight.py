@@ -13,8 +13,9 @@ import torch
 import torchgco
 from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.progress import Bar
+from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
-from torchgco.missions.tables import clearances, ending, mission_row, packed, spheres_of
+from torchgco.missions.tables import clearances, ending, mission_row, packed
 from torchgco.scenarios import Layouts
 
 FEW = 4  # missions in a study, up to which plans are kept and each mission gets figures
@@ -45,14 +46,15 @@ class MissionFlight:
         progress = partial(self._progress, float(problem.dynamics.dt), mission.duration)
         log = mission.fly(problem, seed=setup.seed, ids=ids, report=progress)
         self.bar.update(layouts.count - self.shown)
-        arrays, spheres = log.arrays(self.plans), spheres_of(problem)
+        arrays, contact = log.arrays(self.plans), Contact.among(problem)
+        nearest = np.fmin.reduce(clearances(arrays, log.period, contact), axis=1, initial=np.inf)
         goal, radius = problem.goal.position.numpy(), problem.goal.radius.numpy()  # type: ignore[union-attr]
         rows = []
         for b in range(layouts.count):
             near = float(radius[b]) if mission.goal_radius is None else mission.goal_radius
-            end = ending(arrays, b, log.period, spheres[b], goal[b], near)
-            rows.append({**self._row(b, end.outcome), **_judged(arrays, b, log.period, spheres[b], end)})
-            rows[-1] |= mission_row(arrays, b, log.period, end, mission.planner.airframe)
+            end = ending(arrays, b, log.period, contact, goal[b], near)
+            flown = mission_row(arrays, b, log.period, end, mission.planner.airframe)
+            rows.append({**self._row(b, end.outcome), "clearance_knots": float(nearest[b]), **flown})
         return pd.DataFrame(rows), packed(arrays)
 
     def _row(self, b: int, outcome: Outcome) -> dict[str, Any]:
@@ -74,19 +76,3 @@ class MissionFlight:
         self.bar.set_postfix_str(f"t = {t:.1f} of {duration:g} s{count}", refresh=False)
         self.bar.update(max(0.0, done - self.shown))
         self.shown = max(self.shown, done)
-
-
-def _judged(arrays: Any, b: int, period: float, spheres: Any, end: Any) -> dict[str, Any]:
-    """The study's columns that the log of mission b decides."""
-    knots = clearances(arrays, b, period, spheres)
-    flown = ~np.isnan(arrays["cost"][b])
-    return {
-        "violation": float(arrays["violation"][b][flown].max(initial=0.0)),
-        "clearance": end.clearance,
-        "clearance_knots": float(knots.min(initial=np.inf)),
-        "goal_distance": end.goal_distance,
-        "iterations": int(arrays["iterations"][b][flown].sum()),
-        "outer_iterations": int(flown.sum()),
-        "guided": int((arrays["guided"][b][flown] > 0).sum()),
-        "seconds": float((arrays["planner_seconds"] + arrays["tracker_seconds"])[b][flown].sum()),
-    }

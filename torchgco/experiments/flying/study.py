@@ -41,7 +41,6 @@ from torchgco.experiments.results.records import DONE, JUDGED, TRIALS, Records
 from torchgco.experiments.results.success import sound, with_success
 from torchgco.lagrangian.rollout import open_loop
 from torchgco.missions import Mission
-from torchgco.missions.mission import other_obstacles
 from torchgco.scenarios import Layouts, Task
 
 # From a baseline's name to the whole configuration with that solver.
@@ -173,9 +172,6 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
 def check_mission(mission: Mission, task: Task) -> None:
     dynamics = task.problem.dynamics
     mission.check(dynamics)
-    if others := other_obstacles(task.problem):
-        expected = "one with spheres alone, as missions fly among no other obstacles so far"
-        raise InputError("scenario", expected, f"{task.layouts.name}, which has {others}")
     if mission.duration < dynamics.dt:
         raise InputError("mission.duration", f"at least one control period, {dynamics.dt:g} s", mission.duration)
 

@@ -21,10 +21,11 @@ from torchgco.experiments.results.records import LAYOUTS, MISSION, TRIALS
 from torchgco.experiments.results.runs import read_trials
 from torchgco.experiments.statistics.formats import format_report
 from torchgco.experiments.statistics.mission_tables import mission_lines
-from torchgco.missions.tables import clearances, mission_frame, spheres_of, time_step_frame, unpacked
-from torchgco.obstacles.base import CONTACT_FACTOR
+from torchgco.missions.contact import Contact
+from torchgco.missions.tables import clearances, mission_frame, time_step_frame, unpacked
 from torchgco.plotting import missions as draw
 from torchgco.plotting.animation import mission_animation
+from torchgco.plotting.bodies import bodies
 from torchgco.plotting.course import Course
 from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts
@@ -43,17 +44,16 @@ def mission_table(
     """
     assert setup.mission is not None
     problem = setup.vehicle.task(layouts).problem
-    period, spheres = float(problem.dynamics.dt), spheres_of(problem)
+    period, contact = float(problem.dynamics.dt), Contact.among(problem)
     frames, plans, fine = [], [], []
     for name, rows in zip(solvers, logs, strict=True):
         arrays = unpacked(rows, setup.mission.substeps(period) or 1)
-        distances = [clearances(arrays, b, period, spheres[b]) for b in range(layouts.count)]
-        frame = mission_frame(arrays, layouts.ids.tolist(), period, distances)
+        frame = mission_frame(arrays, layouts.ids.tolist(), period, clearances(arrays, period, contact))
         frame.insert(0, "solver", name)
         frames.append(frame)
         if "plan" in arrays:
             plans.append(arrays["plan"])
-            fine.append(time_step_frame(arrays, layouts.ids.tolist(), period))
+            fine.append(time_step_frame(arrays, layouts.ids.tolist(), period, setup.mission.planner.airframe))
             fine[-1].insert(0, "solver", name)
     if plans:
         steps = pd.concat(fine, ignore_index=True)
@@ -137,9 +137,10 @@ class _Flown:
 def _course(setup: Setup, layouts: Layouts) -> tuple[Course, float]:
     """The obstacles and the goal of one layout, and its control period, s."""
     task = setup.vehicle.task(layouts)
-    centers, contact, velocities = spheres_of(task.problem)[0]
     assert setup.mission is not None
     near = setup.mission.goal_radius
     radius = float(task.goal_radius) if near is None else near
-    course = Course(centers, contact / CONTACT_FACTOR, task.goal[0].numpy(), radius, velocities)
+    held = layouts.vehicle_radius
+    vehicle = setup.vehicle.radius if held is None else held
+    course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle)
     return course, float(task.problem.dynamics.dt)

@@ -37,8 +37,9 @@ from torchgco.experiments.results.records import (
 )
 from torchgco.experiments.results.success import with_success
 from torchgco.judging.judge import frame_columns, judge
+from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
-from torchgco.missions.tables import spheres_of
+from torchgco.missions.tables import step_columns
 from torchgco.scenarios import Layouts, Vehicle
 
 TOLERANCE = 1e-8  # of numbers, relative above 1: other processors and libraries round differently
@@ -211,39 +212,33 @@ def _missions(folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layou
     outcome itself, and what belongs to the end of a flight, can't be confirmed.
     """
     log = _read(folder / MISSION, pd.read_parquet)
+    log["shifted"] = log["source"] == "shifted"
     problem = vehicle.task(layouts).problem
-    spheres = dict(zip(layouts.ids.tolist(), spheres_of(problem), strict=True))
+    contact, period = Contact.among(problem), float(problem.dynamics.dt)
     flights = {key: rows for key, rows in log.groupby(["solver", "mission"], sort=False)}
-    period, rows = float(problem.dynamics.dt), []
+    nearest = {name: _nearest(log[log["solver"] == name], layouts, contact, period) for name in manifest.solvers}
+    rows = []
     for (solver, layout), outcome in held["outcome"].items():
         steps = flights.get((solver, layout), log.iloc[:0])
-        planner, tracker = steps["planner_seconds"].to_numpy(), steps["tracker_seconds"].to_numpy()
         rows.append(
             {
                 "solver": solver, "layout": layout, "status": outcome,
                 "feasible": outcome not in {lost.name for lost in LOST}, "reached": outcome == Outcome.REACHED.name,
-                "violation": steps["violation"].max() if len(steps) else 0.0,
-                "clearance_knots": _nearest(steps, *spheres[layout]), "outer_iterations": len(steps),
-                "guided": int((steps["guided"] > 0).sum()), "seconds": float((planner + tracker).sum()),
-                "missed_deadlines": int((planner + tracker > period).sum()),
-                "shifted_plans": int((steps["source"] == "shifted").sum()),
-                "planner_seconds_median": float(np.median(planner)) if len(steps) else np.nan,
-                "planner_seconds_p99": float(np.quantile(planner, 0.99)) if len(steps) else np.nan,
-                "tracker_seconds_median": float(np.median(tracker)) if len(steps) else np.nan,
-                "tracking_violation": steps["tracking_violation"].max() if len(steps) else 0.0,
+                "clearance_knots": nearest[solver][layout],
+                **step_columns({str(name): column.to_numpy() for name, column in steps.items()}, period),
             }
         )  # fmt: skip
     return pd.DataFrame(rows).set_index(ROW)
 
 
-def _nearest(steps: pd.DataFrame, centers: np.ndarray, contact: np.ndarray, velocities: np.ndarray | None) -> float:
-    """Smallest distance to contact at the starts of the control steps, m; infinite without obstacles."""
-    here = ~np.isnan(contact)
-    if not here.any() or steps.empty:
-        return np.inf
-    at = centers[here] + (0.0 if velocities is None else steps["t"].to_numpy()[:, None, None] * velocities[here])
-    p = steps[["x0", "x1", "x2"]].to_numpy()
-    return float((np.sqrt(((p[:, None] - at) ** 2).sum(-1)) - contact[here]).min())
+def _nearest(log: pd.DataFrame, layouts: Layouts, contact: Contact, period: float) -> dict[int, float]:
+    """Smallest distance to contact at the starts of each mission's control steps, m, by layout; infinite without."""
+    ids = layouts.ids.tolist()
+    p = np.full((len(ids), 1 + log["step"].max() if len(log) else 0, 3), np.nan)
+    p[log["mission"].map(ids.index).to_numpy(dtype=int), log["step"]] = log[["x0", "x1", "x2"]]
+    found = contact.distances(torch.from_numpy(p), period).numpy()
+    nearest = np.fmin.reduce(np.where(np.isnan(p[..., 0]), np.inf, found), axis=1, initial=np.inf)
+    return dict(zip(ids, nearest.tolist(), strict=True))
 
 
 def _differences(held: pd.DataFrame, computed: pd.DataFrame) -> pd.DataFrame:
