@@ -12,6 +12,7 @@ from tests.reference import models
 from tests.reference.problem import ReferenceProblem
 from torchgco import (
     GCO,
+    AugmentedLagrangian,
     Boxes,
     ControlBounds,
     PathProposals,
@@ -98,8 +99,11 @@ def boxed_batch(
     return Problem(plain.dynamics, plain.cost, parts, plain.x0, N), U
 
 
-def quick_gco(problem: Problem) -> Restarts:
-    """The default solver with few paths, offsets and samples: it solves in tenths of a second."""
+def quick_gco(problem: Problem, local: AugmentedLagrangian | None = None) -> Restarts:
+    """The default solver with few paths, offsets and samples: it solves in tenths of a second.
+
+    local  makes the solves instead of the preset's, with the same guidance
+    """
     solver = presets.gco(problem)
     usual = next(one for one in solver.passes if isinstance(one, PathProposals))
 
@@ -115,7 +119,7 @@ def quick_gco(problem: Problem) -> Restarts:
     assert isinstance(guidance, GCO)
     guidance = replace(guidance, sampler=replace(guidance.sampler, samples=48, rounds=4))
     passes = tuple(quick(one) if isinstance(one, PathProposals) else one for one in solver.passes)
-    return replace(solver, local=replace(solver.local, guidance=guidance), passes=passes)
+    return replace(solver, local=replace(local or solver.local, guidance=guidance), passes=passes)
 
 
 def random_trajectory(problem: Problem, seed: int = 0, spread: float = 0.3) -> tuple[Tensor, Tensor]:

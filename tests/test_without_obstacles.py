@@ -13,6 +13,7 @@ import torch
 
 import torchgco
 from tests.problems import planar_batch, quick_gco
+from tests.search.rows import proposed
 from torchgco import (
     ControlBounds,
     FunctionConstraint,
@@ -27,7 +28,7 @@ from torchgco import (
     judge,
 )
 from torchgco.experiments import app
-from torchgco.search import MultiStart, PathProposals
+from torchgco.search import MultiStart, PathProposals, Refine
 
 GOAL = torch.tensor([1.0, 0.4], dtype=torch.float64)
 BOUNDS = ControlBounds([-10, -10], [10, 10])
@@ -46,7 +47,7 @@ GUIDED = quick_gco(planar_batch()[0])
 POLISH = Polish(iterations=2)
 SOLVERS = {
     "gco": GUIDED,
-    "multistart": MultiStart(replace(GUIDED.local, max_outer_iterations=2), starts=2),
+    "multistart": MultiStart(replace(GUIDED.local, guidance=None, max_outer_iterations=2), starts=2),
     "mppi": IteratedMPPI(iterations=2),
     "hold": Hold(),
 }
@@ -87,7 +88,7 @@ def test_polish_needs_no_constraint() -> None:
 @pytest.mark.parametrize("kind", ["shared", "absent", "geometric"])
 def test_no_path_is_proposed(kind: str) -> None:
     problem, _ = planar(EMPTY[kind], BOUNDS)
-    assert not bool(PathProposals().propose(problem).found.any())
+    assert not bool(proposed(PathProposals(), problem).found.any())
 
 
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # 0.1 s between knots is long
@@ -96,7 +97,7 @@ def test_empty_spheres_next_to_others_are_as_good_as_none() -> None:
     more = Problem(problem.dynamics, problem.cost, [EMPTY["shared"], *problem.constraints], problem.x0, problem.N)
     expected, got = (torchgco.solve(p, U0, GUIDED) for p in (problem, more))
     assert int(expected.guided.sum()) > 0 and torch.equal(got.U, expected.U)
-    alone, with_empty = (PathProposals(refine_top=2).propose(p) for p in (problem, more))
+    alone, with_empty = (proposed(PathProposals(refine=Refine(top=2)), p) for p in (problem, more))
     assert torch.equal(alone.found, with_empty.found) and torch.equal(alone.U, with_empty.U)
 
 

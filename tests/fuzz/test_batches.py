@@ -23,7 +23,7 @@ SOLVERS = {
     "al_ilqr": lambda problem: LOCAL,
     "ilqr": lambda problem: ILQR(max_iterations=12),
     "guided": lambda problem: replace(LOCAL, guidance=GCO(MPPI(samples=16))),
-    "gco": lambda problem: replace(quick_gco(problem), local=LOCAL),
+    "gco": lambda problem: quick_gco(problem, LOCAL),
     "multistart": lambda problem: MultiStart(LOCAL, starts=3),
     "mppi": lambda problem: IteratedMPPI(MPPI(samples=16), iterations=3),
 }

@@ -1,7 +1,6 @@
 """A time limit of a solve: passes and attempts stop, every problem keeps a trajectory and a status."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import count
 from types import SimpleNamespace
 
@@ -17,7 +16,7 @@ from torchgco.solvers.contracts import Solver
 LOCAL = AugmentedLagrangian(ILQR(max_iterations=2), initial_penalty=0.1, max_outer_iterations=8)
 SOLVERS: dict[str, Callable[[Problem], Solver]] = {
     "al_ilqr": lambda problem: LOCAL,
-    "restarts": lambda problem: replace(quick_gco(problem), local=LOCAL),
+    "restarts": lambda problem: quick_gco(problem, LOCAL),
     "multistart": lambda problem: MultiStart(LOCAL, starts=4),
 }
 # How a solve may end that the time limit has cut short.

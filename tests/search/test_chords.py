@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -23,7 +25,7 @@ from torchgco import (
 from torchgco.base.kernels import use_native
 from torchgco.lagrangian.quality import chord_clearance
 from torchgco.native.dispatch import open_loop
-from torchgco.search import restarts
+from torchgco.search import ClearChords
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 
@@ -49,16 +51,17 @@ def corners(B: int = 8) -> Problem:
     return planar([Boxes(centers, half, 0.06, rng.uniform(0, 3.1, (B, 10)))], B, dt=0.05, N=160)
 
 
-def without_clearing(monkeypatch: pytest.MonkeyPatch, problem: Problem) -> Tensor:
-    with monkeypatch.context() as patch:
-        patch.setattr(restarts, "clear_chords", lambda *_: None)
-        return solve(problem).U
+def without_clearing(problem: Problem) -> Tensor:
+    whole = presets.gco(problem)
+    *before, last = whole.passes
+    assert isinstance(last, ClearChords)
+    return solve(problem, solver=replace(whole, passes=tuple(before))).U
 
 
 @pytest.mark.parametrize("make", [coarse_disc, corners])
-def test_chords_are_cleared_and_nothing_else_changes(make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chords_are_cleared_and_nothing_else_changes(make) -> None:
     problem = make()
-    before = without_clearing(monkeypatch, problem)
+    before = without_clearing(problem)
     solution = solve(problem)
     old, new = judge(problem, before), judge(problem, solution.U)
     cut = old.feasible & (old.clearance < 0)
@@ -73,12 +76,12 @@ def test_a_coarse_disc_is_cleared_for_every_start() -> None:
     assert bool(judge(problem, solve(problem).U).sound.all())
 
 
-def test_growth_counts_from_the_clearance_that_the_last_solve_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_growth_counts_from_the_clearance_that_the_last_solve_missed() -> None:
     """In this maze the first growth, by what the solve missed, leads to a deeper cut than before."""
     setup = compose(["scenario=mazes", "scenario.walls=4", "seed=99"])
     task = setup.task(setup.layouts(27))
     problem = task.problem.take(torch.tensor([26]))
-    old = judge(problem, without_clearing(monkeypatch, problem))
+    old = judge(problem, without_clearing(problem))
     assert bool(old.feasible) and bool(old.clearance < 0)
     assert bool(judge(problem, solve(problem).U).sound.all())
 

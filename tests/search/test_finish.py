@@ -18,12 +18,14 @@ from torchgco import (
     FunctionCost,
     FunctionDynamics,
     Problem,
+    Restarts,
     Solution,
     StateBounds,
     Status,
     presets,
 )
 from torchgco.base import kernels
+from torchgco.search import Finish
 
 D, INF = torch.float64, math.inf
 LIMITS = torch.tensor([0.08, 0.12, 0.16], dtype=D)  # of Bryson and Denham's problem
@@ -75,6 +77,14 @@ def brachistochrone() -> Problem:
     return Problem(FunctionDynamics(step, 3, 2, 0.02, "none"), cost, [end], torch.zeros(1, 3, dtype=D), 50)
 
 
+def unfinished(problem: Problem) -> Restarts:
+    """The default solver without the row that finishes."""
+    whole = presets.gco(problem)
+    passes = tuple(one for one in whole.passes if not isinstance(one, Finish))
+    assert len(passes) == len(whole.passes) - 1
+    return replace(whole, passes=passes)
+
+
 def feasible(problem: Problem, solution: Solution) -> bool:
     X = torchgco.lagrangian.rollout.open_loop(problem.dynamics, problem.x0, solution.U)
     return all(float(part.worst(X, solution.U).max()) <= 1e-3 for part in problem.constraints)
@@ -83,8 +93,7 @@ def feasible(problem: Problem, solution: Solution) -> bool:
 @pytest.mark.parametrize("make", [bryson_denham, parking, brachistochrone])
 def test_what_a_limit_cut_off_is_finished(make) -> None:
     problem = make()
-    whole = presets.gco(problem)
-    cut = torchgco.solve(problem, solver=replace(whole, finish=None))
+    cut = torchgco.solve(problem, solver=unfinished(problem))
     done = torchgco.solve(problem)
     assert not feasible(problem, cut) and feasible(problem, done)
     assert set(done.statuses) <= {Status.CONVERGED, Status.FEASIBLE} and Status.INFEASIBLE not in cut.statuses
@@ -100,9 +109,7 @@ def test_the_known_optimum_is_found() -> None:
 def test_solves_that_ended_before_are_left_as_they_are() -> None:
     model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), dim=-1), 2, 1, 0.05, "rk4")
     problem = Problem(model, effort(0.05, 1.0), [ends_at(1.0, 0.0)], torch.zeros(2, 2, dtype=D), 40)
-    with_it, without = (torchgco.solve(problem, solver=s) for s in (
-        presets.gco(problem), replace(presets.gco(problem), finish=None),
-    ))  # fmt: skip
+    with_it, without = (torchgco.solve(problem, solver=s) for s in (presets.gco(problem), unfinished(problem)))
     assert without.statuses == [Status.CONVERGED] * 2
     assert torch.equal(with_it.U, without.U) and torch.equal(with_it.iterations, without.iterations)
 

@@ -1,20 +1,21 @@
 """Where a first pass isn't enough: more paths for costly proposals, and samples only where a whole solve fails."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from tests.search.rows import proposed, varied
 from torchgco import PathProposals, Problem, Restarts, Status, compose, presets
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.rollout import open_loop
-from torchgco.search.paths import Proposal
-from torchgco.search.restarts import StopWhenCaught
-from torchgco.search.settings import MORE
+from torchgco.search import Follow
+from torchgco.search.following import Paths, followed
+from torchgco.search.passes import StopWhenCaught
+from torchgco.search.proposals import Proposal, propose
 from torchgco.search.suitability import has_paths
-from torchgco.search.tracking import followed
-from torchgco.search.ways import Ways
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR, descend
 
@@ -28,25 +29,26 @@ def woods() -> Problem:
     return setup.task(setup.layouts(LAYOUTS)).problem
 
 
-@pytest.fixture(scope="module")
-def options() -> PathProposals:
-    paths = presets.gco(3).paths
-    assert paths is not None
-    return replace(paths, num_paths=3)
+ROWS = [one for one in presets.gco(3).passes if isinstance(one, PathProposals)]
+FIRST, COSTLY, CLOSER = (replace(one, num_paths=one.num_paths // 2) for one in ROWS[:3])
 
 
-def proposed(options: PathProposals, problem: Problem, monkeypatch) -> tuple[Proposal, list[tuple[int, int, bool]]]:
-    """The proposals, and of every pass along paths the numbers of paths and of problems, and whether it is closer."""
-    passes, along = [], PathProposals._along
+def costly(gap: float) -> list[PathProposals]:
+    """The rows of the first round, where a proposal may cost this much more than without constraints, as a share."""
+    return [FIRST, replace(COSTLY, max_gap=gap), CLOSER]
 
-    def noted(self: PathProposals, problem: Problem, rest: Tensor, ways: Ways, *words) -> Proposal:
-        passes.append((ways.paths.shape[1], problem.B, self.smoothing < options.smoothing))
-        return along(self, problem, rest, ways, *words)
 
-    monkeypatch.setattr(PathProposals, "_along", noted)
-    found = options.propose(problem)
-    monkeypatch.setattr(PathProposals, "_along", along)
-    return found, passes
+def noted(passes: Sequence[PathProposals], problem: Problem) -> tuple[Proposal, list[tuple[int, int, bool]]]:
+    """The proposals, and of each time that paths were followed, of how many paths and problems, and whether closer."""
+    times, along = [], PathProposals._along
+
+    def note(self: PathProposals, problem: Problem, rest: Tensor, paths: Paths, follow: Follow, *words) -> Proposal:
+        times.append((paths.corners.shape[1], problem.B, follow.smoothing < FIRST.follow[0].smoothing))
+        return along(self, problem, rest, paths, follow, *words)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PathProposals, "_along", note)
+        return propose(passes, problem), times
 
 
 def gaps(problem: Problem, U: Tensor) -> Tensor:
@@ -57,14 +59,14 @@ def gaps(problem: Problem, U: Tensor) -> Tensor:
     return problem.cost.total(open_loop(problem.dynamics, problem.x0, U), U) / free.cost - 1
 
 
-def test_costly_proposals_are_compared_with_those_along_more_paths(woods, options, monkeypatch) -> None:
-    once, passes = proposed(replace(options, max_gap=None), woods, monkeypatch)
-    assert passes == [(options.num_paths, LAYOUTS, False)] and bool(once.found.all())
+def test_costly_proposals_are_compared_with_those_along_more_paths(woods) -> None:
+    once, times = noted([FIRST, replace(CLOSER, refine=FIRST.refine)], woods)
+    assert times == [(3, LAYOUTS, False)] and bool(once.found.all())
     gap = gaps(woods, once.U)
     limit = float(gap.sort().values[1:3].mean())  # two of four problems cost more
-    twice, passes = proposed(replace(options, max_gap=limit), woods, monkeypatch)
-    both = 2 * MORE * options.num_paths  # paths of two searches
-    assert passes == [(options.num_paths, LAYOUTS, False), (both, 2, False), (both, 2, True)]
+    twice, times = noted(costly(limit), woods)
+    both = 2 * 6  # paths of two searches
+    assert times == [(3, LAYOUTS, False), (both, 2, False), (both, 2, True)]
     cheap = gap <= limit
     assert torch.equal(twice.U[cheap], once.U[cheap]) and bool((twice.U[~cheap] != once.U[~cheap]).any())
     assert bool((twice.iterations[~cheap] > once.iterations[~cheap] + 50).all())
@@ -72,33 +74,33 @@ def test_costly_proposals_are_compared_with_those_along_more_paths(woods, option
     assert bool((gaps(woods, twice.U) < gap + 0.05).all())
 
 
-def test_a_candidate_that_is_too_deep_counts_where_refining_mends_it(woods, options, monkeypatch) -> None:
-    shallow = replace(options, max_gap=100.0, max_penetration=1e-9)
-    some, passes = proposed(shallow, woods, monkeypatch)
-    again = passes[1][1]
-    assert passes == [(3, LAYOUTS, False), (3, again, True)] and again > 0
+def test_a_candidate_that_is_too_deep_counts_where_refining_mends_it(woods) -> None:
+    shallow = replace(FIRST, max_penetration=1e-9)
+    some, times = noted([shallow, CLOSER], woods)
+    again = times[1][1]
+    assert times == [(3, LAYOUTS, False), (3, again, True)] and again > 0
     X = open_loop(woods.dynamics, woods.x0, some.U)
     depth = torch.stack([c.worst(X, some.U) for c in woods.geometric]).amax(0)
     refined = some.cost.isfinite()
     assert bool(refined.any()) and torch.equal(refined, some.found) and bool((depth[refined] < 1e-2 + 1e-9).all())
     torch.testing.assert_close(woods.cost.total(X, some.U)[refined], some.cost[refined])
-    few, _ = proposed(replace(shallow, max_gap=None), woods, monkeypatch)  # nothing is refined
+    few, _ = noted([shallow, replace(CLOSER, refine=FIRST.refine, max_penetration=1e-9)], woods)  # nothing is refined
     assert bool((some.found & ~few.found).any())
 
 
-def test_a_proposal_within_the_gap_keeps_its_bits(woods, options, monkeypatch) -> None:
-    once, _ = proposed(replace(options, max_gap=None), woods, monkeypatch)
-    same, passes = proposed(replace(options, max_gap=100.0), woods, monkeypatch)
-    assert torch.equal(once.U, same.U) and len(passes) == 1
+def test_a_proposal_within_the_gap_keeps_its_bits(woods) -> None:
+    once, _ = noted([FIRST, CLOSER], woods)
+    same, times = noted(costly(100.0), woods)
+    assert torch.equal(once.U, same.U) and len(times) == 1
 
 
-def test_no_path_is_followed_more_slowly_than_the_pace(woods, options, monkeypatch) -> None:
+def test_no_path_is_followed_more_slowly_than_the_pace(woods, monkeypatch) -> None:
     """The time without constraints, measured here as it is defined, times the stretch of each path, is the limit."""
     seen, first = [], []
-    monkeypatch.setattr("torchgco.search.paths.followed", lambda *words: seen.append(words) or followed(*words))
+    monkeypatch.setattr("torchgco.search.following.followed", lambda *words: seen.append(words) or followed(*words))
     for pace in (None, 1.2, 0.9):
         seen.clear()
-        replace(options, pace=pace, max_gap=None, arrive=0.9).propose(woods)
+        proposed(varied(FIRST, pace=pace, arrive=0.9), woods)
         first.append(seen[0])
     (path, _, slow, *_), (_, _, limited, *_), (_, _, fast, *_) = first
     assert bool((slow == 0.9).all())
@@ -109,23 +111,23 @@ def test_no_path_is_followed_more_slowly_than_the_pace(woods, options, monkeypat
     share = (left > 0.1 * left[:, :1]).sum(-1).double() / woods.N
     stretch = path.diff(dim=1).norm(dim=-1).sum(-1) / (path[:, 0] - path[:, -1]).norm(dim=-1)
     for found, pace in ((limited, 1.2), (fast, 0.9)):
-        expected = torch.minimum(slow, pace * share.repeat_interleave(options.num_paths) * stretch)
+        expected = torch.minimum(slow, pace * share.repeat_interleave(FIRST.num_paths) * stretch)
         torch.testing.assert_close(found, expected, atol=1.5 / woods.N, rtol=0)
     assert bool((fast < limited).all())
 
 
-def test_costly_problems_in_small_parts_keep_their_bits(woods, options, monkeypatch) -> None:
-    whole, passes = proposed(replace(options, max_gap=1e-9), woods, monkeypatch)
-    monkeypatch.setattr("torchgco.search.paths.MOST", 2 * options.num_paths)
-    parts, more = proposed(replace(options, max_gap=1e-9), woods, monkeypatch)
-    assert [size for _, size, _ in passes] == [4, 4, 4] and [size for _, size, _ in more] == [2, 1, 1, 1, 1] * 2
+def test_costly_problems_in_small_parts_keep_their_bits(woods, monkeypatch) -> None:
+    whole, times = noted(costly(1e-9), woods)
+    monkeypatch.setattr("torchgco.search.proposals.AT_ONCE", 2 * FIRST.num_paths)
+    parts, more = noted(costly(1e-9), woods)
+    assert [size for _, size, _ in times] == [4, 4, 4] and [size for _, size, _ in more] == [2, 2, *[1] * 8]
     assert torch.equal(parts.U, whole.U) and torch.equal(parts.iterations, whole.iterations)
 
 
-def test_the_gap_depends_on_no_other_problem(woods, options) -> None:
-    whole = replace(options, max_gap=0.15).propose(woods)
+def test_the_gap_depends_on_no_other_problem(woods) -> None:
+    whole = propose(costly(0.15), woods)
     index = torch.tensor([2, 0])
-    part = replace(options, max_gap=0.15).propose(woods.take(index))
+    part = propose(costly(0.15), woods.take(index))
     assert torch.equal(part.U, whole.U[index]) and torch.equal(part.iterations, whole.iterations[index])
 
 
@@ -138,16 +140,17 @@ def test_among_moving_obstacles_the_first_solve_runs_to_its_end(monkeypatch) -> 
     solver = presets.gco(3)
     assert not has_paths(problem) and isinstance(solver, Restarts)
     local = replace(solver.local, max_outer_iterations=10)  # too few for some
+    unguided = replace(local, guidance=None)
     guides, iterate = [], AugmentedLagrangian.iterate
 
-    def noted(self, call, guidance=None, *words, **more):
+    def note(self, call, guidance=None, *words, **more):
         guides.append((type(guidance), call.problem.B))
         return iterate(self, call, guidance, *words, **more)
 
-    monkeypatch.setattr(AugmentedLagrangian, "iterate", noted)
-    alone = local.solve(problem, U0)
+    monkeypatch.setattr(AugmentedLagrangian, "iterate", note)
+    alone = unguided.solve(problem, U0)
     guides.clear()
-    found = replace(solver, local=local, attempts=1).solve(problem, U0)
+    found = replace(solver, local=local).solve(problem, U0)
     arrived = (alone.violation <= local.violation_tolerance) & (
         (alone.X[:, -1, :3] - task.goal).norm(dim=-1) < task.goal_radius
     )
@@ -163,9 +166,9 @@ def test_a_converged_solve_is_enough_where_the_goal_is_assumed() -> None:
     problem = setup.task(setup.layouts(2)).problem
     given, assumed = problem, replace(problem, goal=None)
     assert assumed.goal is not None and assumed.goal.assumed
-    solver = replace(presets.gco(3), attempts=1)
+    solver = presets.gco(3)
     U0 = problem.cost.rest_controls(torch.zeros(2, problem.N, problem.m, dtype=torch.float64))
-    alone = solver.local.solve(assumed, U0)
+    alone = replace(solver.local, guidance=None).solve(assumed, U0)
     assert alone.statuses == [Status.CONVERGED] * 2 and float(assumed.goal.distance(alone.X[:, -1, :3]).min()) > 2
     assert torch.equal(solver.solve(assumed, U0).iterations, alone.iterations)
     assert bool((solver.solve(given, U0).iterations > alone.iterations).all())

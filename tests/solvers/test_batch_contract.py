@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.problems import FIELDS, assert_same_bits, boxed_batch, planar_batch, quadrotor_batch
+from tests.search.rows import restarts
 from torchgco import (
     GCO,
     ILQR,
@@ -14,13 +15,13 @@ from torchgco import (
     Problem,
     QuadraticCost,
     QuadrotorPlanning,
-    Restarts,
     Spheres,
 )
 from torchgco.base.status import Status
 from torchgco.baselines import IteratedMPPI
 from torchgco.constraints import ControlBounds
 from torchgco.missions.constraints import FirstStepRates
+from torchgco.search import Follow, Refine
 from torchgco.solution import Solution
 
 SAMPLER = MPPI(samples=20)
@@ -36,12 +37,17 @@ SOLVERS = {
         guidance=GCO(sampler=SAMPLER),
         max_outer_iterations=4,
     ),
-    "restarts": Restarts(
-        local=AugmentedLagrangian(ILQR(max_iterations=6), initial_penalty=0.1, max_outer_iterations=5),
-        paths=PathProposals(
-            num_paths=3, relax_top=2, refine_top=2, track_iterations=4, relax_iterations=3, max_penetration=9.0
+    "restarts": restarts(
+        AugmentedLagrangian(ILQR(max_iterations=6), initial_penalty=0.1, max_outer_iterations=5),
+        PathProposals(
+            num_paths=3,
+            relax_top=2,
+            follow=(Follow(iterations=4),),
+            relax_iterations=3,
+            refine=Refine(top=2),
+            max_penetration=9.0,
         ),
-        sampling=GCO(
+        GCO(
             sampler=MPPI(samples=40, covariance=4.0, rounds=3, noise_knots=5, decay=0.8, elite=3, dwell_cost=1.0),
             start_from_sample=True,
             single_contact_after=2,

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from tests.problems import planar_batch, quadrotor_batch, quick_gco
-from torchgco import ILQR, MPPI, AugmentedLagrangian, MultiStart, Polish, Problem, Restarts
+from tests.search.rows import varied
+from torchgco import ILQR, MPPI, AugmentedLagrangian, MultiStart, PathProposals, Polish, Problem, Restarts
 from torchgco.solvers import augmented_lagrangian, ilqr
 
 BATCHES = {
@@ -18,15 +19,16 @@ BATCHES = {
 def guided(problem: Problem, record: bool = False) -> Restarts:
     """`gco` with few samples and few candidates, which are tracked, relaxed and refined."""
     solver = quick_gco(problem)
-    local = replace(solver.local, max_outer_iterations=4, record=record)
-    paths = replace(solver.paths, relax_iterations=3, track_iterations=4, max_penetration=9.0)
-    sampling = replace(solver.sampling, sampler=MPPI(samples=16))
-    return replace(solver, local=local, paths=paths, sampling=sampling, attempts=2)
+    guidance = replace(solver.local.guidance, sampler=MPPI(samples=16))
+    local = replace(solver.local, guidance=guidance, max_outer_iterations=4, record=record)
+    passes = (varied(row, iterations=4, relax_iterations=3, max_penetration=9.0)
+              if isinstance(row, PathProposals) else row for row in solver.passes)  # fmt: skip
+    return replace(solver, local=local, passes=tuple(passes))
 
 
 SOLVERS = {
     "gco": guided,
-    "multistart": lambda problem: MultiStart(guided(problem).local, starts=2),
+    "multistart": lambda problem: MultiStart(replace(guided(problem).local, guidance=None), starts=2),
 }
 
 

@@ -14,6 +14,7 @@ from torchgco import (
     ControlBounds,
     FunctionConstraint,
     FunctionDynamics,
+    PathProposals,
     Planar,
     Polish,
     Problem,
@@ -189,7 +190,7 @@ def test_solve_hands_the_problem_to_that_solver(monkeypatch) -> None:
 
     def note_call(self, problem, U0, **options):
         calls.append((self, U0, options))
-        return whole(replace(self, attempts=1, paths=None, sampling=None, finish=None), problem, U0, **options)
+        return whole(replace(self, passes=self.passes[:2]), problem, U0, **options)
 
     monkeypatch.setattr(Restarts, "solve", note_call)
     problem, U0 = planar_batch(B=2, N=25)
@@ -206,8 +207,10 @@ def test_offsets_are_for_two_controls() -> None:
         torch.zeros(1, 4, dtype=torch.float64), 10,
     )  # fmt: skip
     solver = presets.gco(problem)
-    suited, lost = suited_paths(solver.paths, problem)
-    assert suited.initial_offsets == () and lost is None
+    suited, lost = suited_paths(solver.passes, problem)
+    given, kept = ([row.follow for row in rows if isinstance(row, PathProposals)] for rows in (solver.passes, suited))
+    assert all(way.initial_offsets != () for ways in given for way in ways) and len(given) == len(kept) > 3
+    assert all(way.initial_offsets == () for ways in kept for way in ways) and lost is None
     assert solve(problem).statuses == [Status.CONVERGED]
 
 
