@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from argparse import ArgumentParser
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import inf, isnan
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from benchmarks.causes.picture import Example, picture, table
-from benchmarks.causes.shortfalls_watch import Search, watching
 from benchmarks.lib import RESULTS
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import WORLDS, Family
@@ -30,16 +29,15 @@ from torchgco import compose, judge, presets
 from torchgco.judging.judge import near_best
 from torchgco.plotting.bodies import Box, bodies
 from torchgco.problem.problem import Problem
-from torchgco.roadmap import scene as seen
 from torchgco.scenarios import Layouts
-from torchgco.search.candidates import TO_THE_END, unwatched
-from torchgco.search.paths import PathProposals
-from torchgco.search.settings import MORE
+from torchgco.search import PathProposals, Refine
+from torchgco.search.proposals import Round
 from torchgco.search.suitability import has_paths
-from torchgco.search.ways import joined
+from torchgco.solution import Comparison, Fate, SearchRecord
 
 PAGE = RESULTS / "shortfalls.md"
-PATHS = MORE * presets.gco(3).paths.num_paths  # of each of the two searches where the best candidate is costly
+COSTLY = next(row for row in presets.gco(3).passes if isinstance(row, PathProposals) and row.when == "costly")
+PATHS = COSTLY.num_paths  # of each of the two searches where the best candidate is costly
 CAUSES = {
     "no solution known": "neither `gco` nor any other search has found a way",
     "another local solution": "moving obstacles, and no paths: waiting, or passing on another side, costs less",
@@ -56,6 +54,27 @@ HEAD = (
     "world", "layout", "cost / best known", "cheapest of all candidates / best known", "first path within 5 %",
     "paths sought", "cause",
 )  # fmt: skip
+
+
+@dataclass
+class Search:
+    """One comparison of candidates, one per path; a search for more paths extends the list of paths."""
+
+    count: int  # paths sought, those of the same homotopy class included
+    relaxed: Sequence[int] = ()
+    compared: Sequence[int] = ()  # the sound ones of those taken
+    chosen: int | None = None  # None: no proposal
+
+    @classmethod
+    def of(cls, record: Comparison) -> Search:
+        """The comparison of a single problem's candidates, from the record of a solve."""
+        (fate,) = record.fate.tolist()
+        assert len(fate) == record.paths.shape[1]  # one start and one pace
+        relaxed, compared, chosen = (
+            [path for path, one in enumerate(fate) if one >= least]
+            for least in (Fate.UNSOUND, Fate.FAILED, Fate.PROPOSED)
+        )
+        return cls(len(fate), relaxed, compared, chosen[0] if chosen else None)
 
 
 def cause(best: float, sound: bool, costs: Sequence[float], searches: Sequence[Search]) -> str:
@@ -99,27 +118,22 @@ def _fate(path: int, searches: Sequence[Search]) -> str:
     return FATES[1] if any(path in search.relaxed for search in last) else FATES[0]
 
 
-def refined(paths: PathProposals, problem: Problem, count: int = PATHS) -> tuple[list[float], dict[int, Tensor]]:
+def refined(problem: Problem, count: int = PATHS) -> tuple[list[float], dict[int, Tensor]]:
     """Costs of the cheaper candidate, followed loosely or closer, along each of `count` paths of each search.
 
     All are refined to the end; the cost is infinite where neither has a good end. Also returns the states (N+1, n) of
     the others by the number of their path.
     """
-    every = replace(paths.roughly(), num_paths=count, relax_top=None, refine_top=2 * count, max_gap=None)
-    scaled = problem.in_cost_units()
-    rest = problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m))
-    scene = seen.scene_of(scaled, rest)
-    assert scene is not None
-    ways = joined(every._ways(scaled, rest, scene), every.among_more_points()._ways(scaled, rest, scene))
-    with watching() as searches:
-        for proposals in (every, every.closer()):
-            proposals._along(scaled, rest, ways, unwatched, TO_THE_END)
+    every = replace(COSTLY, when="caught", num_paths=count, relax_top=None, refine=Refine(top=2 * count), max_gap=None)
+    record = SearchRecord(passes=[(1, "PathProposals", [])])
+    Round(problem, every.at_once, record=record).improve(every)
+    unit, constant = float(problem.cost_unit), float(problem.cost_scale.constant)
     costs, ends = [inf] * (2 * count), {}
-    for search in searches:
-        for path, (X, U) in search.ends.items():
-            cost = float(problem.cost.total(X[None], U[None]))
+    for one in record.comparisons:
+        for path in one.cost[0].isfinite().nonzero().flatten().tolist():
+            cost = unit * float(one.cost[0, path]) + constant
             if cost < costs[path]:
-                costs[path], ends[path] = cost, X
+                costs[path], ends[path] = cost, one.refined[0, path]
     return costs, ends
 
 
@@ -157,9 +171,11 @@ def study(
     """
     assert layouts.best_cost is not None
     best, part = float(layouts.best_cost[i]), task.problem.take(torch.tensor([i]))
-    with watching() as searches:
-        solution = solver.solve(part, task.U0[i : i + 1], seed=seed, ids=torch.tensor([i]))
-    costs, ends = refined(solver.paths, part, count) if has_paths(part) else ([], {})
+    recording = replace(solver, local=replace(solver.local, record=True))
+    solution = recording.solve(part, task.U0[i : i + 1], seed=seed, ids=torch.tensor([i]))
+    assert solution.search is not None
+    searches = [Search.of(one) for one in solution.search.comparisons]
+    costs, ends = refined(part, count) if has_paths(part) else ([], {})
     name = cause(best, cost < inf, costs, searches)
     good, cheapest, at = within(best, costs), min(costs, default=inf), part.position
     found = {

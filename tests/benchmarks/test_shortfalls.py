@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
 
@@ -10,14 +11,10 @@ import pytest
 import torch
 
 from benchmarks.causes import shortfalls
-from benchmarks.causes.shortfalls import CAUSES, cause, listed, refined, study, write
-from benchmarks.causes.shortfalls_watch import Search, watching
+from benchmarks.causes.shortfalls import CAUSES, Search, cause, listed, refined, study, write
 from benchmarks.lib.families import WORLDS
 from torchgco import compose
 from torchgco.judging.judge import box_clearance
-from torchgco.roadmap.scene import scene_of
-from torchgco.search.candidates import Candidates
-from torchgco.search.paths import PathProposals
 
 FEW = Search(3, relaxed=[2, 0], compared=[2], chosen=2)
 MORE = Search(6, relaxed=[2, 4, 0, 1], compared=[4, 2], chosen=4)
@@ -59,27 +56,24 @@ def maze():
     return setup.solver, layouts, setup.task(layouts), 14
 
 
-def test_the_watch_changes_nothing_and_numbers_the_paths(maze) -> None:
+def test_the_record_of_a_solve_numbers_the_paths(maze) -> None:
     solver, _, task, i = maze
     problem, U0, ids = task.problem.take(torch.tensor([i])), task.U0[i : i + 1], torch.tensor([i])
-    methods = PathProposals._along, Candidates.pick, Candidates.refined
-    with watching() as searches:
-        watched = solver.solve(problem, U0, ids=ids)
-    assert (PathProposals._along, Candidates.pick, Candidates.refined) == methods
-    assert torch.equal(watched.U, solver.solve(problem, U0, ids=ids).U)
+    solution = replace(solver, local=replace(solver.local, record=True)).solve(problem, U0, ids=ids)
+    searches = [Search.of(one) for one in solution.search.comparisons]
     assert searches[0].count == 6 and len(searches[0].relaxed) == 3 and len(searches[0].compared) <= 1
     for search in searches:
         assert set(search.compared) <= set(search.relaxed) <= set(range(search.count))
         assert search.chosen is None or search.chosen in search.compared
-    scene = scene_of(problem, problem.cost.rest_controls(U0))
-    few, more = (solver.paths.roadmap.paths(scene, count)[0] for count in (6, 8))
-    assert torch.equal(few, more[:, :6])
+    # A search for more paths extends the list.
+    few, more = (one.paths[0] for one in solution.search.comparisons[:2])
+    assert len(searches) > 1 and torch.equal(few, more[:6])
 
 
 def test_candidates_are_refined_to_their_costs(maze) -> None:
-    solver, _, task, i = maze
+    _, _, task, i = maze
     problem = task.problem.take(torch.tensor([i]))
-    costs, ends = refined(solver.paths, problem, 3)
+    costs, ends = refined(problem, 3)
     assert len(costs) == 6 and {path for path, cost in enumerate(costs) if cost < inf} == set(ends) != set()
     for X in ends.values():
         assert problem.goal.distance(X[None, -1, problem.position]) < 5  # m, of 21

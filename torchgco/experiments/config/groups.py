@@ -139,9 +139,9 @@ def _joined(plane: Any, space: Any) -> Any:
     """One tree for both: equal values as they are, others as interpolations."""
     if isinstance(plane, dict) and isinstance(space, dict) and list(plane) == list(space):
         return {key: _joined(plane[key], space[key]) for key in plane}
-    if isinstance(plane, list) and isinstance(space, list) and len(plane) == len(space):
-        if all(isinstance(item, dict) for item in plane):  # rows of a table: each option can be changed by itself
-            return [_joined(a, b) for a, b in zip(plane, space, strict=True)]
+    rows = isinstance(plane, list) and isinstance(space, list) and len(plane) == len(space)
+    if rows and all(isinstance(item, dict) for item in plane):  # a table's rows: each option can be changed by itself
+        return [_joined(a, b) for a, b in zip(plane, space, strict=True)]
     if plane == space:
         return plane
     return f"${{{BY_DIMENSION}:${{model.dimension}},{_literal(plane)},{_literal(space)}}}"
