@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
 import pytest
 import torch
 
 import torchgco
 from tests.problems import planar_batch
-from torchgco import InputError, Problem, QuadraticCost, presets, solve
+from torchgco import InputError, Problem, QuadraticCost, judge, presets, solve
 from torchgco.presets import PRESETS
 
 MODELS = {"planar": (2, "planar_trap"), "quadrotor": (3, "forest"), "unicycle": (2, "yard")}
@@ -32,12 +35,68 @@ def test_solve_gives_the_bits_of_the_configuration_gco(model: str) -> None:
 
 
 def test_an_option_on_the_command_line_changes_that_option_alone() -> None:
-    setup = torchgco.compose(["solver.paths.num_paths=3", "solver.local.inner.max_iterations=7"])
+    setup = torchgco.compose(["solver.passes.2.num_paths=3", "solver.local.inner.max_iterations=7"])
     solver = presets.gco(3)
-    assert setup.solver.paths.num_paths == 3 and setup.solver.paths.roadmap == solver.paths.roadmap
-    assert setup.solver.local.inner.max_iterations == 7 and setup.solver.sampling == solver.sampling
-    with pytest.raises(InputError, match="num_path"):
-        torchgco.compose(["solver.paths.num_path=3"])
+    inner = replace(solver.local.inner, max_iterations=7)
+    assert setup.solver.local == replace(solver.local, inner=inner)
+    assert setup.solver.passes[2] == replace(solver.passes[2], num_paths=3) != solver.passes[2]
+    assert setup.solver.passes[:2] == solver.passes[:2] and setup.solver.passes[3:] == solver.passes[3:]
+    with pytest.raises(InputError, match=r"^solver\.passes\[2\]\.num_path: .*such as num_paths"):
+        torchgco.compose(["solver.passes.2.num_path=3"])
+
+
+def changed(value: Any, place: str, words: list[str]) -> Any:
+    """The rows, with another value for every number in them; `words` collects the overrides that lead there."""
+    if is_dataclass(value):
+        names = [field.name for field in fields(value)]
+        return replace(value, **{name: changed(getattr(value, name), f"{place}.{name}", words) for name in names})
+    if isinstance(value, tuple) and any(map(is_dataclass, value)):
+        return tuple(changed(item, f"{place}.{number}", words) for number, item in enumerate(value))
+    new = other(value)
+    if new != value:
+        words.append(f"{place}={listed(new)}")
+    return new
+
+
+def other(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(other, value))
+    if type(value) is int:
+        return value + 1 if value > 1 else value
+    return (0.9 * value or 0.05) if type(value) is float else value
+
+
+def listed(value: Any) -> str:
+    return f"[{','.join(map(listed, value))}]" if isinstance(value, tuple) else str(value)
+
+
+@pytest.mark.parametrize("model", ["planar", "quadrotor"])
+def test_every_number_of_a_row_changes_by_the_index_of_its_row(model: str) -> None:
+    space, scenario = MODELS[model]
+    words: list[str] = []
+    passes = changed(presets.gco(space).passes, "solver.passes", words)
+    setup = torchgco.compose([f"model={model}", f"scenario={scenario}", *words])
+    assert setup.solver == replace(presets.gco(space), passes=passes)
+    assert len(words) > 60 and any(".follow.1.stiffness=[" in word for word in words)
+
+
+@pytest.mark.slow
+def test_more_effort_costs_no_more() -> None:
+    """`gco_max` makes the passes of `gco`, then more: its results arrive wherever those do, and cost no more."""
+    for words in (["scenario=woods"], ["scenario=mazes"], ["model=planar", "scenario=planar_random"]):
+        setup = torchgco.compose([*words, "seed=7"])
+        problem = setup.task(setup.layouts(3)).problem
+        usual, more = (judge(problem, solve(problem, solver=name).U) for name in ("gco", "gco_max"))
+        assert bool((more.sound | ~usual.sound).all()), words
+        assert bool((more.cost <= usual.cost * (1 + 1e-9))[usual.sound].all()), words
+
+
+def test_the_most_thorough_preset_has_the_rows_of_the_default_and_more() -> None:
+    for space in (2, 3):
+        usual, more = presets.gco(space), presets.gco_max(space)
+        begin, end = usual.passes[:-2], usual.passes[-2:]
+        assert more.local == usual.local and len(more.passes) > len(usual.passes)
+        assert more.passes[: len(begin)] == begin and more.passes[-2:] == end
 
 
 def test_a_problem_without_a_position_gets_the_planar_settings() -> None:

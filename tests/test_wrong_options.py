@@ -48,11 +48,13 @@ CASES: dict[str, list[Callable[[], object]]] = {
     "model": [lambda: compose(["model=5"])],
     "'a=b=c'": [lambda: compose(["a=b=c"])],
     "model.vehicle": [lambda: compose(["model.vehicle=5"])],
-    "solver.attempts": [lambda: compose(["solver.attempts=1.5"])],
+    "samples.redraws": [lambda: compose(["solver.passes.11.redraws=1.5"])],
     "solver.guidance": [
         lambda: compose(["solver=gco_paper", "solver.guidance=5"]), lambda: AugmentedLagrangian(guidance=MPPI),  # type: ignore
     ],
-    "solver.paths": [lambda: compose(["solver.paths=a"]), lambda: GuidedCasADi(paths=None)],  # type: ignore[arg-type]
+    "solver.passes": [
+        lambda: compose(["solver.passes=a"]), lambda: GuidedCasADi(passes=None), lambda: GuidedCasADi(passes=()),  # type: ignore
+    ],
     "solver.options": [lambda: CasADiSolver(options=5)],  # type: ignore[arg-type]
     "solver.sampler": [lambda: IteratedMPPI(sampler=5)],  # type: ignore[arg-type]
     "solver.violation_tolerance": [lambda: Hold("a")],  # type: ignore[arg-type]

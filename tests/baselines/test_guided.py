@@ -6,15 +6,22 @@ import pytest
 import torch
 
 from tests.problems import planar_batch
+from tests.search.rows import rounds, varied
 from torchgco import ControlBounds, InputError, Problem, Status, judge
 from torchgco.baselines import CasADiSolver, GuidedCasADi
 from torchgco.experiments.config.build import compose
 from torchgco.roadmap import Roadmap
-from torchgco.search import PathProposals
+from torchgco.search import Follow, PathProposals
 
 GUIDED = GuidedCasADi(
-    paths=PathProposals(
-        Roadmap(num_halton=16), num_paths=2, relax_iterations=0, max_penetration=1.0, track_iterations=10
+    passes=rounds(
+        PathProposals(
+            roadmaps=(Roadmap(num_halton=16),),
+            num_paths=2,
+            follow=(Follow(iterations=10),),
+            relax_iterations=0,
+            max_penetration=1.0,
+        )
     )
 )
 
@@ -71,7 +78,10 @@ def test_a_bad_start_affects_its_own_problem_alone() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [dict(solver=CasADiSolver("ipopt")), dict(paths=replace(GUIDED.paths, arrive=0.5, track_iterations=1))],
+    [
+        dict(solver=CasADiSolver("ipopt")),
+        dict(passes=tuple(varied(row, arrive=0.5, iterations=1) for row in GUIDED.passes)),
+    ],
 )
 def test_every_option_is_read(change: dict) -> None:
     problem, U0 = planar_batch(B=1, N=15, obstacles=3, seed=1)
@@ -84,11 +94,12 @@ def test_the_configuration_serves_every_model(model: str) -> None:
     """FATROP has the settings of `fatrop`, and the paths those of `gco`, but for the fields below."""
     solvers = [compose([*model.split(), f"solver={name}"]).solver for name in ("fatrop_guided", "fatrop", "gco")]
     guided, fatrop, gco = solvers
+    first = next(row for row in gco.passes if isinstance(row, PathProposals))
     own = dict(
-        num_paths=4, initial_offsets=(), arrive=gco.paths.paces[:1], relax_iterations=guided.paths.relax_iterations,
-        relax_top=None, refine_top=1, max_penetration=1.0, pace=None, max_gap=None,
+        num_paths=4, initial_offsets=(), arrive=first.follow[0].paces[:1],
+        relax_iterations=guided.passes[0].relax_iterations, relax_top=None, top=1, max_penetration=1.0, pace=None,
     )  # fmt: skip
-    assert guided.solver == fatrop and guided.paths == replace(gco.paths, **own)
+    assert guided.solver == fatrop and guided.passes == rounds(varied(first, **own))
 
 
 def test_bad_calls_are_named() -> None:
@@ -96,4 +107,4 @@ def test_bad_calls_are_named() -> None:
     with pytest.raises(InputError, match="U0"):
         GUIDED.solve(problem, U0[:, :3])
     with pytest.raises(InputError, match="initial_offsets"):
-        replace(GUIDED, paths=replace(GUIDED.paths, initial_offsets=((1.0, 0.0, 0.0),))).prepare(problem)
+        replace(GUIDED, passes=(varied(GUIDED.passes[0], initial_offsets=((1.0, 0.0, 0.0),)),)).prepare(problem)

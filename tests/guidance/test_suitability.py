@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.search.rows import restarts
 from torchgco import (
     GCO,
     MPPI,
@@ -34,7 +35,7 @@ from torchgco.base import kernels
 from torchgco.guidance.gco import REACH, _radius
 from torchgco.guidance.suitability import SAMPLES, suited_sampler
 from torchgco.native.compiler import find_compiler
-from torchgco.search import PathProposals
+from torchgco.search import Follow, PathProposals
 
 
 @pytest.fixture
@@ -69,17 +70,12 @@ def spheres(d: int) -> Spheres:
     return Spheres(centers, [0.4, 0.4], 0.1)
 
 
-BASE = presets.gco(make_problem(2, spheres(2)))
-assert BASE.sampling is not None
-SAMPLER = replace(BASE.sampling.sampler, samples=64, rounds=4)
-SINGLE = replace(
-    BASE,
-    local=replace(BASE.local, max_outer_iterations=6),
-    paths=PathProposals(),
-    sampling=replace(BASE.sampling, sampler=SAMPLER),
-    attempts=2,
-    finish=None,
-)
+BASE = presets.gco(make_problem(2, spheres(2))).local
+assert isinstance(BASE.guidance, GCO)
+SAMPLER = replace(BASE.guidance.sampler, samples=64, rounds=4)
+LOCAL = replace(BASE, guidance=None, max_outer_iterations=6)
+GUIDE = replace(BASE.guidance, sampler=SAMPLER)
+SINGLE = restarts(LOCAL, PathProposals(), GUIDE, attempts=2)
 
 
 def pillars(x: Tensor) -> Tensor:
@@ -145,7 +141,7 @@ def test_without_a_position_nothing_is_guided() -> None:
     solution, warned = solved(without_position)
     assert warned == ["solved without guidance: the dynamics have no position"]
     assert solution.guided.tolist() == [0, 0]
-    expected = torchgco.solve(without_position, solver=SINGLE.local)
+    expected = torchgco.solve(without_position, solver=LOCAL)
     assert torch.equal(solution.U, expected.U)
 
 
@@ -176,12 +172,12 @@ def test_dynamics_that_accept_no_samples_are_guided_by_paths_alone(in_pytorch: N
     plain = vehicle(2)
     refusing = RefusesSamples(plain.function, 4, 2, 0.1, "euler", plain.position)
     problem, lost = make_problem(2, spheres(2), dynamics=refusing), "no trajectory can be sampled (no samples here)"
-    solution, warned = solved(problem, replace(SINGLE, attempts=3))
+    solution, warned = solved(problem, restarts(LOCAL, PathProposals(), GUIDE, attempts=3))
     assert warned == [f"guided in part: {lost}"]
     assert int(solution.guided[0]) == 1 and solution.status.tolist() == [1, 1]
-    solution, warned = solved(problem, replace(SINGLE, paths=None))
+    solution, warned = solved(problem, restarts(LOCAL, None, GUIDE, attempts=2))
     assert warned == [f"solved without guidance: {lost}"]
-    expected = torchgco.solve(make_problem(2, spheres(2)), solver=SINGLE.local)
+    expected = torchgco.solve(make_problem(2, spheres(2)), solver=LOCAL)
     assert torch.equal(solution.U, expected.U) and solution.guided.tolist() == [0, 0]
     with pytest.raises(InputError, match="got no trajectory can be sampled"):
         torchgco.solve(problem, solver=IteratedMPPI(iterations=1))
@@ -219,22 +215,25 @@ def test_the_radius_without_spheres_is_a_share_of_the_distance_to_the_goal() -> 
 
 
 @pytest.mark.parametrize(
-    ("options", "field"),
+    ("guidance", "field"),
     [
-        (dict(sampling=GCO(sampler=MPPI(covariance=[1.0, 1.0, 1.0]))), "mppi.covariance"),
+        (GCO(sampler=MPPI(covariance=[1.0, 1.0, 1.0])), "mppi.covariance"),
     ],
 )
-def test_options_that_do_not_fit_are_named_before_any_problem_is_caught(options: dict[str, Any], field: str) -> None:
+def test_options_that_do_not_fit_are_named_before_any_problem_is_caught(guidance: GCO, field: str) -> None:
     far = Spheres([[50.0, 50.0]], [0.1])
     with pytest.raises(InputError) as error:
-        torchgco.solve(make_problem(2, far), solver=replace(SINGLE, **options))
+        torchgco.solve(make_problem(2, far), solver=replace(SINGLE, local=replace(LOCAL, guidance=guidance)))
     assert error.value.field == field
 
 
 def test_offsets_for_another_number_of_controls_are_left_out() -> None:
     """Presets hold offsets for two controls but serve every vehicle."""
     problem = make_problem(2, spheres(2))
-    plain, more = (solved(problem, replace(SINGLE, paths=PathProposals(initial_offsets=o))) for o in ((), ((1.0,),)))
+    plain, more = (
+        solved(problem, restarts(LOCAL, PathProposals(follow=(Follow(initial_offsets=offsets),)), GUIDE, attempts=2))
+        for offsets in ((), ((1.0,),))
+    )
     assert plain[1] == more[1] == [] and torch.equal(plain[0].U, more[0].U)
 
 
