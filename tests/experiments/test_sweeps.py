@@ -144,6 +144,13 @@ def test_other_settings_with_equal_results_and_other_seeds_are_not_pooled(tmp_pa
     assert counts(merge([tmp_path])) == {"gco [samples=1]": (1, 1), "gco [samples=2]": (2, 2)}
 
 
+def test_an_option_of_a_row_of_a_solver_is_its_label(tmp_path) -> None:
+    for name, top in (("a", 2), ("b", 3)):
+        rows = [{"when": "all"}, {"top": top, "pace": [0.8, 0.6]}]
+        study(tmp_path / name, {"gco": [HIT]}, solver={"gco": {"passes": rows}})
+    assert counts(merge([tmp_path])) == {"gco [passes.1.top=2]": (1, 1), "gco [passes.1.top=3]": (1, 1)}
+
+
 @pytest.mark.parametrize(
     ("key", "label"), [("version", "version"), ("dtype", "device.dtype"), ("device", "device.name")]
 )

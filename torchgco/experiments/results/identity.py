@@ -163,16 +163,17 @@ def layout_digests(
 
 def difference(held: Any, new: Any, path: str = "") -> str:
     """The first key in which two identities differ, as 'key is this there, that here'."""
-    if isinstance(held, dict) and isinstance(new, dict):
-        for key in dict.fromkeys([*new, *held]):
-            if held.get(key) != new.get(key):
-                return difference(held.get(key), new.get(key), f"{path}.{key}" if path else str(key))
+    old, now = _parts(held), _parts(new)
+    if old and now:
+        for key in dict.fromkeys([*now, *old]):
+            if old.get(key) != now.get(key):
+                return difference(old.get(key), now.get(key), f"{path}.{key}" if path else key)
     return f"{path} is {_short(held)} there, {_short(new)} here"
 
 
 def flat(tree: Mapping[str, Any], path: str = "") -> dict[str, Any]:
-    """The leaves of nested dicts by their dotted keys; lists are leaves."""
-    return {key: value for key, value in _branches(tree, path) if not (isinstance(value, Mapping) and value)}
+    """The leaves of nested dicts, and of lists of dicts, by their dotted keys; other lists are leaves."""
+    return {key: value for key, value in _branches(tree, path) if not _parts(value)}
 
 
 def _branches(tree: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
@@ -180,9 +181,15 @@ def _branches(tree: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
     for key, value in tree.items():
         name = f"{path}.{key}" if path else str(key)
         found.append((name, value))
-        if isinstance(value, Mapping):
-            found += _branches(value, name)
+        found += _branches(_parts(value), name)
     return found
+
+
+def _parts(value: Any) -> dict[str, Any]:
+    """What a dict holds by its keys, or a list of dicts, such as the passes of a solver, by their numbers."""
+    if isinstance(value, list) and all(isinstance(item, Mapping) for item in value):
+        return {str(number): item for number, item in enumerate(value)}
+    return {str(key): item for key, item in value.items()} if isinstance(value, Mapping) else {}
 
 
 def _normal(value: Any) -> Any:
