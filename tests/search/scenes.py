@@ -9,6 +9,7 @@ import torch
 from torchgco.obstacles.base import Solids
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated
+from torchgco.roadmap.homotopy import classes
 
 NONE = float("nan")  # the radius of an absent sphere
 
@@ -22,3 +23,8 @@ def spheres(centers: Any, radii: Any) -> Solids:
 def inflated(centers: Any, radii: Any, boxes: Cuboids | None = None) -> Inflated:
     """The same as obstacles, with boxes."""
     return Inflated(spheres(centers, radii), boxes)
+
+
+def first_of_class(paths: torch.Tensor, obstacles: Inflated) -> torch.Tensor:
+    """Whether each path (B, K, P, d) is the first of its homotopy class, (B, K)."""
+    return classes(paths, obstacles) == torch.arange(paths.shape[1])

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from tests.reference import boxes as brute_force
+from tests.search.scenes import first_of_class
 from torchgco import (
     Boxes,
     ControlBounds,
@@ -29,7 +30,6 @@ from torchgco.native.dispatch import engine_of
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.roadmap.geometry import Inflated, Scene
-from torchgco.roadmap.homotopy import one_per_class
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scales, scene_of
 
@@ -113,8 +113,8 @@ def test_paths_on_either_side_of_a_box_are_of_different_classes() -> None:
     boxes = replace(boxes, centers=torch.zeros_like(boxes.centers), radii=torch.full_like(boxes.radii, 0.05))
     corners = torch.tensor([[0.0, 0.9], [0.1, 0.8], [0.0, -0.9]], dtype=torch.float64)
     paths = torch.stack([torch.stack((s.start[0], corner, s.goal[0])) for corner in corners]).unsqueeze(0)
-    assert one_per_class(paths, Inflated(spheres, boxes)).tolist() == [[True, False, True]]
-    assert one_per_class(paths, Inflated(spheres, absent(boxes))).tolist() == [[True, False, False]]
+    assert first_of_class(paths, Inflated(spheres, boxes)).tolist() == [[True, False, True]]
+    assert first_of_class(paths, Inflated(spheres, absent(boxes))).tolist() == [[True, False, False]]
 
 
 def wall_in_the_plane(B: int = 2) -> Problem:

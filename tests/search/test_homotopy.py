@@ -2,9 +2,8 @@
 
 import torch
 
-from tests.search.scenes import NONE, inflated
+from tests.search.scenes import NONE, first_of_class, inflated
 from torchgco.roadmap.geometry import Inflated
-from torchgco.roadmap.homotopy import one_per_class
 
 
 def balls(centers: list[list[float]], radii: list[float], B: int = 1) -> Inflated:
@@ -26,18 +25,18 @@ def test_in_the_plane_paths_on_different_sides_differ() -> None:
         through([0.0, -2.0], [0.5, -1.0]),  # under both, from farther below
     ])  # fmt: skip
     two = balls([[-0.5, 0.0], [0.5, 0.0]], [0.2, 0.2], B=2)
-    assert one_per_class(paths.expand(2, -1, -1, -1), two).tolist() == [[True, False, True, True, False]] * 2
+    assert first_of_class(paths.expand(2, -1, -1, -1), two).tolist() == [[True, False, True, True, False]] * 2
     one = balls([[-0.5, 0.0], [0.5, 0.0]], [0.2, NONE])  # the second is absent
-    assert one_per_class(paths[None], one).tolist() == [[True, False, True, False, False]]
+    assert first_of_class(paths[None], one).tolist() == [[True, False, True, False, False]]
 
 
 def test_a_loop_around_a_disc_is_another_class() -> None:
     straight = through([0.0, 0.5])
     loop = through([0.5, 0.5], [0.0, -0.5], [-0.5, 0.5])
-    assert one_per_class(torch.stack([straight, loop])[None], balls([[0.0, 0.0]], [0.2])).tolist() == [[True, True]]
+    assert first_of_class(torch.stack([straight, loop])[None], balls([[0.0, 0.0]], [0.2])).tolist() == [[True, True]]
 
 
 def test_in_space_paths_far_from_each_other_are_different() -> None:
     ball = balls([[0.0, 0.0, 0.0]], [0.3])
     over, left, near = through([0.0, 0.0, 0.5]), through([0.0, 0.5, 0.0]), through([0.0, 0.1, 0.5])
-    assert one_per_class(torch.stack([over, near, left, over])[None], ball).tolist() == [[True, False, True, False]]
+    assert first_of_class(torch.stack([over, near, left, over])[None], ball).tolist() == [[True, False, True, False]]

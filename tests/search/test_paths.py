@@ -17,7 +17,7 @@ from torchgco import ControlBounds, InputError, PathProposals, Problem, Roadmap,
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.rollout import open_loop
 from torchgco.roadmap.geometry import Inflated
-from torchgco.roadmap.homotopy import one_per_class
+from torchgco.roadmap.homotopy import classes
 from torchgco.search import Follow, Refine
 from torchgco.solvers.ilqr import descend
 
@@ -58,11 +58,12 @@ def only(k: int) -> Iterator[None]:
     """Keep only the first path of class k."""
 
     def one(paths: torch.Tensor, obstacles: Inflated) -> torch.Tensor:
-        first = one_per_class(paths, obstacles)
-        return first & (first.cumsum(-1) == k + 1)
+        label = classes(paths, obstacles)
+        first = label == torch.arange(paths.shape[1])
+        return torch.where(first & (first.cumsum(-1) == k + 1), label, -1)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("torchgco.search.proposals.one_per_class", one)
+        patch.setattr("torchgco.search.proposals.classes", one)
         yield
 
 
