@@ -11,6 +11,8 @@ from torchgco.native.codegen.dynamics import JACOBIAN, STEP, DynamicsSource
 from torchgco.native.codegen.emit import PRELUDE
 from torchgco.native.codegen.source import C
 from torchgco.native.compiler import build
+from torchgco.native.declarations import head
+from torchgco.native.structures import CONSTANTS
 
 LANES = 8
 
@@ -68,7 +70,7 @@ void tgco_draw(uint64_t key, int64_t samples, int64_t rows, double *z) {
 }
 """
     )
-    library = build(f"#define REAL double\n#define LANES {LANES}\n#include <stdint.h>\n{PRELUDE}{code}")
+    library = build(head([], [], {"REAL": "double", "LANES": LANES, **CONSTANTS}) + PRELUDE + code)
     made = torch.empty(key.ids.numel(), rows, samples, dtype=torch.float64)
     for z, word in zip(made, words(key, stream).tolist(), strict=True):
         library.tgco_draw(*(ctypes.c_int64(number) for number in (word, samples, rows)), ctypes.c_void_p(z.data_ptr()))

@@ -9,7 +9,7 @@ from tests.problems import boxed_batch, planar_batch, random_trajectory
 from torchgco import Boxes, Capsules, ControlBounds, Goal, Problem, judge
 from torchgco.baselines.casadi import CasADiSolver
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import engine_of, terms_of
+from torchgco.native.dispatch import engine_of
 from torchgco.obstacles.boxes import BoundBoxes
 
 
@@ -39,9 +39,9 @@ def test_values_and_expansions_are_pytorchs(d: int, phr: bool, rounded: bool, pu
     lagrangian = Lagrangian(problem, Multipliers(tuple(lam), multipliers.mu), None, phr)
     engine = engine_of(problem)
     assert engine is not None and not engine.functions  # nothing is traced
-    cost, merit = engine.value(problem, X, U, terms_of(lagrangian))
+    cost, merit = engine.value(lagrangian, X, U)
     torch.testing.assert_close((cost, merit), lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
-    slopes, H = engine.expand(problem, X, U, terms_of(lagrangian))
+    slopes, H = engine.expand(problem, X, U, lagrangian)
     want, n, s = lagrangian.expand(X, U).transpose(0, 1), problem.n, problem.n + problem.m
     kept = [i for i in range(s + 1) if i != n]
     torch.testing.assert_close(slopes[:, :-1], want[:, :-1, kept, n], rtol=1e-10, atol=1e-9)
@@ -62,7 +62,7 @@ def test_slopes_on_the_axis_of_a_post_are_pytorchs(d: int) -> None:
     lagrangian = Lagrangian(problem, Multipliers.zero(problem, 3.0), None, True)
     engine = engine_of(problem)
     assert engine is not None and bool((problem.constraints[0].value(X, U)[:, :3] > 0).all())
-    slopes, _ = engine.expand(problem, X, U, terms_of(lagrangian))
+    slopes, _ = engine.expand(problem, X, U, lagrangian)
     want, n = lagrangian.expand(X, U).transpose(0, 1), problem.n
     torch.testing.assert_close(slopes[:, -1, :n], want[:, -1, :n, n], rtol=1e-10, atol=1e-9)
     torch.testing.assert_close(slopes[:, :-1, :n], want[:, :-1, :n, n], rtol=1e-10, atol=1e-9)

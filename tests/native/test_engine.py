@@ -30,7 +30,7 @@ from torchgco.base import kernels
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion
 from torchgco.lagrangian.rollout import open_loop
-from torchgco.native.dispatch import EagerWarning, engine_of, terms_of
+from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.solvers import ilqr
 from torchgco.solvers.ending import optimality
 from torchgco.solvers.ilqr import advance
@@ -184,7 +184,7 @@ def test_value_expansion_and_rollouts_are_pytorchs(name: str, guided: str | None
     state, lagrangian = running_state(problem, guided, phr)
     engine = engine_of(problem)
     assert engine is not None
-    for mine, theirs in zip(engine.value(problem, state.X, state.U, terms_of(lagrangian)), lagrangian.value(
+    for mine, theirs in zip(engine.value(lagrangian, state.X, state.U), lagrangian.value(
         state.X, state.U
     ), strict=True):  # fmt: skip
         torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)

@@ -22,7 +22,7 @@ from torchgco import Problem, Status
 from torchgco.base import kernels
 from torchgco.constraints.base import Constraint
 from torchgco.native.compiler import find_compiler
-from torchgco.native.dispatch import EagerWarning, cost_unit, engine_of, terms_of
+from torchgco.native.dispatch import EagerWarning, cost_unit, engine_of
 from torchgco.solvers.lifted import lifted_search, native_lifted_search
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -52,14 +52,14 @@ def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> N
     state, lagrangian = running_state(problem)
     engine, n = engine_of(problem), problem.n
     assert engine is not None
-    values = engine.value(problem, state.X, state.U, terms_of(lagrangian))
+    values = engine.value(lagrangian, state.X, state.U)
     for mine, theirs in zip(values, lagrangian.value(state.X, state.U), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
     z = [i for i in range(n + 1 + problem.m) if i != n]
     H = lagrangian.expand(state.X, state.U).transpose(0, 1)
     expected = blocks(H[..., z, n], H[..., z, :][..., z])
     torch.testing.assert_close(
-        blocks(*engine.expand(problem, state.X, state.U, terms_of(lagrangian))), expected, rtol=1e-10, atol=1e-10
+        blocks(*engine.expand(problem, state.X, state.U, lagrangian)), expected, rtol=1e-10, atol=1e-10
     )
     for count in (1, 4):
         (a, first), (b, second) = running_state(problem), running_state(problem)
@@ -90,23 +90,23 @@ def test_at_rest_kinks_have_pytorchs_derivatives() -> None:
 def test_a_subset_has_the_numbers_of_its_problems() -> None:
     problem = PROBLEMS["constraints"]()
     state, lagrangian = running_state(problem)
-    whole = engine_of(problem).value(problem, state.X, state.U, terms_of(lagrangian))[1]
+    whole = engine_of(problem).value(lagrangian, state.X, state.U)[1]
     for rows in (torch.tensor([3]), torch.tensor([4, 0, 0, 2])):
         part = problem.take(rows)  # of a batch whose parameters are known; `alone` is of a new batch
         alone = PROBLEMS["constraints"]().take(rows)
         for some in (part, alone, part.take(torch.arange(len(rows)))):
-            terms = terms_of(lagrangian.take(rows))
-            assert torch.equal(engine_of(some).value(some, state.X[rows], state.U[rows], terms)[1], whole[rows])
+            own = replace(lagrangian.take(rows), problem=some)
+            assert torch.equal(engine_of(some).value(own, state.X[rows], state.U[rows])[1], whole[rows])
 
 
 def test_the_library_may_be_compiled_for_one_problem_first() -> None:
     """The weight (1, 1) of one problem must not be taken for one that the whole batch shares."""
     problem, other = PROBLEMS["constraints"](), PROBLEMS["constraints"]()
     state, lagrangian = running_state(problem)
-    expected = engine_of(problem).value(problem, state.X, state.U, terms_of(lagrangian))[1]
+    expected = engine_of(problem).value(lagrangian, state.X, state.U)[1]
     assert engine_of(other.take(torch.tensor([2]))) is not None
-    terms = terms_of(replace(lagrangian, problem=other))
-    assert torch.equal(engine_of(other).value(other, state.X, state.U, terms)[1], expected)
+    again = replace(lagrangian, problem=other)
+    assert torch.equal(engine_of(other).value(again, state.X, state.U)[1], expected)
 
 
 @pytest.mark.parametrize("name", ["per problem", "by knot", "constraints"])

@@ -17,9 +17,9 @@ from torch import Tensor
 _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64
 _MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
-_MURMUR_1 = -2048144789  # 0x85EBCA6B as int32
-_MURMUR_2 = -1028477387  # 0xC2B2AE35
-_WEYL = -1640531527  # 0x9E3779B9: neighbouring counters start far apart
+MURMUR_1 = -2048144789  # 0x85EBCA6B as int32
+MURMUR_2 = -1028477387  # 0xC2B2AE35
+WEYL = -1640531527  # 0x9E3779B9: neighbouring counters start far apart
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def standard_normal(
     place = torch.arange(half, dtype=torch.int32, device=key.ids.device).view(half, 1, 1)
     number = torch.arange(samples.start, samples.stop, dtype=torch.int32, device=key.ids.device)
     counter = (number * half).view(1, 1, width) + place
-    word = _mix32_((counter * _WEYL) ^ low)
+    word = _mix32_((counter * WEYL) ^ low)
     radius = _uniform(word).log_().mul_(-2.0).sqrt_()
     angle = _uniform(_mix32_(word ^ high)).mul_(2.0 * math.pi)
     normal = radius.new_empty(2 * half, key.ids.numel(), width)
@@ -81,9 +81,9 @@ def _uniform(word: Tensor) -> Tensor:
 def _mix32_(z: Tensor) -> Tensor:
     """MurmurHash3's 32-bit finaliser, in place; products wrap, and shifts are made logical by a mask."""
     z ^= (z >> 16) & 0xFFFF
-    z *= _MURMUR_1
+    z *= MURMUR_1
     z ^= (z >> 13) & 0x7FFFF
-    z *= _MURMUR_2
+    z *= MURMUR_2
     z ^= (z >> 16) & 0xFFFF
     return z
 

@@ -15,7 +15,7 @@ from torchgco.base.options import Above, AtMost, Count, Natural, NonNegative, Po
 from torchgco.base.shapes import check_shape, tensor
 from torchgco.guidance.samples import Flight, Noise, average, draw, fly
 from torchgco.native.dispatch import open_loop, sampler_of
-from torchgco.native.sampler import Rounds
+from torchgco.native.structures import Sampling, array
 from torchgco.problem.problem import Problem
 
 CHUNK = 8192  # samples rolled out together: memory stays bounded
@@ -86,18 +86,23 @@ class MPPI:
             plan = self._in_chunks(problem, U, key, dtype)
         return open_loop(problem, plan), plan
 
-    def _native(self, problem: Problem, key: DrawKey) -> Rounds:
+    def _native(self, problem: Problem, key: DrawKey) -> Sampling:
         """The rounds as the native library takes them."""
         bounds = self._bounds(problem)
         if bounds is None:
             wide = problem.x0.new_full((1, 1, problem.m), torch.inf)
             bounds = -wide, wide
-        lower, upper, deviation = (row.squeeze(1) for row in (*bounds, self._sigma(problem).sqrt()))
-        return Rounds(
-            self.samples, self.noise_knots, self.decay, self.elite, self.temperature, COLLISION_PENALTY,
-            self.dwell_cost, torch.stack([words(key, i) for i in range(self.rounds)], dim=-1),
-            deviation, lower, upper, *self._places(problem),
+        lower, upper, deviation = (array(row.squeeze(1), knots=False) for row in (*bounds, self._sigma(problem).sqrt()))
+        sampling = Sampling(
+            samples=self.samples, rounds=self.rounds, knots=self.noise_knots, decay=self.decay, elite=self.elite,
+            temperature=self.temperature, collision_penalty=COLLISION_PENALTY, dwell_cost=self.dwell_cost,
+            keys=torch.stack([words(key, i) for i in range(self.rounds)], dim=-1), deviation=deviation,
+            lower=lower, upper=upper,
         )  # fmt: skip
+        left, share = self._places(problem)
+        if left is not None and share is not None:
+            sampling.left, sampling.share = left.to(torch.int32), share.double()
+        return sampling
 
     def _in_chunks(self, problem: Problem, U: Tensor, key: DrawKey, dtype: torch.dtype) -> Tensor:
         """All rounds by PyTorch, some problems at a time."""

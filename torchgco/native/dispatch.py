@@ -13,7 +13,7 @@ from torchgco.base.kernels import native
 from torchgco.lagrangian import rollout
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.compiler import NativeError, find_compiler
-from torchgco.native.engine import Engine, Terms
+from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
 from torchgco.native.sampler import Sampler
 from torchgco.problem.border import check_eager
@@ -103,7 +103,7 @@ def cost_unit(problem: Problem) -> Tensor:
     """
     engine = engine_of(problem)
     if engine is not None and engine.cost is not None and "cost_scale" not in vars(problem):
-        slopes, H = engine.expand(problem, *problem.at_rest, None)
+        slopes, H = engine.expand(problem, *problem.at_rest)
         object.__setattr__(problem, "cost_scale", problem.scale_of(slopes, H.diagonal(dim1=-2, dim2=-1)))
     return problem.cost_unit
 
@@ -151,9 +151,4 @@ def reproducible(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Ten
 def value(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
     """J_var (B,) and L_M (B,)."""
     engine = engine_of(lagrangian.problem)
-    return lagrangian.value(X, U) if engine is None else engine.value(lagrangian.problem, X, U, terms_of(lagrangian))
-
-
-def terms_of(lagrangian: Lagrangian) -> Terms:
-    """The terms that the Lagrangian adds to the cost, in the library's form."""
-    return Terms(lagrangian.multipliers, lagrangian.penalty, lagrangian.phr)
+    return lagrangian.value(X, U) if engine is None else engine.value(lagrangian, X, U)

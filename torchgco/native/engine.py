@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -12,50 +11,21 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.status import Status
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
+from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.native import structures as c
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
-from torchgco.native.codegen.cost import cost_numbers, trace_cost
+from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.dynamics import trace_dynamics
 from torchgco.native.codegen.source import LANES, Form
-from torchgco.native.compiler import build
-from torchgco.native.packing import FLAGS, KINDS, NUMBERS, PATH, QUADRATIC, REGION, Packed, Rows, array, pack_rows
+from torchgco.native.declarations import load
+from torchgco.native.packing import KINDS, constraint_of, guide_of, quadratic_arrays
+from torchgco.native.structures import STRUCTURES, array
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
 
 MOST = 128  # states and controls together: the matrices of a stage lie on the stack
-
-
-@dataclass(frozen=True)
-class Options:
-    """The options of iLQR's loop (see ILQR and LineSearch)."""
-
-    ladder: tuple[float, ...]
-    back: int
-    max_iterations: int
-    accept_last: bool
-    tolerance: float
-    absolute_tolerance: float
-    ratio_min: float
-    ratio_max: float
-    smallest: float
-    first: float
-    growth: float
-    most: float
-    damping: float
-    rounding: float
-    lost_beyond: float
-    damp_below: float
-
-
-@dataclass(frozen=True)
-class Terms:
-    """The terms that the Lagrangian adds to the cost (see Lagrangian)."""
-
-    multipliers: Multipliers
-    penalty: Penalty | None
-    phr: bool
 
 
 class Engine:
@@ -80,73 +50,77 @@ class Engine:
         dense = quadratic is not None and not quadratic.diagonal
         boxes = any(type(constraint) is BoundBoxes for constraint in problem.constraints)
         self.form = Form(self.model, problem.dynamics.position, self.cost, dense, tuple(self.functions.items()), boxes)
-        self.library = build(self.form.source())
+        self.library = load(self.form.source(), STRUCTURES)
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         """X (B, N+1, n) from U (B, N, m)."""
         X = U.new_empty(problem.B, problem.N + 1, problem.n)
         X[:, 0] = problem.x0
-        self._run("tgco_open_loop", problem, self.packed(problem, {"X": X, "U": U.contiguous()}))
+        self._run("tgco_open_loop", problem.B, self.packed(problem, X=X, U=U.contiguous()))
         return X
 
     def closed_loop(self, problem: Problem, X: Tensor, U: Tensor, G: Tensor) -> tuple[Tensor, Tensor]:
         """X and U of a rollout of U + K (x - X) from the first knots of X; G = [K d] (B, N, m, n+1), d isn't used."""
-        tensors = {"X": X.clone(), "U": U.clone(), "gains": G.contiguous()}
-        self._run("tgco_closed_loop", problem, self.packed(problem, tensors))
-        return tensors["X"], tensors["U"]
+        X, U = X.clone(memory_format=torch.contiguous_format), U.clone(memory_format=torch.contiguous_format)
+        self._run("tgco_closed_loop", problem.B, self.packed(problem, X=X, U=U, gains=G.contiguous()))
+        return X, U
 
-    def value(self, problem: Problem, X: Tensor, U: Tensor, terms: Terms) -> tuple[Tensor, Tensor]:
+    def value(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         """J_var (B,) and L_M (B,) of trajectories."""
-        tensors = {"X": X.contiguous(), "U": U.contiguous(), "cost": X.new_empty(problem.B)}
-        tensors["merit"] = torch.empty_like(tensors["cost"])
-        self._run("tgco_value", problem, self.packed(problem, tensors, terms))
-        return tensors["cost"], tensors["merit"]
+        cost, merit = X.new_empty(2, len(X))
+        packed = self.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=cost, merit=merit)
+        self._run("tgco_value", len(X), packed)
+        return cost, merit
 
     def gains(
-        self, problem: Problem, X: Tensor, U: Tensor, terms: Terms, mu_r: Tensor
+        self, lagrangian: Lagrangian, X: Tensor, U: Tensor, mu_r: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Gains G = [K d] (B, N, m, n+1) for J_var + lam'c, the two sums of its expected change, (B,) each, and where
         the backward pass failed, (B,) bool; mu_r (B,) is the regularisation.
         """
-        N, m, z = problem.N, problem.m, problem.n + 1
-        tensors = {"X": X.contiguous(), "U": U.contiguous(), "regularisation": mu_r.contiguous()}
-        tensors |= {name: torch.zeros_like(mu_r) for name in ("cost", "merit")}
-        tensors |= {"gains": X.new_empty(problem.B, N, m, z), "status": _flags(problem.B)}
-        packed = self.packed(problem, tensors, terms)
-        packed.optimality = True
-        self._run("tgco_gains", problem, packed)
-        return tensors["gains"], tensors["cost"], tensors["merit"], tensors["status"] != 0
+        problem = lagrangian.problem
+        G, status = X.new_empty(problem.B, problem.N, problem.m, problem.n + 1), _flags(problem.B)
+        linear, quadratic = torch.zeros_like(mu_r), torch.zeros_like(mu_r)
+        packed = self.terms(
+            lagrangian, X=X.contiguous(), U=U.contiguous(), regularisation=mu_r.contiguous(), cost=linear,
+            merit=quadratic, gains=G, status=status, optimality=True,
+        )  # fmt: skip
+        self._run("tgco_gains", problem.B, packed)
+        return G, linear, quadratic, status != Status.RUNNING
 
-    def expand(self, problem: Problem, X: Tensor, U: Tensor, terms: Terms | None) -> tuple[Tensor, Tensor]:
-        """Gradients (B, N+1, n+m) and Hessians (B, N+1, n+m, n+m) of L_M; of J_var where `terms` is None.
+    def expand(
+        self, problem: Problem, X: Tensor, U: Tensor, lagrangian: Lagrangian | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Gradients (B, N+1, n+m) and Hessians (B, N+1, n+m, n+m) of L_M; of J_var without a Lagrangian.
 
         Only the upper triangles of the Hessians are filled.
         """
         B, N, size = problem.B, problem.N, problem.n + problem.m
-        tensors = {"X": X.contiguous(), "U": U.contiguous(), "slopes": X.new_empty(B, N + 1, size)}
-        tensors |= {"curvatures": X.new_empty(B, N + 1, size, size)}
-        tensors |= {name: X.new_zeros(B) for name in ("cost", "merit", "mu")}
-        packed = self.packed(problem, tensors, terms)
-        if terms is None:
-            packed.constraints = 0
-        self._run("tgco_expand", problem, packed)
-        return tensors["slopes"], tensors["curvatures"]
+        slopes, H, none = X.new_empty(B, N + 1, size), X.new_empty(B, N + 1, size, size), X.new_zeros(B)
+        values = {"X": X.contiguous(), "U": U.contiguous(), "cost": none, "merit": none}
+        if lagrangian is None:
+            packed = self.packed(problem, **values, mu=none, constraints=0)
+        else:
+            packed = self.terms(lagrangian, **values)
+        packed.slopes, packed.curvatures = slopes, H
+        self._run("tgco_expand", B, packed)
+        return slopes, H
 
-    def lift(self, problem: Problem, state: dict[str, Tensor], terms: Terms, rounds: int, gain: float) -> Tensor:
+    def lift(self, lagrangian: Lagrangian, state: dict[str, Tensor], rounds: int, gain: float) -> Tensor:
         """Up to `rounds` steps in states and controls together, in place in `state`; where one gave a better rollout.
 
         Args:
             state: X, U, cost, merit, all contiguous.
             gain: share of L_M by which a rollout must lower it.
         """
-        out = {"converged": _flags(problem.B), "regularisation": torch.zeros_like(state["merit"])}
-        packed = self.packed(problem, {**state, **out}, terms)
-        packed.limit, packed.gain = rounds, gain
-        self._run("tgco_lift", problem, packed)
-        return out["converged"] != 0
+        B = lagrangian.problem.B
+        found, mu_r = _flags(B), torch.zeros_like(state["merit"])
+        packed = self.terms(lagrangian, **state, converged=found, regularisation=mu_r, limit=rounds, gain=gain)
+        self._run("tgco_lift", B, packed)
+        return found != 0
 
     def iterate(
-        self, problem: Problem, state: dict[str, Tensor], terms: Terms, options: Options, limit: int
+        self, lagrangian: Lagrangian, state: dict[str, Tensor], options: c.Options, limit: int
     ) -> dict[str, Tensor]:
         """Up to `limit` iterations of every problem's inner solve, in place in `state`.
 
@@ -154,75 +128,57 @@ class Engine:
             state: X, U, cost, merit, regularisation; inner, iterations, rung (int64): all contiguous.
 
         Returns:
-            status, converged, refused, lost (int32); alpha and used: step length and mu_r of the last iteration.
+            status, a `Status` or `End`; converged, refused, lost (int32); alpha and used: step length and mu_r of the
+            last iteration.
         """
-        out = {name: _flags(problem.B) for name in FLAGS}
-        out |= {name: torch.zeros(problem.B, dtype=torch.float64) for name in ("alpha", "used")}
-        packed = self.packed(problem, {**state, **out}, terms)
-        ladder = torch.tensor(options.ladder, dtype=torch.float64)
-        packed.rungs, packed.ladder = len(options.ladder), ladder.data_ptr()
-        packed.back, packed.limit, packed.max_iterations = options.back, limit, options.max_iterations
-        packed.accept_last = options.accept_last
-        for name in NUMBERS:
-            setattr(packed, name, getattr(options, name))
-        packed.replicas = LANES // 2 ** (problem.B - 1).bit_length() if problem.B <= LANES else 1
-        self._run("tgco_ilqr", problem, packed)
+        B = lagrangian.problem.B
+        out = {name: _flags(B) for name in ("status", "converged", "refused", "lost")}
+        out |= {name: torch.zeros(B, dtype=torch.float64) for name in ("alpha", "used")}
+        replicas = LANES // 2 ** (B - 1).bit_length() if B <= LANES else 1
+        packed = self.terms(lagrangian, **state, **out, options=options, limit=limit, replicas=replicas)
+        self._run("tgco_ilqr", B, packed)
         return out
 
-    def _run(self, name: str, problem: Problem, packed: Packed) -> None:
-        run(getattr(self.library, name), problem.B, LANES, packed)
+    def _run(self, name: str, B: int, packed: c.Problem) -> None:
+        run(getattr(self.library, name), B, LANES, packed)
 
-    def packed(self, problem: Problem, tensors: dict[str, Tensor], terms: Terms | None = None) -> Packed:
-        """The problem in the form that the library reads; it keeps the tensors alive that its pointers point to."""
-        fixed = problem.__dict__.get("packed")
-        if fixed is None:
-            fixed = self._fixed(problem)
-            object.__setattr__(problem, "packed", fixed)
-        packed, keep = Packed.from_buffer_copy(fixed[0]), [fixed, tensors, terms]
-        packed.keep = keep
-        for name, tensor in tensors.items():
-            setattr(packed, name, tensor.data_ptr())
-        if terms is None:
-            packed.constraint = ctypes.cast(fixed[1], ctypes.POINTER(Rows))
-            return packed
-        rows = (Rows * max(1, len(problem.constraints)))()
-        ctypes.memmove(rows, fixed[1], ctypes.sizeof(rows))
-        for row, lam in zip(rows, terms.multipliers.lam, strict=False):
-            keep.append(lam := lam.contiguous())
-            row.lam = lam.data_ptr()
-        keep += [rows, mu := terms.multipliers.mu.contiguous()]
-        packed.constraint, packed.mu = ctypes.cast(rows, ctypes.POINTER(Rows)), mu.data_ptr()
-        packed.phr = terms.phr
-        guide = terms.penalty
-        if guide is not None:
-            packed.guide = PATH if isinstance(guide, GuidePath) else REGION
-            packed.center = array(guide.center, keep, knots=True)
-            packed.weight = array(guide.weight.unsqueeze(-1), keep, knots=False)
-            if isinstance(guide, GuideRegion):
-                packed.radius = array(guide.radius.unsqueeze(-1), keep, knots=True)
+    def packed(self, problem: Problem, **values: Any) -> c.Problem:
+        """A problem without multipliers or a guide, and further fields, in the form that the library reads."""
+        fixed, _ = self._fixed(problem)
+        packed = fixed.copy()
+        for name, value in values.items():
+            setattr(packed, name, value)
         return packed
 
-    def _fixed(self, problem: Problem) -> tuple[Packed, Any, list[Any]]:
-        """The parts that don't change from call to call: model, cost and constraints, without multipliers."""
-        packed, keep, cost = Packed(), [], problem.cost
+    def terms(self, lagrangian: Lagrangian, **values: Any) -> c.Problem:
+        """The same with the terms that the Lagrangian adds to the cost."""
+        multipliers, phr = lagrangian.multipliers, lagrangian.phr
+        rows = [constraint.copy() for constraint in self._fixed(lagrangian.problem)[1]]
+        for row, lam in zip(rows, multipliers.lam, strict=True):
+            row.lam = lam.contiguous()
+        values |= {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": phr, **guide_of(lagrangian.penalty)}
+        return self.packed(lagrangian.problem, **values)
+
+    def _fixed(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
+        """The parts that don't change from call to call: model, cost and constraints; kept with the problem."""
+        if "packed" not in vars(problem):
+            object.__setattr__(problem, "packed", self._made(problem))
+        return vars(problem)["packed"]
+
+    def _made(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         if problem.B == 0:
-            return packed, (Rows * max(1, len(problem.constraints)))(), keep
-        packed.N, packed.elements, packed.constraints = problem.N, problem.B, len(problem.constraints)
-        if self.model.count > 0:
-            own = self.model.parameters(torch.arange(problem.B), problem.dynamics)
-            packed.parameters = array(own, keep, knots=False)
-        if self.cost is None:
-            for i, name in enumerate(QUADRATIC):
-                packed.cost_data[i] = array(getattr(cost, name), keep, knots=name not in ("Qf", "xf_ref", "qf"))
-        else:
-            for i, numbers in enumerate(cost_numbers(problem, self.cost)):
-                packed.cost_data[i] = array(numbers, keep, knots=True)
-        rows = (Rows * max(1, len(problem.constraints)))()
+            return c.Problem(), [c.Constraint() for _ in problem.constraints]
+        rows = []
         for i, constraint in enumerate(problem.constraints):
             source = self.functions.get(i)
             numbers = None if source is None else rows_numbers(problem, i, source)
-            pack_rows(rows[i], constraint, numbers, problem, keep)
-        return packed, rows, keep
+            rows.append(constraint_of(constraint, numbers, problem))
+        packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows)
+        if self.model.count > 0:
+            own = self.model.parameters(torch.arange(problem.B), problem.dynamics)
+            packed.parameters = array(own, knots=False)
+        packed.cost_data = quadratic_arrays(problem.cost) if self.cost is None else cost_arrays(problem, self.cost)
+        return packed, rows
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> None:

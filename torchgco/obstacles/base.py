@@ -16,6 +16,7 @@ from torchgco.constraints.base import Constraint, Sense
 CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
 ADMITTED = 1e-3  # m: the violation up to which solvers and judge call a trajectory feasible, unless options say else
 ABSENT = -1.0  # in C: stands for a length of an absent obstacle, or the square of one, which are never negative
+TINY = 1e-12  # what is divided by is at least this: lengths and their squares in the search for paths
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,7 @@ def squares(a: Tensor, b: Tensor) -> Tensor:
 def squares_from_segments(points: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """Squared distances (B, E, V) of points (B, V, d) from segments a to b (B, E, d)."""
     along = b - a
-    inverse = 1.0 / along.square().sum(-1, keepdim=True).clamp(min=1e-12)
+    inverse = 1.0 / along.square().sum(-1, keepdim=True).clamp(min=TINY)
     # Coordinate by coordinate and in place: these are the largest arrays of the search.
     axes = [(along[..., i, None], points[:, None, :, i] - a[..., i, None]) for i in range(a.shape[-1])]
     share = reduce(torch.add, (toward * step for step, toward in axes)).mul_(inverse).clamp_(0.0, 1.0)

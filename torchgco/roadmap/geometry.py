@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.tree import take
-from torchgco.obstacles.base import Solids
+from torchgco.obstacles.base import TINY, Solids
 from torchgco.obstacles.box_geometry import Cuboids
 
 AT_ONCE = 2**18  # distances between points and obstacles that are held at once
+AROUND = 1.5  # of an obstacle's extent: the region in which points are spread reaches so far beyond its centre
 
 
 class Inflated(NamedTuple):
@@ -48,10 +49,10 @@ class Inflated(NamedTuple):
         return self._make(parts)
 
     def region(self, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """The lower and upper corner (B, d) around start, goal, and the obstacles made larger by half."""
+        """The lower and upper corner (B, d) around start, goal, and the obstacles made `AROUND` times as large."""
         low, high = torch.minimum(start, goal), torch.maximum(start, goal)
         for part in self.kinds:
-            wide, absent = 1.5 * (part.extent + part.radii.unsqueeze(-1)), part.absent.unsqueeze(-1)
+            wide, absent = AROUND * (part.extent + part.radii.unsqueeze(-1)), part.absent.unsqueeze(-1)
             low = torch.minimum(low, (part.centers - wide).masked_fill(absent, torch.inf).amin(1))
             high = torch.maximum(high, (part.centers + wide).masked_fill(absent, -torch.inf).amax(1))
         return low, high
@@ -87,7 +88,7 @@ def points_along(path: Tensor, length: Tensor) -> Tensor:
     steps = (path[:, 1:] - path[:, :-1]).square().sum(-1).sqrt()
     reached = torch.cat((torch.zeros_like(steps[:, :1]), steps.cumsum(-1)), dim=1)
     right = torch.searchsorted(reached, length.contiguous(), right=True).clamp(1, path.shape[1] - 1)
-    share = (length - reached.gather(1, right - 1)) / steps.gather(1, right - 1).clamp(min=1e-12)
+    share = (length - reached.gather(1, right - 1)) / steps.gather(1, right - 1).clamp(min=TINY)
 
     def corner(index: Tensor) -> Tensor:
         return path.gather(1, index.unsqueeze(-1).expand(-1, -1, path.shape[-1]))

@@ -7,47 +7,57 @@ import functools
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchgco.base.kernels import native
-from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
+from torchgco.native.compiler import Compiler, NativeError, find_compiler
+from torchgco.native.declarations import Structure, fields, head, load
 from torchgco.native.dispatch import EagerWarning
-from torchgco.obstacles.base import marked
+from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.points import MIDWAY, RAYS, SHELLS, directions, of_boxes
-from torchgco.roadmap.search import CLEAR, HOPS, LEAST, TIE, Graph
+from torchgco.roadmap.search import CLEAR, HOPS, LEAST, SMALL, TIE, Graph
 
 AT_ONCE = 64  # problems searched together
 
 POINTS, PATHS, BOXES = (Path(__file__).parent / "c" / name for name in ("points.c", "paths.c", "boxes.h"))
 BOX = Path(__file__).parents[1] / "native" / "c" / "box.h"
-SCALARS = "#define V double\n#define tgco_choose(where, a, b) ((where) ? (a) : (b))"  # box.h for one number at a time
+SCALARS = {"V": "double", "tgco_choose(where, a, b)": "((where) ? (a) : (b))"}  # box.h for one number at a time
 # Fused products and sums would be rounded once where PyTorch rounds twice.
 FLAGS = ("-ffp-contract=off",)
-SIZES = (
-    "problems", "spheres", "spread", "candidates", "points", "edges", "neighbours", "hubs", "corners", "directions",
-    "shells", "midway",
-)  # fmt: skip
-NUMBERS = ("margin", "least", "clear", "factor", "tie")
-TENSORS = (
-    "centers", "distances", "start", "goal", "cube", "rays", "shell", "nodes", "ends", "lengths", "price", "path",
-    "string", "cost", "arrives", "box", "beside", "exists", "reach", "largest",
-)  # fmt: skip
 
 
-class Packed(ctypes.Structure):
-    """The structure `Search` of points.c."""
+class Search(Structure):
+    """What the library in C reads and writes: B problems among M spheres, graphs of V points with K edges each, and
+    paths of P corners.
+    """
 
-    _fields_ = [
-        *((name, ctypes.c_int64) for name in SIZES),
-        *((name, ctypes.c_double) for name in NUMBERS),
-        *((name, ctypes.c_void_p) for name in TENSORS),
-        *((name, ctypes.c_int64) for name in ("boxes", "extras")),
-    ]
+    declared = (
+        ("int64_t", "problems spheres spread candidates points edges neighbours hubs corners directions shells midway"),
+        ("double", "margin least clear factor tie"),
+        ("const double *", "centers distances"),  # (B, M, DIM), (B, M): radii, ABSENT where there is no sphere
+        ("const double *", "start goal"),  # (B, DIM)
+        ("const double *", "reach"),  # corners (B, 2, DIM) of the region that holds start, goal and obstacles
+        ("const double *", "cube rays shell"),  # (spread, DIM) in the unit cube; (B, directions, DIM); (shells)
+        ("double *", "nodes"),  # (B, V, DIM)
+        ("int32_t *", "ends"),  # (B, V, K): where edges lead; blocked ones are -1 and come last
+        ("double *", "lengths"),  # (B, V, K), infinite for blocked ones
+        ("double *", "price"),  # (B, V)
+        ("double *", "path"),  # (B, P, DIM)
+        ("double *", "string"),  # (B, 2 P - 1, DIM)
+        ("const double *", "cost"),  # (B, 2 P - 1)
+        ("uint8_t *", "arrives"),  # (B)
+        # Read only where there are boxes.
+        ("int64_t", "boxes extras"),
+        ("const double *", "box"),  # their numbers (B, boxes, BOX_NUMBERS)
+        ("const double *", "beside"),  # points around them (B, extras, DIM)
+        ("const uint8_t *", "exists"),  # (B, extras)
+        ("const double *", "largest"),  # the largest size (B)
+    )
+    _fields_ = fields(declared)
 
 
 @dataclass(frozen=True)
@@ -111,12 +121,11 @@ class NativeSearch:
         if boxes is not None:
             numbers["boxes"] = boxes.radii.shape[1]
             read |= {"box": _numbers(boxes), "largest": boxes.sizes.amax(-1)}
-        read = {field: tensor.contiguous() for field, tensor in read.items()}  # kept until the call returns
-        places: dict[str, Any] = {field: tensor.data_ptr() for field, tensor in (read | written).items()}
+        read = {field: tensor.contiguous() for field, tensor in read.items()}
         B, M = spheres.radii.shape
         numbers |= {"margin": self.margin, "clear": CLEAR, "least": LEAST, "tie": TIE}
-        packed = Packed(problems=B, spheres=M, corners=HOPS + 1, **places, **numbers)
-        if not getattr(self.library, name)(ctypes.byref(packed)):
+        search = Search(problems=B, spheres=M, corners=HOPS + 1, **read, **written, **numbers)
+        if not getattr(self.library, name)(ctypes.byref(search)):
             raise MemoryError("native kernels: no memory")
 
 
@@ -140,11 +149,10 @@ def library_for(like: Tensor, boxes: bool = False) -> ctypes.CDLL | None:
 @functools.cache
 def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.CDLL | None:
     # Without boxes their code is left out, so that it can't change how the spheres' code is compiled.
-    head = f"#define DIM {dimension}\n#define BOXES {int(boxes)}\n"
-    if boxes:
-        head += f"{SCALARS}\n{BOX.read_text()}\n{BOXES.read_text()}"
+    constants = {"DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": SMALL, **(SCALARS if boxes else {})}
+    files = [BOX, BOXES, POINTS, PATHS] if boxes else [POINTS, PATHS]
     try:
-        return build(f"{head}\n{POINTS.read_text()}\n{PATHS.read_text()}", FLAGS)
+        return load("\n".join((head([Search], [], constants), *(file.read_text() for file in files))), [Search], FLAGS)
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.tree import take
-from torchgco.obstacles.base import Solids
+from torchgco.obstacles.base import TINY, Solids
 from torchgco.obstacles.box_geometry import Coordinates, Cuboids, at_share, nearest
 
 RAYS = 8  # points of a circle
@@ -44,7 +44,7 @@ def directions(start: Tensor, goal: Tensor) -> Tensor:
         return torch.cat((cos, sin), dim=-1).expand(start.shape[0], -1, -1)
     along = goal - start
     first = torch.linalg.cross(along, along.new_tensor((0.0, 0.0, 1.0)).expand_as(along))
-    straight_up = first.square().sum(-1, keepdim=True) < 1e-12
+    straight_up = first.square().sum(-1, keepdim=True) < TINY
     first = _unit(torch.where(straight_up, along.new_tensor((1.0, 0.0, 0.0)), first)).unsqueeze(1)
     return cos * first + sin * _unit(torch.linalg.cross(along.unsqueeze(1), first))
 
@@ -113,7 +113,7 @@ def _middles(p: Tensor, q: Tensor, p_radius: Tensor, q_radius: Tensor, exists: T
     """Middles of the gaps between surfaces around p and q (B, K, V, d), of the `MIDWAY` nearest of each k."""
     square = (q - p).square().sum(-1).masked_fill(~exists, torch.inf)
     near = square.sort(dim=-1, stable=True).indices[..., :MIDWAY]
-    share = 0.5 + 0.5 * (p_radius - q_radius) / square.sqrt().clamp(min=1e-12)
+    share = 0.5 + 0.5 * (p_radius - q_radius) / square.sqrt().clamp(min=TINY)
     middle = p + share.unsqueeze(-1) * (q - p)
     place = near.unsqueeze(-1).expand(*near.shape, p.shape[-1])
     return middle.gather(2, place).flatten(1, 2), torch.isfinite(square.gather(-1, near)).flatten(1)
@@ -158,4 +158,4 @@ def _world(boxes: Cuboids, local: Coordinates) -> Tensor:
 
 
 def _unit(v: Tensor) -> Tensor:
-    return v / v.square().sum(-1, keepdim=True).sqrt().clamp(min=1e-12)
+    return v / v.square().sum(-1, keepdim=True).sqrt().clamp(min=TINY)

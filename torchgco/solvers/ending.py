@@ -15,7 +15,7 @@ from torch import Tensor
 from torchgco.base.status import Status
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.native.dispatch import cost_unit, engine_of, terms_of
+from torchgco.native.dispatch import cost_unit, engine_of
 from torchgco.problem.problem import Problem
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import STALLED
@@ -69,7 +69,7 @@ def _backward(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor]
         return lambda mu: backward(F, H, mu)
 
     def native(mu: Tensor) -> BackwardPass:
-        G, linear, quadratic, failed = engine.gains(problem, X, U, terms_of(lagrangian), mu)
+        G, linear, quadratic, failed = engine.gains(lagrangian, X, U, mu)
         return BackwardPass(G.transpose(0, 1), linear, quadratic, failed)
 
     return native

@@ -13,8 +13,8 @@ from torchgco.base.tree import put, take
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.quality import violation
-from torchgco.native.dispatch import engine_of, open_loop, terms_of, value
-from torchgco.native.engine import Options
+from torchgco.native.dispatch import engine_of, open_loop, value
+from torchgco.native.structures import End, Options
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.ending import start_status
@@ -170,9 +170,10 @@ def advance(inner: ILQR, s: InnerState, lagrangian: Lagrangian, limit: int) -> P
     for name in ("X", "U", "cost", "merit", "regularisation", "inner", "iterations", "rung"):
         state[name] = getattr(s, name).clone(memory_format=torch.contiguous_format)
         setattr(s, name, state[name])
-    out = engine.iterate(lagrangian.problem, state, terms_of(lagrangian), _native_options(inner), limit)
+    out = engine.iterate(lagrangian, state, _native_options(inner), limit)
     converged, stuck, lost = (out[name] != 0 for name in ("converged", "refused", "lost"))
-    ended, failed = out["status"] == 1, out["status"] > 1
+    ended = out["status"] == End.ENDED
+    failed = ~ended & (out["status"] != Status.RUNNING)
     rows = lost.nonzero().flatten()
     if rows.numel() > 0:
         won = rows[_lifted(s, lagrangian, rows, native=True)]
@@ -213,12 +214,15 @@ def descend(
 
 def _native_options(inner: ILQR) -> Options:
     search, printed = inner.line_search, inner.as_printed
-    return Options(
-        tuple(search.ladder(printed)), -1 if search.back is None else search.back, inner.max_iterations, printed,
-        0.0 if printed else inner.tolerance, inner.tolerance if printed else 0.0,
-        search.ratio_min, search.ratio_max, search.smallest,
-        REGULARISATION_FIRST, REGULARISATION_GROWTH, REGULARISATION_MAX, 0.0 if printed else DAMPING, ROUNDING, LOST,
-        inner.damp_below,
+    ladder = torch.tensor(search.ladder(printed), dtype=torch.float64)
+    return Options.complete(
+        ladder=ladder, rungs=len(ladder), back=-1 if search.back is None else search.back, accept_last=printed,
+        ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
+        max_iterations=inner.max_iterations, tolerance=0.0 if printed else inner.tolerance,
+        absolute_tolerance=inner.tolerance if printed else 0.0, rounding=ROUNDING, lost=LOST,
+        regularisation_first=REGULARISATION_FIRST, regularisation_growth=REGULARISATION_GROWTH,
+        regularisation_max=REGULARISATION_MAX, damping=0.0 if printed else DAMPING, damping_growth=DAMPING_GROWTH,
+        damping_decay=DAMPING_DECAY, damp_below=inner.damp_below,
     )  # fmt: skip
 
 

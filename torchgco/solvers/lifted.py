@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.rollout import closed_loop
-from torchgco.native.dispatch import engine_of, terms_of
+from torchgco.native.dispatch import engine_of
 from torchgco.solvers.line_search import Rollouts
 from torchgco.solvers.riccati import backward
 
@@ -54,7 +54,7 @@ def native_lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Te
     assert engine is not None
     state = {name: t.clone(memory_format=torch.contiguous_format) for name, t in (("X", X), ("U", U), ("merit", merit))}
     state["cost"] = state["merit"].clone()
-    accepted = engine.lift(lagrangian.problem, state, terms_of(lagrangian), ROUNDS, GAIN)
+    accepted = engine.lift(lagrangian, state, ROUNDS, GAIN)
     return Rollouts(**state, alpha=torch.ones_like(merit), accepted=accepted)
 
 

@@ -31,7 +31,7 @@ static inline V solid(const Constraint *con, const Rows *rows, int64_t j, const 
         }
         for (int a = 0; a < DIM; a++) slopes[a] = tgco_if(here, slopes[a]);
     }
-    return tgco_choose(here, c, SET(-1.0));
+    return tgco_choose(here, c, SET(ABSENT));
 }
 
 /* Whether the knot lies outside of the bounds of box j in every lane. */

@@ -15,8 +15,8 @@ static void commit(Lanes *s, I won, const int *from, V alpha, V cost, V merit) {
 
 /* The line search (lines 14-24) of the lanes `moving`. The `replicas` lanes of a problem try rungs in parallel. */
 static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
-    const Problem *p = s->of;
-    int replicas = p->replicas;
+    const Options *o = &s->of->options;
+    int replicas = s->of->replicas;
     int64_t landed[LANES];
     I open = moving, done = moving & ~moving;
     *shortest = SET(0.0);
@@ -24,12 +24,12 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
         V alpha, cost, merit;
         for (int l = 0; l < LANES; l++) {
             int64_t rung = s->rung[l] + tried + l % replicas;
-            alpha[l] = p->ladder[rung < p->rungs ? rung : p->rungs - 1];
+            alpha[l] = o->ladder[rung < o->rungs ? rung : o->rungs - 1];
         }
         roll(s, alpha, &cost, &merit);
         V ratio = (merit - s->merit) / (alpha * linear + SET(0.5) * alpha * alpha * quadratic);
-        I good = (ratio >= SET(p->ratio_min)) & (ratio <= SET(p->ratio_max));
-        if (p->accept_last) good |= alpha < SET(p->smallest);
+        I good = (ratio >= SET(o->ratio_min)) & (ratio <= SET(o->ratio_max));
+        if (o->accept_last) good |= alpha < SET(o->smallest);
         good &= finite(merit) & open;
         *shortest = tgco_choose(open, merit, *shortest);
         int from[LANES];
@@ -49,18 +49,18 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
         done |= won;
         for (int l = 0; l < LANES; l++) {
             if (won[l]) landed[l] = s->rung[l] + tried + from[l] % replicas;
-            else if (s->rung[l] + tried + replicas >= p->rungs) open[l] = 0;
+            else if (s->rung[l] + tried + replicas >= o->rungs) open[l] = 0;
         }
     }
     /* The next search begins a little above where this one ended; after one that found nothing, at a full step. */
     for (int l = 0; l < LANES; l++)
-        if (moving[l]) s->rung[l] = done[l] && p->back >= 0 && landed[l] > p->back ? landed[l] - p->back : 0;
+        if (moving[l]) s->rung[l] = done[l] && o->back >= 0 && landed[l] > o->back ? landed[l] - o->back : 0;
     return done;
 }
 
 /* One iteration. Returns the lanes that are done, their status, and whether they converged, were refused or diverge. */
 static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused, I *lost) {
-    const Problem *p = s->of;
+    const Options *o = &s->of->options;
     V linear, squares, lowest, zero = SET(0.0), old = s->merit, shortest;
     s->alpha = zero;
     s->used = s->mu_r;
@@ -68,16 +68,16 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
     V quadratic = -linear - s->mu_r * squares, before = s->mu_r;
     I failed = ~(lowest > zero) & running;
     V expected = tgco_fabs(linear + SET(0.5) * quadratic);
-    I settled = expected <= SET(p->rounding) * tgco_fabs(old);
+    I settled = expected <= SET(o->rounding) * tgco_fabs(old);
     I moving = running & ~failed & ~settled;
-    for (int l = 0; l < LANES; l++) status[l] = GOING;
+    for (int l = 0; l < LANES; l++) status[l] = RUNNING;
     if (any(failed)) {
-        V higher = s->mu_r * SET(p->growth);
-        higher = tgco_choose(higher < SET(p->first), SET(p->first), higher);
+        V higher = s->mu_r * SET(o->regularisation_growth);
+        higher = tgco_choose(higher < SET(o->regularisation_first), SET(o->regularisation_first), higher);
         s->mu_r = tgco_choose(failed, higher, s->mu_r);
         I sound = is_finite(s);
         for (int l = 0; l < LANES; l++) if (failed[l]) {
-            if (s->mu_r[l] > p->most) status[l] = NOT_POSITIVE_DEFINITE;
+            if (s->mu_r[l] > o->regularisation_max) status[l] = NOT_POSITIVE_DEFINITE;
             if (!sound[l]) status[l] = NON_FINITE;
         }
     }
@@ -87,27 +87,27 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
     s->made += tgco_truth(running & ~failed);
     /* mu_r of the next iteration */
     V next = zero;
-    if (p->damping > 0) {
-        V up = SET(10.0) * before, down = before / SET(3.0);
-        up = tgco_choose(up < SET(p->damping), SET(p->damping), up);
-        up = tgco_choose(up > SET(p->most), zero, up);
-        I crawls = accepted & (s->alpha < SET(p->damp_below));
-        next = tgco_choose(*refused | crawls, up, tgco_choose(down < SET(p->damping), zero, down));
+    if (o->damping > 0) {
+        V up = SET(o->damping_growth) * before, down = before / SET(o->damping_decay);
+        up = tgco_choose(up < SET(o->damping), SET(o->damping), up);
+        up = tgco_choose(up > SET(o->regularisation_max), zero, up);
+        I crawls = accepted & (s->alpha < SET(o->damp_below));
+        next = tgco_choose(*refused | crawls, up, tgco_choose(down < SET(o->damping), zero, down));
     }
     s->mu_r = tgco_choose(failed | ~running, s->mu_r, next);
     I stuck = *refused & (s->mu_r == zero);
     V change = tgco_fabs(s->merit - old);
     V larger = tgco_choose(change > expected, change, expected);
-    I flat = (larger <= SET(p->tolerance) * tgco_fabs(s->merit)) & ~(before > SET(p->damping));
-    *converged = running & ~failed & (settled | (moving & ~*refused & (flat | (change < SET(p->absolute_tolerance)))));
-    *lost = *refused & ~(shortest <= SET(p->lost_beyond) * tgco_fabs(old));
+    I flat = (larger <= SET(o->tolerance) * tgco_fabs(s->merit)) & ~(before > SET(o->damping));
+    *converged = running & ~failed & (settled | (moving & ~*refused & (flat | (change < SET(o->absolute_tolerance)))));
+    *lost = *refused & ~(shortest <= SET(o->lost) * tgco_fabs(old));
     *lost &= s->inner <= SET(1.0);
-    if (p->damping == 0) *lost = *lost & ~*lost;
-    I over = running & ~failed & (*converged | stuck | (s->inner >= SET((double)p->max_iterations)));
+    if (o->damping == 0) *lost = *lost & ~*lost;
+    I over = running & ~failed & (*converged | stuck | (s->inner >= SET((double)o->max_iterations)));
     *refused = stuck;
     for (int l = 0; l < LANES; l++) if (over[l]) status[l] = ENDED;
-    I limit = running & (*lost | (s->made >= SET((double)p->limit)));
-    for (int l = 0; l < LANES; l++) if (status[l] != GOING) limit[l] = -1;
+    I limit = running & (*lost | (s->made >= SET((double)s->of->limit)));
+    for (int l = 0; l < LANES; l++) if (status[l] != RUNNING) limit[l] = -1;
     return limit & running;
 }
 

@@ -2,30 +2,6 @@
 
 #define BLOCK 32 /* spheres evaluated together: most blocks are far away and add nothing */
 
-/* The term that a row adds to L_M. */
-static inline V worth(const Lanes *s, int equality, V c, V lam) {
-    V half = SET(0.5), mu = s->mu;
-    if (equality) return (lam + half * mu * c) * c;
-    if (s->of->phr) {
-        I idle = lam + mu * c < SET(0.0);
-        return tgco_choose(idle, -half * lam * lam * s->inverse_mu, (lam + half * mu * c) * c);
-    }
-    I idle = (c < SET(0.0)) & (lam == SET(0.0));
-    return (lam + half * tgco_if(~idle, mu) * c) * c;
-}
-
-/* First and second derivative of `worth` by c; where `optimality` is set, of lam c with the penalty's curvature. */
-static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
-    const Problem *p = s->of;
-    V mu = s->mu;
-    if (p->optimality) { *rho = tgco_if(lam != SET(0.0), mu); return lam; }
-    if (equality) { *rho = mu; return lam + mu * c; }
-    I idle = p->phr ? lam + mu * c < SET(0.0) : (c < SET(0.0)) & (lam == SET(0.0));
-    *rho = tgco_if(~idle, mu);
-    V g = lam + *rho * c;
-    return p->phr ? tgco_if(~idle, g) : g;
-}
-
 /* Row j of bounds. */
 static inline V bound(const Constraint *con, const Rows *rows, int64_t j, const V *x, const V *u) {
     int v = con->variable[j];
@@ -88,10 +64,6 @@ static inline void spheres_expand(
         }
     }
 }
-#endif
-
-#if WITH_BOXES
-/* boxes.c stands here. */
 #endif
 
 static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V total) {
@@ -185,7 +157,7 @@ static inline V knot_value(const Lanes *s, int64_t k, const V *x, const V *u, V 
     const Problem *p = s->of;
     V more = SET(0.0);
     for (int64_t i = 0; i < p->constraints; i++)
-        if (p->constraint[i].place[k] >= 0) more = rows_value(s, i, k, x, u, more);
+        if (p->constraint[i].place[k] != NOWHERE) more = rows_value(s, i, k, x, u, more);
 #if DIM > 0
     if (p->guide != NO_GUIDE) more += guide_value(s, k, x);
 #endif
@@ -198,7 +170,7 @@ __attribute__((noinline)) static void knot_expand(const Lanes *s, int64_t k, con
     const Problem *p = s->of;
     cost_expand(s, k, x, u, g, H);
     for (int64_t i = 0; i < p->constraints; i++)
-        if (p->constraint[i].place[k] >= 0) rows_expand(s, i, k, x, u, g, H);
+        if (p->constraint[i].place[k] != NOWHERE) rows_expand(s, i, k, x, u, g, H);
 #if DIM > 0
     if (p->guide != NO_GUIDE) guide_expand(s, k, x, g, H);
 #endif

@@ -2,18 +2,6 @@
 
 #include <float.h>
 
-typedef struct {
-    const Problem *of;
-    int64_t samples, rounds, knots, elite;  /* knots at which noise is drawn; 0: at every stage, white */
-    double temperature, collision_penalty, linger, decay;
-    const uint64_t *keys;                   /* (E, rounds) */
-    Array deviation, lower, upper;          /* (E, 1, NU) */
-    const int32_t *left;                    /* (N): the knot before each stage; unused where white */
-    const double *share;                    /* (N): share of the interval to the next */
-    const int32_t *geometric;               /* of each constraint: whether samples that touch it are counted */
-    double *mean;                           /* (E, N, NU) in and out */
-} Sampling;
-
 /* The working data of one problem, which all lanes of `s` hold. */
 typedef struct {
     const Sampling *of;
@@ -41,7 +29,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
     V count = SET(0.0);
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
-        if (!q->of->geometric[i] || con->place[k] < 0) continue;
+        if (!q->of->geometric[i] || con->place[k] == NOWHERE) continue;
 #if DIM > 0
         if (con->kind == SPHERES) {
             for (int j = 0; j < con->rows; j++) {
@@ -84,7 +72,7 @@ static void fly(Samples *q, int64_t first) {
                 likelihood += q->mean[k * NU + j] / (q->deviation[j] * q->deviation[j]) * eps[j];
     }
     cost += cost_value(&q->s, p->N, x, 0);
-    if (o->linger > 0) cost += SET(o->linger * p->N) * cost_value(&q->s, p->N - 1, x, u);
+    if (o->dwell_cost > 0) cost += SET(o->dwell_cost * p->N) * cost_value(&q->s, p->N - 1, x, u);
     cost += SET(o->temperature) * likelihood;
     for (int l = 0; l < LANES && first + l < o->samples; l++) {
         double score = (double)cost[l] + o->collision_penalty * (double)touched[l];

@@ -9,9 +9,9 @@ static inline F single(float c) { return c - (F){0}; }
 
 static inline W mixed(W z) {
     z ^= z >> 16;
-    z *= 0x85EBCA6Bu;
+    z *= MURMUR_1;
     z ^= z >> 13;
-    z *= 0xC2B2AE35u;
+    z *= MURMUR_2;
     return z ^ (z >> 16);
 }
 
@@ -55,7 +55,7 @@ static void normal(uint64_t key, int64_t first, int64_t rows, V *z) {
     W number;
     for (int l = 0; l < LANES; l++) number[l] = (uint32_t)(first + l) * (uint32_t)half;
     for (int64_t i = 0; i < half; i++) {
-        W word = mixed(((number + (uint32_t)i) * 0x9E3779B9u) ^ low);
+        W word = mixed(((number + (uint32_t)i) * WEYL) ^ low);
         F length = radius(uniform(word)), cosine, sine;
         turn(uniform(mixed(word ^ high)), &cosine, &sine);
         z[i] = __builtin_convertvector(length * cosine, V);

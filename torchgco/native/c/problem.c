@@ -1,57 +1,18 @@
 /* Problems side by side, one per lane of the vectors V; no operation mixes lanes.
 
-   The generated part before this file defines NX, NU, NP, NJ, DIM, POSITION, QUADRATIC_FULL, COST_ARRAYS, MAX_ROWS, and
+   The generated part before this file declares the structures and enumerations of native/structures.py. It defines NX,
+   NU, NP, NJ, DIM, POSITION, QUADRATIC_FULL, WITH_BOXES, COST_ARRAYS, MAX_ROWS, and
 
        tgco_step, tgco_jacobian                         the model
        tgco_gather(P, f, T), tgco_product(f, T, Q)      T = P F and Q = F' T (upper triangle) for its sparse F = [fx fu]
        tgco_pull_back(p, f, g)                          g = F' p
        tgco_rows(i, x, u, p, c), tgco_add_rows(i, ...)  traced constraints, with a knot's own numbers p */
 
-#include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
 #define S (NX + NU)
 #define NZ (NX + 1)
-
-enum { BOUNDS = 0, SPHERES = 1, FUNCTION = 2, BOXES = 3 };
-enum { NO_GUIDE = 0, REGION = 1, PATH = 2 };
-enum { GOING = 0, ENDED = 1, NOT_POSITIVE_DEFINITE = 4, NON_FINITE = 5 };
-
-/* An array over (problems, knots, numbers); a stride of 0 stands for an axis of length 1. E below counts problems. */
-typedef struct { const double *data; int64_t element, knot; int64_t size; } Array;
-
-typedef struct {
-    int32_t kind, equality, rows;  /* rows of a knot */
-    const int32_t *place;          /* (N+1): index among the constraint's knots, -1 where it has no rows */
-    int64_t knots;
-    double *lam;                   /* (E, knots, rows) */
-    const int32_t *variable;       /* BOUNDS: (rows) index into [x, u] */
-    const double *sign;            /* BOUNDS: (rows) +1 for an upper bound, -1 for a lower one */
-    Array bound;                   /* BOUNDS: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM);
-                                      FUNCTION: p (E, knots, ...); BOXES: (E, 1, rows * (2 * DIM + 1 + BOX_NUMBERS)) */
-    Array squares;                 /* SPHERES: squared inflated radii (E, 1, rows), negative where absent */
-    Array velocities;              /* SPHERES: as centres, or NULL */
-    double dt;
-} Constraint;
-
-typedef struct {
-    int64_t N, elements, constraints, rungs, back, limit, max_iterations;
-    double *X, *U, *cost, *merit, *regularisation;  /* (E, ...) in and out */
-    double *alpha, *used;                           /* (E): step length and mu_r of the last iteration */
-    double *gains;                                  /* (E, N, NU, NZ): what tgco_gains writes */
-    double *slopes, *curvatures;                    /* (E, N+1, S), (E, N+1, S, S): what tgco_expand writes */
-    const double *mu;
-    int64_t *inner, *iterations, *rung;
-    int32_t *status, *converged, *refused, *lost;
-    Array parameters, cost_data[COST_ARRAYS];
-    const Constraint *constraint;
-    int32_t guide, phr, accept_last, replicas, optimality;
-    Array center, radius, weight;
-    const double *ladder;
-    double tolerance, absolute_tolerance, ratio_min, ratio_max, smallest;
-    double first, growth, most, damping, rounding, lost_beyond, damp_below, gain;
-} Problem;
 
 /* A constraint's multipliers and numbers. */
 typedef struct {

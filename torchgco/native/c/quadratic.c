@@ -1,7 +1,5 @@
 /* The quadratic cost: value, gradient and Hessian at a knot. Weights are diagonals, or matrices (QUADRATIC_FULL). */
 
-enum { Q, R, Q_LAST, X_REF, X_REF_LAST, U_REF, Q_LINEAR, R_LINEAR, Q_LINEAR_LAST, CROSS };
-
 /* w' e + e' W e / 2 in e = z - reference, for z = x or z = u at a knot; w may be NULL. */
 typedef struct { const V *W, *w, *reference; } Quadratic;
 

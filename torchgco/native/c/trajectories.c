@@ -32,7 +32,7 @@ int tgco_gains(const Problem *p, int64_t first, int64_t last) {
         for (int l = 0; l < LANES && e + l < last; l++) {
             p->cost[e + l] = linear[l];
             p->merit[e + l] = quadratic[l];
-            p->status[e + l] = !(lowest[l] > 0);
+            p->status[e + l] = lowest[l] > 0 ? RUNNING : NOT_POSITIVE_DEFINITE;
             for (int64_t i = 0; i < p->N * NU * NZ; i++) p->gains[(e + l) * p->N * NU * NZ + i] = s->G[i][l];
         }
     }

@@ -14,6 +14,7 @@ from torchgco.base.errors import InputError
 from torchgco.costs.base import Cost, ScaledCost, ShiftedCost
 from torchgco.native.codegen import emit
 from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
+from torchgco.native.structures import COST_ARRAYS, Array, TracedCost, array
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
 
@@ -62,13 +63,16 @@ def trace_cost(problem: Problem) -> CostSource:
     )
 
 
-def cost_numbers(problem: Problem, source: CostSource) -> tuple[Tensor, Tensor, Tensor]:
+def cost_arrays(problem: Problem, source: CostSource) -> list[Array]:
     """The arrays of traced.c: factor and shift (B, 1, 2), and the numbers (B|1, K|1, count) of stages and last knot."""
     cost, factor, shift = unscaled(problem)
     own = own_tensors(cost)
     stage = source.stage.numbers(problem.B, own, lambda: spans_of_cost(problem)[0])
     last = source.last.numbers(problem.B, own, lambda: spans_of_cost(problem)[1])
-    return torch.stack((factor, shift), dim=-1).unsqueeze(1), stage, last
+    scale = torch.stack((factor, shift), dim=-1).unsqueeze(1)
+    numbers = {TracedCost.FACTOR: scale, TracedCost.STAGE: stage, TracedCost.LAST: last}
+    arrays = [array(numbers[which], knots=True) for which in TracedCost]
+    return arrays + [Array()] * (COST_ARRAYS - len(arrays))
 
 
 def spans_of_cost(problem: Problem) -> tuple[Span, Span]:

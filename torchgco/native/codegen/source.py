@@ -11,7 +11,8 @@ from torchgco.native.codegen.cost import CostSource
 from torchgco.native.codegen.dynamics import DynamicsSource
 from torchgco.native.codegen.emit import PRELUDE, literal
 from torchgco.native.codegen.knot import KnotSource
-from torchgco.native.packing import COST_ARRAYS
+from torchgco.native.declarations import defines, head
+from torchgco.native.structures import CONSTANTS, COST_ARRAYS, ENUMERATIONS, STRUCTURES, Quadratic, TracedCost
 
 C = Path(__file__).parents[1] / "c"
 LANES = 8
@@ -40,10 +41,10 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
     for (int e = 0; e < COUNT; e++) g[F_column[e]] += entry(e, f) * p[F_row[e]];
 }
 """
-BOXES_STAND_HERE = "/* boxes.c stands here. */\n"
-COST = "quadratic.c"  # or traced.c
-SOLVER = ("problem.c", COST, "knot.c", "passes.c", "ilqr.c", "trajectories.c")
-SAMPLER = ("problem.c", COST, "knot.c", "normal.c", "mppi.c")
+COST, BOXES = "quadratic.c", ("box.h", "boxes.c")  # or traced.c; left out where there are no boxes
+TERMS = ("problem.c", COST, "penalty.c", *BOXES, "knot.c")
+SOLVER = (*TERMS, "passes.c", "ilqr.c", "trajectories.c")
+SAMPLER = (*TERMS, "normal.c", "mppi.c")
 
 
 _sources: dict[tuple[Any, ...], str] = {}  # reading and joining the files takes longer than a small solve
@@ -78,23 +79,20 @@ class Form:
 
     def _written(self, parts: tuple[str, ...], real: str, lanes: int) -> str:
         model, at = self.dynamics, self.position
-        defines = {
+        sizes = {
             "REAL": real, "LANES": lanes, "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
             "DIM": 0 if at is None else at.stop - at.start, "POSITION": 0 if at is None else at.start,
-            "QUADRATIC_FULL": int(self.dense), "COST_ARRAYS": COST_ARRAYS,
+            "QUADRATIC_FULL": int(self.dense), "WITH_BOXES": int(self.boxes), "COST_ARRAYS": COST_ARRAYS,
             "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]),
         }  # fmt: skip
-        head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
+        cost = Quadratic if self.cost is None else TracedCost
+        shared = head(STRUCTURES, (*ENUMERATIONS, cost), CONSTANTS)
         generated = [model.code, _products(model), "" if self.cost is None else self.cost.code]
         generated += [*dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions)]
-        names = parts if self.cost is None else ["traced.c" if name == COST else name for name in parts]
-        texts = [(C / name).read_text() for name in names]
-        if self.boxes:
-            # Left out elsewhere, so that it can't change how problems without boxes are compiled.
-            head += "#define WITH_BOXES 1\n"
-            solid = "\n".join((C / name).read_text() for name in ("box.h", "boxes.c"))
-            texts = [text.replace(BOXES_STAND_HERE, solid) for text in texts]
-        return "\n".join((head, PRELUDE, *generated, *texts))
+        # Without boxes their code is left out, so that it can't change how the rest is compiled.
+        names = [name for name in parts if self.boxes or name not in BOXES]
+        names = ["traced.c" if name == COST and self.cost is not None else name for name in names]
+        return "\n".join((defines(sizes), shared, PRELUDE, *generated, *((C / name).read_text() for name in names)))
 
 
 def _products(model: DynamicsSource) -> str:

@@ -3,38 +3,14 @@
    Both do the same operations in the same order, and none is fused here (-ffp-contract=off): all numbers but square
    roots, which PyTorch doesn't always round correctly, agree to the last bit. Clearance and nearness are therefore
    compared as squares, detours and costs with a tolerance, and ties are broken by the lowest index: the paths are the
-   same. DIM is the number of coordinates. */
+   same. DIM is the number of coordinates; the part before this file declares `Search` (roadmap/native.py). */
 
 #include <math.h>
-#include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
 #define BLOCK 32  /* edges measured side by side */
-#define TINY 1e-12
 #define CLAMP(x, low, high) ((x) < (low) ? (low) : (x) > (high) ? (high) : (x))
-
-typedef struct {
-    int64_t problems, spheres, spread, candidates, points, edges, neighbours, hubs, corners, directions, shells, midway;
-    double margin, least, clear, factor, tie;
-    const double *centers, *distances;  /* (B, M, DIM), (B, M): radii, negative where absent */
-    const double *start, *goal;         /* (B, DIM) */
-    const double *cube, *rays, *shell;  /* (spread, DIM) in the unit cube; directions (B, rays, DIM); (shells) */
-    double *nodes;                      /* (B, V, DIM) */
-    int32_t *ends;                      /* (B, V, K): where edges lead; blocked ones are -1 and come last */
-    double *lengths;                    /* (B, V, K), infinite for blocked ones */
-    double *price;                      /* (B, V) */
-    double *path;                       /* (B, P, DIM) */
-    double *string;                     /* (B, 2 P - 1, DIM) */
-    const double *cost;                 /* (B, 2 P - 1) */
-    uint8_t *arrives;                   /* (B) */
-    /* Read only where there are boxes: their numbers (B, boxes, BOX_NUMBERS), points around them (B, extras, DIM) and
-       whether each exists, their largest size (B). */
-    const double *box, *beside;
-    const uint8_t *exists;
-    const double *reach, *largest;      /* the former are corners (B, 2, DIM) of the region that holds all */
-    int64_t boxes, extras;
-} Search;
 
 /* The spheres of a problem that are present: radii, their squares, centres coordinate by coordinate; boxes, some of
    them absent; and the largest size of all. */
@@ -223,7 +199,7 @@ static void join(const Search *s, int64_t b, const uint8_t *usable, double *at, 
 static void measure(
     const Search *s, const Spheres *o, const double *p, int64_t n, int64_t k, const int32_t *ends, double *lengths
 ) {
-    double margin = s->margin * (o->largest < 1e-9 ? 1e-9 : o->largest), whole = 0.0;
+    double margin = s->margin * (o->largest < SMALL ? SMALL : o->largest), whole = 0.0;
     for (int i = 0; i < DIM; i++) whole += (p[DIM + i] - p[i]) * (p[DIM + i] - p[i]);
     double shortest = s->least * sqrt(whole);
     int64_t from = 0, slot = 0;

@@ -1,0 +1,298 @@
+"""What Python and C share has one declaration: changed in Python, it changes what C does, or C's library is refused."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from enum import IntEnum
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.native.test_engine import running_state
+from tests.problems import boxed_batch, planar_batch
+from torchgco import ILQR, MPPI, LineSearch, Problem
+from torchgco.base import kernels
+from torchgco.base.draws import DrawKey
+from torchgco.base.status import Status
+from torchgco.guidance import mppi
+from torchgco.native import structures
+from torchgco.native.codegen.source import LANES, SAMPLER, SOLVER, C
+from torchgco.native.compiler import NativeError, build, find_compiler
+from torchgco.native.declarations import Structure, defines, fields, head, load
+from torchgco.native.dispatch import engine_of
+from torchgco.native.structures import CONSTANTS, STRUCTURES, End, Options
+from torchgco.roadmap import native as roadmap
+from torchgco.roadmap.roadmap import Roadmap
+from torchgco.roadmap.scene import scene_of
+from torchgco.solvers import ilqr, lifted
+from torchgco.solvers.ilqr import advance
+from torchgco.solvers.lifted import lifted_search, native_lifted_search
+from torchgco.solvers.state import State
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+
+
+@pytest.fixture(autouse=True)
+def cache() -> None:
+    """Use the user's cache folder: libraries are compiled once for all tests of this file."""
+
+
+@pytest.fixture(autouse=True)
+def native_again() -> Iterator[None]:
+    yield
+    kernels.use_native(True)
+
+
+class Pair(Structure):
+    """Two numbers and where others lie."""
+
+    declared = (("int32_t", "count"), ("double", "first"), ("const double *", "others"))
+    _fields_ = fields(declared)
+
+
+SUM = """
+double tgco_sum(const Pair *pair) {
+    double sum = pair->first;
+    for (int i = 0; i < pair->count; i++) sum += FACTOR * pair->others[i];
+    return sum;
+}
+"""
+
+
+def test_a_structure_of_another_size_is_refused() -> None:
+    source = head([Pair], [], {"FACTOR": 3.0}) + SUM
+    library = load(source, [Pair])
+    library.tgco_sum.restype = ctypes.c_double
+    others = torch.tensor([1.0, 2.0], dtype=torch.float64)
+    assert library.tgco_sum(ctypes.byref(Pair(count=2, first=0.5, others=others))) == 9.5
+
+    class Longer(Structure):
+        declared = (*Pair.declared, ("int32_t", "one_more"))
+        _fields_ = fields(declared)
+
+    Longer.__name__ = "Pair"
+    with pytest.raises(NativeError, match="Pair has 32 bytes in Python, 24 in the library"):
+        load(source, [Longer])
+
+
+@pytest.mark.parametrize("structure", [*STRUCTURES, roadmap.Search], ids=lambda s: s.__name__)
+def test_the_size_of_each_structure_is_compared(structure: type[Structure], monkeypatch) -> None:
+    """A library that reports one byte more or less is refused where the kernels are loaded."""
+    problem = boxed_batch(2, B=1, N=3)[0]
+    plain = ctypes.sizeof
+    for wrong in (-1, 1):
+        monkeypatch.setattr(ctypes, "sizeof", lambda s: plain(s) + (wrong if s is structure else 0))  # noqa: B023
+        with pytest.raises(NativeError, match=f"{structure.__name__} has"):
+            if structure is roadmap.Search:
+                load(head([structure], [], {}), [structure])
+            else:
+                load(head(STRUCTURES, [], CONSTANTS), STRUCTURES)
+        monkeypatch.setattr(ctypes, "sizeof", plain)
+    assert engine_of(problem) is not None
+
+
+def test_no_value_is_lost_by_a_wrong_name_or_type() -> None:
+    with pytest.raises(AttributeError, match="Pair has no field forst"):
+        Pair(forst=1.0)
+    with pytest.raises(TypeError, match=r"Pair lacks first, others"):
+        Pair.complete(count=1)
+    for wrong in (torch.zeros(2), torch.zeros(2, dtype=torch.int64), torch.zeros(4, dtype=torch.float64)[::2]):
+        with pytest.raises(TypeError, match=r"others: expected a contiguous tensor of torch.float64"):
+            Pair(others=wrong)
+    with pytest.raises(TypeError, match="Options lacks"):
+        Options.complete(rungs=1)
+
+
+def test_an_end_is_no_status() -> None:
+    assert End.ENDED not in set(Status)
+
+
+@pytest.mark.parametrize("name", CONSTANTS)
+def test_a_constant_changes_what_is_compiled(name: str, monkeypatch) -> None:
+    engine = engine_of(boxed_batch(2, B=1, N=3)[0])
+    assert engine is not None
+    for parts in (SOLVER, SAMPLER):
+        usual = engine.form._written(parts, "double", LANES)
+        with monkeypatch.context() as patch:
+            patch.setitem(CONSTANTS, name, 7)
+            changed = engine.form._written(parts, "double", LANES)
+        assert changed == usual.replace(f"#define {name} {written(name)}\n", f"#define {name} 7\n") != usual
+    assert any(name in (C / file).read_text() for file in (*SOLVER, *SAMPLER)), "no line of C uses it"
+
+
+def written(name: str) -> str:
+    return defines({name: CONSTANTS[name]}).split()[-1]
+
+
+@pytest.mark.parametrize("kind", [*structures.ENUMERATIONS, structures.Quadratic, structures.TracedCost])
+def test_an_enumeration_has_the_values_of_python(kind: type[IntEnum]) -> None:
+    name = kind.__name__.lower()
+    values = ", ".join(member.name for member in kind)
+    code = f"int tgco_{name}(int i) {{ static const int all[] = {{{values}}}; return all[i]; }}"
+    function = getattr(build(head([], [kind], {}) + code), f"tgco_{name}")
+    assert [function(i) for i in range(len(kind))] == [member.value for member in kind]
+
+
+class Choosy(LineSearch):
+    """Refuses all steps."""
+
+    ratio_min = 5.0
+
+
+def run(inner: ILQR, prepare: Callable[[State], None], problem: Problem, native: bool, count: int) -> State:
+    """The state after `count` iterations, one by one; a backward pass that fails is tried again until it succeeds."""
+    state, lagrangian = running_state(problem)
+    prepare(state)
+    for _ in range(count):
+        end = advance(inner, state, lagrangian, 1) if native else inner.iterate(state, lagrangian)
+        while not native and bool((end.failed & (end.status == Status.RUNNING)).all()):
+            end = inner.iterate(state, lagrangian)
+    return state
+
+
+def damped(state: State) -> None:
+    state.regularisation = torch.full_like(state.merit, 0.5)
+
+
+def unchanged(state: State) -> None:
+    pass
+
+
+def planar() -> Problem:
+    return planar_batch(B=3, N=8)[0]
+
+
+def concave() -> Problem:
+    free = planar_batch(B=2, N=6)[0]
+    return free._with({"cost": replace(free.cost, R=-free.cost.R), "constraints": ()})
+
+
+CHOOSY = ILQR(line_search=Choosy())
+# Constant: another value, the solver, the start, the problem, iterations.
+OF_ILQR: dict[str, tuple[float, ILQR, Callable[[State], None], Callable[[], Problem], int]] = {
+    "REGULARISATION_FIRST": (3e-6, ILQR(), unchanged, concave, 1),
+    "REGULARISATION_GROWTH": (7.0, ILQR(), unchanged, concave, 1),
+    "REGULARISATION_MAX": (0.7, CHOOSY, damped, planar, 1),
+    "DAMPING": (0.05, CHOOSY, unchanged, planar, 1),
+    "DAMPING_GROWTH": (7.0, CHOOSY, damped, planar, 2),
+    "DAMPING_DECAY": (2.0, ILQR(), damped, planar, 1),
+    "ROUNDING": (1e6, ILQR(), unchanged, planar, 1),
+}
+PRINTED = ILQR(as_printed=True, line_search=Choosy())  # takes the last step length
+OF_LINE_SEARCH = {
+    "shrink": (0.3, PRINTED), "smallest": (0.3, PRINTED), "ratio_min": (2.0, ILQR()), "ratio_max": (0.5, ILQR()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OF_ILQR)
+def test_a_constant_of_ilqr_changes_both_kernels(name: str, monkeypatch) -> None:
+    value, inner, prepare, problem, count = OF_ILQR[name]
+    usual = run(inner, prepare, problem(), True, count)
+    monkeypatch.setattr(ilqr, name, value)
+    mine, theirs = (run(inner, prepare, problem(), native, count) for native in (True, False))
+    assert not same(mine, usual) and same(mine, theirs)
+
+
+@pytest.mark.parametrize("name", OF_LINE_SEARCH)
+def test_a_constant_of_the_line_search_changes_both_kernels(name: str, monkeypatch) -> None:
+    value, inner = OF_LINE_SEARCH[name]
+    usual = run(inner, unchanged, planar(), True, 1)
+    monkeypatch.setattr(LineSearch, name, value)
+    mine, theirs = (run(inner, unchanged, planar(), native, 1) for native in (True, False))
+    assert not same(mine, usual) and same(mine, theirs)
+
+
+def same(a: State, b: State) -> bool:
+    names = ("regularisation", "merit", "U")
+    return all(torch.allclose(getattr(a, name), getattr(b, name), rtol=1e-7, atol=1e-10) for name in names)
+
+
+def test_iterates_are_lost_where_python_says(monkeypatch) -> None:
+    """With LOST = 0 every refused iterate counts as lost, and a lifted search follows, in both kernels."""
+    usual = run(CHOOSY, unchanged, planar(), True, 1)
+    for module in (ilqr, lifted):
+        monkeypatch.setattr(module, "LOST", 0.0)
+    mine, theirs = (run(CHOOSY, unchanged, planar(), native, 1) for native in (True, False))
+    assert not same(mine, usual) and same(mine, theirs)
+
+
+@pytest.mark.parametrize(("name", "value"), [("ROUNDS", 1), ("GAIN", 0.9999)])
+def test_a_constant_of_the_lifted_search_changes_both_kernels(name: str, value: float, monkeypatch) -> None:
+    state, lagrangian = running_state(planar())
+    searches = (native_lifted_search, lifted_search)
+    usual = [search(lagrangian, state.X, state.U, state.merit).accepted for search in searches]
+    monkeypatch.setattr(lifted, name, value)
+    changed = [search(lagrangian, state.X, state.U, state.merit).accepted for search in searches]
+    assert bool(usual[0].any()) and torch.equal(*usual)
+    assert not bool(changed[0].all()) and torch.equal(*changed) and not torch.equal(usual[0], changed[0])
+
+
+def test_every_option_reaches_the_library() -> None:
+    """Each field has the value of the option, or of the constant, that bears its name."""
+    inner = ILQR(tolerance=0.011, max_iterations=13, damp_below=0.17, line_search=LineSearch(back=2))
+    options, search = ilqr._native_options(inner), inner.line_search
+    want = {
+        "rungs": len(search.ladder(False)), "back": 2, "max_iterations": 13, "accept_last": 0, "tolerance": 0.011,
+        "absolute_tolerance": 0.0, "ratio_min": search.ratio_min, "ratio_max": search.ratio_max,
+        "smallest": search.smallest, "damp_below": 0.17, "rounding": ilqr.ROUNDING, "lost": lifted.LOST,
+        "regularisation_first": ilqr.REGULARISATION_FIRST, "regularisation_growth": ilqr.REGULARISATION_GROWTH,
+        "regularisation_max": ilqr.REGULARISATION_MAX, "damping": ilqr.DAMPING,
+        "damping_growth": ilqr.DAMPING_GROWTH, "damping_decay": ilqr.DAMPING_DECAY,
+    }  # fmt: skip
+    assert {name: getattr(options, name) for name in Options.kinds if name != "ladder"} == want
+    ladder = (ctypes.c_double * options.rungs).from_address(options.ladder)
+    assert list(ladder) == search.ladder(False)
+    printed = ilqr._native_options(replace(inner, as_printed=True))
+    assert (printed.tolerance, printed.absolute_tolerance, printed.damping, printed.accept_last) == (0.0, 0.011, 0, 1)
+
+
+def test_the_collision_penalty_changes_both_kernels(monkeypatch) -> None:
+    problem, U = planar_batch(B=3, N=20, obstacles=10)
+    drawing, key = MPPI(samples=60, covariance=20.0, temperature=50.0), DrawKey(7, torch.arange(3), torch.arange(3))
+    made = {}
+    for penalty in (mppi.COLLISION_PENALTY, 20.0):
+        monkeypatch.setattr(mppi, "COLLISION_PENALTY", penalty)
+        for native in (True, False):
+            kernels.use_native(native)
+            made[penalty, native] = drawing.improve(problem, U, key)[1]
+        torch.testing.assert_close(made[penalty, True], made[penalty, False], rtol=1e-4, atol=1e-4)
+    assert not torch.allclose(*(made[penalty, True] for penalty, native in made if native), rtol=1e-3)
+
+
+OF_ROADMAP = {
+    "SHELLS": {2: (1.4,)}, "RAYS": 5, "MIDWAY": 1, "CLEAR": 0.4, "LEAST": 0.3, "HOPS": 1, "TIE": 0.5, "AROUND": 4.0,
+    "TINY": 3.0, "SMALL": 30.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OF_ROADMAP)
+def test_a_constant_of_the_roadmap_changes_both_searches(name: str, monkeypatch) -> None:
+    usual = searched()
+    for path, module in list(sys.modules.items()):
+        if path.startswith(("torchgco.roadmap", "torchgco.obstacles")) and hasattr(module, name):
+            monkeypatch.setattr(module, name, OF_ROADMAP[name])
+    roadmap._library.cache_clear()
+    try:
+        changed = searched()
+    finally:
+        roadmap._library.cache_clear()
+    for native, plain in (usual, changed):
+        torch.testing.assert_close(native, plain, rtol=1e-9, atol=1e-9)
+    assert usual[0].shape != changed[0].shape or not torch.allclose(usual[0], changed[0], rtol=1e-6)
+
+
+def searched() -> tuple[Tensor, Tensor]:
+    """Different paths of several problems, by the library and by PyTorch."""
+    problem, U0 = planar_batch(B=8, N=10, obstacles=8)
+    scene = scene_of(problem, U0)
+    assert scene is not None and roadmap.library_for(problem.x0[:, :2]) is not None
+    made = []
+    for native in (True, False):
+        kernels.use_native(native)
+        made.append(Roadmap(num_halton=16).paths(scene, 3)[0])
+    kernels.use_native(True)
+    return made[0], made[1]

@@ -1,0 +1,25 @@
+/* The terms that multipliers and penalty add to L_M for one row of a constraint. */
+
+/* The term that a row adds to L_M. */
+static inline V worth(const Lanes *s, int equality, V c, V lam) {
+    V half = SET(0.5), mu = s->mu;
+    if (equality) return (lam + half * mu * c) * c;
+    if (s->of->phr) {
+        I idle = lam + mu * c < SET(0.0);
+        return tgco_choose(idle, -half * lam * lam * s->inverse_mu, (lam + half * mu * c) * c);
+    }
+    I idle = (c < SET(0.0)) & (lam == SET(0.0));
+    return (lam + half * tgco_if(~idle, mu) * c) * c;
+}
+
+/* First and second derivative of `worth` by c; where `optimality` is set, of lam c with the penalty's curvature. */
+static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
+    const Problem *p = s->of;
+    V mu = s->mu;
+    if (p->optimality) { *rho = tgco_if(lam != SET(0.0), mu); return lam; }
+    if (equality) { *rho = mu; return lam + mu * c; }
+    I idle = p->phr ? lam + mu * c < SET(0.0) : (c < SET(0.0)) & (lam == SET(0.0));
+    *rho = tgco_if(~idle, mu);
+    V g = lam + *rho * c;
+    return p->phr ? tgco_if(~idle, g) : g;
+}

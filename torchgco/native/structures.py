@@ -1,0 +1,129 @@
+"""The structures and enumerations of the solver's library in C. E counts problems."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from torch import Tensor
+
+from torchgco.base.draws import MURMUR_1, MURMUR_2, WEYL
+from torchgco.base.status import Status
+from torchgco.native.declarations import Structure, fields
+from torchgco.obstacles.base import ABSENT
+
+NOWHERE = -1  # the place of a knot at which a constraint has no rows
+CONSTANTS = {
+    "ABSENT": ABSENT, "NOWHERE": NOWHERE,
+    **{name: f"{value & 0xFFFFFFFF:#x}u" for name, value in (
+        ("MURMUR_1", MURMUR_1), ("MURMUR_2", MURMUR_2), ("WEYL", WEYL),
+    )},
+}  # fmt: skip
+
+
+# How a constraint's rows are computed, FUNCTION: by traced code; the penalty of guidance, if any.
+Kind = IntEnum("Kind", "BOUNDS SPHERES FUNCTION BOXES", start=0)
+Guide = IntEnum("Guide", "NO_GUIDE REGION PATH", start=0)
+# How an inner solve is marked that ended, for a reason that `converged` and `refused` say. Others have a `Status`:
+# RUNNING, or the one with which they failed.
+End = IntEnum("End", {"ENDED": -1})
+# The arrays of a quadratic cost and its fields; those of a traced cost: factor and shift, and the numbers of its code.
+QUADRATIC = {
+    "Q": "Q", "R": "R", "Q_LAST": "Qf", "X_REF": "x_ref", "X_REF_LAST": "xf_ref", "U_REF": "u_ref", "Q_LINEAR": "q",
+    "R_LINEAR": "r", "Q_LINEAR_LAST": "qf", "CROSS": "H",
+}  # fmt: skip
+Quadratic = IntEnum("Quadratic", list(QUADRATIC), start=0)
+TracedCost = IntEnum("TracedCost", "FACTOR STAGE LAST", start=0)
+COST_ARRAYS = len(Quadratic)
+
+
+class Array(Structure):
+    """An array over (problems, knots, numbers); a stride of 0 stands for an axis of length 1."""
+
+    declared = (("const double *", "data"), ("int64_t", "element knot size"))
+    _fields_ = fields(declared)
+
+
+class Constraint(Structure):
+    declared = (
+        ("int32_t", "kind equality rows"),  # rows of a knot
+        ("const int32_t *", "place"),  # (N+1): index among the constraint's knots, or NOWHERE
+        ("int64_t", "knots"),
+        ("double *", "lam"),  # (E, knots, rows)
+        ("const int32_t *", "variable"),  # BOUNDS: (rows) index into [x, u]
+        ("const double *", "sign"),  # BOUNDS: (rows) +1 for an upper bound, -1 for a lower one
+        # BOUNDS: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ...); BOXES: see boxes.c.
+        (Array, "bound"),
+        (Array, "squares"),  # SPHERES: squared inflated radii (E, 1, rows), ABSENT where there is none
+        (Array, "velocities"),  # SPHERES: as centres, or NULL
+        ("double", "dt"),
+    )
+    _fields_ = fields(declared)
+
+
+class Options(Structure):
+    """The options of iLQR and its line search (see ILQR and LineSearch)."""
+
+    declared = (
+        ("const double *", "ladder"),  # (rungs): step lengths
+        ("int64_t", "rungs back max_iterations"),  # back: -1 where each search begins with a full step
+        ("int32_t", "accept_last"),
+        ("double", "tolerance absolute_tolerance ratio_min ratio_max smallest damp_below rounding lost"),
+        ("double", "regularisation_first regularisation_growth regularisation_max"),
+        ("double", "damping damping_growth damping_decay"),
+    )
+    _fields_ = fields(declared)
+
+
+class Problem(Structure):
+    """Problems of one form with their iterates, and where results are written."""
+
+    declared = (
+        ("int64_t", "N constraints limit"),
+        ("double *", "X U cost merit regularisation"),  # (E, ...) in and out
+        ("double *", "alpha used"),  # (E): step length and mu_r of the last iteration
+        ("double *", "gains"),  # (E, N, NU, NZ): what tgco_gains writes
+        ("double *", "slopes curvatures"),  # (E, N+1, S), (E, N+1, S, S): what tgco_expand writes
+        ("const double *", "mu"),
+        ("int64_t *", "inner iterations rung"),
+        ("int32_t *", "status converged refused lost"),
+        (Array, "parameters"),
+        ((Array, COST_ARRAYS), "cost_data"),
+        ("const Constraint *", "constraint"),
+        ("int32_t", "guide phr replicas optimality"),
+        (Array, "center radius weight"),
+        (Options, "options"),
+        ("double", "gain"),  # share of L_M by which tgco_lift must lower it
+    )
+    _fields_ = fields(declared)
+
+
+class Sampling(Structure):
+    """MPPI's rounds (see guidance.MPPI)."""
+
+    declared = (
+        ("const Problem *", "of"),
+        ("int64_t", "samples rounds knots elite"),  # knots at which noise is drawn; 0: at every stage, white
+        ("double", "temperature collision_penalty dwell_cost decay"),
+        ("const uint64_t *", "keys"),  # (E, rounds)
+        (Array, "deviation lower upper"),  # (E, 1, NU)
+        ("const int32_t *", "left"),  # (N): the knot before each stage; unused where white
+        ("const double *", "share"),  # (N): share of the interval to the next
+        ("const int32_t *", "geometric"),  # of each constraint: whether samples that touch it are counted
+        ("double *", "mean"),  # (E, N, NU) in and out
+    )
+    _fields_ = fields(declared)
+
+
+STRUCTURES = (Array, Constraint, Options, Problem, Sampling)
+ENUMERATIONS = (Kind, Guide, Status, End)
+
+
+def array(value: Tensor | None, knots: bool) -> Array:
+    """A tensor (B|1, [N|1,] ...) with strides of 0 where an axis has length 1."""
+    if value is None or value.numel() == 0:
+        return Array()
+    value = value.double().contiguous()
+    size = value[0, 0].numel() if knots else value[0].numel()
+    many = value.shape[1] if knots else 1
+    element, knot = 0 if value.shape[0] == 1 else many * size, size if many > 1 else 0
+    return Array(data=value, element=element, knot=knot, size=size)
