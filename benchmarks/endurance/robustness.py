@@ -1,8 +1,9 @@
 """python -m benchmarks.endurance.robustness: what was tried against the library, and how often.
 
 Runs the tests of wrong input, damaged files, killed processes, batches and known answers, the slow ones too, and counts
-the cases and the random examples in them (some minutes on two cores). With --write the tables go into
-benchmarks/results/robustness.md.
+the cases and the random examples in them (some minutes on two cores); then tries mutants of the solver as
+benchmarks/endurance/mutation.py does (an hour or more the first time, --mutants 0 for none). With --write the tables go into
+benchmarks/results/robustness.md and mutation.md.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
+from benchmarks.endurance import mutation
 from benchmarks.lib import RESULTS, ROOT
 from benchmarks.lib.page import put_between
 from benchmarks.lib.provenance import provenance
@@ -85,7 +87,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.endurance.robustness", description=(__doc__ or "").split("\n")[0]
     )
-    parser.add_argument("--write", action="store_true", help="put the tables into results/robustness.md")
+    parser.add_argument("--write", action="store_true", help="put the tables into results/*.md")
+    parser.add_argument("--mutants", type=int, default=60, help="of each language, for benchmarks.endurance.mutation")
     options, more = parser.parse_known_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         cases, examples = run_tests(Path(folder), more)
@@ -96,6 +99,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(text)
     if options.write:
         put_between(PAGE, "<!-- robustness -->", "<!-- end robustness -->", text)
+    if options.mutants > 0:
+        mutation.main(["--each", str(options.mutants), *(["--write"] if options.write else [])])
     return 0 if all(end in ("passed", "skipped") for _, end in cases) else 1
 
 

@@ -211,12 +211,14 @@ def same(a: State, b: State) -> bool:
     return all(torch.allclose(getattr(a, name), getattr(b, name), rtol=1e-7, atol=1e-10) for name in names)
 
 
-def test_iterates_are_lost_where_python_says(monkeypatch) -> None:
+@pytest.mark.parametrize("B", [1, 3])
+def test_iterates_are_lost_where_python_says(B: int, monkeypatch) -> None:
     """With LOST = 0 every refused iterate counts as lost, and a lifted search follows, in both kernels."""
-    usual = run(CHOOSY, unchanged, planar(), True, 1)
+    problem = planar().take(torch.arange(B))
+    usual = run(CHOOSY, unchanged, problem, True, 1)
     for module in (ilqr, lifted):
         monkeypatch.setattr(module, "LOST", 0.0)
-    mine, theirs = (run(CHOOSY, unchanged, planar(), native, 1) for native in (True, False))
+    mine, theirs = (run(CHOOSY, unchanged, problem, native, 1) for native in (True, False))
     assert not same(mine, usual) and same(mine, theirs)
 
 

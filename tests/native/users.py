@@ -15,6 +15,7 @@ from torchgco import ControlBounds, Cost, FirstStepRates, FunctionConstraint, Fu
 from torchgco import Spheres as Discs
 from torchgco.constraints.base import Constraint, Sense
 from torchgco.constraints.bounds import ControlBounds as Bounds
+from torchgco.costs.base import ShiftedCost
 
 B, N = 5, 12
 
@@ -258,6 +259,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "overridden expand": lambda: with_cost(GaussNewton()),
     "scales itself": lambda: with_cost(ScalesItself()),
     "around a quadratic one": lambda: with_cost(around()),
+    "shifted": lambda: with_cost(ShiftedCost(each(), normal(B, seed=32))),
     "constraints": with_constraints,
     "first step": first_step,
 }

@@ -1,5 +1,6 @@
 """The estimated memory of a batch against the memory measured."""
 
+import io
 import subprocess
 import sys
 
@@ -7,7 +8,7 @@ import pytest
 
 from tests.problems import planar_batch, quadrotor_batch
 from torchgco import InputError
-from torchgco.solvers.memory import CPU_LIMIT, element_bytes, is_out_of_memory, plan_batch
+from torchgco.solvers.memory import CPU_LIMIT, element_bytes, free_memory, is_out_of_memory, plan_batch
 
 PEAK = """
 import torch
@@ -48,3 +49,9 @@ def test_running_out_of_memory_is_recognised() -> None:
         RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes")
     )
     assert not is_out_of_memory(RuntimeError("shapes differ"))
+
+
+def test_free_memory_is_what_the_kernel_says(monkeypatch) -> None:
+    text = "MemTotal:       16000000 kB\nMemFree:          100000 kB\nMemAvailable:    2000000 kB\n"
+    monkeypatch.setattr("builtins.open", lambda path: io.StringIO(text) if path == "/proc/meminfo" else None)
+    assert free_memory() == 2_000_000 * 1024

@@ -32,7 +32,7 @@ from torchgco.baselines import Hold, IteratedMPPI
 from torchgco.costs.base import Cost
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.search.suitability import suited_paths
-from torchgco.solvers.ending import STATIONARY, optimality
+from torchgco.solvers.ending import STATIONARY, final_status, optimality
 
 CAREFUL = ILQR(max_iterations=300)
 
@@ -239,3 +239,12 @@ def test_bounded_swing_ups_and_parkings_to_an_equality_are_solved_without_option
     parked = solve(parking)
     assert parked.statuses == [Status.CONVERGED] * 40
     assert float(certify(parking, parked.X, parked.U).kkt_residual.max()) < 0.01
+
+
+def test_a_status_counts_what_lies_at_its_limit() -> None:
+    ended = torch.full((4,), Status.MAX_ITERATIONS)
+    left = torch.tensor([STATIONARY, 1.01 * STATIONARY, STATIONARY, torch.inf], dtype=torch.float64)
+    violation = torch.tensor([1e-3, 1e-3, 1.01e-3, 0.0], dtype=torch.float64)
+    status = final_status(ended, left, violation, 1e-3, constrained=True)
+    want = [Status.CONVERGED, Status.FEASIBLE, Status.MAX_ITERATIONS, Status.NOT_POSITIVE_DEFINITE]
+    assert [Status(int(s)) for s in status] == want

@@ -1,0 +1,223 @@
+"""python -m benchmarks.endurance.mutation: would the tests notice if the solver's code were wrong?
+
+Changes one operator, number or condition at a time, in Python and in C, in a copy of the repository, and runs the tests
+that are meant to guard it. A sample, drawn by a seed, of the files of `AREAS`: some minutes per ten mutants on one
+core. A run that was stopped, even killed, goes on where it was. With --write the table goes into
+benchmarks/results/mutation.md; the reasons that stand there for survivors are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from benchmarks.endurance.mutants import Mutant, mutants_of, sampled
+from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
+from torchgco.experiments.statistics.statistics import wilson
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "benchmarks" / "results" / "mutation.md"
+RECORDS = ROOT / "outputs" / "mutation.jsonl"
+COPIED = ("torchgco", "tests", "benchmarks", "conf", "docs", "notebooks", "pyproject.toml", "README.md")
+KILLED, SURVIVED, TIMEOUT = "killed", "survived", "timeout"
+SEED = 30
+SLOWER, SPARE = 3.0, 60.0  # a mutant's limit: so many times as long as its tests take without it, and spare seconds
+
+
+@dataclass(frozen=True)
+class Area:
+    """Files that the same tests guard, the quickest and most likely first: the first failure ends them."""
+
+    name: str
+    files: tuple[str, ...]
+    tests: tuple[str, ...]
+
+
+AREAS = (
+    Area("lagrangian", ("torchgco/lagrangian/*.py",), (
+        "tests/test_lagrangian.py", "tests/solvers/test_ilqr.py", "tests/solvers/test_optimality.py",
+        "tests/solvers/test_augmented_lagrangian.py",
+    )),
+    Area("solvers", ("torchgco/solvers/*.py",), (
+        "tests/solvers/test_ilqr.py", "tests/solvers/test_iterations.py", "tests/solvers/test_optimality.py",
+        "tests/solvers/test_augmented_lagrangian.py", "tests/solvers/test_against_reference.py",
+        "tests/solvers/test_memory.py", "tests/native/test_declarations.py",
+    )),
+    Area("polish", ("torchgco/solvers/polish/*.py",), ("tests/solvers/test_polish.py",)),
+    Area("roadmap", ("torchgco/roadmap/*.py",), (
+        "tests/search/test_scene.py", "tests/search/test_homotopy.py", "tests/search/test_roadmap.py",
+        "tests/search/test_graph.py",
+        "tests/search/test_paths.py", "tests/search/test_boxes.py",
+    )),
+    Area("solver in C", ("torchgco/native/c/*.[ch]",), (
+        "tests/native/test_emit.py", "tests/native/test_declarations.py", "tests/native/test_engine.py",
+        "tests/native/test_boxes.py", "tests/native/test_sampler.py", "tests/native/test_overruns.py",
+        "tests/native/test_users.py",
+    )),
+    Area("roadmap in C", ("torchgco/roadmap/c/*.[ch]",), (
+        "tests/search/test_graph.py", "tests/search/test_roadmap.py", "tests/native/test_overruns.py",
+        "tests/search/test_boxes.py",
+    )),
+)  # fmt: skip
+
+
+def area_of(mutant: Mutant) -> Area:
+    """The area that a mutant's file belongs to."""
+    return next(area for area in AREAS if any(Path(mutant.path).match(pattern) for pattern in area.files))
+
+
+def drawn(each: int, seed: int) -> list[Mutant]:
+    """`each` mutants of every language, from all of its files alike; area by area, so that tables grow evenly."""
+    found = {Path(path): mutants_of(ROOT, path) for area in AREAS for f in area.files for path in sorted(ROOT.glob(f))}
+    python = [mutant for path, mutants in found.items() if path.suffix == ".py" for mutant in mutants]
+    c = [mutant for path, mutants in found.items() if path.suffix != ".py" for mutant in mutants]
+    pairs = zip(sampled(python, each, seed), sampled(c, each, seed), strict=True)
+    return [mutant for pair in pairs for mutant in pair]
+
+
+class Copy:
+    """A copy of the repository in a scratch folder, with its own cache of kernels and a compiler that hurries."""
+
+    def __init__(self, folder: Path) -> None:
+        self.root = folder / "repository"
+        for name in COPIED:
+            source = ROOT / name
+            if source.is_dir():
+                shutil.copytree(source, self.root / name, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                self.root.mkdir(exist_ok=True)
+                shutil.copy2(source, self.root / name)
+        compiler = folder / "cc"
+        # Every mutant in C is compiled for many forms of problems; optimised code takes several times as long.
+        compiler.write_text('#!/bin/sh\nfor word; do shift; [ "$word" = -O3 ] && word=-O1; set -- "$@" "$word"; done\n'
+                            'exec cc "$@"\n')  # fmt: skip
+        compiler.chmod(0o755)
+        self.environment = {
+            **os.environ, "PYTHONPATH": str(self.root), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1",
+            "TORCHGCO_CC": str(compiler), "TORCHGCO_CACHE": str(folder / "cache"),
+        }  # fmt: skip
+
+    def ends(self, tests: Sequence[str], limit: float | None) -> str:
+        """How the tests end: killed where one fails, survived where all pass, or timeout."""
+        words = ["-m", "pytest", "-x", "-q", "-n", "0", "-m", "not slurm", "-p", "no:cacheprovider", *tests]
+        process = subprocess.Popen(
+            [sys.executable, *words], cwd=self.root, env=self.environment, start_new_session=True,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            return SURVIVED if process.wait(limit) == 0 else KILLED
+        except subprocess.TimeoutExpired:
+            return TIMEOUT
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+    def try_out(self, mutant: Mutant, limit: float) -> str:
+        """How the tests of the mutant's area end, with the mutant in place of its file."""
+        path, tests = self.root / mutant.path, area_of(mutant).tests
+        whole = path.read_bytes()
+        path.write_bytes(mutant.applied(whole))
+        try:
+            return self.ends(tests, limit)
+        finally:
+            path.write_bytes(whole)
+
+
+def read(path: Path) -> dict[str, str]:
+    """How the mutants ended that were tried before, by their keys; a line cut off by a kill is left out."""
+    known = {}
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+            known[row["key"]] = row["end"]
+        except (json.JSONDecodeError, KeyError, TypeError):
+            continue
+    return known
+
+
+def run(mutants: Sequence[Mutant], records: Path, again: bool = False) -> dict[str, str]:
+    """How all mutants end; those in `records` are not tried again, or, with `again`, only those that survived.
+
+    Raises:
+        SystemExit: tests that fail without any mutant.
+    """
+    known = {key: end for key, end in read(records).items() if not (again and end == SURVIVED)}
+    left = [mutant for mutant in mutants if mutant.key not in known]
+    records.parent.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="mutation-") as folder, records.open("a") as file:
+        copy, limits = Copy(Path(folder)), {}
+        for area in tqdm(sorted({area_of(mutant).name for mutant in left}), "unchanged", unit="area"):
+            began = time.monotonic()
+            (tests,) = (a.tests for a in AREAS if a.name == area)
+            if copy.ends(tests, None) != SURVIVED:
+                raise SystemExit(f"the tests of {area} fail without a mutant: {' '.join(tests)}")
+            limits[area] = SLOWER * (time.monotonic() - began) + SPARE
+        for mutant in tqdm(left, "mutants", unit="mutant", smoothing=0.0):
+            known[mutant.key] = copy.try_out(mutant, limits[area_of(mutant).name])
+            file.write("\n" + json.dumps({"key": mutant.key, "end": known[mutant.key]}))
+            file.flush()
+            os.fsync(file.fileno())
+    return known
+
+
+def table(mutants: Sequence[Mutant], ends: dict[str, str]) -> list[str]:
+    """A row per area and one of all: mutants tried, killed, survived, timeout, and the share that died."""
+    lines = ["| area | tried | killed | timeout | survived | noticed |", "| --- | --- | --- | --- | --- | --- |"]
+    tried = [(area_of(mutant).name, ends[mutant.key]) for mutant in mutants if mutant.key in ends]
+    for name in (*dict.fromkeys(area.name for area in AREAS), "all"):
+        count = Counter(end for area, end in tried if name in (area, "all"))
+        n, noticed = count.total(), count[KILLED] + count[TIMEOUT]
+        low, high = (100 * end for end in wilson(noticed, n))
+        share = f"{100 * noticed / n:.0f} % [{low:.0f}, {high:.0f}]" if n else "-"
+        lines.append(f"| {name} | {n} | {count[KILLED]} | {count[TIMEOUT]} | {count[SURVIVED]} | {share} |")
+    return lines
+
+
+def survivors(mutants: Sequence[Mutant], ends: dict[str, str], page: str) -> list[str]:
+    """A row per survivor: place, line of code, change, and the reason that the page gives for it."""
+    lines = ["| file:line | code | change | why no test fails |", "| --- | --- | --- | --- |"]
+    for mutant in sorted(mutants, key=lambda m: (m.path, m.start)):
+        if ends.get(mutant.key) == SURVIVED:
+            code, old, new = (word.replace("|", "\\|") for word in (mutant.code, mutant.old, mutant.new))
+            change = f"| `` {code} `` | {mutant.column}: `` {old} `` {f'to `` {new} ``' if new else 'left out'} |"
+            reason = next((line.split(change)[1] for line in page.splitlines() if change in line), " not examined |")
+            lines.append(f"| {mutant.path.removeprefix('torchgco/')}:{mutant.line} {change}{reason}")
+    return lines
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.endurance.mutation", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--each", type=int, default=60, help="mutants of each language")
+    parser.add_argument("--seed", type=int, default=SEED, help="of the sample")
+    parser.add_argument("--records", type=Path, default=RECORDS, help="what was tried already, and how it ended")
+    parser.add_argument("--again", action="store_true", help="try those again that survived: tests were added")
+    parser.add_argument("--write", action="store_true", help="put the tables into results/mutation.md")
+    options = parser.parse_args(arguments)
+    mutants = drawn(options.each, options.seed)
+    ends = run(mutants, options.records, options.again)
+    origin, lines = provenance("cpu"), [*table(mutants, ends), "", *survivors(mutants, ends, PAGE.read_text())]
+    head = f"Run on {origin['date']} at commit {origin['commit']}, torch {origin['torch']}; seed {options.seed}."
+    text = "\n".join([head, "", *lines])
+    print(text)
+    if options.write:
+        put_between(PAGE, "<!-- mutation -->", "<!-- end mutation -->", text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
