@@ -201,7 +201,9 @@ def survivors(mutants: Sequence[Mutant], ends: dict[str, str], page: str) -> lis
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.endurance.mutation", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.endurance.mutation", description=(__doc__ or "").split("\n")[0]
+    )
     parser.add_argument("--each", type=int, default=60, help="mutants of each language")
     parser.add_argument("--seed", type=int, default=SEED, help="of the sample")
     parser.add_argument("--records", type=Path, default=RECORDS, help="what was tried already, and how it ended")

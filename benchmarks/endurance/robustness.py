@@ -1,9 +1,9 @@
 """python -m benchmarks.endurance.robustness: what was tried against the library, and how often.
 
 Runs the tests of wrong input, damaged files, killed processes, batches and known answers, the slow ones too, and counts
-the cases and the random examples in them (some minutes on two cores); then tries mutants of the solver as
-benchmarks/endurance/mutation.py does (an hour or more the first time, --mutants 0 for none). With --write the tables go into
-benchmarks/results/robustness.md and mutation.md.
+the cases and the random examples in them (some minutes on two cores); then tries mutants of the solver (mutation.py; an
+hour or more the first time, --mutants 0 for none). With --write the tables go into benchmarks/results/robustness.md and
+mutation.md.
 """
 
 from __future__ import annotations
