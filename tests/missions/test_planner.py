@@ -1,5 +1,6 @@
 """The planner: what it solves, from which guess, with which margins, and when it keeps the former plan."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,9 @@ from torchgco.base import kernels
 from torchgco.lagrangian.rollout import open_loop
 from torchgco.missions.disturbance import Disturbance
 from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.planning_problem import Margin
 from torchgco.missions.plant import RotorPlant, hovering
+from torchgco.native.dispatch import followed
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.search import restarts
 from torchgco.solution import Solution
@@ -174,16 +177,33 @@ def test_moving_spheres_are_planned_where_they_will_be() -> None:
     torch.testing.assert_close(part.value(plan.X, plan.U), moved.value(plan.X, plan.U)[:, :10], rtol=1e-12, atol=1e-12)
 
 
+def by_feedback(problem: Problem, plan: Plan, x: Tensor) -> Tensor:
+    """The controls of a plan one stage later, from states x (B, 14), step by step."""
+    controls, last = [], problem.N - 1
+    for k in range(problem.N):
+        old = min(k + 1, last)
+        away = x - plan.X[:, k + 1]
+        controls.append(plan.U[:, old] + (plan.K[:, old] @ away.unsqueeze(-1)).squeeze(-1))
+        x = problem.dynamics.step(x, controls[-1])
+    return torch.stack(controls, dim=1)
+
+
+@pytest.mark.parametrize("feedback", [True, False])
 @pytest.mark.parametrize("multipliers", ["shifted", "reset"])
-def test_the_next_plan_starts_from_the_former_one(multipliers: Any) -> None:
+def test_the_next_plan_starts_from_the_former_one(multipliers: Any, feedback: bool) -> None:
     solver, problem = Recording(), varied()
-    planner = Planner(solver, multipliers=multipliers, max_seconds=100.0)
+    planner = Planner(solver, feedback=feedback, multipliers=multipliers, max_seconds=100.0)
     plan, now = first_plan(planner, problem)
-    next_plan(planner, problem, now, plan, plan.measured)
+    x = plan.measured.clone()
+    x[:, :3] += torch.tensor([0.04, -0.03, 0.02], **DOUBLE)
+    next_plan(planner, problem, now, plan, x)
     first, second = solver.calls
     rest = torch.tensor([0, 0, 0, 9.81], **DOUBLE).expand(4, problem.N, 4)
     assert first["warm"] is None and torch.equal(first["U0"], rest)
-    assert torch.equal(second["U0"], torch.cat((plan.U[:, 1:], plan.U[:, -1:]), dim=1))
+    later = torch.cat((plan.U[:, 1:], plan.U[:, -1:]), dim=1)
+    if feedback:
+        later = by_feedback(second["problem"], plan, second["problem"].x0)
+    torch.testing.assert_close(second["U0"], later, rtol=1e-9, atol=1e-9)
     assert all(99.0 < call["max_seconds"] <= 100.0 for call in (first, second))
     if multipliers == "reset":
         assert second["warm"] is None
@@ -191,6 +211,56 @@ def test_the_next_plan_starts_from_the_former_one(multipliers: Any) -> None:
         for mine, old in zip(second["warm"].lam, plan.multipliers.lam, strict=True):
             assert torch.equal(mine[:, :-1], old[:, 1:]) and torch.equal(mine[:, -1], old[:, -1])
         assert torch.equal(second["warm"].mu, plan.multipliers.mu)
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_feedback_brings_a_vehicle_back_to_its_plan(native: bool) -> None:
+    """Over four seconds the controls alone lead a tilted vehicle far away; the same bits in any batch."""
+    problem = far(3, N=80, goal=6.0)
+    kernels.use_native(native)
+    try:
+        solution = FIRM.solve(problem, problem.cost.rest_controls(problem.x0.new_zeros(3, 80, 4)))
+        x0 = problem.x0.clone()
+        x0[:, 7] += torch.tensor([0.02, -0.01, 0.0], **DOUBLE)
+        tilted = problem.started_at(x0, problem.constraints)
+        U = followed(tilted, solution.X, solution.U, solution.K)
+        index = torch.tensor([1])
+        alone = followed(tilted.take(index), *(part[index] for part in (solution.X, solution.U, solution.K)))
+    finally:
+        kernels.use_native(True)
+    assert torch.equal(alone, U[1:2]) and torch.equal(U[2], solution.U[2])
+    away = [
+        (open_loop(problem.dynamics, x0, held) - solution.X)[..., :3].norm(dim=-1).amax(-1) for held in (U, solution.U)
+    ]
+    assert bool((away[0][:2] < 0.1).all()) and bool((away[1][:2] > 5 * away[0][:2]).all())
+
+
+def test_penalties_do_not_pile_up_over_a_mission() -> None:
+    """What one period raises the penalty by is forgotten in the next one."""
+    solver, problem = Recording(replace(SOLVER, violation_tolerance=1e-9)), varied()
+    planner = Planner(solver)
+    plan, now = first_plan(planner, problem)
+    first = plan.multipliers.mu.clone()
+    for _ in range(3):
+        plan, now = next_plan(planner, problem, now, plan, plan.measured)
+        assert bool((plan.multipliers.mu > first).any())
+        assert torch.equal(solver.calls[-1]["warm"].mu, first)
+
+
+def test_the_margin_covers_what_a_straight_step_cuts_off() -> None:
+    """Points at the full radius and margin, a step apart: the middle of their chord is outside the sphere."""
+    spheres = scene(torch.tensor([[[1.0, 0.0, 0.0], [5.0, 0, 0]]], **DOUBLE), torch.tensor([[0.3, 1.0]], **DOUBLE))
+    obstacles, step = spheres.constraints[0], torch.tensor([0.3], **DOUBLE)
+    assert isinstance(obstacles, BoundSpheres)
+    more = float(Margin(0.01, 0.0, step).of(obstacles))
+    assert more == pytest.approx(0.01 + 0.3**2 / (8 * RADIUS))  # of the smaller one
+    middle = math.sqrt((RADIUS + more) ** 2 - 0.15**2)
+    assert RADIUS + 0.009 < middle < RADIUS + 0.012
+    assert (
+        float(Margin(0.0, 0.0, step).of(obstacles)) == 0.0 and float(Margin(0.01, 0.0, 0 * step).of(obstacles)) == 0.01
+    )
+    none = scene(torch.zeros(1, 0, 3, **DOUBLE)).constraints[0]
+    assert isinstance(none, BoundSpheres) and float(Margin(0.01, 0.0, step).of(none)) == 0.01
 
 
 class Failing(Solver):
@@ -212,7 +282,7 @@ class Failing(Solver):
 
 
 def test_the_former_plan_is_kept_where_the_new_one_is_infeasible_and_worse() -> None:
-    problem, planner = far(4), Planner(Failing())
+    problem, planner = far(4), Planner(Failing(), feedback=False)
     plan, now = first_plan(planner, problem)
     x = plan.measured.clone()
     x[3, 13:] = torch.tensor([4.1, 3.7, 3.7, 4.1], **DOUBLE)  # its former plan is far off, too

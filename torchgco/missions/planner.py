@@ -32,7 +32,7 @@ class Plan:
     U: Tensor  # (B, N, 4)
     K: Tensor  # (B, N, 4, 14): feedback gains
     multipliers: Multipliers
-    penalty: Tensor  # (B,): mu of the search that found the plan, which the plans that continue it start from
+    penalty: Tensor  # (B,): least mu of the searches so far, which plans that continue this one start from
     cost: Tensor
     violation: Tensor
     shifted: Tensor  # bool: the former plan one stage later, as the new one was infeasible
@@ -73,8 +73,9 @@ class Planner:
         max_seconds: time limit of a plan, s; None: none. With a limit, results depend on the machine.
         tolerance: violation (m for lengths) up to which a plan is flown without a look at the former one; infinity: a
             new plan always is, as in the paper, unless its violation is not a number.
-        margin: by which obstacles are grown, m; margin_growth: by how much more per second of the horizon, m/s, in
-            four steps.
+        margin: by which obstacles are grown, m, and above 0 by as much more as a straight step between two knots of the
+            former plan may lead into them; margin_growth: by how much more per second of the horizon, m/s, in four
+            steps.
         first_step: the body rates of the second knot are the ones that the rotors lead to (`FirstStepRates`).
         estimation: gain per control period of an estimated constant acceleration that the planning model lacks, for
             wind and errors of the mass, at most 1; 0: none, as the paper.
@@ -105,7 +106,7 @@ class Planner:
         """
         check_model(problem.dynamics)
         x0, none = planning_state(x, self.airframe), torch.zeros_like(x[:, :3])
-        constraints = self._constraints(problem, 0.0, x, none[:, 0])
+        constraints = self._constraints(problem, 0.0, x, self._margin(x, None), none[:, 0])
         dynamics = problem.dynamics if self.estimation == 0 else biased(problem.dynamics, none)
         return replace(problem, dynamics=dynamics, x0=x0, constraints=constraints)
 
@@ -132,8 +133,9 @@ class Planner:
         U0 = now.cost.rest_controls(x0.new_zeros(now.B, now.N, now.m)) if before is None else shifted(before.U)
         bias = self._estimated(measured, before, float(whole.dynamics.dt))
         dynamics = whole.dynamics if self.estimation == 0 else biased(whole.dynamics, bias)
-        depth = self._margin.unavoidable_depth(whole.started_at(x0, whole.constraints), t, U0)
-        now = now.started_at(x0, self._constraints(whole, t, x, depth), dynamics=dynamics)
+        margin = self._margin(x, before)
+        depth = margin.unavoidable_depth(whole.started_at(x0, whole.constraints), t, U0)
+        now = now.started_at(x0, self._constraints(whole, t, x, margin, depth), dynamics=dynamics)
         solve = _Solve(self, now, seed, ids, began)
         if before is not None and self.feedback:
             U0 = followed(now, shifted(before.X), U0, shifted(before.K))
@@ -149,17 +151,20 @@ class Planner:
         F = (x[:, 13:] + more).clamp(self.airframe.thrust_min, self.airframe.thrust_max)
         return torch.cat((later[:, :6], q, later[:, 10:13], F), dim=-1)
 
-    @property
-    def _margin(self) -> Margin:
-        return Margin(self.margin, self.margin_growth)
+    def _margin(self, x: Tensor, before: Plan | None) -> Margin:
+        """The margin of plans from plants x (B, 17); of a first plan the whole solver looks between the knots."""
+        step = torch.zeros_like(x[:, 0])
+        if before is not None:
+            step = before.X[..., :3].diff(dim=1).square().sum(-1).amax(-1).sqrt()
+        return Margin(self.margin, self.margin_growth, step)
 
-    def _constraints(self, whole: Problem, t: float, x: Tensor, depth: Tensor) -> list[Constraint]:
+    def _constraints(self, whole: Problem, t: float, x: Tensor, margin: Margin, depth: Tensor) -> list[Constraint]:
         """The constraints of plans that start at time t from plants x (B, 17), depth (B,) m within the margin."""
         parts: list[Constraint] = []
         for constraint in whole.constraints:
             later = constraint.later(t)
             if isinstance(later, Obstacles):
-                parts += self._margin.around(later, whole.N, float(whole.dynamics.dt), depth)
+                parts += margin.around(later, whole.N, float(whole.dynamics.dt), depth)
             else:
                 parts.append(later)
         return [*parts, *([first_step(whole, x, self.airframe)] if self.first_step else [])]
@@ -186,7 +191,7 @@ class _Solve:
 
     def next(self, U0: Tensor, before: Plan) -> Plan:
         """Plans that continue former ones, which are flown one stage later by U0 (B, N, 4)."""
-        # What one continuation raises the penalty by must not stay: over a mission it would grow beyond all measure.
+        # What one period raises the penalty by must not stay: over a mission it would grow beyond all measure.
         multipliers = replace(before.multipliers.shifted(), mu=before.penalty)
         warm = multipliers if self.planner.multipliers == "shifted" else None
         plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids))
@@ -199,7 +204,7 @@ class _Solve:
             self._replace(plan, rows, found)
             for name in ("guided", "iterations"):
                 getattr(plan, name)[rows] += getattr(found, name)
-        return plan
+        return replace(plan, penalty=torch.minimum(plan.penalty, before.penalty))
 
     def _solved(self, solver: Solver, problem: Problem, U0: Tensor, warm: Multipliers | None, ids: Tensor) -> Solution:
         return solver.solve(problem, U0, seed=self.seed, ids=ids, warm=warm, max_seconds=self._time_left())
@@ -235,5 +240,6 @@ class _Solve:
         none = torch.zeros_like(solution.cost, dtype=torch.bool)
         return Plan(
             solution.X, solution.U, solution.K, solution.multipliers, solution.multipliers.mu.clone(), solution.cost,
-            solution.violation, none, solution.guided, solution.iterations, solution.X[:, 0], solution.X[:, 0, :3], self.problem.dynamics, 0,
+            solution.violation, none, solution.guided, solution.iterations, solution.X[:, 0], solution.X[:, 0, :3],
+            self.problem.dynamics, 0,
         )  # fmt: skip

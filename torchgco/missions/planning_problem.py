@@ -63,24 +63,36 @@ def acceleration(x: Tensor, airframe: Airframe) -> Tensor:
 
 @dataclass(frozen=True)
 class Margin:
-    """Distance that plans keep from obstacles in addition to their radii.
+    """Distance that plans keep from obstacles in addition to their radii, (B,), m.
+
+    It holds at the knots. Between two of them a straight step of length s leads up to s^2 / (8 r) into a surface of
+    radius r, such as the edge of a box around which the vehicle's radius is laid: the margin is larger by this.
 
     size, growth  m, and m per second of the horizon, in four steps
+    step          the longest that is expected between two knots, (B,), m
     """
 
     size: float
     growth: float
+    step: Tensor
+
+    def of(self, obstacles: Obstacles) -> Tensor:
+        """The margin (B,) at the beginning of the horizon, m."""
+        if self.size == 0 or obstacles.absent.shape[1] == 0:
+            return torch.full_like(self.step, self.size)
+        radius = torch.where(obstacles.absent, torch.inf, obstacles.margins).amin(-1)
+        return self.size + torch.minimum(self.step.square() / (8.0 * radius), 0.5 * self.step)
 
     def around(self, obstacles: Obstacles, N: int, dt: float, depth: Tensor) -> list[Constraint]:
         """Obstacles with the margin: less by `depth` (B,) at the early knots, more at late ones where it grows."""
-        early = min(EARLY, N)
-        parts = [_at(obstacles.grown(self.size - depth), slice(1, early + 1))]
+        early, size = min(EARLY, N), self.of(obstacles)
+        parts = [_at(obstacles.grown(size - depth), slice(1, early + 1))]
         if early == N:
             return parts
         for knots in torch.arange(early + 1, N + 1).chunk(PARTS if self.growth > 0 else 1):
             first, last = int(knots[0]), int(knots[-1]) + 1
-            by = self.size + self.growth * 0.5 * (first + last - 1) * dt
-            parts.append(_at(obstacles.grown(torch.full_like(depth, by)), slice(first, last)))
+            by = size + self.growth * 0.5 * (first + last - 1) * dt
+            parts.append(_at(obstacles.grown(by), slice(first, last)))
         return parts
 
     def unavoidable_depth(self, problem: Problem, t: float, U: Tensor) -> Tensor:
@@ -94,8 +106,9 @@ class Margin:
         depth = torch.zeros_like(p[:, 0, 0])
         for part in problem.constraints:
             if isinstance(part, Obstacles) and part.absent.shape[1] > 0:
-                distance = part.later(t).signed_distance(p, times).amin(1) - self.size  # (B, M)
-                most = self.size + (1.0 - KEPT) * (1.0 - CONTACT_FACTOR) * part.margins
+                size = self.of(part).unsqueeze(-1)
+                distance = part.later(t).signed_distance(p, times).amin(1) - size  # (B, M)
+                most = size + (1.0 - KEPT) * (1.0 - CONTACT_FACTOR) * part.margins
                 depth = torch.maximum(depth, torch.minimum(-distance, most).clamp(min=0.0).amax(-1))
         return depth
 
