@@ -11,12 +11,9 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
-from torchgco.base import interrupts as interrupts  # first: the imports below take seconds
-from torchgco.base import kernels as kernels
-
-# isort: split
 from torchgco import presets as presets
 from torchgco.api import solve as solve
+from torchgco.base import kernels as kernels
 from torchgco.base.errors import ContactWarning as ContactWarning
 from torchgco.base.errors import GuidanceWarning as GuidanceWarning
 from torchgco.base.errors import InputError as InputError
@@ -65,7 +62,7 @@ from torchgco.solvers import plan_batch as plan_batch
 if TYPE_CHECKING:
     from torchgco.experiments.config.build import compose as compose
 
-# In the order of the API reference; `interrupts` is no part of it.
+# In the order of the API reference.
 __all__ = [  # noqa: RUF022
     # the problem
     "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections import Counter
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
@@ -15,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.files import read_arrays
+from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.shapes import check_device
 from torchgco.base.status import Status
 from torchgco.base.tree import take
@@ -129,18 +127,12 @@ class Solution:
         return pd.DataFrame(columns).rename_axis("element")
 
     def save(self, path: str | Path) -> None:
-        """Write an npz next to its final place, then move it there: a reader never sees half a file."""
-        path = Path(path)
+        """Write an npz: all of it or, if interrupted, nothing."""
         arrays = {f.name: getattr(self, f.name).cpu().numpy() for f in fields(self) if f.name in _TENSORS}
         arrays["mu"] = self.multipliers.mu.cpu().numpy()
         for i, lam in enumerate(self.multipliers.lam):
             arrays[f"lam{i}"] = lam.cpu().numpy()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-            np.savez_compressed(file, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(file.name, path)
+        write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
     @classmethod
     def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Solution:

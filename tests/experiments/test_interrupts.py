@@ -12,14 +12,15 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.experiments.commands import ENVIRONMENT, begin, problem_line
+from tests.experiments.commands import ENVIRONMENT, begin, changed, problem_line
 from tests.experiments.test_workers import arguments, wait_for
 from tests.trials import flights, trials
-from torchgco.base.interrupts import Terminated, raised
+from torchgco.experiments.ending import Terminated, raised
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM]
-MOMENTS = [0.2, 0.6, 1.0, 1.5, 2.5]  # s after the start: while modules are loaded, or while the study runs
-REPORT = "import sys; from torchgco.experiments.reports.report import main; sys.exit(main())"
+MOMENTS = [0.0, 0.3, 0.6, 1.0, 2.0]  # s after the command began: while modules are loaded, or while the study runs
+REPORT = "import sys; from torchgco.experiments.reports.report import main; {}sys.exit(main())"
+BEGINNING = "print('begins', flush=True); "
 
 
 @pytest.fixture
@@ -63,19 +64,20 @@ def test_another_program_keeps_its_signals() -> None:
 @pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_signal_at_any_moment_gets_one_line_and_the_study_resumes(workers, number, seconds, run, tmp_path) -> None:
-    words = [*arguments(tmp_path, "Slow"), f"study.workers={workers}"]
+    words = changed(arguments(tmp_path, "Slow"), f"study.workers={workers}")
     process = begin(*words, cwd=tmp_path)
+    wait_for(lambda: (tmp_path / "out").exists() or process.poll() is not None)
     time.sleep(seconds)
     end(process, number)
     (tmp_path / "spared").touch()
-    assert run(*words, "study.workers=1")[0] == 0
+    assert run(*changed(words, "study.workers=1"))[0] == 0
     assert pd.read_parquet(tmp_path / "out" / "trials.parquet")["layout"].tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_sigterm_of_a_study_with_a_shard_leaves_no_process(workers: int, tmp_path) -> None:
-    process = begin(*arguments(tmp_path, "Slow"), f"study.workers={workers}", cwd=tmp_path)
+    process = begin(*changed(arguments(tmp_path, "Slow"), f"study.workers={workers}"), cwd=tmp_path)
     wait_for(lambda: list((tmp_path / "out" / "shards").glob("*.npz")) or process.poll() is not None)
     end(process, signal.SIGTERM)
 
@@ -109,9 +111,10 @@ def group_of(leader: int) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("seconds", MOMENTS)
 def test_a_report_is_interrupted_with_one_line(seconds: float, table) -> None:
-    script = table / "torchgco-report"  # the name decides
-    script.write_text(f"{REPORT}\n")
-    process = subprocess.Popen([sys.executable, script, table], env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+    line = [sys.executable, "-c", REPORT.format(BEGINNING), str(table)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(line, env=ENVIRONMENT, text=True, **pipes)
+    assert process.stdout is not None and process.stdout.readline() == "begins\n"
     time.sleep(seconds)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
@@ -123,7 +126,7 @@ def test_a_report_is_interrupted_with_one_line(seconds: float, table) -> None:
 
 @pytest.mark.slow
 def test_a_reader_that_has_read_enough_is_no_error(table) -> None:
-    line = [sys.executable, "-c", REPORT, str(table)]
+    line = [sys.executable, "-c", REPORT.format(""), str(table)]
     process = subprocess.Popen(line, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None and process.stderr is not None
     process.stdout.close()
@@ -135,6 +138,6 @@ def test_a_reader_that_has_read_enough_is_no_error(table) -> None:
 @pytest.mark.slow
 def test_a_full_standard_output_gets_one_line(table) -> None:
     with open("/dev/full", "w") as full:
-        line = [sys.executable, "-c", REPORT, str(table)]
+        line = [sys.executable, "-c", REPORT.format(""), str(table)]
         done = subprocess.run(line, env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 2 and "standard output: expected room to write" in problem_line(done.stderr)

@@ -14,11 +14,12 @@ from omegaconf import OmegaConf
 from tests.cluster.results import same
 from tests.experiments.commands import HOLD, problem_line
 from torchgco.base.errors import InputError
+from torchgco.base.files import PART
 from torchgco.experiments.config import launching
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.flying import jobs, progress
 from torchgco.experiments.flying.flight import plan_of
-from torchgco.experiments.results.files import PART, create, write
+from torchgco.experiments.results.files import create, write
 from torchgco.experiments.results.identity import Manifest
 from torchgco.experiments.results.records import Records
 
@@ -162,7 +163,7 @@ def test_of_many_processes_one_creates_a_file(tmp_path) -> None:
     with ThreadPoolExecutor(8) as pool:
         made = list(pool.map(make, range(8)))
     assert made.count(True) == 1 and (tmp_path / "study.json").read_bytes() == b"%d" % made.index(True)
-    assert not list(tmp_path.glob(f"*{PART}"))
+    assert not list(tmp_path.glob(f"*{PART[1]}"))
 
 
 def test_two_studies_that_start_together_do_not_share_a_folder(tmp_path, monkeypatch) -> None:
@@ -188,7 +189,7 @@ def test_a_write_survives_the_end_of_the_study_in_another_process(name: str, tmp
     def save(file) -> None:
         file.write(b"new")
         if not written:
-            for part in tmp_path.rglob(f"*{PART}"):
+            for part in tmp_path.rglob(f"*{PART[1]}"):
                 part.unlink()
             if (tmp_path / "shards").exists():
                 (tmp_path / "shards").rmdir()

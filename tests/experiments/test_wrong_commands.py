@@ -123,12 +123,12 @@ SETTINGS = {
     "solver.name": ([None, 3, "a/b", "..", ".", "", "a b", ".hidden", "a" * 65, ABSENT], NAME),
     "scenario": (["abc", None, ABSENT], "expected (a group of keys|this key)"),
     "scenario.name": (["a/b", "..", None, 3], NAME),
-    "scenario.stages": (["abc", 1.5, [1], -1, True, "3"], "expected an integer >= 1"),
-    "scenario.dt": (["abc", None, [1], -1, 0, True, "3", float("nan")], "expected a finite number > 0"),
-    "scenario.num_obstacles": ([10**9], "expected an integer <= 100000"),
+    "scenario.stages": (["abc", 1.5, [1], -1, True, "3"], r"expected a whole number between 1 and 1e\+09"),
+    "scenario.dt": (["abc", None, [1], -1, 0, True, "3", float("nan")], r"expected a number above 0 s"),
+    "scenario.num_obstacles": ([10**9], "expected a whole number between 0 and 100000"),
     "scenario.density": ([1e5], "expected at most 100000 obstacles"),
-    "scenario.obstacle_radius": ([1e200, 10**400], "expected a (finite )?number"),
-    "scenario.start": ([[1e200, 0, 0]], r"expected a number of at most 1e\+06"),
+    "scenario.obstacle_radius": ([1e200, 10**400], "expected a number"),
+    "scenario.start": ([[1e200, 0, 0]], r"expected a list of 3 numbers between -1e\+06 and 1e\+06 m"),
 }
 
 
@@ -143,7 +143,7 @@ def test_wrong_settings_are_refused_by_name(key: str, composed) -> None:
         assert "\n" not in str(caught.value)
 
 
-WALLS = {"pitch": ({"pitch": 1e-9}, "grids of at most 100000 spheres"), "holes": ({"holes": 10**9}, "<= 1000")}
+WALLS = {"pitch": ({"pitch": 1e-9}, "grids of at most 100000 spheres"), "holes": ({"holes": 10**9}, "0 and 1000,")}
 
 
 @pytest.mark.parametrize("field", WALLS)
@@ -215,9 +215,9 @@ MALFORMED = {
     "large": ({"radii": np.full((2, 3), 1e200)}, "layouts.radii: expected values of at most 1e+06 in size"),
     "fast": ({"velocities": np.full((2, 3, 2), 1e9)}, "layouts.velocities: expected values of at most 1e+06 in size"),
     "far start": ({"start": np.full(6, 1e200)}, "layouts.start: expected values of at most 1e+06 in size"),
-    "large vehicle": ({"vehicle_radius": 1e200}, "layouts.vehicle_radius: expected a number of at most 1e+06"),
-    "text number": ({"dt": "0.1"}, "layouts.dt: expected a finite number > 0"),
-    "more stages": ({"stages": 10**12}, "layouts.stages: expected an integer <= 1000000000"),
+    "large vehicle": ({"vehicle_radius": 1e200}, "layouts.vehicle_radius: expected a number between 0 and 1e+06 m"),
+    "text number": ({"dt": "0.1"}, "layouts.dt: expected a number above 0 s"),
+    "more stages": ({"stages": 10**12}, "layouts.stages: expected a whole number between 1 and 1e+09"),
 }
 
 
@@ -291,9 +291,8 @@ def test_wrong_words_of_a_report_get_one_line(table, tmp_path, capsys, monkeypat
         assert problem_line(capsys.readouterr().err).startswith(f"torchgco-report: {field}: expected ")
     assert report([]) == 2 and problem_line(capsys.readouterr().err).startswith("torchgco-report: DIR: expected ")
     for words in ([str(table), "--nope"], [str(table), "--power", "0.5"], [str(table), "--format", "xml"]):
-        with pytest.raises(SystemExit) as stop:
-            report(words)
-        assert stop.value.code == 2 and problem_line(capsys.readouterr().err).startswith("torchgco-report: ")
+        assert report(words) == 2
+        assert problem_line(capsys.readouterr().err).startswith("torchgco-report: command line: expected DIR")
 
     def replace(part, place):
         raise OSError(errno.ENOSPC, "No space left on device")

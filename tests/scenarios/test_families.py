@@ -57,8 +57,8 @@ class TestSeeding:
             ([], 0, "ids: expected a list of at least one integer >= 0, got []"),
             ([-1], 0, "ids: expected a list"),
             ([0.5], 0, "ids: expected a list"),
-            ([0], -1, "seed: expected an integer >= 0, got -1"),
-            ([0], None, "seed: expected an integer >= 0, got None"),
+            ([0], -1, "seed: expected a whole number of at least 0 and at most 1e+18, got -1"),
+            ([0], None, "seed: expected a whole number of at least 0 and at most 1e+18, got None"),
         ):
             with pytest.raises(InputError) as caught:
                 scenario.draw(ids, seed)
@@ -227,38 +227,41 @@ ERRORS = {
         lambda: Forest(clearance=50.0).draw([0], 0),
         "scenario.region: expected room for 30 centres more than 50 m from",
     ),
-    "region": (lambda: Forest(region=[[0, 1], [0, 1]]), "scenario.region: expected 3 pairs [low, high]"),
-    "crossed region": (lambda: PlanarRandom(region=[[1, 0], [0, 1]]), "scenario.region: expected 2 pairs"),
-    "position": (lambda: Forest(start=(0, 0)), "scenario.start: expected a list of 3 numbers, got (0, 0)"),
-    "not numbers": (lambda: PlanarTrap(goal=("a", 0)), "scenario.goal: expected a finite number, got 'a'"),  # type: ignore
-    "text": (lambda: PlanarTrap(goal="12"), "scenario.goal: expected a list of 2 numbers, got '12'"),  # type: ignore
-    "infinite": (lambda: PlanarTrap(start=(np.inf, 0)), "scenario.start: expected a finite number"),
+    "region": (lambda: Forest(region=[[0, 1], [0, 1]]), "scenario.region: expected a list of 3 lists of 2 numbers"),
+    "crossed region": (lambda: PlanarRandom(region=[[1, 0], [0, 1]]), "scenario.region: expected a list of 2 lists"),
+    "position": (lambda: Forest(start=(0, 0)), "scenario.start: expected a list of 3 numbers between"),
+    "not numbers": (lambda: PlanarTrap(goal=("a", 0)), "scenario.goal: expected a list of 2 numbers"),  # type: ignore
+    "text": (lambda: PlanarTrap(goal="12"), "scenario.goal: expected a list of 2 numbers between"),  # type: ignore
+    "infinite": (lambda: PlanarTrap(start=(np.inf, 0)), "scenario.start: expected a list of 2 numbers"),
     "radius": (
         lambda: Walls(obstacle_radius=-1),
-        "scenario.obstacle_radius: expected a finite number >= 0, got -1",
+        "scenario.obstacle_radius: expected a number between 0 and 1e+06 m, got -1",
     ),
     "vehicle": (
         lambda: Walls(vehicle_radius=np.nan),
-        "scenario.vehicle_radius: expected a finite number >= 0",
+        "scenario.vehicle_radius: expected a number between 0 and 1e+06 m",
     ),
     "goal radius": (
         lambda: Walls(goal_radius=0),
-        "scenario.goal_radius: expected a finite number > 0, got 0",
+        "scenario.goal_radius: expected a number above 0 m and at most 1e+06 m, got 0",
     ),
-    "dt": (lambda: Forest(dt=0.0), "scenario.dt: expected a finite number > 0, got 0.0"),
-    "stages": (lambda: Forest(stages=0), "scenario.stages: expected an integer >= 1, got 0"),
+    "dt": (lambda: Forest(dt=0.0), "scenario.dt: expected a number above 0 s and at most 1e+06 s, got 0.0"),
+    "stages": (lambda: Forest(stages=0), "scenario.stages: expected a whole number between 1 and 1e+09, got 0"),
     "name": (lambda: Forest(name=""), "scenario.name: expected a name, got ''"),
-    "number": (lambda: Forest(num_obstacles=-1), "scenario.num_obstacles: expected an integer >= 0, got -1"),
-    "density": (lambda: Forest(density=-0.1), "scenario.density: expected a finite number >= 0, got -0.1"),
+    "number": (
+        lambda: Forest(num_obstacles=-1),
+        "scenario.num_obstacles: expected a whole number between 0 and 100000",
+    ),
+    "density": (lambda: Forest(density=-0.1), "scenario.density: expected a number between 0 and 1e+06, or null"),
     "clearance": (
         lambda: PlanarRandom(start_clearance=-1),
-        "scenario.start_clearance: expected a finite number >= 0",
+        "scenario.start_clearance: expected a number between 0 and 1e+06 m",
     ),
-    "jitter": (lambda: PlanarTrap(jitter=-1), "scenario.jitter: expected a finite number >= 0, got -1"),
-    "centres": (lambda: PlanarTrap(centers=[[1, 2, 3]]), "scenario.centers: expected a list of 2 numbers"),
+    "jitter": (lambda: PlanarTrap(jitter=-1), "scenario.jitter: expected a number between 0 and 1e+06 m, got -1"),
+    "centres": (lambda: PlanarTrap(centers=[[1, 2, 3]]), "scenario.centers: expected a list of lists of 2 numbers"),
     "no centres": (
         lambda: PlanarTrap(centers=[]),
-        "scenario.centers: expected a list of lists of 2 numbers, got []",
+        "scenario.centers: expected at least one disc, got none",
     ),
     "bounds": (
         lambda: PlanarTrap(control_lower=11),
@@ -266,18 +269,18 @@ ERRORS = {
     ),
     "bound": (
         lambda: PlanarTrap(control_lower=[1, 2, 3]),
-        "scenario.control_lower: expected a list of 2 numbers",
+        "scenario.control_lower: expected a number between -1e+06 and 1e+06 m/s^2 or a list of 2",
     ),
-    "speed": (lambda: ForestMoving(speed=-1), "scenario.speed: expected a finite number >= 0, got -1"),
-    "pitch": (lambda: Walls(pitch=0), "scenario.pitch: expected a finite number > 0, got 0"),
-    "holes": (lambda: Walls(holes=1.5), "scenario.holes: expected an integer >= 0, got 1.5"),  # type: ignore
-    "discs": (lambda: Yard(num_discs=-1), "scenario.num_discs: expected an integer >= 0, got -1"),
-    "sides": (lambda: Yard(box_width=(0.5, 0.2)), "scenario.box_width: expected [least, largest] in this order"),
-    "radii": (lambda: Yard(disc_radius=[0.3]), "scenario.disc_radius: expected a list of 2 numbers, got [0.3]"),
-    "yard": (lambda: Yard(region=[[0, 1]]), "scenario.region: expected 2 pairs [low, high]"),
+    "speed": (lambda: ForestMoving(speed=-1), "scenario.speed: expected a number between 0 and 1e+06 m/s, got -1"),
+    "pitch": (lambda: Walls(pitch=0), "scenario.pitch: expected a number above 0 m and at most 1e+06 m, got 0"),
+    "holes": (lambda: Walls(holes=1.5), "scenario.holes: expected a whole number between 0 and 1000, got 1.5"),  # type: ignore
+    "discs": (lambda: Yard(num_discs=-1), "scenario.num_discs: expected a whole number between 0 and 100000, got -1"),
+    "sides": (lambda: Yard(box_width=(0.5, 0.2)), "scenario.box_width: expected a list of 2 numbers above 0 m"),
+    "radii": (lambda: Yard(disc_radius=[0.3]), "scenario.disc_radius: expected a list of 2 numbers"),
+    "yard": (lambda: Yard(region=[[0, 1]]), "scenario.region: expected a list of 2 lists of 2 numbers"),
     "walls": (
         lambda: Walls(positions=[]),
-        "scenario.positions: expected a list of numbers, got []",
+        "scenario.positions: expected at least one wall, got none",
     ),
 }
 

@@ -84,14 +84,14 @@ ERRORS = {
     "goal length": ({"goal": np.zeros(14)}, "layouts.goal: expected n = 6 as start has, got 14"),
     "vehicle radius": (
         {"vehicle_radius": -0.1},
-        "layouts.vehicle_radius: expected a finite number >= 0, got -0.1",
+        "layouts.vehicle_radius: expected a number between 0 and 1e+06 m, got -0.1",
     ),
-    "goal radius": ({"goal_radius": 0.0}, "layouts.goal_radius: expected a finite number > 0, got 0.0"),
-    "dt": ({"dt": 0}, "layouts.dt: expected a finite number > 0, got 0"),
-    "dt array": ({"dt": np.ones(2)}, "layouts.dt: expected a finite number > 0"),
-    "infinite dt": ({"dt": np.inf}, "layouts.dt: expected a finite number > 0, got inf"),
-    "stages": ({"stages": 0}, "layouts.stages: expected an integer >= 1, got 0"),
-    "half a stage": ({"stages": 2.5}, "layouts.stages: expected an integer >= 1, got 2.5"),
+    "goal radius": ({"goal_radius": 0.0}, "layouts.goal_radius: expected a number above 0 m and at most 1e+06 m"),
+    "dt": ({"dt": 0}, "layouts.dt: expected a number above 0 s and at most 1e+06 s, got 0"),
+    "dt array": ({"dt": np.ones(2)}, "layouts.dt: expected a number above 0 s and at most 1e+06 s"),
+    "infinite dt": ({"dt": np.inf}, "layouts.dt: expected a number above 0 s and at most 1e+06 s, got inf"),
+    "stages": ({"stages": 0}, "layouts.stages: expected a whole number between 1 and 1e+09, got 0"),
+    "half a stage": ({"stages": 2.5}, "layouts.stages: expected a whole number between 1 and 1e+09, got 2.5"),
     "bound": ({"control_lower": [NAN, 0.0]}, "layouts.control_lower: expected shape (m,) without NaN"),
     "bound rank": ({"control_upper": 10.0}, "layouts.control_upper: expected shape (m,) without NaN"),
     "bound length": (
@@ -173,7 +173,7 @@ def test_load_refuses(tmp_path):
     np.savez(path, centers=np.zeros((1, 1, 2)), radii=np.ones((1, 1)), radius=1.0)
     assert message(path).startswith("layouts.radius: expected only centers, radii, velocities,")
     np.savez(path, centers=np.zeros((1, 1, 2)), radii=np.ones((1, 1)), dt=-1.0)
-    assert message(path).startswith("layouts.dt: expected a finite number > 0")
+    assert message(path).startswith("layouts.dt: expected a number above 0 s and at most 1e+06 s")
     np.savez(path, centers=np.array([None]), radii=np.ones((1, 1)))
     assert message(path).startswith("scenario.path: expected a readable npz file without pickles")
     path.write_bytes(b"not a zip")

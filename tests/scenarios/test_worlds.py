@@ -94,11 +94,11 @@ def test_spheres_cross_the_corridor_within_the_horizon_and_spare_the_start() -> 
     ("make", "message"),
     [
         (lambda: Woods(density=1e6), "scenario.density: expected at most 50000 trunks in scenario.region"),
-        (lambda: Woods(radii=[0.5, 0.2]), "scenario.radii: expected [least, largest] in this order"),
+        (lambda: Woods(radii=[0.5, 0.2]), "scenario.radii: expected a list of 2 numbers above 0 m"),
         (lambda: Woods(height=[1.0]), "scenario.height: expected a list of 2 numbers"),
         (lambda: Mazes(opening=[20.0, 1.0], opening_region=[[-20, 20], [0, 0]]), "scenario.opening: expected openings"),
-        (lambda: Mazes(walls=-1), "scenario.walls: expected an integer >= 0"),
-        (lambda: Crossing(speeds=[-1, 2]), "scenario.speeds: expected a finite number >= 0"),
+        (lambda: Mazes(walls=-1), "scenario.walls: expected a whole number between 0 and 1000"),
+        (lambda: Crossing(speeds=[-1, 2]), "scenario.speeds: expected a list of 2 numbers between 0 and 1e+06 m/s"),
         (
             lambda: Crossing(corridor=[[-1, -1], [1, 1], [0, 0]], grace=8.0).draw([0], 0),
             "scenario.clearance: expected room for 10 spheres",

@@ -1,16 +1,47 @@
-"""Reading npz files, by their arrays."""
+"""Files: written whole or not at all, and npz files read by their arrays."""
 
 from __future__ import annotations
 
 import math
 import os
+import tempfile
 import zipfile
-from collections.abc import Collection
-from typing import IO
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
 from torchgco.base.errors import InputError
+
+PART = ("torchgco-", ".part")  # beginning and ending of the name of a file that is still being written
+
+
+def write_whole(
+    path: str | os.PathLike[str], save: Callable[[IO[bytes]], Any], move: Callable[[str, Path], None] | None = None
+) -> None:
+    """Let `save(file)` write a temporary file in the same folder, and move it to `path` when it is on the disk.
+
+    A reader sees the old file or the new one, never a part. On any failure the temporary file is removed.
+
+    Args:
+        move: in place of `os.replace`.
+
+    Raises:
+        OSError: the system refuses to write there.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, part = tempfile.mkstemp(PART[1], PART[0], path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            save(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(part, 0o644)
+        (move or os.replace)(part, path)
+    finally:
+        Path(part).unlink(missing_ok=True)  # gone already after a move
 
 
 def read_arrays(

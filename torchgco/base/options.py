@@ -19,6 +19,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, reduce
+from itertools import pairwise
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
@@ -64,8 +65,17 @@ def Within(low: float, high: float, unit: str = "") -> Limit:
     return Limit(f"between {low:g} and {high:g} {unit}".rstrip(), low=low, high=high)
 
 
+class Increasing(Limit):
+    """A list whose numbers don't fall."""
+
+    def holds(self, value: Any) -> bool:
+        """Whether none is below the one before it."""
+        return all(a <= b for a, b in pairwise(value))
+
+
 LONG = 2**63  # integers from here on don't fit into 64 bits
 UNBOUNDED = Limit("or infinity")  # admits infinity, but not NaN
+INCREASING = Increasing("in increasing order")
 
 Natural = Annotated[int, AtLeast(0)]
 Count = Annotated[int, AtLeast(1)]

@@ -20,12 +20,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 import torchgco
 from torchgco.base.errors import InputError
-from torchgco.base.interrupts import farewell, raised
 from torchgco.experiments.config.build import forget_composed, recomposer
 from torchgco.experiments.config.checks import as_input_error, check_once, hydra_words
 from torchgco.experiments.config.groups import ENTRY, config_dir, register_resolver
+from torchgco.experiments.ending import Refused, ended, raised, say, silence
 from torchgco.experiments.flying.jobs import Report
-from torchgco.experiments.results.files import say, silence, write
+from torchgco.experiments.results.files import write
 from torchgco.experiments.results.identity import decisive, digest, plain, settings_of
 
 # conf/hydra/launcher extends the plugins' configurations of the same names. Hydra warns that it may stop to join them;
@@ -71,7 +71,7 @@ def _task(config: DictConfig) -> Report:
         kind, named = ("run", job.run.dir) if alone else ("sweep", job.sweep.dir)
         if not named:
             raise InputError(f"hydra.{kind}.dir", "the name of a folder", "an empty one")
-        with raised():  # modules are loaded, and files are about to be written
+        with raised():  # a job may run in a process that a launcher started
             done = run_study(
                 config, folder, recomposer(overrides, job.runtime.config_sources),
                 lambda: _keep_configuration(config, folder), command=sys.argv[1:] if alone else ["-m", *overrides],
@@ -80,9 +80,7 @@ def _task(config: DictConfig) -> Report:
         _remove_empty(folder)
         if not alone:
             return Report(str(folder), overrides, False, str(as_input_error(error)))
-        # An exit, because Hydra would print a line before an exception.
-        print(f"torchgco: {as_input_error(error)}", file=sys.stderr)
-        sys.exit(2)
+        raise Refused(as_input_error(error)) from None
     except Exception as error:
         if _is_of_launcher(error):
             return Report(str(folder), overrides, False, _stopped(error))
@@ -125,7 +123,11 @@ def _keep_configuration(config: DictConfig, folder: Path) -> None:
 
 
 def main() -> int:
-    """Run the command line; returns the exit code: 0, 2 for malformed input, 130 when interrupted, 143 by SIGTERM."""
+    """Run the command line; returns the exit code, see `ended`."""
+    return ended("torchgco", _command)
+
+
+def _command() -> int:
     if "--version" in sys.argv[1:]:
         say(f"torchgco {torchgco.__version__}")
         return 0
@@ -140,33 +142,28 @@ def main() -> int:
         typed = dict(zip(words, hydra_words(words), strict=True))
         sys.argv[1:] = [typed.get(word, word) for word in sys.argv[1:]]  # Hydra's own main reads them
         _run()
-    except (InputError, HydraException, OmegaConfBaseException) as error:
-        return _refuse(as_input_error(error))
+    except InputError:
+        raise
+    except (HydraException, OmegaConfBaseException) as error:
+        raise as_input_error(error) from None
     except BrokenPipeError as error:  # a reader of Hydra's pages has read enough, as `head` does
         if not _by_hydra(error):
             raise
         silence()
     except OSError as error:  # Hydra can't make the study's folder; the study's own files raise InputError
-        return _refuse(InputError("hydra.run.dir", "a folder that can be made", error))
-    except KeyboardInterrupt as error:
-        return farewell(error)
+        raise InputError("hydra.run.dir", "a folder that can be made", error) from None
     except Exception as error:
         if _is_of_launcher(error):
             print(f"torchgco: {_stopped(error)}", file=sys.stderr)
             return 1
         if not isinstance(error, ValueError) or not _by_hydra(error):
             raise
-        return _refuse(InputError("command line", "words that Hydra accepts", error))
+        raise InputError("command line", "words that Hydra accepts", error) from None
     return 0
 
 
-def _refuse(error: InputError) -> int:
-    print(f"torchgco: {error}", file=sys.stderr)
-    return 2
-
-
 def _refuse_flags(message: str) -> NoReturn:
-    sys.exit(_refuse(InputError("command line", "KEY=VALUE, GROUP=OPTION and the flags of --hydra-help", message)))
+    raise InputError("command line", "KEY=VALUE, GROUP=OPTION and the flags of --hydra-help", message)
 
 
 def _by_hydra(error: BaseException) -> bool:

@@ -15,12 +15,12 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from tempfile import mkstemp
 from typing import Any, NamedTuple
+
+from torchgco.base.files import PART, write_whole
 
 FILES = 200  # at most; the least recently used are removed
 _ABANDONED = 3600.0  # s after which a half-written file belongs to a process that was killed
-_PART = ("torchgco-", ".part")
 _OURS = re.compile(r"[0-9a-f]{32}-[0-9a-f]{32}\.[a-z]+")
 
 
@@ -98,17 +98,10 @@ def save(key: str, suffix: str, content: bytes) -> Path | None:
     if str(place).startswith("~"):
         return None
     path = place / _name(key, suffix, content)
-    part = None
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle, part = mkstemp(_PART[1], _PART[0], place)
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.replace(part, path)
+        write_whole(path, lambda file: file.write(content))
     except OSError:
-        if part is not None:
-            with suppress(OSError):
-                os.unlink(part)
         return None
     _tidy(place)
     return path
@@ -128,7 +121,7 @@ def _tidy(place: Path) -> None:
                 age = time.time() - entry.stat().st_mtime
                 if _OURS.fullmatch(entry.name):  # all other files in the folder are left alone
                     ages.append((age, entry.path))
-                elif entry.name.startswith(_PART[0]) and entry.name.endswith(_PART[1]) and age > _ABANDONED:
+                elif entry.name.startswith(PART[0]) and entry.name.endswith(PART[1]) and age > _ABANDONED:
                     os.unlink(entry.path)
     for _, path in sorted(ages)[FILES:]:
         with suppress(OSError):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.base.options import Seed, check_options, check_value
 from torchgco.scenarios import checks
 from torchgco.scenarios.layouts import Layouts, concatenate
 
@@ -46,7 +47,7 @@ class Scenario(ABC):
         Raises InputError where ids or seed are malformed, or the scenario's rule can't be satisfied.
         """
         numbers = checks.indices(ids, "ids")
-        seed = checks.integer(seed, "seed", 0)
+        seed = check_value(seed, Seed, "seed")
         drawn = concatenate([self._draw_one(generator(seed, int(number))) for number in numbers])
         return replace(drawn, name=self.name, ids=numbers)
 
@@ -62,42 +63,37 @@ def generator(seed: int, number: int) -> np.random.Generator:
 
 @dataclass(frozen=True, kw_only=True)
 class Family(Scenario):
-    """Base of the built-in random families: one start at rest, one goal.
+    """Base of the built-in random families: one start at rest, one goal. Their fields have these, too.
 
-    start, goal  positions (d,) m; the full states are at rest
-    vehicle_radius, goal_radius
-                 m
-    stages       N; dt: s
+    Args:
+        start, goal: positions (d,), m; the full states are at rest.
+        vehicle_radius, goal_radius: m.
+        stages: N.
+        dt: s.
 
-    Raises InputError naming `scenario.<field>`.
+    Raises:
+        InputError: a field out of its range, named as `scenario.<field>`.
     """
 
     name: str
-    vehicle_radius: float
-    start: Sequence[float]
-    goal: Sequence[float]
-    goal_radius: float
-    stages: int
-    dt: float
+    vehicle_radius: checks.Length
+    start: Sequence[checks.Coordinate]
+    goal: Sequence[checks.Coordinate]
+    goal_radius: checks.Size
+    stages: checks.Stages
+    dt: checks.TimeStep
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name:
+        check_options(self, "scenario")
+        if not self.name:
             raise InputError("scenario.name", "a name", repr(self.name))
-        self._set("vehicle_radius", checks.number, at_least=0)
-        for field in ("goal_radius", "dt"):
-            self._set(field, checks.number, above=0)
-        for field in ("start", "goal"):
-            self._set(field, checks.vector, length=self.dimension)
-        self._set("stages", checks.integer, at_least=1, at_most=checks.MOST_STAGES)
+        for field in fields(self):
+            object.__setattr__(self, field.name, checks.plain(getattr(self, field.name)))
 
     @property
     def states(self) -> int:
         """n."""
         return len(self._at_rest(self.start))
-
-    def _set(self, field: str, check: Any, **limits: Any) -> None:
-        """Replace a field by its checked, plain form."""
-        object.__setattr__(self, field, check(getattr(self, field), f"scenario.{field}", **limits))
 
     @abstractmethod
     def _at_rest(self, position: Sequence[float]) -> np.ndarray:

@@ -1,19 +1,19 @@
-"""Checks of the arguments of scenarios and layouts.
+"""The kinds of numbers in scenarios and layouts, as annotations of their fields, and checks of arrays.
 
-Each returns the value in one plain form or raises InputError. Letters as in `layouts`: L layouts,
+Each check returns the value in one plain form or raises InputError. Letters as in `layouts`: L layouts,
 M spheres, K boxes, d the dimension of space, n states, m controls.
 """
 
 from __future__ import annotations
 
-import math
 import operator
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.base.options import INCREASING, Above, AtMost, Within, check_value
 from torchgco.obstacles.boxes import UNIT_WITHIN
 
 LARGEST = 1e6  # m, m/s or s: beyond it, squares and sums lose the digits that obstacles are checked to
@@ -21,70 +21,40 @@ MOST_OBSTACLES = 100_000  # in a layout that is drawn
 MOST_STAGES = 10**9  # beyond any memory, and few enough for arithmetic on bytes
 
 
-def number(value: Any, field: str, above: float = -math.inf, at_least: float = -math.inf) -> float:
-    """`value` as a finite float that is > `above`, >= `at_least`, and at most LARGEST in size."""
-    plain = _plain(value)
-    if not (math.isfinite(plain) and plain > above and plain >= at_least):
-        limit = f" > {above:g}" if above > -math.inf else f" >= {at_least:g}" if at_least > -math.inf else ""
-        raise InputError(field, f"a finite number{limit}", repr(value))
-    if abs(plain) > LARGEST:
-        raise InputError(field, f"a number of at most {LARGEST:g} in size", repr(value))
-    return plain
+Coordinate = Annotated[float, Within(-LARGEST, LARGEST, "m")]
+Length = Annotated[float, Within(0, LARGEST, "m")]
+Size = Annotated[float, Above(0, "m"), AtMost(LARGEST, "m")]
+Duration = Annotated[float, Within(0, LARGEST, "s")]
+TimeStep = Annotated[float, Above(0, "s"), AtMost(LARGEST, "s")]
+Speed = Annotated[float, Within(0, LARGEST, "m/s")]
+Stages = Annotated[int, Within(1, MOST_STAGES)]
+Number = Annotated[int, Within(0, MOST_OBSTACLES)]
+Density = Annotated[float, Within(0, LARGEST)]
+Range = Annotated[tuple[Coordinate, Coordinate], INCREASING]
+Sizes = Annotated[tuple[Size, Size], INCREASING]
+Speeds = Annotated[tuple[Speed, Speed], INCREASING]
+Point2 = tuple[Coordinate, Coordinate]
+Point3 = tuple[Coordinate, Coordinate, Coordinate]
+Region2 = tuple[Range, Range]
+Region3 = tuple[Range, Range, Range]
+# Numbers that layouts share, by field.
+SCALARS: dict[str, Any] = {"vehicle_radius": Length, "goal_radius": Size, "dt": TimeStep, "stages": Stages}
 
 
-def optional_number(value: Any, field: str, **limits: float) -> float | None:
-    """As `number`, None staying None."""
-    return None if value is None else number(value, field, **limits)
+def scalar(name: str, value: Any) -> float | int | None:
+    """A number that layouts share, as a file holds it: also an array without axes, and stages as a float."""
+    if value is None:
+        return None
+    held = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    whole = name == "stages" and isinstance(held, float) and held.is_integer()
+    held = check_value(int(held) if whole else held, SCALARS[name], f"layouts.{name}")
+    return held if name == "stages" else float(held)
 
 
-def integer(value: Any, field: str, at_least: int, at_most: int | None = None) -> int:
-    """`value` as an int >= `at_least` and <= `at_most`; 5.0 is one, 5.5 is not."""
-    plain = _plain(value)
-    if not (plain >= at_least and plain.is_integer()):
-        raise InputError(field, f"an integer >= {at_least}", repr(value))
-    if at_most is not None and plain > at_most:
-        raise InputError(field, f"an integer <= {at_most}", repr(value))
-    return int(value)
-
-
-def _plain(value: Any) -> float:
-    """A number, also in an array without axes, as a float; NaN for all else, such as text and booleans."""
-    try:
-        return float(value) if np.asarray(value).dtype.kind in "iufO" and value is not None else math.nan
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        return math.nan
-
-
-def vector(value: Any, field: str, length: int | None = None) -> tuple[float, ...]:
-    """A sequence of `length` (by default at least one) finite numbers as a tuple of floats."""
-    items = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
-    if not items or (length is not None and len(items) != length):
-        raise InputError(field, "a list of numbers" if length is None else f"a list of {length} numbers", repr(value))
-    return tuple(number(item, field) for item in items)
-
-
-def vectors(value: Any, field: str, length: int) -> tuple[tuple[float, ...], ...]:
-    """A sequence of at least one sequence of `length` numbers, as tuples."""
-    rows = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
-    if not rows:
-        raise InputError(field, f"a list of lists of {length} numbers", repr(value))
-    return tuple(vector(row, field, length) for row in rows)
-
-
-def box(value: Any, field: str, dimension: int) -> tuple[tuple[float, float], ...]:
-    """`dimension` pairs (low, high) with low <= high."""
-    pairs = vectors(value, field, 2)
-    if len(pairs) != dimension or any(low > high for low, high in pairs):
-        raise InputError(field, f"{dimension} pairs [low, high] with low <= high", repr(value))
-    return tuple((low, high) for low, high in pairs)
-
-
-def interval(value: Any, field: str, **limits: float) -> tuple[float, float]:
-    """A pair (least, largest) of numbers in order, within the limits of `number`."""
-    low, high = (number(item, field, **limits) for item in vector(value, field, length=2))
-    if low > high:
-        raise InputError(field, "[least, largest] in this order", repr(value))
-    return low, high
+def plain(value: Any) -> Any:
+    """Sequences, nested ones too, as tuples of floats, and any other value of a field as it is."""
+    rows = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str)
+    return tuple(float(item) if isinstance(item, int | float) else plain(item) for item in value) if rows else value
 
 
 def indices(value: Any, field: str) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,31 +17,25 @@ from torchgco.scenarios.quadrotor import Quadrotor
 class Crossing(Quadrotor):
     """Spheres that each pass a random point of the corridor at a random time, horizontally and at constant velocity.
 
-    num_obstacles  how many
-    corridor       box in which the points are uniform: 3 pairs [low, high], m
-    speeds         [least, largest], uniform, m/s
-    clearance      a sphere is redrawn until it stays farther than this from the start for `grace` s, m
-    grace          s; before, the vehicle can hardly have left
-
     The times are uniform over the horizon and the headings over the circle.
+
+    Args:
+        obstacle_radius: m.
+        num_obstacles: how many.
+        corridor: box in which the points are uniform: 3 pairs [low, high], m.
+        speeds: [least, largest], uniform, m/s.
+        clearance: a sphere is redrawn until it stays farther than this from the start for `grace` s, m.
+        grace: s; before, the vehicle can hardly have left.
     """
 
     name: str = "crossing"
-    obstacle_radius: float = 0.60
-    num_obstacles: int = 10
-    corridor: Sequence[Sequence[float]] = ((1.0, 18.0), (-1.0, 3.0), (-1.0, 1.0))
-    speeds: Sequence[float] = (1.0, 4.0)
-    clearance: float = 1.26
-    grace: float = 1.0
-    stages: int = 160
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._set("num_obstacles", checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
-        for field in ("obstacle_radius", "clearance", "grace"):
-            self._set(field, checks.number, at_least=0)
-        self._set("corridor", checks.box, dimension=3)
-        self._set("speeds", checks.interval, at_least=0)
+    obstacle_radius: checks.Length = 0.60
+    num_obstacles: checks.Number = 10
+    corridor: checks.Region3 = ((1.0, 18.0), (-1.0, 3.0), (-1.0, 1.0))
+    speeds: checks.Speeds = (1.0, 4.0)
+    clearance: checks.Length = 1.26
+    grace: checks.Duration = 1.0
+    stages: checks.Stages = 160
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
         centers, velocities = self._movers(rng, self.num_obstacles)

@@ -7,7 +7,6 @@ rows of NaN. Lengths in metres, times in seconds.
 from __future__ import annotations
 
 import os
-import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,17 +15,16 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError
-from torchgco.base.files import read_arrays
-from torchgco.base.options import check_value
+from torchgco.base.files import read_arrays, write_whole
+from torchgco.base.options import Natural, check_value
 from torchgco.scenarios import checks
 from torchgco.solvers.memory import free_memory
 
 # Arrays of a file, in the order of the fields of Layouts. `layout` holds the ids, if they are not 0..L-1.
 REQUIRED = ("centers", "radii")
-SCALARS = ("vehicle_radius", "goal_radius", "dt", "stages")
 CONTROLS = ("control_lower", "control_upper")
 BOXES = ("box_centers", "box_half_sizes", "box_rotations", "box_radii")
-NAMED = (*REQUIRED, "velocities", *BOXES, "start", "goal", *SCALARS, *CONTROLS, "best_cost")
+NAMED = (*REQUIRED, "velocities", *BOXES, "start", "goal", *checks.SCALARS, *CONTROLS, "best_cost")
 IDS = "layout"
 
 
@@ -90,10 +88,8 @@ class Layouts:
         lengths = {state.shape[1] for state in (self.start, self.goal) if state is not None} - {centers.shape[2]}
         if self.start is not None and self.goal is not None and len(lengths) > 1:
             raise InputError("layouts.goal", f"n = {self.start.shape[1]} as start has", self.goal.shape[1])
-        for name, limit in (("vehicle_radius", "at_least"), ("goal_radius", "above"), ("dt", "above")):
-            put(name, checks.optional_number(getattr(self, name), f"layouts.{name}", **{limit: 0.0}))
-        if self.stages is not None:
-            put("stages", checks.integer(self.stages, "layouts.stages", 1, checks.MOST_STAGES))
+        for name in checks.SCALARS:
+            put(name, checks.scalar(name, getattr(self, name)))
         lower, upper = checks.control_bounds(self.control_lower, self.control_upper)
         put("control_lower", lower)
         put("control_upper", upper)
@@ -141,7 +137,7 @@ class Layouts:
     def pad(self, obstacles: int) -> Layouts:
         """The same layouts with M = `obstacles` spheres, absent ones added last; InputError if there are more."""
         present = self.radii.shape[1]
-        missing = checks.integer(obstacles, "layouts.pad", 0) - present
+        missing = check_value(obstacles, Natural, "layouts.pad") - present
         if missing < 0:
             raise InputError("layouts.pad", f"at least the {present} obstacles there are", obstacles)
         if missing == 0:
@@ -155,16 +151,7 @@ class Layouts:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the arrays to `path` (npz): all of it or, if interrupted, nothing."""
-        path = Path(path)
-        part = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
-        try:
-            with open(part, "xb") as handle:
-                np.savez_compressed(handle, **self.arrays())  # type: ignore[arg-type]
-                handle.flush()
-                os.fsync(handle.fileno())
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
+        write_whole(path, lambda file: np.savez_compressed(file, **self.arrays()))  # type: ignore[arg-type]
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Layouts:
@@ -206,7 +193,7 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
     if not parts:
         raise InputError("layouts", "at least one part to concatenate", "none")
     _same("dimension", [part.dimension for part in parts])
-    shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*SCALARS, *CONTROLS)}
+    shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*checks.SCALARS, *CONTROLS)}
     width = max(part.radii.shape[1] for part in parts)
     parts = [part.pad(width) for part in parts]
     joined = ("start", "goal", "velocities", "best_cost")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.base.options import Within
 from torchgco.scenarios import checks
 from torchgco.scenarios.layouts import Layouts
 from torchgco.scenarios.quadrotor import Quadrotor
@@ -19,42 +20,35 @@ MOST_WALLS = 1000
 class Mazes(Quadrotor):
     """Walls across the way, at even distances, each with a rectangular opening, and loose boxes turned about z.
 
-    walls           how many
-    region          the space that walls and loose boxes fill: 3 pairs [low, high], m
-    extent          [[low, high] in y, [low, high] in z] of each wall, m
-    thickness       of a wall, m
-    opening         its sides in y and z, m
-    opening_region  [[low, high] in y, [low, high] in z], in which the centres of openings are uniform, m
-    loose           number of loose boxes, with centres uniform in the region
-    sizes           [least, largest] half side of a loose box, each uniform, m
-
     A loose box may close an opening.
+
+    Args:
+        walls: how many.
+        region: the space that walls and loose boxes fill: 3 pairs [low, high], m.
+        extent: [[low, high] in y, [low, high] in z] of each wall, m.
+        thickness: of a wall, m.
+        opening: its sides in y and z, m.
+        opening_region: [[low, high] in y, [low, high] in z], in which the centres of openings are uniform, m.
+        loose: number of loose boxes, with centres uniform in the region.
+        sizes: [least, largest] half side of a loose box, each uniform, m.
     """
 
     name: str = "mazes"
-    walls: int = 3
-    region: Sequence[Sequence[float]] = ((2.0, 17.0), (-3.0, 5.0), (-2.0, 2.0))
-    extent: Sequence[Sequence[float]] = ((-24.0, 26.0), (-8.0, 8.0))
-    thickness: float = 0.4
-    opening: Sequence[float] = (1.8, 1.8)
-    opening_region: Sequence[Sequence[float]] = ((-3.0, 5.0), (-2.0, 2.0))
-    loose: int = 6
-    sizes: Sequence[float] = (0.3, 0.9)
-    stages: int = 280
+    walls: Annotated[int, Within(0, MOST_WALLS)] = 3
+    region: checks.Region3 = ((2.0, 17.0), (-3.0, 5.0), (-2.0, 2.0))
+    extent: checks.Region2 = ((-24.0, 26.0), (-8.0, 8.0))
+    thickness: checks.Size = 0.4
+    opening: tuple[checks.Size, checks.Size] = (1.8, 1.8)
+    opening_region: checks.Region2 = ((-3.0, 5.0), (-2.0, 2.0))
+    loose: checks.Number = 6
+    sizes: checks.Sizes = (0.3, 0.9)
+    stages: checks.Stages = 280
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("walls", checks.integer, at_least=0, at_most=MOST_WALLS)
-        self._set("region", checks.box, dimension=3)
-        for field in ("extent", "opening_region"):
-            self._set(field, checks.box, dimension=2)
-        self._set("thickness", checks.number, above=0)
-        self._set("opening", checks.vector, length=2)
-        self._set("loose", checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
-        self._set("sizes", checks.interval, above=0)
         for side, (low, high), (first, last) in zip(self.opening, self.opening_region, self.extent, strict=True):
-            if not (side > 0 and first < low - 0.5 * side and high + 0.5 * side < last):
-                expected = "openings above 0 m that lie inside scenario.extent, wherever they are drawn"
+            if not (first < low - 0.5 * side and high + 0.5 * side < last):
+                expected = "openings that lie inside scenario.extent, wherever they are drawn"
                 raise InputError("scenario.opening", expected, f"{self.opening}")
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:

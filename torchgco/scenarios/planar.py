@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.base.options import Within
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import Family, equal_spheres, uniform_clear
 from torchgco.scenarios.layouts import Layouts
@@ -17,23 +18,26 @@ from torchgco.scenarios.layouts import Layouts
 TRAP = ((0.0, -0.25), (0.1, 0.0), (0.12, 0.25), (0.0, 0.5), (-0.2, 0.6), (-0.2, -0.35))
 
 
+Bound = Annotated[float, Within(-checks.LARGEST, checks.LARGEST, "m/s^2")]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Planar(Family):
     """Base of the planar families: state n = 6 [p, theta, p', theta'], control m = 2 [a_left, a_right].
 
-    control_lower, control_upper
-        one number for both wheels, or one each, or None for the model's own. Without reversing (a lower bound
-        of 0) waiting in a trap is cheaper than leaving it.
+    Args:
+        control_lower, control_upper: one number for both wheels, or one each, m/s^2, or None for the model's own.
+            Without reversing (a lower bound of 0) waiting in a trap is cheaper than leaving it.
     """
 
-    vehicle_radius: float = 0.06
-    start: Sequence[float] = (-1.0, 0.0)
-    goal: Sequence[float] = (1.0, 0.4)
-    goal_radius: float = 0.3
-    stages: int = 200
-    dt: float = 0.05
-    control_lower: float | Sequence[float] | None = -10.0
-    control_upper: float | Sequence[float] | None = 10.0
+    vehicle_radius: checks.Length = 0.06
+    start: checks.Point2 = (-1.0, 0.0)
+    goal: checks.Point2 = (1.0, 0.4)
+    goal_radius: checks.Size = 0.3
+    stages: checks.Stages = 200
+    dt: checks.TimeStep = 0.05
+    control_lower: Bound | tuple[Bound, Bound] | None = -10.0
+    control_upper: Bound | tuple[Bound, Bound] | None = 10.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -41,8 +45,6 @@ class Planar(Family):
             value = getattr(self, field)
             if isinstance(value, int | float):
                 object.__setattr__(self, field, (value, value))
-            if value is not None:
-                self._set(field, checks.vector, length=2)
         lower, upper = self.control_lower, self.control_upper
         if lower is not None and upper is not None and np.greater(lower, upper).any():
             raise InputError("scenario.control_lower", f"at most control_upper, {upper}", lower)
@@ -61,18 +63,23 @@ class Planar(Family):
 
 @dataclass(frozen=True, kw_only=True)
 class PlanarTrap(Planar):
-    """Discs at `centers` (M, 2) m, each coordinate jittered by N(0, jitter^2): a cup in front of the goal."""
+    """Discs at fixed places, each coordinate jittered: a cup in front of the goal.
+
+    Args:
+        obstacle_radius: m.
+        centers: (M, 2), m.
+        jitter: standard deviation of each coordinate, m.
+    """
 
     name: str = "planar_trap"
-    obstacle_radius: float = 0.10
-    centers: Sequence[Sequence[float]] = TRAP
-    jitter: float = 0.03
+    obstacle_radius: checks.Length = 0.10
+    centers: Sequence[checks.Point2] = TRAP
+    jitter: checks.Length = 0.03
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("centers", checks.vectors, length=2)
-        for field in ("obstacle_radius", "jitter"):
-            self._set(field, checks.number, at_least=0)
+        if not self.centers:
+            raise InputError("scenario.centers", "at least one disc", "none")
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
         centers = np.array(self.centers)
@@ -82,25 +89,21 @@ class PlanarTrap(Planar):
 
 @dataclass(frozen=True, kw_only=True)
 class PlanarRandom(Planar):
-    """`num_obstacles` discs, centres uniform in `region` (2 pairs [low, high], m), which may overlap.
+    """Discs with centres uniform in a region, which may overlap.
 
-    A centre is redrawn until it is more than `start_clearance` from the start and `goal_clearance` from the
-    goal, m.
+    Args:
+        obstacle_radius: m.
+        num_obstacles: how many.
+        region: 2 pairs [low, high], m.
+        start_clearance, goal_clearance: a centre is redrawn until it is more than this from start and goal, m.
     """
 
     name: str = "planar_random"
-    obstacle_radius: float = 0.08
-    num_obstacles: int = 15
-    region: Sequence[Sequence[float]] = ((-0.8, 0.9), (-0.8, 0.9))
-    start_clearance: float = 0.22
-    goal_clearance: float = 0.19
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._set("num_obstacles", checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
-        self._set("region", checks.box, dimension=2)
-        for field in ("obstacle_radius", "start_clearance", "goal_clearance"):
-            self._set(field, checks.number, at_least=0)
+    obstacle_radius: checks.Length = 0.08
+    num_obstacles: checks.Number = 15
+    region: checks.Region2 = ((-0.8, 0.9), (-0.8, 0.9))
+    start_clearance: checks.Length = 0.22
+    goal_clearance: checks.Length = 0.19
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
         clear = ((self.start, self.start_clearance), (self.goal, self.goal_clearance))

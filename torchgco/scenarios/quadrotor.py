@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.base.options import Within
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import Family, equal_spheres, uniform_clear
 from torchgco.scenarios.layouts import Layouts
@@ -23,12 +25,12 @@ class Quadrotor(Family):
     Control bounds are the model's.
     """
 
-    vehicle_radius: float = 0.36
-    start: Sequence[float] = (-1.0, 1.0, 0.0)
-    goal: Sequence[float] = (20.0, 1.0, 0.2)
-    goal_radius: float = 2.0
-    stages: int = 100
-    dt: float = 0.05
+    vehicle_radius: checks.Length = 0.36
+    start: checks.Point3 = (-1.0, 1.0, 0.0)
+    goal: checks.Point3 = (20.0, 1.0, 0.2)
+    goal_radius: checks.Size = 2.0
+    stages: checks.Stages = 100
+    dt: checks.TimeStep = 0.05
 
     @property
     def dimension(self) -> int:
@@ -42,27 +44,25 @@ class Quadrotor(Family):
 
 @dataclass(frozen=True, kw_only=True)
 class Forest(Quadrotor):
-    """Spheres with centres uniform in `region` (3 pairs [low, high], m), which may overlap.
+    """Spheres with centres uniform in a region, which may overlap.
 
-    num_obstacles  how many
-    density        per m^3 of the region; if given, num_obstacles is the nearest whole number that it implies
-    clearance      a centre is redrawn until it is more than this from start and goal, m
+    Args:
+        obstacle_radius: m.
+        num_obstacles: how many.
+        density: per m^3 of the region; if given, num_obstacles is the nearest whole number that it implies.
+        region: 3 pairs [low, high], m.
+        clearance: a centre is redrawn until it is more than this from start and goal, m.
     """
 
     name: str = "forest"
-    obstacle_radius: float = 0.60
-    num_obstacles: int = 30
-    density: float | None = None
-    region: Sequence[Sequence[float]] = ((2.0, 16.0), (-1.0, 3.0), (-1.0, 1.0))
-    clearance: float = 1.26
+    obstacle_radius: checks.Length = 0.60
+    num_obstacles: checks.Number = 30
+    density: checks.Density | None = None
+    region: checks.Region3 = ((2.0, 16.0), (-1.0, 3.0), (-1.0, 1.0))
+    clearance: checks.Length = 1.26
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("num_obstacles", checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
-        for field in ("obstacle_radius", "clearance"):
-            self._set(field, checks.number, at_least=0)
-        self._set("density", checks.optional_number, at_least=0)
-        self._set("region", checks.box, dimension=3)
         if self.obstacle_count > checks.MOST_OBSTACLES:
             expected = f"at most {checks.MOST_OBSTACLES} obstacles in scenario.region"
             raise InputError("scenario.density", expected, f"{self.density}, which makes {self.obstacle_count}")
@@ -86,17 +86,18 @@ class Forest(Quadrotor):
 class ForestMoving(Forest):
     """A forest whose spheres move, each in a random horizontal direction at a constant velocity.
 
-    Speeds are uniform in [slowest, speed] m/s. At the first instant it is the Forest of the same seed and number.
+    At the first instant it is the Forest of the same seed and number.
+
+    Args:
+        speed, slowest: the largest and the smallest speed, m/s; speeds are uniform between them.
     """
 
     name: str = "forest_moving"
-    speed: float = 1.0
-    slowest: float = 0.0
+    speed: checks.Speed = 1.0
+    slowest: checks.Speed = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("speed", "slowest"):
-            self._set(name, checks.number, at_least=0)
         if self.slowest > self.speed:
             raise InputError("scenario.slowest", f"at most scenario.speed, {self.speed} m/s", self.slowest)
 
@@ -113,35 +114,32 @@ class ForestMoving(Forest):
 class Walls(Quadrotor):
     """Walls of spheres between start and goal, with round holes at random places.
 
-    positions    x of each wall, m
-    extent       [[low, high] in y, [low, high] in z] of the grid of centres, which starts at the low ends, m
-    pitch        distance between neighbours on the grid, m
-    holes        holes in each wall
-    hole_radius  spheres nearer than this to a hole, centre to centre in the wall's plane, are left out, m
-    hole_region  box [[y], [z]] in which the centres of holes are uniform, m
-
     M is the size of the full grids in every layout (absent spheres last), so it never depends on the draw.
+
+    Args:
+        obstacle_radius: m.
+        positions: x of each wall, m.
+        extent: [[low, high] in y, [low, high] in z] of the grid of centres, which starts at the low ends, m.
+        pitch: distance between neighbours on the grid, m.
+        holes: holes in each wall.
+        hole_radius: spheres nearer than this to a hole, centre to centre in the wall's plane, are left out, m.
+        hole_region: box [[y], [z]] in which the centres of holes are uniform, m.
     """
 
     name: str = "walls"
-    obstacle_radius: float = 0.60
-    stages: int = 160
-    positions: Sequence[float] = (7.0, 13.0)
-    extent: Sequence[Sequence[float]] = ((-5.0, 7.0), (-3.0, 3.0))
-    pitch: float = 0.9
-    holes: int = 1
-    hole_radius: float = 1.5
-    hole_region: Sequence[Sequence[float]] = ((-1.5, 3.5), (-1.0, 1.0))
+    obstacle_radius: checks.Length = 0.60
+    stages: checks.Stages = 160
+    positions: Sequence[checks.Coordinate] = (7.0, 13.0)
+    extent: checks.Region2 = ((-5.0, 7.0), (-3.0, 3.0))
+    pitch: checks.Size = 0.9
+    holes: Annotated[int, Within(0, MOST_HOLES)] = 1
+    hole_radius: checks.Length = 1.5
+    hole_region: checks.Region2 = ((-1.5, 3.5), (-1.0, 1.0))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._set("positions", checks.vector)
-        for field in ("extent", "hole_region"):
-            self._set(field, checks.box, dimension=2)
-        self._set("pitch", checks.number, above=0)
-        self._set("holes", checks.integer, at_least=0, at_most=MOST_HOLES)
-        for field in ("obstacle_radius", "hole_radius"):
-            self._set(field, checks.number, at_least=0)
+        if not self.positions:
+            raise InputError("scenario.positions", "at least one wall", "none")
         steps = [(high - low) / self.pitch + 1 for low, high in self.extent]
         if len(self.positions) * steps[0] * steps[1] > checks.MOST_OBSTACLES:
             expected = f"grids of at most {checks.MOST_OBSTACLES} spheres in scenario.extent"

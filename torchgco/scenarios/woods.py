@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,29 +17,24 @@ from torchgco.scenarios.quadrotor import Quadrotor
 class Woods(Quadrotor):
     """Vertical trunks (capsules) at the points of a Poisson process, which may overlap.
 
-    density  expected number of trunks per m^2 of the region; the number itself varies from layout to layout
-    region   2 pairs [low, high] in x and y, m
-    radii    [least, largest] of the trunks, uniform, m
-    height   z of the trunks' ends, m
-    clearance
-             a trunk is redrawn until its axis is more than this from start and goal, in the plane, m
+    Args:
+        density: expected number of trunks per m^2 of the region; the number itself varies from layout to layout.
+        region: 2 pairs [low, high] in x and y, m.
+        radii: [least, largest] of the trunks, uniform, m.
+        height: z of the trunks' ends, m.
+        clearance: a trunk is redrawn until its axis is more than this from start and goal, in the plane, m.
     """
 
     name: str = "woods"
-    density: float = 0.4
-    region: Sequence[Sequence[float]] = ((2.0, 17.0), (-14.0, 16.0))
-    radii: Sequence[float] = (0.25, 0.45)
-    height: Sequence[float] = (-8.0, 8.0)
-    clearance: float = 1.26
-    stages: int = 240
+    density: checks.Density = 0.4
+    region: checks.Region2 = ((2.0, 17.0), (-14.0, 16.0))
+    radii: checks.Sizes = (0.25, 0.45)
+    height: checks.Range = (-8.0, 8.0)
+    clearance: checks.Length = 1.26
+    stages: checks.Stages = 240
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for field in ("density", "clearance"):
-            self._set(field, checks.number, at_least=0)
-        self._set("region", checks.box, dimension=2)
-        self._set("radii", checks.interval, above=0)
-        self._set("height", checks.interval)
         if self.expected_count > checks.MOST_OBSTACLES / 2:  # a Poisson number hardly ever exceeds its double
             expected = f"at most {checks.MOST_OBSTACLES // 2} trunks in scenario.region"
             raise InputError("scenario.density", expected, f"{self.density}, which makes {self.expected_count:.0f}")

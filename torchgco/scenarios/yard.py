@@ -16,39 +16,30 @@ from torchgco.scenarios.layouts import Layouts
 class Yard(Family):
     """Discs and boxes at any angle, centres uniform in `region`, which may overlap; for the unicycle, n = 4.
 
-    num_discs, num_boxes
-                 how many of each
-    disc_radius, box_length, box_width
-                 pairs [least, largest] in m: radii, and the full lengths of a box's sides, are uniform between them
-    region       2 pairs [low, high] in m
-    clearance    a centre is redrawn until it is more than this from start and goal, m
-
     The start is at rest and heads along the x axis. Control bounds are the model's.
+
+    Args:
+        num_discs, num_boxes: how many of each.
+        disc_radius, box_length, box_width: pairs [least, largest] in m: radii, and the full lengths of a box's sides,
+            are uniform between them.
+        region: 2 pairs [low, high] in m.
+        clearance: a centre is redrawn until it is more than this from start and goal, m.
     """
 
     name: str = "yard"
-    vehicle_radius: float = 0.3
-    start: Sequence[float] = (-5.0, 0.0)
-    goal: Sequence[float] = (5.0, 0.0)
-    goal_radius: float = 0.5
-    stages: int = 100
-    dt: float = 0.1
-    num_discs: int = 8
-    num_boxes: int = 6
-    disc_radius: Sequence[float] = (0.3, 0.6)
-    box_length: Sequence[float] = (1.0, 2.2)
-    box_width: Sequence[float] = (0.3, 0.6)
-    region: Sequence[Sequence[float]] = ((-3.5, 3.5), (-2.5, 2.5))
-    clearance: float = 1.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for field in ("num_discs", "num_boxes"):
-            self._set(field, checks.integer, at_least=0, at_most=checks.MOST_OBSTACLES)
-        for field in ("disc_radius", "box_length", "box_width"):
-            self._set(field, checks.interval, above=0)
-        self._set("region", checks.box, dimension=2)
-        self._set("clearance", checks.number, at_least=0)
+    vehicle_radius: checks.Length = 0.3
+    start: checks.Point2 = (-5.0, 0.0)
+    goal: checks.Point2 = (5.0, 0.0)
+    goal_radius: checks.Size = 0.5
+    stages: checks.Stages = 100
+    dt: checks.TimeStep = 0.1
+    num_discs: checks.Number = 8
+    num_boxes: checks.Number = 6
+    disc_radius: checks.Sizes = (0.3, 0.6)
+    box_length: checks.Sizes = (1.0, 2.2)
+    box_width: checks.Sizes = (0.3, 0.6)
+    region: checks.Region2 = ((-3.5, 3.5), (-2.5, 2.5))
+    clearance: checks.Length = 1.5
 
     @property
     def dimension(self) -> int:

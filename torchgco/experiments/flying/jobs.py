@@ -26,6 +26,7 @@ from omegaconf import DictConfig
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import recomposer
 from torchgco.experiments.config.launching import jobs_at_once
+from torchgco.experiments.ending import Refused
 from torchgco.experiments.results.files import write
 
 CUT = ("study.jobs", "study.job")  # keys in which the jobs of one study differ
@@ -49,15 +50,14 @@ class Report:
 
 
 def _exits(method: Callable[..., None]) -> Callable[..., None]:
-    """Let a callback's error end the process: Hydra would turn it into a warning."""
+    """Let a callback's error end the command: Hydra would turn it into a warning."""
 
     @wraps(method)
     def call(*words: Any, **more: Any) -> None:
         try:
             method(*words, **more)
         except InputError as error:
-            print(f"torchgco: {error}", file=sys.stderr)
-            sys.exit(2)
+            raise Refused(error) from None
         except Exception:
             traceback.print_exc()
             sys.exit(1)
@@ -111,10 +111,8 @@ class Jobs(Callback):
                 _finish(config, report)
             except InputError as error:
                 failed.append(str(error))
-        for line in failed:
-            print(f"torchgco: {line}", file=sys.stderr)
         if failed:
-            sys.exit(2)
+            raise Refused(*failed)
 
 
 def _check(config: DictConfig) -> None:

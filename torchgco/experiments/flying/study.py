@@ -20,13 +20,13 @@ from torchgco.base.kernels import native
 from torchgco.base.status import Status
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.config.launching import side_by_side
+from torchgco.experiments.ending import say
 from torchgco.experiments.flying.flight import Flight, Plan, fly, plan_of, prepare
 from torchgco.experiments.flying.mission_flight import FEW, MissionFlight
 from torchgco.experiments.flying.progress import LAYOUT, Bar, Lines
 from torchgco.experiments.flying.workers import Shared, run_all
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
 from torchgco.experiments.reports.report import write_report
-from torchgco.experiments.results.files import say
 from torchgco.experiments.results.identity import (
     Manifest,
     closed_loop,

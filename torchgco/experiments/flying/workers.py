@@ -15,7 +15,7 @@ from typing import Any, ClassVar, TypeVar
 
 from torchgco.base import notices
 from torchgco.base.errors import InputError
-from torchgco.base.interrupts import raised, throw
+from torchgco.experiments.ending import raised, throw
 from torchgco.experiments.flying.progress import NoBar
 
 Job = TypeVar("Job")

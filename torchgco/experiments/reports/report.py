@@ -19,12 +19,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from torchgco.base.errors import InputError
-from torchgco.base.interrupts import REPORT, farewell, raised
+from torchgco.experiments.ending import ended, say
 from torchgco.experiments.flying.progress import draw
 from torchgco.experiments.reports.report_figures import Drawings, drawings
 from torchgco.experiments.reports.verify import verify
 from torchgco.experiments.reports.verify_text import confirmed_frame, confirmed_text, difference_texts
-from torchgco.experiments.results.files import say, write
+from torchgco.experiments.results.files import write
 from torchgco.experiments.results.kinds import Part, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.records import MANIFEST, TRIALS
@@ -99,8 +99,7 @@ class _Parser(argparse.ArgumentParser):
     """Without the usage before an error: one line for every mistake."""
 
     def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message} (--help lists the options)", file=sys.stderr)
-        sys.exit(2)
+        raise InputError("command line", "DIR and the options of --help", message)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -113,18 +112,15 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """`torchgco-report`. Returns the exit code: 2 for malformed input, 1 where rows can't be confirmed."""
-    options = _parser().parse_args(arguments)
-    try:
+    """`torchgco-report`. Returns the exit code: 1 where rows can't be confirmed, and as `ended`."""
+
+    def work() -> int:
+        options = _parser().parse_args(arguments)
         if not options.folders:
             raise InputError("DIR", "a study, or a folder of studies", "none")
-        with raised():
-            return _verify(options) if options.verify else _report(options)
-    except InputError as error:
-        print(f"torchgco-report: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt as error:
-        return farewell(error, REPORT)
+        return _verify(options) if options.verify else _report(options)
+
+    return ended("torchgco-report", work)
 
 
 def _report(options: argparse.Namespace) -> int:

@@ -4,28 +4,24 @@ from __future__ import annotations
 
 import errno
 import os
-import sys
-import tempfile
 from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
 from typing import IO, Any
 
 from torchgco.base.errors import InputError
+from torchgco.base.files import write_whole
 
-PART = ".part"  # ending of a file that is still being written
 NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)  # of file systems without hard links
 
 
 def write(path: Path, save: Callable[[IO[bytes]], Any]) -> None:
-    """Let `save(file)` write a temporary file in the same folder, fsync it and move it to `path`.
-
-    A reader sees the old file or the new one, never a part. On any failure the temporary file is removed.
+    """As `write_whole`.
 
     Raises:
         InputError: the system refuses to write there (disk full, no permission).
     """
-    _place(path, save, os.replace)
+    _place(path, save)
 
 
 def create(path: Path, save: Callable[[IO[bytes]], Any]) -> bool:
@@ -50,52 +46,23 @@ def create(path: Path, save: Callable[[IO[bytes]], Any]) -> bool:
     return True
 
 
-def _place(path: Path, save: Callable[[IO[bytes]], Any], move: Callable[[str, Path], None]) -> None:
+def _place(path: Path, save: Callable[[IO[bytes]], Any], move: Callable[[str, Path], None] | None = None) -> None:
     for last in (False, True):
-        part: str | None = None
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle, part = tempfile.mkstemp(dir=path.parent, suffix=PART)
-            with os.fdopen(handle, "wb") as file:
-                save(file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(part, 0o644)
-            move(part, path)
-            return
+            return write_whole(path, save, move)
+        except FileExistsError:
+            if move is not None:
+                raise
+            raise _refused(path, "a file in place of a folder") from None
         except OSError as error:
             if isinstance(error, FileNotFoundError) and not last:
                 continue  # another process that finished the study removed the part, or its folder, as left over
-            if isinstance(error, FileExistsError) and part is not None:
-                raise
-            expected = "a folder (hydra.run.dir, --output of a report) with room that may be written to"
-            raise InputError(str(path), expected, error.strerror or error) from None
-        finally:
-            if part is not None:
-                Path(part).unlink(missing_ok=True)  # gone already after a move
+            raise _refused(path, error.strerror or error) from None
 
 
-def say(text: str) -> None:
-    """Print a text; a reader that has read enough, as `head` does, isn't an error.
-
-    Raises:
-        InputError: the system refuses to write (disk full).
-    """
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        silence()
-    except OSError as error:
-        silence()
-        raise InputError("standard output", "room to write", error.strerror or error) from None
-
-
-def silence() -> None:
-    """Let all that is still buffered for standard output, or printed later, go nowhere: nobody reads it.
-
-    Otherwise Python would complain when it ends.
-    """
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _refused(path: Path, reason: object) -> InputError:
+    expected = "a folder (hydra.run.dir, --output of a report) with room that may be written to"
+    return InputError(str(path), expected, reason)
 
 
 def checksum(path: Path) -> str:

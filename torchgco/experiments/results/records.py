@@ -22,7 +22,8 @@ import numpy as np
 import pandas as pd
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.results.files import PART, checksum, create, damaged, write
+from torchgco.base.files import PART
+from torchgco.experiments.results.files import checksum, create, damaged, write
 from torchgco.experiments.results.identity import Manifest, difference
 from torchgco.scenarios import Layouts
 
@@ -180,7 +181,7 @@ class Records:
         """Mark the study as done, with the checksums of its files, and drop its shards."""
         write(self.folder / DONE, _json({name: [checksum(self.folder / name)] for name in self.files}))
         self.drop_shards()
-        for part in self.folder.glob(f"*{PART}"):  # of a start that was killed while it wrote
+        for part in self.folder.glob(f"{PART[0]}*{PART[1]}"):  # of a start that was killed while it wrote
             part.unlink(missing_ok=True)
 
     def drop_shards(self) -> None:
