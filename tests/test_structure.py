@@ -1,6 +1,7 @@
 """Imports go one way through the layers, `import torchgco` stays light, and files and functions stay short."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -131,6 +132,16 @@ def test_instantiate_is_called_in_one_place() -> None:
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.[ch]")), ids=lambda p: p.name)
 def test_c_files_are_short(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= 450
+
+
+@pytest.mark.parametrize("room", ["experiments", "plotting", "scenarios"])
+def test_docstrings_list_arguments_in_sections(room: str) -> None:
+    """As Google's style has them: names in columns would be run together by the API reference."""
+    for path in sorted((PACKAGE / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                lines = (ast.get_docstring(node) or "").splitlines()
+                assert not [line for line in lines if re.match(r"[\w<>]+(, [\w<>]+)* {2,}\S", line)], path
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))

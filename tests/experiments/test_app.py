@@ -159,7 +159,7 @@ BAD = {
     "model misfit": (["model=planar"], "model: expected model=quadrotor"),
     "model misfit in a file": (["scenario=layouts", WALLS, "model=planar"], "model=quadrotor"),
     "too many layouts": (["scenario=layouts", WALLS, "study.layouts=40"], "study.layouts"),
-    "no layouts": (["study.layouts=0"], "study.layouts: expected at least 1"),
+    "no layouts": (["study.layouts=0"], "study.layouts: expected a whole number of at least 1"),
     "no stages": (["scenario.stages=0"], "stages"),
     "negative radius": (["scenario.obstacle_radius=-1"], "obstacle_radius"),
     "weights": (["model.vehicle.control_weight=[1,1,1,-1]"], "cost.R"),

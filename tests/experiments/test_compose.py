@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.experiments.commands import HOLD, ROOT
+from tests.experiments.commands import HOLD, ROOT, problem_line
 from torchgco import InputError, compose, presets
 from torchgco.experiments.config.build import Setup, config_dir
 from torchgco.experiments.config.groups import FAMILIES, options_of
@@ -146,6 +146,13 @@ def test_files_of_a_user_extend_what_is_registered(run, own: list[str]) -> None:
     assert code == 0 and "num_obstacles: 3" in out and "attempts: 9" in out and "vehicle_radius: 0.36" in out, err
     code, _, err = run(*own, "scenario=sparse", *HOLD, "hydra.run.dir=out")
     assert code == 0, err
+
+
+def test_a_mission_of_a_user_without_the_default_ones_keys_is_refused(run, tmp_path: Path) -> None:
+    (tmp_path / "mission").mkdir()
+    (tmp_path / "mission" / "mine.yaml").write_text("duration: 3.0\n")
+    code, _, err = run("--config-dir", str(tmp_path), "experiment=mission", "mission=mine", "hydra.run.dir=out")
+    assert code == 2 and "mission: expected keys that extend those of mission=default" in problem_line(err)
 
 
 def test_the_wheel_and_the_checkout_find_their_configs() -> None:

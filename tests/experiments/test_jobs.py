@@ -92,8 +92,8 @@ def test_a_study_with_a_missing_share_gets_one_line_and_keeps_its_shards(run, tm
         (["study.jobs=4", "study.job=true"], "study.job=True"),
         (["study.jobs=4"], "study.job=None"),
         (["study.job=0"], "study.jobs=None"),
-        (["study.jobs=0", "study.job=0"], "study.jobs: expected at least 1"),
-        (["study.jobs=many", "study.job=0"], "study.jobs: expected at least 1"),
+        (["study.jobs=0", "study.job=0"], "study.jobs: expected a whole number of at least 1"),
+        (["study.jobs=many", "study.job=0"], "study.jobs: expected a whole number of at least 1"),
     ],
 )
 def test_a_malformed_share_gets_one_line(words: list[str], got: str, run, tmp_path) -> None:

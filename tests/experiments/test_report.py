@@ -8,9 +8,8 @@ import pytest
 from tests.trials import flights, manifest, missions, trials
 from torchgco.base.errors import InputError
 from torchgco.experiments.reports.report import main, write_report
-from torchgco.experiments.results.kinds import joined, parts_of
+from torchgco.experiments.results.kinds import format_report, joined, parts_of
 from torchgco.experiments.results.merge import merge
-from torchgco.experiments.statistics.formats import format_report
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import plain, summarise
 from torchgco.experiments.statistics.tables import format_table
@@ -83,20 +82,15 @@ def flown(tmp_path: Path) -> Path:
     return folder
 
 
-def test_given_trajectories_are_drawn(flown: Path) -> None:
-    write_report(flown, {"gco": np.zeros((2, 4, 6))})
-    assert (flown / "figures" / "layouts.png").is_file()
-
-
-def test_trajectories_may_be_made_from_the_files(flown: Path) -> None:
+def test_trajectories_are_made_from_the_controls_and_drawn(flown: Path) -> None:
     seen = {}
 
-    def roll_out(layouts: Any, solutions: Any) -> dict[str, np.ndarray]:
-        seen.update(centers=layouts["centers"].shape, controls=solutions["U"].shape)
+    def roll_out(solutions: Any) -> dict[str, np.ndarray]:
+        seen.update(controls=solutions["U"].shape)
         return {"gco": np.zeros((2, 4, 6))}
 
     write_report(flown, roll_out)
-    assert seen == {"centers": (2, 1, 2), "controls": (1, 2, 3, 2)}
+    assert seen == {"controls": (1, 2, 3, 2)}
     assert (flown / "figures" / "layouts.png").is_file()
 
 

@@ -14,9 +14,8 @@ from tests.experiments.commands import HOLD, problem_line
 from tests.trials import flights, manifest, trials
 from torchgco.experiments.reports import report
 from torchgco.experiments.reports.report import main
-from torchgco.experiments.results.kinds import parts_of
+from torchgco.experiments.results.kinds import format_report, parts_of
 from torchgco.experiments.results.merge import merge
-from torchgco.experiments.statistics.formats import format_report
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import plain, summarise
 from torchgco.experiments.statistics.tables import FORMATS

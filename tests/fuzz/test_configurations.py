@@ -46,7 +46,8 @@ SLOW = ("scenario.num_obstacles", "scenario.num_discs", "scenario.num_boxes", "s
 
 @cache
 def keys(base: str) -> list[str]:
-    return [key for key in flat(plain(compose_config(BASES[base]))) if not key.endswith("_target_") and key not in SLOW]
+    found = flat(plain(compose_config(BASES[base])))
+    return [key for key in found if not key.endswith(("_target_", "_partial_")) and key not in SLOW]
 
 
 def flown_setup(words: tuple[str, ...]) -> Setup:

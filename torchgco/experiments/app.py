@@ -62,8 +62,6 @@ register_resolver("torchgco.folder", study_folder)
 
 
 def _task(config: DictConfig) -> Report:
-    from torchgco.experiments.flying.study import run_study  # here, as workers import this module and need no figures
-
     job = HydraConfig.get()
     folder, overrides = Path(job.runtime.output_dir), list(job.overrides.task)
     alone = job.mode == RunMode.RUN
@@ -71,7 +69,10 @@ def _task(config: DictConfig) -> Report:
         kind, named = ("run", job.run.dir) if alone else ("sweep", job.sweep.dir)
         if not named:
             raise InputError(f"hydra.{kind}.dir", "the name of a folder", "an empty one")
-        with raised():  # a job may run in a process that a launcher started
+        with raised() as noted:  # a job may run in a process that a launcher started
+            from torchgco.experiments.flying.study import run_study  # here: workers import this module, not the figures
+
+            noted.raise_late()
             done = run_study(
                 config, folder, recomposer(overrides, job.runtime.config_sources),
                 lambda: _keep_configuration(config, folder), command=sys.argv[1:] if alone else ["-m", *overrides],

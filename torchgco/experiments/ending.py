@@ -12,8 +12,8 @@ from types import FrameType
 
 from torchgco.base.errors import InputError
 
-Handler = Callable[[int, FrameType | None], None]
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+OWN = (signal.default_int_handler, signal.SIG_DFL)  # handlers of Python and of the system
 
 
 class Refused(SystemExit):
@@ -47,31 +47,44 @@ def ended(command: str, work: Callable[[], int]) -> int:
         return 128 + (signal.SIGTERM if terminated else signal.SIGINT)
 
 
+class Noted:
+    """A handler that raises, and notes the signal first: modules that are being loaded and destructors drop exceptions.
+
+    While `held` is true, signals are noted only.
+    """
+
+    def __init__(self) -> None:
+        self.held = False
+        self.numbers: list[int] = []
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        self.numbers.append(number)
+        if not self.held:
+            self.raise_late()
+
+    def raise_late(self) -> None:
+        """Raise for a signal that was noted, but whose exception got lost."""
+        if self.numbers:
+            raise Terminated if self.numbers[0] == signal.SIGTERM else KeyboardInterrupt
+
+
 @contextmanager
-def raised(handler: Handler | None = None) -> Iterator[None]:
+def raised() -> Iterator[Noted]:
     """In this block Ctrl-C raises KeyboardInterrupt and SIGTERM raises Terminated; afterwards all is as before.
 
     A signal that is ignored stays so, as in the background of a shell, and the handler of another program is kept.
-
-    Args:
-        handler: in place of `throw`.
     """
-    before = {}
+    noted, before = Noted(), {}
     if threading.current_thread() is threading.main_thread():  # only that one may set handlers and gets signals
-        own = (signal.default_int_handler, signal.SIG_DFL, throw)
-        before = {number: held for number in SIGNALS if (held := signal.getsignal(number)) in own}
+        handlers = {number: signal.getsignal(number) for number in SIGNALS}
+        before = {number: held for number, held in handlers.items() if held in OWN or isinstance(held, Noted)}
     for number in before:
-        signal.signal(number, handler or throw)
+        signal.signal(number, noted)
     try:
-        yield
+        yield noted
     finally:
         for number, held in before.items():
             signal.signal(number, held)
-
-
-def throw(number: int, frame: FrameType | None) -> None:
-    """The handler that raises."""
-    raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
 
 def say(text: str) -> None:

@@ -49,12 +49,14 @@ def mission_animation(
 ) -> Path:
     """Write a GIF of a mission from above and from the side, 5 pictures per second, in real time where 100 suffice.
 
-    frame   with columns t and x0 to x2, a row per control step
-    plans   planned positions (K, N+1, 3), m, K at least the frame's rows
-    period  of control steps and of the plan's knots, s
-    title   before the time
+    Args:
+        frame: with columns t and x0 to x2, a row per control step.
+        plans: planned positions (K, N+1, 3), m, K at least the frame's rows.
+        period: of control steps and of the plan's knots, s.
+        title: before the time.
 
-    Raises InputError as `snapshots_figure`.
+    Raises:
+        InputError: as `snapshots_figure`.
     """
     t, track = flight(frame, "t")["t"], positions(frame)
     check_plans(plans, len(t))
@@ -88,9 +90,10 @@ def planar_animation(
 ) -> Path:
     """Write a GIF of trajectories in the plane, one picture after the other.
 
-    centers, inflated_radii       of circles, (M, 2) and (M,), m
-    ends                          start and goal, (2,) each, m
-    vehicle_radius, goal_radius   m
+    Args:
+        centers, inflated_radii: of circles, (M, 2) and (M,), m.
+        ends: start and goal, (2,) each, m.
+        vehicle_radius, goal_radius: m.
 
     Raises InputError without a picture.
     """

@@ -24,9 +24,10 @@ LOGARITHMIC = 50.0  # ratio of the largest to the smallest cost from which the a
 def convergence_figure(trace: pd.DataFrame, elements: Sequence[int] | None = None) -> Figure:
     """Cost per iteration, a panel per problem: lines at multiplier updates, bands where guidance is on.
 
-    trace     a row per problem and iteration, with columns element (the problem), iteration, outer (index of the outer
-              iteration), cost (J_var) and guided (bool); with a column attempt, attempts follow each other
-    elements  which problems to show; by default the first four
+    Args:
+        trace: a row per problem and iteration, with columns element (the problem), iteration, outer (index of the outer
+            iteration), cost (J_var) and guided (bool); with a column attempt, attempts follow each other.
+        elements: which problems to show; by default the first four.
 
     A multiplier update is drawn between the iterations before and after it. Raises InputError for a missing
     column, an empty trace and a problem that isn't in it.

@@ -79,7 +79,8 @@ def draw_instant(
     Spheres are shown whole; boxes and capsules are cut where the vehicle is, as they may be higher or wider than the
     view.
 
-    period  of the plan's knots, s; knots inside an obstacle at their own time are crossed
+    Args:
+        period: of the plan's knots, s; knots inside an obstacle at their own time are crossed.
     """
     _draw_bodies(ax, course, t, float(np.delete(track[-1], plane)[0]), plane)
     draw.draw_ends(ax, track[0], course.goal, course.goal_radius, plane)

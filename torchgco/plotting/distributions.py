@@ -26,7 +26,8 @@ def is_spread(trials: pd.DataFrame, column: str) -> bool:
 def clearance_figure(trials: pd.DataFrame) -> Figure:
     """Share of the layouts with at most a given clearance along the trajectory (m): a step line per solver.
 
-    trials  with columns scenario, model, solver, clearance, two finite ones of a solver in a task at least
+    Args:
+        trials: with columns scenario, model, solver, clearance, two finite ones of a solver in a task at least.
 
     Every (scenario, model) with such clearances has a panel. Left of the line at 0 trajectories cut an obstacle: the
     height there is the share of collisions. Clearances that aren't finite are counted below the axis; a line ends
@@ -44,7 +45,8 @@ def clearance_figure(trials: pd.DataFrame) -> Figure:
 def violation_figure(trials: pd.DataFrame) -> Figure:
     """Share of the layouts with at most a given violation, on a logarithmic axis, otherwise as `clearance_figure`.
 
-    trials  with columns scenario, model, solver, violation
+    Args:
+        trials: with columns scenario, model, solver, violation.
 
     Violations below 1e-12, zero included, are drawn there. Success requires a violation left of the line at 1e-3.
     """

@@ -26,7 +26,8 @@ def grid(
 ) -> tuple[Figure, list[tuple[Axes, ...]]]:
     """A figure, and the axes of each of `count` maps, one for each plane.
 
-    boxes  lower and upper corners (2, d), m, of the maps in each row
+    Args:
+        boxes: lower and upper corners (2, d), m, of the maps in each row.
     """
     spans = [(box[1] - box[0]) for box in boxes]
     fewest = max(columns, 2)

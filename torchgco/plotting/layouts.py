@@ -50,20 +50,21 @@ def layout_grid(
 ) -> Figure:
     """Maps of the first columns x rows layouts with each solver's trajectories; in space also their side views.
 
-    layouts       arrays of a layout file: centers (L, M, d) and radii (L, M) in metres, and, where present,
-                  velocities (L, M, d), boxes, start and goal ((n,) or (L, n)), vehicle_radius, goal_radius, dt,
-                  layout (L,) ids
-    trajectories  states X (L, N+1, n) by solver, positions first, nan where there is none; the first solver is the one
-                  under study, drawn over the others
-    trials        with columns scenario, model, layout, solver, feasible, reached
-    columns       default: 4 in the plane, 3 in space
+    Args:
+        layouts: arrays of a layout file: centers (L, M, d) and radii (L, M) in metres, and, where present, velocities
+            (L, M, d), boxes, start and goal ((n,) or (L, n)), vehicle_radius, goal_radius, dt, layout (L,) ids.
+        trajectories: states X (L, N+1, n) by solver, positions first, nan where there is none; the first solver is the
+            one under study, drawn over the others.
+        trials: with columns scenario, model, layout, solver, feasible, reached.
+        columns: default: 4 in the plane, 3 in space.
 
     Obstacles are filled as they are and outlined at the vehicle's radius from their sides, as the vehicle is drawn as a
     point. In space each is cut at the height (in the side view: at the y) that the first solver has at its x; those
     that this cut misses are dotted where they are near. A moving obstacle is drawn where it comes closest to the first
     solver's trajectory, if it comes near. Crosses mark contact, at the knots and between them.
 
-    Raises InputError where the trajectories don't fit the layouts, or one has no row in `trials`.
+    Raises:
+        InputError: the trajectories don't fit the layouts, or one has no row in `trials`.
     """
     count = len(layouts["radii"])
     paths = {solver: np.asarray(states, dtype=float) for solver, states in trajectories.items()}

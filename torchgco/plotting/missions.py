@@ -42,8 +42,9 @@ AXES = ("x", "y", "z")
 def compute_figure(frames: Frames, period: float) -> Figure:
     """Time of planner and tracker in every control step against the control period, a panel per solver.
 
-    frames  with columns t, planner_seconds, tracker_seconds and guided
-    period  s
+    Args:
+        frames: with columns t, planner_seconds, tracker_seconds and guided.
+        period: s.
 
     A step in which guidance was on has a blue band. The title counts the steps in which planner and tracker together
     took longer than the period. Raises InputError for frames that lack a column or hold several missions.
@@ -72,7 +73,8 @@ def distance_figure(frames: Frames, course: Course) -> Figure:
 
     Of a box or a capsule it is the distance from its sides or its axis, and r_obs the radius that rounds it.
 
-    frames  with columns t and x0 to x2; a row per time step shows contacts between control steps, too
+    Args:
+        frames: with columns t and x0 to x2; a row per time step shows contacts between control steps, too.
 
     Planners keep to the line at 1, bodies touch at 0.95; the lower panel shows these closer. A dot marks the end of a
     mission. If all radii are alike, the right axes have metres.
@@ -105,12 +107,14 @@ def snapshots_figure(
 ) -> Figure:
     """Plan, vehicle, flown track and obstacles at chosen control steps, from above and from the side, a row per step.
 
-    frame   with columns t and x0 to x2, a row per control step
-    plans   planned positions (K, N+1, 3), m, K at least the frame's rows
-    steps   indices of control steps
-    period  of control steps and of the plan's knots, s
+    Args:
+        frame: with columns t and x0 to x2, a row per control step.
+        plans: planned positions (K, N+1, 3), m, K at least the frame's rows.
+        steps: indices of control steps.
+        period: of control steps and of the plan's knots, s.
 
-    Raises InputError as `compute_figure`, for a step that isn't in the frame, and for plans that don't fit it.
+    Raises:
+        InputError: as `compute_figure`, for a step that isn't in the frame, and for plans that don't fit it.
     """
     t, track = flight(frame, "t")["t"], positions(frame)
     check_plans(plans, len(t))
@@ -140,8 +144,10 @@ def snapshots_figure(
 def commands_figure(frame: pd.DataFrame, airframe: Airframe | None = None) -> Figure:
     """Commanded rotor speeds and thrusts of the four rotors over time.
 
-    frame  with columns t, u1 to u4 (rpm) and f1 to f4 (N), a row per time step, or per control step: in such a frame
-           u1_low to u4_high, the least and the largest speed of each step, are drawn as a band around the first one
+    Args:
+        frame: with columns t, u1 to u4 (rpm) and f1 to f4 (N), a row per time step, or per control step: in such a
+            frame u1_low to u4_high, the least and the largest speed of each step, are drawn as a band around the first
+            one.
 
     Dashed are the limits of the thrusts, and the speeds that hold a thrust at its limits. Commands may exceed these, as
     a rotor answers with a lag. Raises InputError as `compute_figure`.
@@ -170,7 +176,8 @@ def commands_figure(frame: pd.DataFrame, airframe: Airframe | None = None) -> Fi
 def states_figure(frame: pd.DataFrame, goal: np.ndarray) -> Figure:
     """Position, velocity, Euler angles and body rates over time, targets dotted: the goal (3,), m, at rest and upright.
 
-    frame  with columns t and x0 to x12
+    Args:
+        frame: with columns t and x0 to x12.
 
     Positions have a panel each, the other states one together. Raises InputError as `compute_figure`.
     """
@@ -200,8 +207,9 @@ def states_figure(frame: pd.DataFrame, goal: np.ndarray) -> Figure:
 def tracking_figure(frame: pd.DataFrame, part: Literal["both", "violation", "time"] = "both") -> Figure:
     """Largest violation of the tracking problems (N) and the tracker's time (ms) in every control step.
 
-    frame  with columns t, tracking_violation and tracker_seconds; a time is that of all solves of a control step
-    part   a panel each, or one of them alone
+    Args:
+        frame: with columns t, tracking_violation and tracker_seconds; a time is that of all solves of a control step.
+        part: a panel each, or one of them alone.
 
     Violations below 1e-16 N, zero included, are drawn there. Raises InputError as `compute_figure`.
     """
@@ -225,7 +233,8 @@ def tracking_figure(frame: pd.DataFrame, part: Literal["both", "violation", "tim
 def outcomes_figure(trials: pd.DataFrame) -> Figure:
     """Shares of the four ends of missions, a bar per solver, a panel per (scenario, model).
 
-    trials  with columns scenario, model, solver and outcome, a name of `Outcome`; missions without one don't count
+    Args:
+        trials: with columns scenario, model, solver and outcome, a name of `Outcome`; missions without one don't count.
 
     Counts are written into the bars, n behind them. Raises InputError for an unknown outcome.
     """

@@ -16,7 +16,8 @@ OUTCOMES = ("feasible", "reached", "success")
 def rates_figure(summary: pd.DataFrame) -> Figure:
     """Rates of feasible, reached and success with Wilson intervals, a panel per (scenario, model).
 
-    summary  as `experiments.statistics.summarise` returns it
+    Args:
+        summary: as `experiments.statistics.summarise` returns it.
 
     The label above a bar counts the trials that attained the outcome, of all where it is defined. An outcome that is
     defined nowhere has no bar. Solvers that flew different numbers of trials, hence different layouts, are marked.

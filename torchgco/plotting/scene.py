@@ -21,11 +21,13 @@ BETWEEN = 4  # places per stage at which contact is looked for
 class Scene:
     """L layouts, lengths in metres.
 
-    bodies      the obstacles present in each layout
-    start, goal (L, d), nan where unknown
-    margin      the vehicle's radius; goal_radius: nan where unknown
-    dt          s, 0 where unknown: moving obstacles are then drawn where they start
-    ids         (L,) index of each layout in its file or generator
+    Args:
+        bodies: the obstacles present in each layout.
+        start, goal: (L, d), nan where unknown.
+        margin: the vehicle's radius.
+        goal_radius: nan where unknown.
+        dt: s, 0 where unknown: moving obstacles are then drawn where they start.
+        ids: (L,) index of each layout in its file or generator.
     """
 
     bodies: tuple[tuple[Body, ...], ...]

@@ -59,7 +59,8 @@ def solver_dash(solver: str) -> Dash:
 def panels(count: int, columns: int, size: tuple[float, float], share: bool = False) -> tuple[Figure, list[Axes]]:
     """A figure with `count` panels of `size` (width, height in inches) in at most `columns` columns.
 
-    share  one scale for all panels, labelled at the outer ones only
+    Args:
+        share: one scale for all panels, labelled at the outer ones only.
     """
     columns = min(columns, count)
     rows = ceil(count / columns)

@@ -35,8 +35,9 @@ WORDS = {
 def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
     """Rates with 95 % Wilson intervals and costs against one swept variable: a panel per outcome, a line per solver.
 
-    summary   as `experiments.statistics.summarise` or `summarise_missions` returns it, with a column `variable`
-    variable  a column of numbers gives lines with bands, any other column groups of bars
+    Args:
+        summary: as `experiments.statistics.summarise` or `summarise_missions` returns it, with a column `variable`.
+        variable: a column of numbers gives lines with bands, any other column groups of bars.
 
     Every task, which are the values of the other swept variables too, has its row of panels. What has no value
     anywhere has no panel: an outcome that is defined nowhere, of missions one that never occurs, a cost. The cost is

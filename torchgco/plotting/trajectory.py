@@ -64,11 +64,12 @@ def draw_trajectory(
 ) -> None:
     """Dots, cool at the first knot and warm at the last; red crosses at infeasible knots.
 
-    positions    (N+1, d)
-    infeasible   (N+1,) bool; None: no crosses
-    every        a dot at every `every`-th knot
-    cross_every  a cross at every `cross_every`-th infeasible knot
-    size         area of a dot, points^2
+    Args:
+        positions: (N+1, d).
+        infeasible: (N+1,) bool; None: no crosses.
+        every: a dot at every `every`-th knot.
+        cross_every: a cross at every `cross_every`-th infeasible knot.
+        size: area of a dot, points^2.
     """
     share = np.linspace(0.0, 1.0, len(positions))
     # The line keeps dots together where the vehicle is fast.
@@ -138,8 +139,9 @@ def time_bar(figure: Figure, axes: Iterable[Axes], horizon: float) -> None:
 def handles(*names: str, **labels: str) -> list[Artist]:
     """Entries of a legend: any of knot, infeasible, plan, samples, region, pull, obstacle, inflated, start and goal.
 
-    names   in the order of the legend
-    labels  other words for some of them, by name
+    Args:
+        names: in the order of the legend.
+        labels: other words for some of them, by name.
     """
     point: dict[str, Any] = {"linestyle": "none"}
     known: dict[str, Artist] = {

@@ -44,7 +44,8 @@ class Scenario(ABC):
     def draw(self, ids: Sequence[int], seed: int) -> Layouts:
         """The layouts numbered `ids` (each >= 0) under `seed` (>= 0), in that order.
 
-        Raises InputError where ids or seed are malformed, or the scenario's rule can't be satisfied.
+        Raises:
+            InputError: ids or seed are malformed, or the scenario's rule can't be satisfied.
         """
         numbers = checks.indices(ids, "ids")
         seed = check_value(seed, Seed, "seed")

@@ -32,23 +32,23 @@ IDS = "layout"
 class Layouts:
     """A batch of obstacle layouts, with start, goal and other parts of the task where known.
 
-    centers         (L, M, d) m, rows of NaN where an obstacle is absent
-    radii           (L, M) m, NaN where absent
-    velocities      (L, M, d) m/s, constant, or None if nothing moves
-    start, goal     (L, n) states, given as (n,) or (L, n), positions first; or positions alone, (d,) or (L, d), where
-                    the vehicle rests; or None
-    vehicle_radius  m; goal_radius: m; dt: s; stages: N; each one number for all layouts, or None
-    control_lower, control_upper
-                    (m,) in the units of the inputs, infinite where unbounded, or None
-    best_cost       (L,) J_var of the best solution known, NaN where none is, or None
-    box_centers, box_half_sizes
-                    (L, K, d) m, rows of NaN where a box is absent, or None if there are none; half the sides' lengths
-    box_rotations   (L, K) rad in the plane, (L, K, 4) unit quaternions [w, x, y, z] in space: from the sides to the
-                    axes of space, NaN where absent; None: sides along the axes
-    box_radii       (L, K) m by which boxes are rounded outwards, NaN where absent; None: sharp boxes. Where above 0,
-                    half sides may be 0: a capsule has one side above 0
-    name            of the family, or the stem of the file
-    ids             (L,) int64, index of each layout in its file or generator; 0..L-1 unless given
+    Args:
+        centers: (L, M, d) m, rows of NaN where an obstacle is absent.
+        radii: (L, M) m, NaN where absent.
+        velocities: (L, M, d) m/s, constant, or None if nothing moves.
+        start, goal: (L, n) states, given as (n,) or (L, n), positions first; or positions alone, (d,) or (L, d), where
+            the vehicle rests; or None.
+        vehicle_radius, goal_radius, dt, stages: m, m, s, N; each one number for all layouts, or None.
+        control_lower, control_upper: (m,) in the units of the inputs, infinite where unbounded, or None.
+        best_cost: (L,) J_var of the best solution known, NaN where none is, or None.
+        box_centers, box_half_sizes: (L, K, d) m, rows of NaN where a box is absent, or None if there are none; half the
+            sides' lengths.
+        box_rotations: (L, K) rad in the plane, (L, K, 4) unit quaternions [w, x, y, z] in space: from the sides to the
+            axes of space, NaN where absent; None: sides along the axes.
+        box_radii: (L, K) m by which boxes are rounded outwards, NaN where absent; None: sharp boxes. Where above 0,
+            half sides may be 0: a capsule has one side above 0.
+        name: of the family, or the stem of the file.
+        ids: (L,) int64, index of each layout in its file or generator; 0..L-1 unless given.
 
     Arrays are copied on construction. Raises InputError naming `layouts.<field>`.
     """

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
-from typing import Any
+from dataclasses import dataclass, fields, replace
+from functools import cache, partial
+from typing import Annotated, Any, Literal
 
 import hydra
 import torch
@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchgco.base.errors import InputError
 from torchgco.base.kernels import use_native
-from torchgco.base.options import check_value
+from torchgco.base.options import Count, Within, check_options, check_value
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
 from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register
 from torchgco.experiments.config.launching import allotted_cores
@@ -54,8 +54,7 @@ class Setup:
         """
         count = count if count is not None else self.config.study.layouts
         count = count if count is not None else self.scenario.available or DEFAULT_LAYOUTS
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise InputError("study.layouts", "at least 1", repr(count))
+        check_value(count, Count, "study.layouts")
         self._refuse_beyond_memory(self.scenario.draw(range(1), self.seed), count)
         return self.vehicle.at_rest(self.scenario.draw(range(count), self.seed))
 
@@ -188,6 +187,10 @@ def _mission(setup: Setup) -> Mission | None:
     if setup.scenario.dimension != 3:
         raise InputError("scenario", FLOWN, setup.scenario.name)
     made, plant = _instantiate(node, "mission"), _instantiate(setup.config.plant, "plant")
+    if not isinstance(made, partial) or "planner" not in made.keywords:
+        raise InputError(
+            "mission", "keys that extend those of mission=default", "a node without its _target_ or planner"
+        )
     field = "mission.planner"
     try:
         planner = made.keywords["planner"](solver=setup.solver)
@@ -222,24 +225,24 @@ def _instantiate(node: DictConfig, field: str, leave_out: str | None = None) -> 
         raise as_input_error(error, field) from None
 
 
+@dataclass(frozen=True)
+class _Device:
+    """The node `device`."""
+
+    name: Literal["cpu", "cuda"]
+    dtype: Literal["float64", "float32"]
+    kernels: Literal["native", "eager"]
+    threads: Annotated[int, Within(1, MOST)] | None
+
+    def __post_init__(self) -> None:
+        check_options(self, "device")
+
+
 def _device(node: DictConfig) -> tuple[torch.device, torch.dtype]:
     """The device and dtype; also sets the threads and kernels of this process."""
-    if node.name not in ("cpu", "cuda"):
-        raise InputError("device.name", "cpu or cuda", node.name)
-    if node.name == "cuda" and not torch.cuda.is_available():
+    given = _Device(**{field.name: node[field.name] for field in fields(_Device)})
+    if given.name == "cuda" and not torch.cuda.is_available():
         raise InputError("device", "device=cpu, as no CUDA device is visible", "device=cuda")
-    if node.dtype not in ("float64", "float32"):
-        raise InputError("device.dtype", "float64 or float32", node.dtype)
-    if node.kernels not in ("native", "eager"):
-        raise InputError("device.kernels", "native or eager", repr(node.kernels))
-    torch.set_num_threads(_threads(node.threads))
-    use_native(node.kernels == "native")
-    return torch.device(node.name), getattr(torch, node.dtype)
-
-
-def _threads(wanted: int | None) -> int:
-    if wanted is None:
-        return allotted_cores()
-    if isinstance(wanted, bool) or not isinstance(wanted, int) or not 1 <= wanted <= MOST:
-        raise InputError("device.threads", f"1 to {MOST}, or null for all that are allotted", repr(wanted))
-    return wanted
+    torch.set_num_threads(allotted_cores() if given.threads is None else given.threads)
+    use_native(given.kernels == "native")
+    return torch.device(given.name), getattr(torch, given.dtype)

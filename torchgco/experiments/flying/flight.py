@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 import pandas as pd
@@ -17,6 +17,7 @@ from torch import Tensor
 import torchgco
 from torchgco.base.errors import InputError
 from torchgco.base.kernels import use_native
+from torchgco.base.options import Count, Within, check_options
 from torchgco.base.status import Status
 from torchgco.experiments.config.build import MOST, Setup
 from torchgco.experiments.config.launching import allotted_cores, jobs_at_once
@@ -38,67 +39,59 @@ NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
 
 @dataclass(frozen=True)
 class Plan:
-    """How a study is flown: checked options of `study` that decide no result.
+    """How a study is flown: options of `study` that decide no result.
 
-    batch_size  problems worked on at once by a process; None: as many as are fast and fit into memory
-    shard_size  layouts to a file
-    workers     processes
-    repair      damaged files are redone
-    figures     figures are drawn when all is flown
-    job, jobs   this process flies share `job` (0..jobs-1) of the layouts; job is None where it flies all
+    Args:
+        batch_size: problems worked on at once by a process; "auto": as many as are fast and fit into memory.
+        shard_size: layouts to a file.
+        workers: processes; None: as many as the cores allow.
+        repair: damaged files are redone.
+        figures: figures are drawn when all is flown.
+        jobs: how many jobs share the layouts; None: one, which flies all.
+        job: the one that this process is, 0..jobs-1; None where it flies all.
+
+    Raises:
+        InputError: an option that is malformed, and a share of no study.
     """
 
-    batch_size: int | None
-    shard_size: int
-    workers: int
+    batch_size: Count | Literal["auto"]
+    shard_size: Count
+    workers: Annotated[int, Within(1, MOST)] | None
     repair: bool
     figures: bool
-    job: int | None
-    jobs: int
+    jobs: Count | None
+    job: Any
+
+    def __post_init__(self) -> None:
+        check_options(self, "study")
+        whole = isinstance(self.job, int) and not isinstance(self.job, bool)
+        one_of = whole and self.jobs is not None and 0 <= self.job < self.jobs
+        if not one_of and not (self.job is None and self.jobs is None):
+            raise InputError(
+                "study.job", "one of 0 to study.jobs - 1, as in -m study.jobs=4 'study.job=range(0,4)'",
+                f"study.job={self.job} study.jobs={self.jobs}",
+            )  # fmt: skip
 
     def share(self, ids: Sequence[int], count: int) -> list[int]:
         """The part of `ids` that this process flies, of a study's layouts 0..count-1.
 
         A layout's share depends on nothing else: a job that is started again flies what it left.
         """
-        return [number for number in ids if self.job is None or number * self.jobs // count == self.job]
+        return [number for number in ids if self.jobs is None or number * self.jobs // count == self.job]
 
 
 def plan_of(setup: Setup) -> Plan:
-    """The plan of a configuration; InputError names the option that is malformed."""
-    given = setup.config.study
-    for name in ("repair", "figures"):
-        if not isinstance(given[name], bool):
-            raise InputError(f"study.{name}", "true or false", repr(given[name]))
-    jobs = 1 if given.jobs is None else _count(given.jobs, "jobs", ", or null for a study in one piece")
-    job = given.job
-    if (job is None) != (given.jobs is None) or (job is not None and not _is_one_of(job, jobs)):
-        raise InputError(
-            "study.job", "one of 0 to study.jobs - 1, as in -m study.jobs=4 'study.job=range(0,4)'",
-            f"study.job={job} study.jobs={given.jobs}",
-        )  # fmt: skip
+    """The plan of a configuration, with its number of processes.
+
+    Raises:
+        InputError: as Plan.
+    """
+    plan = Plan(**{field.name: setup.config.study[field.name] for field in fields(Plan)})
+    if plan.workers is not None:
+        return plan
     # On a GPU the batches of several processes would share one device.
-    processes = 1 if setup.device.type == "cuda" else max(1, allotted_cores() // torch.get_num_threads())
-    return Plan(
-        batch_size=None if given.batch_size == "auto" else _count(given.batch_size, "batch_size", ", or auto"),
-        shard_size=_count(given.shard_size, "shard_size"),
-        workers=processes if given.workers is None else _count(given.workers, "workers", ", or null: all cores", MOST),
-        repair=given.repair,
-        figures=given.figures,
-        job=job,
-        jobs=jobs,
-    )
-
-
-def _is_one_of(number: object, count: int) -> bool:
-    return isinstance(number, int) and not isinstance(number, bool) and 0 <= number < count
-
-
-def _count(value: object, name: str, otherwise: str = "", most: int | None = None) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1 or (most is not None and value > most):
-        limits = "at least 1" if most is None else f"1 to {most}"
-        raise InputError(f"study.{name}", f"{limits}{otherwise}", repr(value))
-    return value
+    cores = torch.get_num_threads() if setup.device.type == "cuda" else allotted_cores()
+    return replace(plan, workers=max(1, cores // torch.get_num_threads()))
 
 
 @dataclass
@@ -150,8 +143,9 @@ class Flight:
         solver, at_once = self.solver.prepare(problem), problem.B
         if solver.in_slots(1) is not None:
             plan = plan_of(self.setup)
-            processes = plan.workers * jobs_at_once()
-            at_once = min(problem.B, plan.batch_size or plan_batch(problem, self.setup.device, processes))
+            processes = (plan.workers or 1) * jobs_at_once()
+            given = None if plan.batch_size == "auto" else plan.batch_size
+            at_once = min(problem.B, given or plan_batch(problem, self.setup.device, processes))
             solver = solver.in_slots(at_once)
         while True:
             together = torch.zeros_like(ids)

@@ -37,10 +37,11 @@ EXTRAS = {"ray": "ray"}  # extra of the package by launcher; the others are in "
 class Report:
     """How a job ended; what the command's task returns.
 
-    folder      of the study
-    overrides   of the job
-    done        False: the job flew its share of a study
-    refused     the error as one line, None where there was none
+    Args:
+        folder: of the study.
+        overrides: of the job.
+        done: False: the job flew its share of a study.
+        refused: the error as one line, None where there was none.
     """
 
     folder: str

@@ -149,7 +149,7 @@ def _report(study: _Study, folder: Path) -> str:
     """Write the report of a finished study, and return it as text."""
     if study.setup.mission is not None:
         return write_mission_report(folder, study.setup, figures=study.plan.figures)
-    return write_report(folder, lambda held, flown: _trajectories(study, flown), figures=study.plan.figures)
+    return write_report(folder, lambda flown: _trajectories(study, flown), figures=study.plan.figures)
 
 
 def _study(config: DictConfig, recompose: Recompose) -> _Study:
@@ -196,7 +196,7 @@ def _fly(study: _Study, records: Records, missing: Mapping[str, Sequence[int]], 
     if not batches:
         return
     with _bar(study, sum(map(len, missing.values())), name) as bar:
-        workers = min(study.plan.workers, len(batches))
+        workers = min(study.plan.workers or 1, len(batches))
         if workers > 1:
             _fly_side_by_side(study, records, batches, workers, bar)
         else:  # in this process, with a bar that moves inside a batch

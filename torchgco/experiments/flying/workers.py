@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from types import FrameType
 from typing import Any, ClassVar, TypeVar
 
 from torchgco.base import notices
 from torchgco.base.errors import InputError
-from torchgco.experiments.ending import raised, throw
+from torchgco.experiments.ending import Noted, raised
 from torchgco.experiments.flying.progress import NoBar
 
 Job = TypeVar("Job")
@@ -79,7 +78,7 @@ def _run_pool(
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(processes, CONTEXT, _begin_worker, begin)
     try:
-        with _interrupts_noted() as noted:
+        with raised() as noted:
             with _interrupts_held(noted):
                 futures = {pool.submit(_work, work, job, number): number for number, job in left.items()}
             while futures:
@@ -104,26 +103,8 @@ def _run_pool(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-class _Noted:
-    """The signals of a pool: each is noted before it raises, because Python drops exceptions of destructors."""
-
-    def __init__(self) -> None:
-        self.held = False  # while true, a signal is noted only
-        self.numbers: list[int] = []
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        self.numbers.append(number)
-        if not self.held:
-            throw(number, frame)
-
-    def raise_late(self) -> None:
-        """Raise for a signal that was noted, but whose exception got lost."""
-        if self.numbers:
-            throw(self.numbers[0], None)
-
-
 @contextmanager
-def _interrupts_held(noted: _Noted) -> Iterator[None]:
+def _interrupts_held(noted: Noted) -> Iterator[None]:
     """Signals wait until the end of the block: a process that is half started would end with an error of its own.
 
     Processes started in the block never see Ctrl-C, nor the signals of schedulers before a time limit, which reach all
@@ -137,14 +118,6 @@ def _interrupts_held(noted: _Noted) -> Iterator[None]:
         noted.held = False
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     noted.raise_late()
-
-
-@contextmanager
-def _interrupts_noted() -> Iterator[_Noted]:
-    """The signals that arrive in the block."""
-    noted = _Noted()
-    with raised(noted):
-        yield noted
 
 
 class Shared(NoBar):

@@ -14,12 +14,11 @@ from matplotlib.figure import Figure
 from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.mission_flight import FEW
 from torchgco.experiments.flying.progress import draw as draw_all
-from torchgco.experiments.reports.report_figures import several
+from torchgco.experiments.reports.report import several
 from torchgco.experiments.results.files import write
-from torchgco.experiments.results.kinds import parts_of, write_tables
+from torchgco.experiments.results.kinds import format_report, parts_of, write_tables
 from torchgco.experiments.results.records import LAYOUTS, MISSION, TRIALS
 from torchgco.experiments.results.runs import read_trials
-from torchgco.experiments.statistics.formats import format_report
 from torchgco.experiments.statistics.mission_tables import mission_lines
 from torchgco.missions.contact import Contact
 from torchgco.missions.tables import clearances, mission_frame, time_step_frame, unpacked
@@ -110,8 +109,10 @@ def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Cal
 class _Flown:
     """What is kept of few missions.
 
-    steps  rows of mission.parquet; fine: rows of time_steps.parquet
-    plans  planned positions (L, K, N+1, 3) by solver
+    Args:
+        steps: rows of mission.parquet.
+        fine: rows of time_steps.parquet.
+        plans: planned positions (L, K, N+1, 3) by solver.
     """
 
     steps: pd.DataFrame

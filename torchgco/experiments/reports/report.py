@@ -7,7 +7,6 @@ run, and reports on all of them together.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -21,57 +20,56 @@ from matplotlib.figure import Figure
 from torchgco.base.errors import InputError
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.flying.progress import draw
-from torchgco.experiments.reports.report_figures import Drawings, drawings
-from torchgco.experiments.reports.verify import verify
-from torchgco.experiments.reports.verify_text import confirmed_frame, confirmed_text, difference_texts
+from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
 from torchgco.experiments.results.files import write
-from torchgco.experiments.results.kinds import Part, parts_of, write_tables
+from torchgco.experiments.results.kinds import MISSION, Part, format_report, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
-from torchgco.experiments.results.records import MANIFEST, TRIALS
+from torchgco.experiments.results.records import LAYOUTS, MANIFEST, SOLUTIONS, TRIALS
 from torchgco.experiments.results.runs import is_merged, read_trials
-from torchgco.experiments.statistics.formats import format_report
-from torchgco.experiments.statistics.statistics import plain
+from torchgco.experiments.statistics.mission_statistics import summarise_missions
+from torchgco.experiments.statistics.statistics import TASK, plain, summarise, task_columns
 from torchgco.experiments.statistics.tables import FORMATS, format_frame
+from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
+from torchgco.plotting.missions import outcomes_figure
+from torchgco.plotting.rates import rates_figure
 from torchgco.plotting.style import save
+from torchgco.plotting.sweeps import sweep_figure
 from torchgco.scenarios.layouts import Layouts
 
+Drawings = dict[str, Callable[[], Figure]]
+FACETS = 6  # most tasks that have panels of their own; more are pooled over the swept variables
 Arrays = Mapping[str, np.ndarray]
-# X (L, N+1, n) by solver, or a function that makes them from the arrays in layouts.npz and in solutions.npz.
-Trajectories = Arrays | Callable[[Arrays, Arrays], Arrays]
 
 
-def write_report(
-    folder: str | os.PathLike[str],
-    trajectories: Trajectories | None = None,
-    form: str = "table",
-    figures: bool = True,
-) -> str:
+def write_report(folder: Path, trajectories: Callable[[Arrays], Arrays] | None = None, figures: bool = True) -> str:
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
-    trajectories  states for the picture of the layouts, which needs `layouts.npz` too: X (L, N+1, n) by
-                  solver, in the order of that file; or a function of (layouts, solutions), the arrays of the two
-                  files, that returns this (`solutions` is empty without `solutions.npz`). None: no such
-                  picture.
-    form          one of `tables.FORMATS`
-    figures       False: tables alone
+    Args:
+        trajectories: states for the picture of the layouts, X (L, N+1, n) by solver in the order of `layouts.npz`, from
+            the arrays of `solutions.npz`; None: no such picture.
+        figures: False: tables alone.
 
-    Raises InputError if the table is missing, unreadable or empty, and where the trajectories don't fit the
-    layouts.
+    Raises:
+        InputError: the table is missing, unreadable or empty, or the trajectories don't fit the layouts.
     """
-    folder = Path(folder)
-    return _written(folder, read_trials(folder / TRIALS), trajectories, form, figures)
+    return _written(folder, read_trials(folder / TRIALS), trajectories, figures=figures)
 
 
 def _written(
-    folder: Path, trials: pd.DataFrame, trajectories: Trajectories | None, form: str, figures: bool = True
+    folder: Path,
+    trials: pd.DataFrame,
+    trajectories: Callable[[Arrays], Arrays] | None = None,
+    form: str = "table",
+    figures: bool = True,
 ) -> str:
     parts = parts_of(trials)
     write_tables(folder, parts)
     held = _figures(parts) if figures else {}
     if figures and trajectories is not None:
-        layouts = Layouts.load(folder / "layouts.npz").arrays()
-        states = trajectories(layouts, _solutions(folder / "solutions.npz")) if callable(trajectories) else trajectories
+        layouts = Layouts.load(folder / LAYOUTS).arrays()
+        with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
+            states = trajectories(solutions)
         held["layouts"] = lambda: layout_grid(layouts, states, trials)
     draw({name: partial(_draw, folder, name, figure) for name, figure in held.items()})
     return format_report(parts, form)
@@ -88,11 +86,46 @@ def _draw(folder: Path, name: str, figure: Callable[[], Figure]) -> None:
     write(folder / "figures" / f"{name}.png", lambda file: save(figure(), file))
 
 
-def _solutions(path: Path) -> Arrays:
-    if not path.is_file():
-        return {}
-    with np.load(path, allow_pickle=False) as held:
-        return dict(held)
+def drawings(part: Part) -> Drawings:
+    """Functions that draw, by name: rates against every swept variable, then rates and distributions of each task.
+
+    What would be empty isn't drawn: a distribution or shares of single trials.
+    """
+    mission = part.kind == MISSION
+    named, again = ("outcomes", summarise_missions) if mission else ("rates", summarise)
+    trials, summary, held = part.trials, part.summary, {}
+    swept = task_columns(trials)[len(TASK) :]
+    for name in swept:
+        others = [other for other in swept if other != name]
+        rows, table = trials[trials[name].notna()], summary[summary[name].notna()]
+        if len(table[[*TASK, *others]].drop_duplicates()) > FACETS:
+            table = again(rows.drop(columns=others))
+        held[f"{named}-{name}"] = lambda table=table, name=name: sweep_figure(table, name)
+    if len(summary[[*TASK, *swept]].drop_duplicates()) > FACETS:
+        trials = trials.drop(columns=swept)
+        summary = again(trials)
+    if not mission:
+        held["rates"] = lambda: rates_figure(summary)
+    elif len(shown := several(trials)):
+        held["outcomes"] = lambda: outcomes_figure(shown)
+    return held | _distributions(trials, "missions-" if mission else "")
+
+
+def several(trials: pd.DataFrame) -> pd.DataFrame:
+    """The missions of those tasks in which a solver flew more than one: shares of a single mission say nothing."""
+    tasks = task_columns(trials)
+    counts = trials.groupby([*tasks, "solver"], sort=False, dropna=False, observed=True)["layout"].transform("size")
+    most = trials.assign(_n=counts).groupby(tasks, sort=False, dropna=False, observed=True)["_n"].transform("max")
+    return trials[most > 1]
+
+
+def _distributions(trials: pd.DataFrame, prefix: str) -> Drawings:
+    held: Drawings = {}
+    if is_spread(trials, "clearance"):
+        held[f"{prefix}clearance"] = lambda: clearance_figure(trials)
+    if not prefix and is_spread(trials, "violation"):  # a mission's is that of its plans
+        held["violation"] = lambda: violation_figure(trials)
+    return held
 
 
 class _Parser(argparse.ArgumentParser):
@@ -136,7 +169,7 @@ def _report(options: argparse.Namespace) -> int:
     write(output / TRIALS, lambda file: plain(merged).to_parquet(file, index=False, use_dictionary=text))
     trials = merged.copy(deep=False)
     trials.attrs = {}  # pandas copies them for every table that it makes from this one
-    say(_written(output, trials, None, options.format))
+    say(_written(output, trials, form=options.format))
     repeated = merged.attrs[REPEATED]
     notes = [f"{repeated} rows left out: another run has the same flight, and each counts once"] if repeated else []
     for note in [*notes, f"written to {output}"]:

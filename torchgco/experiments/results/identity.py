@@ -64,9 +64,10 @@ def closed_loop(configuration: Mapping[str, Any]) -> dict[str, Any]:
 class Manifest:
     """The flights of a study: the content of its study.json.
 
-    configuration  resolved, with `version`, as the study was first started
-    solvers        resolved settings by name, the solver under study first
-    layouts        digest of each layout by its id
+    Args:
+        configuration: resolved, with `version`, as the study was first started.
+        solvers: resolved settings by name, the solver under study first.
+        layouts: digest of each layout by its id.
     """
 
     configuration: dict[str, Any]
@@ -128,9 +129,10 @@ def layout_digests(
 ) -> dict[int, str]:
     """Digest of each layout by its id: the obstacles, and all else that a flight depends on except the solver.
 
-    vehicle  `model.vehicle` of the resolved configuration; layouts override it where they hold values. The best
-             known cost doesn't count.
-    loop     of missions, see `closed_loop`
+    Args:
+        vehicle: `model.vehicle` of the resolved configuration; layouts override it where they hold values. The best
+            known cost doesn't count.
+        loop: of missions, see `closed_loop`.
     """
     model = {key: value for key, value in vehicle.items() if key not in (*OVERRULED, "name")}
     if layouts.dt is not None:

@@ -1,7 +1,8 @@
-"""Trajectories and missions: two kinds of trials that may share a table, each with statistics of its own."""
+"""Trajectories and missions: two kinds of trials that may share a table, each with statistics and texts of its own."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,10 @@ import pandas as pd
 
 from torchgco.experiments.results.files import write
 from torchgco.experiments.statistics.mission_statistics import summarise_missions
+from torchgco.experiments.statistics.mission_tables import format_missions, printed_missions
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import TASK, are_missions, summarise, task_columns
+from torchgco.experiments.statistics.tables import format_frame, format_table, printed
 
 KIND = "kind"  # first column of summary.csv and paired.csv
 TRAJECTORY, MISSION = "trajectory", "mission"
@@ -21,8 +24,9 @@ TRAJECTORY, MISSION = "trajectory", "mission"
 class Part:
     """The trials of one kind with their statistics.
 
-    summary  see `summarise`, and of missions `summarise_missions`
-    paired   see `compare`; of missions by `reached` alone
+    Args:
+        summary: see `summarise`, and of missions `summarise_missions`.
+        paired: see `compare`; of missions by `reached` alone.
     """
 
     kind: str
@@ -34,7 +38,8 @@ class Part:
 def parts_of(trials: pd.DataFrame) -> list[Part]:
     """The kinds in a table of trials, each without the swept variables of the other.
 
-    Raises InputError as `summarise`.
+    Raises:
+        InputError: as `summarise`.
     """
     missions = are_missions(trials)
     if trials.empty or not missions.any():
@@ -72,3 +77,30 @@ def _stacked(tables: Sequence[tuple[str, pd.DataFrame]]) -> pd.DataFrame:
         held[-1].insert(0, KIND, kind)
     filled = [table for table in held if len(table)]
     return pd.concat(filled, ignore_index=True) if filled else held[0]
+
+
+def format_report(parts: Sequence[Part], form: str) -> str:
+    """The statistics of all kinds of trials, in one of `tables.FORMATS`.
+
+    Formats:
+        csv: the summary with all its columns.
+        json: all columns of both tables, under "summary" and "paired"; null where a number is undefined.
+        markdown, latex: the columns that a paper prints, of both tables, for each kind.
+        table: as `format_table` and `format_missions`.
+    """
+    if form == "table":
+        return "\n\n".join(_text(part) for part in parts)
+    if form in ("csv", "json"):
+        tables = joined(parts)
+        if form == "csv":
+            return format_frame(tables["summary"], form)
+        return json.dumps({name: json.loads(format_frame(table, form)) for name, table in tables.items()}, indent=1)
+    return "\n\n".join(format_frame(table, form) for part in parts for table in _printed(part))
+
+
+def _text(part: Part) -> str:
+    return (format_missions if part.kind == MISSION else format_table)(part.summary, part.paired)
+
+
+def _printed(part: Part) -> list[pd.DataFrame]:
+    return (printed_missions if part.kind == MISSION else printed)(part.summary, part.paired)

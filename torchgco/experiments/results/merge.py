@@ -91,7 +91,8 @@ def _tagged(runs: Sequence[Run]) -> tuple[pd.DataFrame, list[str]]:
 def _variant(run: Run, settings: Mapping[str, dict[str, Any]], code: str, device: str, dtype: str, version: str) -> str:
     """All that distinguishes a solver's results from those of its other variants, as JSON for `labels`.
 
-    settings  of all solvers whose manifest was found, by digest
+    Args:
+        settings: of all solvers whose manifest was found, by digest.
     """
     kernels = run.configuration.get("device", {}).get("kernels", "native")
     held = flat(settings.get(code, {"settings": code}))

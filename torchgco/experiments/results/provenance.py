@@ -2,17 +2,17 @@
 
 Each file is a list with an entry per start, the oldest first. An entry is a dict of
 
-    command             the command line
-    torchgco            version, and where the package is a git checkout its commit, and whether files differ from it
-    packages            versions of Python and of the libraries that compute
-    machine             platform, processor, number of cores, first line of the C compiler's version (null: none)
-    threads, workers    per process, and processes
-    seed
-    job                 [job, jobs] where the process flew a share, else null
-    started             UTC
-    ended               "finished", "share flown" (by a job: others finish the study), "interrupted", "failed", or null
-                        while it runs and where it was killed
-    wall_seconds, processor_seconds     from start to end, of all its processes; null as above
+- command: the command line
+- torchgco: version, and where the package is a git checkout its commit, and whether files differ from it
+- packages: versions of Python and of the libraries that compute
+- machine: platform, processor, number of cores, first line of the C compiler's version (null: none)
+- threads, workers: per process, and processes
+- seed
+- job: [job, jobs] where the process flew a share, else null
+- started: UTC
+- ended: "finished", "share flown" (by a job: others finish the study), "interrupted", "failed", or null while it runs
+  and where it was killed
+- wall_seconds, processor_seconds: from start to end, of all its processes; null as above
 
 Nothing here names a host, a user or the environment. A record that can't be written is left out: it never makes a study
 fail.

@@ -36,9 +36,10 @@ NEEDED = (*ROW, *DIGESTS, "best_from")  # columns that tell trials apart, and ho
 class Run:
     """One table of trials with its known origin.
 
-    configuration  of the study; empty for a table alone, without study.json
-    solvers        resolved settings by name; empty likewise
-    planned        trials of the whole study where it isn't finished; None where it is
+    Args:
+        configuration: of the study; empty for a table alone, without study.json.
+        solvers: resolved settings by name; empty likewise.
+        planned: trials of the whole study where it isn't finished; None where it is.
     """
 
     folder: Path

@@ -62,7 +62,8 @@ def _rows_of(trials: pd.DataFrame, task: tuple[Any, ...], tasks: int) -> pd.Data
 def _swept(runs: Sequence[Run], tables: Sequence[pd.DataFrame]) -> list[dict[str, Any]]:
     """The swept variables of each run that flew a task; none for a run whose configuration isn't known.
 
-    tables  the trials of each run in that task
+    Args:
+        tables: the trials of each run in that task.
     """
     given = [_keys(run) for run in runs]
     known = [keys for keys in given if keys]

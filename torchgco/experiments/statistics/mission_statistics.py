@@ -18,15 +18,16 @@ AT_ONCE = "missions_at_once"
 def summarise_missions(trials: pd.DataFrame) -> pd.DataFrame:
     """One row per (scenario, model, swept variables, solver): the columns of `summarise`, and of missions.
 
-    <outcome>_count, _n, _rate, _low, _high
-                        for collision, timeout and diverged as for reached: the four are disjoint
-    <column>            for flight_time, energy, clearance, planner_seconds_median, planner_seconds_p99 and
-                        tracker_seconds_median: the median over the missions that reached the goal
-    missed_deadlines, shifted_plans
-                        means over all missions
-    missions_at_once    most missions that were planned as one batch, which all times are divided by
+    Columns:
+        <outcome>_count, _n, _rate, _low, _high: for collision, timeout and diverged as for reached: the four are
+            disjoint.
+        <column>: for flight_time, energy, clearance, planner_seconds_median, planner_seconds_p99 and
+            tracker_seconds_median: the median over the missions that reached the goal.
+        missed_deadlines, shifted_plans: means over all missions.
+        missions_at_once: most missions that were planned as one batch, which all times are divided by.
 
-    Raises InputError as `summarise`.
+    Raises:
+        InputError: as `summarise`.
     """
     summary = summarise(trials)
     rows = [_of_missions(trials.iloc[place]) for place in grouped(trials, [*task_columns(trials), "solver"])]

@@ -30,18 +30,17 @@ from torchgco.experiments.statistics.statistics import (
 class PairedResult:
     """Two solvers on the same trials, counted by which of them attained the outcome.
 
-    n              trials in which both solvers flew and the outcome is defined for both
-    both, only_a, only_b, neither
-                   how many of the n trials were attained by both, by one only, by neither
-    difference     rate of a minus rate of b over the n trials, nan where n is 0
-    p_value        exact McNemar, two-sided: a fair coin for the trials that only one of the two attained
-    undefined      trials that both flew, left out because the outcome isn't defined
-    unmatched      trials that only one of the two flew
-    cost_n         trials that both reached, with finite positive costs
-    cost_ratio     median over them of the cost of a divided by that of b; nan where cost_n is 0
-    cost_low, cost_high
-                   95 % interval of this median from order statistics, which assumes no distribution; nan below 6
-                   trials, which can't give one
+    Args:
+        n: trials in which both solvers flew and the outcome is defined for both.
+        both, only_a, only_b, neither: how many of the n trials were attained by both, by one only, by neither.
+        difference: rate of a minus rate of b over the n trials, nan where n is 0.
+        p_value: exact McNemar, two-sided: a fair coin for the trials that only one of the two attained.
+        undefined: trials that both flew, left out because the outcome isn't defined.
+        unmatched: trials that only one of the two flew.
+        cost_n: trials that both reached, with finite positive costs.
+        cost_ratio: median over them of the cost of a divided by that of b; nan where cost_n is 0.
+        cost_low, cost_high: 95 % interval of this median from order statistics, which assumes no distribution; nan
+            below 6 trials, which can't give one.
     """
 
     solver_a: str

@@ -65,22 +65,26 @@ def plain(table: pd.DataFrame) -> pd.DataFrame:
 def summarise(trials: pd.DataFrame) -> pd.DataFrame:
     """One row per (scenario, model, solver), in order of appearance; in a merged table also per swept variable.
 
-    n                   trials; seed: their seeds, as text; invalid: those of invalid start, all failures
-    <outcome>_count, _n, _rate, _low, _high
-                        for feasible, reached and success: attained, defined, their ratio, its 95 % interval
-    violation_ok        share of all n whose violation is at most 1e-3
-    violation_median    over all n, one that isn't a number counting as infinite
-    cost_median_reached over the trials that reached the goal
-    cost_median         over the cost_n trials whose cost is finite
-    cost_ratio_median, _p90
-                        cost divided by the best known cost, over the cost_ratio_n trials that reached the goal and
-                        have a positive best cost
-    <effort>_median, _p90
-                        iterations, outer_iterations, guided and seconds over the trials with a valid start; nan if
-                        one of them lacks the number
-    status_<NAME>       trials that ended with this status; missions: with this outcome
+    Columns:
+        n: trials.
+        seed: their seeds, as text.
+        invalid: those of invalid start, all failures.
+        <outcome>_count, _n, _rate, _low, _high: for feasible, reached and success: attained, defined, their ratio, its
+            95 % interval.
+        violation_ok: share of all n whose violation is at most 1e-3.
+        violation_median: over all n, one that isn't a number counting as infinite.
+        cost_median_reached: over the trials that reached the goal.
+        cost_median: over the cost_n trials whose cost is finite.
+        cost_ratio_median, _p90: cost divided by the best known cost, over the cost_ratio_n trials that reached the goal
+            and have a positive best cost.
+        <effort>_median, _p90: iterations, outer_iterations, guided and seconds over the trials with a valid start; nan
+            if one of them lacks the number.
+        status_<NAME>: trials that ended with this status; missions: with this outcome.
 
-    _p90 is the 90 % quantile, interpolated linearly. Raises InputError if `trials` is empty or lacks a column.
+    _p90 is the 90 % quantile, interpolated linearly.
+
+    Raises:
+        InputError: `trials` is empty or lacks a column.
     """
     check_trials(trials)
     names = [*task_columns(trials), "solver"]
@@ -141,7 +145,8 @@ class _Values:
 def attained(trials: pd.DataFrame, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
     """Each outcome (rows,): 1 attained, 0 not, NaN where undefined; an invalid start counts as a failure.
 
-    groups  positions of the rows of each solver on each task, see `grouped`
+    Args:
+        groups: positions of the rows of each solver on each task, see `grouped`.
 
     Where no valid trial of a group defines success (there is no best cost), it stays undefined for the invalid ones
     too: a rate of 0 would be read as a measurement.

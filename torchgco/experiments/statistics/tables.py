@@ -14,7 +14,8 @@ FORMATS = ("table", "csv", "markdown", "latex", "json")
 def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
     """The report for a terminal, some 120 columns wide: rates, effort, statuses and comparisons of each task.
 
-    summary, paired  as `summarise` and `compare` return them; `paired` may have no rows
+    Args:
+        summary, paired: as `summarise` and `compare` return them; `paired` may have no rows.
 
     A rate reads "30/32 94 % [80, 98]": attained of defined, and the 95 % Wilson interval. "-" stands for an
     undefined value. Costs are medians, over the trials that reached the goal and over all that are finite. Effort and
@@ -135,7 +136,8 @@ PAIRED = ("paired", "outcome", *COUNTS.values(), "difference", "McNemar p", "lef
 def paired_lines(rows: pd.DataFrame, swept: Sequence[str], costs: bool = True) -> str:
     """Comparisons for a terminal, with the swept variables `swept`; none without a trial that counts.
 
-    costs  False: without the ratio of costs
+    Args:
+        costs: False: without the ratio of costs.
     """
     width = len(PAIRED) if costs else len(PAIRED) - 1
     lines = [[*headers(swept), *PAIRED[:width]]]
