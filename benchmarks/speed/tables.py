@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.lib.page import put_between
+from benchmarks.lib.page import markdown, put
 from benchmarks.speed.results import Row
 
-TARGETS = "<!-- targets -->", "<!-- end targets -->"  # in README.md
-SPEED = "<!-- speed -->", "<!-- end speed -->"  # in results/speed.md: all other sections
 NOT_MEASURED = "Not measured yet: `make benchmark` does."
 NO_GPU = "No GPU was at hand: `make benchmark-gpu` measures `families`, `batch` and `mppi` where there is one."
 
@@ -41,14 +39,11 @@ WORDS = {
 
 def section_table(rows: list[Row]) -> str:
     """A Markdown table: a row per case and solver, a column per quantity, in the order of measurement."""
-    lines = list(dict.fromkeys((row["case"], row["solver"]) for row in rows))
-    heads = list(dict.fromkeys(_head(row) for row in rows))
+    lines = dict.fromkeys((row["case"], row["solver"]) for row in rows)
+    heads = dict.fromkeys(_head(row) for row in rows)
     cells = {(row["case"], row["solver"], _head(row)): _rounded(row["value"]) for row in rows}
-    text = ["| case | solver | " + " | ".join(heads) + " |", "|---" * (len(heads) + 2) + "|"]
-    for case, solver in lines:
-        values = [cells.get((case, solver, head), "") for head in heads]
-        text.append(f"| {case} | `{solver}` | " + " | ".join(values) + " |")
-    return "\n".join(text)
+    values = ([case, f"`{solver}`", *(cells.get((case, solver, head), "") for head in heads)] for case, solver in lines)
+    return markdown(["case", "solver", *heads], values)
 
 
 def _rounded(value: str) -> str:
@@ -102,5 +97,5 @@ def _source(row: Row) -> str:
 
 def rewrite(folder: Path, rows: list[Row]) -> None:
     """Put the tables between their marks in the folder's README.md and results/speed.md."""
-    put_between(folder / "README.md", *TARGETS, targets_text(rows))
-    put_between(folder / "results" / "speed.md", *SPEED, speed_text(rows))
+    put(folder / "README.md", "targets", targets_text(rows))
+    put(folder / "results" / "speed.md", "speed", speed_text(rows))

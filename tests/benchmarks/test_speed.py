@@ -28,7 +28,7 @@ from benchmarks.speed.bench import Bench
 from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
-from benchmarks.speed.tables import SPEED, TARGETS, rewrite, section_table
+from benchmarks.speed.tables import rewrite, section_table
 from torchgco.native import engine as native_engine
 
 TINY = Sizes(
@@ -170,16 +170,17 @@ def test_a_finished_section_replaces_its_former_rows_and_no_others(tmp_path: Pat
 def test_the_tables_are_rewritten_in_place(tmp_path: Path) -> None:
     readme, page = tmp_path / "README.md", tmp_path / "results" / "speed.md"
     page.parent.mkdir()
-    for file, (begin, end) in ((readme, TARGETS), (page, SPEED)):
-        file.write_text(f"before\n{begin}\nold\n{end}\nafter\n")
+    for file, name in ((readme, "targets"), (page, "speed")):
+        file.write_text(f"before\n<!-- {name} -->\nold\n<!-- end {name} -->\nafter\n")
     rows = [row_of(*words) for words in (("mppi", "0.12345"), ("share", "1234.4"), ("mppi", "7", "cuda"))]
     rows.append(row_of("targets", "39 x FATROP"))
     rewrite(tmp_path, rows)
     first, second = readme.read_text(), page.read_text()
     rewrite(tmp_path, rows)
     assert (readme.read_text(), page.read_text()) == (first, second)
-    for text, (begin, end) in ((first, TARGETS), (second, SPEED)):
-        assert text.startswith(f"before\n{begin}\n") and text.endswith(f"{end}\nafter\n") and "old" not in text
+    for text, name in ((first, "targets"), (second, "speed")):
+        assert text.startswith(f"before\n<!-- {name} -->\n") and text.endswith(f"<!-- end {name} -->\nafter\n")
+        assert "old" not in text
     assert "39 x FATROP" in first and "39 x FATROP" not in second
     assert "| 0.123 |" in second and "| 1234 |" in second and "## Speed on a GPU" in second
     page.write_text("no marks")
