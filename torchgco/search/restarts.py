@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_options
@@ -13,6 +13,7 @@ from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Late, Search
 from torchgco.search.chords import ClearChords
+from torchgco.search.finish import Finish
 from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Pass, Solve
 from torchgco.search.proposals import PathProposals
 from torchgco.search.suitability import has_paths, suited_paths
@@ -37,21 +38,18 @@ class Restarts(Solver):
         passes: in their order; the first ones make a solve from the given guess.
 
     Raises:
-        InputError: a field out of its range, or passes that don't begin with a solve.
+        InputError: a field out of its range, passes that don't begin with a solve, or one that would improve proposals
+            where there are none.
     """
 
     local: AugmentedLagrangian = AugmentedLagrangian()
     passes: tuple[Pass, ...] = PASSES
 
     def __post_init__(self) -> None:
+        if isinstance(self.passes, list | tuple):
+            _check(self.passes)
+            object.__setattr__(self, "passes", tuple(self.passes))
         check_options(self, "solver")
-        object.__setattr__(self, "passes", tuple(self.passes))
-        for number, one in enumerate(self.passes):
-            if not isinstance(one, Pass):
-                raise InputError(f"solver.passes[{number}]", "a pass of torchgco.search", shown(one))
-        first = next((one for one in self.passes if not (isinstance(one, Solve) and one.when == "pathless")), None)
-        if not isinstance(first, Solve):
-            raise InputError("solver.passes", "a Solve first, not only for problems without paths", shown(first))
 
     def table(self) -> pd.DataFrame:
         """The passes, a row each: which problems they look at, and what they do with them."""
@@ -60,8 +58,9 @@ class Restarts(Solver):
         return pd.DataFrame(rows_of(self.passes), index=pd.RangeIndex(1, len(self.passes) + 1, name="row"))
 
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
-        """The solver without `finish`, as the next plan continues what a limit cuts off; and the local solver."""
-        return replace(self, finish=None), replace(self.local, max_outer_iterations=rounds)
+        """The passes but `Finish`, as the next plan continues what a limit cuts off; and the local solver, unguided."""
+        passes = tuple(one for one in self.passes if not isinstance(one, Finish))
+        return replace(self, passes=passes), replace(self.local, guidance=None, max_outer_iterations=rounds)
 
     def in_slots(self, slots: int) -> Restarts:
         """The same solver with at most `slots` problems at a time."""
@@ -109,3 +108,19 @@ class Restarts(Solver):
         losses += [] if unsought is None else [unsought]
         warn_of_losses(losses, guidance is None and not any(isinstance(one, PathProposals) for one in passes))
         return passes, guidance
+
+
+def _check(passes: Sequence[Any]) -> None:
+    """InputError for what is no pass, for no first solve, or for a pass that would improve proposals before any."""
+    begun = False
+    for number, one in enumerate(passes):
+        if not isinstance(one, Pass):
+            raise InputError(f"solver.passes[{number}]", "a pass of torchgco.search", shown(one))
+        if isinstance(one, PathProposals) and one.continues and not begun:
+            expected = f"path proposals before those for problems that are {one.when}, and no FromProposal in between"
+            raise InputError(f"solver.passes[{number}].when", expected, one.when)
+        begun = isinstance(one, PathProposals) or (begun and not isinstance(one, FromProposal))
+    first = next((one for one in passes if not (isinstance(one, Solve) and one.when == "pathless")), None)
+    if not isinstance(first, Solve):
+        got = "none" if first is None else type(first).__name__
+        raise InputError("solver.passes", "a Solve first, not only for problems without paths", got)
