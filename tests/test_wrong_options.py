@@ -52,6 +52,8 @@ CASES: dict[str, list[Callable[[], object]]] = {
     "solver.guidance": [
         lambda: compose(["solver=gco_paper", "solver.guidance=5"]), lambda: AugmentedLagrangian(guidance=MPPI),  # type: ignore
     ],
+    "solver.passes.13": [lambda: compose(["~solver.passes.13"])],
+    "solver.passes[2]": [lambda: compose(["solver.passes.2=3"])],
     "solver.passes": [
         lambda: compose(["solver.passes=a"]), lambda: GuidedCasADi(passes=None), lambda: GuidedCasADi(passes=()),  # type: ignore
     ],

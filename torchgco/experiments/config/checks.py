@@ -24,12 +24,15 @@ def hydra_words(words: Iterable[str]) -> list[str]:
     """The words of a command line as Hydra takes them: `~mission` for `mission=null`.
 
     Raises:
-        InputError: a value that is no name, where the word chooses an option of a group: Hydra fails there.
+        InputError: a value that is no name, where the word chooses an option of a group; a row of a list to delete: Hydra
+            fails there.
     """
     return [_hydra_word(word) for word in words]
 
 
 def _hydra_word(word: str) -> str:
+    if re.fullmatch(r"~[\w.]+\.\d+", word):  # Hydra fails there, too
+        raise InputError(word[1:], "a key: a row of a list can be changed by its index, but not deleted", word)
     key, equals, value = word.lstrip("+").partition("=")
     group = key.split("@")[0]
     if equals and re.fullmatch(r"[\w/]+", group) and (options := options_of(group)):

@@ -1,0 +1,194 @@
+"""The table of a solver: which rows it takes, that every field of every row is read, and how it shows them."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any, get_args
+
+import pytest
+import torch
+
+from tests.problems import planar_batch
+from tests.search.gates import LOCAL, PASSES, PATHS, SAMPLING, SHORT, gates
+from tests.search.rows import closer, restarts, thorough, varied
+from tests.search.test_chords import corners
+from tests.search.test_finish import brachistochrone, parking
+from torchgco import ILQR, AugmentedLagrangian, InputError, PathProposals, Problem, Restarts, Solution, Spheres, presets
+from torchgco.search import ClearChords, Finish, FromProposal, FromSamples, IntoGoal, Refine, Solve
+from torchgco.search.passes import Pass
+from torchgco.search.table import COLUMNS
+
+pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
+DRAWN = FromSamples("caught", redraws=1)
+COSTLY = replace(PATHS, when="costly", num_paths=2, refine=Refine(top=2, needed=True), max_gap=1e-3)
+
+
+def at_gates(*passes: Pass, weight: float = 6.0) -> Solution:
+    """Four problems that need different attempts, by a table; samples are those of the local solver's guidance."""
+    return Restarts(replace(LOCAL, guidance=SAMPLING), passes).solve(*gates(weight), seed=3)
+
+
+def among_moving(*passes: Pass) -> Solution:
+    """Problems among moving obstacles, where no path can be sought."""
+    problem, U0 = planar_batch(B=4, N=40, obstacles=8, seed=4)
+    moving = Spheres([[0.1, 0.1], [0.1, 0.3]], [0.2, 0.2], 0.06, velocities=torch.zeros(2, 2, dtype=torch.float64))
+    problem = replace(problem, constraints=[moving, problem.constraints[1]])
+    return Restarts(replace(LOCAL, guidance=SAMPLING), passes).solve(problem, U0, seed=3)
+
+
+def around_one(*passes: Pass) -> Solution:
+    """A sphere that a trajectory touches alone."""
+    problem, U0 = planar_batch(B=1, N=60, obstacles=1, seed=1)
+    problem = replace(problem, constraints=[Spheres([[[0.0, 0.2]]], [[0.2]], 0.1), problem.constraints[1]])
+    return Restarts(replace(LOCAL, guidance=SAMPLING), passes).solve(problem, U0)
+
+
+def unfinished(*passes: Pass, problem: Problem | None = None) -> Solution:
+    """The fastest slide to a point, which the local solver's limits cut off; or another problem."""
+    problem = brachistochrone() if problem is None else problem
+    local = replace(presets.gco(problem).local, guidance=None)
+    return Restarts(local, passes).solve(problem, problem.x0.new_zeros(problem.B, problem.N, problem.m))
+
+
+def parked(*passes: Pass) -> Solution:
+    """A car at rest that should stand next to its place, where only other controls help."""
+    return unfinished(*passes, problem=parking())
+
+
+def around_corners(*passes: Pass) -> Solution:
+    """Boxes whose corners are cut between two knots."""
+    problem = corners()
+    local = presets.gco(problem).local
+    return Restarts(local, passes).solve(problem, problem.x0.new_zeros(problem.B, problem.N, problem.m))
+
+
+LONG = Finish(AugmentedLagrangian(ILQR(max_iterations=50), max_outer_iterations=30, patience=8))
+ALONG = (Solve(), PATHS, FromProposal())
+# For every field: the problems, the rows before, the row, another value, the rows after.
+FIELDS: dict[tuple[type, str], tuple[Any, tuple[Pass, ...], Pass, Any, tuple[Pass, ...]]] = {
+    (Solve, "until"): (at_gates, (), Solve(), "end", (DRAWN,)),
+    (Solve, "when"): (at_gates, (Solve("end"),), Solve(), "all", (DRAWN,)),
+    (Solve, "single_contact_after"): (around_one, (), Solve(), 1, (DRAWN,)),
+    (PathProposals, "when"): (at_gates, ALONG, PATHS, "far", (FromProposal(),)),
+    (PathProposals, "max_gap"): (at_gates, (Solve(), PATHS), COSTLY, 1e9, (FromProposal(),)),
+    (FromSamples, "when"): (at_gates, ALONG, FromSamples("unproposed", redraws=1), "caught", ()),
+    (FromSamples, "redraws"): (at_gates, (Solve(),), DRAWN, 2, ()),
+    (Finish, "solver"): (unfinished, (Solve(),), LONG, replace(LONG.solver, penalty_growth=5.0), ()),
+    (Finish, "change"): (parked, (Solve(),), LONG, 0.3, ()),
+    (ClearChords, "rounds"): (around_corners, (Solve("end"),), ClearChords(), 1, ()),
+}
+
+
+def differ(one: Solution, other: Solution) -> bool:
+    return not (torch.equal(one.U, other.U) and torch.equal(one.iterations, other.iterations))
+
+
+@pytest.mark.parametrize(("kind", "name"), FIELDS, ids=lambda part: part if isinstance(part, str) else part.__name__)
+def test_every_field_is_read(kind: type, name: str) -> None:
+    flown, before, row, other, after = FIELDS[kind, name]
+    assert isinstance(row, kind) and getattr(row, name) != other
+    one, two = (flown(*before, r, *after) for r in (row, replace(row, **{name: other})))
+    assert differ(one, two)
+
+
+def test_a_first_solve_runs_to_its_end_where_no_path_can_be_sought_alone() -> None:
+    """Rows for that case change nothing where paths can be sought."""
+    first = Solve("end", "pathless")
+    assert not differ(at_gates(first, Solve(), DRAWN), at_gates(Solve(), DRAWN))
+    assert differ(among_moving(first, Solve(), DRAWN), among_moving(Solve(), DRAWN))
+
+
+def test_no_field_is_forgotten_above() -> None:
+    """Those of paths and how they are followed are read in test_paths."""
+    there = {field.name for field in fields(PathProposals)} - {"when", "max_gap"}
+    every = {(kind, field.name) for kind in get_args(Pass) for field in fields(kind)}
+    assert set(FIELDS) == every - {(PathProposals, name) for name in there}
+
+
+@pytest.mark.parametrize(
+    ("passes", "field", "expected"),
+    [
+        ((), "solver.passes", "a Solve first"), ((PATHS,), "solver.passes", "a Solve first"),
+        ((Solve("end", "pathless"),), "solver.passes", "a Solve first"),
+        ((Solve("end", "pathless"), PATHS, Solve()), "solver.passes", "a Solve first"),
+        ((Solve(), 5), "solver.passes[1]", "a pass"), ((Solve,), "solver.passes[0]", "a pass"),
+        ((Solve(), AugmentedLagrangian()), "solver.passes[1]", "a pass"), (Solve(), "solver.passes", "a list"),
+        (None, "solver.passes", "a list"), ("all", "solver.passes", "a list"),
+        ((Solve(), closer(PATHS)), "solver.passes[1].when", "path proposals before"),
+        ((*ALONG, IntoGoal(), COSTLY), "solver.passes[4].when", "path proposals before"),
+    ],
+)  # fmt: skip
+def test_a_table_that_cannot_work_is_refused(passes: Any, field: str, expected: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Restarts(passes=passes)
+    assert caught.value.field == field and len(str(caught.value).splitlines()) == 1
+    assert f"expected {expected}" in str(caught.value)
+
+
+def test_a_list_of_rows_is_a_table() -> None:
+    rows = [Solve("end", "pathless"), Solve(), ClearChords()]
+    assert Restarts(passes=rows) == Restarts(passes=tuple(rows)) and hash(Restarts(passes=rows))
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: Solve(until="late"), "solve.until"), (lambda: Solve(when="far"), "solve.when"),
+        (lambda: Solve(single_contact_after=1.5), "solve.single_contact_after"),
+        (lambda: FromSamples(when="far"), "samples.when"), (lambda: FromSamples(redraws=-1), "samples.redraws"),
+        (lambda: Finish(change=0.0), "finish.change"), (lambda: Finish(solver=ILQR()), "finish.solver"),
+        (lambda: ClearChords(rounds=0), "chords.rounds"),
+    ],
+)  # fmt: skip
+def test_options_out_of_range_are_named(make: Any, field: str) -> None:
+    with pytest.raises(InputError) as caught:
+        make()
+    assert caught.value.field == field
+
+
+@pytest.mark.parametrize("name", ["gco", "gco_fast", "gco_max"])
+@pytest.mark.parametrize("space", [2, 3])
+def test_the_table_shows_every_pass(name: str, space: int) -> None:
+    solver = presets.PRESETS[name](space)
+    assert isinstance(solver, Restarts)
+    table = solver.table()
+    assert table["pass"].tolist() == [type(one).__name__ for one in solver.passes]
+    assert table.columns.tolist() == list(COLUMNS) and table.index.tolist() == [*range(1, len(solver.passes) + 1)]
+    assert all(isinstance(text, str) for text in table.to_numpy().flatten())
+    assert table["problems"].ne("").all() and table["accepted"].ne("").all()
+    rows = [one for one in solver.passes if isinstance(one, PathProposals)]
+    shown = table[table["pass"] == "PathProposals"]
+    for row, text in zip(rows, shown["how they are followed"], strict=True):
+        assert all(f"{follow.iterations} iterations" in text for follow in row.follow)
+    assert (shown["paths"] == "the same").tolist() == [not row.roadmaps for row in rows]
+
+
+def test_rows_that_differ_are_shown_differently() -> None:
+    """Of every field of a row that says what it does, at least with a value far from the present one."""
+    follow = PATHS.follow[0]
+    rows = [
+        Solve(), Solve("end"), Solve(when="all"), Solve(when="pathless"), Solve(single_contact_after=4), PATHS,
+        replace(PATHS, when="far"), replace(PATHS, num_paths=7), replace(PATHS, relax_top=2),
+        replace(PATHS, relax_iterations=0), replace(PATHS, refine=Refine(top=5)), replace(PATHS, max_penetration=0.2),
+        replace(PATHS, roadmaps=(*PATHS.roadmaps, *PATHS.roadmaps)), COSTLY, replace(COSTLY, max_gap=0.4),
+        replace(COSTLY, max_gap=None), closer(PATHS), thorough(PATHS), replace(PATHS, follow=(follow, follow)),
+        varied(PATHS, tube=None), varied(PATHS, arrive=(0.9, 0.8)), varied(PATHS, smoothing=0.3),
+        varied(PATHS, stiffness=(7.0,)),
+        FromSamples(), FromSamples(redraws=2), FromSamples("caught"), Finish(), LONG, ClearChords(), ClearChords(9),
+        FromProposal(), IntoGoal(),
+    ]  # fmt: skip
+    table = Restarts(passes=(Solve(), PATHS, *rows)).table().iloc[2:]
+    assert len(table) == len(rows) and not table.duplicated().any()
+
+
+@pytest.mark.parametrize("attempts", [1, 3])
+def test_rows_run_in_their_order_and_only_where_they_apply(attempts: int, monkeypatch) -> None:
+    """PASSES arrives along a path; SHORT is attracted to the goal; no row is left out or made twice."""
+    made = []
+    for kind in get_args(Pass):
+        run = kind.run
+        monkeypatch.setattr(kind, "run", lambda self, search, run=run: made.append(self) or run(self, search))
+    solver = restarts(LOCAL, PATHS, SAMPLING, attempts=attempts)
+    solution = solver.solve(*gates(), seed=3)
+    assert made == list(solver.passes)
+    assert solution.guided[[PASSES, SHORT]].tolist() == [1, 1]
