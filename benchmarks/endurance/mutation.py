@@ -210,6 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--again", action="store_true", help="try those again that survived: tests were added")
     parser.add_argument("--write", action="store_true", help="put the tables into results/mutation.md")
     options = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the tests that run and the copy go, too
     mutants = drawn(options.each, options.seed)
     ends = run(mutants, options.records, options.again)
     origin, lines = provenance("cpu"), [*table(mutants, ends), "", *survivors(mutants, ends, PAGE.read_text())]

@@ -24,8 +24,8 @@ def hydra_words(words: Iterable[str]) -> list[str]:
     """The words of a command line as Hydra takes them: `~mission` for `mission=null`.
 
     Raises:
-        InputError: a value that is no name, where the word chooses an option of a group; a row of a list to delete: Hydra
-            fails there.
+        InputError: a value that is no name, where the word chooses an option of a group, or a row of a list to delete:
+            Hydra fails there.
     """
     return [_hydra_word(word) for word in words]
 
