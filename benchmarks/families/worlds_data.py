@@ -18,7 +18,8 @@ from benchmarks.lib.families import WORLDS, Family
 from torchgco import compose, judge
 from torchgco.judging.distances import box_segment_distance
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.roadmap.roadmap import Roadmap, length
+from torchgco.roadmap.geometry import length
+from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
 from torchgco.scenarios import Layouts, Task, concatenate
 from torchgco.solvers.contracts import Solver
