@@ -131,7 +131,7 @@ def test_instantiate_is_called_in_one_place() -> None:
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.[ch]")), ids=lambda p: p.name)
 def test_c_files_are_short(path: Path) -> None:
-    assert len(path.read_text().splitlines()) <= 450
+    assert len(path.read_text().splitlines()) <= 600
 
 
 @pytest.mark.parametrize("room", ["experiments", "plotting", "scenarios"])

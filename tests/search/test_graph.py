@@ -217,7 +217,7 @@ def test_pytorch_searches_in_single_precision_and_without_a_compiler(monkeypatch
     assert library_for(s.start) is None
     paths, _ = Roadmap().paths(s)
     monkeypatch.undo()
-    monkeypatch.setattr(native, "POINTS", Path(__file__))  # not C code
+    monkeypatch.setattr(native, "SEARCH", Path(__file__))  # not C code
     native._library.cache_clear()
     with pytest.warns(EagerWarning, match=r"PyTorch's kernels where \w+ are sought"):
         assert library_for(s.start) is None

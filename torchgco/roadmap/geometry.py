@@ -14,7 +14,7 @@ from torchgco.obstacles.base import TINY, Solids
 from torchgco.obstacles.box_geometry import Cuboids
 
 AT_ONCE = 2**18  # distances between points and obstacles that are held at once
-AROUND = 1.5  # of an obstacle's extent: the region in which points are spread reaches so far beyond its centre
+AROUND = 1.5  # times as large as they are, obstacles lie within the region in which points are spread
 
 
 class Inflated(NamedTuple):
@@ -49,7 +49,7 @@ class Inflated(NamedTuple):
         return self._make(parts)
 
     def region(self, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """The lower and upper corner (B, d) around start, goal, and the obstacles made `AROUND` times as large."""
+        """The lower and upper corner (B, d) around start, goal, and the obstacles, each `AROUND` times as large."""
         low, high = torch.minimum(start, goal), torch.maximum(start, goal)
         for part in self.kinds:
             wide, absent = AROUND * (part.extent + part.radii.unsqueeze(-1)), part.absent.unsqueeze(-1)

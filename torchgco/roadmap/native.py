@@ -23,9 +23,9 @@ from torchgco.roadmap.search import CLEAR, HOPS, LEAST, SMALL, TIE, Graph
 
 AT_ONCE = 64  # problems searched together
 
-POINTS, PATHS, BOXES = (Path(__file__).parent / "c" / name for name in ("points.c", "paths.c", "boxes.h"))
+SEARCH, BOXES = (Path(__file__).parent / "c" / name for name in ("search.c", "boxes.h"))
 BOX = Path(__file__).parents[1] / "native" / "c" / "box.h"
-SCALARS = {"V": "double", "tgco_choose(where, a, b)": "((where) ? (a) : (b))"}  # box.h for one number at a time
+SCALARS = "#define V double\n#define tgco_choose(where, a, b) ((where) ? (a) : (b))"  # box.h for one number at a time
 # Fused products and sums would be rounded once where PyTorch rounds twice.
 FLAGS = ("-ffp-contract=off",)
 
@@ -38,9 +38,8 @@ class Search(Structure):
     declared = (
         ("int64_t", "problems spheres spread candidates points edges neighbours hubs corners directions shells midway"),
         ("double", "margin least clear factor tie"),
-        ("const double *", "centers distances"),  # (B, M, DIM), (B, M): radii, ABSENT where there is no sphere
+        ("const double *", "centers distances"),  # (B, M, DIM), (B, M): radii, negative where absent
         ("const double *", "start goal"),  # (B, DIM)
-        ("const double *", "reach"),  # corners (B, 2, DIM) of the region that holds start, goal and obstacles
         ("const double *", "cube rays shell"),  # (spread, DIM) in the unit cube; (B, directions, DIM); (shells)
         ("double *", "nodes"),  # (B, V, DIM)
         ("int32_t *", "ends"),  # (B, V, K): where edges lead; blocked ones are -1 and come last
@@ -50,6 +49,7 @@ class Search(Structure):
         ("double *", "string"),  # (B, 2 P - 1, DIM)
         ("const double *", "cost"),  # (B, 2 P - 1)
         ("uint8_t *", "arrives"),  # (B)
+        ("const double *", "reach"),  # corners (B, 2, DIM) of the region that holds start, goal and obstacles
         # Read only where there are boxes.
         ("int64_t", "boxes extras"),
         ("const double *", "box"),  # their numbers (B, boxes, BOX_NUMBERS)
@@ -149,10 +149,11 @@ def library_for(like: Tensor, boxes: bool = False) -> ctypes.CDLL | None:
 @functools.cache
 def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.CDLL | None:
     # Without boxes their code is left out, so that it can't change how the spheres' code is compiled.
-    constants = {"DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": SMALL, **(SCALARS if boxes else {})}
-    files = [BOX, BOXES, POINTS, PATHS] if boxes else [POINTS, PATHS]
+    constants = {"DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": SMALL}
+    parts = [BOX, BOXES, SEARCH] if boxes else [SEARCH]
+    texts = (SCALARS, *(part.read_text() for part in parts))
     try:
-        return load("\n".join((head([Search], [], constants), *(file.read_text() for file in files))), [Search], FLAGS)
+        return load("\n".join((head([Search], [], constants), *texts)), [Search], FLAGS)
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)
