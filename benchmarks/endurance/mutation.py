@@ -49,7 +49,7 @@ class Area:
 
 AREAS = (
     Area("lagrangian", ("torchgco/lagrangian/*.py",), (
-        "tests/test_lagrangian.py", "tests/solvers/test_ilqr.py", "tests/solvers/test_optimality.py",
+        "tests/lagrangian/test_lagrangian.py", "tests/solvers/test_ilqr.py", "tests/solvers/test_optimality.py",
         "tests/solvers/test_augmented_lagrangian.py",
     )),
     Area("solvers", ("torchgco/solvers/*.py",), (
@@ -59,9 +59,9 @@ AREAS = (
     )),
     Area("polish", ("torchgco/solvers/polish/*.py",), ("tests/solvers/test_polish.py",)),
     Area("roadmap", ("torchgco/roadmap/*.py",), (
-        "tests/search/test_scene.py", "tests/search/test_homotopy.py", "tests/search/test_roadmap.py",
-        "tests/search/test_graph.py",
-        "tests/search/test_paths.py", "tests/search/test_boxes.py",
+        "tests/search/test_scene.py", "tests/roadmap/test_homotopy.py", "tests/roadmap/test_roadmap.py",
+        "tests/roadmap/test_graph.py",
+        "tests/search/test_paths.py", "tests/roadmap/test_boxes.py",
     )),
     Area("solver in C", ("torchgco/native/c/*.[ch]",), (
         "tests/native/test_emit.py", "tests/native/test_declarations.py", "tests/native/test_engine.py",
@@ -69,8 +69,8 @@ AREAS = (
         "tests/native/test_users.py",
     )),
     Area("roadmap in C", ("torchgco/roadmap/c/*.[ch]",), (
-        "tests/search/test_graph.py", "tests/search/test_roadmap.py", "tests/native/test_overruns.py",
-        "tests/search/test_boxes.py",
+        "tests/roadmap/test_graph.py", "tests/roadmap/test_roadmap.py", "tests/native/test_overruns.py",
+        "tests/roadmap/test_boxes.py",
     )),
 )  # fmt: skip
 

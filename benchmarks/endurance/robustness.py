@@ -28,7 +28,7 @@ PAGE = RESULTS / "robustness.md"
 # Kinds of trials, and the tests that make them: files, folders, or parts of a test's name after "::".
 KINDS: dict[str, tuple[str, ...]] = {
     "wrong options and arguments from Python": (
-        "tests/test_wrong_input.py", "tests/test_wrong_options.py", "tests/test_options.py",
+        "tests/test_wrong_input.py", "tests/test_wrong_options.py", "tests/base/test_options.py",
     ),
     "wrong words and values on the command line": ("tests/experiments/test_wrong_commands.py",),
     "wrong layouts and layout files": ("tests/scenarios/test_layouts.py", "tests/scenarios/test_boxed_layouts.py"),

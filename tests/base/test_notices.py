@@ -14,7 +14,7 @@ import pytest
 from torchgco.base import notices
 from torchgco.native.compiler import find_compiler
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 COMPILE = "from torchgco.native.compiler import build; build('int tgco_one(void) { return 1; }')"
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.constraints.test_boxes import check_bounds, one_by_one
+from tests.obstacles.test_boxes import check_bounds, one_by_one
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch, random_trajectory
 from tests.reference import boxes as brute_force
 from torchgco import Boxes, Capsules, Constraint, InputError, Problem, Spheres
