@@ -98,7 +98,7 @@ def ipopt(problem: Problem, seed: int) -> pd.DataFrame:
             U0 = torch.nn.functional.interpolate(knots, STAGES, mode="linear", align_corners=True).mT.contiguous()
         flights.append(COMPARISON.fly(f"IPOPT, {STARTS} starts", problem, lambda U=U0: solver.solve(problem, U)))
     every = pd.concat(flights)
-    best = every.assign(dear=~every.sound).sort_values(["dear", "cost"], kind="stable")
+    best = every.assign(lost=~every.sound).sort_values(["lost", "cost"], kind="stable")
     best = best[~best.index.duplicated()].sort_index()
     return best.assign(seconds=sum(flight.seconds for flight in flights))
 
