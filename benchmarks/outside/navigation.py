@@ -1,4 +1,4 @@
-"""python -m benchmarks.outside.navigation: the navigation problems of jaxipm, in problems per second and of IPOPT.
+"""python -m benchmarks.outside.navigation: the navigation problems of jaxipm, in problems per second, ours and IPOPT's.
 
 Both solvers run in worker processes with one thread each, one worker, then two that share the starts. IPOPT has the
 published guess and options. All results are judged by `recount`, in NumPy. With --write the table goes into
