@@ -16,6 +16,7 @@ from tests.trials import missions
 from tests.trials import trials as hand_made
 from torchgco.experiments.flying import study
 from torchgco.experiments.reports import report
+from torchgco.experiments.reports.verify import verify
 from torchgco.experiments.statistics.mission_tables import mission_lines
 from torchgco.plotting import missions as draw
 
@@ -141,12 +142,27 @@ def test_bad_missions_are_refused_in_one_line(run, tmp_path, words: list[str], f
     assert not (tmp_path / "out" / "study.json").exists()
 
 
-@pytest.mark.parametrize(("scenario", "words"), [("woods", "trunks (capsules)"), ("mazes", "boxes")])
-def test_worlds_without_spheres_are_refused_in_the_words_of_the_command(run, scenario: str, words: str) -> None:
-    code, _, err = run("experiment=mission", f"scenario={scenario}", "hydra.run.dir=out")
-    line = problem_line(err)
-    assert code == 2 and line.startswith("torchgco: scenario: expected one with spheres alone")
-    assert f"got {scenario}, which has {words}" in line and "Bound" not in line
+@pytest.mark.parametrize("experiment", ["mission", "mission_study"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["scenario=woods", "scenario.density=0.05", "scenario.stages=60"],
+        ["scenario=mazes", "scenario.walls=1", "scenario.loose=2", "scenario.stages=60"],
+    ],
+    ids=["woods", "mazes"],
+)
+def test_missions_fly_through_woods_and_mazes(run, tmp_path, experiment: str, words: list[str]) -> None:
+    layouts = ["study.layouts=1", "study.baselines=[al_ilqr]"] if experiment == "mission_study" else []
+    short = [*words, "mission.duration=0.1", "study.workers=1", "hydra.run.dir=out"]
+    code, out, _ = run(f"experiment={experiment}", *short, *layouts)
+    assert code == 0 and f"{words[0].partition('=')[2]} 0, gco: TIMEOUT after 0.10 s" in out
+    table, log = trials(tmp_path), pd.read_parquet(tmp_path / "out" / "mission.parquet")
+    assert (table["clearance"] > 0).all() and np.isfinite(table["clearance_knots"]).all()
+    nearest = log.groupby("solver", sort=False)["clearance"].min()
+    assert nearest.tolist() == pytest.approx(table["clearance_knots"].tolist())
+    assert (tmp_path / "out" / "figures" / "0-gco.gif").exists()
+    verified, unfinished = verify([tmp_path / "out"])
+    assert not unfinished and not any(study.differs for study in verified)
 
 
 def test_a_plant_needs_a_mission(run) -> None:

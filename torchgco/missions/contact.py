@@ -59,6 +59,6 @@ class Contact(PerElement):
     def _nearest(self, p: Tensor, t: float, dt: float) -> Tensor:
         nearest = torch.full_like(p[:, 0, 0], torch.inf)
         for part in self.obstacles:
-            later = replace(part.later(t), dt=dt)
-            nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(later, p)[1])
+            now = replace(part.later(t), dt=dt) if part.moving else part
+            nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(now, p)[1])
         return nearest
