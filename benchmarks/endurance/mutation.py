@@ -25,8 +25,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from benchmarks.endurance.mutants import Mutant, mutants_of, sampled
-from benchmarks.lib.page import put_between
 from benchmarks.lib.provenance import provenance
+from benchmarks.lib.page import put_between
 from torchgco.experiments.statistics.statistics import wilson
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,13 +34,14 @@ PAGE = ROOT / "benchmarks" / "results" / "mutation.md"
 RECORDS = ROOT / "outputs" / "mutation.jsonl"
 COPIED = ("torchgco", "tests", "benchmarks", "conf", "docs", "notebooks", "pyproject.toml", "README.md")
 KILLED, SURVIVED, TIMEOUT = "killed", "survived", "timeout"
+SAME = "Same results"  # with which the reason of a survivor begins that can't be noticed
 SEED = 30
 SLOWER, SPARE = 3.0, 60.0  # a mutant's limit: so many times as long as its tests take without it, and spare seconds
 
 
 @dataclass(frozen=True)
 class Area:
-    """Files that the same tests guard, the quickest and most likely first: the first failure ends them."""
+    """Files that the same tests guard, the quickest first: the first failure ends them."""
 
     name: str
     files: tuple[str, ...]
@@ -60,19 +61,35 @@ AREAS = (
     Area("polish", ("torchgco/solvers/polish/*.py",), ("tests/solvers/test_polish.py",)),
     Area("roadmap", ("torchgco/roadmap/*.py",), (
         "tests/search/test_scene.py", "tests/roadmap/test_homotopy.py", "tests/roadmap/test_roadmap.py",
-        "tests/roadmap/test_graph.py",
-        "tests/search/test_paths.py", "tests/roadmap/test_boxes.py",
+        "tests/roadmap/test_graph.py", "tests/search/test_paths.py", "tests/roadmap/test_boxes.py",
     )),
     Area("solver in C", ("torchgco/native/c/*.[ch]",), (
-        "tests/native/test_emit.py", "tests/native/test_declarations.py", "tests/native/test_engine.py",
-        "tests/native/test_boxes.py", "tests/native/test_sampler.py", "tests/native/test_overruns.py",
-        "tests/native/test_users.py",
+        "tests/native/test_engine.py", "tests/native/test_declarations.py", "tests/native/test_emit.py",
+        "tests/native/test_sampler.py", "tests/native/test_boxes.py", "tests/native/test_users.py",
+        "tests/native/test_overruns.py",
     )),
     Area("roadmap in C", ("torchgco/roadmap/c/*.[ch]",), (
         "tests/roadmap/test_graph.py", "tests/roadmap/test_roadmap.py", "tests/native/test_overruns.py",
         "tests/roadmap/test_boxes.py",
     )),
 )  # fmt: skip
+
+
+# Of an area's tests, those that some of its files meet first.
+FIRST = {
+    "memory.py": "tests/solvers/test_memory.py", "ending.py": "tests/solvers/test_optimality.py",
+    "lifted.py": "tests/native/test_declarations.py", "boxes.c": "tests/native/test_boxes.py",
+    "mppi.c": "tests/native/test_sampler.py", "normal.c": "tests/native/test_sampler.py",
+    "ilqr.c": "tests/native/test_declarations.py", "trajectories.c": "tests/native/test_engine.py",
+    "traced.c": "tests/native/test_users.py", "lanes.h": "tests/native/test_emit.py",
+    "boxes.h": "tests/roadmap/test_boxes.py",
+}  # fmt: skip
+
+
+def tests_of(mutant: Mutant) -> list[str]:
+    """The tests that a mutant meets, in turn."""
+    name = Path(mutant.path).name
+    return list(dict.fromkeys((*([FIRST[name]] if name in FIRST else []), *area_of(mutant).tests)))
 
 
 def area_of(mutant: Mutant) -> Area:
@@ -129,11 +146,11 @@ class Copy:
 
     def try_out(self, mutant: Mutant, limit: float) -> str:
         """How the tests of the mutant's area end, with the mutant in place of its file."""
-        path, tests = self.root / mutant.path, area_of(mutant).tests
+        path = self.root / mutant.path
         whole = path.read_bytes()
         path.write_bytes(mutant.applied(whole))
         try:
-            return self.ends(tests, limit)
+            return self.ends(tests_of(mutant), limit)
         finally:
             path.write_bytes(whole)
 
@@ -175,17 +192,40 @@ def run(mutants: Sequence[Mutant], records: Path, again: bool = False) -> dict[s
     return known
 
 
-def table(mutants: Sequence[Mutant], ends: dict[str, str]) -> list[str]:
-    """A row per area and one of all: mutants tried, killed, survived, timeout, and the share that died."""
-    lines = ["| area | tried | killed | timeout | survived | noticed |", "| --- | --- | --- | --- | --- | --- |"]
-    tried = [(area_of(mutant).name, ends[mutant.key]) for mutant in mutants if mutant.key in ends]
-    for name in (*dict.fromkeys(area.name for area in AREAS), "all"):
-        count = Counter(end for area, end in tried if name in (area, "all"))
-        n, noticed = count.total(), count[KILLED] + count[TIMEOUT]
-        low, high = (100 * end for end in wilson(noticed, n))
-        share = f"{100 * noticed / n:.0f} % [{low:.0f}, {high:.0f}]" if n else "-"
-        lines.append(f"| {name} | {n} | {count[KILLED]} | {count[TIMEOUT]} | {count[SURVIVED]} | {share} |")
+def table(mutants: Sequence[Mutant], ends: dict[str, str], page: str) -> list[str]:
+    """A row per area and one of all: mutants tried, killed, survived, timeout, and the shares that were noticed."""
+    lines = ["| area | tried | killed | timeout | survived | no change | noticed of all | noticed of changes |"]
+    lines += ["| " + " | ".join(["---"] * 8) + " |"]
+    tried = [mutant for mutant in mutants if mutant.key in ends]
+    for name in (*(area.name for area in AREAS), "all"):
+        part = [mutant for mutant in tried if name in (area_of(mutant).name, "all")]
+        count = Counter(ends[mutant.key] for mutant in part)
+        noticed, same = count[KILLED] + count[TIMEOUT], sum(reason_of(m, page).startswith(SAME) for m in part)
+        shares = f"{_share(noticed, len(part))} | {_share(noticed, len(part) - same)}"
+        ended = " | ".join(str(count[end]) for end in (KILLED, TIMEOUT, SURVIVED))
+        lines.append(f"| {name} | {len(part)} | {ended} | {same} | {shares} |")
     return lines
+
+
+def _share(count: int, n: int) -> str:
+    """A share and its Wilson interval."""
+    if n == 0:
+        return "-"
+    low, high = (100 * end for end in wilson(count, n))
+    return f"{100 * count / n:.0f} % [{low:.0f}, {high:.0f}]"
+
+
+def _change(mutant: Mutant) -> str:
+    """A line of code and the change to it, as cells of the page."""
+    code, old, new = (word.replace("|", "\\|") for word in (mutant.code, mutant.old, mutant.new))
+    return f"| `` {code} `` | {mutant.column}: `` {old} `` {f'to `` {new} ``' if new else 'left out'} |"
+
+
+def reason_of(mutant: Mutant, page: str) -> str:
+    """Why no test fails, as the page says; the line may have moved."""
+    change = _change(mutant)
+    found = [line.split(change)[1].strip(" |") for line in page.splitlines() if change in line]
+    return found[0] if found else "not examined"
 
 
 def survivors(mutants: Sequence[Mutant], ends: dict[str, str], page: str) -> list[str]:
@@ -193,17 +233,13 @@ def survivors(mutants: Sequence[Mutant], ends: dict[str, str], page: str) -> lis
     lines = ["| file:line | code | change | why no test fails |", "| --- | --- | --- | --- |"]
     for mutant in sorted(mutants, key=lambda m: (m.path, m.start)):
         if ends.get(mutant.key) == SURVIVED:
-            code, old, new = (word.replace("|", "\\|") for word in (mutant.code, mutant.old, mutant.new))
-            change = f"| `` {code} `` | {mutant.column}: `` {old} `` {f'to `` {new} ``' if new else 'left out'} |"
-            reason = next((line.split(change)[1] for line in page.splitlines() if change in line), " not examined |")
-            lines.append(f"| {mutant.path.removeprefix('torchgco/')}:{mutant.line} {change}{reason}")
+            place = f"| {mutant.path.removeprefix('torchgco/')}:{mutant.line}"
+            lines.append(f"{place} {_change(mutant)} {reason_of(mutant, page)} |")
     return lines
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.endurance.mutation", description=(__doc__ or "").split("\n")[0]
-    )
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.endurance.mutation", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--each", type=int, default=60, help="mutants of each language")
     parser.add_argument("--seed", type=int, default=SEED, help="of the sample")
     parser.add_argument("--records", type=Path, default=RECORDS, help="what was tried already, and how it ended")
@@ -213,7 +249,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the tests that run and the copy go, too
     mutants = drawn(options.each, options.seed)
     ends = run(mutants, options.records, options.again)
-    origin, lines = provenance("cpu"), [*table(mutants, ends), "", *survivors(mutants, ends, PAGE.read_text())]
+    origin, page = provenance("cpu"), PAGE.read_text()
+    lines = [*table(mutants, ends, page), "", *survivors(mutants, ends, page)]
     head = f"Run on {origin['date']} at commit {origin['commit']}, torch {origin['torch']}; seed {options.seed}."
     text = "\n".join([head, "", *lines])
     print(text)

@@ -108,15 +108,19 @@ def test_mutants_are_killed_survive_or_never_end_and_a_killed_run_goes_on(small:
     }  # fmt: skip
     assert len(tried) == 3 and set(ends) == {m.key for m in made}
     assert (small / "torchgco" / "count.py").read_text() == text
-    assert [line.split(" | ")[1] for line in table(made, ends)[2:]] == [str(len(made))] * 2
+    assert [line.split(" | ")[1] for line in table(made, ends, "")[2:]] == [str(len(made))] * 2
 
 
-def test_the_page_keeps_the_reasons_of_survivors(tmp_path: Path) -> None:
+def test_the_page_keeps_the_reasons_of_survivors(tmp_path: Path, monkeypatch) -> None:
     made = mutants_of(tmp_path, written(tmp_path, "a.py", "a = 1 | 2\n"))
     ends = {mutant.key: SURVIVED for mutant in made}
     first = survivors(made, ends, "")
     assert len(first) == 5 and all(line.endswith("| not examined |") for line in first[2:])
-    page = "\n".join(first).replace("a.py:1", "a.py:7").replace("not examined", "only speed", 1)
+    page = "\n".join(first).replace("a.py:1", "a.py:7").replace("not examined", "Same results: speed", 1)
     again = survivors(made, ends, page)
-    assert [line.rsplit(" | ", 1)[1] for line in again[2:]] == ["only speed |", "not examined |", "not examined |"]
+    reasons = ["Same results: speed |", "not examined |", "not examined |"]
+    assert [line.rsplit(" | ", 1)[1] for line in again[2:]] == reasons
     assert len(survivors(made, {made[0].key: KILLED}, page)) == 2
+    monkeypatch.setattr(mutation, "AREAS", (Area("a", ("a.py",), ()),))
+    row = table(made, {**ends, made[1].key: KILLED, made[2].key: KILLED}, page)[-1]
+    assert row == "| all | 3 | 2 | 0 | 1 | 1 | 67 % [21, 94] | 100 % [34, 100] |"
