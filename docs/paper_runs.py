@@ -17,6 +17,8 @@ from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.native.dispatch import open_loop
 from torchgco.plotting.trajectory import inside
 from torchgco.problem.problem import Problem
+from torchgco.search import PathProposals
+from torchgco.search.proposals import propose
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Advice
 
@@ -155,7 +157,8 @@ def _solve(name: str, overrides: tuple[str, ...], number: int, draws: int) -> So
     setup = compose([*overrides, f"solver={name}", "device.threads=1"])
     layout = setup.scenario.draw([number], setup.seed)
     task = setup.task(layout)
-    solver, witness, paths = setup.solver, None, getattr(setup.solver, "paths", None)
+    solver, witness = setup.solver, None
+    first_round = [one for one in getattr(solver, "passes", ())[:5] if isinstance(one, PathProposals)]
     if hasattr(solver, "local"):
         solver = replace(solver, local=replace(solver.local, record=True))
     else:
@@ -163,8 +166,8 @@ def _solve(name: str, overrides: tuple[str, ...], number: int, draws: int) -> So
         solver = replace(solver, record=True, guidance=witness)
     solution = solver.solve(task.problem, task.U0, seed=setup.seed, ids=torch.tensor([draws]))
     proposal = None
-    if paths is not None and bool((solution.guided > 0).all()):
-        U = paths.propose(task.problem).U  # once more: a proposal makes no random draws
+    if first_round and bool((solution.guided > 0).all()):
+        U = propose(first_round, task.problem).U  # once more: a proposal makes no random draws
         proposal = open_loop(task.problem, U)[0, :, task.problem.position].numpy()
     assert layout.vehicle_radius is not None and layout.dt is not None and task.goal_radius is not None
     scene = (layout.centers[0], layout.radii[0], layout.vehicle_radius, float(task.goal_radius), layout.dt)

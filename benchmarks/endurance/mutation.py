@@ -25,8 +25,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from benchmarks.endurance.mutants import Mutant, mutants_of, sampled
-from benchmarks.lib.provenance import provenance
 from benchmarks.lib.page import put_between
+from benchmarks.lib.provenance import provenance
 from torchgco.experiments.statistics.statistics import wilson
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -239,7 +239,9 @@ def survivors(mutants: Sequence[Mutant], ends: dict[str, str], page: str) -> lis
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.endurance.mutation", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.endurance.mutation", description=(__doc__ or "").split("\n")[0]
+    )
     parser.add_argument("--each", type=int, default=60, help="mutants of each language")
     parser.add_argument("--seed", type=int, default=SEED, help="of the sample")
     parser.add_argument("--records", type=Path, default=RECORDS, help="what was tried already, and how it ended")

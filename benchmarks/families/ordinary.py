@@ -18,6 +18,7 @@ from benchmarks.lib.comparison import timed
 from benchmarks.lib.page import INTERVALS, SET_UP, interval, markdown
 from torchgco import Problem, presets, solve
 from torchgco.lagrangian.rollout import open_loop
+from torchgco.search import Finish
 
 ADMITTED = 1e-3
 HEAD = ("family", "n", "cut off by limits", "default", "ms per problem, cut off", "ms per problem, default")
@@ -33,7 +34,8 @@ class Batch:
 
 def flown(problem: Problem, finished: bool) -> Batch:
     """One batch by the default solver, or by the same without its finish."""
-    solver = presets.gco(problem) if finished else replace(presets.gco(problem), finish=None)
+    solver = presets.gco(problem)
+    solver = replace(solver, passes=tuple(one for one in solver.passes if finished or not isinstance(one, Finish)))
     solve(problem.take(slice(0, 1)), solver=solver, max_seconds=1e-2)  # compiles
     solution, seconds = timed(lambda: solve(problem, solver=solver))
     X = open_loop(problem.dynamics, problem.x0, solution.U)

@@ -18,6 +18,7 @@ from torchgco import (
     ControlBounds,
     FunctionConstraint,
     FunctionDynamics,
+    PathProposals,
     Problem,
     QuadraticCost,
     Solution,
@@ -26,6 +27,11 @@ from torchgco import (
     presets,
     solve,
 )
+
+
+def at_paces(proposals: PathProposals, paces: tuple[float, ...]) -> PathProposals:
+    """The same pass, with paths followed at other paces."""
+    return replace(proposals, follow=tuple(replace(follow, arrive=paces) for follow in proposals.follow))
 
 
 @dataclass(frozen=True)
@@ -48,8 +54,8 @@ class Golden:
         if self.paces is None:
             return solve(problem, U0)
         solver = presets.gco(problem)
-        assert solver.paths is not None
-        return solve(problem, solver=replace(solver, paths=replace(solver.paths, arrive=self.paces)))
+        passes = (at_paces(one, self.paces) if isinstance(one, PathProposals) else one for one in solver.passes)
+        return solve(problem, solver=replace(solver, passes=tuple(passes)))
 
     def batch(self, count: int = 1, seed: int = 0) -> tuple[Problem, Tensor]:
         """The problem from the published start and from count - 1 starts drawn around it; U0 (count, N, m)."""

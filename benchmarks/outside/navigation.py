@@ -64,7 +64,7 @@ def default(problem: Problem, ids: Tensor) -> Callable[[], Solution]:
 
 def local(problem: Problem, ids: Tensor) -> Callable[[], Solution]:
     """The default's local solver alone, AL-iLQR from hovering, to a violation of `TOLERANCE`."""
-    solver = replace(presets.gco(problem).local, violation_tolerance=TOLERANCE)
+    solver = replace(presets.gco(problem).local, guidance=None, violation_tolerance=TOLERANCE)
     return lambda: torchgco.solve(problem, solver=solver, ids=ids)
 
 

@@ -65,10 +65,10 @@ def measure(order: dict[str, Any]) -> dict[str, Any]:
     bench = Bench(sizes, device=order["device"])
     setup = bench.setup("scenario=forest")
     if order["limited"]:
-        setup = replace(setup, solver=_limited(setup.solver))
+        setup = replace(setup, solver=limited(setup.solver))
     batch = order["batch"]
     warm = _task(setup, 0, min(batch, 2))
-    _limited(setup.solver).solve(warm.problem, warm.U0)  # compiles, and allocates what is allocated once
+    limited(setup.solver).solve(warm.problem, warm.U0)  # compiles, and allocates what is allocated once
     held = _start_of_memory(bench.device)
     total, iterations, flown = Took(0.0, 0.0), 0, 0
     # A mean of few problems is uncertain: small batches repeat until `fewest_layouts` layouts are flown.
@@ -86,9 +86,10 @@ def _task(setup: Setup, start: int, batch: int) -> Task:
     return setup.task(setup.scenario.draw(range(start, start + batch), setup.seed))
 
 
-def _limited(solver: Restarts) -> Restarts:
-    """Two outer iterations, and one attempt."""
-    return replace(solver, local=replace(solver.local, max_outer_iterations=2), attempts=1)
+def limited(solver: Restarts) -> Restarts:
+    """Two outer iterations, and one attempt: neither a second round of proposals nor other draws of samples."""
+    passes = (*solver.passes[:7], solver.passes[10], *solver.passes[12:])
+    return replace(solver, local=replace(solver.local, max_outer_iterations=2), passes=passes)
 
 
 def _start_of_memory(device: str) -> int | None:

@@ -12,7 +12,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -25,7 +24,8 @@ from torchgco.native.dispatch import engine_of, sampler_of
 from torchgco.problem.problem import Problem
 
 if TYPE_CHECKING:
-    from benchmarks.speed.bench import Bench  # a process that measures a first solve loads nothing else
+    from benchmarks.speed.batch import limited
+from benchmarks.speed.bench import Bench  # a process that measures a first solve loads nothing else
 
 SECTION = "first_use"
 IMPORTS = 5  # number; their median counts
@@ -67,8 +67,7 @@ def _started(words: list[str], environment: dict[str, str]) -> str:
 def measure(name: str) -> dict[str, float]:
     """Processor seconds, compilers included, by name; for "both, wall" elapsed seconds."""
     problem = _problem(name)
-    solver = presets.gco(problem)
-    solver = replace(solver, local=replace(solver.local, max_outer_iterations=2), attempts=1)
+    solver = limited(presets.gco(problem))
     engine = _took(lambda: engine_of(problem))
     first, again = (_took(lambda: solver.solve(problem, _controls(problem))) for _ in range(2))
     rest = [max(0.0, a - b) for a, b in zip(first, again, strict=True)]

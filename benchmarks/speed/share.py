@@ -13,10 +13,10 @@ SECTION = "share"
 # A phase lasts while its function runs, except for phases inside it; the rest is the outer loop.
 PHASES = {
     "paths sought": "torchgco.roadmap.roadmap.Roadmap.paths",
-    "paths tracked": "torchgco.search.paths.PathProposals.track",
-    "candidates relaxed": "torchgco.search.paths.PathProposals.relax",
+    "paths tracked": "torchgco.search.following.Follow.track",
+    "candidates relaxed": "torchgco.search.proposals.PathProposals.relax",
     "candidates refined": "torchgco.search.candidates.Candidates.refined",
-    "rest of the proposal": "torchgco.search.paths.PathProposals.propose",
+    "rest of the proposal": "torchgco.search.proposals.PathProposals.improve",
     "plans sampled": "torchgco.guidance.mppi.MPPI.improve",
     "set-up": "torchgco.native.engine.Engine.__init__",
 }
