@@ -320,9 +320,9 @@ def test_without_a_compiler_pytorch_solves(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_pivot_of_zero_is_a_failed_factorisation() -> None:
-    """Controls that cost nothing and move nothing: both kernels regularise, where 1 / 0 would follow."""
-    idle = FunctionDynamics(lambda x, u: x + 0.0 * u, 2, 2, dt=1.0, integrator="none")
-    problem = Problem(idle, QuadraticCost([1.0] * 2, [0.0] * 2, [1.0] * 2), [], normal(3, 2), 1)
+    """A control that costs nothing and moves nothing: both kernels regularise. No NaN follows that would show it."""
+    idle = FunctionDynamics(lambda x, u: x + 0.0 * u, 2, 1, dt=1.0, integrator="none")
+    problem = Problem(idle, QuadraticCost([1.0] * 2, [0.0], [1.0] * 2), [], normal(3, 2), 1)
     (a, first), (b, second) = running_state(problem), running_state(problem)
     assert bool(a.merit.isfinite().all())
     end = DAMPED.iterate(a, first)
