@@ -65,9 +65,10 @@ def test_every_experiment_composes_with_every_scenario_model_and_solver(experime
     """As it is, and on every scenario and file; models are named or left to the scenario, solvers take turns."""
     setup = checked(f"experiment={experiment}")
     assert setup.layouts().count == (setup.config.study.layouts or 64)
-    solvers, named = cycle(options_of("solver")), cycle((True, False))
+    turns, named = iter(options_of("solver")[3 * EXPERIMENTS.index(experiment) % 12 :]), cycle((True, False))
     for name, (model, words) in scenes().items():
-        given = [f"experiment={experiment}", *words, f"solver={next(solvers)}"]
+        solver = next(turns) if name in ("forest", *FILES) else "hold"  # whose configuration is quick to compose
+        given = [f"experiment={experiment}", *words, f"solver={solver}"]
         given += [f"model={model}"] if next(named) and f"model={model}" not in words else []
         if experiment in MISSIONS and model != "quadrotor":
             assert "scenario: expected spheres in space for a mission: crossing, forest" in refused(*given)
