@@ -135,13 +135,13 @@ def test_batch_size_counts_those_that_take_a_freed_slot(run, tmp_path, monkeypat
 def test_out_of_memory_reaches_a_wrapped_solver(run, tmp_path, monkeypatch) -> None:
     seen = []
 
-    def iterate(self, call, *rest, real=AugmentedLagrangian.iterate):
+    def outer_loop(self, call, *rest, real=AugmentedLagrangian.outer_loop):
         seen.append(self.slots)
         if self.slots > 1:
             raise torch.OutOfMemoryError("no more")
         return real(self, call, *rest)
 
-    monkeypatch.setattr(AugmentedLagrangian, "iterate", iterate)
+    monkeypatch.setattr(AugmentedLagrangian, "outer_loop", outer_loop)
     words = ["solver=multistart", "solver.starts=1", "solver.local.max_outer_iterations=1", "scenario.stages=5"]
     code, _, err = run(*words, "study.layouts=4", "study.baselines=[]", "study.workers=1", "hydra.run.dir=out")
     assert code == 0 and seen == [4, 2, 1] and "on with 1 problems at once" in err

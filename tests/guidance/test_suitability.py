@@ -33,7 +33,7 @@ from torchgco import (
 )
 from torchgco.base import kernels
 from torchgco.guidance.gco import REACH, _radius
-from torchgco.guidance.suitability import SAMPLES, suited_sampler
+from torchgco.guidance.suitability import TRIAL_SAMPLES, suited_sampler
 from torchgco.native.compiler import find_compiler
 from torchgco.search import Follow, PathProposals
 
@@ -163,7 +163,7 @@ class RefusesSamples(FunctionDynamics):
     """Accepts trajectories, but not several samples at once."""
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
-        if x.shape[1:-1] == (SAMPLES,):
+        if x.shape[1:-1] == (TRIAL_SAMPLES,):
             raise IndexError("no samples here")
         return super().step(x, u)
 

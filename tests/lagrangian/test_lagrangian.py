@@ -5,7 +5,7 @@ import torch
 
 from tests.problems import planar_batch, quadrotor_batch, random_trajectory
 from torchgco.constraints import FunctionConstraint, StateBounds
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, penalty_weights, update
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, penalty_weights, update_and_raise_penalty
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion
 from torchgco.problem.problem import Problem
 
@@ -140,7 +140,7 @@ def test_update_of_multipliers_and_penalty() -> None:
     problem, _ = planar_batch(B=2, N=5)
     X, U = random_trajectory(problem)
     multipliers = _random_multipliers(problem, X, U)
-    new = update(problem, X, U, multipliers, 3.0, mu_max=30.0)
+    new = update_and_raise_penalty(problem, X, U, multipliers, 3.0, mu_max=30.0)
     for constraint, lam, after in zip(problem.constraints, multipliers.lam, new.lam, strict=True):
         expected = lam + multipliers.mu.view(-1, 1, 1) * constraint.value(X, U)
         torch.testing.assert_close(after, expected.clamp(min=0.0))

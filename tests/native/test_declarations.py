@@ -148,9 +148,9 @@ def run(inner: ILQR, prepare: Callable[[State], None], problem: Problem, native:
     state, lagrangian = running_state(problem)
     prepare(state)
     for _ in range(count):
-        end = advance(inner, state, lagrangian, 1) if native else inner.iterate(state, lagrangian)
+        end = advance(inner, state, lagrangian, 1) if native else inner.one_iteration(state, lagrangian)
         while not native and bool((end.failed & (end.status == Status.RUNNING)).all()):
-            end = inner.iterate(state, lagrangian)
+            end = inner.one_iteration(state, lagrangian)
     return state
 
 
@@ -266,7 +266,7 @@ def test_the_collision_penalty_changes_both_kernels(monkeypatch) -> None:
 
 
 OF_ROADMAP = {
-    "SHELLS": {2: (1.4,)}, "RAYS": 5, "MIDWAY": 1, "CLEAR": 0.4, "LEAST": 0.3, "HOPS": 1, "TIE": 0.5, "AROUND": 4.0,
+    "SHELLS": {2: (1.4,)}, "RAYS": 5, "MIDWAY": 1, "CLEAR": 0.4, "EDGE_COST": 0.3, "HOPS": 1, "TIE": 0.5, "AROUND": 4.0,
     "TINY": 3.0, "SMALL": 30.0,
 }  # fmt: skip
 

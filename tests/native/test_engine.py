@@ -158,7 +158,7 @@ def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict
     ends: dict[int, tuple[bool, bool, int]] = {}
     for _ in range(3 * count):
         frozen = replace(state)
-        end = inner.iterate(state, lagrangian)
+        end = inner.one_iteration(state, lagrangian)
         for b in range(lagrangian.problem.B):
             if b in ends:  # an ended problem keeps its state
                 for name in ("X", "U", "cost", "merit", "inner", "iterations", "rung", "regularisation"):
@@ -269,7 +269,7 @@ def test_statuses_are_those_of_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
         native = natively(inner, b, second, 3)
         statuses = torch.zeros(2, dtype=torch.int64)
         for _ in range(20):
-            end = inner.iterate(a, first)
+            end = inner.one_iteration(a, first)
             statuses = torch.where(statuses == 0, end.status, statuses)
             if bool((end.ended | (statuses > 0)).all()):
                 break
@@ -325,7 +325,7 @@ def test_a_pivot_of_zero_is_a_failed_factorisation() -> None:
     problem = Problem(idle, QuadraticCost([1.0] * 2, [0.0], [1.0] * 2), [], normal(3, 2), 1)
     (a, first), (b, second) = running_state(problem), running_state(problem)
     assert bool(a.merit.isfinite().all())
-    end = DAMPED.iterate(a, first)
+    end = DAMPED.one_iteration(a, first)
     native = natively(DAMPED, b, second, 1)
     assert bool(end.failed.all()) and a.regularisation.tolist() == [ilqr.REGULARISATION_FIRST] * 3
     assert native.used.tolist() == [ilqr.REGULARISATION_FIRST] * 3 and not bool(native.stuck.any())

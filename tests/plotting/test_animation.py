@@ -51,8 +51,8 @@ def test_a_mission_plays_in_real_time_and_stands_at_its_end(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("steps", [20, 30, 31, 100])
 def test_a_long_mission_has_few_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
-    assert animation.MOST == 100
-    monkeypatch.setattr(animation, "MOST", 10)
+    assert animation.MAX_FRAMES == 100
+    monkeypatch.setattr(animation, "MAX_FRAMES", 10)
     frame, plans = flown(steps)
     found, duration = pictures(mission_animation(frame, plans, course(0.0), PERIOD, tmp_path / "a.gif"))
     assert 5 < len(found) <= 10 and duration <= 2000

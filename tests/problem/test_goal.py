@@ -11,7 +11,7 @@ from torch import Tensor
 from tests.problems import planar_batch, quick_gco
 from torchgco import Cost, FunctionDynamics, Goal, InputError, Planar, Problem, Spheres, judge
 from torchgco.lagrangian.quality import goal_tolerance, has_arrived
-from torchgco.problem.goal import SHARE
+from torchgco.problem.goal import RADIUS_SHARE
 from torchgco.roadmap.scene import arrives, scene_of
 
 CUP = [[0.0, -0.25], [0.1, 0.0], [0.12, 0.25], [0.0, 0.5], [-0.2, 0.6], [-0.2, -0.35]]
@@ -48,7 +48,7 @@ def test_a_quadratic_cost_names_its_goal() -> None:
     assert problem.goal is not None and problem.goal.assumed
     assert problem.goal.position.tolist() == [[1.0, 0.4]] * 2
     apart = (4.0 + 0.16) ** 0.5
-    assert problem.goal.radius.tolist() == pytest.approx([SHARE * apart] * 2)
+    assert problem.goal.radius.tolist() == pytest.approx([RADIUS_SHARE * apart] * 2)
     X = ending(problem, (1.0, 0.4 + 0.089 * apart), (1.0, 0.4 + 0.091 * apart))
     assert has_arrived(problem, X).tolist() == [True, False]
     assert has_arrived(problem, X, 2.0).tolist() == [True, True]
@@ -63,7 +63,7 @@ def test_a_given_goal_prevails_over_the_cost_and_is_aimed_at_closely() -> None:
     assert problem.goal is not None and problem.goal.position.tolist() == [[1.0, 0.3], [0.9, 0.4]]
     near = goal_tolerance(problem)
     assert near is not None and float(near[0]) == 0.01  # a goal radius below 9 % is the tolerance,
-    assert float(near[1]) == pytest.approx(SHARE * (1.9**2 + 0.16) ** 0.5)  # a larger one is reduced to 9 %
+    assert float(near[1]) == pytest.approx(RADIUS_SHARE * (1.9**2 + 0.16) ** 0.5)  # a larger one is reduced to 9 %
     X = ending(problem, (1.0, 0.32), (0.9, 0.5))
     assert has_arrived(problem, X).tolist() == [False, True] and arrives(problem, X).tolist() == [True, True]
     assert judge(problem, U).reached.tolist() == [False, bool(judge(problem, U).feasible[1])]

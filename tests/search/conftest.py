@@ -14,7 +14,7 @@ from torchgco.search.candidates import LINE_SEARCH
 @pytest.fixture
 def solves(monkeypatch) -> Iterator[list[Solve]]:
     """All local solves made after this fixture, in order; those that refine candidates are left out."""
-    made, iterate = [], AugmentedLagrangian.iterate
+    made, iterate = [], AugmentedLagrangian.outer_loop
 
     def noted(self, call, guidance=None, penalty=None, *rest, **options):
         end = iterate(self, call, guidance, penalty, *rest, **options)
@@ -22,7 +22,7 @@ def solves(monkeypatch) -> Iterator[list[Solve]]:
             made.append(Solve(call, guidance, penalty, end))
         return end
 
-    monkeypatch.setattr(AugmentedLagrangian, "iterate", noted)
+    monkeypatch.setattr(AugmentedLagrangian, "outer_loop", noted)
     yield made
 
 

@@ -75,7 +75,7 @@ def test_an_arrived_iterate_is_kept_within_an_attempt_too(by_arrival: bool, monk
     monkeypatch.setattr("torchgco.lagrangian.quality.GOAL_TOLERANCE", 0.5)
     problem, U0, local = given(monkeypatch)
     call = Call.checked(problem, torch.full_like(U0, ARRIVES))
-    end = local.iterate(call, Given(levels=(STAYS,)), by_arrival=by_arrival)
+    end = local.outer_loop(call, Given(levels=(STAYS,)), by_arrival=by_arrival)
     assert bool(end.best.U.mean() > 3.0) == by_arrival
 
 

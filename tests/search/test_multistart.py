@@ -48,7 +48,7 @@ def test_a_spent_budget_ends_the_starts() -> None:
 def test_the_budget_counts_the_iterations_of_every_start(monkeypatch) -> None:
     """A start begins if and only if the iterations of the earlier solves are below the budget."""
     made: dict[int, list[int]] = {b: [] for b in range(4)}
-    iterate = AugmentedLagrangian.iterate
+    iterate = AugmentedLagrangian.outer_loop
 
     def noted(self, call, *rest, **options):
         end = iterate(self, call, *rest, **options)
@@ -58,7 +58,7 @@ def test_the_budget_counts_the_iterations_of_every_start(monkeypatch) -> None:
 
     problem, U0 = planar_batch(B=4, N=25, obstacles=9, seed=4)
     problem.x0[2, :2] = problem.constraints[0].centers[2, 0]  # inside an obstacle: no guess helps
-    monkeypatch.setattr(AugmentedLagrangian, "iterate", noted)
+    monkeypatch.setattr(AugmentedLagrangian, "outer_loop", noted)
     guided = replace(LOCAL, guidance=GCO(MPPI(samples=8), single_contact_after=1))
     budget = 40
     solution = MultiStart(guided, starts=50, budget=budget, covariance=9.0, noise_knots=5).solve(problem, U0)

@@ -88,7 +88,7 @@ def test_the_cheapest_relaxed_candidate_is_proposed() -> None:
 def test_chunks_change_no_result(monkeypatch) -> None:
     problem, two = cups(N=40), varied(QUICK, num_paths=2, iterations=2, relax_iterations=1)
     whole = proposed(two, problem)
-    for size in ("proposals.AT_ONCE", "candidates.AT_ONCE"):
+    for size in ("proposals.PATHS_AT_ONCE", "candidates.CANDIDATES_AT_ONCE"):
         monkeypatch.setattr(f"torchgco.search.{size}", 4)
     parts = proposed(two, problem)
     assert torch.equal(whole.U, parts.U) and torch.equal(whole.found, parts.found)

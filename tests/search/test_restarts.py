@@ -120,7 +120,7 @@ def test_without_a_path_and_without_samples_the_stopped_solve_continues(solves: 
     """All proposals penetrate deeper than `max_penetration`; their candidates' iterations still count."""
     problem, U0 = gates()
     problem, U0 = problem.take(torch.tensor([PASSES])), U0[:1]
-    caught = LOCAL.iterate(Call.checked(problem, U0).in_cost_units()[0], StopWhenCaught(None))
+    caught = LOCAL.outer_loop(Call.checked(problem, U0).in_cost_units()[0], StopWhenCaught(None))
     shallow = replace(PATHS, max_penetration=1e-9)
     proposal, more = proposed(shallow, problem), proposed(thorough(shallow), problem)
     solution = restarts(LOCAL, shallow).solve(problem, U0)
@@ -236,7 +236,7 @@ def test_a_caught_problem_without_a_path_or_samples_is_solved_to_its_end() -> No
     problem = Problem(problem.dynamics, problem.cost, [moving, *problem.constraints[1:]], problem.x0, problem.N)
     local = AugmentedLagrangian(ILQR(max_iterations=10), initial_penalty=0.1, max_outer_iterations=12)
     scaled, _ = Call.checked(problem, U0).in_cost_units()
-    stopped, reports = local.iterate(scaled, StopWhenCaught(None)), []
+    stopped, reports = local.outer_loop(scaled, StopWhenCaught(None)), []
     assert bool((stopped.status == STOPPED).any())
     end = restarts(local, PathProposals()).solve(problem, U0, callback=reports.append)
     assert reports[-1].finished == problem.B

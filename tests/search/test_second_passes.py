@@ -118,7 +118,7 @@ def test_no_path_is_followed_more_slowly_than_the_pace(woods, monkeypatch) -> No
 
 def test_costly_problems_in_small_parts_keep_their_bits(woods, monkeypatch) -> None:
     whole, times = noted(costly(1e-9), woods)
-    monkeypatch.setattr("torchgco.search.proposals.AT_ONCE", 2 * FIRST.num_paths)
+    monkeypatch.setattr("torchgco.search.proposals.PATHS_AT_ONCE", 2 * FIRST.num_paths)
     parts, more = noted(costly(1e-9), woods)
     assert [size for _, size, _ in times] == [4, 4, 4] and [size for _, size, _ in more] == [2, 2, *[1] * 8]
     assert torch.equal(parts.U, whole.U) and torch.equal(parts.iterations, whole.iterations)
@@ -141,13 +141,13 @@ def test_among_moving_obstacles_the_first_solve_runs_to_its_end(monkeypatch) -> 
     assert not has_paths(problem) and isinstance(solver, Restarts)
     local = replace(solver.local, max_outer_iterations=10)  # too few for some
     unguided = replace(local, guidance=None)
-    guides, iterate = [], AugmentedLagrangian.iterate
+    guides, iterate = [], AugmentedLagrangian.outer_loop
 
     def note(self, call, guidance=None, *words, **more):
         guides.append((type(guidance), call.problem.B))
         return iterate(self, call, guidance, *words, **more)
 
-    monkeypatch.setattr(AugmentedLagrangian, "iterate", note)
+    monkeypatch.setattr(AugmentedLagrangian, "outer_loop", note)
     alone = unguided.solve(problem, U0)
     guides.clear()
     found = replace(solver, local=local).solve(problem, U0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-MOST = 300  # letters of a value in an error
+MAX_LETTERS = 300  # letters of a value in an error
 
 
 class InputError(ValueError):
@@ -11,7 +11,8 @@ class InputError(ValueError):
     def __init__(self, field: str, expected: str, got: object) -> None:
         self.field, self.expected, self.got = field, expected, got
         text = " ".join(str(got).split())
-        super().__init__(f"{field}: expected {expected}, got {text if len(text) <= MOST else f'{text[:MOST]}...'}")
+        shown = text if len(text) <= MAX_LETTERS else f"{text[:MAX_LETTERS]}..."
+        super().__init__(f"{field}: expected {expected}, got {shown}")
 
     def __reduce__(self) -> tuple[type, tuple[str, str, str]]:
         return type(self), (self.field, self.expected, str(self.got))  # so that a worker process can return it

@@ -17,7 +17,7 @@ from torchgco.guidance.mppi import MPPI
 from torchgco.native.dispatch import engine_of
 from torchgco.problem.problem import Problem
 
-SAMPLES = 2  # of a trial
+TRIAL_SAMPLES = 2  # of a trial
 
 
 def suited_sampler(sampler: MPPI | None, problem: Problem) -> tuple[MPPI | None, str | None]:
@@ -73,8 +73,8 @@ def failure(trial: Callable[[Problem], None], problem: Problem, dtype: torch.dty
 
 def _sample(problem: Problem) -> None:
     """One stage of some samples of one problem."""
-    x = problem.x0.unsqueeze(1).repeat(1, SAMPLES, 1)
-    u = x.new_zeros(1, SAMPLES, problem.m)
+    x = problem.x0.unsqueeze(1).repeat(1, TRIAL_SAMPLES, 1)
+    u = x.new_zeros(1, TRIAL_SAMPLES, problem.m)
     cost = problem.cost.stage(x, u, 0) + problem.cost.terminal(x)
     after = problem.dynamics.step(x, u)
     check_form("dynamics", after, x)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchgco.obstacles.boxes import BoundBoxes
 
-ROUNDS = 70  # each shrinks a segment by a third
+SHRINKAGES = 70  # each shrinks a segment by a third
 
 
 def box_distance(boxes: BoundBoxes, p: Tensor) -> Tensor:
@@ -40,7 +40,7 @@ def _closest(axes: Tensor, center: Tensor, half: Tensor, a: Tensor, along: Tenso
     a, along = (axes @ (a - center).unsqueeze(-1)).squeeze(-1), (axes @ along.unsqueeze(-1)).squeeze(-1)
     low = torch.zeros_like(a[:, :1])
     high = torch.ones_like(low)
-    for _ in range(ROUNDS):
+    for _ in range(SHRINKAGES):
         left, right = low + (high - low) / 3, high - (high - low) / 3
         falls = (_distance(a + left * along, half) > _distance(a + right * along, half)).unsqueeze(-1)
         low, high = torch.where(falls, left, low), torch.where(falls, high, right)

@@ -143,7 +143,7 @@ class Lagrangian:
         return slack
 
 
-def update(
+def update_and_raise_penalty(
     problem: Problem, X: Tensor, U: Tensor, multipliers: Multipliers, growth: Tensor | float, mu_max: float
 ) -> Multipliers:
     """lam + mu c, at least 0 for inequalities; mu times `growth`, at most mu_max (Equations 21, 22)."""

@@ -7,10 +7,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchgco.problem.goal import SHARE
+from torchgco.problem.goal import RADIUS_SHARE
 from torchgco.problem.problem import Problem
 
-GOAL_TOLERANCE = SHARE  # share of the distance from start to goal
+GOAL_TOLERANCE = RADIUS_SHARE  # share of the distance from start to goal
 
 
 class Rated(Protocol):

@@ -52,7 +52,7 @@ class Plan:
 TRAJECTORY = ("X", "U", "K", "multipliers", "penalty", "cost", "violation", "shifted")
 OTHERS = ("guided", "iterations", "measured", "bias")
 CONTINUED = 4  # outer iterations at most that continue a former plan
-LEAST = 1e-4  # s, of a time limit
+MIN_SECONDS = 1e-4  # s, of a time limit
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ class _Solve:
         self._keep_former(plan, before, U0, multipliers)
         rows = (~(plan.violation <= self.planner.tolerance)).nonzero().flatten()
         left = self._time_left()
-        if self.local is not self.solver and rows.numel() > 0 and (left is None or left > LEAST):
+        if self.local is not self.solver and rows.numel() > 0 and (left is None or left > MIN_SECONDS):
             found = self._plan(self._solved(self.solver, self.problem.take(rows), U0[rows], None, self.ids[rows]))
             self._replace(plan, rows, found)
             for name in ("guided", "iterations"):
@@ -210,9 +210,9 @@ class _Solve:
         return solver.solve(problem, U0, seed=self.seed, ids=ids, warm=warm, max_seconds=self._time_left())
 
     def _time_left(self) -> float | None:
-        """Seconds that are left of the limit, at least `LEAST`; None without a limit."""
+        """Seconds that are left of the limit, at least `MIN_SECONDS`; None without a limit."""
         limit = self.planner.max_seconds
-        return None if limit is None else max(LEAST, limit - (time.perf_counter() - self.began))
+        return None if limit is None else max(MIN_SECONDS, limit - (time.perf_counter() - self.began))
 
     def _keep_former(self, plan: Plan, before: Plan, U: Tensor, multipliers: Multipliers) -> None:
         """Put former plans, flown one stage later by U, in the place of new ones that are infeasible and worse."""

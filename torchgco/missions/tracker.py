@@ -15,7 +15,7 @@ from torchgco.constraints import StateBounds
 from torchgco.costs import QuadraticCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.quadrotor import GRAVITY, Airframe, RotorTracking
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted, update
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted, update_and_raise_penalty
 from torchgco.lagrangian.quality import violation
 from torchgco.missions.constraints import ThrustSum
 from torchgco.problem.problem import Problem
@@ -116,7 +116,7 @@ class Tracker:
         for _ in range(rounds):
             found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, self.inner.rules.phr), U)
             U = found.U
-            multipliers = update(problem, found.X, U, multipliers, growth, PENALTY_MAX)
+            multipliers = update_and_raise_penalty(problem, found.X, U, multipliers, growth, PENALTY_MAX)
         return Tracking(problem, U[:, 0], violation(problem, found.X, U), U, multipliers)
 
     def _reference(self, x: Tensor, reference: Reference, offset: float) -> tuple[Tensor, Tensor]:

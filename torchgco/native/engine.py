@@ -25,7 +25,7 @@ from torchgco.native.structures import STRUCTURES, array
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
 
-MOST = 128  # states and controls together: the matrices of a stage lie on the stack
+MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
 class Engine:
@@ -39,8 +39,8 @@ class Engine:
     def __init__(self, problem: Problem) -> None:
         if problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
-        if problem.n + problem.m > MOST:
-            raise InputError("dynamics", f"at most {MOST} states and controls together", problem.n + problem.m)
+        if problem.n + problem.m > MAX_VARIABLES:
+            raise InputError("dynamics", f"at most {MAX_VARIABLES} states and controls together", problem.n + problem.m)
         self.model = trace_dynamics(problem.dynamics)
         quadratic = problem.cost if type(problem.cost) is BoundQuadratic else None
         self.cost = trace_cost(problem) if quadratic is None else None
@@ -119,7 +119,7 @@ class Engine:
         self._run("tgco_lift", B, packed)
         return found != 0
 
-    def iterate(
+    def inner_solve(
         self, lagrangian: Lagrangian, state: dict[str, Tensor], options: c.Options, limit: int
     ) -> dict[str, Tensor]:
         """Up to `limit` iterations of every problem's inner solve, in place in `state`.

@@ -22,7 +22,7 @@ from torchgco.plotting.missions import check_plans
 from torchgco.plotting.style import INK, PALETTE, tidy
 
 FPS = 5
-MOST = 100  # frames of a mission
+MAX_FRAMES = 100  # frames of a mission
 DPI = 80
 PALE = "#C8C8C8"
 
@@ -60,7 +60,7 @@ def mission_animation(
     """
     t, track = flight(frame, "t")["t"], positions(frame)
     check_plans(plans, len(t))
-    every = max(1, round(1.0 / (FPS * period)), ceil((len(t) - 1) / (MOST - 2)))
+    every = max(1, round(1.0 / (FPS * period)), ceil((len(t) - 1) / (MAX_FRAMES - 2)))
     steps = sorted({*range(0, len(t), every), len(t) - 1})
     low, high = course.limits(track)
     spans = (high - low)[1:] / (high - low)[0]
@@ -75,7 +75,7 @@ def mission_animation(
             tidy(ax, f"{title}  {t[step]:.1f} s".strip() if plane == draw.ABOVE else "", grid=None)
         axes[0].set_xlabel("")
 
-    last = steps[-1:] * min(FPS, MOST - len(steps))  # the end stays for a second
+    last = steps[-1:] * min(FPS, MAX_FRAMES - len(steps))  # the end stays for a second
     return _write(figure, show, [*steps, *last], path)
 
 

@@ -12,7 +12,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement
 
-SHARE = 0.09  # radius of a goal that is derived from a cost, as a share of the distance from start to goal
+RADIUS_SHARE = 0.09  # radius of a goal that is derived from a cost, as a share of the distance from start to goal
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Goal(PerElement):
             return None
         check_shape(state, (dims.B, dims.n), "cost.goal")
         apart = (dims.like - state)[:, dims.position].square().sum(-1).sqrt()
-        return cls(state[:, dims.position], SHARE * apart, assumed=True)
+        return cls(state[:, dims.position], RADIUS_SHARE * apart, assumed=True)
 
     def distance(self, p: Tensor) -> Tensor:
         """Distances (B, ...) of points p (B, ..., d) from the centre, m."""

@@ -13,7 +13,7 @@ from torchgco.base.tree import take
 from torchgco.obstacles.base import TINY, Solids
 from torchgco.obstacles.box_geometry import Cuboids
 
-AT_ONCE = 2**18  # distances between points and obstacles that are held at once
+DISTANCES_AT_ONCE = 2**18  # distances between points and obstacles that are held at once
 AROUND = 1.5  # times as large as they are, obstacles lie within the region in which points are spread
 
 
@@ -60,7 +60,8 @@ class Inflated(NamedTuple):
     def depth(self, points: Tensor) -> Tensor:
         """How deep points (B, V, d) lie beneath the surface of an obstacle, (B, V), m; negative outside of all."""
         B, V = points.shape[:2]
-        parts = torch.arange(B, device=points.device).split(max(1, AT_ONCE // max(1, V * self.sizes.shape[1])))
+        at_once = max(1, DISTANCES_AT_ONCE // max(1, V * self.sizes.shape[1]))
+        parts = torch.arange(B, device=points.device).split(at_once)
         return torch.cat([take(self, rows)._depth(points[rows]) for rows in parts])
 
     def _depth(self, points: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgco.roadmap.geometry import Inflated, length, points_along
 
-POINTS = 65  # at which two paths in space are compared
+COMPARED_POINTS = 65  # at which two paths in space are compared
 
 
 def classes(paths: Tensor, obstacles: Inflated) -> Tensor:
@@ -42,7 +42,7 @@ def _wind_alike(paths: Tensor, obstacles: Inflated) -> Tensor:
 def _are_close(paths: Tensor, obstacles: Inflated) -> Tensor:
     """(B, K, K): nowhere farther apart than the largest obstacle's size, at the same shares of their lengths."""
     flat = paths.flatten(0, 1)
-    share = torch.linspace(0.0, 1.0, POINTS, dtype=flat.dtype, device=flat.device)
-    points = points_along(flat, share * length(flat).unsqueeze(-1)).view(*paths.shape[:2], POINTS, -1)
+    share = torch.linspace(0.0, 1.0, COMPARED_POINTS, dtype=flat.dtype, device=flat.device)
+    points = points_along(flat, share * length(flat).unsqueeze(-1)).view(*paths.shape[:2], COMPARED_POINTS, -1)
     apart = (points.unsqueeze(2) - points.unsqueeze(1)).square().sum(-1).amax(-1).sqrt()
     return apart <= obstacles.largest.unsqueeze(-1)

@@ -19,9 +19,9 @@ from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.points import MIDWAY, RAYS, SHELLS, directions, of_boxes
-from torchgco.roadmap.search import CLEAR, HOPS, LEAST, SMALL, TIE, Graph
+from torchgco.roadmap.search import CLEAR, EDGE_COST, HOPS, SMALL, TIE, Graph
 
-AT_ONCE = 64  # problems searched together
+PROBLEMS_AT_ONCE = 64  # problems searched together
 
 SEARCH, BOXES = (Path(__file__).parent / "c" / name for name in ("search.c", "boxes.h"))
 BOX = Path(__file__).parents[1] / "native" / "c" / "box.h"
@@ -123,7 +123,7 @@ class NativeSearch:
             read |= {"box": _numbers(boxes), "largest": boxes.sizes.amax(-1)}
         read = {field: tensor.contiguous() for field, tensor in read.items()}
         B, M = spheres.radii.shape
-        numbers |= {"margin": self.margin, "clear": CLEAR, "least": LEAST, "tie": TIE}
+        numbers |= {"margin": self.margin, "clear": CLEAR, "least": EDGE_COST, "tie": TIE}
         search = Search(problems=B, spheres=M, corners=HOPS + 1, **read, **written, **numbers)
         if not getattr(self.library, name)(ctypes.byref(search)):
             raise MemoryError("native kernels: no memory")

@@ -17,7 +17,7 @@ from torchgco.obstacles.box_geometry import Coordinates, Cuboids, at_share, near
 RAYS = 8  # points of a circle
 SHELLS = {2: (1.05, 1.3), 3: (1.15,)}  # radii of the circles of points around a sphere, by the number of coordinates
 MIDWAY = 4  # nearest neighbours of an obstacle: each gap to one gets a point
-ROUNDS = 8  # projections from one box to the other and back; the two points converge to the nearest of both
+PROJECTIONS = 8  # projections from one box to the other and back; the two points converge to the nearest of both
 PAIRS = 32768  # of boxes that are projected onto each other at once: their coordinates fit into the processor's cache
 
 
@@ -95,7 +95,7 @@ def _gaps(boxes: Cuboids, spheres: Solids, start: Tensor, goal: Tensor) -> tuple
     first = torch.where(thin, _world(boxes, _level(boxes, start, goal)), boxes.centers)
     other: Coordinates = [x.unsqueeze(2).expand(-1, -1, K) for x in first.unbind(-1)]  # (B, j, i): of box j, for box i
     own = other
-    for _ in range(ROUNDS):
+    for _ in range(PROJECTIONS):
         before, own = own, _projected(boxes, other)  # of box i, for box j
         other = _swapped(_projected(boxes, _swapped(own)))
         if all(torch.equal(x, y) for x, y in zip(before, own, strict=True)):

@@ -22,7 +22,9 @@ from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.search import Search
 
-AT_ONCE = 4  # problems that PyTorch searches together: memory holds the distances of all edges from all obstacles
+PROBLEMS_AT_ONCE = (
+    4  # problems searched together by PyTorch: memory holds distances of all edges from all obstacles
+)
 NODES = 128  # points around obstacles: those of the shortest detours
 # A second search has more points, where the first had no places for all of them and found no path, or only a long one
 # (in distances from start to goal): the points next to the straight line take all places, before any lies in the gaps
@@ -63,7 +65,7 @@ class Roadmap:
             path; and whether there is a path (B,).
         """
         library = roadmap.library_for(scene.start, scene.obstacles.boxes is not None)
-        most = AT_ONCE if library is None else roadmap.AT_ONCE
+        most = PROBLEMS_AT_ONCE if library is None else roadmap.PROBLEMS_AT_ONCE
         everyone = torch.arange(scene.start.shape[0], device=scene.start.device)
         parts = [self._paths(scene, rows, count, library) for rows in everyone.split(most)]
         return torch.cat([path for path, _ in parts]), torch.cat([found for _, found in parts])

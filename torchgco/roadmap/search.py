@@ -22,7 +22,7 @@ from torchgco.roadmap.points import around_spheres, between_spheres, of_boxes
 HOPS = 64  # edges of a path, at most
 CLEAR = 0.001  # smallest gap between a point and all obstacles, as a share of the largest r_obs + r_veh
 TIE = 1e-12  # share of the cost by which equally cheap paths may differ
-LEAST = 1e-6  # share of the distance from start to goal that is added to every edge: no edge may cost nothing
+EDGE_COST = 1e-6  # share of the distance from start to goal that is added to every edge: no edge may cost nothing
 SMALL = 1e-9  # m: the margin's unit is at least this
 CLASS = 8  # paths are drawn taut in groups: those of up to 8 edges, of up to 16, ...
 
@@ -167,7 +167,7 @@ class Search:
             gap = torch.minimum(gap, left.amin(-1).view(ends.shape))
         length = (b - a).square().sum(-1).sqrt().view(ends.shape)
         # Every edge costs something: otherwise paths could circle among points that coincide.
-        length = length + LEAST * (points[:, 1] - points[:, 0]).square().sum(-1).sqrt().view(-1, 1, 1)
+        length = length + EDGE_COST * (points[:, 1] - points[:, 0]).square().sum(-1).sqrt().view(-1, 1, 1)
         margin = self.margin * self.obstacles.largest.clamp(min=SMALL).view(-1, 1, 1)
         close = 1.0 + ((margin - gap) / margin).clamp(0.0, 1.0)
         return torch.where(free, length * close, torch.inf)

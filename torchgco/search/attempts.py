@@ -67,9 +67,9 @@ class Best:
         guide_first: bool = False,
         solver: AugmentedLagrangian | None = None,
     ) -> SolveEnd:
-        """A solve with progress and trace of the whole; see `AugmentedLagrangian.iterate`. None: by the own solver."""
+        """A solve with progress and trace of the whole; see `AugmentedLagrangian.outer_loop`. None: by its own."""
         call = replace(call, callback=self._callback(call))
-        return (solver or self.solver).iterate(call, guidance, penalty, self.recorder, guide_first, by_arrival=True)
+        return (solver or self.solver).outer_loop(call, guidance, penalty, self.recorder, guide_first, by_arrival=True)
 
     def keep(self, rows: Tensor, new: SolveEnd) -> None:
         """Keep the better of the old and the new trajectories of `rows`: arrived, then feasible, then cheapest."""

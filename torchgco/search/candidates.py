@@ -20,7 +20,7 @@ from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR, descend
 from torchgco.solvers.line_search import LineSearch
 
-AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
+CANDIDATES_AT_ONCE = 256  # candidates solved at once: bounds the memory of any batch
 PENALTY = 80.0  # of obstacles for candidates without a guide, in q0 / R^4
 TOLERANCE = 5e-5  # of tracking and relaxing, as a share of L_M; refining takes a tenth of it
 LINE_SEARCH = LineSearch(back=2)
@@ -112,8 +112,8 @@ class Candidates:
         return replace(Multipliers.zero(self.of(rows), 0.0), mu=penalty * self.unit[rows])
 
     def parts(self) -> Iterator[Tensor]:
-        """Rows of the live candidates, `AT_ONCE` at a time."""
-        return (rows for rows in self.live.nonzero().flatten().split(AT_ONCE) if rows.numel() > 0)
+        """Rows of the live candidates, `CANDIDATES_AT_ONCE` at a time."""
+        return (rows for rows in self.live.nonzero().flatten().split(CANDIDATES_AT_ONCE) if rows.numel() > 0)
 
     def arrive(self) -> Tensor:
         """Whether each candidate ends near the goal, (B * count,)."""

@@ -24,10 +24,10 @@ from torchgco.solvers.ilqr import descend
 OFFSET_LASTS = 0.1  # share of the horizon that an initial offset lasts
 TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
 SHORTEST = 0.05  # share of the horizon between departure and arrival
-NEAR = 0.1  # of the distance to the goal: the last part is approached slowly
+LAST_PART = 0.1  # of the distance to the goal: the last part is approached slowly
 CUT = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
 HALVINGS = 3  # of the share of the horizon over which they are averaged
-SAMPLES = 64  # points of a path at which its depth is measured, about
+DEPTH_POINTS = 64  # points of a path at which its depth is measured, about
 
 
 class Free(NamedTuple):
@@ -148,7 +148,7 @@ def unconstrained(problem: Problem, rest: Tensor, iterations: int) -> Free:
     end, _ = descend(inner_solver(iterations), plain(problem), rest)
     assert problem.goal is not None
     left = problem.goal.distance(end.X[..., problem.position])
-    near = left <= NEAR * left[:, :1]
+    near = left <= LAST_PART * left[:, :1]
     share = near.to(torch.int8).argmax(-1).to(left) / problem.N
     return Free(end.cost, torch.where(near.any(-1), share, torch.inf), end.iterations)
 
@@ -189,7 +189,7 @@ def followed(
     """
     center, B = travel(path, depart, arrive, smoothing, N), R.shape[0]
     for _ in range(HALVINGS if B > 0 else 0):
-        points = center[:, :: max(1, N // SAMPLES)]
+        points = center[:, :: max(1, N // DEPTH_POINTS)]
         deepest = obstacles.depth(points.reshape(B, -1, points.shape[-1])).view(B, -1, points.shape[1]).amax(-1)
         deep = deepest > CUT * R.unsqueeze(-1)
         if not bool(deep.any()):

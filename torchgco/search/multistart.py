@@ -63,7 +63,7 @@ class MultiStart(Solver):
         session = Session(call, solver.inner.rules)
         scaled = session.call
         guidance = None if solver.guidance is None else solver.guidance.suited(scaled.problem)
-        best = Best(scaled, solver.iterate(scaled, guidance), solver)
+        best = Best(scaled, solver.outer_loop(scaled, guidance), solver)
         left = call.problem.start_is_clear & torch.isfinite(call.problem.x0).all(-1)  # no guess helps an invalid start
         for start in range(1, self.starts):
             rows = (left if self.budget is None else left & (best.end.iterations < self.budget)).nonzero().flatten()

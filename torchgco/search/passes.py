@@ -61,7 +61,7 @@ class Solve:
             return
         stop = StopWhenCaught(self.single_contact_after) if self.until == "caught" and search.guided else None
         if not search.begun:
-            search.begin(search.solver.iterate(search.call, stop, recorder=search.recorder, by_arrival=True))
+            search.begin(search.solver.outer_loop(search.call, stop, recorder=search.recorder, by_arrival=True))
             if search.record is not None:
                 search.record.passes[-1][2].extend(search.call.rows.tolist())
         elif search.guided:

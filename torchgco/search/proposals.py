@@ -33,7 +33,7 @@ from torchgco.search.following import Follow, Free, Paths, plain, unconstrained
 from torchgco.search.record import comparison
 from torchgco.solution import SearchRecord
 
-AT_ONCE = 1536  # paths of all problems that are compared and tracked together: bounds the memory
+PATHS_AT_ONCE = 1536  # paths of all problems that are compared and tracked together: bounds the memory
 ALIKE = 2e-3  # relaxed candidates whose penalised costs differ by less, as a share, count as the same
 
 
@@ -114,7 +114,7 @@ class PathProposals:
     @property
     def at_once(self) -> int:
         """How many problems are looked at together."""
-        return max(1, AT_ONCE // (self.num_paths * max(1, len(self.roadmaps))))
+        return max(1, PATHS_AT_ONCE // (self.num_paths * max(1, len(self.roadmaps))))
 
     def improve(self, part: Part, watch: Watch) -> None:
         """Better proposals for the problems of `part` that this pass looks at, in place."""

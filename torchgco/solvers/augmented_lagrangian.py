@@ -13,7 +13,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtLeast, AtMost, Count, Positive, check_options
 from torchgco.base.status import Status
 from torchgco.base.tree import copied, put, take
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, update
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, update_and_raise_penalty
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import is_preferred, violation
 from torchgco.native.dispatch import open_loop, value
@@ -81,10 +81,10 @@ class AugmentedLagrangian(Solver):
         """Solve a checked call."""
         session = Session(call, self.inner.rules, self.record)
         guidance = None if self.guidance is None else self.guidance.suited(session.call.problem)
-        end = self.iterate(session.call, guidance, recorder=session.recorder)
+        end = self.outer_loop(session.call, guidance, recorder=session.recorder)
         return session.finished(end, self.violation_tolerance, self.slots)
 
-    def iterate(
+    def outer_loop(
         self,
         call: Call,
         guidance: Guidance | None = None,
@@ -184,7 +184,7 @@ class OuterLoop:
             growth = growth.masked_fill(worst > HALVED * s.last_violation[rows], solver.stalled_growth)
         if self.rules.ends:
             growth = growth.masked_fill(worst <= solver.violation_tolerance, 1.0)
-        multipliers = update(problem, X, U, take(s.multipliers, rows), growth, PENALTY_MAX)
+        multipliers = update_and_raise_penalty(problem, X, U, take(s.multipliers, rows), growth, PENALTY_MAX)
         self._keep_best(s, rows, problem, Iterate(X, U, multipliers, s.cost[rows], worst))
         s.multipliers = copied(s.multipliers)
         put(s.multipliers, rows, multipliers)

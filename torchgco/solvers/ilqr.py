@@ -85,7 +85,7 @@ class ILQR(Solver):
         ended = SolveEnd(end, end, status, s.iterations, (s.iterations > 0).long(), none)
         return session.finished(ended, VIOLATION_TOLERANCE)
 
-    def iterate(self, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
+    def one_iteration(self, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
         """One iteration of every running problem, in place, by PyTorch's kernels; `advance` prefers native ones."""
         F, H = linearise(lagrangian.problem, s.X, s.U), lagrangian.expand(s.X, s.U)
         step = backward(F, H, s.regularisation)
@@ -165,12 +165,12 @@ def advance(inner: ILQR, s: InnerState, lagrangian: Lagrangian, limit: int) -> P
     """
     engine = engine_of(lagrangian.problem)
     if engine is None:
-        return inner.iterate(s, lagrangian)
+        return inner.one_iteration(s, lagrangian)
     state = {}
     for name in ("X", "U", "cost", "merit", "regularisation", "inner", "iterations", "rung"):
         state[name] = getattr(s, name).clone(memory_format=torch.contiguous_format)
         setattr(s, name, state[name])
-    out = engine.iterate(lagrangian, state, _native_options(inner), limit)
+    out = engine.inner_solve(lagrangian, state, _native_options(inner), limit)
     converged, stuck, lost = (out[name] != 0 for name in ("converged", "refused", "lost"))
     ended = out["status"] == End.ENDED
     failed = ~ended & (out["status"] != Status.RUNNING)

@@ -17,7 +17,7 @@ from torchgco.native.dispatch import engine_of
 from torchgco.solvers.line_search import Rollouts
 from torchgco.solvers.riccati import backward
 
-ROUNDS = 20  # steps at most
+LIFTED_STEPS = 20  # steps at most
 GAIN = 1e-2  # share of L_M by which a rollout must lower it
 LOST = 1e6  # rollouts diverge where even the shortest step makes L_M this many times as large
 
@@ -33,7 +33,7 @@ def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -
     none = torch.zeros_like(merit, dtype=torch.bool)
     found = Rollouts(X.clone(), U.clone(), merit.clone(), merit.clone(), torch.ones_like(merit), none)
     rows = torch.arange(X.shape[0], device=X.device)
-    for i in range(ROUNDS):
+    for i in range(LIFTED_STEPS):
         if rows.numel() == 0:
             break
         part, dynamics = lagrangian.take(rows), lagrangian.problem.dynamics.take(rows)
@@ -54,7 +54,7 @@ def native_lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Te
     assert engine is not None
     state = {name: t.clone(memory_format=torch.contiguous_format) for name, t in (("X", X), ("U", U), ("merit", merit))}
     state["cost"] = state["merit"].clone()
-    accepted = engine.lift(lagrangian, state, ROUNDS, GAIN)
+    accepted = engine.lift(lagrangian, state, LIFTED_STEPS, GAIN)
     return Rollouts(**state, alpha=torch.ones_like(merit), accepted=accepted)
 
 

@@ -13,15 +13,15 @@ from torchgco.native.dispatch import engine_of
 from torchgco.problem.problem import Problem, check_problem
 
 CPU_LIMIT = 256  # a larger batch is no faster on a core: the overhead that problems share is negligible by then
-SHARE = 0.5  # of the free memory; the rest is the system's and other processes'
-NUMBER = 8  # bytes of float64
+FREE_MEMORY_SHARE = 0.5  # of the free memory; the rest is the system's and other processes'
+BYTES_PER_NUMBER = 8  # bytes of float64
 
 
 def least_bytes(N: int, n: int, m: int, rows: int) -> int:
     """Bytes that a problem of this size takes at least in a solve; `rows` of its constraints at all knots together."""
     gains = N * 2 * m * (n + 1)
     trajectories = N * (n + m) * 16  # iterate, best, last, result, and those tried by a line search
-    return NUMBER * (gains + trajectories + 12 * rows)
+    return BYTES_PER_NUMBER * (gains + trajectories + 12 * rows)
 
 
 def element_bytes(problem: Problem) -> int:
@@ -32,7 +32,7 @@ def element_bytes(problem: Problem) -> int:
     rows = sum(lam.numel() for lam in Multipliers.zero(one, 0.0).lam)
     # F, H and the derivatives they are built from; native kernels hold them for eight problems only.
     expansion = 0 if engine_of(problem) is not None else N * (2 * z * s + 2 * s * s)
-    return least_bytes(N, n, m, rows) + NUMBER * expansion
+    return least_bytes(N, n, m, rows) + BYTES_PER_NUMBER * expansion
 
 
 def plan_batch(problem: Problem, device: str | torch.device | None = None, processes: int = 1) -> int:
@@ -50,7 +50,7 @@ def plan_batch(problem: Problem, device: str | torch.device | None = None, proce
     check_value(processes, Count, "processes")
     where = problem.x0.device if device is None else check_device(device)
     free = torch.cuda.mem_get_info(where)[0] if where.type == "cuda" else free_memory()
-    fits = max(1, int(SHARE * free / processes) // element_bytes(problem))
+    fits = max(1, int(FREE_MEMORY_SHARE * free / processes) // element_bytes(problem))
     return fits if where.type == "cuda" else min(fits, CPU_LIMIT)
 
 

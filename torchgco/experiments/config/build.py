@@ -28,7 +28,7 @@ from torchgco.solvers.memory import free_memory, least_bytes
 
 DEFAULT_LAYOUTS = 64
 FLOWN = "one in space for a mission: crossing, forest, forest_moving, mazes, walls, woods, or a layout file"
-MOST = 1024  # threads or processes: PyTorch ends with an error of the system long before the system's own limit
+MAX_PROCESSES = 1024  # threads, too: PyTorch ends with an error of the system long before the system's own limit
 register()
 
 
@@ -232,7 +232,7 @@ class _Device:
     name: Literal["cpu", "cuda"]
     dtype: Literal["float64", "float32"]
     kernels: Literal["native", "eager"]
-    threads: Annotated[int, Within(1, MOST)] | None
+    threads: Annotated[int, Within(1, MAX_PROCESSES)] | None
 
     def __post_init__(self) -> None:
         check_options(self, "device")

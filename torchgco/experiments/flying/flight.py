@@ -19,7 +19,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.kernels import use_native
 from torchgco.base.options import Count, Within, check_options
 from torchgco.base.status import Status
-from torchgco.experiments.config.build import MOST, Setup
+from torchgco.experiments.config.build import MAX_PROCESSES, Setup
 from torchgco.experiments.config.launching import allotted_cores, jobs_at_once
 from torchgco.experiments.flying.progress import Bar
 from torchgco.judging.certificate import certify
@@ -56,7 +56,7 @@ class Plan:
 
     batch_size: Count | Literal["auto"]
     shard_size: Count
-    workers: Annotated[int, Within(1, MOST)] | None
+    workers: Annotated[int, Within(1, MAX_PROCESSES)] | None
     repair: bool
     figures: bool
     jobs: Count | None

@@ -19,7 +19,7 @@ SWEPT = ("scenario.", "model.vehicle.", "mission.", "plant.")
 NAMES = ("scenario.name", "scenario._target_", "model.vehicle.name", "model.vehicle._target_")  # have columns
 FILE = "scenario.path"
 RUN = "hydra.run.dir"
-MOST = 3  # settings named in a label
+LABEL_SETTINGS = 3  # settings named in a label
 
 
 def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
@@ -153,8 +153,8 @@ def labels(variants: Sequence[str]) -> dict[str, str]:
         differ = ["version"]
     made: dict[str, str] = {}
     for variant, settings in held.items():
-        more = f", {len(differ) - MOST} more" if len(differ) > MOST else ""
-        label = ", ".join(f"{key}={_value(settings, key)}" for key in differ[:MOST]) + more
+        more = f", {len(differ) - LABEL_SETTINGS} more" if len(differ) > LABEL_SETTINGS else ""
+        label = ", ".join(f"{key}={_value(settings, key)}" for key in differ[:LABEL_SETTINGS]) + more
         alike = sum(other == label or other.startswith(f"{label} #") for other in made.values())
         made[variant] = f"{label} #{alike + 1}" if alike else label
     return made

@@ -12,7 +12,7 @@ MEDIANS = (
     "flight_time", "energy", "clearance", "planner_seconds_median", "planner_seconds_p99", "tracker_seconds_median",
 )  # fmt: skip
 MEANS = ("missed_deadlines", "shifted_plans")
-AT_ONCE = "missions_at_once"
+MISSIONS_AT_ONCE = "missions_at_once"
 
 
 def summarise_missions(trials: pd.DataFrame) -> pd.DataFrame:
@@ -45,4 +45,4 @@ def _of_missions(group: pd.DataFrame) -> dict[str, object]:
     reached = group[group["outcome"] == Outcome.REACHED.name]
     row |= {name: pd.Series(numbers_of(reached[name])).median() for name in MEDIANS}
     row |= {name: float(numbers_of(group[name]).mean()) for name in MEANS}
-    return row | {AT_ONCE: int(group["batch_size"].max())}
+    return row | {MISSIONS_AT_ONCE: int(group["batch_size"].max())}

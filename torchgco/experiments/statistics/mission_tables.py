@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from torchgco.experiments.statistics.mission_statistics import AT_ONCE
+from torchgco.experiments.statistics.mission_statistics import MISSIONS_AT_ONCE
 from torchgco.experiments.statistics.statistics import TASK
 from torchgco.experiments.statistics.tables import (
     aligned,
@@ -23,7 +23,7 @@ from torchgco.missions.outcome import Outcome
 EFFORT = (
     ("flight time", "flight_time", "{:.2f} s"), ("clearance", "clearance", "{:.3f} m"),
     ("energy", "energy", "{:.0f} J"),
-    ("at once", AT_ONCE, "{:.0f}"), ("planner", "planner_seconds_median", "{:.4f} s"),
+    ("at once", MISSIONS_AT_ONCE, "{:.0f}"), ("planner", "planner_seconds_median", "{:.4f} s"),
     ("99 %", "planner_seconds_p99", "{:.4f} s"), ("tracker", "tracker_seconds_median", "{:.4f} s"),
     ("missed", "missed_deadlines", "{:.1f}"), ("kept plans", "shifted_plans", "{:.1f}"),
 )  # fmt: skip
@@ -66,7 +66,7 @@ def format_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
         seeds = ", ".join(dict.fromkeys(seed for held in task["seed"] for seed in held.split()))
         swept = swept_of(task)
         blocks += [f"missions in {scenario} ({model}), seed {seeds}", _outcomes(task, swept), _effort(task, swept)]
-        if (task[AT_ONCE] > 1).any():
+        if (task[MISSIONS_AT_ONCE] > 1).any():
             blocks[-1] += f"\n{DIVIDED}"
         rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
         if (rows["n"] > 0).any():
@@ -105,5 +105,5 @@ def _effort(task: pd.DataFrame, swept: Sequence[str]) -> str:
 def _measured(row: pd.Series) -> list[str]:
     """The cells of EFFORT; of a batch no deadlines, which its divided times don't decide."""
     unknown = {name for _, name, _ in EFFORT if pd.isna(row[name])}
-    unknown |= {"missed_deadlines"} if row[AT_ONCE] > 1 else set()
+    unknown |= {"missed_deadlines"} if row[MISSIONS_AT_ONCE] > 1 else set()
     return ["-" if name in unknown else form.format(row[name]) for _, name, form in EFFORT]

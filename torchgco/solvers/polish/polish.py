@@ -35,7 +35,7 @@ SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)
 NEAR = 1e-2  # rows with c above minus this share of their slope's length are in the program from the start
 PIVOT = 1e-3  # the smallest pivot that is convex enough, as a share of the mean of `_mean_along`
 ACTIVE = 1e-3  # as NEAR: rows that count as active in the KKT residual
-ROUNDS = 10  # rounds of adding the rows that a step would violate to a program
+PROGRAM_ROUNDS = 10  # rounds of adding the rows that a step would violate to a program
 
 
 @dataclass(frozen=True)
@@ -247,7 +247,7 @@ def _program(point: _Point, L: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor
     size = model.slopes.norm(dim=-1)
     member = (model.equality | (lam > 0) | (model.c > -NEAR * size)) & (size > 0)
     g = torch.linalg.solve_triangular(L, gradient.unsqueeze(-1), upper=False).squeeze(-1)
-    for _ in range(ROUNDS):
+    for _ in range(PROGRAM_ROUNDS):
         rows = member.nonzero().flatten()
         if rows.numel() > 2 * gradient.numel():
             return None  # the linearised rows contradict each other, or the model is flat
