@@ -12,7 +12,6 @@ from torch import Tensor
 from torchgco import compose
 from torchgco.base.draws import DrawKey
 from torchgco.guidance import GCO, MPPI
-from torchgco.guidance.samples import draw
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.native.dispatch import open_loop
 from torchgco.plotting.trajectory import inside
@@ -41,9 +40,7 @@ class Sampling:
 
     def controls(self, count: int) -> Tensor:
         """Controls (count, N, m) of the first samples of round 1: the draws of this call, made again."""
-        sampler, mean = self.sampler, self.U.transpose(0, 1).unsqueeze(2)
-        noise = sampler._noise(self.problem, self.key, sampler._sigma(self.problem).sqrt(), 0, range(count))
-        return draw(mean, noise, sampler._bounds(self.problem))[:, 0].transpose(0, 1).contiguous()
+        return self.sampler.first_samples(self.problem, self.U, self.key, count)[:, 0].contiguous()
 
     def samples(self, count: int) -> np.ndarray:
         """Positions (count, N+1, d) of the first samples, m."""

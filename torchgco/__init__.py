@@ -19,6 +19,7 @@ from torchgco.base.errors import GuidanceWarning as GuidanceWarning
 from torchgco.base.errors import InputError as InputError
 from torchgco.base.errors import ScaleWarning as ScaleWarning
 from torchgco.base.status import Status as Status
+from torchgco.base.version import VERSION
 from torchgco.baselines import Hold as Hold
 from torchgco.baselines import IteratedMPPI as IteratedMPPI
 from torchgco.constraints import Constraint as Constraint
@@ -77,7 +78,7 @@ __all__ = [  # noqa: RUF022
     "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "ScaleWarning",
 ]  # fmt: skip
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 # On some processors the library behind PyTorch's matrix products (MKL) picks a kernel by a matrix's address in memory,
 # and so by its place in the batch: a problem's bits would depend on the other problems. Read at MKL's first use.

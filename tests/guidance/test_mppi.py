@@ -14,7 +14,7 @@ from tests.reference.mppi import MppiSettings, mppi
 from torchgco import GCO, MPPI, InputError
 from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.guidance.detection import active_counts, caught_knots
-from torchgco.guidance.samples import Flight, Noise, draw, fly
+from torchgco.guidance.mppi import Flight, Noise, draw, fly
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.lagrangian.rollout import open_loop
 

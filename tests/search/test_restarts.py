@@ -35,7 +35,7 @@ from torchgco import (
     Status,
     judge,
 )
-from torchgco.guidance.region import GuideRegion
+from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.search import Follow, FromSamples
 from torchgco.search.passes import SEED_STEP, StopWhenCaught

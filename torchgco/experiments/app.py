@@ -18,8 +18,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import torchgco
 from torchgco.base.errors import InputError
+from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import forget_composed, recomposer
 from torchgco.experiments.config.checks import as_input_error, check_once, hydra_words
 from torchgco.experiments.config.groups import ENTRY, config_dir, register_resolver
@@ -54,7 +54,7 @@ def _described(_root_: Any) -> str:
         solvers.setdefault(name, settings_of(recompose(name)))
     path = held["scenario"].get("path")
     scenario = Path(path).stem if path else held["scenario"]["name"]
-    described = [torchgco.__version__, held["seed"], held["study"]["layouts"], decisive(held, solvers)]
+    described = [VERSION, held["seed"], held["study"]["layouts"], decisive(held, solvers)]
     return f"{scenario}-{held['model']['vehicle']['name']}-{held['solver']['name']}-{digest(described)[:8]}"
 
 
@@ -130,7 +130,7 @@ def main() -> int:
 
 def _command() -> int:
     if "--version" in sys.argv[1:]:
-        say(f"torchgco {torchgco.__version__}")
+        say(f"torchgco {VERSION}")
         return 0
     # Hydra would print and exit by itself; with this it raises its errors, and each is printed as one line.
     os.environ["HYDRA_FULL_ERROR"] = "1"

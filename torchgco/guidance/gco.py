@@ -13,7 +13,6 @@ from torchgco.base.options import AtLeast, Count, Positive, check_options
 from torchgco.base.tree import put, take
 from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.mppi import MPPI
-from torchgco.guidance.region import guide_along
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.native.dispatch import cost_unit
@@ -100,3 +99,12 @@ def _radius(problem: Problem, X: Tensor) -> Tensor:
     at = problem.position
     ends = X[:, 1:, at] if problem.goal is None else problem.goal.position.unsqueeze(1)
     return REACH * (ends - problem.x0[:, None, at]).square().sum(-1).sqrt().amax(-1)
+
+
+def guide_along(guide: GuideRegion, X_safe: Tensor, caught: Tensor, radius: Tensor) -> GuideRegion:
+    """Balls of `radius` (B,) around X_safe (B, N+1, n) at the caught knots (B, N+1), none elsewhere."""
+    return replace(
+        guide,
+        center=X_safe[..., guide.position],
+        radius=torch.where(caught, radius.unsqueeze(-1), torch.inf),
+    )

@@ -22,9 +22,7 @@ from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.search import Search
 
-PROBLEMS_AT_ONCE = (
-    4  # problems searched together by PyTorch: memory holds distances of all edges from all obstacles
-)
+PROBLEMS_AT_ONCE = 4  # problems searched together by PyTorch: memory holds distances of all edges from all obstacles
 NODES = 128  # points around obstacles: those of the shortest detours
 # A second search has more points, where the first had no places for all of them and found no path, or only a long one
 # (in distances from start to goal): the points next to the straight line take all places, before any lies in the gaps

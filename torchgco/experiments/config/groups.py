@@ -21,7 +21,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from omegaconf import OmegaConf
 
-import torchgco
+from torchgco.base.version import PACKAGE
 from torchgco.missions import Disturbance, Mission, Planner, RotorPlant, Tracker
 from torchgco.presets import PRESETS
 from torchgco.scenarios import (
@@ -68,7 +68,7 @@ def register_resolver(name: str, resolver: Callable[..., Any]) -> None:
 
 def config_dir() -> Path:
     """Absolute path of conf/: next to the package in a checkout, inside it in a wheel."""
-    package = Path(torchgco.__file__).resolve().parent
+    package = PACKAGE
     for candidate in (package / "conf", package.parent / "conf"):
         if (candidate / "config.yaml").is_file():
             return candidate

@@ -14,11 +14,11 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-import torchgco
 from torchgco.base.errors import InputError
 from torchgco.base.kernels import use_native
 from torchgco.base.options import Count, Within, check_options
 from torchgco.base.status import Status
+from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import MAX_PROCESSES, Setup
 from torchgco.experiments.config.launching import allotted_cores, jobs_at_once
 from torchgco.experiments.flying.progress import Bar
@@ -128,7 +128,7 @@ class Flight:
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),
                 "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": together,
                 "threads": torch.get_num_threads(), "device": setup.device.type,
-                "dtype": str(setup.dtype).removeprefix("torch."), "version": torchgco.__version__,
+                "dtype": str(setup.dtype).removeprefix("torch."), "version": VERSION,
             }
         )  # fmt: skip
         return rows, U.numpy()

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-import torchgco
+from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.progress import Bar
 from torchgco.missions.contact import Contact
@@ -65,7 +65,7 @@ class MissionFlight:
             "feasible": outcome not in LOST, "reached": outcome == Outcome.REACHED, "sound": False,
             **dict.fromkeys(SINGLE, np.nan),
             "batch_size": self.layouts.count, "threads": torch.get_num_threads(), "device": setup.device.type,
-            "dtype": str(setup.dtype).removeprefix("torch."), "version": torchgco.__version__,
+            "dtype": str(setup.dtype).removeprefix("torch."), "version": VERSION,
         }  # fmt: skip
 
     def _progress(self, period: float, duration: float, step: int, flying: int) -> None:

@@ -14,10 +14,10 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-import torchgco
 from torchgco.base.errors import InputError
 from torchgco.base.kernels import native
 from torchgco.base.status import Status
+from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.config.launching import side_by_side
 from torchgco.experiments.ending import say
@@ -160,7 +160,7 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
         check_mission(setup.mission, task)
     configs = _rivals(config, recompose)
     solvers = {name: setup.solver if held is config else solver_of(held) for name, held in configs.items()}
-    configuration = {"version": torchgco.__version__, **plain(config)}
+    configuration = {"version": VERSION, **plain(config)}
     manifest = Manifest(
         configuration=configuration,
         solvers={name: settings_of(held) for name, held in configs.items()},

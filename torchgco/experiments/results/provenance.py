@@ -35,7 +35,7 @@ from typing import Any
 
 import torch
 
-import torchgco
+from torchgco.base.version import PACKAGE, VERSION
 from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.flight import Plan
 from torchgco.experiments.results.files import write
@@ -106,8 +106,8 @@ def _keep(path: Path, entries: list[dict[str, Any]]) -> None:
 
 def _source() -> dict[str, Any]:
     """Version, and commit of a checkout. An installed package may lie in a checkout of something else: no commit."""
-    root = Path(torchgco.__file__).resolve().parents[1]
-    told: dict[str, Any] = {"version": torchgco.__version__, "commit": None, "changed": None}
+    root = PACKAGE.parent
+    told: dict[str, Any] = {"version": VERSION, "commit": None, "changed": None}
     if (root / ".git").exists():
         told["commit"] = _git(root, "rev-parse", "HEAD").strip()
         told["changed"] = bool(_git(root, "status", "--porcelain", "--", "torchgco", "conf"))
