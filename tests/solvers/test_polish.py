@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from torchgco import (
 from torchgco.baselines import Hold
 from torchgco.judging.judge import judge, sphere_clearance
 from torchgco.lagrangian.rollout import open_loop
+from torchgco.solvers.polish import polish
 from torchgco.solvers.polish.active_set import multipliers, projected
 from torchgco.solvers.polish.condensed import Condensed
 
@@ -268,3 +270,10 @@ def test_chord_clearance_is_the_judges(batch: str) -> None:
     problem, solution = solved(batch)
     spheres = problem.constraints[0]
     torch.testing.assert_close(spheres.chord_clearance(solution.X), sphere_clearance(spheres, solution.X)[1])
+
+
+def test_a_residual_is_relative_to_the_gradient_of_the_cost() -> None:
+    model = SimpleNamespace(
+        lagrangian_gradient=lambda lam: torch.tensor([-6.0, 2.0]) * lam, gradient=torch.tensor([-2.0, 1.0])
+    )
+    assert polish._slope(model, torch.ones(2)) == 6.0 / (1.0 + 2.0)
