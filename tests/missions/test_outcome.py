@@ -13,7 +13,7 @@ from torchgco import Airframe, Problem, QuadraticCost, QuadrotorPlanning, Sphere
 from torchgco.missions.contact import Contact
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import Ending, Outcome, judge_flight
-from torchgco.missions.tables import energy, mission_frame, mission_row, samples, time_step_frame
+from torchgco.missions.tables import ending, energy, mission_frame, mission_row, samples, time_step_frame
 
 PER_SEGMENT = 200  # points between two samples of the dense judge
 FRAME = Airframe()
@@ -131,6 +131,18 @@ def test_contact_comes_before_the_goal() -> None:
     end = judged(t, position, center, np.array([0.06]), None, goal, 0.11)
     assert end.outcome == Outcome.COLLISION  # at 0.39 m, before the sample at 0.4 m is near enough to the goal
     assert all(outcome.sentence.endswith(".") for outcome in Outcome)
+
+
+def test_a_state_that_is_not_finite_ends_a_mission_wherever_it_is(flights: tuple[MissionLog, list[Ending]]) -> None:
+    """Body rates, say; and control steps count although no plan was found for them."""
+    log, _ = flights
+    arrays, contact, goal = log.arrays(), Contact(()), np.array([9.0, 0.0, 0.0])
+    arrays |= {name: arrays[name].copy() for name in ("x", "cost")}
+    arrays["cost"][2, 3:] = np.nan
+    assert ending(arrays, 2, DT, contact, goal, 0.1).flight_time == pytest.approx(6 * DT)
+    arrays["x"][2, 3, 2:, 11] = np.nan
+    end = ending(arrays, 2, DT, contact, goal, 0.1)
+    assert (end.outcome, end.flight_time) == (Outcome.DIVERGED, pytest.approx(3 * DT + 0.02))
 
 
 def own_ends(log: MissionLog) -> list[float]:

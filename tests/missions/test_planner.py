@@ -223,9 +223,9 @@ def test_feedback_brings_a_vehicle_back_to_its_plan(native: bool) -> None:
         x0 = problem.x0.clone()
         x0[:, 7] += torch.tensor([0.02, -0.01, 0.0], **DOUBLE)
         tilted = problem.started_at(x0, problem.constraints)
-        U = followed(tilted, solution.X, solution.U, solution.K)
+        U = followed(tilted, solution.X, solution.U, solution.K)[1]
         index = torch.tensor([1])
-        alone = followed(tilted.take(index), *(part[index] for part in (solution.X, solution.U, solution.K)))
+        alone = followed(tilted.take(index), *(part[index] for part in (solution.X, solution.U, solution.K)))[1]
     finally:
         kernels.use_native(True)
     assert torch.equal(alone, U[1:2]) and torch.equal(U[2], solution.U[2])
@@ -233,6 +233,16 @@ def test_feedback_brings_a_vehicle_back_to_its_plan(native: bool) -> None:
         (open_loop(problem.dynamics, x0, held) - solution.X)[..., :3].norm(dim=-1).amax(-1) for held in (U, solution.U)
     ]
     assert bool((away[0][:2] < 0.1).all()) and bool((away[1][:2] > 5 * away[0][:2]).all())
+
+
+def test_gains_that_lead_away_are_not_used() -> None:
+    solver, problem = Recording(), varied()
+    plan, now = first_plan(Planner(solver), problem)
+    x = plan.measured.clone()
+    x[:, :3] += 0.05
+    for gains in (1e6 * plan.K, torch.full_like(plan.K, 1e300)):
+        next_plan(Planner(solver), problem, now, replace(plan, K=gains), x)
+        assert torch.equal(solver.calls[-1]["U0"], torch.cat((plan.U[:, 1:], plan.U[:, -1:]), dim=1))
 
 
 def test_penalties_do_not_pile_up_over_a_mission() -> None:

@@ -73,7 +73,7 @@ class MissionLog:
 
     def steps(self) -> np.ndarray:
         """Control steps that each mission made, (B,)."""
-        return (~torch.isnan(self.cost)).sum(1).numpy()
+        return (~torch.isnan(self.planner_seconds)).sum(1).numpy()
 
     def arrays(self, plans: bool = False) -> dict[str, np.ndarray]:
         """What a study keeps of every mission, by name (B, ...); with the planned positions where asked for."""

@@ -14,10 +14,10 @@ from torchgco.base.tree import Rows, put, take
 from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.lagrangian.lagrangian import Multipliers, shifted
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
 from torchgco.lagrangian.quality import violation
 from torchgco.missions.planning_problem import Margin, acceleration, biased, check_model, first_step, planning_state
-from torchgco.native.dispatch import followed, open_loop
+from torchgco.native.dispatch import followed, open_loop, value
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
@@ -42,6 +42,14 @@ class Plan:
     bias: Tensor  # (B, 3): estimated acceleration that the model lacks, m/s^2
     model: Dynamics  # that was planned with
     step: int
+
+    @property
+    def continued(self) -> Multipliers:
+        """The multipliers one stage later.
+
+        What one period raises the penalty by doesn't stay: over a mission it would grow beyond all measure.
+        """
+        return replace(self.multipliers.shifted(), mu=self.penalty)
 
     def take(self, index: Rows) -> Plan:
         """The plans in `index`."""
@@ -138,7 +146,7 @@ class Planner:
         now = now.started_at(x0, self._constraints(whole, t, x, margin, depth), dynamics=dynamics)
         solve = _Solve(self, now, seed, ids, began)
         if before is not None and self.feedback:
-            U0 = followed(now, shifted(before.X), U0, shifted(before.K))
+            U0 = _brought_back(now, before)
         plan = solve.first(U0) if before is None else solve.next(U0, before)
         return replace(plan, measured=measured, bias=bias, step=step), now, time.perf_counter() - began
 
@@ -178,6 +186,18 @@ class Planner:
         return before.bias + self.estimation * (shown - expected - before.bias)
 
 
+def _brought_back(problem: Problem, before: Plan) -> Tensor:
+    """The controls (B, N, 4) of former plans one stage later, with feedback where that has the better Lagrangian.
+
+    Gains along a plan that is far from stationary may lead away.
+    """
+    X, U = shifted(before.X), shifted(before.U)
+    lagrangian = Lagrangian(problem, before.continued, None, True)
+    rollouts = followed(problem, X, U, shifted(before.K)), (open_loop(problem, U), U)
+    fed, plain = (value(lagrangian, *rollout)[1].nan_to_num(torch.inf) for rollout in rollouts)
+    return torch.where((fed <= plain).view(-1, 1, 1), rollouts[0][1].nan_to_num(), U)
+
+
 class _Solve:
     """The solves of one control step."""
 
@@ -191,8 +211,7 @@ class _Solve:
 
     def next(self, U0: Tensor, before: Plan) -> Plan:
         """Plans that continue former ones, which are flown one stage later by U0 (B, N, 4)."""
-        # What one period raises the penalty by must not stay: over a mission it would grow beyond all measure.
-        multipliers = replace(before.multipliers.shifted(), mu=before.penalty)
+        multipliers = before.continued
         warm = multipliers if self.planner.multipliers == "shifted" else None
         plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids))
         plan.penalty.copy_(before.penalty)

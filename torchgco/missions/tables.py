@@ -41,7 +41,7 @@ def clearances(arrays: Arrays, period: float, contact: Contact) -> np.ndarray:
     """Distances (B, K) of missions from contact at the starts of their control steps, m; NaN after their ends."""
     start = arrays["x"][:, :, 0, :3]
     found = contact.distances(torch.from_numpy(start), period).numpy()
-    return np.where(np.isnan(arrays["cost"]), np.nan, found)
+    return np.where(np.isnan(arrays["planner_seconds"]), np.nan, found)
 
 
 def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances: np.ndarray) -> pd.DataFrame:
@@ -154,9 +154,9 @@ def step_columns(steps: Arrays, period: float) -> dict[str, float]:
 def ending(arrays: Arrays, b: int, period: float, contact: Contact, goal: np.ndarray, goal_radius: float) -> Ending:
     """How mission b ended; `contact` is that of all missions, the goal (3,) its own. See `judge_flight`."""
     _, x = samples(arrays, b, period)
-    dt = period / arrays["commands"].shape[2]
-    return judge_flight(x[:, :3], dt, contact.take(slice(b, b + 1)), goal, goal_radius)
+    dt, finite = period / arrays["commands"].shape[2], np.isfinite(x).all(axis=-1, keepdims=True)
+    return judge_flight(np.where(finite, x[:, :3], np.nan), dt, contact.take(slice(b, b + 1)), goal, goal_radius)
 
 
 def _steps(arrays: Arrays, b: int) -> int:
-    return int((~np.isnan(arrays["cost"][b])).sum())
+    return int((~np.isnan(arrays["planner_seconds"][b])).sum())

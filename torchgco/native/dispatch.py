@@ -114,8 +114,8 @@ def open_loop(problem: Problem, U: Tensor) -> Tensor:
     return rollout.open_loop(problem.dynamics, problem.x0, U) if engine is None else engine.open_loop(problem, U)
 
 
-def followed(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> Tensor:
-    """Controls (B, N, m) that bring the problem's start back to X (B, N+1, n) by the feedback u = U + K (x - X).
+def followed(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """The rollout, X and U, that brings the problem's start back to X (B, N+1, n) by the feedback u = U + K (x - X).
 
     Gains K (B, N, m, n) that aren't finite count as 0.
     """
@@ -124,8 +124,8 @@ def followed(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> Tensor:
     X, G = torch.cat((problem.x0.unsqueeze(1), X[:, 1:]), dim=1), torch.nn.functional.pad(K, (0, 1))
     engine = engine_of(problem)
     if engine is not None:
-        return engine.closed_loop(problem, X, U, G)[1]
-    return rollout.closed_loop(problem.dynamics, X, U, G.transpose(0, 1).contiguous(), alpha)[1]
+        return engine.closed_loop(problem, X, U, G)
+    return rollout.closed_loop(problem.dynamics, X, U, G.transpose(0, 1).contiguous(), alpha)
 
 
 def reproducible(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
