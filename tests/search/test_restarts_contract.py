@@ -103,7 +103,7 @@ def test_a_problem_that_cannot_start_is_not_attempted_and_disturbs_no_other(
 
 
 def test_the_trace_names_the_attempt() -> None:
-    """It is the row of the table, counted from 1 in any batch."""
+    """It is the row of the table, counted from 1 in any batch, up to the first row that draws more than once."""
     problem, U0 = gates()
     solver = replace(SOLVER, local=replace(SOLVER.local, record=True))
     solution = solver.solve(problem, U0, seed=3)
