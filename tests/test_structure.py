@@ -11,23 +11,17 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "torchgco"
 LAYERS = [
     ["base"],
-    ["dynamics", "costs", "constraints"],
+    ["tracing", "dynamics", "costs", "constraints"],
     ["obstacles"],
     ["problem"],
-    ["tracing"],
-    ["lagrangian"],
-    ["judging"],
-    ["solution"],
-    ["native"],
-    ["solvers"],
-    ["guidance"],
-    ["roadmap"],
-    ["search"],
-    ["baselines", "missions"],
-    ["presets", "contact"],
-    ["scenarios", "api"],
-    ["plotting"],
-    ["experiments"],
+    ["lagrangian", "judging"],
+    ["solution", "native"],
+    ["solvers", "roadmap", "contact"],
+    ["guidance", "missions", "scenarios"],
+    ["search", "plotting"],
+    ["baselines"],
+    ["presets"],
+    ["api", "experiments"],
 ]
 MODULES = sorted(
     p for p in PACKAGE.rglob("*.py") if (p.name != "__main__.py" and p.parent != PACKAGE) or p.stem != "__init__"
