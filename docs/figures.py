@@ -90,13 +90,12 @@ def draw(problem: Problem, solution: Solution, layouts: Layouts) -> dict[str, Fi
 
 
 def tables() -> str:
-    """The passes of `gco` in the plane and in space, as Markdown."""
-    parts = []
-    for name, dimension in (("In the plane", 2), ("In space", 3)):
-        table = presets.gco(dimension).table().reset_index()
-        lines = [table.columns.tolist(), ["---"] * len(table.columns), *table.values.tolist()]
-        parts += [f"{name}:", "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)]
-    return "\n\n".join(parts)
+    """The passes of `gco` as Markdown; values that differ: in the plane / in space."""
+    plane, space = (presets.gco(dimension).table().reset_index() for dimension in (2, 3))
+    lines = [space.columns.tolist(), ["---"] * len(space.columns)]
+    for a, b in zip(plane.values.tolist(), space.values.tolist(), strict=True):
+        lines.append([x if x == y or y == "" else f"{x} / {y}" if x else y for x, y in zip(a, b, strict=True)])
+    return "\n".join(f"|{'|'.join(map(str, line))}|" for line in lines)
 
 
 def with_tables(text: str) -> str:

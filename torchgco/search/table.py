@@ -22,7 +22,10 @@ PROBLEMS = {
 
 
 def rows_of(passes: Sequence[Pass]) -> list[dict[str, str]]:
-    """A row per pass, with the columns `COLUMNS`; empty where one says nothing."""
+    """A row per pass, with the columns `COLUMNS`; empty where one says nothing.
+
+    A trajectory is accepted where it is better than the best before: arrived before feasible before cheap.
+    """
     return [dict.fromkeys(COLUMNS, "") | {"pass": type(one).__name__} | _described(one) for one in passes]
 
 
@@ -30,24 +33,23 @@ def _described(one: Pass) -> dict[str, str]:
     match one:
         case Solve():
             unsolved = "all, or those that have not arrived" if one.when == "unarrived" else PROBLEMS[one.when]
-            after = (
-                "" if one.single_contact_after is None else f" (of one from outer iteration {one.single_contact_after})"
-            )
-            stop = f"until a knot lies inside two obstacles{after}" if one.until == "caught" else "to the end"
+            after = one.single_contact_after
+            single = "" if after is None else f", or inside one after {after} outer iterations"
+            stop = f"until a knot lies inside two obstacles{single}" if one.until == "caught" else "to the end"
             return {"problems": unsolved, "accepted": stop}
         case PathProposals():
             return _proposals(one)
         case FromProposal():
-            return {"problems": "with a proposal", "accepted": "better than before"}
+            return {"problems": "with a proposal"}
         case IntoGoal():
-            return {"problems": "caught, close to the goal, not arrived", "accepted": "better than before"}
+            return {"problems": "caught, close to the goal, not arrived"}
         case FromSamples():
             draws = "continued once" if one.redraws == 0 else f"{one.redraws} times, other draws"
-            return {"problems": f"{PROBLEMS[one.when]}: {draws}", "accepted": "better than before"}
+            return {"problems": f"{PROBLEMS[one.when]}: {draws}"}
         case Finish():
             inner, outer = one.solver.inner.max_iterations, one.solver.max_outer_iterations
             limits = f"{outer} x {inner} iterations"
-            return {"problems": f"cut off by a limit, or stalled: {limits}", "accepted": "better than before"}
+            return {"problems": f"cut off by a limit, or stalled: {limits}"}
         case ClearChords():
             return {
                 "problems": f"touching an obstacle between two knots: {one.rounds} rounds",
@@ -56,7 +58,9 @@ def _described(one: Pass) -> dict[str, str]:
 
 
 def _proposals(one: PathProposals) -> dict[str, str]:
-    gap = "never" if one.max_gap is None else f"proposal over {one.max_gap:.0%} dearer than without obstacles"
+    if one.when == "costly" and one.max_gap is None:
+        return {"problems": "none"}
+    gap = "" if one.max_gap is None else f"proposal over {one.max_gap:.0%} dearer than without obstacles"
     points = " and ".join(str(roadmap.num_halton) for roadmap in one.roadmaps)
     at_least = " as refined" if one.refine.needed else ""
     relax = "all" if one.relax_top is None else f"best {one.relax_top}"
@@ -74,5 +78,5 @@ def _follow(follow: Follow) -> str:
     guide = "spring" if follow.tube is None else "tube"
     stiffness = ", ".join(f"{value:g}" for value in follow.stiffness)
     starts, paces = 1 + len(follow.initial_offsets), len(follow.paces)
-    several = f", {starts} starts x {paces} paces" if starts * paces > 1 else ""
+    several = f", {starts * paces} candidates" if starts * paces > 1 else ""
     return f"{guide} {stiffness}, {follow.iterations} iterations, corners over {follow.smoothing:g} N{several}"
