@@ -24,8 +24,7 @@ from torchgco.native.dispatch import engine_of, sampler_of
 from torchgco.problem.problem import Problem
 
 if TYPE_CHECKING:
-    from benchmarks.speed.batch import limited
-from benchmarks.speed.bench import Bench  # a process that measures a first solve loads nothing else
+    from benchmarks.speed.bench import Bench  # a process that measures a first solve loads nothing else
 
 SECTION = "first_use"
 IMPORTS = 5  # number; their median counts
@@ -67,6 +66,8 @@ def _started(words: list[str], environment: dict[str, str]) -> str:
 def measure(name: str) -> dict[str, float]:
     """Processor seconds, compilers included, by name; for "both, wall" elapsed seconds."""
     problem = _problem(name)
+    from benchmarks.speed.batch import limited
+
     solver = limited(presets.gco(problem))
     engine = _took(lambda: engine_of(problem))
     first, again = (_took(lambda: solver.solve(problem, _controls(problem))) for _ in range(2))

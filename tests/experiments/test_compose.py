@@ -21,7 +21,6 @@ DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
 EXPERIMENTS = options_of("experiment")
 MISSIONS = ("mission", "mission_study")
-BOXED = ("woods", "mazes")  # missions fly among spheres alone
 OF_MODEL = {
     "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": ("yard",),
     "quadrotor": ("crossing", "forest", "forest_mission", "forest_moving", "mazes", "walls", "woods"),
@@ -71,9 +70,7 @@ def test_every_experiment_composes_with_every_scenario_model_and_solver(experime
         given = [f"experiment={experiment}", *words, f"solver={solver}"]
         given += [f"model={model}"] if next(named) and f"model={model}" not in words else []
         if experiment in MISSIONS and model != "quadrotor":
-            assert "scenario: expected spheres in space for a mission: crossing, forest" in refused(*given)
-        elif experiment in MISSIONS and name in BOXED:
-            assert "scenario: expected one with spheres alone" in refused(*given)
+            assert "scenario: expected one in space for a mission: crossing, forest" in refused(*given)
         else:
             setup = checked(*given)
             assert setup.vehicle.name == model and (setup.mission is not None) == (experiment in MISSIONS)

@@ -53,7 +53,6 @@ WRONG = {
     ),
     "a group's key": (["scenario.obstacles=3"], "scenario.obstacles: expected a key that the configuration has"),
     "no mission": (["mission.duration=3"], "mission: expected experiment=mission, as its keys are given"),
-    "mission in a wood": ([*MISSION, "scenario=woods"], "scenario: expected one with spheres alone, as missions fly"),
     "mission in the plane": ([*MISSION, "scenario=yard"], "scenario: expected one in space for a mission: crossing"),
     "short mission": ([*MISSION, "mission.duration=1e-9"], "mission.duration: expected at least one control period"),
     "null solver": (["solver=null"], "solver: expected one of al_ilqr, fatrop"),

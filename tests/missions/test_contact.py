@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.constraints.test_obstacles import HalfPlane
 from tests.missions.missions import DOUBLE, SOLVER, far, mission
 from tests.missions.test_mission import ends
+from tests.obstacles.test_obstacles import HalfPlane
 from torchgco import Boxes, Capsules, ControlBounds, InputError, Problem, Spheres
 from torchgco.constraints import Constraint
 from torchgco.judging import judge

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.constraints.test_obstacles import HalfPlane
 from tests.missions.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
+from tests.obstacles.test_obstacles import HalfPlane
 from torchgco import Airframe, Cost, Goal, InputError, Planar, Problem, QuadraticCost, QuadrotorPlanning
 from torchgco.missions.contact import Contact
 from torchgco.missions.disturbance import Disturbance

@@ -18,6 +18,7 @@ from torchgco.plotting.convergence import convergence_figure
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.rates import rates_figure
 from torchgco.plotting.style import PALETTE, legend_columns, save, solver_colours, solver_dash
+from torchgco.presets import PRESETS
 
 
 def bars(ax: Axes) -> list[Rectangle]:
@@ -46,7 +47,7 @@ def test_a_solver_keeps_its_colour_among_any_others() -> None:
 
 
 def test_each_solver_of_the_library_has_a_look_of_its_own() -> None:
-    names = sorted(path.stem for path in (Path(__file__).parents[2] / "conf" / "solver").glob("*.yaml"))
+    names = sorted(PRESETS)
     assert len(set(solver_colours(names).values())) == len(names) == 12
     assert all(solver_colours([name])[name] == colour for name, colour in solver_colours(names).items())
     common = ("gco", "al_ilqr", "gco_paper", "mppi")
