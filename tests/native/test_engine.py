@@ -27,6 +27,7 @@ from torchgco import (
     StateBounds,
 )
 from torchgco.base import kernels
+from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion
 from torchgco.lagrangian.rollout import open_loop
@@ -34,6 +35,7 @@ from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.solvers import ilqr
 from torchgco.solvers.ending import optimality
 from torchgco.solvers.ilqr import advance
+from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import PassEnd, State
 
 DAMPED = ILQR()
@@ -211,6 +213,21 @@ def test_gains_and_optimality_are_pytorchs(name: str) -> None:
     torch.testing.assert_close(native.K, plain.K, rtol=1e-8, atol=1e-8)
     torch.testing.assert_close(native.d, plain.d, rtol=1e-8, atol=1e-8)
     torch.testing.assert_close(native.left, plain.left, rtol=1e-8, atol=0)
+
+
+@pytest.mark.parametrize("mu_r", [0.0, 0.7])
+def test_a_regularised_backward_pass_expects_pytorchs_change(mu_r: float) -> None:
+    problem = quadrotor_batch(B=5, N=15, obstacles=5)[0]
+    state, lagrangian = running_state(problem)
+    mu = torch.full((5,), mu_r, dtype=torch.float64)
+    want = backward(linearise(problem, state.X, state.U), lagrangian.expand_optimality(state.X, state.U), mu)
+    G, linear, quadratic, failed = engine_of(problem).gains(lagrangian, state.X, state.U, mu)
+    assert torch.equal(failed, want.failed) and not bool(failed.any())
+    mine = BackwardPass(G.transpose(0, 1), linear, quadratic, failed)
+    torch.testing.assert_close(mine.gains, want.gains, rtol=1e-8, atol=1e-8)
+    for alpha in (0.25, 1.0):
+        steps = torch.full_like(mu, alpha)
+        torch.testing.assert_close(mine.expected_change(steps), want.expected_change(steps), rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize(("n", "m", "N"), [(1, 1, 1), (2, 3, 4), (5, 1, 9), (20, 20, 3), (13, 4, 1), (40, 3, 2)])
