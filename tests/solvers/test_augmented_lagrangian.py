@@ -161,3 +161,12 @@ def test_guidance_can_stop_a_solve() -> None:
     plain = solver.solve(problem, U0)
     assert stopped.outer_iterations[1] == 1 and Status.RUNNING not in stopped.statuses
     assert torch.equal(stopped.U[[0, 2]], plain.U[[0, 2]])
+
+
+def test_a_callback_counts_the_passes_from_one() -> None:
+    problem, U0 = planar_batch(B=3, N=10)
+    seen: list[tuple[int, int, int]] = []
+    solver = AugmentedLagrangian(max_outer_iterations=3).in_slots(2)
+    solver.solve(problem, U0, callback=lambda now: seen.append((now.passes, now.finished, now.total)))
+    assert [passes for passes, _, _ in seen] == list(range(1, len(seen) + 1)) and len(seen) > 1
+    assert seen[-1][1:] == (3, 3)

@@ -5,10 +5,19 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
 from tests.problems import planar_batch, quadrotor_batch
 from torchgco import InputError
-from torchgco.solvers.memory import CPU_LIMIT, element_bytes, free_memory, is_out_of_memory, plan_batch
+from torchgco.native.dispatch import engine_of
+from torchgco.solvers.memory import (
+    CPU_LIMIT,
+    element_bytes,
+    free_memory,
+    is_out_of_memory,
+    least_bytes,
+    plan_batch,
+)
 
 PEAK = """
 import torch
@@ -55,3 +64,11 @@ def test_free_memory_is_what_the_kernel_says(monkeypatch) -> None:
     text = "MemTotal:       16000000 kB\nMemFree:          100000 kB\nMemAvailable:    2000000 kB\n"
     monkeypatch.setattr("builtins.open", lambda path: io.StringIO(text) if path == "/proc/meminfo" else None)
     assert free_memory() == 2_000_000 * 1024
+
+
+def test_the_estimate_is_that_of_one_problem() -> None:
+    problem, _ = planar_batch(B=4, N=10, obstacles=3)
+    X, U = torch.zeros(4, 11, 6).double(), torch.zeros(4, 10, 2).double()
+    rows = sum(c.value(X, U)[0].numel() for c in problem.constraints)
+    assert engine_of(problem) is not None
+    assert element_bytes(problem) == least_bytes(10, 6, 2, rows)
