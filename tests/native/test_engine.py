@@ -347,3 +347,14 @@ def test_a_pivot_of_zero_is_a_failed_factorisation() -> None:
     assert bool(end.failed.all()) and a.regularisation.tolist() == [ilqr.REGULARISATION_FIRST] * 3
     assert native.used.tolist() == [ilqr.REGULARISATION_FIRST] * 3 and not bool(native.stuck.any())
     assert engine_of(problem).gains(second, b.X, b.U, torch.zeros_like(b.merit))[3].all()
+
+
+@pytest.mark.parametrize(("times", "converges"), [(0.0, True), (1.0, True), (1.01, False)])
+def test_a_small_change_under_damping_is_no_convergence(times: float, converges: bool) -> None:
+    """Up to the first value of the damping, a step is short because the iterate is good."""
+    problem, loose = planar_batch(B=3, N=8)[0], ILQR(tolerance=1e3)
+    for native in (True, False):
+        state, lagrangian = running_state(problem)
+        state.regularisation = torch.full_like(state.merit, times * ilqr.DAMPING)
+        end = natively(loose, state, lagrangian, 1) if native else loose.iterate(state, lagrangian)
+        assert end.converged.tolist() == [converges] * 3
