@@ -194,7 +194,7 @@ def run(mutants: Sequence[Mutant], records: Path, again: bool = False) -> dict[s
 
 def table(mutants: Sequence[Mutant], ends: dict[str, str], page: str) -> list[str]:
     """A row per area and one of all: mutants tried, killed, survived, timeout, and the shares that were noticed."""
-    lines = ["| area | tried | killed | timeout | survived | no change | noticed of all | noticed of changes |"]
+    lines = ["| area | tried | killed | timeout | survived | same results | noticed of all | of the others |"]
     lines += ["| " + " | ".join(["---"] * 8) + " |"]
     tried = [mutant for mutant in mutants if mutant.key in ends]
     for name in (*(area.name for area in AREAS), "all"):

@@ -277,3 +277,11 @@ def test_a_residual_is_relative_to_the_gradient_of_the_cost() -> None:
         lagrangian_gradient=lambda lam: torch.tensor([-6.0, 2.0]) * lam, gradient=torch.tensor([-2.0, 1.0])
     )
     assert polish._slope(model, torch.ones(2)) == 6.0 / (1.0 + 2.0)
+
+
+def test_where_the_exact_model_gives_no_step_the_other_one_does(monkeypatch) -> None:
+    problem, before = solved("planar")
+    plain, want = polish._convex, Polish(curvature=False).refine(problem, before)
+    assert not torch.equal(want.U, before.U)
+    monkeypatch.setattr(polish, "_convex", lambda point, exact: None if exact else plain(point, exact))
+    assert_same_bits(Polish(curvature=True).refine(problem, before), want)
