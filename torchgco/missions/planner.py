@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -16,7 +17,15 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
 from torchgco.lagrangian.quality import violation
-from torchgco.missions.planning_problem import Margin, acceleration, biased, check_model, first_step, planning_state
+from torchgco.missions.planning_problem import (
+    Margin,
+    acceleration,
+    biased,
+    check_model,
+    first_step,
+    follows,
+    planning_state,
+)
 from torchgco.native.dispatch import followed, open_loop, value
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
@@ -32,7 +41,7 @@ class Plan:
     U: Tensor  # (B, N, 4)
     K: Tensor  # (B, N, 4, 14): feedback gains
     multipliers: Multipliers
-    penalty: Tensor  # (B,): least mu of the searches so far, which plans that continue this one start from
+    penalty: Tensor  # (B,): least mu of the searches that succeeded, which plans that continue this one start from
     cost: Tensor
     violation: Tensor
     shifted: Tensor  # bool: the former plan one stage later, as the new one was infeasible
@@ -43,13 +52,17 @@ class Plan:
     model: Dynamics  # that was planned with
     step: int
 
-    @property
-    def continued(self) -> Multipliers:
-        """The multipliers one stage later.
+    def continued(self, problem: Problem) -> Multipliers:
+        """The multipliers one stage later; where a group of obstacles ends, a knot takes those of the next group.
 
         What one period raises the penalty by doesn't stay: over a mission it would grow beyond all measure.
         """
-        return replace(self.multipliers.shifted(), mu=self.penalty)
+        held, parts = self.multipliers.lam, problem.constraints
+        lam = [shifted(own) for own in held]
+        for i, (own, following) in enumerate(pairwise(parts)):
+            if isinstance(own, Obstacles) and isinstance(following, Obstacles) and follows(own, following):
+                lam[i] = torch.cat((held[i][:, 1:], held[i + 1][:, :1]), dim=1)
+        return Multipliers(tuple(lam), self.penalty)
 
     def take(self, index: Rows) -> Plan:
         """The plans in `index`."""
@@ -172,7 +185,7 @@ class Planner:
         for constraint in whole.constraints:
             later = constraint.later(t)
             if isinstance(later, Obstacles):
-                parts += margin.around(later, whole.N, float(whole.dynamics.dt), depth)
+                parts += margin.around(later, whole.N, float(whole.dynamics.dt), depth, x[:, :3])
             else:
                 parts.append(later)
         return [*parts, *([first_step(whole, x, self.airframe)] if self.first_step else [])]
@@ -192,7 +205,7 @@ def _brought_back(problem: Problem, before: Plan) -> Tensor:
     Gains along a plan that is far from stationary may lead away.
     """
     X, U = shifted(before.X), shifted(before.U)
-    lagrangian = Lagrangian(problem, before.continued, None, True)
+    lagrangian = Lagrangian(problem, before.continued(problem), None, True)
     rollouts = followed(problem, X, U, shifted(before.K)), (open_loop(problem, U), U)
     fed, plain = (value(lagrangian, *rollout)[1].nan_to_num(torch.inf) for rollout in rollouts)
     return torch.where((fed <= plain).view(-1, 1, 1), rollouts[0][1].nan_to_num(), U)
@@ -211,7 +224,7 @@ class _Solve:
 
     def next(self, U0: Tensor, before: Plan) -> Plan:
         """Plans that continue former ones, which are flown one stage later by U0 (B, N, 4)."""
-        multipliers = before.continued
+        multipliers = before.continued(self.problem)
         warm = multipliers if self.planner.multipliers == "shifted" else None
         plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids))
         plan.penalty.copy_(before.penalty)
@@ -223,7 +236,8 @@ class _Solve:
             self._replace(plan, rows, found)
             for name in ("guided", "iterations"):
                 getattr(plan, name)[rows] += getattr(found, name)
-        return replace(plan, penalty=torch.minimum(plan.penalty, before.penalty))
+        lower = (plan.penalty < before.penalty) & (plan.violation <= self.planner.tolerance)
+        return replace(plan, penalty=torch.where(lower, plan.penalty, before.penalty))
 
     def _solved(self, solver: Solver, problem: Problem, U0: Tensor, warm: Multipliers | None, ids: Tensor) -> Solution:
         return solver.solve(problem, U0, seed=self.seed, ids=ids, warm=warm, max_seconds=self._time_left())

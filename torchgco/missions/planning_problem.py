@@ -21,6 +21,7 @@ from torchgco.problem.problem import Problem
 PARTS = 4  # of the horizon, with a margin each, where margins grow
 BLIND = 3  # knots whose positions the controls of a plan can't change, or hardly
 EARLY = 10  # knots in which a vehicle may leave a margin that it has entered
+TINY = 1e-9  # m, against rounding
 KEPT = 0.25  # share of the clearance from contact that an entered margin leaves
 
 
@@ -83,16 +84,23 @@ class Margin:
         radius = torch.where(obstacles.absent, torch.inf, obstacles.margins).amin(-1)
         return self.size + torch.minimum(self.step.square() / (8.0 * radius), 0.5 * self.step)
 
-    def around(self, obstacles: Obstacles, N: int, dt: float, depth: Tensor) -> list[Constraint]:
-        """Obstacles with the margin: less by `depth` (B,) at the early knots, more at late ones where it grows."""
+    def around(self, obstacles: Obstacles, N: int, dt: float, depth: Tensor, start: Tensor) -> list[Constraint]:
+        """Obstacles with the margin: less by `depth` (B,) at the early knots, more at late ones where it grows.
+
+        Nowhere is it so large that the start (B, 3), m, would be in contact with the grown obstacles.
+        """
         early, size = min(EARLY, N), self.of(obstacles)
         parts = [_at(obstacles.grown(size - depth), slice(1, early + 1))]
         if early == N:
             return parts
+        room = torch.full_like(depth, torch.inf)
+        if obstacles.absent.shape[1] > 0:
+            distance = obstacles.signed_distance(start.unsqueeze(1), start.new_zeros(1))[:, 0]
+            room = ((distance + (1.0 - CONTACT_FACTOR) * obstacles.margins) / CONTACT_FACTOR).amin(-1) - TINY
         for knots in torch.arange(early + 1, N + 1).chunk(PARTS if self.growth > 0 else 1):
             first, last = int(knots[0]), int(knots[-1]) + 1
             by = size + self.growth * 0.5 * (first + last - 1) * dt
-            parts.append(_at(obstacles.grown(by), slice(first, last)))
+            parts.append(_at(obstacles.grown(torch.minimum(by, room)), slice(first, last)))
         return parts
 
     def unavoidable_depth(self, problem: Problem, t: float, U: Tensor) -> Tensor:
@@ -111,6 +119,11 @@ class Margin:
                 most = size + (1.0 - KEPT) * (1.0 - CONTACT_FACTOR) * part.margins
                 depth = torch.maximum(depth, torch.minimum(-distance, most).clamp(min=0.0).amax(-1))
         return depth
+
+
+def follows(first: Any, second: Any) -> bool:
+    """Whether two groups of `Margin.around` are of the same obstacles, the second from the knot after the first."""
+    return first.knots.stop == second.knots.start and torch.equal(first.absent, second.absent)
 
 
 def first_step(problem: Problem, x: Tensor, airframe: Airframe) -> FirstStepRates:
