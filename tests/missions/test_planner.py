@@ -212,7 +212,7 @@ def test_the_next_plan_starts_from_the_former_one(multipliers: Any, feedback: bo
         assert second["warm"] is None
     else:
         for mine, old in zip(second["warm"].lam, plan.multipliers.lam, strict=True):
-            assert torch.equal(mine[:, :-1], old[:, 1:]) and torch.equal(mine[:, -1], old[:, -1])
+            assert torch.equal(mine[:, :-1], old[:, 1:])
         assert torch.equal(second["warm"].mu, plan.multipliers.mu)
 
 
@@ -258,6 +258,18 @@ def test_penalties_do_not_pile_up_over_a_mission() -> None:
         plan, now = next_plan(planner, problem, now, plan, plan.measured)
         assert bool((plan.multipliers.mu > first).any())
         assert torch.equal(solver.calls[-1]["warm"].mu, first)
+
+
+def test_a_knot_that_joins_the_next_group_brings_its_multipliers() -> None:
+    """Early and late knots are constraints of their own: the tenth knot one stage later is the eleventh now."""
+    plan, now = first_plan(Planner(SOLVER), varied())
+    lam = tuple(torch.arange(part.numel(), **DOUBLE).view(part.shape) for part in plan.multipliers.lam)
+    held = replace(plan, multipliers=replace(plan.multipliers, lam=lam)).continued(now)
+    early, late = held.lam[:2]
+    assert isinstance(now.constraints[0], BoundSpheres) and early.shape[1] == 10
+    assert torch.equal(early, torch.cat((lam[0][:, 1:], lam[1][:, :1]), dim=1))
+    for mine, old in zip((late, *held.lam[2:]), lam[1:], strict=True):  # the last of a horizon keeps its own
+        assert torch.equal(mine, torch.cat((old[:, 1:], old[:, -1:]), dim=1))
 
 
 def test_the_margin_covers_what_a_straight_step_cuts_off() -> None:
