@@ -7,14 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.problems import quick_gco
 from tests.search.gates import CLOSED, FREE, PASSES, SHORT, gates
-from torchgco import Polish, Restarts, Solution, presets
+from torchgco import Polish, Restarts, Solution
 from torchgco.solution import Fate
 
 
 @pytest.fixture(scope="module")
 def solver() -> Restarts:
-    solver = presets.gco(2)
+    solver = quick_gco(gates()[0])
     return replace(solver, local=replace(solver.local, record=True))
 
 
