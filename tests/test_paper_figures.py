@@ -105,8 +105,8 @@ def test_samples_of_a_mission_belong_to_their_control_step(script: ModuleType) -
     (part,) = importlib.import_module("paper_flights").fly(["gco_paper"], 0.15)
     for step, call in enumerate(part.sampled):
         state = part.frame.loc[step, [f"x{i}" for i in range(13)]].to_numpy(dtype=float)
-        assert np.array_equal(call.problem.x0[0, :13].numpy(), state)
-        assert np.array_equal(call.samples(2)[:, 0], np.stack([state[:3]] * 2))
+        assert np.allclose(call.problem.x0[0, :13].numpy(), state, rtol=0, atol=1e-12)  # a quaternion is normed again
+        assert np.allclose(call.samples(2)[:, 0], np.stack([state[:3]] * 2), rtol=0, atol=1e-12)
 
 
 def test_costs_are_drawn_one_below_the_other(script: ModuleType) -> None:

@@ -222,7 +222,7 @@ def test_iterates_are_lost_where_python_says(B: int, monkeypatch) -> None:
     assert not same(mine, usual) and same(mine, theirs)
 
 
-@pytest.mark.parametrize(("name", "value"), [("ROUNDS", 1), ("GAIN", 0.9999)])
+@pytest.mark.parametrize(("name", "value"), [("LIFTED_STEPS", 1), ("GAIN", 0.9999)])
 def test_a_constant_of_the_lifted_search_changes_both_kernels(name: str, value: float, monkeypatch) -> None:
     state, lagrangian = running_state(planar())
     searches = (native_lifted_search, lifted_search)

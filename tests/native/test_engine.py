@@ -356,5 +356,5 @@ def test_a_small_change_under_damping_is_no_convergence(times: float, converges:
     for native in (True, False):
         state, lagrangian = running_state(problem)
         state.regularisation = torch.full_like(state.merit, times * ilqr.DAMPING)
-        end = natively(loose, state, lagrangian, 1) if native else loose.iterate(state, lagrangian)
+        end = natively(loose, state, lagrangian, 1) if native else loose.one_iteration(state, lagrangian)
         assert end.converged.tolist() == [converges] * 3
