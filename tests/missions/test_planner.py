@@ -284,6 +284,7 @@ def test_the_margin_covers_what_a_straight_step_cuts_off() -> None:
     assert (
         float(Margin(0.0, 0.0, step).of(obstacles)) == 0.0 and float(Margin(0.01, 0.0, 0 * step).of(obstacles)) == 0.01
     )
+    assert float(Margin(0.01, 0.0, step).between(spheres)) == pytest.approx(more - 0.01)
     none = scene(torch.zeros(1, 0, 3, **DOUBLE)).constraints[0]
     assert isinstance(none, BoundSpheres) and float(Margin(0.01, 0.0, step).of(none)) == 0.01
 

@@ -92,8 +92,9 @@ class Planner:
             state then leads metres away.
         multipliers: "shifted" starts from those of the former plan one stage later, "reset" from zero, as the paper.
         max_seconds: time limit of a plan, s; None: none. With a limit, results depend on the machine.
-        tolerance: violation (m for lengths) up to which a plan is flown without a look at the former one; infinity: a
-            new plan always is, as in the paper, unless its violation is not a number.
+        tolerance: violation (m for lengths) up to which a plan is flown without a look at the former one; what the
+            margin has for the way between two knots comes on top. Infinity: a new plan always is, as in the paper,
+            unless its violation is not a number.
         margin: by which obstacles are grown, m, and above 0 by as much more as a straight step between two knots of the
             former plan may lead into them; margin_growth: by how much more per second of the horizon, m/s, in four
             steps.
@@ -157,7 +158,8 @@ class Planner:
         margin = self._margin(x, before)
         depth = margin.unavoidable_depth(whole.started_at(x0, whole.constraints), t, U0)
         now = now.started_at(x0, self._constraints(whole, t, x, margin, depth), dynamics=dynamics)
-        solve = _Solve(self, now, seed, ids, began)
+        allowed = self.tolerance + margin.between(whole)
+        solve = _Solve(self, now, seed, ids, began, allowed)
         if before is not None and self.feedback:
             U0 = _brought_back(now, before)
         plan = solve.first(U0) if before is None else solve.next(U0, before)
@@ -214,8 +216,11 @@ def _brought_back(problem: Problem, before: Plan) -> Tensor:
 class _Solve:
     """The solves of one control step."""
 
-    def __init__(self, planner: Planner, problem: Problem, seed: int, ids: Tensor, began: float) -> None:
+    def __init__(
+        self, planner: Planner, problem: Problem, seed: int, ids: Tensor, began: float, allowed: Tensor
+    ) -> None:
         self.planner, self.problem, self.seed, self.ids, self.began = planner, problem, seed, ids, began
+        self.allowed = allowed  # violation (B,)
         self.solver, self.local = planner.solver.in_closed_loop(CONTINUED)
 
     def first(self, U0: Tensor) -> Plan:
@@ -229,14 +234,14 @@ class _Solve:
         plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids))
         plan.penalty.copy_(before.penalty)
         self._keep_former(plan, before, U0, multipliers)
-        rows = (~(plan.violation <= self.planner.tolerance)).nonzero().flatten()
+        rows = (~(plan.violation <= self.allowed)).nonzero().flatten()
         left = self._time_left()
         if self.local is not self.solver and rows.numel() > 0 and (left is None or left > MIN_SECONDS):
             found = self._plan(self._solved(self.solver, self.problem.take(rows), U0[rows], None, self.ids[rows]))
             self._replace(plan, rows, found)
             for name in ("guided", "iterations"):
                 getattr(plan, name)[rows] += getattr(found, name)
-        lower = (plan.penalty < before.penalty) & (plan.violation <= self.planner.tolerance)
+        lower = (plan.penalty < before.penalty) & (plan.violation <= self.allowed)
         return replace(plan, penalty=torch.where(lower, plan.penalty, before.penalty))
 
     def _solved(self, solver: Solver, problem: Problem, U0: Tensor, warm: Multipliers | None, ids: Tensor) -> Solution:
@@ -249,7 +254,7 @@ class _Solve:
 
     def _keep_former(self, plan: Plan, before: Plan, U: Tensor, multipliers: Multipliers) -> None:
         """Put former plans, flown one stage later by U, in the place of new ones that are infeasible and worse."""
-        rows = (~(plan.violation <= self.planner.tolerance)).nonzero().flatten()
+        rows = (~(plan.violation <= self.allowed)).nonzero().flatten()
         if rows.numel() == 0:
             return
         part = self.problem.take(rows)

@@ -84,6 +84,11 @@ class Margin:
         radius = torch.where(obstacles.absent, torch.inf, obstacles.margins).amin(-1)
         return self.size + torch.minimum(self.step.square() / (8.0 * radius), 0.5 * self.step)
 
+    def between(self, problem: Problem) -> Tensor:
+        """The largest part of the margins (B,) that is for what happens between two knots, m."""
+        parts = [self.of(part) for part in problem.constraints if isinstance(part, Obstacles)]
+        return torch.stack([torch.full_like(self.step, self.size), *parts]).amax(0) - self.size
+
     def around(self, obstacles: Obstacles, N: int, dt: float, depth: Tensor, start: Tensor) -> list[Constraint]:
         """Obstacles with the margin: less by `depth` (B,) at the early knots, more at late ones where it grows.
 
