@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import torch
 from figures import solve
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -19,6 +18,7 @@ from torchgco.plotting import trajectory
 from torchgco.plotting.animation import Picture, mission_animation, planar_animation
 from torchgco.plotting.course import VIEWS, flight
 from torchgco.plotting.style import INK, PALETTE, SMALL, legend
+from torchgco.solution import Fate
 
 SHOWN = "gco_paper"  # the solver of Figures 10 to 12, A4 and A5
 SNAPSHOTS = (1, 3)  # of Figure 10: guided control steps, and later ones
@@ -147,29 +147,24 @@ def animate(flights: Sequence[Flight], outputs: Path) -> None:
 
 
 def free(path: Path) -> Path:
-    """Animate one solve by gco: its first iterates, candidates along paths, the proposal, and the result."""
-    calls, layouts, final = solve(0)
-    first = [words[2][0, :, :2].numpy() for words, _ in calls["caught"]]
-    end = next(i for i, (_, advice) in enumerate(calls["caught"]) if bool(advice.stop.any()))
-    pictures = [Picture(f"1  AL-iLQR, inner solve {i + 1}", x[None], seconds=0.7) for i, x in enumerate(first[:end])]
-    caught = first[end]
-    pictures.append(Picture(f"1  AL-iLQR, inner solve {end + 1}: caught", caught[None], seconds=1.5))
-    tracked = calls["tracked"][0][1]
-    rows = tracked.live.nonzero().flatten().tolist()
-    every = tracked.X[rows, :, :2].numpy()
+    """Animate one solve by gco: where it is caught, candidates along paths, the proposal, and the result."""
+    _, solution, layouts = solve(0)
+    assert solution.search is not None and solution.search.caught is not None
+    first, caught = solution.search.comparisons[0], solution.search.caught[1][:, :, :2].numpy()
+    fate = first.fate[0]
+    pictures = [Picture("1  AL-iLQR is caught", caught, seconds=1.5)]
+    every = first.tracked[0, fate != Fate.ABSENT, :, :2].numpy()
     for count in range(6, len(every), 6):
-        pictures.append(Picture(f"2  {len(every)} candidates track paths", every[:count], caught[None], 0.1))
-    pictures.append(Picture(f"2  {len(every)} candidates track paths", every, caught[None], 1.2))
-    relaxed, sound = calls["relaxed"][0][1]
-    sets = relaxed.X[sound.nonzero().flatten(), :, :2].numpy()
+        pictures.append(Picture(f"2  {len(every)} candidates track paths", every[:count], caught, 0.1))
+    pictures.append(Picture(f"2  {len(every)} candidates track paths", every, caught, 1.2))
+    sets = first.relaxed[0, fate >= Fate.RELAXED, :, :2].numpy()
     pictures.append(Picture(f"3  relaxed: {len(sets)} are sound", sets, seconds=1.5))
-    (before, _, kept, _), (refined, _, best, _) = calls["refined"][0]
-    kept = [row for row in kept.nonzero().flatten().tolist() if not torch.equal(before.U[row], refined.U[row])]
-    few = refined.X[kept, :, :2].numpy()
+    few = first.refined[0, first.cost[0].isfinite(), :, :2].numpy()
     pictures.append(Picture(f"4  refined: {len(few)} end feasible", few, seconds=1.5))
-    proposal = refined.X[int(best[0]), :, :2].numpy()
-    pictures.append(Picture("5  the cheapest is the proposal", proposal[None], few, 1.5))
-    pictures.append(Picture("6  solved on from there: the result", final[None], caught[None], 2.5))
+    proposal = first.refined[0, fate == Fate.PROPOSED, :, :2].numpy()
+    pictures.append(Picture("5  the cheapest is the proposal", proposal, few, 1.5))
+    final = solution.X[:1, :, :2].numpy()
+    pictures.append(Picture("6  solved on from there: the result", final, caught, 2.5))
     assert layouts.start is not None and layouts.goal is not None
     assert layouts.vehicle_radius is not None and layouts.goal_radius is not None
     start, goal = (np.broadcast_to(x, (1, x.shape[-1]))[0, :2] for x in (layouts.start, layouts.goal))

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 import torch
 
 from torchgco.base.draws import DrawKey
-from torchgco.base.options import Natural, check_options
+from torchgco.base.options import Count, Natural, check_options
 from torchgco.base.status import Status
 from torchgco.base.tree import put, take
 from torchgco.guidance.detection import caught_knots
@@ -50,7 +50,7 @@ class Solve:
 
     until: Literal["caught", "end"] = "caught"
     when: Literal["pathless", "unarrived", "all"] = "unarrived"
-    single_contact_after: int | None = None
+    single_contact_after: Count | None = None
 
     def __post_init__(self) -> None:
         check_options(self, "solve")
