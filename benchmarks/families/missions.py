@@ -138,6 +138,14 @@ def timing(outputs: Path, alone: int, together: int) -> str:
     return "\n".join([*lines, "", *text])
 
 
+def _origin(done: str) -> str:
+    origin = provenance("cpu")
+    return (
+        f"{done} on {origin['date']} at commit {origin['commit']}, seed 0, 95 % Wilson intervals in percent; one\n"
+        f"thread, {origin['processor']}, shared."
+    )
+
+
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.families.missions", description="Fly missions, and count."
@@ -145,7 +153,9 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--cases", type=int, default=len(CASES), help="so many of the cases")
     parser.add_argument("--planners", nargs="+", default=list(PLANNERS), choices=list(PLANNERS), metavar="NAME")
     parser.add_argument("--share", type=float, default=1.0, help="of the number of missions")
-    parser.add_argument("--alone", type=int, default=20, help="missions that fly alone, for times")
+    parser.add_argument(
+        "--alone", type=int, default=20, help="missions that fly alone, for times; 0: the page keeps its times"
+    )
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "missions")
     parser.add_argument("--write", action="store_true", help="put the tables into benchmarks/results/missions.md")
     asked = parser.parse_args(words)
@@ -155,18 +165,15 @@ def main(words: Sequence[str] | None = None) -> int:
             if solver in SLOW and case != WITH_PEERS[0]:
                 continue
             parts.append(fly(case, solver, max(1, round(asked.share * PLANNERS[solver])), asked.outputs))
-    together = max(1, round(asked.share * PLANNERS["gco"]))
-    origin = provenance("cpu")
-    head = (
-        f"Flown on {origin['date']} at commit {origin['commit']}, seed 0, 95 % Wilson intervals in percent; one\n"
-        f"thread, {origin['processor']}, shared."
-    )
     trials = pd.concat(parts)
-    text = f"{head}\n\n{table(trials)}\n\n{misses(trials)}\n\n{timing(asked.outputs, asked.alone, together)}"
-    print(text)
-    if asked.write:
-        marks = "<!-- missions -->", "<!-- end missions -->"
-        put_between(RESULTS / "missions.md", *marks, text)
+    blocks = {"missions": f"{_origin('Flown')}\n\n{table(trials)}\n\n{misses(trials)}"}
+    if asked.alone > 0:
+        together = max(1, round(asked.share * PLANNERS["gco"]))
+        blocks["times"] = f"{_origin('Measured')}\n\n{timing(asked.outputs, asked.alone, together)}"
+    for name, text in blocks.items():
+        print(text)
+        if asked.write:
+            put_between(RESULTS / "missions.md", f"<!-- {name} -->", f"<!-- end {name} -->", text)
     return 0
 
 
