@@ -81,7 +81,6 @@ def gco(space: Space) -> Restarts:
 
 def gco_fast(space: Space) -> Restarts:
     """One attempt along the shortest path, tracked from rest."""
-    solver = gco(space)
     solve, proposals, _ = _parts(space)
     guidance = _guidance(space)
     follow = replace(proposals.follow[0], initial_offsets=(), arrive=proposals.follow[0].paces[:1], iterations=10)
@@ -89,7 +88,7 @@ def gco_fast(space: Space) -> Restarts:
     closer = replace(one, when="unproposed", roadmaps=(), follow=(_closer(follow),))
     guidance = replace(guidance, sampler=replace(guidance.sampler, samples=64, rounds=10))
     return Restarts(
-        local=replace(solver.local, guidance=guidance),
+        local=replace(_local(space), guidance=guidance),
         passes=(
             replace(solve, until="end", when="pathless"),
             solve,
