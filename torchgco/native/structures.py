@@ -12,8 +12,10 @@ from torchgco.native.declarations import Structure, fields
 from torchgco.obstacles.base import ABSENT
 
 NOWHERE = -1  # the place of a knot at which a constraint has no rows
+PAIRS = 64  # entries of a filter; the oldest are forgotten
+LONGEST_FALL = 50  # reductions of the barrier parameter in one iteration
 CONSTANTS = {
-    "ABSENT": ABSENT, "NOWHERE": NOWHERE,
+    "ABSENT": ABSENT, "NOWHERE": NOWHERE, "PAIRS": PAIRS, "LONGEST_FALL": LONGEST_FALL, "PARTS": 3,
     **{name: f"{value & 0xFFFFFFFF:#x}u" for name, value in (
         ("MURMUR_1", MURMUR_1), ("MURMUR_2", MURMUR_2), ("WEYL", WEYL),
     )},
@@ -114,7 +116,24 @@ class Sampling(Structure):
     _fields_ = fields(declared)
 
 
-STRUCTURES = (Array, Constraint, Options, Problem, Sampling)
+class Interior(Structure):
+    """The interior point (see solvers.interior)."""
+
+    declared = (
+        ("const Problem *", "of"),
+        ("double *", "barrier error theta"),  # (E): mu, in and out; error of the end test and sum of residuals, out
+        ("int64_t", "max_iterations failures"),
+        ("int32_t", "corrects warm"),
+        ("double", "tolerance violation push steepest boundary central smallest restored"),
+        ("double", "barrier_error barrier_share barrier_floor usual_multiplier largest_multiplier"),
+        ("double", "highest lowest gain_theta gain_phi armijo switching power_theta power_phi"),
+        ("double", "shift_first shift_least shift_decay shift_growth shift_growth_first shift_max"),
+        ("double", "shift_recovery recovery_decay"),
+    )
+    _fields_ = fields(declared)
+
+
+STRUCTURES = (Array, Constraint, Options, Problem, Sampling, Interior)
 ENUMERATIONS = (Kind, Guide, Status, End)
 
 

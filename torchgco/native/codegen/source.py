@@ -45,6 +45,7 @@ COST, BOXES = "quadratic.c", ("box.h", "boxes.c")  # or traced.c; left out where
 TERMS = ("problem.c", COST, "penalty.c", *BOXES, "knot.c")
 SOLVER = (*TERMS, "passes.c", "ilqr.c", "trajectories.c")
 SAMPLER = (*TERMS, "normal.c", "mppi.c")
+INTERIOR = (*TERMS, "interior_rows.c", "interior_step.c", "interior.c")
 
 
 _sources: dict[tuple[Any, ...], str] = {}  # reading and joining the files takes longer than a small solve
@@ -61,11 +62,13 @@ class Form:
     functions: tuple[tuple[int, KnotSource], ...]  # the constraints that are traced, by their place
     boxes: bool = False  # whether there are boxes among the obstacles
 
-    def source(self, parts: tuple[str, ...] = SOLVER, real: str = "double", lanes: int = LANES) -> str:
-        """The C file of the solver or the sampler, for numbers of type `real`."""
-        key = (*self._key, parts, real, lanes)
+    def source(
+        self, parts: tuple[str, ...] = SOLVER, real: str = "double", lanes: int = LANES, more: str = ""
+    ) -> str:
+        """The C file of one of the solvers or the sampler, for numbers of type `real`; `more` is generated code."""
+        key = (*self._key, parts, real, lanes, more)
         if key not in _sources:
-            _sources[key] = self._written(parts, real, lanes)
+            _sources[key] = self._written(parts, real, lanes, more)
             if len(_sources) > KEPT:
                 del _sources[next(iter(_sources))]
         return _sources[key]
@@ -77,7 +80,7 @@ class Form:
         functions = tuple((i, rows.key) for i, rows in self.functions)
         return self.dynamics.key, at and (at.start, at.stop), cost, self.dense, functions, self.boxes
 
-    def _written(self, parts: tuple[str, ...], real: str, lanes: int) -> str:
+    def _written(self, parts: tuple[str, ...], real: str, lanes: int, more: str) -> str:
         model, at = self.dynamics, self.position
         sizes = {
             "REAL": real, "LANES": lanes, "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
@@ -88,7 +91,7 @@ class Form:
         cost = Quadratic if self.cost is None else TracedCost
         shared = head(STRUCTURES, (*ENUMERATIONS, cost), CONSTANTS)
         generated = [model.code, _products(model), "" if self.cost is None else self.cost.code]
-        generated += [*dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions)]
+        generated += [*dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions), *([more] if more else [])]
         # Without boxes their code is left out, so that it can't change how the rest is compiled.
         names = [name for name in parts if self.boxes or name not in BOXES]
         names = ["traced.c" if name == COST and self.cost is not None else name for name in names]

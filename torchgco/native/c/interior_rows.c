@@ -1,0 +1,165 @@
+/* The interior point's data, and the rows of constraints in it: c(x, u) + s = 0 with slacks s > 0, or c(x, u) = 0.
+
+   The generated part also defines
+
+       tgco_curve(x, u, parameters, y, H)               H += second derivatives of y' step, upper triangle
+       tgco_push(f, z, out)                             out = F z
+       tgco_model_rows(i, x, u, p, by, cc, lam, g, H)   traced rows: g[a] += c_z' by[a], H += c_z' cc c_z + lam' c_zz
+       tgco_along_rows(i, x, u, p, z, out)              out = c_z z */
+
+#define SOFT 1e-8 /* dual regularisation of equalities: a step fulfils them up to so much of the multipliers' change */
+
+typedef struct {
+    Lanes lanes;
+    const Interior *how;
+    V *y, *yn;                   /* (N+1, NX): costates of the states, and those of a full step */
+    V *gap, *gapn, *aim;         /* (N, NX): step(x, u) - x', of the iterate, of the trial, and what a step is to close */
+    V *H, *f;                    /* (N+1, S, S) upper triangles, (N, NJ) */
+    V *cost_slope, *g[PARTS];    /* (N+1, S): cost; with J' of multipliers, of the condensed residuals, of 1 / s */
+    V *P, *p, *L;                /* (N+1, NX, NX), (N+1, NX), (N, NU, NU): the Riccati recursion */
+    V *dx, *du;                  /* (N+1, NX), (N, NU) */
+    V *c, *cn, *s, *sn, *z, *r, *ds, *dz; /* (rows): values, slacks, multipliers, residuals, and of trial and step */
+    int64_t *first, rows;        /* the first row of each constraint, and how many there are */
+    V mu, shift, scale, objective; /* objective: 0 where feasibility alone is sought */
+    V *memory;
+} Barrier;
+
+/* Rows of constraint i at knot k begin here. */
+static inline int64_t row_of(const Barrier *t, int64_t i, int64_t k) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    return t->first[i] + con->place[k] * con->rows;
+}
+
+/* Values c of constraint i at knot k. */
+static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V *c) {
+    const Constraint *con = s->of->constraint + i;
+    const Rows *rows = s->rows + i;
+    if (con->kind == BOUNDS) {
+        for (int j = 0; j < con->rows; j++) c[j] = bound(con, rows, j, x, u);
+#if DIM > 0
+    } else if (con->kind == SPHERES) {
+        V away[DIM];
+        for (int j = 0; j < con->rows; j++) c[j] = sphere(con, rows, j, k, x, away);
+#endif
+#if WITH_BOXES
+    } else if (con->kind == BOXES) {
+        for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, x, 0);
+#endif
+    } else tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
+}
+
+/* What row q adds: by[0] its multiplier, by[1] the condensed residual, by[2] mu's factor, and the curvature across. */
+static inline V weigh(const Barrier *t, int equality, int64_t q, V *by) {
+    by[0] = t->z[q];
+    if (equality) {
+        by[1] = t->objective * t->z[q] + t->r[q] * SET(1.0 / SOFT);
+        by[2] = SET(0.0);
+        return SET(1.0 / SOFT);
+    }
+    V sigma = t->z[q] / t->s[q];
+    by[1] = sigma * t->r[q];
+    by[2] = SET(1.0) / t->s[q];
+    return sigma;
+}
+
+#if DIM > 0
+/* A row of the position alone, with its slopes and lam times its curvature (DIM, DIM), upper triangle. */
+static inline void add_row(Barrier *t, int64_t k, int64_t q, const V *slopes, const V *curvature) {
+    V by[PARTS], cc = weigh(t, 0, q, by), *H = t->H + k * S * S;
+    for (int a = 0; a < DIM; a++) {
+        for (int part = 0; part < PARTS; part++) t->g[part][k * S + POSITION + a] += by[part] * slopes[a];
+        for (int b = a; b < DIM; b++)
+            H[(POSITION + a) * S + POSITION + b] += cc * slopes[a] * slopes[b] + curvature[a * DIM + b];
+    }
+}
+
+static inline void add_spheres(Barrier *t, int64_t i, int64_t k, const V *x) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    const Rows *rows = t->lanes.rows + i;
+    int64_t q = row_of(t, i, k);
+    for (int j = 0; j < con->rows; j++, q++) {
+        V slopes[DIM], curvature[DIM * DIM], bend;
+        sphere(con, rows, j, k, x, slopes);
+        bend = tgco_if(rows->squares[j] >= SET(0.0), SET(-2.0) * t->objective * t->z[q]);
+        for (int a = 0; a < DIM; a++) {
+            slopes[a] *= SET(-2.0);
+            for (int b = 0; b < DIM; b++) curvature[a * DIM + b] = a == b ? bend : SET(0.0);
+        }
+        add_row(t, k, q, slopes, curvature);
+    }
+}
+#endif
+
+#if WITH_BOXES
+static inline void add_boxes(Barrier *t, int64_t i, int64_t k, const V *x) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    int64_t q = row_of(t, i, k);
+    V slopes[DIM], flat[DIM * DIM];
+    for (int a = 0; a < DIM * DIM; a++) flat[a] = SET(0.0); /* faces don't bend, and edges are left to the shift */
+    for (int j = 0; j < con->rows; j++, q++) {
+        solid(con, t->lanes.rows + i, j, x, slopes);
+        add_row(t, k, q, slopes, flat);
+    }
+}
+#endif
+
+static inline void add_bounds(Barrier *t, int64_t i, int64_t k) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    int64_t q = row_of(t, i, k);
+    for (int j = 0; j < con->rows; j++, q++) {
+        V by[PARTS], cc = weigh(t, 0, q, by), sign = SET(con->sign[j]);
+        int v = con->variable[j];
+        for (int part = 0; part < PARTS; part++) t->g[part][k * S + v] += sign * by[part];
+        t->H[k * S * S + v * S + v] += cc;
+    }
+}
+
+/* Adds constraint i at knot k to the model of a step. */
+static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const V *u) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    const Rows *rows = t->lanes.rows + i;
+    if (con->kind == BOUNDS) { add_bounds(t, i, k); return; }
+#if DIM > 0
+    if (con->kind == SPHERES) { add_spheres(t, i, k, x); return; }
+#endif
+#if WITH_BOXES
+    if (con->kind == BOXES) { add_boxes(t, i, k, x); return; }
+#endif
+    V by[PARTS * MAX_ROWS], cc[MAX_ROWS], lam[MAX_ROWS], own[PARTS];
+    int64_t q = row_of(t, i, k);
+    for (int j = 0; j < con->rows; j++) {
+        cc[j] = weigh(t, con->equality, q + j, own);
+        for (int part = 0; part < PARTS; part++) by[part * MAX_ROWS + j] = own[part];
+        lam[j] = t->objective * t->z[q + j];
+    }
+    V *g[PARTS];
+    for (int part = 0; part < PARTS; part++) g[part] = t->g[part] + k * S;
+    tgco_model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), by, cc, lam, g, t->H + k * S * S);
+}
+
+/* The change of the rows of constraint i at knot k along z = [dx, du], into out. */
+static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, const V *u, const V *z, V *out) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    const Rows *rows = t->lanes.rows + i;
+    if (con->kind == BOUNDS) {
+        for (int j = 0; j < con->rows; j++) out[j] = SET(con->sign[j]) * z[con->variable[j]];
+#if DIM > 0
+    } else if (con->kind == SPHERES) {
+        for (int j = 0; j < con->rows; j++) {
+            V away[DIM];
+            sphere(con, rows, j, k, x, away);
+            out[j] = SET(0.0);
+            for (int a = 0; a < DIM; a++) out[j] -= SET(2.0) * away[a] * z[POSITION + a];
+        }
+#endif
+#if WITH_BOXES
+    } else if (con->kind == BOXES) {
+        for (int j = 0; j < con->rows; j++) {
+            V slopes[DIM];
+            solid(con, rows, j, x, slopes);
+            out[j] = SET(0.0);
+            for (int a = 0; a < DIM; a++) out[j] += slopes[a] * z[POSITION + a];
+        }
+#endif
+    } else tgco_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), z, out);
+}

@@ -1,0 +1,134 @@
+"""C of the second derivatives that the interior point needs: of a model's step and of traced constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from torchgco.native import store
+from torchgco.native.codegen import emit
+from torchgco.native.codegen.dynamics import DynamicsSource, elements, makers
+from torchgco.native.codegen.knot import Knot, KnotSource, knot_source
+
+
+def curvature_code(model: DynamicsSource, functions: Iterable[tuple[int, KnotSource]]) -> str:
+    """The functions that interior_rows.c describes, for a model and the traced constraints by their place."""
+    rows = [(i, knot_source("curves", source.span, _rows_code, __file__)) for i, source in functions]
+    code = dict.fromkeys(source.code for _, source in rows)
+    return "\n".join([_model_code(model), _push(model), *code, _switches(rows)])
+
+
+def _model_code(model: DynamicsSource) -> str:
+    """`tgco_curve(x, u, p, y, H)`: H += sum_i y_i times the second derivatives of state i, upper triangle."""
+
+    def make(_: str) -> dict[str, Any]:
+        import casadi as ca
+
+        x, u = ca.SX.sym("x", model.n), ca.SX.sym("u", model.m)
+        p, y = ca.SX.sym("p", model.traced.count), ca.SX.sym("y", model.n)
+        ahead = model.traced(elements(p), elements(x)[None], elements(u)[None]).reshape(-1)
+        total = ca.dot(y, ca.densify(ca.vertcat(*ahead)))
+        return {"code": _curves("tgco_curve", [x, u, p, y], total, ca.vertcat(x, u))}
+
+    return store.made(("curvature", model.key, *makers(__file__)), make).content["code"]
+
+
+def _rows_code(knot: Knot, name: str) -> str:
+    """`tgco_NAME_model` and `tgco_NAME_along` of a traced constraint, as interior_rows.c describes them."""
+    import casadi as ca
+
+    z, inputs = ca.vertcat(knot.x, knot.u), [knot.x, knot.u, knot.numbers]
+    slopes = ca.sparsify(ca.jacobian(knot.rows, z, {"allow_reverse": False}))
+    rows, columns = slopes.sparsity().get_triplet()
+    nonzeros: list[Any] = slopes.nonzeros()
+    places = sorted(zip(rows, columns, range(len(rows)), strict=True))
+    lam = ca.SX.sym("lam", knot.rows.numel())
+    lines = [
+        _curves(f"tgco_{name}_bend", [*inputs, lam], ca.dot(lam, knot.rows), z),
+        emit.emit(f"tgco_{name}_slants", ca.Function("slants", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)])),
+        f"static inline void tgco_{name}_model(const V *x, const V *u, const V *p, const V *by, const V *cc,",
+        "    const V *lam, V *const *g, V *H) {",
+        f"    V e[{max(1, len(rows))}];",
+        f"    tgco_{name}_slants(x, u, p, e);",
+    ]
+    for row, column, i in places:
+        lines.append(f"    for (int a = 0; a < PARTS; a++) g[a][{column}] += e[{i}] * by[a * MAX_ROWS + {row}];")
+        for other, later, j in places:
+            if other == row and later >= column:
+                lines.append(f"    H[{column} * (NX + NU) + {later}] += e[{i}] * cc[{row}] * e[{j}];")
+    lines += [
+        f"    tgco_{name}_bend(x, u, p, lam, H);",
+        "}",
+        f"static inline void tgco_{name}_along(const V *x, const V *u, const V *p, const V *z, V *out) {{",
+        f"    V e[{max(1, len(rows))}];",
+        f"    tgco_{name}_slants(x, u, p, e);",
+        f"    for (int j = 0; j < {knot.rows.numel()}; j++) out[j] = SET(0.0);",
+        *(f"    out[{row}] += e[{i}] * z[{column}];" for row, column, i in places),
+        "}",
+    ]
+    return "\n".join(lines)
+
+
+def _curves(name: str, inputs: list[Any], total: Any, z: Any) -> str:
+    """`NAME(inputs, H)`: H += the second derivatives of `total` by z, upper triangle."""
+    import casadi as ca
+
+    hessian = ca.sparsify(_hessian(total, z, inputs))
+    size = z.numel()
+    found: list[Any] = hessian.nonzeros()
+    rows, columns = hessian.sparsity().get_triplet()
+    upper = [(i, j, entry) for i, j, entry in zip(rows, columns, found, strict=True) if j >= i]
+    column = ca.cse(ca.densify(ca.vertcat(ca.SX(0, 1), *(entry for *_, entry in upper))))
+    arguments = ", ".join(f"const V *in{i}" for i in range(len(inputs)))
+    passed = ", ".join(f"in{i}" for i in range(len(inputs)))
+    lines = [
+        emit.emit(f"{name}_entries", ca.Function("entries", inputs, [column])),
+        f"__attribute__((noinline)) static void {name}({arguments}, V *H) {{",
+        f"    V e[{max(1, len(upper))}];",
+        f"    {name}_entries({passed}, e);",
+        *(f"    H[{i * size + j}] += e[{at}];" for at, (i, j, _) in enumerate(upper)),
+        "}",
+    ]
+    return "\n".join(lines)
+
+
+def _hessian(total: Any, z: Any, inputs: list[Any]) -> Any:
+    """Second derivatives; forward mode alone where there are branches.
+
+    Reverse mode is shorter, but lets a NaN of the branch not taken through as 0 * NaN.
+    """
+    import casadi as ca
+
+    function = ca.Function("total", inputs, [total])
+    branches = {ca.OP_IF_ELSE_ZERO}
+    if branches.isdisjoint(function.instruction_id(i) for i in range(function.n_instructions())):
+        return ca.hessian(total, z)[0]
+    forward = {"allow_reverse": False}
+    return ca.jacobian(ca.jacobian(total, z, forward).T, z, forward)
+
+
+def _push(model: DynamicsSource) -> str:
+    """`tgco_push(f, z, out)`: out = F z."""
+    lines = ["static inline void tgco_push(const V *restrict f, const V *restrict z, V *restrict out) {"]
+    lines.append("    for (int i = 0; i < NX; i++) out[i] = SET(0.0);")
+    for row, column, place, value in zip(model.rows, model.columns, model.places, model.values, strict=True):
+        factor = f"f[{place}] * " if place >= 0 else "" if value == 1.0 else f"SET({emit.literal(value)}) * "
+        lines.append(f"    out[{row}] += {factor}z[{column}];")
+    return "\n".join([*lines, "}"])
+
+
+def _switches(rows: Iterable[tuple[int, KnotSource]]) -> str:
+    """`tgco_model_rows` and `tgco_along_rows`, which call the functions of a constraint by its place."""
+    models, alongs = [], []
+    for i, source in rows:
+        models.append(f"    case {i}: tgco_{source.key}_model(x, u, p, by, cc, lam, g, H); break;")
+        alongs.append(f"    case {i}: tgco_{source.key}_along(x, u, p, z, out); break;")
+    return "\n".join(
+        [
+            "static inline void tgco_model_rows(int i, const V *x, const V *u, const V *p, const V *by, const V *cc,",
+            "    const V *lam, V *const *g, V *H) {",
+            "    switch (i) {", *models, "    }", "}",
+            "static inline void tgco_along_rows(int i, const V *x, const V *u, const V *p, const V *z, V *out) {",
+            "    switch (i) {", *alongs, "    }", "}",
+        ]
+    )  # fmt: skip

@@ -1,0 +1,57 @@
+"""The interior point in C: its library for a form of problems, and the options that it reads."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.native.codegen.curvature import curvature_code
+from torchgco.native.codegen.source import INTERIOR, LANES
+from torchgco.native.declarations import load
+from torchgco.native.engine import Engine, run
+from torchgco.native.structures import STRUCTURES, Interior
+from torchgco.problem.problem import Problem
+
+
+class InteriorEngine:
+    """The library of a form of problems; compiled when it is made.
+
+    Raises:
+        InputError: a part without a counterpart in C.
+        NativeError: no compiler, or it refuses the source.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        curves = curvature_code(engine.model, engine.functions.items())
+        self.library = load(engine.form.source(INTERIOR, more=curves), STRUCTURES)
+
+    def solve(
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
+    ) -> dict[str, Tensor]:
+        """States, controls, multipliers and barrier parameters in place; X begins with the problem's start.
+
+        Args:
+            X, U: (B, N+1, n), (B, N, m), contiguous.
+            multipliers: of every constraint, (B, K, p), contiguous.
+            barrier: mu (B,).
+            options: the fields of `structures.Interior`.
+
+        Returns:
+            status, iterations (B,); error of the end test and theta, the sum of residuals (B,); gains (B, N, m, n+1).
+        """
+        B, N = problem.B, problem.N
+        out = {"status": torch.zeros(B, dtype=torch.int32), "iterations": torch.zeros(B, dtype=torch.int64)}
+        out["gains"] = X.new_zeros(B, N, problem.m, problem.n + 1)
+        ends = {name: X.new_zeros(B) for name in ("error", "theta")}
+        rows = [constraint.copy() for constraint in self.engine._fixed(problem)[1]]
+        for row, lam in zip(rows, multipliers, strict=True):
+            row.lam = lam
+        packed = self.engine.packed(problem, X=X, U=U, constraint=rows, **out)
+        run(
+            self.library.tgco_interior, B, LANES,
+            Interior.complete(of=packed, barrier=barrier, **ends, **options),
+        )  # fmt: skip
+        return out | ends
