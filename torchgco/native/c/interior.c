@@ -6,10 +6,10 @@ typedef struct { double theta, phi; } Pair;
 
 /* What the globalisation remembers of each lane. */
 typedef struct {
-    V theta, phi, highest, lowest, last, forced, made, entered;
+    V theta, phi, highest, lowest, last, forced, made, entered, slope, alpha;
     Pair filter[LANES][PAIRS];
-    int pairs[LANES], failures[LANES];
-    I restoring;
+    int pairs[LANES], failures[LANES], shortened[LANES], ahead[LANES];
+    I restoring, crawls, watching; /* watching: a step was taken on trial; theta, phi, slope and alpha are those before it */
 } Track;
 
 static int64_t shape(Barrier *t, V *memory) {
@@ -25,6 +25,7 @@ static int64_t shape(Barrier *t, V *memory) {
     t->dx = cut(&m, (N + 1) * NX); t->du = cut(&m, N * NU);
     t->c = cut(&m, rows); t->cn = cut(&m, rows); t->s = cut(&m, rows); t->sn = cut(&m, rows); t->z = cut(&m, rows);
     t->r = cut(&m, rows); t->ds = cut(&m, rows); t->dz = cut(&m, rows);
+    t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
     return m - memory;
 }
 
@@ -263,6 +264,38 @@ static void accept(Barrier *t, I won, V alpha, V dual) {
     for (int64_t q = 0; q < t->rows; q++) t->c[q] = tgco_choose(won, t->cn[q], t->c[q]);
 }
 
+/* Keeps the iterate of the lanes `of`, or goes back to it. */
+static void keep(Barrier *t, I of, int back) {
+    const Lanes *s = &t->lanes;
+    int64_t N = s->of->N;
+    V *kept = t->kept;
+    struct { V *values; int64_t count; } parts[] = {
+        {s->X, (N + 1) * NX}, {t->y, (N + 1) * NX}, {s->U, N * NU}, {t->gap, N * NX},
+        {t->c, t->rows}, {t->s, t->rows}, {t->z, t->rows}};
+    for (int part = 0; part < (int)(sizeof parts / sizeof *parts); part++) {
+        V *values = parts[part].values;
+        for (int64_t i = 0; i < parts[part].count; i++, kept++)
+            if (back) values[i] = tgco_choose(of, *kept, values[i]); else *kept = tgco_choose(of, values[i], *kept);
+    }
+}
+
+/* Lanes whose steps have been short for long take some full ones on trial (the paper's watchdog). */
+static void watch(Barrier *t, Track *k, I moving, V slope, V full) {
+    I begins = moving & ~moving;
+    for (int l = 0; l < LANES; l++) {
+        if (!moving[l] || k->watching[l] || k->restoring[l] || k->shortened[l] < t->how->patience) continue;
+        begins[l] = k->watching[l] = -1;
+        k->slope[l] = slope[l]; k->alpha[l] = full[l];
+        k->ahead[l] = 0;
+    }
+    if (any(begins)) keep(t, begins, 0);
+}
+
+static void go_back(Barrier *t, Track *k, I of) {
+    keep(t, of, 1);
+    for (int l = 0; l < LANES; l++) if (of[l]) k->watching[l] = k->shortened[l] = 0;
+}
+
 /* Moves the lanes `moving` along their steps; returns those that found a step length. A lane moves as soon as it has
    found it; what is computed for it from there on is not used. */
 static I search(Barrier *t, Track *k, I moving, V tau) {
@@ -271,16 +304,27 @@ static I search(Barrier *t, Track *k, I moving, V tau) {
     longest(t, tau, &full, &dual);
     I none = moving & ~moving, open = moving, won = none, corrected = none;
     alpha = full;
+    watch(t, k, moving, slope, full);
     for (int tries = 0; any(open); tries++) {
         attempt(t, alpha, &theta, &phi);
-        I good = none, again = none, undo = none;
+        I good = none, again = none, undo = none, back = none;
         for (int l = 0; l < LANES; l++) {
-            int descends;
+            int descends, watching = k->watching[l] != 0;
             if (!open[l]) continue;
-            if (is_good(t, k, l, alpha[l], slope[l], theta[l], phi[l], &descends)) {
+            double from = watching ? k->slope[l] : slope[l], length = watching ? k->alpha[l] : alpha[l];
+            int accepted = is_good(t, k, l, length, from, theta[l], phi[l], &descends);
+            if (watching && !accepted) {
+                if (theta[l] <= k->highest[l] && phi[l] - phi[l] == 0 && k->ahead[l]++ < how->trials) good[l] = -1, k->crawls[l] = 0;
+                else back[l] = -1;
+                continue;
+            }
+            if (accepted) {
+                if (watching) k->watching[l] = 0;
                 if (!descends && !k->restoring[l]) remember(t, k, l);
                 k->theta[l] = theta[l]; k->phi[l] = phi[l];
                 good[l] = -1;
+                k->crawls[l] = alpha[l] < how->crawl * full[l] && !watching ? -1 : 0;
+                k->shortened[l] = alpha[l] < full[l] && !watching ? k->shortened[l] + 1 : 0;
             } else if (tries == 0 && how->corrects && !k->restoring[l] && theta[l] >= k->theta[l]) {
                 again[l] = -1;
             } else {
@@ -290,8 +334,9 @@ static I search(Barrier *t, Track *k, I moving, V tau) {
             }
         }
         if (any(good)) accept(t, good, alpha, dual);
-        won |= good;
-        open &= ~good;
+        if (any(back)) go_back(t, k, back);
+        won |= good | back;
+        open &= ~won;
         if (!any(again) && !any(undo)) continue;
         V p, d;
         if (any(again)) correct(t, again, alpha); else uncorrect(t);
@@ -330,8 +375,9 @@ static void begin(Barrier *t, Track *k, I of) {
     t->objective = tgco_choose(of, one, t->objective);
     k->last = tgco_choose(of, zero, k->last); k->forced = tgco_choose(of, zero, k->forced);
     k->made = tgco_choose(of, zero, k->made);
-    k->restoring &= ~of;
-    for (int l = 0; l < LANES; l++) if (of[l]) k->failures[l] = 0;
+    k->restoring &= ~of; k->watching &= ~of;
+    t->soft = tgco_choose(of, SET(how->soft), t->soft);
+    for (int l = 0; l < LANES; l++) if (of[l]) k->failures[l] = k->shortened[l] = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
         for (int64_t j = 0; j < con->knots * con->rows; j++)
@@ -362,7 +408,7 @@ static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V s
     I lowered = running & ~running;
     for (int tries = 0; tries < LONGEST_FALL; tries++) {
         V error = most(base, complementarity(t, t->mu) * scale_z);
-        I low = running & ~k->restoring & (error <= SET(how->barrier_error) * t->mu) & (t->mu > smallest);
+        I low = running & ~k->restoring & ~k->watching & (error <= SET(how->barrier_error) * t->mu) & (t->mu > smallest);
         if (!any(low)) break;
         V slow = SET(how->barrier_share) * t->mu, fast = t->mu * tgco_sqrt(t->mu);
         V next = most(smallest, least(slow, fast));
@@ -392,6 +438,22 @@ static I factor_shifted(Barrier *t, Track *k, I running) {
     }
     k->last = tgco_choose(running & (t->shift > SET(0.0)), t->shift, k->last);
     return running & ~lost;
+}
+
+/* Where equalities contradict each other to first order, their multipliers explode: a softer step is taken there. */
+static I soften(Barrier *t, Track *k, I moving) {
+    const Interior *how = t->how;
+    for (;;) {
+        V largest = SET(0.0);
+        ROWS(t, 1, largest = most(tgco_fabs(t->z[q] + t->dz[q]), largest))
+        I large = moving & (largest > SET(how->explodes)) & (t->soft < SET(how->softest));
+        if (!any(large)) return moving;
+        t->soft = tgco_choose(large, SET(100.0) * t->soft, t->soft);
+        expand(t);
+        moving = factor_shifted(t, k, moving);
+        solve(t);
+        solve_rows(t);
+    }
 }
 
 /* Lanes whose line search failed look for feasibility alone: steps of least length that close residuals. Where there is
@@ -432,27 +494,36 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     expand(t);
     errors(t, &dual, &primal, &scale_z);
     *error = most(most(dual, primal), complementarity(t, SET(0.0)) * scale_z);
-    I ended = running & ~running;
+    I ended = running & ~running, astray = running & k->watching & ~finite(*error);
+    if (any(astray)) go_back(t, k, astray);
     for (int l = 0; l < LANES; l++) {
-        if (!running[l]) continue;
+        if (!running[l] || astray[l]) continue;
         if (!k->restoring[l] && (*error)[l] <= how->tolerance && primal[l] <= how->violation) status[l] = CONVERGED;
         else if (!((*error)[l] - (*error)[l] == 0)) status[l] = NON_FINITE;
         else if (k->made[l] >= how->max_iterations) status[l] = MAX_ITERATIONS;
         else continue;
         ended[l] = -1;
     }
-    running &= ~ended;
+    running &= ~ended & ~astray;
     if (!any(running)) return ended;
     lower_barrier(t, k, running, dual, primal, scale_z);
     I moving = factor_shifted(t, k, running);
-    for (int l = 0; l < LANES; l++) if (running[l] && !moving[l]) { status[l] = NOT_POSITIVE_DEFINITE; ended[l] = -1; }
     solve(t);
     solve_rows(t);
+    moving = soften(t, k, moving);
+    astray = running & ~moving & k->watching;
+    if (any(astray)) go_back(t, k, astray);
+    for (int l = 0; l < LANES; l++)
+        if (running[l] && !moving[l] && !astray[l]) { status[l] = NOT_POSITIVE_DEFINITE; ended[l] = -1; }
     V tau = most(SET(how->boundary), SET(1.0) - t->mu);
     I won = search(t, k, moving, tau);
     k->made += tgco_truth(running);
-    k->forced = tgco_choose(won, tgco_choose(k->restoring, k->forced, k->forced * SET(how->recovery_decay)), k->forced);
-    k->forced = tgco_if(k->forced >= SET(how->shift_least), k->forced);
+    /* Where only short steps are accepted, the model reaches less far than the step: more curvature makes it shorter. */
+    V floor = SET(how->shift_crawl), lower = k->forced * SET(how->recovery_decay);
+    V higher = tgco_choose(t->shift > floor, SET(how->recovery_growth) * t->shift, most(floor, k->last));
+    lower = tgco_if(lower >= floor, lower);
+    k->forced = tgco_choose(won & ~k->restoring, tgco_choose(k->crawls, higher, lower), k->forced);
+    t->soft = tgco_choose(won, most(SET(how->soft), SET(0.1) * t->soft), t->soft);
     residuals(t, t->c, t->s, t->r);
     for (int l = 0; l < LANES; l++) if (won[l] && !k->restoring[l]) k->failures[l] = k->failures[l] > 0 && k->forced[l] == 0 ? 0 : k->failures[l];
     I lost = recover(t, k, moving & ~won);

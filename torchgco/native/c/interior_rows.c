@@ -7,8 +7,6 @@
        tgco_model_rows(i, x, u, p, by, cc, lam, g, H)   traced rows: g[a] += c_z' by[a], H += c_z' cc c_z + lam' c_zz
        tgco_along_rows(i, x, u, p, z, out)              out = c_z z */
 
-#define SOFT 1e-8 /* dual regularisation of equalities: a step fulfils them up to so much of the multipliers' change */
-
 typedef struct {
     Lanes lanes;
     const Interior *how;
@@ -20,7 +18,10 @@ typedef struct {
     V *dx, *du;                  /* (N+1, NX), (N, NU) */
     V *c, *cn, *s, *sn, *z, *r, *ds, *dz; /* (rows): values, slacks, multipliers, residuals, and of trial and step */
     int64_t *first, rows;        /* the first row of each constraint, and how many there are */
-    V mu, shift, scale, objective; /* objective: 0 where feasibility alone is sought */
+    V mu, shift, scale;
+    V objective; /* 0 where feasibility alone is sought */
+    V soft;      /* dual regularisation: a step fulfils equalities up to so much of the change of their multipliers */
+    V *kept; /* the iterate before the steps on trial */
     V *memory;
 } Barrier;
 
@@ -52,9 +53,9 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, con
 static inline V weigh(const Barrier *t, int equality, int64_t q, V *by) {
     by[0] = t->z[q];
     if (equality) {
-        by[1] = t->objective * t->z[q] + t->r[q] * SET(1.0 / SOFT);
+        by[1] = t->objective * t->z[q] + t->r[q] / t->soft;
         by[2] = SET(0.0);
-        return SET(1.0 / SOFT);
+        return SET(1.0) / t->soft;
     }
     V sigma = t->z[q] / t->s[q];
     by[1] = sigma * t->r[q];

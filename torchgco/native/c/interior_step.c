@@ -170,7 +170,7 @@ static void solve_rows(Barrier *t) {
                 V change = t->ds[q] + t->r[q];
                 if (con->equality) {
                     t->ds[q] = SET(0.0);
-                    t->dz[q] = change * SET(1.0 / SOFT);
+                    t->dz[q] = change / t->soft;
                 } else {
                     t->ds[q] = -change;
                     t->dz[q] = (t->mu + t->z[q] * change) / t->s[q] - t->z[q];
