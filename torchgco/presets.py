@@ -31,6 +31,7 @@ from torchgco.search import (
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Solver
 from torchgco.solvers.ilqr import ILQR
+from torchgco.solvers.interior import InteriorPoint
 
 Space = Problem | int
 
@@ -137,6 +138,11 @@ def mppi(space: Space) -> IteratedMPPI:
     return IteratedMPPI(replace(_printed_sampler(space), saturation="bounds"), iterations=100)
 
 
+def interior_point(space: Space) -> InteriorPoint:
+    """A primal-dual interior point on multiple shooting, from the guess alone."""
+    return InteriorPoint()
+
+
 def multistart(space: Space) -> MultiStart:
     """AL-iLQR from random guesses, with as many iterations as `gco` makes in the family where it makes the most."""
     if _in_the_plane(space):
@@ -182,6 +188,7 @@ PRESETS: dict[str, Callable[[Space], Solver]] = {
         al_ilqr,
         ilqr,
         mppi,
+        interior_point,
         multistart,
         hold,
         ipopt,

@@ -15,12 +15,14 @@ from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
+from torchgco.native.interior import InteriorEngine
 from torchgco.native.sampler import Sampler
 from torchgco.problem.border import check_eager
 from torchgco.problem.problem import Problem
 
 NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
 CURRENT = "current"  # marks the form of problems that a solve works on
+INTERIOR = "interior"  # marks the library of the interior point
 WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
 KEPT = 64  # engines of problems without a user's code, the most recent ones
 AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
@@ -94,6 +96,16 @@ def sampler_of(problem: Problem, dtype: torch.dtype) -> Sampler | None:
     if dtype not in problem.form:
         problem.form[dtype] = Sampler(engine, dtype)
     return problem.form[dtype]
+
+
+def interior_of(problem: Problem) -> InteriorEngine | None:
+    """The library of the interior point for problems of this form; None where there is none."""
+    engine = engine_of(problem)
+    if engine is None:
+        return None
+    if INTERIOR not in problem.form:
+        problem.form[INTERIOR] = InteriorEngine(engine)
+    return problem.form[INTERIOR]
 
 
 def cost_unit(problem: Problem) -> Tensor:

@@ -18,7 +18,7 @@ from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.dispatch import cost_unit, engine_of
 from torchgco.problem.problem import Problem
 from torchgco.solvers.riccati import BackwardPass, backward
-from torchgco.solvers.state import STALLED
+from torchgco.solvers.state import SOLVED, STALLED
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 LEAST_COST = 1e-6  # the cost counts as at least this share of the cost of staying at the start
@@ -90,12 +90,12 @@ def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: floa
     INFEASIBLE: not feasible, although higher penalties were tried for as long as they gained anything. Where neither
     holds, and where a solve failed, the reason stays.
     """
-    stationary, fits = left <= STATIONARY, violation <= tolerance
-    reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED), int(Status.MAX_ITERATIONS), ended)
+    stationary, fits = (left <= STATIONARY) | (ended == SOLVED), violation <= tolerance
+    reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED) | (ended == SOLVED), int(Status.MAX_ITERATIONS), ended)
     status = torch.where(fits & constrained, int(Status.FEASIBLE), reason)
     status = torch.where(stationary & fits, int(Status.CONVERGED), status)
     status = torch.where(~fits & (ended == STALLED), int(Status.INFEASIBLE), status)
-    status = torch.where(torch.isinf(left), int(Status.NOT_POSITIVE_DEFINITE), status)
+    status = torch.where(torch.isinf(left) & (ended != SOLVED), int(Status.NOT_POSITIVE_DEFINITE), status)
     status = torch.where((ended == Status.TIME_LIMIT) & ~fits, ended, status)  # more time might find more
     failed = (ended == Status.NON_FINITE) | (ended == Status.NOT_POSITIVE_DEFINITE) | (ended == Status.INVALID_START)
     return torch.where(failed, ended, status)

@@ -43,4 +43,5 @@ class Rules:
 
 
 PRINTED = Rules(in_cost_units=False, phr=False, accept_last=True, damped=False, ends=False)
+RAW = Rules(in_cost_units=False, phr=True, accept_last=False, damped=True, ends=True)
 STANDARD = Rules(in_cost_units=True, phr=True, accept_last=False, damped=True, ends=True)

@@ -371,7 +371,7 @@ static void begin(Barrier *t, Track *k, I of) {
     V one = SET(1.0), zero = SET(0.0), largest = zero;
     const Interior *how = t->how;
     const Problem *p = t->lanes.of;
-    t->scale = tgco_choose(of, one, t->scale);
+    for (int l = 0; l < LANES; l++) if (of[l]) t->scale[l] = how->factor[t->lanes.element[l]];
     t->objective = tgco_choose(of, one, t->objective);
     k->last = tgco_choose(of, zero, k->last); k->forced = tgco_choose(of, zero, k->forced);
     k->made = tgco_choose(of, zero, k->made);
@@ -389,7 +389,7 @@ static void begin(Barrier *t, Track *k, I of) {
     expand(t);
     for (int64_t i = 0; i < (p->N + 1) * S; i++) largest = most(tgco_fabs(t->cost_slope[i]), largest);
     V steepest = SET(how->steepest), scale = tgco_choose(largest > steepest, steepest / largest, one);
-    t->scale = tgco_choose(of & finite(scale), scale, t->scale);
+    t->scale = tgco_choose(of & finite(scale), t->scale * scale, t->scale);
     settle(t, k, of, 1);
     if (how->warm) {
         ROWS(t, 0, t->z[q] = tgco_choose(of, most(t->scale * t->z[q], t->mu / (SET(how->central) * t->s[q])), t->z[q]))

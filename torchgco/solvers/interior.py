@@ -1,0 +1,164 @@
+"""A primal-dual interior point on multiple shooting: constrained problems to a tight tolerance, from any guess."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.options import Above, AtMost, Count, Positive, check_options
+from torchgco.base.status import Status
+from torchgco.base.tree import copied, put, take
+from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.quality import violation
+from torchgco.native.dispatch import followed, interior_of, open_loop
+from torchgco.problem.problem import Problem
+from torchgco.solution import Solution
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
+from torchgco.solvers.contracts import Call, Progress, Solver
+from torchgco.solvers.ending import start_status
+from torchgco.solvers.ilqr import ILQR
+from torchgco.solvers.rules import RAW
+from torchgco.solvers.session import Session
+from torchgco.solvers.state import SOLVED, Iterate, SolveEnd
+
+AT_ONCE = 256  # problems between two looks at the clock
+PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
+# Waechter and Biegler (2006), in whose words these have the names in brackets; where no name is given, ours.
+FILTER: dict[str, Any] = {
+    "boundary": 0.99,  # share of the way to where a slack is 0 (tau_min)
+    "central": 1e10,  # factor by which s z may leave mu (kappa_Sigma)
+    "barrier_error": 10.0, "barrier_share": 0.2, "barrier_floor": 0.1,  # kappa_epsilon, kappa_mu; tolerance times this
+    "usual_multiplier": 100.0, "largest_multiplier": 1e3,  # s_max; costates at the start are 0 where larger
+    "highest": 1e4, "lowest": 1e-4,  # theta_max, theta_min, as multiples of theta at the start, of 1 at least
+    "gain_theta": 1e-5, "gain_phi": 1e-8, "armijo": 1e-4,  # gamma_theta, gamma_phi, eta_phi
+    "switching": 1.0, "power_theta": 1.1, "power_phi": 2.3,  # delta, s_theta, s_phi
+    "shift_first": 1e-4, "shift_least": 1e-20, "shift_max": 1e20,  # delta_w: first, min, max
+    "shift_decay": 1.0 / 3.0, "shift_growth": 8.0, "shift_growth_first": 100.0,  # kappa_w: minus, plus, plus-bar
+    "patience": 10, "trials": 3,  # short steps before the watchdog, and its full steps
+    "corrects": 1, "steepest": 100.0, "smallest": 1e-10,  # second-order corrections; slope of the cost; step length
+    "soft": 1e-8, "softest": 1e-2, "explodes": 1e6,  # dual regularisation (delta_c), raised where multipliers explode
+    "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
+    "shift_recovery": 1e-3, "restored": 0.9, "failures": 6,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class InteriorPoint(Solver):
+    """The method of Waechter and Biegler (2006) with a Riccati recursion over the stages, many problems side by side.
+
+    States and controls are variables, and the dynamics are constraints between them, so a guess of states may be
+    anything; Hessians are exact. Returned trajectories are rollouts. Problems that native kernels can't serve are solved
+    by AL-iLQR instead.
+
+    Args:
+        tolerance: of the optimality conditions, scaled as in the paper.
+        violation_tolerance: residual (metres for lengths) up to which a trajectory counts as feasible.
+        max_iterations: of each problem.
+        initial_barrier: the barrier parameter mu at the start.
+        warm_barrier: the same for a call with multipliers of an earlier solution.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    tolerance: Positive = 1e-6
+    violation_tolerance: Positive = 1e-6
+    max_iterations: Count = 500
+    initial_barrier: Positive = 0.1
+    warm_barrier: Positive = 1e-6
+
+    def __post_init__(self) -> None:
+        check_options(self, "solver")
+
+    def run(self, call: Call) -> Solution:
+        """Solve a checked call."""
+        session = Session(call, RAW)
+        return session.finished(self.solved(session.call), self.violation_tolerance)
+
+    def solved(self, call: Call, X0: Tensor | None = None) -> SolveEnd:
+        """The solve without its verdict, in the units of the call.
+
+        Args:
+            X0: states to begin with, (B, N+1, n); None: the rollout of the call's controls, or the start held where
+                that is not finite.
+        """
+        problem = call.problem
+        kernels = interior_of(problem)
+        if kernels is None:
+            return self._without_kernels().outer_loop(call)
+        X = open_loop(problem, call.U0) if X0 is None else X0.clone()
+        start = problem.x0.unsqueeze(1).expand_as(X)
+        status = start_status(problem, start, problem.x0[:, 0], problem.start_is_clear)
+        X = torch.where(torch.isfinite(X).flatten(1).all(-1).view(-1, 1, 1), X, start)
+        end = SolveEnd.blank(problem, call.U0)
+        end.best.X[:] = X
+        end.status[:] = status
+        rows = (status == Status.RUNNING).nonzero().flatten()
+        for part in rows.split(AT_ONCE):
+            if call.late:
+                end.status[part] = Status.TIME_LIMIT
+                continue
+            self._some(kernels, call.take(part), X[part], part, end)
+            if call.callback is not None:
+                done = int((end.status != Status.RUNNING).sum())
+                call.callback(Progress(1, call.rows[part], done, problem.B))
+        return end
+
+    def _some(self, kernels: Any, call: Call, X: Tensor, rows: Tensor, end: SolveEnd) -> None:
+        """Solves problems, and puts how they ended into `end` at `rows`."""
+        problem, warm = call.problem, call.warm
+        X, U, push = X.contiguous(), call.U0.clone(memory_format=torch.contiguous_format), 1e-2
+        if warm is None:
+            multipliers, mu = Multipliers.zero(problem, 1.0).lam, self.initial_barrier
+            X, U = inside(problem, X, U, push)
+        else:
+            multipliers, mu, push = tuple(lam.clone() for lam in warm.lam), self.warm_barrier, self.warm_barrier
+            X, U = inside(problem, X, U, push)
+        unit = torch.ones_like(X[:, 0, 0]) if call.unit is None else call.unit
+        out = kernels.solve(
+            problem, X, U, multipliers, torch.full_like(unit, mu), warm=int(warm is not None), factor=unit, push=push,
+            max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **FILTER,
+        )  # fmt: skip
+        X, U = followed(problem, X, U, out["gains"][..., :-1])
+        lam = tuple(_active(problem.constraints[i].sense, part, X, U, problem, i) for i, part in enumerate(multipliers))
+        found = Iterate(
+            X, U, Multipliers(lam, PENALTY / unit * torch.ones_like(unit)), problem.cost.total(X, U),
+            violation(problem, X, U),
+        )  # fmt: skip
+        put(end.best, rows, found)
+        put(end.last, rows, copied(found))
+        status = out["status"].long()
+        end.status[rows] = torch.where(status == Status.CONVERGED, SOLVED, status)
+        end.iterations[rows] = out["iterations"]
+
+    def _without_kernels(self) -> AugmentedLagrangian:
+        """AL-iLQR to the same violation, with limits that few problems reach."""
+        return AugmentedLagrangian(
+            ILQR(max_iterations=200, damp_below=0.125), initial_penalty=2.0, max_outer_iterations=100,
+            stalled_growth=10.0, patience=8, violation_tolerance=self.violation_tolerance,
+        )  # fmt: skip
+
+
+def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor, Tensor]:
+    """X (B, N+1, n) and U (B, N, m) moved inside of their bounds, by a share `push` of their size or range at most."""
+    X, U = X.clone(), U.clone()
+    for bounds in problem.constraints:
+        if isinstance(bounds, ControlBounds | StateBounds):
+            z = U if bounds.of == "u" else X
+            lower, upper = bounds.lower.unsqueeze(1), bounds.upper.unsqueeze(1)
+            room = 0.5 * (upper - lower)  # two bounds that coincide leave none
+            low = lower + torch.where(lower.isinf(), 0.0, torch.minimum(push * lower.abs().clamp(min=1.0), push * room))
+            high = upper - torch.where(upper.isinf(), 0.0, torch.minimum(push * upper.abs().clamp(min=1.0), push * room))
+            z[:, bounds.knots] = torch.minimum(torch.maximum(z[:, bounds.knots], low), high)
+    return X, U
+
+
+def _active(sense: str, lam: Tensor, X: Tensor, U: Tensor, problem: Problem, i: int) -> Tensor:
+    """The multipliers of a constraint, 0 where a row is inactive: there its slack exceeds them."""
+    if sense == "equality":
+        return lam
+    return torch.where(lam > -problem.constraints[i].value(X, U), lam, 0.0)
