@@ -249,6 +249,27 @@ def first_step() -> Problem:
     return Problem(base.dynamics, base.cost, [FirstStepRates(thrusts), *base.constraints], base.x0, base.N)
 
 
+def by_stage(x: Tensor, u: Tensor, k: int | Tensor, drag: Tensor, wind: Tensor, dt: Tensor) -> Tensor:
+    """A step of a car: drag per problem, wind per problem and stage, lengths per stage, brakes that fade with k."""
+    angle, speed = x[..., 2], x[..., 3]
+    k = torch.as_tensor(k, dtype=x.dtype)
+    fade = torch.where(k > 5, 0.5, 1.0) * 0.95**k
+    ahead = torch.stack((speed * angle.cos(), speed * angle.sin(), u[..., 1], fade * u[..., 0] - drag * speed), dim=-1)
+    return x + dt * (ahead + torch.cat((wind, torch.zeros_like(wind)), dim=-1))
+
+
+def with_stages(function: Callable[..., Tensor] = by_stage, rows: slice = slice(None)) -> Problem:
+    base = user_problem(B, N)
+    wind, lengths = 0.3 * normal(B, N, 2, seed=33)[rows], torch.linspace(0.05, 0.2, N).double().view(1, N, 1)
+    model = FunctionDynamics(
+        function, 4, 2, dt=0.1, integrator="none", position=slice(0, 2),
+        values={"drag": normal(B, seed=34).abs()[rows]}, knot_values={"wind": wind, "dt": lengths},
+    )  # fmt: skip
+    cost = Errand(each().target[rows, :2].contiguous())
+    bounds, discs = ControlBounds(-2, 2), Discs([[1.0, 1.0]], [0.3], 0.1)
+    return Problem(model, cost, [bounds, discs], base.x0[rows], N)
+
+
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "smooth": lambda: with_cost(Smooth()),
     "per problem": lambda: with_cost(each()),
@@ -262,6 +283,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "shifted": lambda: with_cost(ShiftedCost(each(), normal(B, seed=32))),
     "constraints": with_constraints,
     "first step": first_step,
+    "dynamics by stage": with_stages,
 }
 
 

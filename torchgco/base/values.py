@@ -27,7 +27,7 @@ class Values(PerElement):
     names: tuple[str, ...] = ()
     rows: tuple[Tensor, ...] = ()  # (B, ...)
     knot_names: tuple[str, ...] = ()
-    knot_rows: tuple[Tensor, ...] = ()  # (B, N+1, ...)
+    knot_rows: tuple[Tensor, ...] = ()  # (B, N+1, ...), of dynamics (B, N, ...)
     stages: int = 0  # N
 
     batched: ClassVar[tuple[str, ...]] = ("rows", "knot_rows")
@@ -53,17 +53,23 @@ NONE = Values()
 
 
 def bound_values(
-    values: Any, knot_values: Any, functions: tuple[Callable[..., Any] | None, ...], dims: Dimensions, field: str
+    values: Any,
+    knot_values: Any,
+    functions: tuple[Callable[..., Any] | None, ...],
+    dims: Dimensions,
+    field: str,
+    knots: int | None = None,
 ) -> Values:
-    """Values by name for B problems of N stages: (B, ...), and (B|1, N+1, ...) for those of the knots.
+    """Values by name for B problems: (B, ...), and (B|1, knots, ...) for those of the knots, by default N+1.
 
     Raises:
         InputError: no mapping of names to numbers, another shape, or a name that no function takes.
     """
+    knots = dims.N + 1 if knots is None else knots
     if isinstance(values, Values):
-        return _checked(values, dims, field)
+        return _checked(values, dims, field, knots)
     found: dict[str, dict[str, Tensor]] = {"values": {}, "knot_values": {}}
-    for kind, given, shape in (("values", values, (dims.B,)), ("knot_values", knot_values, (dims.B, dims.N + 1))):
+    for kind, given, shape in (("values", values, (dims.B,)), ("knot_values", knot_values, (dims.B, knots))):
         if given is not None and not isinstance(given, Mapping):
             raise InputError(f"{field}.{kind}", "a dict of tensors by name, or None", shown(given))
         for name, value in (given or {}).items():
@@ -80,11 +86,11 @@ def bound_values(
     return Values(tuple(rows), tuple(rows.values()), tuple(at_knots), tuple(at_knots.values()), dims.N)
 
 
-def _checked(values: Values, dims: Dimensions, field: str) -> Values:
+def _checked(values: Values, dims: Dimensions, field: str, knots: int) -> Values:
     """Values that were bound before, to another problem maybe."""
     for names, rows, shape in (
         (values.names, values.rows, (dims.B,)),
-        (values.knot_names, values.knot_rows, (dims.B, dims.N + 1)),
+        (values.knot_names, values.knot_rows, (dims.B, knots)),
     ):
         for name, row in zip(names, rows, strict=True):
             if tuple(row.shape[: len(shape)]) != shape or row.dtype != dims.like.dtype:

@@ -99,10 +99,9 @@ def transcribe(problem: Problem) -> Program:
     parameters = ca.vertcat(start, *own)
     limits, at_knot = _limits(at_knot, variables, parameters)
 
-    rows, equality = [], []
-    one_step = ca.Function("step", [x[0], u[0], own[0]], [_column(step(_elements(own[0]), X[:, 0], U[:, 0])[0])])
+    rows, equality, ahead = [], [], _ahead(problem, step, own[0], X, U)
     for k in range(N + 1):
-        gap = [(row, True) for row in _elements(x[k + 1] - one_step(x[k], u[k], own[0]))] if k < N else []
+        gap = [(row, True) for row in _elements(x[k + 1] - ahead[k])] if k < N else []
         rows += [row for row, _ in gap + at_knot[k]]
         equality += [is_equality for _, is_equality in gap + at_knot[k]]
     return Program(
@@ -118,10 +117,24 @@ def _traces(problem: Problem) -> tuple[Traced, Traced, list[Traced]]:
         return Traced(field, lambda i, *z: getattr(part.take(i), method)(*z), *examples, own=own_tensors(part))
 
     return (
-        trace("dynamics.step", problem.dynamics, "step", X[:, 0], U[:, 0]),
+        trace("dynamics.step", problem.along, "step", *((X[:, :-1], U) if _changes(problem) else (X[:, 0], U[:, 0]))),
         trace("cost", problem.cost, "total", X, U),
         [trace(f"constraints[{i}] ({type(c).__name__})", c, "value", X, U) for i, c in enumerate(problem.constraints)],
     )
+
+
+def _changes(problem: Problem) -> bool:
+    """Whether the dynamics depend on the stage."""
+    return problem.along is not problem.dynamics
+
+
+def _ahead(problem: Problem, step: Traced, own: ca.SX, X: np.ndarray, U: np.ndarray) -> list[ca.SX]:
+    """step(x_k, u_k) of each stage, from X (1, N+1, n) and U (1, N, m)."""
+    if _changes(problem):
+        return [_column(after) for after in step(_elements(own), X[:, :-1], U)[0]]
+    first = [_column(z[0, 0]) for z in (X, U)]
+    one = ca.Function("step", [*first, own], [_column(step(_elements(own), X[:, 0], U[:, 0])[0])])
+    return [one(_column(x), _column(u), own) for x, u in zip(X[0], U[0], strict=False)]
 
 
 def _limits(

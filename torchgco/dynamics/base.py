@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from dataclasses import field as hidden
 from typing import Any, ClassVar, Literal, Self
 
 from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
+from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Seconds, check_options
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement
-from torchgco.base.values import NONE, bound_values
+from torchgco.base.values import NONE, Knot, Values, asks_for_knot, bound_values
 from torchgco.dynamics.integrators import INTEGRATORS
 
 
@@ -31,7 +33,7 @@ class Dynamics(PerElement):
 
     Derivatives and native kernels are made from this method. `position` says which states are the position in metres
     that obstacles are compared with, or is None. A parameter that may be a tensor (B,), one value per problem, is named
-    in `per_element` and shaped by `shapes.lead`.
+    in `per_element` and shaped by `shapes.lead`. Dynamics that depend on the knot override `at`.
     """
 
     n: int
@@ -53,6 +55,13 @@ class Dynamics(PerElement):
         """The state one time step later, (..., n)."""
         return INTEGRATORS[self.integrator](lambda x: self.field(x, u), x, self.dt)
 
+    def at(self, k: int | Tensor) -> Self:
+        """The model of stage k, or of stages k (K,), which are then the second axis of x (B, K, n).
+
+        Solvers call `dynamics.at(k).step(x, u)`. Most models are the same at every stage: this one.
+        """
+        return self
+
     def bind(self, dims: Dimensions) -> Self:
         """The model checked and shaped for one problem; called once, by Problem."""
         return self
@@ -70,24 +79,32 @@ class FunctionDynamics(Dynamics):
         drag = torch.tensor([0.2, 0.5]).double()  # of two problems
         boat = FunctionDynamics(field, n=4, m=2, dt=0.1, values={"drag": drag})  # calls field(x, u, drag=...)
 
+    The function may take an argument k (without a default): the number of the stage, or the numbers (K,) of the stages
+    of x (B, K, n).
+
     Args:
+        dt: s, the same for all stages. Stages of different length: integrator="none", a function that makes a whole
+            step, and its lengths in `knot_values`; obstacles that move then still count in steps of dt.
         values: numbers per problem by name, (B, ...), which the function takes as arguments of these names, shaped to
             fit x: (B, ...), or (B, 1, ...) where x has an axis of knots or samples. Numbers that change from solve to
-            solve belong here: with another captured number the code is compiled again. Dynamics that change with time
-            have a clock among their states.
+            solve belong here: with another captured number the code is compiled again.
+        knot_values: the same per stage, (B|1, N, ...); the function sees the rows of its stages, (B, ...), (B, K, ...)
+            or (B, 1, ...).
 
     Raises:
         InputError: a field out of its range or of another kind; on `Problem(...)`: values of another shape or that the
-            function doesn't take.
+            function doesn't take; `step` or `field` of dynamics that depend on the stage without `at`.
     """
 
-    function: Callable[[Tensor, Tensor], Tensor]
+    function: Callable[..., Tensor]
     n: Count
     m: Count
     dt: Seconds
     integrator: Literal["euler", "midpoint", "rk4", "none"] = "euler"
     position: slice | None = None
     values: Any = None
+    knot_values: Any = None
+    k: Any = hidden(default=None, repr=False)  # the stage or the stages (K,), set by `at`
 
     batched: ClassVar[tuple[str, ...]] = ("values",)
     calls_function: ClassVar[bool] = True
@@ -96,7 +113,15 @@ class FunctionDynamics(Dynamics):
         check_options(self, "dynamics")
 
     def bind(self, dims: Dimensions) -> Self:
-        return replace(self, values=bound_values(self.values, None, (self.function,), dims, "dynamics"))
+        values = bound_values(self.values, self.knot_values, (self.function,), dims, "dynamics", knots=dims.N)
+        return replace(self, values=values)
+
+    def at(self, k: Knot) -> Self:
+        return replace(self, k=k) if self._depends_on_stage else self
+
+    @property
+    def _depends_on_stage(self) -> bool:
+        return asks_for_knot(self.function) or (isinstance(self.values, Values) and bool(self.values.knot_names))
 
     @property
     def is_integrated(self) -> bool:
@@ -109,4 +134,6 @@ class FunctionDynamics(Dynamics):
         return super().step(x, u) if self.is_integrated else self._called(x, u)
 
     def _called(self, x: Tensor, u: Tensor) -> Tensor:
-        return (self.values or NONE).call(self.function, x, u)
+        if self.k is None and self._depends_on_stage:
+            raise InputError("dynamics", "a stage, as in `dynamics.at(k).step(x, u)`", "none")
+        return (self.values or NONE).call(self.function, x, u, k=self.k)

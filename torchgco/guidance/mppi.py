@@ -234,7 +234,7 @@ def fly(problem: Problem, mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tens
     cost, hits = x.new_zeros(2, *x.shape[:2]).unbind(0)
     for k, u in enumerate(V.unbind(0)):
         cost = cost + problem.cost.stage(x, u, k)
-        x = problem.dynamics.step(x, u).contiguous()  # so that sums over components add in one order for any batch
+        x = problem.dynamics.at(k).step(x, u).contiguous()  # so that sums over components add in the same order
         for constraint in problem.geometric:
             if constraint.holds_at(k + 1):
                 hits = hits + (constraint.at(x, k + 1) >= 0).sum(-1)

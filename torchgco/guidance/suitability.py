@@ -76,7 +76,7 @@ def _sample(problem: Problem) -> None:
     x = problem.x0.unsqueeze(1).repeat(1, TRIAL_SAMPLES, 1)
     u = x.new_zeros(1, TRIAL_SAMPLES, problem.m)
     cost = problem.cost.stage(x, u, 0) + problem.cost.terminal(x)
-    after = problem.dynamics.step(x, u)
+    after = problem.dynamics.at(0).step(x, u)
     check_form("dynamics", after, x)
     hits = [(constraint.at(after, 1) >= 0).sum(-1) for constraint in problem.geometric]
     for name, rows in (("cost", cost), *(("a constraint", rows) for rows in hits)):

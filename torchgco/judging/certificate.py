@@ -111,7 +111,7 @@ def frame_columns(certificate: Certificate) -> dict[str, Any]:
 
 
 def _dynamics_residual(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    gap = (X[:, 1:] - problem.dynamics.step(X[:, :-1], U)).abs().amax()
+    gap = (X[:, 1:] - problem.along.step(X[:, :-1], U)).abs().amax()
     return torch.maximum(gap, (X[:, 0] - problem.x0).abs().amax())
 
 
@@ -159,7 +159,7 @@ CHORDS: dict[type[Obstacles], Callable[[Any, Tensor], Tensor]] = {
 
 def _bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """How far the path may leave the chord of each interval, (N,), m."""
-    dynamics = problem.dynamics
+    dynamics = problem.along
     if dynamics.integrator not in ("midpoint", "rk4"):
         return X.new_zeros(problem.N)
     half = X[:, :-1] + 0.5 * dynamics.dt * dynamics.field(X[:, :-1], U)
@@ -173,10 +173,10 @@ def _acceleration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     at = problem.dynamics.position
     assert at is not None  # or there would be no obstacles
     d = at.stop - at.start
-    twins = problem.dynamics.take(torch.zeros(d, dtype=torch.int64, device=X.device))
+    twins = problem.along.take(torch.zeros(d, dtype=torch.int64, device=X.device))
     u = U.repeat(d, 1, 1)
     (slopes,) = gradients(lambda x: twins.field(x, u)[..., at].diagonal(dim1=0, dim2=2), X.repeat(d, 1, 1))
-    return (slopes * problem.dynamics.field(X, U)).sum(-1).mT
+    return (slopes * problem.along.field(X, U)).sum(-1).mT
 
 
 def _kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
@@ -246,7 +246,7 @@ def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> 
     Also, for the first row, the sums (N, m) of the magnitudes of its terms.
     """
     n, N = problem.n, problem.N
-    twins = problem.dynamics.take(torch.zeros(n, dtype=torch.int64, device=X.device))
+    twins = problem.along.take(torch.zeros(n, dtype=torch.int64, device=X.device))
     x, u = X[:, :-1].repeat(n, 1, 1), U.repeat(n, 1, 1)
     fx, fu = gradients(lambda x, u: twins.step(x, u).diagonal(dim1=0, dim2=2), x, u)  # (n, N, n), (n, N, m)
     total, terms = torch.empty_like(gU), torch.empty_like(gU[0])

@@ -89,7 +89,7 @@ def judge(
         cost = torch.zeros_like(problem.x0[:, 0])
         for k in range(problem.N):
             cost = cost + problem.cost.stage(X[-1], U[:, k], k)
-            X.append(problem.dynamics.step(X[-1], U[:, k]))
+            X.append(problem.dynamics.at(k).step(X[-1], U[:, k]))
         cost = cost + problem.cost.terminal(X[-1])
         return _verdict(problem, torch.stack(X, dim=1), U, cost, center, radius)
 

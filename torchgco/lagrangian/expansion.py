@@ -13,7 +13,7 @@ def linearise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     Stage first, as the backward pass reads it.
     """
     n, m, (B, N) = problem.n, problem.m, U.shape[:2]
-    fx, fu = problem.dynamics.jacobians(X[:, :-1], U)
+    fx, fu = problem.along.jacobians(X[:, :-1], U)
     F = X.new_zeros(N, B, n + 1, n + 1 + m)
     F[..., :n, :n] = fx.transpose(0, 1)
     F[..., :n, n + 1 :] = fu.transpose(0, 1)

@@ -11,8 +11,8 @@ from torchgco.dynamics.base import Dynamics
 def open_loop(dynamics: Dynamics, x0: Tensor, U: Tensor) -> Tensor:
     """X (B, N+1, n) from x0 (B, n) and U (B, N, m)."""
     x, knots = x0, [x0]
-    for u in U.unbind(1):
-        x = dynamics.step(x, u)
+    for k, u in enumerate(U.unbind(1)):
+        x = dynamics.at(k).step(x, u)
         knots.append(x)
     return torch.stack(knots, dim=1)
 
@@ -26,10 +26,10 @@ def closed_loop(dynamics: Dynamics, X: Tensor, U: Tensor, G: Tensor, alpha: Tens
     """
     x, knots, controls = X[:, 0], [X[:, 0]], []
     step = alpha.unsqueeze(-1)
-    for old_x, old_u, gains in zip(X[:, :-1].unbind(1), U.unbind(1), G.unbind(0), strict=True):
+    for k, (old_x, old_u, gains) in enumerate(zip(X[:, :-1].unbind(1), U.unbind(1), G.unbind(0), strict=True)):
         deviation = torch.cat((x - old_x, step), dim=-1).unsqueeze(-1)  # K and alpha d in one product
         u = old_u + torch.bmm(gains, deviation).squeeze(-1)
-        x = dynamics.step(x, u)
+        x = dynamics.at(k).step(x, u)
         knots.append(x)
         controls.append(u)
     return torch.stack(knots, dim=1), torch.stack(controls, dim=1)

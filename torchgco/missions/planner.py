@@ -168,7 +168,7 @@ class Planner:
     def predicted(self, x: Tensor, plan: Plan) -> Tensor:
         """The plants (B, 17) one period later, from x (B, 17) at the plan's first knot: as the plan's model leads."""
         now = planning_state(x, self.airframe)
-        later = plan.model.step(now, plan.U[:, 0])
+        later = plan.model.at(0).step(now, plan.U[:, 0])
         q = later[:, 6:10] / later[:, 6:10].square().sum(-1, keepdim=True).sqrt()
         more = (later[:, 13:] - now[:, 13:]) * self.airframe.mass / 4.0
         F = (x[:, 13:] + more).clamp(self.airframe.thrust_min, self.airframe.thrust_max)

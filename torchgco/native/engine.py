@@ -17,8 +17,8 @@ from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native import structures as c
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
-from torchgco.native.codegen.dynamics import trace_dynamics
 from torchgco.native.codegen.source import LANES, Form
+from torchgco.native.codegen.stages import trace_model
 from torchgco.native.declarations import load
 from torchgco.native.packing import KINDS, constraint_of, guide_of, quadratic_arrays
 from torchgco.native.structures import STRUCTURES, array
@@ -41,7 +41,7 @@ class Engine:
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
         if problem.n + problem.m > MAX_VARIABLES:
             raise InputError("dynamics", f"at most {MAX_VARIABLES} states and controls together", problem.n + problem.m)
-        self.model = trace_dynamics(problem.dynamics)
+        self.model = trace_model(problem)
         quadratic = problem.cost if type(problem.cost) is BoundQuadratic else None
         self.cost = trace_cost(problem) if quadratic is None else None
         traced = (i for i, constraint in enumerate(problem.constraints) if type(constraint) not in KINDS)
@@ -175,8 +175,7 @@ class Engine:
             rows.append(constraint_of(constraint, numbers, problem))
         packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows)
         if self.model.count > 0:
-            own = self.model.parameters(torch.arange(problem.B), problem.dynamics)
-            packed.parameters = array(own, knots=False)
+            packed.parameters = array(self.model.numbers(problem.B, problem.dynamics), knots=True)
         packed.cost_data = quadratic_arrays(problem.cost) if self.cost is None else cost_arrays(problem, self.cost)
         return packed, rows
 

@@ -88,7 +88,7 @@ class Problem(Structure):
         ("const double *", "mu"),
         ("int64_t *", "inner iterations rung"),
         ("int32_t *", "status converged refused lost"),
-        (Array, "parameters"),
+        (Array, "parameters"),  # of the model: (E, N, count)
         ((Array, COST_ARRAYS), "cost_data"),
         ("const Constraint *", "constraint"),
         ("int32_t", "guide phr replicas optimality"),

@@ -26,8 +26,8 @@ NOISE = 8.0  # times the rounding error of a difference, or its change with the 
 APART = "values of a problem that depend on its own row alone; numbers per problem belong in `values` or `batched`"
 
 
-def check_dynamics(dynamics: Dynamics, x0: Tensor) -> None:
-    """Check a user's model for problems that start at x0 (B, n).
+def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
+    """Check a user's model for problems of N stages that start at x0 (B, n).
 
     Raises:
         InputError: names the method, what was expected, and what it returned.
@@ -36,16 +36,17 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor) -> None:
         return
     n, rows = dynamics.n, _ends(x0)
     x, u = _states(x0, 3), _controls(x0, 3, dynamics.m)
+    several, one = dynamics.at(torch.arange(3, device=x0.device).clamp(max=N - 1)), dynamics.at(0)
     for name in ("field", "step") if dynamics.is_integrated else ("step",):
-        method = lambda i, x, u, name=name: getattr(dynamics.take(i), name)(x, u)
+        method = lambda model, name=name: lambda i, x, u: getattr(model.take(i), name)(x, u)
         wanted = f"{'derivatives' if name == 'field' else 'states'} (..., {n}) in {x0.dtype}, shaped as its states"
-        _check_values(f"dynamics.{name}", method, rows, (x[:, 0], u[:, 0]), (2, n), wanted)
-        _check_values(f"dynamics.{name}", method, rows, (x, u), (2, 3, n), wanted)
+        _check_values(f"dynamics.{name}", method(one), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
+        _check_values(f"dynamics.{name}", method(several), rows, (x, u), (2, 3, n), wanted)
     weights = 1.0 + 0.5 * _direction(x)
-    step = lambda x, u: (weights * dynamics.take(rows).step(x, u)).flatten(1).sum(-1)
+    step = lambda x, u: (weights * several.take(rows).step(x, u)).flatten(1).sum(-1)
 
     def own(dx: Tensor, du: Tensor) -> Tensor:
-        fx, fu = dynamics.take(rows).jacobians(x, u)
+        fx, fu = several.take(rows).jacobians(x, u)
         ahead = (fx @ dx.unsqueeze(-1) + fu @ du.unsqueeze(-1)).squeeze(-1)
         return (weights * ahead).flatten(1).sum(-1)
 
@@ -117,7 +118,8 @@ def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint
     first, wanted = slice(0, 1), "a function that torch.func can differentiate"
     X, U = x0[first].unsqueeze(1).repeat(1, N + 1, 1), x0.new_zeros(1, N, dynamics.m)
     if is_users(dynamics):
-        _called("dynamics.step", wanted, dynamics.take(first).jacobians, X[:, :-1], U)
+        stages = dynamics.take(first).at(torch.arange(N, device=x0.device))
+        _called("dynamics.step", wanted, stages.jacobians, X[:, :-1], U)
     if is_users(cost):
         _called("cost", wanted, cost.take(first).expand, X, U, _blocks(X, U)[first])
     for i, constraint in enumerate(constraints):

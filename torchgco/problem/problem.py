@@ -78,7 +78,7 @@ class Problem:
     def _check_code(self, dynamics: Dynamics | None, cost: Cost | None, constraints: Sequence[Constraint]) -> None:
         """Try what a user's code does; bound constraints."""
         if dynamics is not None:
-            check_dynamics(dynamics, self.x0)
+            check_dynamics(dynamics, self.x0, self.N)
         if cost is not None:
             check_cost(cost, self.x0, self.N, self.m)
         for i, constraint in enumerate(constraints):
@@ -101,6 +101,11 @@ class Problem:
     @property
     def m(self) -> int:
         return self.dynamics.m
+
+    @property
+    def along(self) -> Dynamics:
+        """The dynamics of all stages together, for states (B, N, n) and controls (B, N, m)."""
+        return self.dynamics.at(torch.arange(self.N, device=self.x0.device))
 
     @property
     def position(self) -> slice:
@@ -321,7 +326,7 @@ class Problem:
                     raise InputError(f"dynamics.{name}", wanted, f"{value.dtype} on {value.device}")
                 check_tensor(value, f"dynamics.{name}")
         try:
-            after = self.dynamics.step(self.x0, self.x0.new_zeros(self.B, self.m))
+            after = self.dynamics.at(0).step(self.x0, self.x0.new_zeros(self.B, self.m))
         except MISTAKES as error:
             message = (str(error).splitlines() or [type(error).__name__])[0]
             raise InputError("dynamics.step", f"a step for states {tuple(self.x0.shape)}", message) from error

@@ -61,7 +61,7 @@ def _expand(problem: Problem) -> None:
     """Evaluate the parts of an iLQR iteration, for one problem that stays at its start."""
     X = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1)
     U = X.new_zeros(1, problem.N, problem.m)
-    check_form("dynamics", problem.dynamics.step(X[:, :-1], U), X[:, :-1])
+    check_form("dynamics", problem.along.step(X[:, :-1], U), X[:, :-1])
     lagrangian = Lagrangian(problem, Multipliers.zero(problem, 1.0), None, True)
     check_form("cost", lagrangian.value(X, U)[1], X[:, 0, 0])
     linearise(problem, X, U)

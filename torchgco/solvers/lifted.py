@@ -38,7 +38,7 @@ def lifted_search(lagrangian: Lagrangian, X: Tensor, U: Tensor, merit: Tensor) -
             break
         part, dynamics = lagrangian.take(rows), lagrangian.problem.dynamics.take(rows)
         n, F = X.shape[-1], linearise(part.problem, X, U)
-        F[:, :, :n, n] = (dynamics.step(X[:, :-1], U) - X[:, 1:]).transpose(0, 1)
+        F[:, :, :n, n] = (part.problem.along.step(X[:, :-1], U) - X[:, 1:]).transpose(0, 1)
         step = backward(F, part.expand(X, U), torch.zeros_like(X[:, 0, 0]))
         if i > 0:  # the first gains are those that failed
             _keep(found, rows, part, *closed_loop(dynamics, X, U, step.gains, torch.ones_like(X[:, 0, 0])))

@@ -64,7 +64,7 @@ static void fly(Samples *q, int64_t first) {
     for (int64_t k = 0; k < p->N; k++) {
         draw(q, k, eps, u);
         cost += cost_value(&q->s, k, x, u);
-        model_step(x, u, q->s.parameters, x + NX);
+        model_step(x, u, model_at(&q->s, k), x + NX);
         memcpy(x, x + NX, NX * sizeof(V));
         touched += hits(q, k + 1, x);
         if (o->knots == 0)

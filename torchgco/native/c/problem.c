@@ -45,6 +45,11 @@ static void fill(V *to, const Array *from, int64_t knots, int lane, int64_t elem
         for (int64_t i = 0; i < from->size; i++) to[k * from->size + i][lane] = source[k * from->knot + i];
 }
 
+/* The same of one knot. */
+static void fill_stage(V *to, const Array *from, int64_t k, int lane, int64_t element) {
+    for (int64_t i = 0; i < from->size; i++) to[i][lane] = from->data[element * from->element + k * from->knot + i];
+}
+
 static inline const V *at(const V *array, const Array *shape, int64_t k) {
     return array + (shape->knot ? k * shape->size : 0);
 }
@@ -54,6 +59,9 @@ static inline const V *cost_at(const Lanes *s, int i, int64_t k) {
     return at(s->cost_data[i], s->of->cost_data + i, k);
 }
 
+/* The model's own numbers at stage k. */
+static inline const V *model_at(const Lanes *s, int64_t k) { return at(s->parameters, &s->of->parameters, k); }
+
 static V *cut(V **memory, int64_t count) { V *part = *memory; *memory += count; return part; }
 
 static int64_t lay_out(Lanes *s, V *memory) {
@@ -62,7 +70,7 @@ static int64_t lay_out(Lanes *s, V *memory) {
     V *m = memory;
     s->X = cut(&m, (N + 1) * NX); s->U = cut(&m, N * NU); s->Xn = cut(&m, (N + 1) * NX); s->Un = cut(&m, N * NU);
     s->G = cut(&m, N * NU * NZ);
-    s->parameters = cut(&m, length(&p->parameters, 1));
+    s->parameters = cut(&m, length(&p->parameters, N));
     for (int i = 0; i < COST_ARRAYS; i++) s->cost_data[i] = cut(&m, length(p->cost_data + i, N));
     s->center = cut(&m, length(&p->center, N + 1)); s->radius = cut(&m, length(&p->radius, N + 1));
     for (int64_t i = 0; i < p->constraints; i++) {
@@ -96,7 +104,7 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
     int64_t N = p->N;
     s->element[lane] = e;
     for (int i = 0; i < NX; i++) s->X[i][lane] = p->X[e * (N + 1) * NX + i];
-    fill(s->parameters, &p->parameters, 1, lane, e);
+    fill(s->parameters, &p->parameters, N, lane, e);
     for (int i = 0; i < COST_ARRAYS; i++) fill(s->cost_data[i], p->cost_data + i, N, lane, e);
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *c = p->constraint + i;

@@ -47,12 +47,13 @@ int tgco_open_loop(const Problem *p, int64_t first, int64_t last) {
     for (int64_t e = first; e < last; e += LANES) {
         for (int l = 0; l < LANES; l++) {
             int64_t element = e + l < last ? e + l : e;
-            fill(parameters, &p->parameters, 1, l, element);
+            fill_stage(parameters, &p->parameters, 0, l, element);
             for (int i = 0; i < NX; i++) x[i][l] = p->X[element * (N + 1) * NX + i];
         }
         for (int64_t k = 0; k < N; k++) {
             for (int l = 0; l < LANES; l++) {
                 int64_t element = e + l < last ? e + l : e;
+                if (p->parameters.knot) fill_stage(parameters, &p->parameters, k, l, element);
                 for (int j = 0; j < NU; j++) u[j][l] = p->U[(element * N + k) * NU + j];
             }
             model_step(x, u, parameters, x + NX);
@@ -71,12 +72,13 @@ int tgco_closed_loop(const Problem *p, int64_t first, int64_t last) {
     for (int64_t e = first; e < last; e += LANES) {
         for (int l = 0; l < LANES; l++) {
             int64_t element = e + l < last ? e + l : e;
-            fill(parameters, &p->parameters, 1, l, element);
+            fill_stage(parameters, &p->parameters, 0, l, element);
             for (int i = 0; i < NX; i++) x[i][l] = p->X[element * (N + 1) * NX + i];
         }
         for (int64_t k = 0; k < N; k++) {
             for (int l = 0; l < LANES; l++) {
                 int64_t element = e + l < last ? e + l : e;
+                if (p->parameters.knot) fill_stage(parameters, &p->parameters, k, l, element);
                 double *X = p->X + (element * (N + 1) + k) * NX, *U = p->U + (element * N + k) * NU;
                 const double *K = p->gains + (element * N + k) * NU * NZ;
                 for (int j = 0; j < NU; j++) {

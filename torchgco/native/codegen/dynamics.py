@@ -50,6 +50,10 @@ class DynamicsSource:
         """Number of the Jacobian's entries that `tgco_jacobian` writes."""
         return sum(place >= 0 for place in self.places)
 
+    def numbers(self, B: int, of: Dynamics) -> Tensor:
+        """The own numbers (B|1, K|1, count) of B problems with the model `of`, with an axis of stages."""
+        return self.parameters(torch.arange(B), of).unsqueeze(1)
+
     def parameters(self, index: Tensor, of: Dynamics | None = None) -> Tensor:
         """The own numbers (B, count) float64 of the problems in `index` (B,) int64, on its device.
 
@@ -96,7 +100,13 @@ def _made(traced: Traced, n: int, m: int) -> dict[str, Any]:
 
     x, u, p = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("p", traced.count)
     ahead = traced(elements(p), elements(x)[None], elements(u)[None]).reshape(-1)
-    ahead = ca.densify(ca.vertcat(*ahead))
+    return step_parts(x, u, p, ca.densify(ca.vertcat(*ahead)))
+
+
+def step_parts(x: Any, u: Any, p: Any, ahead: Any) -> dict[str, Any]:
+    """The code of a step `ahead` (n) of x, u and the numbers p, CasADi's columns, and the lists of a DynamicsSource."""
+    import casadi as ca
+
     # Forward mode only, as `torch.func.jvp`: reverse mode would let a NaN of the branch not taken through as 0 * NaN.
     jacobian = ca.sparsify(ca.jacobian(ahead, ca.vertcat(x, u), {"allow_reverse": False}))
     step, jacobian = ca.cse([ahead, jacobian])

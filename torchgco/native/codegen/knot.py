@@ -99,15 +99,22 @@ def knot_source(kind: str, span: Span, code_of: Callable[[Knot, str], str], *fil
     Raises:
         InputError: an operation without a counterpart; rows that join knots, or whose operations differ between knots.
     """
+    return knot_parts(kind, span, lambda knot, key: {"code": code_of(knot, key)}, *files)[0]
+
+
+def knot_parts(
+    kind: str, span: Span, parts_of: Callable[[Knot, str], dict[str, Any]], *files: str
+) -> tuple[KnotSource, dict[str, Any]]:
+    """`knot_source` of parts, of which "code" is one, and these parts."""
     shape = str((span.n, span.m, span.states, span.controls, list(span.knots)))
 
     def make(key: str) -> dict[str, Any]:
         knot, places = _one_knot(span)
-        return {"code": code_of(knot, key[:16]), "size": knot.rows.numel(), "places": places}
+        return {**parts_of(knot, key[:16]), "size": knot.rows.numel(), "places": places}
 
     key, parts = store.made((kind, shape, span.traced.fingerprint(), *makers(__file__, *files)), make)
     places = torch.tensor(parts["places"], dtype=torch.int64).reshape(len(parts["places"]), -1)
-    return KnotSource(parts["code"], key[:16], parts["size"], places, span)
+    return KnotSource(parts["code"], key[:16], parts["size"], places, span), parts
 
 
 def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:

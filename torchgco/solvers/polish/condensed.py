@@ -110,7 +110,7 @@ class Condensed:
 
         def value(z: Tensor) -> Tensor:
             X, U = z[..., :n], z[:, :-1, n:]
-            total = twins.cost.total(X, U).sum() + (costate * twins.dynamics.step(X[:, :-1], U)).sum()
+            total = twins.cost.total(X, U).sum() + (costate * twins.along.step(X[:, :-1], U)).sum()
             for constraint, weight in zip(twins.constraints, weights, strict=True):
                 total = total + (weight * constraint.value(X, U)).sum()
             return total

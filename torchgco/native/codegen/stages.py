@@ -1,0 +1,60 @@
+"""C of a model that differs from stage to stage: its step at one stage, with the numbers of each stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.dynamics import Dynamics
+from torchgco.native.codegen import dynamics as code
+from torchgco.native.codegen.dynamics import DynamicsSource, step_parts, trace_dynamics
+from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_parts
+from torchgco.problem.problem import Problem
+from torchgco.tracing import Traced, own_tensors
+
+
+@dataclass(frozen=True)
+class StagesSource(DynamicsSource):
+    """A DynamicsSource whose numbers p are those of a stage."""
+
+    stage: KnotSource = field(repr=False, compare=False)
+
+    def numbers(self, B: int, of: Dynamics) -> Tensor:
+        return self.stage.numbers(B, own_tensors(of), lambda: _span(of, len(self.stage.span.knots)))
+
+
+def trace_model(problem: Problem) -> DynamicsSource:
+    """The C of a problem's dynamics, taken from the cache folder if it was made before.
+
+    Raises:
+        InputError: a step that can't be traced, holds an operation without a counterpart, or differs between stages in
+            more than its numbers.
+    """
+    model = problem.dynamics
+    if problem.along is model:
+        return trace_dynamics(model)
+    span = _span(model, problem.N)
+    source, parts = knot_parts("stages", span, _parts, __file__, str(code.__file__))
+    lists = {name: tuple(parts[name]) for name in ("rows", "columns", "places_of_entries", "values")}
+    lists["places"] = lists.pop("places_of_entries")
+    count = source.places.shape[1]
+    return StagesSource(
+        model.n, model.m, count, source.code, **lists, key=source.key, traced=span.traced, own=list(span.own),
+        stage=source,
+    )  # fmt: skip
+
+
+def _span(model: Dynamics, N: int) -> Span:
+    """The steps of all stages of one problem, traced together."""
+    own, stages = own_tensors(model), torch.arange(N)
+    X, U = (torch.zeros(1, N, size, dtype=torch.float64) for size in (model.n, model.m))
+    traced = Traced("dynamics.step", lambda i, X, U: model.take(i).at(stages).step(X, U), X, U, own=own)
+    return Span(traced, own, model.n, model.m, N, N, range(N))
+
+
+def _parts(knot: Knot, _: str) -> dict[str, Any]:
+    parts = step_parts(knot.x, knot.u, knot.numbers, knot.rows)
+    return {**parts, "places_of_entries": parts.pop("places")}
