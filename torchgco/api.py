@@ -68,10 +68,8 @@ def _guess(problem: Problem) -> Tensor:
         middle, outside = rest.clone(), torch.zeros_like(rest, dtype=torch.bool)
         for bounds in problem.constraints:
             if isinstance(bounds, ControlBounds):
-                at = torch.zeros(problem.N, dtype=torch.bool, device=rest.device)
-                at[bounds.knots] = True
-                breaks = (rest < bounds.lower.unsqueeze(1)) | (rest > bounds.upper.unsqueeze(1))
-                outside |= at.view(1, -1, 1) & breaks
-                middle = torch.where(at.view(1, -1, 1), bounds.middle(rest), middle)
+                held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
+                outside[:, bounds.knots] |= (held < lower) | (held > upper)
+                middle[:, bounds.knots] = bounds.middle(held)
         lost = ~torch.isfinite(rollout.open_loop(problem.dynamics, problem.x0, rest)).flatten(1).all(-1)
         return torch.where(outside.flatten(1).any(-1).logical_or(lost).view(-1, 1, 1), middle, rest)

@@ -14,7 +14,7 @@ from tests.native import users
 from tests.native.lanes import drawn
 from tests.native.test_engine import user_problem
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
-from torchgco import MPPI, Problem, Spheres, presets
+from torchgco import MPPI, ControlBounds, Problem, Spheres, presets
 from torchgco.base import kernels
 from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.guidance import mppi
@@ -54,6 +54,19 @@ def users_own(name: str) -> tuple[Problem, Tensor]:
     return problem.take(slice(0, 3)), torch.zeros(3, problem.N, problem.m, dtype=torch.float64)
 
 
+def bounds_by_knot() -> tuple[Problem, Tensor]:
+    problem, U = planar_batch(B=3, N=20)
+    fading = torch.linspace(3.0, 0.5, 20).double().view(1, 20, 1) * torch.tensor([1.0, 1.5, 2.0]).double().view(3, 1, 1)
+    late = ControlBounds([[[-0.5, -torch.inf]]], 0.25 * fading[:, 12:].expand(-1, -1, 2), knots=slice(12, 20))
+    bounds = ControlBounds(-fading.expand(-1, -1, 2), 2.5)
+    return Problem(problem.dynamics, problem.cost, [bounds, late, problem.constraints[0]], problem.x0, 20), U
+
+
+def bounds_of_some_knots() -> tuple[Problem, Tensor]:
+    problem, U = bounds_by_knot()
+    return Problem(problem.dynamics, problem.cost, [problem.constraints[1]], problem.x0, 20), U
+
+
 PROBLEMS = {
     "planar": partial(planar_batch, B=3, N=20),
     "quadrotor": partial(quadrotor_batch, B=3, N=20),
@@ -63,6 +76,8 @@ PROBLEMS = {
     "functions": given_as_functions,
     "a user's cost": partial(users_own, "by knot"),
     "dynamics by stage": partial(users_own, "dynamics by stage"),
+    "bounds by knot": bounds_by_knot,
+    "bounds of some knots": bounds_of_some_knots,
 }
 SAMPLERS = {
     "as printed": MPPI(samples=30, covariance=0.5, temperature=50.0),

@@ -11,7 +11,16 @@ from torch import Tensor
 
 from tests.native.test_engine import normal, user_problem
 from tests.problems import quadrotor_batch
-from torchgco import ControlBounds, Cost, FirstStepRates, FunctionConstraint, FunctionDynamics, Problem, QuadraticCost
+from torchgco import (
+    ControlBounds,
+    Cost,
+    FirstStepRates,
+    FunctionConstraint,
+    FunctionDynamics,
+    Problem,
+    QuadraticCost,
+    StateBounds,
+)
 from torchgco import Spheres as Discs
 from torchgco.constraints.base import Constraint, Sense
 from torchgco.constraints.bounds import ControlBounds as Bounds
@@ -270,6 +279,20 @@ def with_stages(function: Callable[..., Tensor] = by_stage, rows: slice = slice(
     return Problem(model, cost, [bounds, discs], base.x0[rows], N)
 
 
+def with_bounds_by_knot() -> Problem:
+    base = user_problem(B, N)
+    lower = -0.2 - normal(B, N, 2, seed=35).abs()
+    lower[2, 3:6, 0] = -torch.inf
+    ceiling = torch.full((1, 3, 4), torch.inf).double()
+    ceiling[0, :2, 3], ceiling[0, 2, :2] = 0.3, torch.tensor([0.1, 0.2]).double()
+    rows = [
+        ControlBounds(lower, [0.4, 0.5]),
+        StateBounds(-torch.inf, ceiling, knots=[2, 5, -1]),
+        StateBounds(-5.0, torch.linspace(2, 1, N).double().view(1, N, 1).expand(B, N, 4)),
+    ]
+    return Problem(base.dynamics, each(), rows, base.x0, N)
+
+
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "smooth": lambda: with_cost(Smooth()),
     "per problem": lambda: with_cost(each()),
@@ -284,6 +307,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "constraints": with_constraints,
     "first step": first_step,
     "dynamics by stage": with_stages,
+    "bounds by knot": with_bounds_by_knot,
 }
 
 

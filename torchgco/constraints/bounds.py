@@ -19,7 +19,8 @@ LOOSE = 1e20  # stands for infinity in rows: a component may be bounded in one p
 class _Bounds(Constraint):
     """lower <= z <= upper, as rows [z - upper, lower - z] of the bounded components.
 
-    Bounds are (size,) or, per problem, (B, size), or one number for all components; infinity means unbounded.
+    Bounds are one number for all components, (size,), per problem (B, size), or per knot (B|1, K, size) with a row for
+    each of the K `knots` in their order; infinity means unbounded.
 
     Raises:
         InputError: on `Problem(...)`: wrong shape, NaN, bounds crossed, nothing bounded, a lower bound of infinity or
@@ -36,48 +37,78 @@ class _Bounds(Constraint):
     of: ClassVar[Literal["x", "u"]]
 
     def bind(self, dims: Dimensions) -> Self:
-        if self.above is not None:  # bound already
+        if self.above is not None and self.lower.dim() == 2:  # bound already; other knots may not fit another problem
             return self
         name, size = ("control_bounds", dims.m) if self.of == "u" else ("state_bounds", dims.n)
         last = dims.N - 1 if self.of == "u" else dims.N
-        lower = self._checked(self.lower, f"{name}.lower", size, dims, torch.inf)
-        upper = self._checked(self.upper, f"{name}.upper", size, dims, -torch.inf)
+        default = slice(0, dims.N) if self.of == "u" else slice(1, dims.N + 1)
+        knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", dims.like.device)
+        shape = dims.B, len(range(last + 1)[knots]) if isinstance(knots, slice) else len(knots), size
+        lower = self._checked(self.lower, f"{name}.lower", shape, dims, torch.inf)
+        upper = self._checked(self.upper, f"{name}.upper", shape, dims, -torch.inf)
+        if lower.dim() != upper.dim():
+            lower, upper = (bound if bound.dim() == 3 else bound.unsqueeze(1) for bound in (lower, upper))
         if bool((lower > upper).any()):
             raise InputError(f"{name}.lower", "at most the upper bound", f"{lower.tolist()} over {upper.tolist()}")
-        default = slice(0, dims.N) if self.of == "u" else slice(1, dims.N + 1)
-        above, below = (torch.isfinite(bound).any(dim=0).nonzero().flatten() for bound in (upper, lower))
+        above, below = (torch.isfinite(bound).flatten(0, -2).any(dim=0).nonzero().flatten() for bound in (upper, lower))
         if above.numel() + below.numel() == 0:
             raise InputError(name, "at least one finite bound", "none")
-        knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", lower.device)
         return replace(self, lower=lower, upper=upper, knots=knots, above=_range(above), below=_range(below))
 
     @property
+    def by_knot(self) -> tuple[Tensor, Tensor]:
+        """The lower and the upper bounds with an axis of knots, (B|1, K|1, size)."""
+        lower, upper = (bound if bound.dim() == 3 else bound.unsqueeze(1) for bound in (self.lower, self.upper))
+        return lower, upper
+
+    def over(self, count: int) -> tuple[Tensor, Tensor]:
+        """The same of the knots 0..count-1, (B|1, count|1, size); infinite where the bounds don't hold."""
+        if self.knots == slice(0, count):
+            return self.by_knot
+        found = []
+        for bound, free in zip(self.by_knot, (-torch.inf, torch.inf), strict=True):
+            found.append(bound.new_full((bound.shape[0], count, bound.shape[2]), free))
+            found[-1][:, self.knots] = bound
+        return found[0], found[1]
+
+    @property
     def range(self) -> Tensor:
-        """The distance between the bounds, (B|1, size); infinite where one is missing."""
-        return self.upper - self.lower
+        """The distance between the bounds, (B|1, size), the largest of all knots; infinite where one is missing."""
+        lower, upper = self.by_knot
+        return (upper - lower).amax(1)
 
     def range_from(self, z: Tensor, signs: Tensor) -> Tensor:
-        """Distances (B, P, size) from z (B, 1, size) to the bounds that signs (P, size) point to, at least 0."""
-        upper, lower = self.upper.unsqueeze(1), self.lower.unsqueeze(1)
+        """Distances (B, P, size) from z (B, 1, size) to the bounds that signs (P, size) point to, at least 0.
+
+        Of the bounds of several knots, the widest count.
+        """
+        lower, upper = self.by_knot
+        lower, upper = lower.amin(1, keepdim=True), upper.amax(1, keepdim=True)
         return torch.where(signs > 0, upper - z, z - lower).clamp(min=0.0)
 
     def middle(self, z: Tensor) -> Tensor:
         """The middle of the bounds in the shape of z (B, K, size); z within them where one is missing."""
-        lower, upper, both = self.lower.unsqueeze(1), self.upper.unsqueeze(1), torch.isfinite(self.range).unsqueeze(1)
-        return torch.where(both, 0.5 * (lower + upper), torch.clamp(z, lower, upper))
+        lower, upper = self.by_knot
+        return torch.where(torch.isfinite(upper - lower), 0.5 * (lower + upper), torch.clamp(z, lower, upper))
 
     def limits(self) -> tuple[Tensor, Tensor]:
-        """The upper and the lower bounds of the rows, (B|1, rows above) and (B|1, rows below), as finite numbers.
+        """The upper and the lower bounds of the rows, (B|1, K|1, rows above) and (.., rows below), as finite numbers.
 
         A row of minus infinity, times a multiplier of 0, would be NaN.
         """
-        return self.upper[:, self.above].clamp(max=LOOSE), self.lower[:, self.below].clamp(min=-LOOSE)
+        lower, upper = self.by_knot
+        return upper[..., self.above].clamp(max=LOOSE), lower[..., self.below].clamp(min=-LOOSE)
 
-    def _checked(self, value: Any, name: str, size: int, dims: Dimensions, refused: float) -> Tensor:
+    def _checked(self, value: Any, name: str, shape: tuple[int, int, int], dims: Dimensions, refused: float) -> Tensor:
+        """A bound as (B|1, size) or (B|1, K|1, size), for the shape (B, K, size)."""
+        B, K, size = shape
         bound = tensor(value, name, dims.like)
         bound = bound.repeat(size) if bound.dim() == 0 else bound
         bound = bound.unsqueeze(0) if bound.dim() == 1 else bound
-        check_shape(bound, (1 if bound.shape[0] == 1 else dims.B, size), name)
+        if bound.dim() == 3:
+            check_shape(bound, (*(1 if bound.shape[i] == 1 else shape[i] for i in (0, 1)), size), name)
+        elif bound.shape not in ((1, size), (B, size)):
+            raise InputError(name, f"shape ({B}, {size}), or per knot ({B} or 1, {K}, {size})", tuple(bound.shape))
         bad = torch.isnan(bound) | (bound == refused)
         if bool(bad.any()):
             raise InputError(name, f"numbers or {-refused}", float(bound[bad][0]))
@@ -85,7 +116,7 @@ class _Bounds(Constraint):
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         z = (U if self.of == "u" else X)[:, self.knots]
-        upper, lower = (bound.unsqueeze(1) for bound in self.limits())
+        upper, lower = self.limits()
         return torch.cat((z[..., self.above] - upper, lower - z[..., self.below]), dim=-1)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:

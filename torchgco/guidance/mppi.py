@@ -125,9 +125,10 @@ class MPPI:
         """The rounds as the native library takes them."""
         bounds = self._bounds(problem)
         if bounds is None:
-            wide = problem.x0.new_full((1, 1, problem.m), torch.inf)
+            wide = problem.x0.new_full((1, 1, 1, problem.m), torch.inf)
             bounds = -wide, wide
-        lower, upper, deviation = (array(row.squeeze(1), knots=False) for row in (*bounds, self._sigma(problem).sqrt()))
+        lower, upper = (array(bound.squeeze(2).transpose(0, 1), knots=True) for bound in bounds)
+        deviation = array(self._sigma(problem).sqrt(), knots=True)
         sampling = Sampling(
             samples=self.samples, rounds=self.rounds, knots=self.noise_knots, decay=self.decay, elite=self.elite,
             temperature=self.temperature, collision_penalty=COLLISION_PENALTY, dwell_cost=self.dwell_cost,
@@ -196,12 +197,12 @@ class MPPI:
         return torch.where(torch.isfinite(S), S, torch.finfo(S.dtype).max)
 
     def _bounds(self, problem: Problem) -> tuple[Tensor, Tensor] | None:
-        """Limits of the samples as `saturation` says (Algorithm 3, line 7): two tensors (B|1, 1, m)."""
+        """Limits of the samples as `saturation` says (Algorithm 3, line 7): two tensors (N|1, B|1, 1, m)."""
         bounds = problem.control_bounds
         if self.saturation is None or bounds is None:
             return None
-        upper = bounds.upper.unsqueeze(1)
-        return (bounds.lower.unsqueeze(1) if self.saturation == "bounds" else -upper), upper
+        lower, upper = (bound.transpose(0, 1).unsqueeze(2) for bound in bounds.over(problem.N))
+        return (lower if self.saturation == "bounds" else -upper), upper
 
     def _sigma(self, problem: Problem) -> Tensor:
         """Diagonal of Sigma, (B|1, 1, m)."""
@@ -222,7 +223,7 @@ class MPPI:
 
 
 def draw(mean: Tensor, noise: Noise, bounds: tuple[Tensor, Tensor] | None) -> Tensor:
-    """Controls V (N, B, S, m) around mean (N, B, 1, m), clamped to bounds (B|1, 1, m)."""
+    """Controls V (N, B, S, m) around mean (N, B, 1, m), clamped to bounds (N|1, B|1, 1, m)."""
     V = mean + noise.eps
     return V if bounds is None else torch.clamp(V, *bounds)
 

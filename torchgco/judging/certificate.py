@@ -120,7 +120,8 @@ def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     for bounds in problem.constraints:
         if isinstance(bounds, (ControlBounds, StateBounds)):
             z = (U if bounds.of == "u" else X)[:, bounds.knots]
-            excess = torch.maximum(z - bounds.upper.unsqueeze(1), bounds.lower.unsqueeze(1) - z)
+            lower, upper = bounds.by_knot
+            excess = torch.maximum(z - upper, lower - z)
             worst = torch.maximum(worst, excess.amax())
     return worst
 

@@ -139,7 +139,7 @@ def first_step(problem: Problem, x: Tensor, airframe: Airframe) -> FirstStepRate
         if isinstance(bounds, ControlBounds):
             w = x[:, 10:13]
             share = model.dt / torch.as_tensor(model.rate_time_constant, dtype=x.dtype).reshape(-1, 1)
-            lower, upper = (w + share * (bound[:, :3] - w) for bound in (bounds.lower, bounds.upper))
+            lower, upper = (w + share * (bound[:, 0, :3] - w) for bound in bounds.by_knot)
             reachable = lower, upper
     return FirstStepRates(x[:, 13:], model.dt, airframe, reachable)
 

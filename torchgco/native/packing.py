@@ -64,9 +64,9 @@ def _bounds(constraint: ControlBounds | StateBounds, problem: Problem) -> dict[s
     above, below = variables[constraint.above], variables[constraint.below]
     sign = torch.cat((torch.ones(above.numel()), -torch.ones(below.numel()))).double()
     upper, lower = constraint.limits()
-    B = max(len(upper), len(lower))  # one may be shared by all problems
-    bound = torch.cat((upper.expand(B, -1), lower.expand(B, -1)), dim=1)
-    return {"variable": torch.cat((above, below)), "sign": sign, "bound": array(bound, knots=False)}
+    B, K = (max(upper.shape[i], lower.shape[i]) for i in (0, 1))  # one may be shared by all problems or knots
+    bound = torch.cat((upper.expand(B, K, -1), lower.expand(B, K, -1)), dim=-1)
+    return {"variable": torch.cat((above, below)), "sign": sign, "bound": array(bound, knots=True)}
 
 
 def _spheres(spheres: BoundSpheres) -> dict[str, Any]:

@@ -53,7 +53,7 @@ class Constraint(Structure):
         ("double *", "lam"),  # (E, knots, rows)
         ("const int32_t *", "variable"),  # BOUNDS: (rows) index into [x, u]
         ("const double *", "sign"),  # BOUNDS: (rows) +1 for an upper bound, -1 for a lower one
-        # BOUNDS: (E, 1, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ...); BOXES: see boxes.c.
+        # BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ...); BOXES: see boxes.c.
         (Array, "bound"),
         (Array, "squares"),  # SPHERES: squared inflated radii (E, 1, rows), ABSENT where there is none
         (Array, "velocities"),  # SPHERES: as centres, or NULL
@@ -107,7 +107,7 @@ class Sampling(Structure):
         ("int64_t", "samples rounds knots elite"),  # knots at which noise is drawn; 0: at every stage, white
         ("double", "temperature collision_penalty dwell_cost decay"),
         ("const uint64_t *", "keys"),  # (E, rounds)
-        (Array, "deviation lower upper"),  # (E, 1, NU)
+        (Array, "deviation lower upper"),  # (E, 1, NU), bounds (E, N, NU)
         ("const int32_t *", "left"),  # (N): the knot before each stage; unused where white
         ("const double *", "share"),  # (N): share of the interval to the next
         ("const int32_t *", "geometric"),  # of each constraint: whether samples that touch it are counted

@@ -2,10 +2,10 @@
 
 #define BLOCK 32 /* spheres evaluated together: most blocks are far away and add nothing */
 
-/* Row j of bounds. */
-static inline V bound(const Constraint *con, const Rows *rows, int64_t j, const V *x, const V *u) {
+/* Row j of bounds at knot k. */
+static inline V bound(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, const V *u) {
     int v = con->variable[j];
-    return SET(con->sign[j]) * ((v < NX ? x[v] : u[v - NX]) - rows->bound[j]);
+    return SET(con->sign[j]) * ((v < NX ? x[v] : u[v - NX]) - at(rows->bound, &con->bound, con->place[k])[j]);
 }
 
 #if DIM > 0
@@ -71,7 +71,7 @@ static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, con
     const Rows *rows = s->rows + i;
     const V *lam = rows->lam + con->place[k] * con->rows;
     if (con->kind == BOUNDS) {
-        for (int j = 0; j < con->rows; j++) total += worth(s, 0, bound(con, rows, j, x, u), lam[j]);
+        for (int j = 0; j < con->rows; j++) total += worth(s, 0, bound(con, rows, j, k, x, u), lam[j]);
 #if DIM > 0
     } else if (con->kind == SPHERES) {
         total = spheres_value(s, con, rows, k, x, total);
@@ -95,7 +95,7 @@ static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x,
     if (con->kind == BOUNDS) {
         for (int j = 0; j < con->rows; j++) {
             int v = con->variable[j];
-            V rho, slope = pull(s, 0, bound(con, rows, j, x, u), lam[j], &rho);
+            V rho, slope = pull(s, 0, bound(con, rows, j, k, x, u), lam[j], &rho);
             g[v] += SET(con->sign[j]) * slope;
             H[v * S + v] += rho;
         }

@@ -6,7 +6,7 @@
 typedef struct {
     const Sampling *of;
     Lanes s;
-    V *mean, *z, *sum, deviation[NU], lower[NU], upper[NU];
+    V *mean, *z, *sum, *lower, *upper, deviation[NU];
     double *score;
     V *memory;
 } Samples;
@@ -14,12 +14,13 @@ typedef struct {
 /* Noise and controls of stage k. */
 static inline void draw(const Samples *q, int64_t k, V *eps, V *u) {
     const Sampling *o = q->of;
+    const V *lower = at(q->lower, &o->lower, k), *upper = at(q->upper, &o->upper, k);
     for (int j = 0; j < NU; j++) {
         const V *left = q->z + (o->knots > 0 ? o->left[k] : k) * NU + j;
         V z = o->knots > 0 ? left[0] + SET(o->share[k]) * (left[NU] - left[0]) : left[0];
         eps[j] = z * q->deviation[j];
         V v = q->mean[k * NU + j] + eps[j];
-        u[j] = tgco_fmin(tgco_fmax(v, q->lower[j]), q->upper[j]);
+        u[j] = tgco_fmin(tgco_fmax(v, lower[j]), upper[j]);
     }
 }
 
@@ -128,11 +129,13 @@ static int begin(Samples *q, const Sampling *o) {
     memset(q, 0, sizeof *q);
     q->of = o;
     int64_t N = o->of->N, rows = (o->knots ? o->knots : N) * NU;
+    int64_t bounds = length(&o->lower, N) + length(&o->upper, N);
     if (!start(&q->s, o->of)) return 0;
-    q->memory = aligned_alloc(sizeof(V), (2 * N * NU + rows + 1) * sizeof(V));
+    q->memory = aligned_alloc(sizeof(V), (2 * N * NU + rows + bounds + 1) * sizeof(V));
     q->score = malloc((o->samples + o->elite) * sizeof(double));
     if (!q->memory || !q->score) { finish(&q->s); free(q->memory); free(q->score); return 0; }
     q->mean = q->memory; q->sum = q->mean + N * NU; q->z = q->sum + N * NU;
+    q->lower = q->z + rows; q->upper = q->lower + length(&o->lower, N);
     return 1;
 }
 
@@ -146,8 +149,8 @@ int tgco_sample(const Sampling *o, int64_t first, int64_t last) {
         for (int l = 0; l < LANES; l++) {
             enter_problem(&q->s, l, e);
             fill(spread, &o->deviation, 1, l, e);
-            fill(q->lower, &o->lower, 1, l, e);
-            fill(q->upper, &o->upper, 1, l, e);
+            fill(q->lower, &o->lower, o->of->N, l, e);
+            fill(q->upper, &o->upper, o->of->N, l, e);
         }
         for (int64_t i = 0; i < size; i++) q->mean[i] = SET(o->mean[e * size + i]);
         double shrunk = 1;
