@@ -25,6 +25,7 @@ from torchgco.baselines import IteratedMPPI as IteratedMPPI
 from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
 from torchgco.constraints import FunctionConstraint as FunctionConstraint
+from torchgco.constraints import RateBounds as RateBounds
 from torchgco.constraints import StateBounds as StateBounds
 from torchgco.costs import Cost as Cost
 from torchgco.costs import FunctionCost as FunctionCost
@@ -68,7 +69,7 @@ __all__ = [  # noqa: RUF022
     # the problem
     "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules", "ControlBounds",
-    "StateBounds", "FirstStepRates", "FunctionConstraint", "FunctionCost",
+    "StateBounds", "RateBounds", "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # solving it
     "solve", "Solution", "Status", "presets", "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR",
     "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",

@@ -68,6 +68,13 @@ class SearchRecord:
     caught: tuple[Tensor, Tensor] | None = None
     comparisons: list[Comparison] = field(default_factory=list)
 
+    def of_first_states(self, n: int) -> SearchRecord:
+        """The same with the first n states alone."""
+        caught = None if self.caught is None else (self.caught[0], self.caught[1][..., :n])
+        names = "tracked", "relaxed", "refined"
+        each = [replace(one, **{name: getattr(one, name)[..., :n] for name in names}) for one in self.comparisons]
+        return SearchRecord(self.passes, caught, each)
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -97,6 +104,11 @@ class Solution:
     def take(self, index: Tensor) -> Solution:
         """The problems in `index` (records are left behind)."""
         return take(replace(self, trace=None, search=None), index)
+
+    def of_first_states(self, n: int) -> Solution:
+        """The same with the first n states alone, of which K is then the feedback."""
+        search = None if self.search is None else self.search.of_first_states(n)
+        return replace(self, X=self.X[..., :n].contiguous(), K=self.K[..., :n].contiguous(), search=search)
 
     def __repr__(self) -> str:
         B, N, m = self.U.shape

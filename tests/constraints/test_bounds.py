@@ -11,7 +11,18 @@ from torch import Tensor, inf
 
 import torchgco
 from tests.native.users import N, with_bounds_by_knot
-from torchgco import MPPI, ControlBounds, FunctionCost, FunctionDynamics, InputError, Problem, StateBounds, Status
+from torchgco import (
+    ILQR,
+    MPPI,
+    AugmentedLagrangian,
+    ControlBounds,
+    FunctionCost,
+    FunctionDynamics,
+    InputError,
+    Problem,
+    StateBounds,
+    Status,
+)
 from torchgco.base import kernels
 from torchgco.base.draws import DrawKey
 from torchgco.baselines import CasADiSolver
@@ -20,6 +31,7 @@ from torchgco.native.dispatch import EagerWarning
 
 D = torch.float64
 STEPS = 20
+BRIEF = AugmentedLagrangian(inner=ILQR(max_iterations=3), max_outer_iterations=3)
 
 
 def point(*constraints: Any, B: int = 2, goal: float = 5.0, stages: int = STEPS) -> Problem:
@@ -52,13 +64,13 @@ def test_controls_follow_their_bounds_natively() -> None:
 def test_problems_and_bounds_shared_by_them_give_the_same(native: bool) -> None:
     kernels.use_native(native)
     try:
-        whole = torchgco.solve(point(ControlBounds(-1.0, fading())), solver="al_ilqr").U
+        whole = torchgco.solve(point(ControlBounds(-1.0, fading())), solver=BRIEF).U
         for b in (0, 1):
             alone = point(ControlBounds(-1.0, fading()[b : b + 1]), B=1)
             part = point(ControlBounds(-1.0, fading())).take(torch.tensor([b]))
             shared = point(ControlBounds(-1.0, fading()[b : b + 1]), B=2)
             for one in (alone, part, shared):
-                assert torch.equal(torchgco.solve(one, solver="al_ilqr").U[0], whole[b])
+                assert torch.equal(torchgco.solve(one, solver=BRIEF).U[0], whole[b])
     finally:
         kernels.use_native(True)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -109,6 +109,8 @@ class PreparedCasADi(Solver):
     problem: Problem
     program: Program
     function: Any  # casadi.Function
+
+    joins_knots: ClassVar[bool] = True
 
     def run(self, call: Call) -> Solution:
         """As `CasADiSolver.run`; InputError for another problem than the prepared one."""

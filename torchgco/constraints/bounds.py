@@ -35,13 +35,13 @@ class _Bounds(Constraint):
 
     per_element: ClassVar[tuple[str, ...]] = ("lower", "upper")
     of: ClassVar[Literal["x", "u"]]
+    label: ClassVar[str]  # in errors
 
     def bind(self, dims: Dimensions) -> Self:
         if self.above is not None and self.lower.dim() == 2:  # bound already; other knots may not fit another problem
             return self
-        name, size = ("control_bounds", dims.m) if self.of == "u" else ("state_bounds", dims.n)
-        last = dims.N - 1 if self.of == "u" else dims.N
-        default = slice(0, dims.N) if self.of == "u" else slice(1, dims.N + 1)
+        name, size, last = self.label, dims.m if self.of == "u" else dims.n, dims.N - 1 if self.of == "u" else dims.N
+        default = slice(self._first_knot, last + 1)
         knots = resolve_knots(default if self.knots is None else self.knots, last, f"{name}.knots", dims.like.device)
         shape = dims.B, len(range(last + 1)[knots]) if isinstance(knots, slice) else len(knots), size
         lower = self._checked(self.lower, f"{name}.lower", shape, dims, torch.inf)
@@ -54,6 +54,10 @@ class _Bounds(Constraint):
         if above.numel() + below.numel() == 0:
             raise InputError(name, "at least one finite bound", "none")
         return replace(self, lower=lower, upper=upper, knots=knots, above=_range(above), below=_range(below))
+
+    @property
+    def _first_knot(self) -> int:
+        return 0 if self.of == "u" else 1
 
     @property
     def by_knot(self) -> tuple[Tensor, Tensor]:
@@ -115,19 +119,27 @@ class _Bounds(Constraint):
         return bound
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        z = (U if self.of == "u" else X)[:, self.knots]
+        z = self._bounded(X, U)
         upper, lower = self.limits()
         return torch.cat((z[..., self.above] - upper, lower - z[..., self.below]), dim=-1)
 
+    def _bounded(self, X: Tensor, U: Tensor) -> Tensor:
+        """What is bounded, (B, K, size)."""
+        return (U if self.of == "u" else X)[:, self.knots]
+
+    def _by_component(self, g: Tensor, h: Tensor) -> Tensor:
+        """Sums (2, B, K, size) over the rows of each component: of g, as the rows point, and of h."""
+        sums = g.new_zeros(2, *g.shape[:2], self.upper.shape[-1])
+        split = sums[..., self.above].shape[-1]
+        for total, rows, sign in zip(sums, (g, h), (-1.0, 1.0), strict=True):
+            total[..., self.above] += rows[..., :split]
+            total[..., self.below] += sign * rows[..., split:]
+        return sums
+
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         n, size = X.shape[-1], self.upper.shape[-1]
-        at = slice(n + 1, n + 1 + size) if self.of == "u" else slice(0, n)
-        gradient, diagonal = H.new_zeros(2, *g.shape[:2], size)
-        split = gradient[..., self.above].shape[-1]
-        gradient[..., self.above] += g[..., :split]
-        gradient[..., self.below] -= g[..., split:]
-        diagonal[..., self.above] += h[..., :split]
-        diagonal[..., self.below] += h[..., split:]
+        at = slice(n + 1, n + 1 + size) if self.of == "u" else slice(0, size)
+        gradient, diagonal = self._by_component(g, h)
         H[:, self.knots, at, n] += gradient
         H[:, self.knots, n, at] += gradient
         if isinstance(self.knots, slice):
@@ -148,6 +160,7 @@ class ControlBounds(_Bounds):
     """lower <= u_k <= upper at knots 0..N-1, in the units of u."""
 
     of: ClassVar[Literal["x", "u"]] = "u"
+    label: ClassVar[str] = "control_bounds"
 
 
 @dataclass(frozen=True)
@@ -155,3 +168,80 @@ class StateBounds(_Bounds):
     """lower <= x_k <= upper at knots 1..N (x_0 is given), in the units of x."""
 
     of: ClassVar[Literal["x", "u"]] = "x"
+    label: ClassVar[str] = "state_bounds"
+
+
+@dataclass(frozen=True)
+class RateBounds(_Bounds):
+    """lower <= u_k - u_{k-1} <= upper at knots 1..N-1, and at knot 0 where `previous` says what came before.
+
+        gentle = RateBounds(-0.1, 0.1, previous=[0.0, 9.81])  # of two controls, by at most 0.1 a step
+
+    Bounds are of the change from one stage to the next, in the units of u: an actuator's limit per second times dt.
+    Solvers see the bounded controls of the stage before as further states, last in x: so does a callback, and a solver
+    of one's own. Solutions have the problem's own states. A problem has one RateBounds at most.
+
+    Args:
+        lower, upper: as for other bounds; without a lower one, say, controls may fall at any rate.
+        knots: of u_k, within 1..N-1, or 0..N-1 with `previous`.
+        previous: u_{-1}, one number for all controls, (m,) or (B, m); None: u_0 is free.
+
+    Raises:
+        InputError: on `Problem(...)`: as other bounds; a `previous` of another shape or not finite, knot 0 without it.
+    """
+
+    previous: Any = None
+    states: Tensor | None = field(default=None, repr=False)  # (m,) int64: where x has each u_{k-1}, in a solver
+
+    per_element: ClassVar[tuple[str, ...]] = ("lower", "upper", "previous")
+    of: ClassVar[Literal["x", "u"]] = "u"
+    label: ClassVar[str] = "rate_bounds"
+
+    def bind(self, dims: Dimensions) -> Self:
+        if self.previous is None:
+            bound = super().bind(dims)
+            if bound.holds_at(0):
+                raise InputError("rate_bounds.knots", "knots from 1 on, or the controls `previous`", "knot 0")
+            return bound
+        previous = tensor(self.previous, "rate_bounds.previous", dims.like)
+        previous = previous.expand(1, dims.m) if previous.dim() == 0 else previous
+        previous = previous.unsqueeze(0) if previous.dim() == 1 else previous
+        check_shape(previous, (1 if previous.shape[0] == 1 else dims.B, dims.m), "rate_bounds.previous")
+        if not bool(torch.isfinite(previous).all()):
+            raise InputError("rate_bounds.previous", "finite numbers", "NaN or infinity")
+        return super(RateBounds, replace(self, previous=previous)).bind(dims)
+
+    @property
+    def _first_knot(self) -> int:
+        return 1 if self.previous is None else 0
+
+    @property
+    def controls(self) -> Tensor:
+        """Which controls are bounded, (r,) int64."""
+        every = torch.arange(self.upper.shape[-1], device=self.upper.device)
+        return torch.cat((every[self.above], every[self.below])).unique()
+
+    def with_states_from(self, first: int) -> Self:
+        """The same rows for a solver's states, of which those from `first` on are the bounded controls of k - 1."""
+        states = torch.zeros(self.upper.shape[-1], dtype=torch.int64, device=self.upper.device)
+        states[self.controls] = first + torch.arange(len(self.controls), device=states.device)
+        return replace(self, states=states)
+
+    def _bounded(self, X: Tensor, U: Tensor) -> Tensor:
+        if self.states is not None:
+            return (U - X[:, :-1, self.states])[:, self.knots]
+        first = U[:, :1] if self.previous is None else self.previous.unsqueeze(1).expand(U.shape[0], 1, -1)
+        return (U - torch.cat((first, U[:, :-1]), dim=1))[:, self.knots]
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        if self.states is None:
+            raise NotImplementedError("rows of two knots have no block; solvers take `with_states_from`")
+        one, controls = X.shape[-1], self.controls
+        x, u = self.states[controls], one + 1 + controls
+        gradient, diagonal = self._by_component(g, h)[..., controls]
+        add = H.new_zeros(*g.shape[:2], *H.shape[2:])
+        for at, sign in ((u, 1.0), (x, -1.0)):
+            add[..., at, one] = add[..., one, at] = sign * gradient
+            add[..., at, at] = diagonal
+        add[..., u, x] = add[..., x, u] = -diagonal
+        H[:, self.knots] += add

@@ -15,7 +15,7 @@ from torchgco.base.options import Count, Seconds, check_value
 from torchgco.base.shapes import MISTAKES, Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, cast
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.bounds import ControlBounds
+from torchgco.constraints.bounds import ControlBounds, RateBounds
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
@@ -347,6 +347,9 @@ def _check_constraints(constraints: Any) -> None:
     for constraint in constraints:
         if not isinstance(constraint, Constraint):
             raise InputError("constraints", "a list of Constraint", _named(constraint))
+    rates = sum(isinstance(constraint, RateBounds) for constraint in constraints)
+    if rates > 1:
+        raise InputError("constraints", "one RateBounds at most", rates)
 
 
 def _named(part: object) -> str:

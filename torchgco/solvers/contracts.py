@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.native.dispatch import cost_unit, current
 from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.rates import with_controls_before
 from torchgco.solution import Solution
 
 
@@ -114,7 +115,14 @@ def check_ids(ids: Any, problem: Problem) -> None:
 
 
 class Solver:
-    """A solver for batches of problems. Its fields are its options; it keeps no state between calls."""
+    """A solver for batches of problems. Its fields are its options; it keeps no state between calls.
+
+    Attributes:
+        joins_knots: whether `run` takes rows of two knots (`RateBounds`) as they are; else the controls of the stage
+            before are further states of `call.problem`.
+    """
+
+    joins_knots: ClassVar[bool] = False
 
     def solve(
         self,
@@ -143,7 +151,9 @@ class Solver:
         """
         check_problem(problem)
         with computing_on(problem.x0.device):
-            return self.run(Call.checked(problem, U0, seed, ids, warm, callback, max_seconds))
+            whole = problem if self.joins_knots else with_controls_before(problem)
+            found = self.run(Call.checked(whole, U0, seed, ids, warm, callback, max_seconds))
+            return found if whole is problem else found.of_first_states(problem.n)
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""

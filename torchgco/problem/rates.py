@@ -1,0 +1,194 @@
+"""Limits on how far controls change from one stage to the next, for solvers: the control before becomes a state.
+
+Rows of two knots fit no recursion over stages. With the states [x, controls of the stage before], they are rows of one
+knot; all other parts see the first n states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.base.tree import is_users
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
+from torchgco.costs.base import Cost, WrappedCost
+from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.dynamics.base import Dynamics
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.problem import Problem
+
+# Besides obstacles, which read the position alone: kinds that find their states and controls among others, too.
+IN_PLACE = (ControlBounds, StateBounds)
+FORM = "with controls before"  # what is kept with the form of the problem for this one
+
+
+def with_controls_before(problem: Problem) -> Problem:
+    """The problem with the controls of the stage before among its states, last; itself where no rates are bounded.
+
+    Constraints keep their places, rows and knots, and so multipliers their shapes.
+    """
+    bounds = next((c for c in problem.constraints if isinstance(c, RateBounds)), None)
+    if bounds is None:
+        return problem
+    n, controls, x0 = problem.n, bounds.controls, problem.x0
+    before = x0.new_zeros(1, problem.m) if bounds.previous is None else bounds.previous
+    parts: dict[str, object] = {
+        "dynamics": _Dynamics(problem.dynamics, controls),
+        "cost": _cost(problem.cost, n, len(controls)),
+        "constraints": tuple(_constraint(c, n) for c in problem.constraints),
+        "x0": torch.cat((x0, before[:, controls].expand(problem.B, -1)), dim=-1),
+    }
+    return problem._with(parts, form=problem.form.setdefault(FORM, {}))
+
+
+@dataclass(frozen=True)
+class _Dynamics(Dynamics):
+    """A model whose states are followed by some of the controls of the stage before."""
+
+    model: Dynamics
+    controls: Tensor  # (r,) int64: which controls
+
+    batched: ClassVar[tuple[str, ...]] = ("model",)
+
+    n = property(lambda self: self.model.n + len(self.controls))  # type: ignore[assignment]
+    m = property(lambda self: self.model.m)  # type: ignore[assignment]
+    dt = property(lambda self: self.model.dt)  # type: ignore[assignment]
+    position = property(lambda self: self.model.position)  # type: ignore[assignment]
+    calls_function = property(lambda self: is_users(self.model))
+
+    def at(self, k: int | Tensor) -> Self:
+        model = self.model.at(k)
+        return self if model is self.model else replace(self, model=model)
+
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.cat((self.model.step(x[..., : self.model.n], u), u[..., self.controls]), dim=-1)
+
+    def jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        n, r = self.model.n, len(self.controls)
+        by_x, by_u = self.model.jacobians(x[..., :n], u)
+        fx, fu = x.new_zeros(*x.shape, n + r), x.new_zeros(*x.shape, u.shape[-1])
+        fx[..., :n, :n], fu[..., :n, :] = by_x, by_u
+        fu[..., n + torch.arange(r), self.controls] = 1.0
+        return fx, fu
+
+
+def _cost(cost: Cost, n: int, r: int) -> Cost:
+    if type(cost) is BoundQuadratic:
+        return _quadratic(cost, r)
+    if type(cost).total is not Cost.total:
+        return _OwnTotal(cost, n)
+    return _FirstStates(cost, n) if type(cost).expand is Cost.expand else _OwnExpansion(cost, n)
+
+
+def _quadratic(cost: BoundQuadratic, r: int) -> BoundQuadratic:
+    """The same cost, which is no matter of r further states."""
+    square = 0 if cost.diagonal else r
+    sizes = {
+        "Q": (r, square),
+        "Qf": (r, square),
+        "x_ref": (r, 0),
+        "xf_ref": (r, 0),
+        "q": (r, 0),
+        "qf": (r, 0),
+        "H": (r, 0),
+    }
+    parts = {}
+    for name, (last, other) in sizes.items():
+        value = getattr(cost, name)
+        parts[name] = None if value is None else torch.nn.functional.pad(value, (0, last, 0, other))
+    return replace(cost, **parts)
+
+
+@dataclass(frozen=True)
+class _FirstStates(WrappedCost):
+    """A cost of the first n states."""
+
+    n: int
+
+    batched: ClassVar[tuple[str, ...]] = ("cost",)
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return self.cost.stage(x[..., : self.n], u, k)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return self.cost.terminal(x[..., : self.n])
+
+    def goal(self, x0: Tensor) -> None:
+        """The problem has its goal already."""
+
+
+class _OwnExpansion(_FirstStates):
+    """Where the cost has its own `expand`."""
+
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        blocks = _blocks(H, self.n, U.shape[-1])
+        self.cost.expand(X[..., : self.n], U, blocks)
+        H.zero_()
+        _add(H, blocks, self.n)
+
+
+class _OwnTotal(_OwnExpansion):
+    """Where it has its own `total`."""
+
+    def total(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.cost.total(X[..., : self.n], U)
+
+
+def _constraint(constraint: Constraint, n: int) -> Constraint:
+    if isinstance(constraint, RateBounds):
+        return constraint.with_states_from(n)
+    in_place = isinstance(constraint, Obstacles) or type(constraint) in IN_PLACE
+    return constraint if in_place else _Rows(constraint, n)
+
+
+@dataclass(frozen=True)
+class _Rows(Constraint):
+    """A constraint on the first n states."""
+
+    constraint: Constraint
+    n: int
+
+    batched: ClassVar[tuple[str, ...]] = ("constraint",)
+
+    sense = property(lambda self: self.constraint.sense)  # type: ignore[assignment]
+    geometric = property(lambda self: self.constraint.geometric)  # type: ignore[assignment]
+    knots = property(lambda self: self.constraint.knots)  # type: ignore[assignment]
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.constraint.value(X[..., : self.n], U)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.constraint.violation(X[..., : self.n], U)
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        return self.constraint.at(x[..., : self.n], k)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        blocks = _blocks(H, self.n, U.shape[-1])
+        self.constraint.accumulate(X[..., : self.n], U, g, h, blocks)
+        _add(H, blocks, self.n)
+
+    def grown(self, by: Tensor) -> Self:
+        return replace(self, constraint=self.constraint.grown(by))
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        return self.constraint.start_is_clear(x0[:, : self.n])
+
+
+def _blocks(H: Tensor, n: int, m: int) -> Tensor:
+    """Homogeneous blocks (B, N+1, s, s) of zeros for n states and m controls."""
+    s = n + 1 + m
+    return H.new_zeros(*H.shape[:2], s, s)
+
+
+def _add(H: Tensor, blocks: Tensor, n: int) -> None:
+    """Add homogeneous blocks of the first n states to H, whose other states come between them and the controls."""
+    last = blocks.shape[-1] - n
+    H[..., :n, :n] += blocks[..., :n, :n]
+    H[..., :n, -last:] += blocks[..., :n, n:]
+    H[..., -last:, :n] += blocks[..., n:, :n]
+    H[..., -last:, -last:] += blocks[..., n:, n:]
