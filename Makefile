@@ -3,6 +3,7 @@
 # make ladder   seven solvers on the public layouts (ten minutes on one core)
 # make quality   how often gco reaches the goal on the public layouts, and how well (ARGS="--solvers gco gco_max" for more
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
+# make general   48 families of constrained problems, compared with IPOPT and FATROP (ARGS="--solvers gco al_ilqr" for others)
 # make worlds   woods, mazes, crossing spheres and the outside benchmarks, with pages in benchmarks/results (half an hour)
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
@@ -36,8 +37,8 @@ FIND := import sys; from torchgco.native.compiler import find_compiler; sys.exit
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle worlds benchmark benchmark-gpu ladder docs \
-    figures paper
+.PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle general worlds benchmark benchmark-gpu ladder \
+    docs figures paper
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -66,6 +67,10 @@ quality: $(RUNTIME)
 
 oracle: $(RUNTIME)
 	$(BIN)/python -m benchmarks.families.oracle $(ARGS)
+
+general: $(PEERS)
+	$(BIN)/python -m benchmarks.families.general_peers
+	$(BIN)/python -m benchmarks.families.general --write --restart 3 $(ARGS)
 
 worlds: $(PEERS)
 	$(BIN)/python -m benchmarks.families.worlds --write $(ARGS)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 from argparse import ArgumentParser
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -82,7 +82,8 @@ def known_of(name: str, seed: int, digests: Sequence[str], file: Path = FILE) ->
     """The rows of a family's problems as they are drawn now."""
     rows = rows_of(file)
     rows = rows[(rows.family == name) & (rows.seed == seed)]
-    return rows[rows.digest == rows.instance.map(dict(enumerate(digests)))]
+    rows = rows[rows.digest == rows.instance.map(dict(enumerate(digests)))]
+    return rows.astype(dict.fromkeys(("cost", "violation", "seconds"), float))
 
 
 def flights(name: str, seed: int, limit: int, family_limit: int, file: Path) -> Iterator[dict[str, Any]]:
@@ -125,10 +126,12 @@ class Flight:
         }  # fmt: skip
 
 
-def prepared(plugin: Literal["fatrop", "ipopt"], problem: Problem) -> PreparedCasADi | None:
+def prepared(
+    plugin: Literal["fatrop", "ipopt"], problem: Problem, options: Mapping[str, Any] | None = None
+) -> PreparedCasADi | None:
     """The peer with its program built; None where it refuses the problem, such as FATROP rows that join knots."""
     try:
-        return CasADiSolver(plugin, max_iterations=500, tolerance=1e-6).prepare(problem)
+        return CasADiSolver(plugin, max_iterations=500, tolerance=1e-6, options=options).prepare(problem)
     except InputError:
         return None
 
