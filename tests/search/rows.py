@@ -58,7 +58,7 @@ def restarts(
     every     all of them, even where one arrives
     """
     when, after = ("caught" if every else "unarrived"), None if guidance is None else guidance.single_contact_after
-    first = Solve(when="all" if every else "unarrived", single_contact_after=after)
+    first = Solve(single_contact_after=after)
     passes: list[Pass] = [Solve("end", "pathless"), first]
     if proposals is not None:
         passes += [*rounds(replace(proposals, when=when)), FromProposal(), IntoGoal()]

@@ -67,7 +67,7 @@ ALONG = (Solve(), PATHS, FromProposal())
 # For every field: the problems, the rows before, the row, another value, the rows after.
 FIELDS: dict[tuple[type, str], tuple[Any, tuple[Pass, ...], Pass, Any, tuple[Pass, ...]]] = {
     (Solve, "until"): (at_gates, (), Solve(), "end", (DRAWN,)),
-    (Solve, "when"): (at_gates, (Solve("end"),), Solve(), "all", (DRAWN,)),
+    (Solve, "when"): (at_gates, (Solve("end"),), Solve(), "pathless", (DRAWN,)),
     (Solve, "single_contact_after"): (around_one, (), Solve(), 1, (DRAWN,)),
     (PathProposals, "when"): (at_gates, ALONG, PATHS, "far", (FromProposal(),)),
     (PathProposals, "max_gap"): (at_gates, (Solve(), PATHS), COSTLY, 1e9, (FromProposal(),)),
@@ -167,7 +167,7 @@ def test_rows_that_differ_are_shown_differently() -> None:
     """Of every field of a row that says what it does, at least with a value far from the present one."""
     follow = PATHS.follow[0]
     rows = [
-        Solve(), Solve("end"), Solve(when="all"), Solve(when="pathless"), Solve(single_contact_after=4), PATHS,
+        Solve(), Solve("end"), Solve(when="pathless"), Solve(single_contact_after=4), PATHS,
         replace(PATHS, when="far"), replace(PATHS, num_paths=7), replace(PATHS, relax_top=2),
         replace(PATHS, relax_iterations=0), replace(PATHS, refine=Refine(top=5)), replace(PATHS, max_penetration=0.2),
         replace(PATHS, roadmaps=(*PATHS.roadmaps, *PATHS.roadmaps)), COSTLY, replace(COSTLY, max_gap=0.4),

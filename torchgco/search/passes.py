@@ -40,7 +40,7 @@ class Solve:
         until: "caught": a solve is stopped where its trajectory is caught between obstacles; "end": it isn't.
         when: "pathless": where no path can be sought, as among moving obstacles, where waiting is often enough;
             "unarrived": where no solve has been made, or has not arrived. Problems that converge are not solved again
-            where the goal is assumed: it may lie beyond the horizon. "all": always.
+            where the goal is assumed: it may lie beyond the horizon.
         single_contact_after: from this outer iteration on, a knot inside one obstacle counts as caught, too; None: only
             knots inside two.
 
@@ -49,7 +49,7 @@ class Solve:
     """
 
     until: Literal["caught", "end"] = "caught"
-    when: Literal["pathless", "unarrived", "all"] = "unarrived"
+    when: Literal["pathless", "unarrived"] = "unarrived"
     single_contact_after: Count | None = None
 
     def __post_init__(self) -> None:
@@ -72,7 +72,7 @@ class Solve:
         goal, done = search.call.problem.goal, best.arrived()
         if goal is not None and goal.assumed:
             done = done | (caught.status == Status.CONVERGED)
-        rows = (torch.ones_like(done) if self.when == "all" else ~done).nonzero().flatten()
+        rows = (~done).nonzero().flatten()
         if rows.numel() > 0:
             again: SolveEnd = best.attempt(search.call.take(rows), stop)
             best.keep(rows, again)

@@ -13,7 +13,6 @@ from torchgco.search.proposals import PathProposals
 COLUMNS = ("pass", "problems", "paths", "how they are followed", "relaxed", "refined", "accepted")
 PROBLEMS = {
     "pathless": "all, where no path can be sought",
-    "all": "all",
     "caught": "caught",
     "unarrived": "caught, not arrived",
     "far": "caught, not even close to the goal",
