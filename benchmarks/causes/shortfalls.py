@@ -29,10 +29,10 @@ from torchgco import compose, judge, presets
 from torchgco.judging.judge import near_best
 from torchgco.plotting.bodies import Box, bodies
 from torchgco.problem.problem import Problem
+from torchgco.roadmap.scene import has_paths
 from torchgco.scenarios import Layouts
 from torchgco.search import PathProposals, Refine
 from torchgco.search.proposals import Round
-from torchgco.search.suitability import has_paths
 from torchgco.solution import Comparison, Fate, SearchRecord
 
 PAGE = RESULTS / "shortfalls.md"

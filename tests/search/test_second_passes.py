@@ -11,11 +11,11 @@ from tests.search.rows import proposed, varied
 from torchgco import PathProposals, Problem, Restarts, Status, compose, presets
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.rollout import open_loop
+from torchgco.roadmap.scene import has_paths
 from torchgco.search import Follow
 from torchgco.search.following import Paths, followed
 from torchgco.search.passes import StopWhenCaught
 from torchgco.search.proposals import Proposal, propose
-from torchgco.search.suitability import has_paths
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR, descend
 

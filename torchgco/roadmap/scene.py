@@ -40,6 +40,14 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     return Scene(problem.x0[:, at], problem.goal.position, obstacles, traversal_cost)
 
 
+def has_paths(problem: Problem) -> bool:
+    """Whether there is a goal, and obstacles among which the roadmap can seek a path to it."""
+    if problem.dynamics.position is None:
+        return False
+    one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
+    return scene_of(one, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))) is not None
+
+
 def _by_kind(start: Tensor, parts: Sequence[Solids]) -> Inflated | None:
     """The spheres and the boxes among obstacles of problems with starts (B, d); None where there are none at all."""
     boxes = _joined([part for part in parts if isinstance(part, Cuboids)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from torchgco.base.tree import copied, put, take
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import has_arrived, is_preferred
+from torchgco.roadmap.scene import has_paths
 from torchgco.search.proposals import PathProposals, Round
 from torchgco.solution import SearchRecord
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -107,24 +109,25 @@ class Late(Exception):
 class Search:
     """The state of one solve by passes.
 
-    Attributes:
+    Args:
         call: in the units that the solver works in.
+        passes: None for those that can't serve.
         guidance: of attempts from samples; None: none can serve.
-        has_paths: whether there is a goal, and obstacles among which paths can be sought.
-        guided: whether there is anything to do where a trajectory is caught.
+        recorder: of every iteration; None: nothing is recorded.
     """
 
     def __init__(
         self,
         call: Call,
         solver: AugmentedLagrangian,
+        passes: Sequence[object],
         guidance: Guidance | None,
-        has_paths: bool,
-        guided: bool,
         recorder: Recorder | None = None,
     ) -> None:
-        self.call, self.solver, self.recorder = call, solver, recorder
-        self.guidance, self.has_paths, self.guided = guidance, has_paths, guided
+        self.call, self.solver, self.guidance, self.recorder = call, solver, guidance, recorder
+        # Whether there is anything to do where a trajectory is caught, and whether that includes paths.
+        self.guided = guidance is not None or any(isinstance(one, PathProposals) for one in passes)
+        self.has_paths = self.guided and has_paths(call.problem)
         self.record = None if recorder is None else SearchRecord()
         self._best: Best | None = None
         self._caught: SolveEnd | None = None

@@ -57,7 +57,7 @@ class Solve:
 
     def run(self, search: Search) -> None:
         """Solve; see the class."""
-        if self.when == "pathless" and search.guided and search.has_paths:
+        if self.when == "pathless" and search.has_paths:
             return
         stop = StopWhenCaught(self.single_contact_after) if self.until == "caught" and search.guided else None
         if not search.begun:

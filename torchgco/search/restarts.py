@@ -16,7 +16,7 @@ from torchgco.search.chords import ClearChords
 from torchgco.search.finish import Finish
 from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Pass, Solve
 from torchgco.search.proposals import PathProposals
-from torchgco.search.suitability import has_paths, suited_paths
+from torchgco.search.suitability import suited_paths
 from torchgco.search.table import rows_of
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -71,9 +71,7 @@ class Restarts(Solver):
         solver = self.local
         session = Session(call, solver.inner.rules, solver.record)
         passes, guidance = self._suited(session.call.problem)
-        guided = guidance is not None or any(isinstance(one, PathProposals) for one in passes)
-        possible = guided and has_paths(session.call.problem)
-        search = Search(session.call, solver, guidance, possible, guided, session.recorder)
+        search = Search(session.call, solver, passes, guidance, session.recorder)
         self._run(search, passes)
         solution = session.finished(search.best.end, solver.violation_tolerance, solver.slots)
         return replace(solution, search=search.finish_record())

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
-
 from torchgco.guidance.suitability import check_form, failure
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import engine_of
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.scene import scene_of
+from torchgco.roadmap.scene import has_paths
 from torchgco.search.passes import Pass
 from torchgco.search.proposals import PathProposals
 
@@ -47,14 +45,6 @@ def _with_fitting_offsets(proposals: PathProposals, m: int) -> PathProposals:
     fits = (all(len(offset) == m for offset in follow.initial_offsets) for follow in proposals.follow)
     follow = (f if fit else replace(f, initial_offsets=()) for f, fit in zip(proposals.follow, fits, strict=True))
     return replace(proposals, follow=tuple(follow))
-
-
-def has_paths(problem: Problem) -> bool:
-    """Whether there is a goal, and obstacles among which the roadmap can seek a path to it."""
-    if problem.dynamics.position is None:
-        return False
-    one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
-    return scene_of(one, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))) is not None
 
 
 def _expand(problem: Problem) -> None:
