@@ -46,9 +46,8 @@ class Restarts(Solver):
     passes: tuple[Pass, ...] = PASSES
 
     def __post_init__(self) -> None:
-        if isinstance(self.passes, list | tuple):
-            _check(self.passes)
-            object.__setattr__(self, "passes", tuple(self.passes))
+        _check(self.passes)
+        object.__setattr__(self, "passes", tuple(self.passes))
         check_options(self, "solver")
 
     def table(self) -> pd.DataFrame:
@@ -108,8 +107,10 @@ class Restarts(Solver):
         return passes, guidance
 
 
-def _check(passes: Sequence[Any]) -> None:
-    """InputError for what is no pass, for no first solve, or for a pass that would improve proposals before any."""
+def _check(passes: Any) -> None:
+    """InputError for what is no list of passes, for no first solve, or for a pass that would improve no proposals."""
+    if not isinstance(passes, list | tuple):
+        raise InputError("solver.passes", "a list of passes of torchgco.search", shown(passes))
     begun = False
     for number, one in enumerate(passes):
         if not isinstance(one, Pass):
