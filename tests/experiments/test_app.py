@@ -156,7 +156,7 @@ BAD = {
     "added key": (["+solver.local.inner.speed=3"], "speed"),
     "missing path": (["scenario=layouts"], "scenario.path: expected the layout file: add scenario.path=FILE.npz"),
     "no such file": (["scenario=layouts", "scenario.path=nowhere.npz"], "scenario.path: expected a layout file"),
-    "model misfit": (["model=planar"], "model: expected model=quadrotor"),
+    "model misfit": (["model=planar"], "with 14 states, or scenario=planar_random or planar_trap, got model=planar"),
     "model misfit in a file": (["scenario=layouts", WALLS, "model=planar"], "model=quadrotor"),
     "too many layouts": (["scenario=layouts", WALLS, "study.layouts=40"], "study.layouts"),
     "no layouts": (["study.layouts=0"], "study.layouts: expected a whole number of at least 1"),

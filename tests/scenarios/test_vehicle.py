@@ -68,7 +68,11 @@ def test_the_built_in_models_are_those_of_the_configurations() -> None:
     [
         ("model=planar scenario=yard", "expected model=unicycle, as yard is 2-D with 4 states, got model=planar"),
         ("model=unicycle scenario=planar_trap", "model=planar, as planar_trap is 2-D with 6 states, got model=un"),
-        ("model=quadrotor scenario=yard", "expected model=unicycle, as yard is 2-D with 4 states, got model=quadrotor"),
+        (
+            "model=quadrotor scenario=yard",
+            "expected model=unicycle, as yard is 2-D with 4 states, or scenario=crossing or forest or forest_moving or "
+            "mazes or walls or woods, got model=quadrotor",
+        ),
         ("model=unicycle scenario=forest", "expected model=quadrotor, as forest is 3-D with 14 states"),
     ],
 )
@@ -84,7 +88,7 @@ def test_layouts_without_states_fit_both_models_in_the_plane(tmp_path) -> None:
     for name in ("planar", "unicycle"):
         setup = compose([*words, f"model={name}"])
         assert setup.task().problem.n == BUILT_IN[name][1]
-    with pytest.raises(InputError, match="expected model=planar or model=unicycle, as bare is 2-D, got model=quad"):
+    with pytest.raises(InputError, match="expected model=planar or model=unicycle, as bare is 2-D, or scenario=crossing or"):
         compose([*words, "model=quadrotor"])
 
 

@@ -18,7 +18,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.kernels import use_native
 from torchgco.base.options import Count, Within, check_options, check_value
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
-from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register
+from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register, scenarios_for
 from torchgco.experiments.config.launching import allotted_cores
 from torchgco.experiments.results.identity import plain
 from torchgco.missions import Mission
@@ -161,6 +161,8 @@ def build(config: DictConfig) -> Setup:
     if d != setup.vehicle.dimension or another:
         form = f"{d}-D" if n is None else f"{d}-D with {n} states"
         wanted = f"{fitting(d, n)}, as {setup.scenario.name} is {form}"
+        if d != setup.vehicle.dimension and (others := scenarios_for(setup.vehicle.name)):
+            wanted += f", or scenario={' or '.join(others)}"
         raise InputError("model", wanted, f"model={setup.vehicle.name}")
     return setup
 

@@ -82,6 +82,12 @@ def options_of(group: str) -> list[str]:
     return sorted({Path(name).stem for name in (*stored, *(config_dir() / group).glob("*.yaml"))})
 
 
+def scenarios_for(model: str) -> list[str]:
+    """The families of layouts that a built-in model flies; none for another model."""
+    made = (family() for family in FAMILIES)
+    return sorted(one.name for one in made if BUILT_IN.get(model) == (one.dimension, one.states))
+
+
 def register() -> None:
     """Store the options of all groups; to be called before Hydra composes anything."""
     register_resolver(BY_DIMENSION, lambda dimension, plane, space: space if dimension == 3 else plane)
