@@ -25,7 +25,7 @@ from torchgco import Problem, Solution, compose, presets
 from torchgco.plotting.style import INK, PALETTE, save, tidy
 from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, MARGIN, NEIGHBOURS, NODES, Roadmap, halton
 from torchgco.roadmap.scene import scene_of
-from torchgco.roadmap.search import Search
+from torchgco.roadmap.search import TorchSearch
 from torchgco.scenarios import Layouts
 from torchgco.solution import Fate
 
@@ -135,7 +135,7 @@ def _edges(problem: Problem) -> list[np.ndarray]:
     scene = scene_of(problem.in_cost_units(), problem.at_rest[1])
     roadmap: Roadmap = presets.gco(problem).passes[2].roadmaps[0]  # type: ignore[union-attr]
     assert scene is not None
-    search = Search(scene.obstacles.reduced(roadmap.max_overlap), MARGIN)
+    search = TorchSearch(scene.obstacles.reduced(roadmap.max_overlap), MARGIN)
     cube = halton(roadmap.num_halton, 2).to(scene.start)
     graph: Any = search.graph(scene.start, scene.goal, cube, NODES, NEIGHBOURS, HALTON_NEIGHBOURS)
     points, free = graph.points[0].numpy(), torch.isfinite(graph.lengths[0]).nonzero().tolist()

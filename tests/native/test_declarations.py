@@ -79,7 +79,7 @@ def test_a_structure_of_another_size_is_refused() -> None:
         load(source, [Longer])
 
 
-@pytest.mark.parametrize("structure", [*STRUCTURES, roadmap.Search], ids=lambda s: s.__name__)
+@pytest.mark.parametrize("structure", [*STRUCTURES, roadmap.Arguments], ids=lambda s: s.__name__)
 def test_the_size_of_each_structure_is_compared(structure: type[Structure], monkeypatch) -> None:
     """A library that reports one byte more or less is refused where the kernels are loaded."""
     problem = boxed_batch(2, B=1, N=3)[0]
@@ -87,7 +87,7 @@ def test_the_size_of_each_structure_is_compared(structure: type[Structure], monk
     for wrong in (-1, 1):
         monkeypatch.setattr(ctypes, "sizeof", lambda s: plain(s) + (wrong if s is structure else 0))  # noqa: B023
         with pytest.raises(NativeError, match=f"{structure.__name__} has"):
-            if structure is roadmap.Search:
+            if structure is roadmap.Arguments:
                 load(head([structure], [], {}), [structure])
             else:
                 load(head(STRUCTURES, [], CONSTANTS), STRUCTURES)

@@ -19,7 +19,7 @@ from torchgco.roadmap import native as native
 from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.native import NativeSearch, library_for
 from torchgco.roadmap.roadmap import Roadmap, halton
-from torchgco.roadmap.search import HOPS, Graph, Search
+from torchgco.roadmap.search import HOPS, Graph, TorchSearch
 
 B = 3
 
@@ -136,10 +136,10 @@ def test_both_make_the_same_graph(name: str) -> None:
     torch.testing.assert_close(made[0], made[1], rtol=1e-12, atol=1e-12)
 
 
-def searches(obstacles: Inflated, margin: float) -> tuple[NativeSearch, Search]:
+def searches(obstacles: Inflated, margin: float) -> tuple[NativeSearch, TorchSearch]:
     library = library_for(obstacles.middles)
     assert library is not None
-    return NativeSearch(library, obstacles, margin), Search(obstacles, margin)
+    return NativeSearch(library, obstacles, margin), TorchSearch(obstacles, margin)
 
 
 def chain(points: int) -> Graph:

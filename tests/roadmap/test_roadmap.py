@@ -15,7 +15,7 @@ from torchgco.roadmap.geometry import Scene, points_along
 from torchgco.roadmap.native import NativeSearch, library_for
 from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, Roadmap, halton
 from torchgco.roadmap.scene import scene_of
-from torchgco.roadmap.search import Graph, Search
+from torchgco.roadmap.search import Graph, TorchSearch
 
 
 def flat(points, rows):
@@ -145,7 +145,7 @@ def test_no_path_on_the_graph_is_cheaper(native: bool) -> None:
     points = torch.cat((s.start[:, None], s.goal[:, None], torch.as_tensor(rng.uniform(-1, 1, (3, 50, 2)))), dim=1)
     near = torch.as_tensor(rng.integers(0, 52, (3, 52, 8)))
     price = torch.as_tensor(rng.uniform(0.5, 2.0, (3, 52)))
-    search = Search(s.obstacles, margin)
+    search = TorchSearch(s.obstacles, margin)
     graph = Graph(points, near, search._lengths(points, near))
     if native:
         search = NativeSearch(library_for(points), s.obstacles, margin)

@@ -88,7 +88,9 @@ def test_layouts_without_states_fit_both_models_in_the_plane(tmp_path) -> None:
     for name in ("planar", "unicycle"):
         setup = compose([*words, f"model={name}"])
         assert setup.task().problem.n == BUILT_IN[name][1]
-    with pytest.raises(InputError, match="expected model=planar or model=unicycle, as bare is 2-D, or scenario=crossing or"):
+    with pytest.raises(
+        InputError, match="expected model=planar or model=unicycle, as bare is 2-D, or scenario=crossing or"
+    ):
         compose([*words, "model=quadrotor"])
 
 

@@ -30,7 +30,7 @@ SCALARS = "#define V double\n#define tgco_choose(where, a, b) ((where) ? (a) : (
 FLAGS = ("-ffp-contract=off",)
 
 
-class Search(Structure):
+class Arguments(Structure):
     """What the library in C reads and writes: B problems among M spheres, graphs of V points with K edges each, and
     paths of P corners.
     """
@@ -62,7 +62,7 @@ class Search(Structure):
 
 @dataclass(frozen=True)
 class NativeSearch:
-    """The methods of search.Search, documented there, in a C library."""
+    """The methods of search.TorchSearch, documented there, in a C library."""
 
     library: ctypes.CDLL
     obstacles: Inflated
@@ -124,8 +124,8 @@ class NativeSearch:
         read = {field: tensor.contiguous() for field, tensor in read.items()}
         B, M = spheres.radii.shape
         numbers |= {"margin": self.margin, "clear": CLEAR, "least": EDGE_COST, "tie": TIE}
-        search = Search(problems=B, spheres=M, corners=HOPS + 1, **read, **written, **numbers)
-        if not getattr(self.library, name)(ctypes.byref(search)):
+        arguments = Arguments(problems=B, spheres=M, corners=HOPS + 1, **read, **written, **numbers)
+        if not getattr(self.library, name)(ctypes.byref(arguments)):
             raise MemoryError("native kernels: no memory")
 
 
@@ -153,7 +153,7 @@ def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.C
     parts = [BOX, BOXES, SEARCH] if boxes else [SEARCH]
     texts = (SCALARS, *(part.read_text() for part in parts))
     try:
-        return load("\n".join((head([Search], [], constants), *texts)), [Search], FLAGS)
+        return load("\n".join((head([Arguments], [], constants), *texts)), [Arguments], FLAGS)
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)

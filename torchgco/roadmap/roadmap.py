@@ -20,7 +20,7 @@ from torchgco.base.tree import take
 from torchgco.roadmap import native as roadmap
 from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.native import NativeSearch
-from torchgco.roadmap.search import Search
+from torchgco.roadmap.search import TorchSearch
 
 PROBLEMS_AT_ONCE = 4  # problems searched together by PyTorch: memory holds distances of all edges from all obstacles
 NODES = 128  # points around obstacles: those of the shortest detours
@@ -85,7 +85,7 @@ class Roadmap:
         there were as many points around obstacles as the graph takes."""
         start, goal = scene.start[rows], scene.goal[rows]
         obstacles = take(scene.obstacles, rows).reduced(self.max_overlap)
-        search = Search(obstacles, MARGIN) if library is None else NativeSearch(library, obstacles, MARGIN)
+        search = TorchSearch(obstacles, MARGIN) if library is None else NativeSearch(library, obstacles, MARGIN)
         cube = halton(self.num_halton, start.shape[-1]).to(start)
         graph = search.graph(start, goal, cube, nodes, neighbours, HALTON_NEIGHBOURS)
         price = scene.traversal_cost(graph.points, rows)

@@ -36,7 +36,7 @@ class Graph(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Search:
+class TorchSearch:
     """Graphs between obstacles and the cheapest paths over them, B problems.
 
     Args:

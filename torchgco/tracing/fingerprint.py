@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from torchgco.tracing.recorder import Call, Slot
+from torchgco.tracing.recorder import Operation, Slot
 
 FORMAT = 1  # to be raised when the digested text changes, or its meaning in a replay
 
@@ -18,20 +18,20 @@ def fingerprint(
     variables: Mapping[Slot, tuple[int, ...]],
     own: Mapping[Slot, tuple[int, ...]],
     constants: Mapping[Slot, np.ndarray],
-    calls: Sequence[Call],
+    operations: Sequence[Operation],
     result: Slot,
 ) -> str:
     """Hexadecimal digits that two functions share only where they have the same operations, constants and shapes.
 
     Args:
         variables, own: shapes of the function's arguments, and of the numbers that differ between problems.
-        constants: all other tensors that no call makes.
-        calls: in order, with slots in the place of tensors.
+        constants: all other tensors that no operation makes.
+        operations: in order, with slots in the place of tensors.
         result: the slot of the result.
     """
     # A slot's own number may differ between recordings: here, slots are numbered in the order in which they occur.
     order = count()
-    made = (slot for call in calls for slot in call.outputs)
+    made = (slot for operation in operations for slot in operation.outputs)
     names = {slot: f"${next(order)}" for slot in (*variables, *own, *constants, *made)}
     digest = hashlib.sha256(f"format {FORMAT}\n".encode())
     for kind, shapes in (("variable", variables), ("own", own)):
@@ -40,8 +40,8 @@ def fingerprint(
     for slot, value in constants.items():
         plain = value.astype(np.float64) if value.dtype == object else value
         digest.update(f"constant {names[slot]} {plain.dtype.str} {plain.shape}\n".encode() + plain.tobytes() + b"\n")
-    for call in calls:
-        words = (call.operation, call.args, call.kwargs, call.result)
+    for operation in operations:
+        words = (operation.function, operation.args, operation.kwargs, operation.result)
         digest.update(" ".join(_word(word, names) for word in words).encode() + b"\n")
     digest.update(names[result].encode())
     return digest.hexdigest()

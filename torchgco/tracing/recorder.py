@@ -26,10 +26,10 @@ class Slot:
 
 
 @dataclass(frozen=True, eq=False)
-class Call:
+class Operation:
     """One operation, with slots in the place of tensors."""
 
-    operation: Any
+    function: Any
     args: tuple
     kwargs: dict[str, Any]
     result: Any  # a slot, or a sequence of them
@@ -42,22 +42,22 @@ class Call:
     def outputs(self) -> list[Slot]:
         return [leaf for leaf in tree_leaves(self.result) if isinstance(leaf, Slot)]
 
-    def replay(self, operation: Callable, known: dict[Slot, Any]) -> None:
-        """Apply `operation` to known values, and add its result to `known`."""
+    def replay(self, function: Callable, known: dict[Slot, Any]) -> None:
+        """Apply `function` to known values, and add its result to `known`."""
         args, kwargs = tree_map(lambda leaf: known[leaf] if isinstance(leaf, Slot) else leaf, (self.args, self.kwargs))
-        made = operation(*args, **kwargs)
+        made = function(*args, **kwargs)
         for slot, value in zip(self.outputs, made if isinstance(made, (list, tuple)) else [made], strict=True):
             known[slot] = value
 
 
-class Recorder(TorchDispatchMode):
+class Recording(TorchDispatchMode):
     """Records every operation that reaches PyTorch's kernels, and decomposes those that CasADi doesn't know."""
 
     def __init__(self, inputs: Iterable[Tensor]) -> None:
         super().__init__()
         self._seen: dict[int, tuple[Slot, Tensor]] = {}  # holds the tensor: its id isn't reused
         self._numbers = count()
-        self.calls: list[Call] = []
+        self.operations: list[Operation] = []
         self.captured: dict[Slot, Tensor] = {}
         self.inputs = [self._new(tensor) for tensor in inputs]
         self._followers = set(self.inputs)
@@ -96,10 +96,10 @@ class Recorder(TorchDispatchMode):
         inputs, options = tree_map(lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs))
         out = func(*args, **kwargs)
         made = tree_map(lambda leaf: self._new(leaf) if isinstance(leaf, Tensor) else leaf, out)
-        call = Call(func, inputs, options, made)
-        self.calls.append(call)
-        if not self._followers.isdisjoint(call.inputs):
-            self._followers.update(call.outputs)
+        operation = Operation(func, inputs, options, made)
+        self.operations.append(operation)
+        if not self._followers.isdisjoint(operation.inputs):
+            self._followers.update(operation.outputs)
         return out
 
     def _follows(self, *tree: Any) -> bool:
@@ -111,25 +111,25 @@ class _Unfit(Exception):
     """A function does what a recording can't hold."""
 
 
-def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Recorder:
+def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Recording:
     """The recorded operations of function(*examples); `field` names the function in errors.
 
     Raises:
         InputError: the function can't be traced.
     """
-    recorder = Recorder(examples)
+    recording = Recording(examples)
     # Writes in place become writes into a copy: PyTorch's part and CasADi's must not share memory.
     pure = torch.func.functionalize(function, remove="mutations")
     try:
-        with torch.no_grad(), recorder, WithoutReading():
+        with torch.no_grad(), recording, WithoutReading():
             result = pure(*examples)
     except InputError:
         raise  # the function itself says what is wrong
     except Exception as error:  # any error of the function
         message = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise InputError(field, "a function that can be traced", message) from error
-    recorder.result = recorder.slot(result)
-    return recorder
+    recording.result = recording.slot(result)
+    return recording
 
 
 @cache

@@ -18,7 +18,7 @@ from torchgco.base.tree import PerElement
 from torchgco.tracing.arrays import boxed
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.operations import OPERATIONS
-from torchgco.tracing.recorder import Call, Slot, name_of, record
+from torchgco.tracing.recorder import Operation, Slot, name_of, record
 
 INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
 
@@ -43,18 +43,18 @@ class Traced:
     ) -> None:
         self.field = field
         index = torch.zeros(1, dtype=torch.int64, device=examples[0].device)
-        recorder = record(field, function, index, *examples)
-        self._index, *self._variables = recorder.inputs
-        self._result, self._captured = recorder.result, recorder.captured
-        calls = _needed(recorder.calls, self._result)
-        followers = _followers(calls, self._variables)
-        self._symbolic = [call for call in calls if followers.issuperset(call.outputs)]
-        self._plain = [call for call in calls if not followers.issuperset(call.outputs)]
-        for call in self._symbolic:
-            if name_of(call.operation) not in OPERATIONS:
-                raise _unknown(field, call)
+        recording = record(field, function, index, *examples)
+        self._index, *self._variables = recording.inputs
+        self._result, self._captured = recording.result, recording.captured
+        operations = _needed(recording.operations, self._result)
+        followers = _followers(operations, self._variables)
+        self._symbolic = [one for one in operations if followers.issuperset(one.outputs)]
+        self._plain = [one for one in operations if not followers.issuperset(one.outputs)]
+        for operation in self._symbolic:
+            if name_of(operation.function) not in OPERATIONS:
+                raise _unknown(field, operation)
         # Where PyTorch's part ends and CasADi's begins.
-        border = dict.fromkeys(slot for call in self._symbolic for slot in call.inputs) | {self._result: None}
+        border = dict.fromkeys(slot for one in self._symbolic for slot in one.inputs) | {self._result: None}
         border = [slot for slot in border if slot not in followers]
         own_ids = {id(tensor) for tensor in own}
         named = [slot for slot, tensor in self._captured.items() if id(tensor) in own_ids]
@@ -63,9 +63,9 @@ class Traced:
         computed = self._computed(index)
         self._own_shapes = [tuple(computed[slot].shape) for slot in self._own]
         self._constants = {slot: _array(computed[slot]) for slot in border if slot not in varying}
-        indices = {slot for call in self._symbolic if name_of(call.operation) in INDEXING for slot in call.inputs[1:]}
+        indices = {slot for one in self._symbolic if name_of(one.function) in INDEXING for slot in one.inputs[1:]}
         self._replaceable = [slot for slot, a in self._constants.items() if a.dtype == object or slot not in indices]
-        self._indexed = {slot for call in self._plain if self._index in call.inputs for slot in call.inputs}
+        self._indexed = {slot for one in self._plain if self._index in one.inputs for slot in one.inputs}
         self._shapes = [tuple(example.shape) for example in examples]
 
     @property
@@ -147,19 +147,19 @@ class Traced:
         known |= _placed(parameters, dict(zip(self._own, self._own_shapes, strict=True)))
         if constants is not None:
             known |= _placed(constants, {slot: self._constants[slot].shape for slot in self._replaceable})
-        for call in self._symbolic:
+        for operation in self._symbolic:
             try:
-                call.replay(OPERATIONS[name_of(call.operation)], known)
+                operation.replay(OPERATIONS[name_of(operation.function)], known)
             except Exception as error:  # any error of CasADi or NumPy with these arguments
-                raise _unknown(self.field, call) from error
+                raise _unknown(self.field, operation) from error
         return boxed(known[self._result])
 
     def _computed(self, index: Tensor) -> dict[Slot, Any]:
         """PyTorch's part, for one problem."""
         known: dict[Slot, Any] = {self._index: index} | self._captured
         with torch.no_grad():
-            for call in self._plain:
-                call.replay(call.operation, known)
+            for operation in self._plain:
+                operation.replay(operation.function, known)
         return known
 
 
@@ -179,22 +179,22 @@ def own_tensors(part: PerElement) -> list[Tensor]:
     return found
 
 
-def _needed(calls: list[Call], result: Slot) -> list[Call]:
-    """The calls that the result depends on."""
+def _needed(operations: list[Operation], result: Slot) -> list[Operation]:
+    """The operations that the result depends on."""
     wanted, kept = {result}, []
-    for call in reversed(calls):
-        if not wanted.isdisjoint(call.outputs):
-            wanted.update(call.inputs)
-            kept.append(call)
+    for operation in reversed(operations):
+        if not wanted.isdisjoint(operation.outputs):
+            wanted.update(operation.inputs)
+            kept.append(operation)
     return kept[::-1]
 
 
-def _followers(calls: Iterable[Call], sources: Iterable[Slot]) -> set[Slot]:
+def _followers(operations: Iterable[Operation], sources: Iterable[Slot]) -> set[Slot]:
     """`sources`, and all slots that depend on them."""
     reached = set(sources)
-    for call in calls:
-        if not reached.isdisjoint(call.inputs):
-            reached.update(call.outputs)
+    for operation in operations:
+        if not reached.isdisjoint(operation.inputs):
+            reached.update(operation.outputs)
     return reached
 
 
@@ -214,5 +214,5 @@ def _array(value: Tensor) -> np.ndarray:
     return plain.double().numpy().astype(object) if value.is_floating_point() else plain.numpy()
 
 
-def _unknown(field: str, call: Call) -> InputError:
-    return InputError(field, "operations that CasADi has a counterpart for", str(call.operation))
+def _unknown(field: str, operation: Operation) -> InputError:
+    return InputError(field, "operations that CasADi has a counterpart for", str(operation.function))

@@ -3,7 +3,7 @@
    Both do the same operations in the same order, and none is fused here (-ffp-contract=off): all numbers but square
    roots, which PyTorch doesn't always round correctly, agree to the last bit. Clearance and nearness are therefore
    compared as squares, detours and costs with a tolerance, and ties are broken by the lowest index: the paths are the
-   same. DIM is the number of coordinates; the part before this file declares `Search` (roadmap/native.py). */
+   same. DIM is the number of coordinates; the part before this file declares `Arguments` (roadmap/native.py). */
 
 #include <math.h>
 #include <stdlib.h>
@@ -30,7 +30,7 @@ typedef struct {
     int32_t *first, *source, *fresh, *next, *seen;
 } Room;
 
-static Spheres spheres_of(const Search *s, int64_t b, double *room) {
+static Spheres spheres_of(const Arguments *s, int64_t b, double *room) {
     const double *R = s->distances + b * s->spheres;
     double *square = room + DIM * s->spheres, *radius = square + s->spheres;
     Spheres o = {.radius = radius, .square = square};
@@ -104,7 +104,7 @@ static double square_of(const double *a, const double *b) {
 }
 
 /* Candidates around the spheres, midway between each and its nearest, and around boxes; returns their number. */
-static int64_t propose(const Search *s, int64_t b, double *values, int32_t *near, double *to) {
+static int64_t propose(const Arguments *s, int64_t b, double *values, int32_t *near, double *to) {
     const double *o = s->centers + b * s->spheres * DIM, *R = s->distances + b * s->spheres;
     const double *rays = s->rays + b * s->directions * DIM;
     double *p = to;
@@ -134,7 +134,7 @@ static int64_t propose(const Search *s, int64_t b, double *values, int32_t *near
 }
 
 /* Start, goal, and points spread over the region that holds start, goal and obstacles. */
-static void scatter(const Search *s, int64_t b, double *to) {
+static void scatter(const Arguments *s, int64_t b, double *to) {
     const double *start = s->start + b * DIM, *goal = s->goal + b * DIM, *reach = s->reach + b * 2 * DIM;
     for (int i = 0; i < DIM; i++) {
         double low = reach[i], high = reach[DIM + i];
@@ -146,7 +146,7 @@ static void scatter(const Search *s, int64_t b, double *to) {
 /* The points of a graph: those of `scatter`, then the candidates with the shortest detours; unused places lie at the
    start. */
 static void choose(
-    const Search *s, int64_t b, const Spheres *o, const double *others, int64_t count, double *values,
+    const Arguments *s, int64_t b, const Spheres *o, const double *others, int64_t count, double *values,
     int32_t *indices, uint8_t *usable
 ) {
     double gap = s->clear * o->largest, *nodes = s->nodes + b * s->points * DIM;
@@ -167,7 +167,7 @@ static void choose(
 }
 
 /* Each free point's edges: to the nearest points, to the nearest of those from `scatter`, to the goal. */
-static void join(const Search *s, int64_t b, const uint8_t *usable, double *at, double *values, int32_t *found) {
+static void join(const Arguments *s, int64_t b, const uint8_t *usable, double *at, double *values, int32_t *found) {
     const double *nodes = s->nodes + b * s->points * DIM;
     int64_t n = s->points, k = s->edges, given = 2 + s->spread, near = s->neighbours, hubs = s->hubs;
     int64_t most = near > hubs ? near : hubs;
@@ -197,7 +197,7 @@ static void join(const Search *s, int64_t b, const uint8_t *usable, double *at, 
 
 /* Lengths of the edges of n points, k each, to `ends`: longer close to an obstacle, infinite through one. */
 static void measure(
-    const Search *s, const Spheres *o, const double *p, int64_t n, int64_t k, const int32_t *ends, double *lengths
+    const Arguments *s, const Spheres *o, const double *p, int64_t n, int64_t k, const int32_t *ends, double *lengths
 ) {
     double margin = s->margin * (o->largest < SMALL ? SMALL : o->largest), whole = 0.0;
     for (int i = 0; i < DIM; i++) whole += (p[DIM + i] - p[i]) * (p[DIM + i] - p[i]);
@@ -312,7 +312,7 @@ static void relax(Room *r, int64_t n, int64_t rounds) {
 
 /* The cheapest path from point 0 to point 1, as corners; returns whether there is one. */
 static int cheapest(
-    const Search *s, Room r, const double *p, int64_t n, int64_t k, const int32_t *ends, const double *lengths,
+    const Arguments *s, Room r, const double *p, int64_t n, int64_t k, const int32_t *ends, const double *lengths,
     const double *price, double *path
 ) {
     for (int64_t v = 0; v < n; v++)
@@ -361,7 +361,7 @@ static void lay(const double *path, int64_t corners, double *string) {
 
 /* Called from Python; 0 where there is no memory ------------------------------------------------------------------- */
 
-int32_t tgco_graph(const Search *s) {
+int32_t tgco_graph(const Arguments *s) {
     int64_t n = s->points, k = s->edges, list = n + k + s->midway;
     int64_t size = (DIM + 2) * s->spheres + (DIM + 1) * n + DIM * s->candidates + list;
     double *memory = malloc(size * sizeof(double) + list * sizeof(int32_t) + n);
@@ -382,7 +382,7 @@ int32_t tgco_graph(const Search *s) {
     return 1;
 }
 
-int32_t tgco_cheapest(const Search *s) {
+int32_t tgco_cheapest(const Arguments *s) {
     int64_t n = s->points, k = s->edges, size = s->corners * DIM;
     void *memory = malloc(room_size(n, k));
     if (!memory) return 0;
@@ -401,7 +401,7 @@ int32_t tgco_cheapest(const Search *s) {
     return 1;
 }
 
-int32_t tgco_taut(const Search *s) {
+int32_t tgco_taut(const Arguments *s) {
     int64_t most = 2 * s->corners - 1, size = s->corners * DIM;
     size_t lengths_size = most * most * sizeof(double), ends_size = most * most * sizeof(int32_t);
     size_t room = room_size(most, most), spheres = (DIM + 2) * s->spheres * sizeof(double);
@@ -426,7 +426,7 @@ int32_t tgco_taut(const Search *s) {
     return 1;
 }
 
-int32_t tgco_raise(const Search *s) {
+int32_t tgco_raise(const Arguments *s) {
     int64_t n = s->points, M = s->spheres;
     double *at = malloc((DIM + 1) * n * sizeof(double)), *nearest = at + DIM * n;
     if (!at) return 0;
