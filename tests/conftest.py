@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from torchgco.base import kernels
+from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start

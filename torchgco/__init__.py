@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from torchgco import presets as presets
 from torchgco.api import solve as solve
-from torchgco.base import kernels as kernels
 from torchgco.base.errors import ContactWarning as ContactWarning
 from torchgco.base.errors import GuidanceWarning as GuidanceWarning
 from torchgco.base.errors import InputError as InputError
@@ -44,6 +43,7 @@ from torchgco.judging.certificate import Certificate as Certificate
 from torchgco.judging.certificate import certify as certify
 from torchgco.judging.judge import judge as judge
 from torchgco.missions.constraints import FirstStepRates as FirstStepRates
+from torchgco.native import kernels as kernels
 from torchgco.obstacles import Boxes as Boxes
 from torchgco.obstacles import Capsules as Capsules
 from torchgco.obstacles import Spheres as Spheres

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import torchgco
 from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem
-from torchgco.base import kernels
+from torchgco.native import kernels
 from torchgco.native.dispatch import EagerWarning, engine_of
 
 D = torch.float64

@@ -32,8 +32,8 @@ from torchgco import (
     QuadraticCost,
     Solution,
 )
-from torchgco.base import kernels
 from torchgco.lagrangian.rollout import open_loop
+from torchgco.native import kernels
 
 D = torch.float64
 B, N, SIZE = 3, 8, 3

@@ -31,9 +31,9 @@ from torchgco import (
     Status,
     presets,
 )
-from torchgco.base import kernels
 from torchgco.guidance.gco import REACH, _radius
 from torchgco.guidance.suitability import TRIAL_SAMPLES, suited_sampler
+from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler
 from torchgco.search import Follow, PathProposals
 

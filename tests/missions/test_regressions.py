@@ -20,10 +20,10 @@ from torchgco import (
     Spheres,
     StateBounds,
 )
-from torchgco.base import kernels
 from torchgco.constraints import Constraint, ControlBounds
 from torchgco.lagrangian.rollout import open_loop as eager_rollout
 from torchgco.missions.planning_problem import BiasedPlanning
+from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import cost_unit, engine_of, open_loop
 

@@ -15,8 +15,7 @@ import torch
 
 from tests.problems import planar_batch
 from torchgco import presets
-from torchgco.base import kernels
-from torchgco.native import compiler, store
+from torchgco.native import compiler, kernels, store
 from torchgco.native.compiler import NativeError, build, find_compiler
 from torchgco.native.dispatch import engine_of
 

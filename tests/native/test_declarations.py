@@ -15,11 +15,10 @@ from torch import Tensor
 from tests.native.test_engine import running_state
 from tests.problems import boxed_batch, planar_batch
 from torchgco import ILQR, MPPI, LineSearch, Problem
-from torchgco.base import kernels
 from torchgco.base.draws import DrawKey
 from torchgco.base.status import Status
 from torchgco.guidance import mppi
-from torchgco.native import structures
+from torchgco.native import kernels, structures
 from torchgco.native.codegen.source import LANES, SAMPLER, SOLVER, C
 from torchgco.native.compiler import NativeError, build, find_compiler
 from torchgco.native.declarations import Structure, defines, fields, head, load

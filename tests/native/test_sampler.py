@@ -15,10 +15,9 @@ from tests.native.lanes import drawn
 from tests.native.test_engine import user_problem
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from torchgco import MPPI, ControlBounds, Problem, Spheres, presets
-from torchgco.base import kernels
 from torchgco.base.draws import DrawKey, standard_normal
 from torchgco.guidance import mppi
-from torchgco.native import dispatch
+from torchgco.native import dispatch, kernels
 from torchgco.native.compiler import find_compiler
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

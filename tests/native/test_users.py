@@ -19,8 +19,8 @@ from tests.native.test_engine import DAMPED, eager, natively, normal, running_st
 from tests.native.users import PROBLEMS, Each, Smooth, Tube, each, errands, with_cost
 from tests.problems import planar_batch, quick_gco
 from torchgco import Problem, Status
-from torchgco.base import kernels
 from torchgco.constraints.base import Constraint
+from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import EagerWarning, cost_unit, engine_of
 from torchgco.solvers.lifted import lifted_search, native_lifted_search

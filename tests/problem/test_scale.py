@@ -8,8 +8,8 @@ from torch import Tensor
 
 import torchgco
 from torchgco import FunctionCost, FunctionDynamics, Problem, QuadraticCost, Spheres, presets
-from torchgco.base import kernels
 from torchgco.costs.base import ShiftedCost
+from torchgco.native import kernels
 
 D = torch.float64
 

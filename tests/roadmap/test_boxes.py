@@ -25,8 +25,8 @@ from torchgco import (
     presets,
     solve,
 )
-from torchgco.base.kernels import use_native
 from torchgco.native.dispatch import engine_of
+from torchgco.native.kernels import use_native
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.roadmap.geometry import Inflated, Scene

@@ -12,8 +12,8 @@ from tests.problems import quick_gco
 from tests.reference import boxes as brute_force
 from tests.search.scenes import NONE, spheres
 from torchgco import Capsules, ControlBounds, Goal, Planar, Problem, QuadraticCost, QuadrotorPlanning, Spheres, judge
-from torchgco.base.kernels import use_native
 from torchgco.base.tree import take
+from torchgco.native.kernels import use_native
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.roadmap.geometry import Inflated, Scene

@@ -22,9 +22,9 @@ from torchgco import (
     presets,
     solve,
 )
-from torchgco.base.kernels import use_native
 from torchgco.lagrangian.quality import chord_clearance
 from torchgco.native.dispatch import open_loop
+from torchgco.native.kernels import use_native
 from torchgco.search import ClearChords
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")

@@ -24,7 +24,7 @@ from torchgco import (
     Status,
     presets,
 )
-from torchgco.base import kernels
+from torchgco.native import kernels
 from torchgco.search import Finish
 
 D, INF = torch.float64, math.inf

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.kernels import native
 from torchgco.lagrangian import rollout
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
 from torchgco.native.interior import InteriorEngine
+from torchgco.native.kernels import native
 from torchgco.native.sampler import Sampler
 from torchgco.problem.border import check_eager
 from torchgco.problem.problem import Problem

@@ -15,13 +15,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchgco.base.errors import InputError
-from torchgco.base.kernels import use_native
 from torchgco.base.options import Count, Within, check_options, check_value
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
 from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register, scenarios_for
 from torchgco.experiments.config.launching import allotted_cores
 from torchgco.experiments.results.identity import plain
 from torchgco.missions import Mission
+from torchgco.native.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 from torchgco.scenarios.vehicle import BUILT_IN, fitting
 from torchgco.solvers.memory import free_memory, least_bytes

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.kernels import use_native
 from torchgco.base.options import Count, Within, check_options
 from torchgco.base.status import Status
 from torchgco.base.version import VERSION
@@ -26,6 +25,7 @@ from torchgco.judging.certificate import certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
 from torchgco.judging.judge import frame_columns, judge
 from torchgco.native.dispatch import engine_of
+from torchgco.native.kernels import use_native
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts
 from torchgco.solution import Solution

@@ -15,7 +15,6 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torchgco.base.errors import InputError
-from torchgco.base.kernels import native
 from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
@@ -41,6 +40,7 @@ from torchgco.experiments.results.records import DONE, JUDGED, TRIALS, Records
 from torchgco.experiments.results.success import sound, with_success
 from torchgco.lagrangian.rollout import open_loop
 from torchgco.missions import Mission
+from torchgco.native.kernels import native
 from torchgco.scenarios import Layouts, Task
 
 # From a baseline's name to the whole configuration with that solver.

@@ -36,7 +36,7 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, con
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
     if (con->kind == BOUNDS) {
-        for (int j = 0; j < con->rows; j++) c[j] = bound(con, rows, j, x, u);
+        for (int j = 0; j < con->rows; j++) c[j] = bound(con, rows, j, k, x, u);
 #if DIM > 0
     } else if (con->kind == SPHERES) {
         V away[DIM];

@@ -9,6 +9,7 @@ from torchgco.native import store
 from torchgco.native.codegen import emit
 from torchgco.native.codegen.dynamics import DynamicsSource, elements, makers
 from torchgco.native.codegen.knot import Knot, KnotSource, knot_source
+from torchgco.native.codegen.stages import StagesSource
 
 
 def curvature_code(model: DynamicsSource, functions: Iterable[tuple[int, KnotSource]]) -> str:
@@ -21,6 +22,9 @@ def curvature_code(model: DynamicsSource, functions: Iterable[tuple[int, KnotSou
 def _model_code(model: DynamicsSource) -> str:
     """`tgco_curve(x, u, p, y, H)`: H += sum_i y_i times the second derivatives of state i, upper triangle."""
 
+    if isinstance(model, StagesSource):
+        return knot_source("curvature", model.stage.span, _stage_code, __file__).code
+
     def make(_: str) -> dict[str, Any]:
         import casadi as ca
 
@@ -31,6 +35,13 @@ def _model_code(model: DynamicsSource) -> str:
         return {"code": _curves("tgco_curve", [x, u, p, y], total, ca.vertcat(x, u))}
 
     return store.made(("curvature", model.key, *makers(__file__)), make).content["code"]
+
+
+def _stage_code(knot: Knot, _: str) -> str:
+    import casadi as ca
+
+    y = ca.SX.sym("y", knot.rows.numel())
+    return _curves("tgco_curve", [knot.x, knot.u, knot.numbers, y], ca.dot(y, knot.rows), ca.vertcat(knot.x, knot.u))
 
 
 def _rows_code(knot: Knot, name: str) -> str:
