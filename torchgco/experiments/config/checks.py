@@ -63,7 +63,7 @@ def _default_options() -> dict[str, str | None]:
     return {key: option for entry in base["defaults"] if isinstance(entry, dict) for key, option in entry.items()}
 
 
-def check(held: Mapping[str, Any]) -> None:
+def check(config: Mapping[str, Any]) -> None:
     """Check the groups, keys and names of a resolved configuration, without its node `hydra`.
 
     Raises:
@@ -75,30 +75,30 @@ def check(held: Mapping[str, Any]) -> None:
     groups = {key: option for key, option in chosen if key.isidentifier() and key != "experiment"}
     own = [key for key in base if key not in ("defaults", "hydra")]
     needed = [*own, *(key for key, option in groups.items() if option is not None)]
-    _keys(held, "", needed, [*own, *groups])
+    _keys(config, "", needed, [*own, *groups])
     device: Any = OmegaConf.load(conf / "device" / f"{groups['device']}.yaml")
     for name, known in (("study", base["study"]), ("device", device), ("model", MODEL)):
-        _keys(held[name], name, list(known), list(known))
+        _keys(config[name], name, list(known), list(known))
     for name in ("scenario", "solver"):
-        _keys(held[name], name, ["_target_"])
-    _keys(held["model"]["vehicle"], "model.vehicle", ["_target_", "name"])
-    check_value(held["seed"], Seed, "seed")
-    _name(held["solver"].get("name"), "solver.name")
-    _name(held["model"]["vehicle"]["name"], "model.vehicle.name")
-    if "path" not in held["scenario"]:
-        _name(held["scenario"].get("name"), "scenario.name")
-    _baselines(held["study"]["baselines"])
+        _keys(config[name], name, ["_target_"])
+    _keys(config["model"]["vehicle"], "model.vehicle", ["_target_", "name"])
+    check_value(config["seed"], Seed, "seed")
+    _name(config["solver"].get("name"), "solver.name")
+    _name(config["model"]["vehicle"]["name"], "model.vehicle.name")
+    if "path" not in config["scenario"]:
+        _name(config["scenario"].get("name"), "scenario.name")
+    _baselines(config["study"]["baselines"])
 
 
-def _keys(held: Any, group: str, needed: Sequence[str], known: Sequence[str] = ()) -> None:
-    """Check that `held` is a group with the needed keys and, where others are known at all, with no unknown ones."""
-    if not isinstance(held, Mapping):
-        raise InputError(group, "a group of keys", repr(held))
+def _keys(node: Any, group: str, needed: Sequence[str], known: Sequence[str] = ()) -> None:
+    """Check that `node` is a group with the needed keys and, where others are known at all, with no unknown ones."""
+    if not isinstance(node, Mapping):
+        raise InputError(group, "a group of keys", repr(node))
     inside = f"{group}." if group else ""
     for name in needed:
-        if name not in held:
+        if name not in node:
             raise InputError(f"{inside}{name}", "this key in the configuration", "none")
-    for name in held if known else ():
+    for name in node if known else ():
         if name not in known:
             raise InputError(f"{inside}{name}", f"one of the keys {', '.join(known)}", name)
 

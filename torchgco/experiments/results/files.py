@@ -21,7 +21,7 @@ def write(path: Path, save: Callable[[IO[bytes]], Any]) -> None:
     Raises:
         InputError: the system refuses to write there (disk full, no permission).
     """
-    _place(path, save)
+    _write(path, save)
 
 
 def create(path: Path, save: Callable[[IO[bytes]], Any]) -> bool:
@@ -31,22 +31,22 @@ def create(path: Path, save: Callable[[IO[bytes]], Any]) -> bool:
         InputError: the system refuses to write there (disk full, no permission).
     """
 
-    def move(part: str, place: Path) -> None:
+    def move(part: str, whole: Path) -> None:
         try:
-            os.link(part, place)
+            os.link(part, whole)
         except OSError as error:
             if error.errno not in NO_LINKS:
                 raise
-            os.replace(part, place)
+            os.replace(part, whole)
 
     try:
-        _place(path, save, move)
+        _write(path, save, move)
     except FileExistsError:
         return False
     return True
 
 
-def _place(path: Path, save: Callable[[IO[bytes]], Any], move: Callable[[str, Path], None] | None = None) -> None:
+def _write(path: Path, save: Callable[[IO[bytes]], Any], move: Callable[[str, Path], None] | None = None) -> None:
     for last in (False, True):
         try:
             return write_whole(path, save, move)

@@ -96,15 +96,15 @@ class Records:
         if not path.is_file():
             return False
         for name, sums in (self._checksums() or {TRIALS: []}).items():
-            place = self.folder / name
-            if place.is_file() and checksum(place) in sums:
+            file = self.folder / name
+            if file.is_file() and checksum(file) in sums:
                 continue
             if not self.repair:
-                raise damaged(place, "is damaged" if place.is_file() else "is missing")
+                raise damaged(file, "is damaged" if file.is_file() else "is missing")
             if name != LAYOUTS:
                 path.unlink(missing_ok=True)  # another job may be repairing, too
                 return False
-            write(place, _arrays(layouts.arrays()))
+            write(file, _arrays(layouts.arrays()))
             self.close()
         return True
 

@@ -59,8 +59,8 @@ def find_runs(folders: Iterable[str | os.PathLike[str]]) -> list[Run]:
         InputError: a missing folder, folders without trials, a damaged file, a table that is no study's.
     """
     given = [Path(folder) for folder in folders]
-    places = {place.resolve(): (place, place in given) for place in _places(given)}
-    runs = [run for place, is_given in places.values() if (run := _run(place, is_given)) is not None]
+    found = {folder.resolve(): (folder, folder in given) for folder in _below(given)}
+    runs = [run for folder, is_given in found.values() if (run := _run(folder, is_given)) is not None]
     if not runs:
         raise InputError("folders", f"a {TRIALS} in or below them", ", ".join(map(str, given)) or "no folder")
     return runs
@@ -97,7 +97,7 @@ def _read(path: str | os.PathLike[str], **options: Any) -> pd.DataFrame:
         raise InputError("trials", "a readable parquet file", f"{path} ({reason})") from None
 
 
-def _places(folders: list[Path]) -> Iterator[Path]:
+def _below(folders: list[Path]) -> Iterator[Path]:
     for folder in folders:
         if not folder.is_dir():
             raise InputError("folders", "an existing folder", folder)

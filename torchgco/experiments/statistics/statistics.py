@@ -171,13 +171,13 @@ def wilson(count: int, n: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def check_trials(trials: pd.DataFrame, place: object = "a table") -> None:
-    """Raise InputError if a table, read from `place`, is empty, lacks a column or has text for numbers."""
+def check_trials(trials: pd.DataFrame, source: object = "a table") -> None:
+    """Raise InputError if a table, read from `source`, is empty, lacks a column or has text for numbers."""
     missing = [name for name in COLUMNS if name not in trials.columns]
     if missing:
-        raise InputError("trials", "the columns of a study", f"{place} without {', '.join(missing)}")
+        raise InputError("trials", "the columns of a study", f"{source} without {', '.join(missing)}")
     if trials.empty:
-        raise InputError("trials", "at least one row", f"{place} with none")
+        raise InputError("trials", "at least one row", f"{source} with none")
     types = pd.api.types
     for names, is_right, convert, kind in (
         (NUMBERS, types.is_numeric_dtype, numbers_of, "numbers"),
@@ -188,7 +188,7 @@ def check_trials(trials: pd.DataFrame, place: object = "a table") -> None:
                 if not is_right(trials[name].dtype):
                     convert(trials[name])
             except (TypeError, ValueError):
-                raise InputError("trials", f"{kind} in column {name}", f"{place} with others") from None
+                raise InputError("trials", f"{kind} in column {name}", f"{source} with others") from None
 
 
 def numbers_of(column: pd.Series) -> np.ndarray:
