@@ -23,10 +23,10 @@ from torchgco import (
     StateBounds,
     Status,
 )
-from torchgco.base import kernels
 from torchgco.base.draws import DrawKey
 from torchgco.baselines import CasADiSolver
 from torchgco.judging.certificate import certify
+from torchgco.native import kernels
 from torchgco.native.dispatch import EagerWarning
 
 D = torch.float64

@@ -30,11 +30,11 @@ from torchgco import (
     StateBounds,
     Status,
 )
-from torchgco.base import kernels
 from torchgco.base.draws import DrawKey
 from torchgco.baselines import CasADiSolver
 from torchgco.judging.certificate import certify
 from torchgco.judging.judge import judge
+from torchgco.native import kernels
 from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.problem.rates import with_controls_before
 

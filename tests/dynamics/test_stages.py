@@ -13,11 +13,11 @@ from torch import Tensor
 import torchgco
 from tests.native.users import N, with_stages
 from torchgco import ILQR, AugmentedLagrangian, FunctionCost, FunctionDynamics, InputError, Problem, Status
-from torchgco.base import kernels
 from torchgco.baselines import CasADiSolver
 from torchgco.judging.certificate import certify
 from torchgco.judging.judge import judge
 from torchgco.lagrangian import rollout
+from torchgco.native import kernels
 from torchgco.native.dispatch import EagerWarning, engine_of, open_loop
 
 D = torch.float64

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.base.options import Above, AtMost, Count, Positive, check_options
+from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.status import Status
-from torchgco.base.tree import copied, put, take
+from torchgco.base.tree import copied, put
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
