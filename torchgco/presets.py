@@ -17,6 +17,7 @@ from torchgco.problem.problem import Problem
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search import (
     ClearChords,
+    Converge,
     Finish,
     Follow,
     FromProposal,
@@ -61,6 +62,7 @@ def gco(space: Space) -> Restarts:
     return Restarts(
         local=replace(_local(space), guidance=_guidance(space)),
         passes=(
+            Converge(when="first"),
             replace(solve, until="end", when="pathless"),
             solve,
             proposals,
@@ -75,6 +77,7 @@ def gco(space: Space) -> Restarts:
             samples,
             IntoGoal(),
             _finish(space),
+            Converge(),
             ClearChords(),
         ),
     )
@@ -91,6 +94,7 @@ def gco_fast(space: Space) -> Restarts:
     return Restarts(
         local=replace(_local(space), guidance=guidance),
         passes=(
+            Converge(when="first"),
             replace(solve, until="end", when="pathless"),
             solve,
             one,
@@ -100,6 +104,7 @@ def gco_fast(space: Space) -> Restarts:
             FromSamples("unproposed"),
             IntoGoal(),
             _finish(space),
+            Converge(),
             ClearChords(),
         ),
     )
@@ -112,7 +117,7 @@ def gco_max(space: Space) -> Restarts:
     many = replace(proposals, when="caught", num_paths=16, relax_top=None, refine=Refine(top=16))
     closer = replace(many, when="unproposed", roadmaps=(), follow=(_closer(many.follow[0]),))
     more = (many, closer, FromProposal(), IntoGoal(), replace(samples, when="caught"), IntoGoal())
-    return replace(solver, passes=(*solver.passes[:-2], *more, *solver.passes[-2:]))
+    return replace(solver, passes=(*solver.passes[:-3], *more, *solver.passes[-3:]))
 
 
 def gco_paper(space: Space) -> AugmentedLagrangian:

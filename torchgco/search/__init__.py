@@ -2,6 +2,7 @@
 
 from torchgco.search.candidates import Refine as Refine
 from torchgco.search.chords import ClearChords as ClearChords
+from torchgco.search.converge import Converge as Converge
 from torchgco.search.finish import Finish as Finish
 from torchgco.search.following import Follow as Follow
 from torchgco.search.multistart import MultiStart as MultiStart

@@ -13,6 +13,7 @@ from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Late, Search
 from torchgco.search.chords import ClearChords
+from torchgco.search.converge import Converge
 from torchgco.search.finish import Finish
 from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Pass, Solve
 from torchgco.search.proposals import PathProposals
@@ -57,8 +58,8 @@ class Restarts(Solver):
         return pd.DataFrame(rows_of(self.passes), index=pd.RangeIndex(1, len(self.passes) + 1, name="row"))
 
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
-        """The passes but `Finish`, as the next plan continues what a limit cuts off; and the local solver, unguided."""
-        passes = tuple(one for one in self.passes if not isinstance(one, Finish))
+        """The passes but the last solves, as the next plan continues this one; and the local solver, unguided."""
+        passes = tuple(one for one in self.passes if not isinstance(one, Converge | Finish))
         return replace(self, passes=passes), replace(self.local, guidance=None, max_outer_iterations=rounds)
 
     def in_slots(self, slots: int) -> Restarts:
@@ -119,7 +120,8 @@ def _check(passes: Any) -> None:
             expected = f"path proposals before those for problems that are {one.when}, and no FromProposal in between"
             raise InputError(f"solver.passes[{number}].when", expected, one.when)
         begun = isinstance(one, PathProposals) or (begun and not isinstance(one, FromProposal))
-    first = next((one for one in passes if not (isinstance(one, Solve) and one.when == "pathless")), None)
+    some = [isinstance(one, Solve | Converge) and one.when in ("pathless", "first") for one in passes]
+    first = next((one for one, of_some in zip(passes, some, strict=True) if not of_some), None)
     if not isinstance(first, Solve):
         got = "none" if first is None else type(first).__name__
         raise InputError("solver.passes", "a Solve first, not only for problems without paths", got)

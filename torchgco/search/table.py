@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from torchgco.search.chords import ClearChords
+from torchgco.search.converge import Converge
 from torchgco.search.finish import Finish
 from torchgco.search.following import Follow
 from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Pass, Solve
@@ -45,6 +46,10 @@ def _described(one: Pass) -> dict[str, str]:
         case FromSamples():
             draws = "continued once" if one.redraws == 0 else f"{one.redraws} times, other draws"
             return {"problems": f"{PROBLEMS[one.when]}: {draws}"}
+        case Converge():
+            problems = "all, where there are no obstacles" if one.when == "first" else "not solved as tightly yet"
+            tight = f"violation {one.solver.violation_tolerance:g}, optimality {one.solver.tolerance:g}"
+            return {"problems": f"{problems}: interior point", "accepted": tight}
         case Finish():
             inner, outer = one.solver.inner.max_iterations, one.solver.max_outer_iterations
             limits = f"{outer} x {inner} iterations"

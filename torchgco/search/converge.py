@@ -1,0 +1,73 @@
+"""Solves by the interior point: the first of problems without obstacles, and the last of all that are not yet tight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchgco.base.options import check_options
+from torchgco.base.status import Status
+from torchgco.base.tree import take
+from torchgco.lagrangian.quality import has_arrived, is_preferred
+from torchgco.native.dispatch import interior_of
+from torchgco.search.attempts import Search
+from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.state import SOLVED, SolveEnd
+
+WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
+
+
+@dataclass(frozen=True)
+class Converge:
+    """Solves by the interior point, to its own tight tolerance.
+
+    It needs native kernels; where there are none, the other passes are left to solve.
+
+    Args:
+        solver: of these solves.
+        when: "first": problems without obstacles, from the given guess. "last": all that are not yet solved as tightly,
+            from the best trajectory; where that leads to none that is feasible, from the given guess.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    solver: InteriorPoint = InteriorPoint()
+    when: Literal["first", "last"] = "last"
+
+    def __post_init__(self) -> None:
+        check_options(self, "converge")
+
+    def run(self, search: Search) -> None:
+        """Solve; see the class."""
+        problem = search.call.problem
+        if problem.B == 0 or not problem.constraints or interior_of(problem) is None:
+            return
+        if self.when == "last":
+            self._tighten(search)
+        elif not problem.geometric:
+            search.begin(self.solver.solved(search.call))
+
+    def _tighten(self, search: Search) -> None:
+        best = search.best
+        status = best.end.status
+        rows = ((status != SOLVED) & (status != Status.INVALID_START)).nonzero().flatten()
+        start = take(best.end.best, rows)
+        call = search.call.take(rows)
+        self._keep(search, rows, self.solver.solved(replace(call, U0=start.U, warm=start.multipliers), start.X))
+        lost = rows[best.end.best.violation[rows] > search.solver.violation_tolerance]
+        self._keep(search, lost, self.solver.solved(search.call.take(lost)))
+
+    def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
+        """Keep solved trajectories, unless others arrive or cost less by more than a small violation is worth."""
+        if rows.numel() == 0:
+            return
+        problem, limit = search.call.problem.take(rows), search.solver.violation_tolerance
+        old, new = take(search.best.end.best, rows), end.best
+        arrives = has_arrived(problem, new.X) | ~has_arrived(problem, old.X)
+        near = new.cost <= old.cost + WORTH * old.cost.abs()
+        serves = is_preferred(problem, new, old, limit) | ((end.status == SOLVED) & arrives & near)
+        search.best.replace(rows, serves & torch.isfinite(new.cost), new, end)
