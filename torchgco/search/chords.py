@@ -14,6 +14,8 @@ from torchgco.base.options import Count, check_options
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import chord_clearance, has_arrived, violation
 from torchgco.search.attempts import Search
+from torchgco.search.converge import tightened
+from torchgco.solvers.interior import InteriorPoint
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
 MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves differ by as much
@@ -30,12 +32,14 @@ class ClearChords:
 
     Args:
         rounds: solves at most, each with larger obstacles than the one before.
+        solver: ends each of them.
 
     Raises:
         InputError: a field out of its range.
     """
 
     rounds: Count = 4
+    solver: InteriorPoint = InteriorPoint()
 
     def __post_init__(self) -> None:
         check_options(self, "chords")
@@ -54,7 +58,7 @@ class ClearChords:
             whole, old = problem.take(rows), take(best.end.best, rows)
             call = search.call.take(rows)
             call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
-            new = best.attempt(call)
+            new = tightened(self.solver, call, best.attempt(call))
             found = replace(new.best, violation=violation(whole, new.best.X, new.best.U))
             now[rows] = chord_clearance(whole, found.X)
             serves = (found.violation <= limit) & (now[rows] > clearance[rows])

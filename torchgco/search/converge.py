@@ -10,12 +10,13 @@ from torch import Tensor
 
 from torchgco.base.options import check_options
 from torchgco.base.status import Status
-from torchgco.base.tree import take
+from torchgco.base.tree import put, take
 from torchgco.lagrangian.quality import has_arrived, is_preferred
 from torchgco.native.dispatch import interior_of
 from torchgco.search.attempts import Search
+from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.state import SOLVED, SolveEnd
+from torchgco.solvers.state import SOLVED, Iterate, SolveEnd
 
 WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
 
@@ -57,7 +58,7 @@ class Converge:
         rows = ((status != SOLVED) & (status != Status.INVALID_START)).nonzero().flatten()
         start = take(best.end.best, rows)
         call = search.call.take(rows)
-        self._keep(search, rows, self.solver.solved(replace(call, U0=start.U, warm=start.multipliers), start.X))
+        self._keep(search, rows, _continued(self.solver, call, start))
         lost = rows[best.end.best.violation[rows] > search.solver.violation_tolerance]
         self._keep(search, lost, self.solver.solved(search.call.take(lost)))
 
@@ -71,3 +72,19 @@ class Converge:
         near = new.cost <= old.cost + WORTH * old.cost.abs()
         serves = is_preferred(problem, new, old, limit) | ((end.status == SOLVED) & arrives & near)
         search.best.replace(rows, serves & torch.isfinite(new.cost), new, end)
+
+
+def tightened(solver: InteriorPoint, call: Call, end: SolveEnd) -> SolveEnd:
+    """How the solves of a call end, continued by the interior point where that solves them, in place."""
+    if interior_of(call.problem) is None:
+        return end
+    new = _continued(solver, call, end.best)
+    rows = (new.status == SOLVED).nonzero().flatten()
+    put(end.best, rows, take(new.best, rows))
+    end.status[rows] = SOLVED
+    end.iterations.add_(new.iterations)
+    return end
+
+
+def _continued(solver: InteriorPoint, call: Call, start: Iterate) -> SolveEnd:
+    return solver.solved(replace(call, U0=start.U, warm=start.multipliers), start.X)

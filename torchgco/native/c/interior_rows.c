@@ -92,14 +92,35 @@ static inline void add_spheres(Barrier *t, int64_t i, int64_t k, const V *x) {
 #endif
 
 #if WITH_BOXES
+/* lam times the second derivatives of row j (DIM, DIM): the distance bends around edges and corners, not along faces. */
+static inline void bend_box(const Constraint *con, const Rows *rows, int64_t j, const V *x, V lam, V *curvature) {
+    const V *factors = rows->bound + con->rows * 2 * DIM, *box = factors + con->rows + j * BOX_NUMBERS;
+    V zero = SET(0.0), local[DIM], away[DIM], square = zero;
+    seen_from(box, x + POSITION, local);
+    for (int i = 0; i < DIM; i++) { away[i] = beyond(local[i], BOX_HALF(box)[i]); square += away[i] * away[i]; }
+    I bends = (square > zero) & (BOX_RADIUS(box) >= zero);
+    V inverse = tgco_if(bends, SET(1.0) / tgco_choose(bends, square, SET(1.0)));
+    V weight = -lam * factors[j] * tgco_sqrt(inverse);
+    for (int a = 0; a < DIM; a++) for (int b = 0; b < DIM; b++) {
+        V sum = zero;
+        for (int i = 0; i < DIM; i++) for (int l = 0; l < DIM; l++) {
+            V entry = -away[i] * away[l] * inverse;
+            if (i == l) entry += tgco_truth(away[i] != zero);
+            sum += box[DIM + i * DIM + a] * entry * box[DIM + l * DIM + b];
+        }
+        curvature[a * DIM + b] = weight * sum;
+    }
+}
+
 static inline void add_boxes(Barrier *t, int64_t i, int64_t k, const V *x) {
     const Constraint *con = t->lanes.of->constraint + i;
+    const Rows *rows = t->lanes.rows + i;
     int64_t q = row_of(t, i, k);
-    V slopes[DIM], flat[DIM * DIM];
-    for (int a = 0; a < DIM * DIM; a++) flat[a] = SET(0.0); /* faces don't bend, and edges are left to the shift */
+    V slopes[DIM], curvature[DIM * DIM];
     for (int j = 0; j < con->rows; j++, q++) {
-        solid(con, t->lanes.rows + i, j, x, slopes);
-        add_row(t, k, q, slopes, flat);
+        solid(con, rows, j, x, slopes);
+        bend_box(con, rows, j, x, t->objective * t->z[q], curvature);
+        add_row(t, k, q, slopes, curvature);
     }
 }
 #endif
