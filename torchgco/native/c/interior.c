@@ -421,13 +421,14 @@ static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V s
     for (int l = 0; l < LANES; l++) if (lowered[l]) k->pairs[l] = 0;
 }
 
-/* Factors of all lanes, their curvature shifted where it must be; lanes that no shift helps leave `running`. */
-static I factor_shifted(Barrier *t, Track *k, I running) {
+/* Factors of all lanes, their curvature shifted where it must be, those of the lanes `anew` from the least shift on;
+   lanes that no shift helps leave `running`. */
+static I factor_shifted(Barrier *t, const Track *k, I running, I anew) {
     const Interior *how = t->how;
-    t->shift = k->forced;
+    t->shift = tgco_choose(anew, k->forced, t->shift);
     I lost = running & ~running;
     for (;;) {
-        I bad = running & ~factor(t) & ~lost;
+        I bad = running & ~factor(t, 1) & ~lost;
         if (!any(bad)) break;
         V before = k->last, first = SET(how->shift_first), floor = SET(how->shift_least);
         V start = tgco_choose(before == SET(0.0), first, most(floor, before * SET(how->shift_decay)));
@@ -436,12 +437,11 @@ static I factor_shifted(Barrier *t, Track *k, I running) {
         t->shift = tgco_choose(bad, next, t->shift);
         lost |= bad & (t->shift > SET(how->shift_max));
     }
-    k->last = tgco_choose(running & (t->shift > SET(0.0)), t->shift, k->last);
     return running & ~lost;
 }
 
 /* Where equalities contradict each other to first order, their multipliers explode: a softer step is taken there. */
-static I soften(Barrier *t, Track *k, I moving) {
+static I soften(Barrier *t, const Track *k, I moving) {
     const Interior *how = t->how;
     for (;;) {
         V largest = SET(0.0);
@@ -450,7 +450,7 @@ static I soften(Barrier *t, Track *k, I moving) {
         if (!any(large)) return moving;
         t->soft = tgco_choose(large, SET(100.0) * t->soft, t->soft);
         expand(t);
-        moving = factor_shifted(t, k, moving);
+        moving = factor_shifted(t, k, moving, large);
         solve(t);
         solve_rows(t);
     }
@@ -507,10 +507,11 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     running &= ~ended & ~astray;
     if (!any(running)) return ended;
     lower_barrier(t, k, running, dual, primal, scale_z);
-    I moving = factor_shifted(t, k, running);
+    I moving = factor_shifted(t, k, running, running);
     solve(t);
     solve_rows(t);
     moving = soften(t, k, moving);
+    k->last = tgco_choose(moving & (t->shift > SET(0.0)), t->shift, k->last);
     astray = running & ~moving & k->watching;
     if (any(astray)) go_back(t, k, astray);
     for (int l = 0; l < LANES; l++)
@@ -577,6 +578,10 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
         V error;
         I ended = iterate(t, k, running, status, &error);
         fresh &= ~fresh;
+        if (any(ended)) { /* gains along the trajectories that leave, whatever the other lanes do */
+            expand(t);
+            factor(t, 0);
+        }
         for (int l = 0; l < LANES; l++) {
             if (!ended[l]) continue;
             leave_barrier(t, k, l, status[l], error[l]);

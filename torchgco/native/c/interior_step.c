@@ -53,8 +53,8 @@ static void expand(Barrier *t) {
 }
 
 /* Factors L and gains K of the recursion with `shift` on the diagonal; where it isn't positive definite, the answer is
-   false. */
-static I factor(Barrier *t) {
+   false. `hopeless`: it may stop where no lane is positive definite. */
+static I factor(Barrier *t, int hopeless) {
     Lanes *s = &t->lanes;
     int64_t N = s->of->N;
     V T[S * NX], Q[S * S], Y[NU * NX];
@@ -84,7 +84,7 @@ static I factor(Barrier *t) {
             for (int a = 0; a < j; a++) for (int i = 0; i < NX; i++) row[i] -= L[j * NU + a] * Y[a * NX + i];
             for (int i = 0; i < NX; i++) row[i] *= inverse;
         }
-        if (!any(good)) return good;
+        if (hopeless && !any(good)) return good;
         for (int j = NU - 1; j >= 0; j--) {
             V *row = K + j * NZ;
             for (int i = 0; i < NX; i++) row[i] = -Y[j * NX + i];
