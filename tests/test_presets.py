@@ -35,14 +35,14 @@ def test_solve_gives_the_bits_of_the_configuration_gco(model: str) -> None:
 
 
 def test_an_option_on_the_command_line_changes_that_option_alone() -> None:
-    setup = torchgco.compose(["solver.passes.2.num_paths=3", "solver.local.inner.max_iterations=7"])
+    setup = torchgco.compose(["solver.passes.3.num_paths=3", "solver.local.inner.max_iterations=7"])
     solver = presets.gco(3)
     inner = replace(solver.local.inner, max_iterations=7)
     assert setup.solver.local == replace(solver.local, inner=inner)
-    assert setup.solver.passes[2] == replace(solver.passes[2], num_paths=3) != solver.passes[2]
-    assert setup.solver.passes[:2] == solver.passes[:2] and setup.solver.passes[3:] == solver.passes[3:]
-    with pytest.raises(InputError, match=r"^solver\.passes\[2\]\.num_path: .*such as num_paths"):
-        torchgco.compose(["solver.passes.2.num_path=3"])
+    assert setup.solver.passes[3] == replace(solver.passes[3], num_paths=3) != solver.passes[3]
+    assert setup.solver.passes[:3] == solver.passes[:3] and setup.solver.passes[4:] == solver.passes[4:]
+    with pytest.raises(InputError, match=r"^solver\.passes\[3\]\.num_path: .*such as num_paths"):
+        torchgco.compose(["solver.passes.3.num_path=3"])
 
 
 def changed(value: Any, place: str, words: list[str]) -> Any:
@@ -94,9 +94,9 @@ def test_more_effort_costs_no_more() -> None:
 def test_the_most_thorough_preset_has_the_rows_of_the_default_and_more() -> None:
     for space in (2, 3):
         usual, more = presets.gco(space), presets.gco_max(space)
-        begin, end = usual.passes[:-2], usual.passes[-2:]
+        begin, end = usual.passes[:-3], usual.passes[-3:]
         assert more.local == usual.local and len(more.passes) > len(usual.passes)
-        assert more.passes[: len(begin)] == begin and more.passes[-2:] == end
+        assert more.passes[: len(begin)] == begin and more.passes[-3:] == end
 
 
 def test_a_problem_without_a_position_gets_the_planar_settings() -> None:

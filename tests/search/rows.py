@@ -26,6 +26,13 @@ def closer(proposals: PathProposals) -> PathProposals:
     return replace(proposals, when="unproposed", roadmaps=(), follow=follow, relax_top=None)
 
 
+def without(solver: Restarts, *kinds: type) -> Restarts:
+    """The solver without its rows of these kinds."""
+    left = tuple(one for one in solver.passes if not isinstance(one, kinds))
+    assert len(left) < len(solver.passes)
+    return replace(solver, passes=left)
+
+
 def rounds(proposals: PathProposals) -> tuple[PathProposals, PathProposals]:
     """The rows of one round as the default makes it: `proposals`, and `closer`."""
     return proposals, closer(proposals)

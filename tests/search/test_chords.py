@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from tests.search.rows import without
 from torchgco import (
     Boxes,
     ControlBounds,
@@ -25,7 +24,7 @@ from torchgco import (
 from torchgco.lagrangian.quality import chord_clearance
 from torchgco.native.dispatch import open_loop
 from torchgco.native.kernels import use_native
-from torchgco.search import ClearChords
+from torchgco.search import ClearChords, Converge
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 
@@ -52,10 +51,7 @@ def corners(B: int = 8) -> Problem:
 
 
 def without_clearing(problem: Problem) -> Tensor:
-    whole = presets.gco(problem)
-    *before, last = whole.passes
-    assert isinstance(last, ClearChords)
-    return solve(problem, solver=replace(whole, passes=tuple(before))).U
+    return solve(problem, solver=without(presets.gco(problem), ClearChords)).U
 
 
 @pytest.mark.parametrize("make", [coarse_disc, corners])
@@ -81,9 +77,10 @@ def test_growth_counts_from_the_clearance_that_the_last_solve_missed() -> None:
     setup = compose(["scenario=mazes", "scenario.walls=4", "seed=99"])
     task = setup.task(setup.layouts(27))
     problem = task.problem.take(torch.tensor([26]))
-    old = judge(problem, without_clearing(problem))
+    solver = without(presets.gco(problem), Converge)
+    old = judge(problem, solve(problem, solver=without(solver, ClearChords)).U)
     assert bool(old.feasible) and bool(old.clearance < 0)
-    assert bool(judge(problem, solve(problem).U).sound.all())
+    assert bool(judge(problem, solve(problem, solver=solver).U).sound.all())
 
 
 def test_a_problem_is_cleared_alike_in_every_batch() -> None:

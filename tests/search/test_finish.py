@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.search.rows import without
 from torchgco import (
     ILQR,
     AugmentedLagrangian,
@@ -25,7 +26,7 @@ from torchgco import (
     presets,
 )
 from torchgco.native import kernels
-from torchgco.search import Finish
+from torchgco.search import Converge, Finish
 
 D, INF = torch.float64, math.inf
 LIMITS = torch.tensor([0.08, 0.12, 0.16], dtype=D)  # of Bryson and Denham's problem
@@ -78,11 +79,13 @@ def brachistochrone() -> Problem:
 
 
 def unfinished(problem: Problem) -> Restarts:
-    """The default solver without the row that finishes."""
-    whole = presets.gco(problem)
-    passes = tuple(one for one in whole.passes if not isinstance(one, Finish))
-    assert len(passes) == len(whole.passes) - 1
-    return replace(whole, passes=passes)
+    """The default solver's AL-iLQR without the row that finishes."""
+    return without(presets.gco(problem), Converge, Finish)
+
+
+def finished(problem: Problem) -> Restarts:
+    """The same with that row."""
+    return without(presets.gco(problem), Converge)
 
 
 def feasible(problem: Problem, solution: Solution) -> bool:
@@ -94,7 +97,7 @@ def feasible(problem: Problem, solution: Solution) -> bool:
 def test_what_a_limit_cut_off_is_finished(make) -> None:
     problem = make()
     cut = torchgco.solve(problem, solver=unfinished(problem))
-    done = torchgco.solve(problem)
+    done = torchgco.solve(problem, solver=finished(problem))
     assert not feasible(problem, cut) and feasible(problem, done)
     assert set(done.statuses) <= {Status.CONVERGED, Status.FEASIBLE} and Status.INFEASIBLE not in cut.statuses
 
@@ -109,7 +112,7 @@ def test_the_known_optimum_is_found() -> None:
 def test_solves_that_ended_before_are_left_as_they_are() -> None:
     model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), dim=-1), 2, 1, 0.05, "rk4")
     problem = Problem(model, effort(0.05, 1.0), [ends_at(1.0, 0.0)], torch.zeros(2, 2, dtype=D), 40)
-    with_it, without = (torchgco.solve(problem, solver=s) for s in (presets.gco(problem), unfinished(problem)))
+    with_it, without = (torchgco.solve(problem, solver=s) for s in (finished(problem), unfinished(problem)))
     assert without.statuses == [Status.CONVERGED] * 2
     assert torch.equal(with_it.U, without.U) and torch.equal(with_it.iterations, without.iterations)
 

@@ -13,10 +13,21 @@ from tests.search.gates import LOCAL, PASSES, PATHS, SAMPLING, SHORT, gates
 from tests.search.rows import closer, restarts, thorough, varied
 from tests.search.test_chords import corners
 from tests.search.test_finish import brachistochrone, parking
-from torchgco import ILQR, AugmentedLagrangian, InputError, PathProposals, Problem, Restarts, Solution, Spheres, presets
-from torchgco.search import ClearChords, Finish, FromProposal, FromSamples, IntoGoal, Refine, Solve
+from torchgco import (
+    ILQR,
+    AugmentedLagrangian,
+    InputError,
+    PathProposals,
+    Problem,
+    Restarts,
+    Solution,
+    Spheres,
+    presets,
+)
+from torchgco.search import ClearChords, Converge, Finish, FromProposal, FromSamples, IntoGoal, Refine, Solve
 from torchgco.search.passes import Pass
 from torchgco.search.table import COLUMNS
+from torchgco.solvers.interior import InteriorPoint
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 DRAWN = FromSamples("caught", redraws=1)
@@ -73,8 +84,11 @@ FIELDS: dict[tuple[type, str], tuple[Any, tuple[Pass, ...], Pass, Any, tuple[Pas
     (PathProposals, "max_gap"): (at_gates, (Solve(), PATHS), COSTLY, 1e9, (FromProposal(),)),
     (FromSamples, "when"): (at_gates, ALONG, FromSamples("unproposed", redraws=1), "caught", ()),
     (FromSamples, "redraws"): (at_gates, (Solve(),), DRAWN, 2, ()),
+    (Converge, "solver"): (unfinished, (Solve(),), Converge(), InteriorPoint(tolerance=1e-2), ()),
+    (Converge, "when"): (unfinished, (Solve(),), Converge(), "first", ()),
     (Finish, "solver"): (unfinished, (Solve(),), LONG, replace(LONG.solver, penalty_growth=5.0), ()),
     (Finish, "change"): (parked, (Solve(),), LONG, 0.3, ()),
+    (ClearChords, "solver"): (around_corners, (Solve("end"),), ClearChords(), InteriorPoint(tolerance=1e-2), ()),
     (ClearChords, "rounds"): (around_corners, (Solve("end"),), ClearChords(), 1, ()),
 }
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.search.rows import proposed, varied
+from tests.search.rows import proposed, varied, without
 from torchgco import PathProposals, Problem, Restarts, Status, compose, presets
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.rollout import open_loop
 from torchgco.roadmap.scene import has_paths
-from torchgco.search import Follow
+from torchgco.search import Converge, Follow
 from torchgco.search.following import Paths, followed
 from torchgco.search.passes import StopWhenCaught
 from torchgco.search.proposals import Proposal, propose
@@ -137,7 +137,7 @@ def test_among_moving_obstacles_the_first_solve_runs_to_its_end(monkeypatch) -> 
     layouts = setup.layouts(8)
     task = setup.task(layouts)
     problem, U0 = task.problem, task.U0
-    solver = presets.gco(3)
+    solver = without(presets.gco(3), Converge)
     assert not has_paths(problem) and isinstance(solver, Restarts)
     local = replace(solver.local, max_outer_iterations=10)  # too few for some
     unguided = replace(local, guidance=None)
@@ -166,7 +166,7 @@ def test_a_converged_solve_is_enough_where_the_goal_is_assumed() -> None:
     problem = setup.task(setup.layouts(2)).problem
     given, assumed = problem, replace(problem, goal=None)
     assert assumed.goal is not None and assumed.goal.assumed
-    solver = presets.gco(3)
+    solver = without(presets.gco(3), Converge)
     U0 = problem.cost.rest_controls(torch.zeros(2, problem.N, problem.m, dtype=torch.float64))
     alone = replace(solver.local, guidance=None).solve(assumed, U0)
     assert alone.statuses == [Status.CONVERGED] * 2 and float(assumed.goal.distance(alone.X[:, -1, :3]).min()) > 2

@@ -29,8 +29,9 @@ class Converge:
 
     Args:
         solver: of these solves.
-        when: "first": problems without obstacles, from the given guess. "last": all that are not yet solved as tightly,
-            from the best trajectory; where that leads to none that is feasible, from the given guess.
+        when: "first": problems without obstacles, from the given guess; by AL-iLQR where that fails. "last": all that
+            are not yet solved as tightly, from the best trajectory; where that leads to none that is feasible, from the
+            given guess.
 
     Raises:
         InputError: a field out of its range.
@@ -49,13 +50,16 @@ class Converge:
             return
         if self.when == "last":
             self._tighten(search)
-        elif not problem.geometric:
+        elif not problem.geometric and not search.begun:
             search.begin(self.solver.solved(search.call))
+            if search.record is not None:
+                search.record.passes[-1][2].extend(search.call.rows.tolist())
+            rows = _unsolved(search)
+            search.best.improve(rows, search.call.take(rows))
 
     def _tighten(self, search: Search) -> None:
         best = search.best
-        status = best.end.status
-        rows = ((status != SOLVED) & (status != Status.INVALID_START)).nonzero().flatten()
+        rows = _unsolved(search)
         start = take(best.end.best, rows)
         call = search.call.take(rows)
         self._keep(search, rows, _continued(self.solver, call, start))
@@ -72,6 +76,11 @@ class Converge:
         near = new.cost <= old.cost + WORTH * old.cost.abs()
         serves = is_preferred(problem, new, old, limit) | ((end.status == SOLVED) & arrives & near)
         search.best.replace(rows, serves & torch.isfinite(new.cost), new, end)
+
+
+def _unsolved(search: Search) -> Tensor:
+    status = search.best.end.status
+    return ((status != SOLVED) & (status != Status.INVALID_START)).nonzero().flatten()
 
 
 def tightened(solver: InteriorPoint, call: Call, end: SolveEnd) -> SolveEnd:

@@ -26,7 +26,7 @@ from torchgco.search.converge import Converge
 from torchgco.search.finish import Finish
 from torchgco.search.proposals import PathProposals
 from torchgco.solvers.contracts import Advice
-from torchgco.solvers.state import SOLVED, SolveEnd
+from torchgco.solvers.state import SolveEnd
 
 WITHIN = 0.95  # share of the goal tolerance to which trajectories are attracted
 STIFF = 1e3  # weight of that attraction, in units of cost per radius^4
@@ -41,7 +41,7 @@ class Solve:
         until: "caught": a solve is stopped where its trajectory is caught between obstacles; "end": it isn't.
         when: "pathless": where no path can be sought, as among moving obstacles, where waiting is often enough;
             "unarrived": where no solve has been made, or has not arrived. Problems that converge are not solved again
-            where the goal is assumed: it may lie beyond the horizon. Without obstacles: what is not solved yet.
+            where the goal is assumed: it may lie beyond the horizon.
         single_contact_after: from this outer iteration on, a knot inside one obstacle counts as caught, too; None: only
             knots inside two.
 
@@ -67,9 +67,6 @@ class Solve:
                 search.record.passes[-1][2].extend(search.call.rows.tolist())
         elif search.guided:
             self._again(search, stop)
-        elif self.when == "unarrived":
-            rows = (search.best.end.status != SOLVED).nonzero().flatten()
-            search.best.improve(rows, search.call.take(rows))
 
     def _again(self, search: Search, stop: StopWhenCaught | None) -> None:
         best, caught = search.best, search.caught

@@ -91,7 +91,8 @@ def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: floa
     holds, and where a solve failed, the reason stays.
     """
     stationary, fits = (left <= STATIONARY) | (ended == SOLVED), violation <= tolerance
-    reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED) | (ended == SOLVED), int(Status.MAX_ITERATIONS), ended)
+    limit = torch.full_like(ended, int(Status.MAX_ITERATIONS))
+    reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED) | (ended == SOLVED), limit, ended)
     status = torch.where(fits & constrained, int(Status.FEASIBLE), reason)
     status = torch.where(stationary & fits, int(Status.CONVERGED), status)
     status = torch.where(~fits & (ended == STALLED), int(Status.INFEASIBLE), status)

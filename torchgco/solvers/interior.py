@@ -51,8 +51,8 @@ class InteriorPoint(Solver):
     """The method of Waechter and Biegler (2006) with a Riccati recursion over the stages, many problems side by side.
 
     States and controls are variables, and the dynamics are constraints between them, so a guess of states may be
-    anything; Hessians are exact. Returned trajectories are rollouts. Problems that native kernels can't serve are solved
-    by AL-iLQR instead.
+    anything; Hessians are exact. Returned trajectories are rollouts. What native kernels can't serve is solved by
+    AL-iLQR instead.
 
     Args:
         tolerance: of the optimality conditions, scaled as in the paper.
@@ -150,10 +150,11 @@ def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor,
         if isinstance(bounds, ControlBounds | StateBounds):
             z = U if bounds.of == "u" else X
             lower, upper = bounds.lower.unsqueeze(1), bounds.upper.unsqueeze(1)
-            room = 0.5 * (upper - lower)  # two bounds that coincide leave none
-            low = lower + torch.where(lower.isinf(), 0.0, torch.minimum(push * lower.abs().clamp(min=1.0), push * room))
-            high = upper - torch.where(upper.isinf(), 0.0, torch.minimum(push * upper.abs().clamp(min=1.0), push * room))
-            z[:, bounds.knots] = torch.minimum(torch.maximum(z[:, bounds.knots], low), high)
+            half = 0.5 * (upper - lower)  # two bounds that coincide leave no room
+            low, high = (
+                torch.where(z.isinf(), 0.0, push * torch.minimum(z.abs().clamp(min=1.0), half)) for z in (lower, upper)
+            )
+            z[:, bounds.knots] = torch.minimum(torch.maximum(z[:, bounds.knots], lower + low), upper - high)
     return X, U
 
 

@@ -62,9 +62,7 @@ class Form:
     functions: tuple[tuple[int, KnotSource], ...]  # the constraints that are traced, by their place
     boxes: bool = False  # whether there are boxes among the obstacles
 
-    def source(
-        self, parts: tuple[str, ...] = SOLVER, real: str = "double", lanes: int = LANES, more: str = ""
-    ) -> str:
+    def source(self, parts: tuple[str, ...] = SOLVER, real: str = "double", lanes: int = LANES, more: str = "") -> str:
         """The C file of one of the solvers or the sampler, for numbers of type `real`; `more` is generated code."""
         key = (*self._key, parts, real, lanes, more)
         if key not in _sources:
@@ -91,7 +89,8 @@ class Form:
         cost = Quadratic if self.cost is None else TracedCost
         shared = head(STRUCTURES, (*ENUMERATIONS, cost), CONSTANTS)
         generated = [model.code, _products(model), "" if self.cost is None else self.cost.code]
-        generated += [*dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions), *([more] if more else [])]
+        generated += [*dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions)]
+        generated += [more] if more else []
         # Without boxes their code is left out, so that it can't change how the rest is compiled.
         names = [name for name in parts if self.boxes or name not in BOXES]
         names = ["traced.c" if name == COST and self.cost is not None else name for name in names]
