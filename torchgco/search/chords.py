@@ -19,7 +19,6 @@ from torchgco.solvers.interior import InteriorPoint
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
 MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves differ by as much
-MAX_GROWTH = 5.0  # and at most this many times what the best trajectory misses: a solve that failed says nothing
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class ClearChords:
             if rows.numel() == 0:
                 return
             best.next_attempt()
-            by[rows] += torch.minimum(-MARGIN * now[rows], -MAX_GROWTH * clearance[rows]).clamp(min=MIN_GROWTH * limit)
+            by[rows] += (-MARGIN * now[rows]).clamp(min=MIN_GROWTH * limit)
             whole, old = problem.take(rows), take(best.end.best, rows)
             call = search.call.take(rows)
             call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)

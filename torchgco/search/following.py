@@ -26,7 +26,6 @@ TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
 SHORTEST = 0.05  # share of the horizon between departure and arrival
 LAST_PART = 0.1  # of the distance to the goal: the last part is approached slowly
 CUT = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
-HALVINGS = 3  # of the share of the horizon over which they are averaged
 DEPTH_POINTS = 64  # points of a path at which its depth is measured, about
 
 
@@ -188,7 +187,7 @@ def followed(
         R: mean inflated radius (B,), m.
     """
     center, B = travel(path, depart, arrive, smoothing, N), R.shape[0]
-    for _ in range(HALVINGS if B > 0 else 0):
+    while B > 0 and smoothing * N >= 2.0:
         points = center[:, :: max(1, N // DEPTH_POINTS)]
         deepest = obstacles.depth(points.reshape(B, -1, points.shape[-1])).view(B, -1, points.shape[1]).amax(-1)
         deep = deepest > CUT * R.unsqueeze(-1)
