@@ -526,7 +526,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     k->forced = tgco_choose(won & ~k->restoring, tgco_choose(k->crawls, higher, lower), k->forced);
     t->soft = tgco_choose(won, most(SET(how->soft), SET(0.1) * t->soft), t->soft);
     residuals(t, t->c, t->s, t->r);
-    for (int l = 0; l < LANES; l++) if (won[l] && !k->restoring[l]) k->failures[l] = k->failures[l] > 0 && k->forced[l] == 0 ? 0 : k->failures[l];
+    for (int l = 0; l < LANES; l++) if (won[l] && !k->restoring[l] && k->forced[l] == 0) k->failures[l] = 0;
     I lost = recover(t, k, moving & ~won);
     for (int l = 0; l < LANES; l++) if (lost[l]) { status[l] = LINE_SEARCH_FAILED; ended[l] = -1; }
     resume(t, k);
