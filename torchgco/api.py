@@ -9,7 +9,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import computing_on
 from torchgco.constraints import ControlBounds
 from torchgco.contact import warned_of_contact
-from torchgco.lagrangian import rollout
+from torchgco.native.dispatch import current, open_loop
 from torchgco.presets import named
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
@@ -51,6 +51,7 @@ def solve(
         solver = named(solver, problem)
     if not isinstance(solver, Solver):
         raise InputError("solver", "a solver, such as presets.gco(problem), or the name of a preset", shown(solver))
+    problem = current(problem)  # traced once, for the guess and for the solve
     if U0 is None:
         U0 = warm.U if warm is not None else _guess(problem)
     multipliers = None if warm is None else warm.multipliers
@@ -71,5 +72,5 @@ def _guess(problem: Problem) -> Tensor:
                 held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
                 outside[:, bounds.knots] |= (held < lower) | (held > upper)
                 middle[:, bounds.knots] = bounds.middle(held)
-        lost = ~torch.isfinite(rollout.open_loop(problem.dynamics, problem.x0, rest)).flatten(1).all(-1)
+        lost = ~torch.isfinite(open_loop(problem, rest)).flatten(1).all(-1)
         return torch.where(outside.flatten(1).any(-1).logical_or(lost).view(-1, 1, 1), middle, rest)

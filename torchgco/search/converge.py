@@ -58,18 +58,18 @@ class Converge:
             search.best.improve(rows, search.call.take(rows))
 
     def _tighten(self, search: Search) -> None:
-        best = search.best
-        rows = _unsolved(search)
+        best, rows = search.best, _unsolved(search)
+        if rows.numel() == 0:
+            return
         start = take(best.end.best, rows)
         call = search.call.take(rows)
         self._keep(search, rows, _continued(self.solver, call, start))
         lost = rows[best.end.best.violation[rows] > search.solver.violation_tolerance]
-        self._keep(search, lost, self.solver.solved(search.call.take(lost)))
+        if lost.numel() > 0:
+            self._keep(search, lost, self.solver.solved(search.call.take(lost)))
 
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
         """Keep solved trajectories, unless others arrive or cost less by more than a small violation is worth."""
-        if rows.numel() == 0:
-            return
         problem, limit = search.call.problem.take(rows), search.solver.violation_tolerance
         old, new = take(search.best.end.best, rows), end.best
         arrives = has_arrived(problem, new.X) | ~has_arrived(problem, old.X)
