@@ -48,7 +48,7 @@ CASES: dict[str, list[Callable[[], object]]] = {
     "model": [lambda: compose(["model=5"])],
     "'a=b=c'": [lambda: compose(["a=b=c"])],
     "model.vehicle": [lambda: compose(["model.vehicle=5"])],
-    "samples.redraws": [lambda: compose(["solver.passes.12.redraws=1.5"])],
+    "samples.redraws": [lambda: compose(["solver.passes.11.redraws=1.5"])],
     "solver.guidance": [
         lambda: compose(["solver=gco_paper", "solver.guidance=5"]), lambda: AugmentedLagrangian(guidance=MPPI),  # type: ignore
     ],

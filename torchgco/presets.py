@@ -46,7 +46,7 @@ def gco(space: Space) -> Restarts:
     """The default: AL-iLQR with restarts along paths of several homotopy classes, and from samples."""
     solve, proposals, samples = _parts(space)
     more = 2 * proposals.num_paths
-    closer, longer = _closer(proposals.follow[0]), _longer(proposals.follow[0])
+    closer = _closer(proposals.follow[0])
     known = replace(proposals, when="unproposed", roadmaps=(), relax_top=None)
     rough = Refine(top=4, rounds=4, violation=1e-2, cut=0.3, needed=True)
     plane = _in_the_plane(space)
@@ -58,7 +58,10 @@ def gco(space: Space) -> Restarts:
         follow=(proposals.follow[0], closer), relax_top=None if plane else 12, refine=rough, max_penetration=0.5,
         max_gap=None if plane else 0.15,
     )  # fmt: skip
-    thorough = replace(proposals, when="far", num_paths=more, follow=(longer,), relax_top=None, refine=Refine(top=more))
+    thorough = replace(
+        proposals, when="far", num_paths=more, follow=(_longer(proposals.follow[0]),), relax_top=None,
+        refine=Refine(top=more),
+    )  # fmt: skip
     return Restarts(
         local=replace(_local(space), guidance=_guidance(space)),
         passes=(
@@ -71,7 +74,6 @@ def gco(space: Space) -> Restarts:
             FromProposal(),
             IntoGoal(),
             thorough,
-            replace(known, follow=(_closer(longer),), refine=thorough.refine),
             FromProposal(),
             FromSamples("unproposed"),
             samples,
