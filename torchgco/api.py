@@ -12,6 +12,7 @@ from torchgco.contact import warned_of_contact
 from torchgco.native.dispatch import current, open_loop
 from torchgco.presets import named
 from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.rates import with_controls_before
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 
@@ -51,15 +52,19 @@ def solve(
         solver = named(solver, problem)
     if not isinstance(solver, Solver):
         raise InputError("solver", "a solver, such as presets.gco(problem), or the name of a preset", shown(solver))
-    problem = current(problem)  # traced once, for the guess and for the solve
-    if U0 is None:
-        U0 = warm.U if warm is not None else _guess(problem)
+    if U0 is None and warm is not None:
+        U0 = warm.U
+    elif U0 is None:
+        whole = with_controls_before(problem)
+        traced = current(whole)
+        problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
+        U0 = _guess(problem, traced)
     multipliers = None if warm is None else warm.multipliers
     found = solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds)
     return warned_of_contact(problem, found)
 
 
-def _guess(problem: Problem) -> Tensor:
+def _guess(problem: Problem, whole: Problem) -> Tensor:
     """Controls (B, N, m) at rest; the middle of their bounds where rest breaks these or overflows.
 
     A bound at infinity has no middle: there the other bound, or rest.
@@ -72,5 +77,5 @@ def _guess(problem: Problem) -> Tensor:
                 held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
                 outside[:, bounds.knots] |= (held < lower) | (held > upper)
                 middle[:, bounds.knots] = bounds.middle(held)
-        lost = ~torch.isfinite(open_loop(problem, rest)).flatten(1).all(-1)
+        lost = ~torch.isfinite(open_loop(whole, rest)).flatten(1).all(-1)
         return torch.where(outside.flatten(1).any(-1).logical_or(lost).view(-1, 1, 1), middle, rest)

@@ -88,7 +88,7 @@ def _task(setup: Setup, start: int, batch: int) -> Task:
 
 def limited(solver: Restarts) -> Restarts:
     """Two outer iterations, and one attempt: neither a second round of proposals nor other draws of samples."""
-    passes = (*solver.passes[:8], solver.passes[11], *solver.passes[13:])
+    passes = (*solver.passes[:8], solver.passes[10], *solver.passes[12:])
     return replace(solver, local=replace(solver.local, max_outer_iterations=2), passes=passes)
 
 

@@ -149,12 +149,13 @@ def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor,
     for bounds in problem.constraints:
         if isinstance(bounds, ControlBounds | StateBounds):
             z = U if bounds.of == "u" else X
-            lower, upper = bounds.lower.unsqueeze(1), bounds.upper.unsqueeze(1)
+            (lower, upper), size = bounds.by_knot, bounds.lower.shape[-1]
             half = 0.5 * (upper - lower)  # two bounds that coincide leave no room
             low, high = (
                 torch.where(z.isinf(), 0.0, push * torch.minimum(z.abs().clamp(min=1.0), half)) for z in (lower, upper)
             )
-            z[:, bounds.knots] = torch.minimum(torch.maximum(z[:, bounds.knots], lower + low), upper - high)
+            held = z[:, bounds.knots, :size]
+            z[:, bounds.knots, :size] = torch.minimum(torch.maximum(held, lower + low), upper - high)
     return X, U
 
 
