@@ -157,7 +157,7 @@ def fly(peer: PreparedCasADi | None, b: int, start: Start, limit: int) -> Flight
     gap = max(float((X[:, 1:] - next_states).abs().max()), float((X[:, 0] - problem.x0).abs().max()))
     violation = max(float(violation_along(problem, X, U)), gap)
     rolled = float(violation_along(problem, rollout(problem, U), U))
-    status = SOLVED if success and violation <= ADMITTED else said.replace(",", " ") or "FAILED"
+    status = SOLVED if success and violation <= ADMITTED else said if said.isidentifier() else "FAILED"
     return Flight(status, float(cost_along(problem, X, U)), violation, rolled, seconds, iterations)
 
 
