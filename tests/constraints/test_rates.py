@@ -223,12 +223,12 @@ def test_obstacles_are_searched_as_without_rates() -> None:
     model, x0 = Planar(turn_gain=10.0, turn_drag=1.0, drag=1.0), torch.zeros(2, 6, dtype=D)
     x0[1, 1] = 0.1
     free = torchgco.solve(Problem(model, cost, parts, x0, 60))
-    problem = Problem(model, cost, [*parts, RateBounds(-0.4, 0.4)], x0, 60)
+    problem = Problem(model, cost, [*parts, RateBounds(-0.6, 0.6)], x0, 60)
     with warnings.catch_warnings():
         warnings.simplefilter("error", EagerWarning)
         slow = torchgco.solve(problem)
-    assert float(changes(free.U).abs().max()) > 0.6
-    assert float(changes(slow.U).abs().max()) <= 0.4001
+    assert float(changes(free.U).abs().max()) > 0.7
+    assert float(changes(slow.U).abs().max()) <= 0.6001
     for each in (free, slow):
         assert bool(judge(problem if each is slow else Problem(model, cost, parts, x0, 60), each.U).reached.all())
 
