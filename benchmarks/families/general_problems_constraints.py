@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from math import cos
-from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -24,9 +22,7 @@ from benchmarks.families.general_problems_base import (
 )
 from benchmarks.families.general_problems_classics import GRAVITY
 from benchmarks.families.general_problems_obstacles import double_integrator, planar_quad_field, quaternion_field
-from torchgco import Constraint, ControlBounds, FunctionConstraint, FunctionCost, FunctionDynamics, Problem, StateBounds
-from torchgco.base.shapes import Dimensions
-from torchgco.costs.base import add_blocks
+from torchgco import ControlBounds, FunctionConstraint, FunctionCost, FunctionDynamics, Problem, RateBounds, StateBounds
 
 
 def landing(draw: Draws) -> Drawn:
@@ -154,35 +150,13 @@ def input_rate_state(draw: Draws) -> Drawn:
     return Drawn(Problem(FunctionDynamics(step, 3, 1, 0.05, "none"), cost, parts, x0, 120), end)
 
 
-@dataclass(frozen=True)
-class InputRate(Constraint):
-    """|u_{k+1} - u_k| <= most at the knots 0..N-2: rows that join two knots."""
-
-    most: float
-    knots: Any = None
-
-    def bind(self, dims: Dimensions) -> Self:
-        return replace(self, knots=slice(0, dims.N - 1))
-
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        change = U[:, 1:] - U[:, :-1]
-        return torch.cat((change - self.most, -change - self.most), dim=-1)
-
-    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        # H has blocks of single knots: (du_{k+1} - du_k)^2 <= 2 du_{k+1}^2 + 2 du_k^2 stands for the product of two.
-        n, m = X.shape[-1], U.shape[-1]
-        slope, curvature = g[..., :m] - g[..., m:], torch.diag_embed(2.0 * (h[..., :m] + h[..., m:]))
-        add_blocks(H[:, 1:-1], n, None, slope, None, curvature)
-        add_blocks(H[:, :-2], n, None, -slope, None, curvature)
-
-
 def input_rate_rows(draw: Draws) -> Drawn:
     """The same arm and limit with the torque as the control."""
     field = lambda x, u: arm_rates(x, u[..., 0])
     angle = draw(1.0, 2.3)
     end = draw.states(angle, 0)
     cost = toward(end, [0.1, 0.01], [0.002], [20, 2])
-    parts = [ControlBounds(-4, 4), InputRate(0.3)]
+    parts = [ControlBounds(-4, 4), RateBounds(-0.3, 0.3)]
     x0 = draw([-0.5, -0.5], [0.5, 0.5])
     return Drawn(Problem(FunctionDynamics(field, 2, 1, 0.05, "rk4"), cost, parts, x0, 120), end)
 

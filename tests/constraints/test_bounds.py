@@ -27,8 +27,7 @@ from torchgco.base.draws import DrawKey
 from torchgco.baselines import CasADiSolver
 from torchgco.judging.certificate import certify
 from torchgco.native import kernels
-from torchgco.native.dispatch import current
-from torchgco.native.dispatch import EagerWarning
+from torchgco.native.dispatch import EagerWarning, current
 
 D = torch.float64
 STEPS = 20
