@@ -57,6 +57,7 @@ from torchgco.search import Restarts as Restarts
 from torchgco.solution import Solution as Solution
 from torchgco.solvers import ILQR as ILQR
 from torchgco.solvers import AugmentedLagrangian as AugmentedLagrangian
+from torchgco.solvers import InteriorPoint as InteriorPoint
 from torchgco.solvers import LineSearch as LineSearch
 from torchgco.solvers import Polish as Polish
 from torchgco.solvers import plan_batch as plan_batch
@@ -71,7 +72,7 @@ __all__ = [  # noqa: RUF022
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules", "ControlBounds",
     "StateBounds", "RateBounds", "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # solving it
-    "solve", "Solution", "Status", "presets", "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR",
+    "solve", "Solution", "Status", "presets", "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint",
     "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",

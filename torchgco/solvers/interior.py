@@ -9,13 +9,16 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import Count, Positive, check_options
+from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import Status
-from torchgco.base.tree import copied, put
+from torchgco.base.tree import put
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
-from torchgco.native.dispatch import followed, interior_of, open_loop
-from torchgco.problem.problem import Problem
+from torchgco.native.dispatch import cost_unit, followed, interior_of, open_loop
+from torchgco.native.interior import InteriorEngine
+from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.rates import with_controls_before
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Progress, Solver
@@ -25,6 +28,7 @@ from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
 from torchgco.solvers.state import SOLVED, Iterate, SolveEnd
 
+PUSH = 1e-2  # least slack at the start, and how far guesses are moved inside of their bounds
 AT_ONCE = 256  # problems between two looks at the clock
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
 # Waechter and Biegler (2006), in whose words these have the names in brackets; where no name is given, ours.
@@ -79,6 +83,27 @@ class InteriorPoint(Solver):
         session = Session(call, RAW)
         return session.finished(self.solved(session.call), self.violation_tolerance)
 
+    def solve_from(self, problem: Problem, X0: Tensor, U0: Tensor, max_seconds: float | None = None) -> Solution:
+        """Solve from states that the controls need not lead to, such as waypoints; without kernels, from U0 alone.
+
+        Args:
+            X0: (B, N+1, n); the first states are those of the problem, whatever is given.
+            U0: (B, N, m).
+            max_seconds: as of `solve`.
+
+        Raises:
+            InputError: X0 or U0 don't fit the problem.
+        """
+        check_problem(problem)
+        check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
+        check_tensor(X0, "X0", problem.x0)
+        whole = with_controls_before(problem)
+        session = Session(Call.checked(whole, U0, max_seconds=max_seconds), RAW)
+        more = open_loop(session.call.problem, U0)[..., problem.n :]  # controls before, where their change is bounded
+        end = self.solved(session.call, torch.cat((X0, more), dim=-1))
+        found = session.finished(end, self.violation_tolerance)
+        return found if whole is problem else found.of_first_states(problem.n)
+
     def solved(self, call: Call, X0: Tensor | None = None) -> SolveEnd:
         """The solve without its verdict, in the units of the call.
 
@@ -90,7 +115,7 @@ class InteriorPoint(Solver):
         kernels = interior_of(problem)
         if kernels is None:
             return self._without_kernels().outer_loop(call)
-        X = open_loop(problem, call.U0) if X0 is None else X0.clone()
+        X = open_loop(problem, call.U0) if X0 is None else torch.cat((problem.x0.unsqueeze(1), X0[:, 1:]), dim=1)
         start = problem.x0.unsqueeze(1).expand_as(X)
         status = start_status(problem, start, problem.x0[:, 0], problem.start_is_clear)
         X = torch.where(torch.isfinite(X).flatten(1).all(-1).view(-1, 1, 1), X, start)
@@ -108,16 +133,15 @@ class InteriorPoint(Solver):
                 call.callback(Progress(1, call.rows[part], done, problem.B))
         return end
 
-    def _some(self, kernels: Any, call: Call, X: Tensor, rows: Tensor, end: SolveEnd) -> None:
+    def _some(self, kernels: InteriorEngine, call: Call, X: Tensor, rows: Tensor, end: SolveEnd) -> None:
         """Solves problems, and puts how they ended into `end` at `rows`."""
         problem, warm = call.problem, call.warm
-        X, U, push = X.contiguous(), call.U0.clone(memory_format=torch.contiguous_format), 1e-2
         if warm is None:
-            multipliers, mu = Multipliers.zero(problem, 1.0).lam, self.initial_barrier
-            X, U = inside(problem, X, U, push)
+            multipliers, mu, push = Multipliers.zero(problem, 1.0).lam, self.initial_barrier, PUSH
         else:
-            multipliers, mu, push = tuple(lam.clone() for lam in warm.lam), self.warm_barrier, self.warm_barrier
-            X, U = inside(problem, X, U, push)
+            mu = push = self.warm_barrier
+            multipliers = tuple(lam.clone(memory_format=torch.contiguous_format) for lam in warm.lam)
+        X, U = (z.contiguous() for z in inside(problem, X, call.U0, push))
         unit = torch.ones_like(X[:, 0, 0]) if call.unit is None else call.unit
         out = kernels.solve(
             problem, X, U, multipliers, torch.full_like(unit, mu), warm=int(warm is not None), factor=unit, push=push,
@@ -125,12 +149,11 @@ class InteriorPoint(Solver):
         )  # fmt: skip
         X, U = followed(problem, X, U, out["gains"][..., :-1])
         lam = tuple(_active(problem.constraints[i].sense, part, X, U, problem, i) for i, part in enumerate(multipliers))
-        found = Iterate(
-            X, U, Multipliers(lam, PENALTY / unit * torch.ones_like(unit)), problem.cost.total(X, U),
-            violation(problem, X, U),
-        )  # fmt: skip
+        penalty = PENALTY * (cost_unit(problem) if call.unit is None else torch.ones_like(unit))
+        cost = problem.cost.total(X, U)
+        found = Iterate(X, U, Multipliers(lam, penalty), cost, violation(problem, X, U))
         put(end.best, rows, found)
-        put(end.last, rows, copied(found))
+        put(end.last, rows, found)
         status = out["status"].long()
         end.status[rows] = torch.where(status == Status.CONVERGED, SOLVED, status)
         end.iterations[rows] = out["iterations"]
