@@ -19,7 +19,7 @@ from torchgco.base.draws import DrawKey
 from torchgco.base.status import Status
 from torchgco.guidance import mppi
 from torchgco.native import kernels, structures
-from torchgco.native.codegen.source import LANES, SAMPLER, SOLVER, C
+from torchgco.native.codegen.source import INTERIOR, LANES, SAMPLER, SOLVER, C
 from torchgco.native.compiler import NativeError, build, find_compiler
 from torchgco.native.declarations import Structure, defines, fields, head, load
 from torchgco.native.dispatch import engine_of
@@ -114,13 +114,13 @@ def test_an_end_is_no_status() -> None:
 def test_a_constant_changes_what_is_compiled(name: str, monkeypatch) -> None:
     engine = engine_of(boxed_batch(2, B=1, N=3)[0])
     assert engine is not None
-    for parts in (SOLVER, SAMPLER):
-        usual = engine.form._written(parts, "double", LANES)
+    for parts in (SOLVER, SAMPLER, INTERIOR):
+        usual = engine.form._written(parts, "double", LANES, "")
         with monkeypatch.context() as patch:
             patch.setitem(CONSTANTS, name, 7)
-            changed = engine.form._written(parts, "double", LANES)
+            changed = engine.form._written(parts, "double", LANES, "")
         assert changed == usual.replace(f"#define {name} {written(name)}\n", f"#define {name} 7\n") != usual
-    assert any(name in (C / file).read_text() for file in (*SOLVER, *SAMPLER)), "no line of C uses it"
+    assert any(name in (C / file).read_text() for file in (*SOLVER, *SAMPLER, *INTERIOR)), "no line of C uses it"
 
 
 def written(name: str) -> str:

@@ -8,6 +8,7 @@ import torch
 from tests.problems import planar_batch, quadrotor_batch, quick_gco
 from tests.search.rows import varied
 from torchgco import ILQR, MPPI, AugmentedLagrangian, MultiStart, PathProposals, Polish, Problem, Restarts
+from torchgco.native.interior import InteriorEngine
 from torchgco.solvers import augmented_lagrangian, ilqr
 
 BATCHES = {
@@ -52,6 +53,13 @@ def made(monkeypatch) -> list[int]:
         return moved
 
     monkeypatch.setattr(Polish, "_step", step)
+
+    def interior(self, *arguments, real=InteriorEngine.solve, **options):
+        out = real(self, *arguments, **options)
+        made.append(int(out["iterations"].sum()))
+        return out
+
+    monkeypatch.setattr(InteriorEngine, "solve", interior)
     return made
 
 

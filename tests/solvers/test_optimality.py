@@ -190,7 +190,7 @@ def test_solve_hands_the_problem_to_that_solver(monkeypatch) -> None:
 
     def note_call(self, problem, U0, **options):
         calls.append((self, U0, options))
-        return whole(replace(self, passes=self.passes[:2]), problem, U0, **options)
+        return whole(replace(self, passes=self.passes[:3]), problem, U0, **options)
 
     monkeypatch.setattr(Restarts, "solve", note_call)
     problem, U0 = planar_batch(B=2, N=25)

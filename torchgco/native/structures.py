@@ -122,7 +122,6 @@ class Interior(Structure):
     declared = (
         ("const Problem *", "of"),
         ("double *", "barrier error theta"),  # (E): mu, in and out; error of the end test and sum of residuals, out
-        ("const double *", "factor"),  # (E): of the cost
         ("int64_t", "max_iterations failures patience trials"),
         ("int32_t", "corrects warm"),
         ("double", "tolerance violation push steepest boundary central smallest restored"),

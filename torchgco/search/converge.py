@@ -63,10 +63,11 @@ class Converge:
             return
         start = take(best.end.best, rows)
         call = search.call.take(rows)
+        call = replace(call, callback=best.callback(call))
         self._keep(search, rows, _continued(self.solver, call, start))
         lost = rows[best.end.best.violation[rows] > search.solver.violation_tolerance]
         if lost.numel() > 0:
-            self._keep(search, lost, self.solver.solved(search.call.take(lost)))
+            self._keep(search, lost, self.solver.solved(replace(search.call.take(lost), callback=None)))
 
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
         """Keep solved trajectories, unless others arrive or cost less by more than a small violation is worth."""

@@ -53,7 +53,6 @@ class Call:
     outer: Tensor  # (B,) int64: outer iterations that this call continues; draws are keyed by their number
     warm: Multipliers | None
     callback: Callback | None
-    unit: Tensor | None = None  # (B,): unit of the problem's costs, None: 1
     deadline: float | None = None  # of `time.monotonic`, s; after it the solve ends with the best trajectory so far
 
     @classmethod
@@ -86,7 +85,7 @@ class Call:
             if not isinstance(warm, Multipliers):
                 raise InputError("warm", "Multipliers, such as those of a solution", type(warm).__name__)
             warm.check(problem)
-        return cls(current(problem), U0, seed, ids, rows, torch.zeros_like(rows), warm, callback, None, deadline)
+        return cls(current(problem), U0, seed, ids, rows, torch.zeros_like(rows), warm, callback, deadline)
 
     @property
     def late(self) -> bool:
@@ -97,14 +96,14 @@ class Call:
         """The same call for the problems in `index`."""
         warm = None if self.warm is None else take(self.warm, index)
         U0, ids, rows, outer = take((self.U0, self.ids, self.rows, self.outer), index)
-        part, unit = self.problem.take(index), None if self.unit is None else take(self.unit, index)
-        return type(self)(part, U0, self.seed, ids, rows, outer, warm, self.callback, unit, self.deadline)
+        part = self.problem.take(index)
+        return type(self)(part, U0, self.seed, ids, rows, outer, warm, self.callback, self.deadline)
 
     def in_cost_units(self) -> tuple[Self, Tensor]:
         """The same call with costs and multipliers in units of `Problem.cost_unit`, and these units (B,)."""
         unit = cost_unit(self.problem)
         warm = None if self.warm is None else self.warm.scaled(1.0 / unit)
-        return replace(self, problem=self.problem.in_cost_units(), warm=warm, unit=unit), unit
+        return replace(self, problem=self.problem.in_cost_units(), warm=warm), unit
 
 
 def check_ids(ids: Any, problem: Problem) -> None:

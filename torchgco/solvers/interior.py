@@ -43,7 +43,7 @@ FILTER: dict[str, Any] = {
     "shift_first": 1e-4, "shift_least": 1e-20, "shift_max": 1e20,  # delta_w: first, min, max
     "shift_decay": 1.0 / 3.0, "shift_growth": 8.0, "shift_growth_first": 100.0,  # kappa_w: minus, plus, plus-bar
     "patience": 10, "trials": 3,  # short steps before the watchdog, and its full steps
-    "corrects": 1, "steepest": 100.0, "smallest": 1e-10,  # second-order corrections; slope of the cost; step length
+    "corrects": 1, "steepest": 1.0, "smallest": 1e-10,  # second-order corrections; slopes of the cost, as scaled; step length
     "soft": 1e-8, "softest": 1e-2, "explodes": 1e6,  # dual regularisation (delta_c), raised where multipliers explode
     "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
     "shift_recovery": 1e-3, "restored": 0.9, "failures": 6,
@@ -69,7 +69,7 @@ class InteriorPoint(Solver):
         InputError: a field out of its range.
     """
 
-    tolerance: Positive = 1e-6
+    tolerance: Positive = 1e-8
     violation_tolerance: Positive = 1e-6
     max_iterations: Count = 500
     initial_barrier: Positive = 0.1
@@ -142,16 +142,14 @@ class InteriorPoint(Solver):
             mu = push = self.warm_barrier
             multipliers = tuple(lam.clone(memory_format=torch.contiguous_format) for lam in warm.lam)
         X, U = (z.contiguous() for z in inside(problem, X, call.U0, push))
-        unit = torch.ones_like(X[:, 0, 0]) if call.unit is None else call.unit
         out = kernels.solve(
-            problem, X, U, multipliers, torch.full_like(unit, mu), warm=int(warm is not None), factor=unit, push=push,
+            problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None), push=push,
             max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **FILTER,
         )  # fmt: skip
         X, U = followed(problem, X, U, out["gains"][..., :-1])
         lam = tuple(_active(problem.constraints[i].sense, part, X, U, problem, i) for i, part in enumerate(multipliers))
-        penalty = PENALTY * (cost_unit(problem) if call.unit is None else torch.ones_like(unit))
-        cost = problem.cost.total(X, U)
-        found = Iterate(X, U, Multipliers(lam, penalty), cost, violation(problem, X, U))
+        fitted = Multipliers(lam, PENALTY * cost_unit(problem))
+        found = Iterate(X, U, fitted, problem.cost.total(X, U), violation(problem, X, U))
         put(end.best, rows, found)
         put(end.last, rows, found)
         status = out["status"].long()

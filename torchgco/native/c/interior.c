@@ -366,12 +366,24 @@ static void settle(Barrier *t, Track *k, I of, int anew) {
     for (int l = 0; l < LANES; l++) if (of[l]) k->pairs[l] = 0;
 }
 
+/* The largest slope or curvature of the cost in any one variable. */
+static V steepest(const Barrier *t) {
+    const Lanes *s = &t->lanes;
+    V largest = SET(0.0), g[S], H[S * S];
+    for (int64_t k = 0; k <= s->of->N; k++) {
+        memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+        cost_expand(s, k, s->X + k * NX, k < s->of->N ? s->U + k * NU : 0, g, H);
+        for (int i = 0; i < S; i++) largest = most(most(tgco_fabs(g[i]), tgco_fabs(H[i * S + i])), largest);
+    }
+    return largest;
+}
+
 /* Lanes `of` have just been loaded: the scale of their cost, slacks and multipliers. */
 static void begin(Barrier *t, Track *k, I of) {
-    V one = SET(1.0), zero = SET(0.0), largest = zero;
+    V one = SET(1.0), zero = SET(0.0), largest;
     const Interior *how = t->how;
     const Problem *p = t->lanes.of;
-    for (int l = 0; l < LANES; l++) if (of[l]) t->scale[l] = how->factor[t->lanes.element[l]];
+    t->scale = tgco_choose(of, one, t->scale);
     t->objective = tgco_choose(of, one, t->objective);
     k->last = tgco_choose(of, zero, k->last); k->forced = tgco_choose(of, zero, k->forced);
     k->made = tgco_choose(of, zero, k->made);
@@ -385,11 +397,9 @@ static void begin(Barrier *t, Track *k, I of) {
                 if (of[l]) t->z[t->first[i] + j][l] = con->lam[t->lanes.element[l] * con->knots * con->rows + j];
     }
     for (int l = 0; l < LANES; l++) if (of[l]) t->mu[l] = how->barrier[t->lanes.element[l]];
-    settle(t, k, of, 1);
-    expand(t);
-    for (int64_t i = 0; i < (p->N + 1) * S; i++) largest = most(tgco_fabs(t->cost_slope[i]), largest);
-    V steepest = SET(how->steepest), scale = tgco_choose(largest > steepest, steepest / largest, one);
-    t->scale = tgco_choose(of & finite(scale), t->scale * scale, t->scale);
+    largest = steepest(t);
+    V scale = SET(how->steepest) / largest;
+    t->scale = tgco_choose(of & finite(scale) & (largest > zero), scale, t->scale);
     settle(t, k, of, 1);
     if (how->warm) {
         ROWS(t, 0, t->z[q] = tgco_choose(of, most(t->scale * t->z[q], t->mu / (SET(how->central) * t->s[q])), t->z[q]))
