@@ -70,7 +70,7 @@ def test_freed_slots_are_taken_by_waiting_problems(batch: str, solver: str) -> N
     problem.x0[4, 0] = torch.nan  # a waiting problem that cannot start
     seen = []
     few = SOLVERS[solver].in_slots(2).solve(problem, U0, seed=3, callback=lambda p: seen.append(p))
-    assert seen[-1].finished == 7
+    assert seen[-1].finished == seen[-1].total == 7
     seen = [p for p in seen if p.candidates is None and p.state is not None]  # of the outer loop
     assert max(p.state.rows.numel() for p in seen) == 2
     assert max(len(set(p.rows.tolist())) for p in seen) == max(p.rows.numel() for p in seen) == 2

@@ -9,13 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from torchgco.base.options import Count, check_options
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import chord_clearance, has_arrived, violation
+from torchgco.native.dispatch import interior_of
 from torchgco.search.attempts import Search
-from torchgco.search.converge import tightened
+from torchgco.search.converge import continued
 from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.state import SOLVED, SolveEnd
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
 MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves differ by as much
@@ -54,14 +57,28 @@ class ClearChords:
                 return
             best.next_attempt()
             by[rows] += (-MARGIN * now[rows]).clamp(min=MIN_GROWTH * limit)
-            whole, old = problem.take(rows), take(best.end.best, rows)
+            old = take(best.end.best, rows)
             call = search.call.take(rows)
             call = replace(call, problem=call.problem.grown(by[rows]), U0=old.U, warm=old.multipliers)
-            new = tightened(self.solver, call, best.attempt(call))
-            found = replace(new.best, violation=violation(whole, new.best.X, new.best.U))
-            now[rows] = chord_clearance(whole, found.X)
-            serves = (found.violation <= limit) & (now[rows] > clearance[rows])
-            serves &= has_arrived(whole, found.X) | ~has_arrived(whole, old.X)
-            best.replace(rows, serves, found, new)
+            new = best.attempt(call)
+            serves, now[rows] = self._kept(search, rows, new, clearance[rows])
+            if interior_of(problem) is not None:
+                tight = continued(self.solver, replace(call, callback=None), new.best)
+                least = torch.where(serves & (tight.status == SOLVED), now[rows].clamp(max=0.0), torch.inf)
+                too, clear = self._kept(search, rows, tight, least)
+                now[rows] = torch.where(too, clear, now[rows])
             clearance[rows] = torch.where(serves, now[rows], clearance[rows])
             rows = rows[clearance[rows] < 0]
+
+    def _kept(self, search: Search, rows: Tensor, new: SolveEnd, least: Tensor) -> tuple[Tensor, Tensor]:
+        """Where new trajectories of `rows` serve, with more clearance than `least`, they replace the best.
+
+        Returns where they did, and their clearances.
+        """
+        best, problem = search.best, search.call.problem.take(rows)
+        found = replace(new.best, violation=violation(problem, new.best.X, new.best.U))
+        clearance = chord_clearance(problem, found.X)
+        serves = (found.violation <= search.solver.violation_tolerance) & (clearance > least)
+        serves &= has_arrived(problem, found.X) | ~has_arrived(problem, take(best.end.best, rows).X)
+        best.replace(rows, serves, found, new)
+        return serves, clearance

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.options import check_options
 from torchgco.base.status import Status
-from torchgco.base.tree import put, take
+from torchgco.base.tree import take
 from torchgco.lagrangian.quality import has_arrived, is_preferred
 from torchgco.native.dispatch import interior_of
 from torchgco.search.attempts import Search
@@ -64,7 +64,7 @@ class Converge:
         start = take(best.end.best, rows)
         call = search.call.take(rows)
         call = replace(call, callback=best.callback(call))
-        self._keep(search, rows, _continued(self.solver, call, start))
+        self._keep(search, rows, continued(self.solver, call, start))
         lost = rows[best.end.best.violation[rows] > search.solver.violation_tolerance]
         if lost.numel() > 0:
             self._keep(search, lost, self.solver.solved(replace(search.call.take(lost), callback=None)))
@@ -84,17 +84,6 @@ def _unsolved(search: Search) -> Tensor:
     return ((status != SOLVED) & (status != Status.INVALID_START)).nonzero().flatten()
 
 
-def tightened(solver: InteriorPoint, call: Call, end: SolveEnd) -> SolveEnd:
-    """How the solves of a call end, continued by the interior point where that solves them, in place."""
-    if interior_of(call.problem) is None:
-        return end
-    new = _continued(solver, call, end.best)
-    rows = (new.status == SOLVED).nonzero().flatten()
-    put(end.best, rows, take(new.best, rows))
-    end.status[rows] = SOLVED
-    end.iterations.add_(new.iterations)
-    return end
-
-
-def _continued(solver: InteriorPoint, call: Call, start: Iterate) -> SolveEnd:
+def continued(solver: InteriorPoint, call: Call, start: Iterate) -> SolveEnd:
+    """Solves of a call from trajectories, with their multipliers."""
     return solver.solved(replace(call, U0=start.U, warm=start.multipliers), start.X)

@@ -43,7 +43,8 @@ FILTER: dict[str, Any] = {
     "shift_first": 1e-4, "shift_least": 1e-20, "shift_max": 1e20,  # delta_w: first, min, max
     "shift_decay": 1.0 / 3.0, "shift_growth": 8.0, "shift_growth_first": 100.0,  # kappa_w: minus, plus, plus-bar
     "patience": 10, "trials": 3,  # short steps before the watchdog, and its full steps
-    "corrects": 1, "steepest": 1.0, "smallest": 1e-10,  # second-order corrections; slopes of the cost, as scaled; step length
+    "corrects": 1, "smallest": 1e-10,  # second-order corrections; least step length
+    "steepest": 1.0,  # slope or curvature of the cost, to which it is scaled
     "soft": 1e-8, "softest": 1e-2, "explodes": 1e6,  # dual regularisation (delta_c), raised where multipliers explode
     "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
     "shift_recovery": 1e-3, "restored": 0.9, "failures": 6,
