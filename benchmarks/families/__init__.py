@@ -1,1 +1,1 @@
-"""Families of layouts and of ordinary problems: how often the goal is reached, and at what cost."""
+"""Families of layouts and of constrained problems: how often the goal is reached, and at what cost."""
