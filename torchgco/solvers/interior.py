@@ -109,8 +109,8 @@ class InteriorPoint(Solver):
         """The solve without its verdict, in the units of the call.
 
         Args:
-            X0: states to begin with, (B, N+1, n); None: the rollout of the call's controls, or the start held where
-                that is not finite.
+            X0: states to begin with, (B, N+1, n), of which the first isn't used; None: the rollout of the call's
+                controls, or the start held where that is not finite.
         """
         problem = call.problem
         kernels = interior_of(problem)
