@@ -174,7 +174,8 @@ def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor,
             (lower, upper), size = bounds.by_knot, bounds.lower.shape[-1]
             half = 0.5 * (upper - lower)  # two bounds that coincide leave no room
             low, high = (
-                torch.where(z.isinf(), 0.0, push * torch.minimum(z.abs().clamp(min=1.0), half)) for z in (lower, upper)
+                torch.where(at.isinf(), 0.0, push * torch.minimum(at.abs().clamp(min=1.0), half))
+                for at in (lower, upper)
             )
             held = z[:, bounds.knots, :size]
             z[:, bounds.knots, :size] = torch.minimum(torch.maximum(held, lower + low), upper - high)
