@@ -58,7 +58,7 @@ def curved(seed: int) -> Problem:
     def field(x: Tensor, u: Tensor, a: Tensor, k: Tensor) -> Tensor:
         (p, q, r), (v, w) = x.unbind(-1), u.unbind(-1)
         first = a[..., 0] * q * (2 * p).sin() + v * r.cos()
-        return torch.stack((first, v * w + a[..., 1] * r * r, w + p * q * v - 0.1 * k * r), dim=-1)
+        return torch.stack((first, v * w + a[..., 1] * r * r, w + p * q * v - 0.1 * r * k), dim=-1)
 
     def stage(x: Tensor, u: Tensor) -> Tensor:
         return (2 * x[..., 0] + u[..., 0]).cos() + x.square().sum(-1) * (1 + u[..., 1].square()) + u.square().sum(-1)

@@ -122,7 +122,7 @@ def curvature(program: Program, point: Point) -> Array:
         constrained = y @ program.gaps(w) + e @ program.equalities(w) + z @ program.inequalities(w)
         return point.scale * program.cost(w) + constrained
 
-    return torch.autograd.functional.hessian(lagrangian, torch.from_numpy(point.w)).numpy()
+    return np.asarray(torch.autograd.functional.hessian(lagrangian, torch.from_numpy(point.w)))
 
 
 def residual(at: Linear, point: Point) -> Array:
@@ -236,3 +236,8 @@ def kkt_residual(program: Program, X: Tensor, U: Tensor, e: Array, z: Array) -> 
     slope = (slope + at.G.T @ y)[split:]
     parts = (slope, at.gap, at.e, np.maximum(at.c, 0), z * at.c, np.minimum(z, 0))
     return max(float(abs(part).max(initial=0.0)) for part in parts)
+
+
+def curvature_of_cost(program: Program, w: Array) -> Array:
+    """Second derivatives of the cost by w."""
+    return np.asarray(torch.autograd.functional.hessian(program.cost, torch.from_numpy(w)))

@@ -1,0 +1,419 @@
+"""The interior point from guess to solution: optima that are known, infeasible problems, guesses, and batches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.problems import assert_same_bits
+from tests.reference.interior import Program, curvature_of_cost, kkt_residual, linear
+from torchgco import (
+    Boxes,
+    ControlBounds,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    Problem,
+    QuadraticCost,
+    RateBounds,
+    Solution,
+    Spheres,
+    StateBounds,
+    Status,
+)
+from torchgco.baselines import CasADiSolver
+from torchgco.lagrangian.rollout import open_loop
+from torchgco.native import kernels
+from torchgco.native.compiler import find_compiler
+from torchgco.solvers import interior
+from torchgco.solvers.contracts import Call
+from torchgco.solvers.interior import InteriorPoint
+
+pytestmark = [
+    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
+    pytest.mark.filterwarnings("ignore::torchgco.ContactWarning"),
+]
+
+D, INF, DT = torch.float64, torch.inf, 0.1
+SOLVED = (Status.CONVERGED, Status.FEASIBLE)
+FAST, FORCE = 0.55, 6.0  # m/s and m/s^2: limits of the flights
+IPOPT = CasADiSolver("ipopt", violation_tolerance=1e-6)
+PUSHES = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac")
+NEAR = replace(IPOPT, options={"mu_init": 1e-8, "warm_start_init_point": "yes", **dict.fromkeys(PUSHES, 1e-8)})
+
+
+# Flights against drag to rest at a target -----------------------------------------------------------------------------
+
+
+def field(x: Tensor, u: Tensor, drag: Tensor) -> Tensor:
+    """Drag falls with height, and drives a falling body to infinity in finite time."""
+    p, v = x.unbind(-1)
+    return torch.stack((v, u[..., 0] - drag * (-0.3 * p).exp() * v * v), dim=-1)
+
+
+def at_rest(x: Tensor, target: Tensor) -> Tensor:
+    return torch.stack((x[..., 0] - target, x[..., 1]), dim=-1)
+
+
+def flights(
+    B: int = 20, target: Tensor | None = None, ceiling: float | Tensor = INF, drag: Tensor | None = None, N: int = 30
+) -> Problem:
+    """Twenty different problems; the speed limit binds in some of them."""
+    k = torch.arange(B, dtype=D)
+    target = 1 + 0.1 * (k % 5) if target is None else target
+    drag = 0.2 + 0.05 * (k % 7) if drag is None else drag
+    high = torch.stack((torch.as_tensor(ceiling, dtype=D).expand(B), torch.full((B,), FAST, dtype=D)), dim=-1)
+    return Problem(
+        FunctionDynamics(field, 2, 1, DT, values={"drag": drag}),
+        QuadraticCost([0.5, 0.1], [0.2], [0.0, 0.0]),
+        [
+            FunctionConstraint(at_rest, "equality", knots=[N], values={"target": target}),
+            ControlBounds(-FORCE, FORCE),
+            StateBounds([-INF, -0.3], high),
+        ],
+        torch.stack((-0.1 * (k % 3), 0.1 * (k % 4)), dim=-1),
+        N,
+    )
+
+
+def zeros(problem: Problem) -> Tensor:
+    return torch.zeros(problem.B, problem.N, problem.m, dtype=D)
+
+
+def solved(problem: Problem, U0: Tensor | None = None, X0: Tensor | None = None, **options: Any) -> Solution:
+    """The solution from a guess of controls (none: zeros) and of states (none: their rollout)."""
+    solver = InteriorPoint(**options)
+    U0 = zeros(problem) if U0 is None else U0
+    if X0 is None:
+        return solver.solve(problem, U0)
+    end = solver.solved(Call.checked(problem, U0), X0).best
+    found = solver.solve(problem, U0)
+    return replace(found, X=end.X, U=end.U, cost=end.cost, violation=end.violation, multipliers=end.multipliers)
+
+
+def assert_solved(problem: Problem, solution: Solution, tolerance: float = 1e-6) -> None:
+    """Converged, and a rollout whose violation is small and correctly reported."""
+    assert solution.statuses == [Status.CONVERGED] * problem.B
+    X = open_loop(problem.dynamics, problem.x0, solution.U)
+    torch.testing.assert_close(solution.X, X, rtol=1e-12, atol=1e-12)
+    worst = torch.stack([part.worst(X, solution.U) for part in problem.constraints]).amax(0)
+    torch.testing.assert_close(solution.violation, worst, rtol=0, atol=1e-11)
+    torch.testing.assert_close(solution.cost, problem.cost.total(X, solution.U), rtol=1e-12, atol=0)
+    assert float(worst.max()) <= tolerance
+
+
+def test_what_is_returned_agrees_with_numpy() -> None:
+    """Rollouts of the returned controls, their cost and their violation, all computed anew."""
+    problem = flights()
+    solution = solved(problem)
+    assert_solved(problem, solution)
+    drag, target = (part["drag"] if "drag" in part else part["target"] for part in given(problem))
+    for b in range(problem.B):
+        X, cost = [problem.x0[b].numpy()], 0.0
+        U = solution.U[b, :, 0].numpy()
+        for u in U:
+            p, v = X[-1]
+            cost += 0.5 * (0.5 * p * p + 0.1 * v * v + 0.2 * u * u)
+            X.append(np.array([p + DT * v, v + DT * (u - drag[b] * np.exp(-0.3 * p) * v * v)]))
+        path = np.array(X)
+        np.testing.assert_allclose(solution.X[b].numpy(), path, rtol=1e-12, atol=1e-12)
+        assert float(solution.cost[b]) == pytest.approx(cost, rel=1e-12)
+        ends = abs(path[-1] - [target[b], 0.0])
+        worst = max(*ends, (path[1:, 1] - FAST).max(), (-0.3 - path[1:, 1]).max(), (abs(U) - FORCE).max(), 0.0)
+        assert float(solution.violation[b]) == pytest.approx(worst, abs=1e-11) and worst <= 1e-6
+    assert bool((solution.X[:, 1:, 1].amax(1) > FAST - 1e-5).any())  # the limit binds
+
+
+def given(problem: Problem) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The numbers of the default flights by name."""
+    k = np.arange(problem.B)
+    return {"drag": 0.2 + 0.05 * (k % 7)}, {"target": 1 + 0.1 * (k % 5)}
+
+
+WEAK = pytest.mark.xfail(strict=True, reason="multipliers of rows that nearly bind are returned as 0")
+
+
+@pytest.mark.parametrize("rows", ["all", pytest.param("returned", marks=WEAK)])
+@pytest.mark.parametrize(("tolerance", "limit"), [(1e-6, 1e-5), (1e-8, 1e-7)])
+def test_the_conditions_of_optimality_hold(tolerance: float, limit: float, rows: str, monkeypatch) -> None:
+    """With the multipliers of all rows, and with the returned ones."""
+    if rows == "all":
+        monkeypatch.setattr(interior, "_active", lambda sense, lam, *_: lam)
+    problem = flights(4)
+    solution = solved(problem, tolerance=tolerance, violation_tolerance=tolerance)
+    assert_solved(problem, solution, tolerance)
+    ends, *bounds = solution.multipliers.lam
+    for b in range(problem.B):
+        e, z = ends[b].flatten().numpy(), torch.cat([lam[b].flatten() for lam in bounds]).numpy()
+        program = Program(problem.take(slice(b, b + 1)))
+        assert kkt_residual(program, solution.X[b : b + 1], solution.U[b : b + 1], e, z) <= limit
+        assert abs(e).max() > 1e-2
+
+
+def test_the_last_iterations_converge_superlinearly() -> None:
+    """The barrier parameter sets the pace: two iterations together are of an order above 1."""
+    problem = flights(8)
+    best = solved(problem, tolerance=1e-11, violation_tolerance=1e-9)
+    last = int(best.iterations.max())
+    errors = torch.stack(
+        [(solved(problem, tolerance=1e-11, max_iterations=K).U - best.U).abs().amax((1, 2)) for K in range(1, last)]
+    )
+    for b in range(problem.B):
+        made = errors[: int(best.iterations[b]) - 1, b].tolist()
+        pairs = [(old, new) for old, new in zip(made, made[2:], strict=False) if old < 1e-2]
+        assert len(pairs) >= 2 and all(new < old**1.3 for old, new in pairs) and made[-1] < 1e-5
+
+
+# Optima that are known ------------------------------------------------------------------------------------------------
+
+
+def circle(angles: Tensor) -> tuple[Problem, Tensor]:
+    """Maratos' problem from points on the circle: controls of one stage, and no dynamics."""
+    problem = Problem(
+        FunctionDynamics(lambda x, u: x + 0 * u[..., :1], 1, 2, 1.0, "none"),
+        FunctionCost(lambda x, u: 2 * (u.square().sum(-1) - 1) - u[..., 0]),
+        [FunctionConstraint(lambda u: u.square().sum(-1, keepdim=True) - 1, "equality", of="u")],
+        torch.zeros(len(angles), 1, dtype=D),
+        1,
+    )
+    return problem, torch.stack((angles.cos(), angles.sin()), dim=-1).unsqueeze(1)
+
+
+def test_full_steps_near_the_circle_of_maratos() -> None:
+    """Every full step raises both cost and violation there; few iterations suffice nevertheless."""
+    problem, U0 = circle(torch.tensor([0.8, -1.5, 1.5, 2.0, -2.5], dtype=D))
+    solution = solved(problem, U0, tolerance=1e-9)
+    assert_solved(problem, solution)
+    torch.testing.assert_close(solution.cost, torch.full((5,), -1.0, dtype=D), rtol=1e-9, atol=0)
+    assert int(solution.iterations.max()) <= 15
+    ends = solution.multipliers.lam[0].flatten()
+    torch.testing.assert_close(ends, torch.full((5,), -1.5, dtype=D), rtol=1e-7, atol=0)
+
+
+def test_convergence_with_equalities_alone_is_quadratic() -> None:
+    problem, U0 = circle(torch.tensor([0.8], dtype=D))
+    errors = []
+    for K in range(1, 12):
+        u = solved(problem, U0, tolerance=1e-14, max_iterations=K).U[0, 0]
+        errors.append(float(torch.linalg.vector_norm(u - torch.tensor([1.0, 0.0], dtype=D))))
+    pairs = [(a, b) for a, b in pairwise(errors) if 1e-7 < a < 0.3]
+    assert len(pairs) >= 2 and all(b <= 5 * a * a for a, b in pairs) and errors[-1] < 1e-12
+
+
+def linear_quadratic() -> Problem:
+    """Random linear systems with bounds on controls and states, many of which bind."""
+    random = np.random.default_rng(5)
+    A = torch.from_numpy(np.eye(4) + 0.25 * random.normal(size=(8, 4, 4)))
+    by_u = torch.from_numpy(random.normal(size=(8, 4, 2)))
+
+    def step(x: Tensor, u: Tensor, A: Tensor, by_u: Tensor) -> Tensor:
+        return (A * x.unsqueeze(-2)).sum(-1) + (by_u * u.unsqueeze(-2)).sum(-1)
+
+    return Problem(
+        FunctionDynamics(step, 4, 2, 1.0, "none", values={"A": A, "by_u": by_u}),
+        QuadraticCost([1.0, 2, 0.5, 1], [0.1, 0.2], [5.0, 5, 5, 5]),
+        [ControlBounds([-0.6, -INF], [0.5, 0.7]), StateBounds([-INF, -1.2, -INF, -1.5], [1.5, INF, INF, 1.5])],
+        torch.from_numpy(random.normal(size=(8, 4))),
+        15,
+    )
+
+
+def test_linear_problems_have_the_costs_of_a_dense_program() -> None:
+    import casadi as ca
+
+    problem = linear_quadratic()
+    solution = solved(problem, tolerance=1e-10, violation_tolerance=1e-8)
+    feasible = 0
+    for b in range(problem.B):
+        program = Program(problem.take(slice(b, b + 1)))
+        w = np.zeros(problem.N * (problem.n + problem.m))
+        at, H = linear(program, w, 1.0), curvature_of_cost(program, w)
+        rows, wanted = np.concatenate((at.G, at.C)), -np.concatenate((at.gap, at.c))
+        lowest = np.where(np.arange(len(wanted)) < len(at.gap), wanted, -np.inf)
+        shapes = {"h": ca.DM(H).sparsity(), "a": ca.DM(rows).sparsity()}
+        dense = ca.conic("dense", "qpoases", shapes, {"printLevel": "none", "error_on_fail": False})
+        found = dense(h=H, g=at.slope, a=rows, lba=lowest, uba=wanted)
+        if not dense.stats()["success"]:
+            assert solution.statuses[b] not in SOLVED
+            continue
+        feasible += 1
+        cost = float(found["cost"]) + float(program.cost(torch.from_numpy(w)))
+        assert solution.statuses[b] == Status.CONVERGED and float(solution.violation[b]) <= 1e-8
+        assert float(solution.cost[b]) == pytest.approx(cost, rel=1e-9)
+    assert feasible >= 5
+
+
+def everything(B: int = 4, N: int = 20) -> Problem:
+    """Dynamics by knot, bounds by knot, limits on rates, values by problem, spheres that move, and boxes."""
+    k = torch.arange(B, dtype=D)
+    stages = torch.arange(N, dtype=D)
+
+    def push(x: Tensor, u: Tensor, drag: Tensor, wind: Tensor, k: Tensor) -> Tensor:
+        v = x[..., 2:]
+        force = u + torch.stack((wind[..., 0], 0.1 * (0.3 * (k + 0 * v[..., 0])).sin()), dim=-1)
+        return torch.cat((v, force - drag.unsqueeze(-1) * v), dim=-1)
+
+    def within(x: Tensor, room: Tensor) -> Tensor:
+        return (x[..., :2].square().sum(-1) - room).unsqueeze(-1)
+
+    centers = torch.tensor([[-0.3, 0.12], [0.5, -0.5]], dtype=D).repeat(B, 1, 1)
+    centers[1::2, 1] = torch.nan
+    limits = (2.6 - 0.05 * stages).view(1, N, 1) * torch.ones(B, 1, 2, dtype=D)
+    limits[2] *= 0.9
+    return Problem(
+        FunctionDynamics(
+            push, 4, 2, 0.15, "midpoint", slice(0, 2), values={"drag": 0.2 + 0.1 * k},
+            knot_values={"wind": 0.2 * (0.5 * stages).cos().view(1, N, 1)},
+        ),
+        QuadraticCost([1.0, 1, 0.1, 0.1], [0.1, 0.1], [100.0, 100, 10, 10], [1.2, 0.1, 0, 0]),
+        [
+            Spheres(centers, 0 * centers[..., 0] + 0.2, 0.1, [[0.03, 0.02], [0.0, 0.03]]),
+            ControlBounds(-limits, limits),
+            RateBounds(-0.8, [0.7, 0.9], previous=[0.1, 0.0]),
+            StateBounds([-INF, -INF, -0.9, -INF], [INF, INF, 0.9, 0.4], knots=slice(1, N)),
+            Boxes([[0.4, -0.1]], [[0.15, 0.1]], 0.1, [0.4]),
+            FunctionConstraint(within, values={"room": 3 - 0.5 * k}),
+        ],
+        torch.stack((-1.2 + 0.02 * k, 0 * k, 0 * k, 0 * k), dim=-1),
+        N,
+    )  # fmt: skip
+
+
+def test_all_that_a_problem_may_have_at_the_cost_of_ipopt() -> None:
+    """Among obstacles each finds a minimum of its own from a guess, but IPOPT stays at the one found here."""
+    problem = everything()
+    solution = solved(problem, tolerance=1e-8)
+    assert_solved(problem, solution)
+    continued = NEAR.prepare(problem).run_from(solution.X, solution.U)
+    assert continued.statuses == [Status.CONVERGED] * problem.B
+    torch.testing.assert_close(solution.cost, continued.cost, rtol=1e-6, atol=0)
+    binding = [float(part.value(solution.X, solution.U).max()) > -1e-6 for part in problem.constraints]
+    assert all(binding[:5])  # every kind of rows binds somewhere
+
+
+def test_flights_at_the_cost_of_ipopt() -> None:
+    problem = flights(6)
+    solution, peer = solved(problem, tolerance=1e-8), IPOPT.solve(problem, zeros(problem))
+    torch.testing.assert_close(solution.cost, peer.cost, rtol=1e-6, atol=0)
+
+
+# Infeasible problems --------------------------------------------------------------------------------------------------
+
+
+def test_infeasible_problems_end_so_and_disturb_no_other() -> None:
+    """Targets farther than the speed limit lets one fly, and targets above the ceiling."""
+    target, ceiling = torch.full((9,), 1.1, dtype=D), torch.full((9,), INF, dtype=D)
+    target[2], target[6], ceiling[3], ceiling[8] = 4.0, 2.5, 0.5, 0.9
+    problem = flights(9, target, ceiling)
+    together, failed = solved(problem), [2, 3, 6, 8]
+    assert not {together.statuses[b] for b in failed} & set(SOLVED)
+    good = torch.tensor([b for b in range(9) if b not in failed])
+    assert together.take(good).statuses == [Status.CONVERGED] * 5
+    assert_same_bits(together.take(good), solved(problem.take(good)))
+    for b in failed:
+        reach = float(problem.x0[b, 0] + DT * (problem.x0[b, 1] + (problem.N - 1) * FAST))
+        least = float(target[b]) - reach if b in (2, 6) else 0.5 * float(target[b] - ceiling[b])
+        assert 0.99 * least <= float(together.violation[b]) <= 2.02 * least + 0.02
+
+
+# Batches --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("threads")
+def test_a_result_has_the_same_bits_in_every_batch() -> None:
+    """Alone, in full and in part of the lanes, in places that others have left, in any order and on two threads."""
+    problem = flights()
+    together = solved(problem)
+    assert len(set(together.iterations.tolist())) > 2
+    for rows in ([3], [19], range(7), range(8), range(9), range(19, -1, -1), [5, 5, 5, 2, 5]):
+        index = torch.tensor(list(rows))
+        assert_same_bits(solved(problem.take(index)), together.take(index))
+    torch.set_num_threads(2)
+    assert_same_bits(solved(problem), together)
+
+
+def test_an_empty_batch_has_an_empty_solution() -> None:
+    problem = circle(torch.zeros(2, dtype=D))[0].take(torch.arange(0))
+    assert solved(problem).X.shape == (0, 2, 1) and solved(problem).statuses == []
+
+
+def test_a_problem_that_overflows_ends_alone() -> None:
+    """Where the derivatives overflow, and where the start isn't finite, beside problems that go on in other lanes."""
+    problem = flights(10)
+    drag = 0.2 + 0.05 * (torch.arange(10, dtype=D) % 7)
+    drag[3], x0 = 1e300, problem.x0.clone()
+    x0[6, 1] = torch.nan
+    broken = flights(10, drag=drag)
+    broken = Problem(broken.dynamics, broken.cost, broken.constraints, x0, broken.N)
+    solution, good = solved(broken), torch.tensor([0, 1, 2, 4, 5, 7, 8, 9])
+    assert solution.statuses[3] not in SOLVED and solution.statuses[6] == Status.NON_FINITE
+    assert_same_bits(solution.take(good), solved(problem).take(good))
+
+
+# Guesses --------------------------------------------------------------------------------------------------------------
+
+
+def line(problem: Problem) -> Tensor:
+    """States on a straight line from the start to rest at the target, (B, N+1, 2)."""
+    share = torch.linspace(0, 1, problem.N + 1, dtype=D).view(1, -1, 1)
+    end = torch.stack((torch.from_numpy(given(problem)[1]["target"]), torch.zeros(problem.B, dtype=D)), dim=-1)
+    return (1 - share) * problem.x0.unsqueeze(1) + share * end.unsqueeze(1)
+
+
+@pytest.mark.parametrize("kind", ["line", "far line", "random states", "outside of the bounds", "overflow"])
+def test_one_optimum_from_guesses_of_all_kinds(kind: str) -> None:
+    problem = flights(9)
+    random = torch.Generator().manual_seed(2)
+    X0, U0 = None, zeros(problem)
+    if kind == "line":
+        X0 = line(problem)
+    elif kind == "far line":
+        X0 = 20 * line(problem)  # the first state is no guess
+    elif kind == "random states":
+        X0 = torch.randn(problem.B, problem.N + 1, 2, generator=random, dtype=D)
+    elif kind == "outside of the bounds":
+        U0 = torch.full_like(U0, 3 * FORCE)
+    else:
+        U0 = torch.full_like(U0, -100.0)
+        assert not bool(torch.isfinite(open_loop(problem.dynamics, problem.x0, U0)).all(-1).all(-1).any())
+    best = solved(problem, tolerance=1e-8)
+    found = solved(problem, U0, X0, tolerance=1e-8)
+    assert float(found.violation.max()) <= 1e-6 and (X0 is not None or found.statuses == [Status.CONVERGED] * 9)
+    torch.testing.assert_close(found.cost, best.cost, rtol=1e-7, atol=0)
+
+
+def test_a_warm_start_takes_fewer_iterations() -> None:
+    problem = flights(9)
+    before = solved(problem)
+    moved = Problem(problem.dynamics, problem.cost, problem.constraints, problem.x0 + 0.001, problem.N)
+    cold = InteriorPoint().solve(moved, before.U)
+    warm = InteriorPoint().solve(moved, before.U, warm=before.multipliers)
+    assert_solved(moved, warm)
+    torch.testing.assert_close(warm.cost, cold.cost, rtol=1e-5, atol=0)
+    assert int(warm.iterations.sum()) <= 0.5 * int(cold.iterations.sum())
+
+
+def test_without_kernels_problems_are_solved_all_the_same() -> None:
+    problem = flights(2)
+    best = solved(problem)
+    kernels.use_native(False)
+    try:
+        found = solved(problem)
+    finally:
+        kernels.use_native(True)
+    assert set(found.statuses) <= set(SOLVED) and float(found.violation.max()) <= 1e-6
+    torch.testing.assert_close(found.cost, best.cost, rtol=1e-2, atol=0)
