@@ -116,12 +116,15 @@ class InteriorPoint(Solver):
         kernels = interior_of(problem)
         if kernels is None:
             return self._without_kernels().outer_loop(call)
-        X = open_loop(problem, call.U0) if X0 is None else torch.cat((problem.x0.unsqueeze(1), X0[:, 1:]), dim=1)
+        rollout = open_loop(problem, call.U0)
+        X = rollout if X0 is None else torch.cat((problem.x0.unsqueeze(1), X0[:, 1:]), dim=1)
         start = problem.x0.unsqueeze(1).expand_as(X)
         status = start_status(problem, start, problem.x0[:, 0], problem.start_is_clear)
         X = torch.where(torch.isfinite(X).flatten(1).all(-1).view(-1, 1, 1), X, start)
         end = SolveEnd.blank(problem, call.U0)
-        end.best.X[:] = X
+        end.best.X[:] = rollout  # where a solve never begins
+        end.best.cost[:] = problem.cost.total(rollout, call.U0)
+        end.best.violation[:] = violation(problem, rollout, call.U0)
         end.status[:] = status
         rows = (status == Status.RUNNING).nonzero().flatten()
         for part in rows.split(AT_ONCE):
