@@ -417,3 +417,21 @@ def test_without_kernels_problems_are_solved_all_the_same() -> None:
         kernels.use_native(True)
     assert set(found.statuses) <= set(SOLVED) and float(found.violation.max()) <= 1e-6
     torch.testing.assert_close(found.cost, best.cost, rtol=1e-2, atol=0)
+
+
+def test_a_start_inside_an_obstacle_has_a_status_of_its_own() -> None:
+    problem = everything()
+    x0 = problem.x0.clone()
+    x0[1, :2] = problem.constraints[0].centers[1, 0]
+    inside = Problem(problem.dynamics, problem.cost, problem.constraints, x0, problem.N)
+    solution, rest = solved(inside), torch.tensor([0, 2, 3])
+    assert solution.statuses[1] == Status.INVALID_START
+    assert_same_bits(solution.take(rest), solved(problem).take(rest))
+
+
+def test_where_no_time_is_left_the_guess_is_returned_and_not_called_feasible() -> None:
+    problem = flights(3)
+    late = InteriorPoint().solve(problem, zeros(problem), max_seconds=1e-9)
+    assert late.statuses == [Status.TIME_LIMIT] * 3 and torch.equal(late.U, zeros(problem))
+    ends = problem.constraints[0].worst(late.X, late.U)
+    torch.testing.assert_close(late.violation, ends, rtol=1e-12, atol=0)
