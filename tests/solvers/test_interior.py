@@ -62,13 +62,18 @@ def at_rest(x: Tensor, target: Tensor) -> Tensor:
     return torch.stack((x[..., 0] - target, x[..., 1]), dim=-1)
 
 
+def drags_and_targets(B: int) -> tuple[Tensor, Tensor]:
+    k = torch.arange(B, dtype=D)
+    return 0.2 + 0.05 * (k % 7), 1 + 0.1 * (k % 5)
+
+
 def flights(
     B: int = 20, target: Tensor | None = None, ceiling: float | Tensor = INF, drag: Tensor | None = None, N: int = 30
 ) -> Problem:
     """Twenty different problems; the speed limit binds in some of them."""
     k = torch.arange(B, dtype=D)
-    target = 1 + 0.1 * (k % 5) if target is None else target
-    drag = 0.2 + 0.05 * (k % 7) if drag is None else drag
+    usual = drags_and_targets(B)
+    drag, target = usual[0] if drag is None else drag, usual[1] if target is None else target
     high = torch.stack((torch.as_tensor(ceiling, dtype=D).expand(B), torch.full((B,), FAST, dtype=D)), dim=-1)
     return Problem(
         FunctionDynamics(field, 2, 1, DT, values={"drag": drag}),
@@ -94,8 +99,9 @@ def solved(problem: Problem, U0: Tensor | None = None, X0: Tensor | None = None,
     if X0 is None:
         return solver.solve(problem, U0)
     end = solver.solved(Call.checked(problem, U0), X0).best
-    found = solver.solve(problem, U0)
-    return replace(found, X=end.X, U=end.U, cost=end.cost, violation=end.violation, multipliers=end.multipliers)
+    return replace(
+        solver.solve(problem, U0), X=end.X, U=end.U, cost=end.cost, violation=end.violation, multipliers=end.multipliers
+    )
 
 
 def assert_solved(problem: Problem, solution: Solution, tolerance: float = 1e-6) -> None:
@@ -114,7 +120,7 @@ def test_what_is_returned_agrees_with_numpy() -> None:
     problem = flights()
     solution = solved(problem)
     assert_solved(problem, solution)
-    drag, target = (part["drag"] if "drag" in part else part["target"] for part in given(problem))
+    drag, target = (part.numpy() for part in drags_and_targets(problem.B))
     for b in range(problem.B):
         X, cost = [problem.x0[b].numpy()], 0.0
         U = solution.U[b, :, 0].numpy()
@@ -129,12 +135,6 @@ def test_what_is_returned_agrees_with_numpy() -> None:
         worst = max(*ends, (path[1:, 1] - FAST).max(), (-0.3 - path[1:, 1]).max(), (abs(U) - FORCE).max(), 0.0)
         assert float(solution.violation[b]) == pytest.approx(worst, abs=1e-11) and worst <= 1e-6
     assert bool((solution.X[:, 1:, 1].amax(1) > FAST - 1e-5).any())  # the limit binds
-
-
-def given(problem: Problem) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The numbers of the default flights by name."""
-    k = np.arange(problem.B)
-    return {"drag": 0.2 + 0.05 * (k % 7)}, {"target": 1 + 0.1 * (k % 5)}
 
 
 WEAK = pytest.mark.xfail(strict=True, reason="multipliers of rows that nearly bind are returned as 0")
@@ -161,10 +161,8 @@ def test_the_last_iterations_converge_superlinearly() -> None:
     """The barrier parameter sets the pace: two iterations together are of an order above 1."""
     problem = flights(8)
     best = solved(problem, tolerance=1e-11, violation_tolerance=1e-9)
-    last = int(best.iterations.max())
-    errors = torch.stack(
-        [(solved(problem, tolerance=1e-11, max_iterations=K).U - best.U).abs().amax((1, 2)) for K in range(1, last)]
-    )
+    found = [solved(problem, tolerance=1e-11, max_iterations=K) for K in range(1, int(best.iterations.max()))]
+    errors = torch.stack([(one.U - best.U).abs().amax((1, 2)) for one in found])
     for b in range(problem.B):
         made = errors[: int(best.iterations[b]) - 1, b].tolist()
         pairs = [(old, new) for old, new in zip(made, made[2:], strict=False) if old < 1e-2]
@@ -323,6 +321,25 @@ def test_infeasible_problems_end_so_and_disturb_no_other() -> None:
         assert 0.99 * least <= float(together.violation[b]) <= 2.02 * least + 0.02
 
 
+def test_an_equality_given_twice_does_no_harm_and_two_that_contradict_each_other_end() -> None:
+    plain = flights(8)
+    off = torch.zeros(8, dtype=D)
+    off[1], off[6] = 0.3, -0.1
+    target = drags_and_targets(8)[1] + off
+    again = FunctionConstraint(at_rest, "equality", knots=[plain.N], values={"target": target})
+    problem = Problem(plain.dynamics, plain.cost, [*plain.constraints, again], plain.x0, plain.N)
+    solution, once = solved(problem), solved(plain)
+    good, failed = torch.tensor([0, 2, 3, 4, 5, 7]), torch.tensor([1, 6])
+    assert solution.take(good).statuses == [Status.CONVERGED] * 6
+    torch.testing.assert_close(solution.cost[good], once.cost[good], rtol=1e-6, atol=0)
+    assert not set(solution.take(failed).statuses) & set(SOLVED)
+    least = 0.5 * off[failed].abs()
+    assert bool(
+        (solution.violation[failed] >= 0.99 * least).all() and (solution.violation[failed] <= 2.02 * least).all()
+    )
+    assert_same_bits(solved(problem.take(good)), solution.take(good))
+
+
 # Batches --------------------------------------------------------------------------------------------------------------
 
 
@@ -352,9 +369,9 @@ def test_an_empty_batch_has_an_empty_solution() -> None:
 
 
 def test_a_problem_that_overflows_ends_alone() -> None:
-    """Where the derivatives overflow, and where the start isn't finite, beside problems that go on in other lanes."""
+    """Where the derivatives overflow, and where the start isn't finite, while problems in other lanes go on."""
     problem = flights(10)
-    drag = 0.2 + 0.05 * (torch.arange(10, dtype=D) % 7)
+    drag, _ = drags_and_targets(10)
     drag[3], x0 = 1e300, problem.x0.clone()
     x0[6, 1] = torch.nan
     broken = flights(10, drag=drag)
@@ -370,7 +387,7 @@ def test_a_problem_that_overflows_ends_alone() -> None:
 def line(problem: Problem) -> Tensor:
     """States on a straight line from the start to rest at the target, (B, N+1, 2)."""
     share = torch.linspace(0, 1, problem.N + 1, dtype=D).view(1, -1, 1)
-    end = torch.stack((torch.from_numpy(given(problem)[1]["target"]), torch.zeros(problem.B, dtype=D)), dim=-1)
+    end = torch.stack((drags_and_targets(problem.B)[1], torch.zeros(problem.B, dtype=D)), dim=-1)
     return (1 - share) * problem.x0.unsqueeze(1) + share * end.unsqueeze(1)
 
 
@@ -379,10 +396,8 @@ def test_one_optimum_from_guesses_of_all_kinds(kind: str) -> None:
     problem = flights(9)
     random = torch.Generator().manual_seed(2)
     X0, U0 = None, zeros(problem)
-    if kind == "line":
-        X0 = line(problem)
-    elif kind == "far line":
-        X0 = 20 * line(problem)  # the first state is no guess
+    if "line" in kind:
+        X0 = (1 if kind == "line" else 20) * line(problem)  # the first state is no guess
     elif kind == "random states":
         X0 = torch.randn(problem.B, problem.N + 1, 2, generator=random, dtype=D)
     elif kind == "outside of the bounds":
@@ -422,7 +437,7 @@ def test_without_kernels_problems_are_solved_all_the_same() -> None:
 def test_a_start_inside_an_obstacle_has_a_status_of_its_own() -> None:
     problem = everything()
     x0 = problem.x0.clone()
-    x0[1, :2] = problem.constraints[0].centers[1, 0]
+    x0[1, :2] = torch.tensor([-0.3, 0.12])
     inside = Problem(problem.dynamics, problem.cost, problem.constraints, x0, problem.N)
     solution, rest = solved(inside), torch.tensor([0, 2, 3])
     assert solution.statuses[1] == Status.INVALID_START
@@ -433,5 +448,4 @@ def test_where_no_time_is_left_the_guess_is_returned_and_not_called_feasible() -
     problem = flights(3)
     late = InteriorPoint().solve(problem, zeros(problem), max_seconds=1e-9)
     assert late.statuses == [Status.TIME_LIMIT] * 3 and torch.equal(late.U, zeros(problem))
-    ends = problem.constraints[0].worst(late.X, late.U)
-    torch.testing.assert_close(late.violation, ends, rtol=1e-12, atol=0)
+    torch.testing.assert_close(late.violation, problem.constraints[0].worst(late.X, late.U), rtol=1e-12, atol=0)
