@@ -115,7 +115,7 @@ def test_out_of_memory_halves_the_batch(run, tmp_path, monkeypatch) -> None:
         return real(self, rows)
 
     monkeypatch.setattr(OuterLoop, "begin", begin)
-    code, _, err = run(*TINY, "solver=al_ilqr", "hydra.run.dir=out", "study.baselines=[]")
+    code, _, err = run(*TINY, "hydra.run.dir=out", "study.baselines=[]")
     assert code == 0 and "on with 1 problems at once" in err
     assert (pd.read_parquet(tmp_path / "out" / "trials.parquet").batch_size == 1).all()
 

@@ -38,6 +38,7 @@ LOOKED_AT = (0, 5, 8)  # the last one takes a lane that another problem has left
 # Without what would make a step another one than the formulae's: corrections, shifts after short steps, softer steps.
 PLAIN = FILTER | {
     "corrects": 0, "crawl": 0.0, "explodes": 1e300, "patience": 100, "tolerance": 1e-6, "violation": 1e-6, "push": 1e-2,
+    "steepest": 100.0,
 }  # fmt: skip
 
 
@@ -146,9 +147,7 @@ def iterates(
     X, U, lam, mus = X.clone(), U.clone(), tuple(part.clone() for part in lam), torch.full((B,), mu, dtype=D)
     kernels = interior_of(problem)
     assert kernels is not None
-    out = kernels.solve(
-        problem, X, U, lam, mus, factor=torch.ones(B, dtype=D), warm=int(warm), max_iterations=count, **PLAIN
-    )
+    out = kernels.solve(problem, X, U, lam, mus, warm=int(warm), max_iterations=count, **PLAIN)
     return {"X": X, "U": U, "lam": lam, "mu": mus, **out}
 
 

@@ -136,9 +136,15 @@ def begin(
     """The first iterate: slacks, multipliers (of inequalities and equalities, `warm`) and the scale of the cost."""
     w = torch.cat((X[0, 1:].flatten(), U.flatten())).numpy().copy()
     at = linear(program, w, 1.0)
-    first = abs(torch.autograd.functional.jacobian(lambda x: _stage_cost(program, x, U[0, 0]), program.problem.x0[0]))
-    largest = max(float(abs(at.slope).max()), float(first.max()))
-    scale = how["steepest"] / largest if largest > how["steepest"] else 1.0
+    first = lambda x: _stage_cost(program, x, U[0, 0])
+    derivatives = torch.autograd.functional
+    parts = [
+        torch.from_numpy(at.slope), derivatives.hessian(program.cost, torch.from_numpy(w)).diagonal(),
+        derivatives.jacobian(first, program.problem.x0[0]),
+        derivatives.hessian(first, program.problem.x0[0]).diagonal(),
+    ]  # fmt: skip
+    largest = max(float(part.abs().max()) for part in parts)
+    scale = how["steepest"] / largest if largest > 0 else 1.0
     s = np.maximum(-at.c, how["push"])
     z, e = (mu / s, np.zeros_like(at.e)) if warm is None else (scale * warm[0], scale * warm[1])
     z = np.maximum(z, mu / (how["central"] * s))
@@ -151,7 +157,7 @@ def begin(
 
 
 def _stage_cost(program: Program, x: Tensor, u: Tensor) -> Tensor:
-    """The cost of stage 0, whose slope by x counts in the scale."""
+    """The cost of stage 0, whose derivatives by x count in the scale."""
     return program.problem.cost.stage(x.unsqueeze(0), u.unsqueeze(0), 0)[0]
 
 
