@@ -70,7 +70,7 @@ class Best:
         solver: AugmentedLagrangian | None = None,
     ) -> SolveEnd:
         """A solve with progress and trace of the whole; see `AugmentedLagrangian.outer_loop`. None: by its own."""
-        call = replace(call, callback=self.callback(call))
+        call = replace(call, callback=self._callback(call))
         return (solver or self.solver).outer_loop(call, guidance, penalty, self.recorder, guide_first, by_arrival=True)
 
     def keep(self, rows: Tensor, new: SolveEnd) -> None:
@@ -89,7 +89,7 @@ class Best:
         for name in ("iterations", "outer", "guided"):
             getattr(self.end, name)[rows] += getattr(new, name)
 
-    def callback(self, call: Call) -> Callback | None:
+    def _callback(self, call: Call) -> Callback | None:
         """Reports an attempt's progress as the batch's, where all other problems have finished; it never falls."""
         if call.callback is None:
             return None

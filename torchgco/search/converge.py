@@ -62,12 +62,12 @@ class Converge:
         if rows.numel() == 0:
             return
         start = take(best.end.best, rows)
-        call = search.call.take(rows)
-        call = replace(call, callback=best.callback(call))
+        whole = replace(search.call, callback=None)  # a few iterations: not worth a report
+        call = whole.take(rows)
         self._keep(search, rows, continued(self.solver, call, start))
         lost = rows[best.end.best.violation[rows] > search.solver.violation_tolerance]
         if lost.numel() > 0:
-            self._keep(search, lost, self.solver.solved(replace(search.call.take(lost), callback=None)))
+            self._keep(search, lost, self.solver.solved(whole.take(lost)))
 
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
         """Keep solved trajectories, unless others arrive or cost less by more than a small violation is worth."""
