@@ -11,7 +11,7 @@ typedef struct {
     Lanes lanes;
     const Interior *how;
     V *y, *yn;                   /* (N+1, NX): costates of the states, and those of a full step */
-    V *gap, *gapn, *aim;         /* (N, NX): step(x, u) - x', of the iterate, of the trial, and what a step is to close */
+    V *gap, *gapn, *aim;         /* (N, NX): step(x, u) - x', of iterate and trial, and what a step is to close */
     V *H, *f;                    /* (N+1, S, S) upper triangles, (N, NJ) */
     V *cost_slope, *g[PARTS];    /* (N+1, S): cost; with J' of multipliers, of the condensed residuals, of 1 / s */
     V *P, *p, *L;                /* (N+1, NX, NX), (N+1, NX), (N, NU, NU): the Riccati recursion */
@@ -92,7 +92,7 @@ static inline void add_spheres(Barrier *t, int64_t i, int64_t k, const V *x) {
 #endif
 
 #if WITH_BOXES
-/* lam times the second derivatives of row j (DIM, DIM): the distance bends around edges and corners, not along faces. */
+/* lam times the second derivatives of row j (DIM, DIM): distances bend around edges and corners, not along faces. */
 static inline void bend_box(const Constraint *con, const Rows *rows, int64_t j, const V *x, V lam, V *curvature) {
     const V *factors = rows->bound + con->rows * 2 * DIM, *box = factors + con->rows + j * BOX_NUMBERS;
     V zero = SET(0.0), local[DIM], away[DIM], square = zero;

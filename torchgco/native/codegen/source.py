@@ -45,7 +45,7 @@ COST, BOXES = "quadratic.c", ("box.h", "boxes.c")  # or traced.c; left out where
 TERMS = ("problem.c", COST, "penalty.c", *BOXES, "knot.c")
 SOLVER = (*TERMS, "passes.c", "ilqr.c", "trajectories.c")
 SAMPLER = (*TERMS, "normal.c", "mppi.c")
-INTERIOR = (*TERMS, "interior_rows.c", "interior_step.c", "interior.c")
+INTERIOR = (*TERMS, *(f"interior{part}.c" for part in ("_rows", "_step", "_memory", "_search", "")))
 
 
 _sources: dict[tuple[Any, ...], str] = {}  # reading and joining the files takes longer than a small solve

@@ -1,0 +1,146 @@
+/* What the interior point remembers of each lane, its multipliers, and the test of its end. Names are those of the
+   paper (Waechter and Biegler 2006): theta is the sum of all residuals, phi the cost less mu times the logarithms of
+   the slacks. */
+
+typedef struct { double theta, phi; } Pair;
+
+/* What the globalisation remembers of each lane. */
+typedef struct {
+    V theta, phi, highest, lowest, last, forced, made, entered, slope, alpha;
+    Pair filter[LANES][PAIRS];
+    int pairs[LANES], failures[LANES], shortened[LANES], ahead[LANES];
+    I restoring, crawls;
+    I watching; /* a step was taken on trial; theta, phi, slope and alpha are those before it */
+} Track;
+
+static int64_t shape(Barrier *t, V *memory) {
+    const Problem *p = t->lanes.of;
+    int64_t N = p->N, rows = t->rows;
+    V *m = memory;
+    t->y = cut(&m, (N + 1) * NX); t->yn = cut(&m, (N + 1) * NX);
+    t->gap = cut(&m, N * NX); t->gapn = cut(&m, N * NX); t->aim = cut(&m, N * NX);
+    t->H = cut(&m, (N + 1) * S * S); t->f = cut(&m, N * NJ + 1);
+    t->cost_slope = cut(&m, (N + 1) * S);
+    for (int part = 0; part < PARTS; part++) t->g[part] = cut(&m, (N + 1) * S);
+    t->P = cut(&m, (N + 1) * NX * NX); t->p = cut(&m, (N + 1) * NX); t->L = cut(&m, N * NU * NU);
+    t->dx = cut(&m, (N + 1) * NX); t->du = cut(&m, N * NU);
+    t->c = cut(&m, rows); t->cn = cut(&m, rows); t->s = cut(&m, rows); t->sn = cut(&m, rows); t->z = cut(&m, rows);
+    t->r = cut(&m, rows); t->ds = cut(&m, rows); t->dz = cut(&m, rows);
+    t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
+    return m - memory;
+}
+
+static void finish_barrier(Barrier *t) { free(t->memory); free(t->first); finish(&t->lanes); }
+
+static int start_barrier(Barrier *t, const Interior *how) {
+    const Problem *p = how->of;
+    memset(t, 0, sizeof *t);
+    t->how = how;
+    if (!start(&t->lanes, p)) return 0;
+    t->first = calloc(p->constraints + 1, sizeof *t->first);
+    if (!t->first) { finish(&t->lanes); return 0; }
+    for (int64_t i = 0; i < p->constraints; i++) {
+        t->first[i] = t->rows;
+        t->rows += p->constraint[i].knots * p->constraint[i].rows;
+    }
+    int64_t count = shape(t, 0);
+    t->memory = aligned_alloc(sizeof(V), (count + 1) * sizeof(V));
+    if (!t->memory) { finish_barrier(t); return 0; }
+    memset(t->memory, 0, (count + 1) * sizeof(V));
+    shape(t, t->memory);
+    return 1;
+}
+
+static inline V most(V a, V b) { return tgco_choose((a > b) | (a != a), a, b); } /* NaN stays */
+static inline V least(V a, V b) { return tgco_choose(a < b, a, b); }
+
+/* The statement for every row q of an inequality, or of an equality. */
+#define ROWS(t, sense, ...) \
+    for (int64_t i_ = 0, q = 0; i_ < (t)->lanes.of->constraints; i_++) { \
+        const Constraint *con_ = (t)->lanes.of->constraint + i_; \
+        int64_t end_ = q + con_->knots * con_->rows; \
+        if (con_->equality != (sense)) { q = end_; continue; } \
+        for (; q < end_; q++) { __VA_ARGS__; } \
+    }
+
+/* Sum of the logarithms of the slacks, by their product: one logarithm for all rows. */
+static V logarithms(const Barrier *t, const V *s) {
+    V product = SET(1.0), exponents = SET(0.0);
+    int count = 0;
+    ROWS(t, 0, {
+        product *= s[q];
+        if (++count % 8 == 0) {
+            I bits = (I)product, exponent = ((bits >> 52) & 0x7ff) - 1023;
+            exponents += __builtin_convertvector(exponent, V);
+            product = (V)((bits & 0x000fffffffffffffLL) | 0x3ff0000000000000LL);
+        }
+    })
+    return tgco_log(product) + SET(0x1.62e42fefa39efp-1) * exponents;
+}
+
+static V size_of(const Barrier *t, const V *gap, const V *r) {
+    V sum = SET(0.0);
+    for (int64_t i = 0; i < t->lanes.of->N * NX; i++) sum += tgco_fabs(gap[i]);
+    for (int64_t q = 0; q < t->rows; q++) sum += tgco_fabs(r[q]);
+    return sum;
+}
+
+/* Multipliers ---------------------------------------------------------------------------------------------------- */
+
+/* Costates of the lanes `of` that make the Lagrangian stationary in the states; none where they are too large. */
+static void adjoin(Barrier *t, I of) {
+    const Problem *p = t->lanes.of;
+    V largest = SET(0.0), q[S];
+    memset(t->yn, 0, (p->N + 1) * NX * sizeof(V));
+    for (int64_t k = p->N; k > 0; k--) {
+        V *y = t->yn + k * NX;
+        for (int i = 0; i < S; i++) q[i] = SET(0.0);
+        if (k < p->N) tgco_pull_back(y + NX, t->f + k * NJ, q);
+        for (int i = 0; i < NX; i++) {
+            y[i] = q[i] + t->g[0][k * S + i];
+            largest = most(tgco_fabs(y[i]), largest);
+        }
+    }
+    I sound = largest <= SET(t->how->largest_multiplier);
+    for (int64_t i = 0; i < (p->N + 1) * NX; i++) t->y[i] = tgco_choose(of, tgco_if(sound, t->yn[i]), t->y[i]);
+}
+
+/* Multipliers anew for the lanes `of`: those of the central path, and none of equalities. */
+static void renew(Barrier *t, I of) {
+    ROWS(t, 0, t->z[q] = tgco_choose(of, t->mu / t->s[q], t->z[q]))
+    ROWS(t, 1, t->z[q] = tgco_choose(of, SET(0.0), t->z[q]))
+    V objective = t->objective;
+    t->objective = tgco_choose(of, SET(1.0), objective);
+    expand(t);
+    adjoin(t, of);
+    t->objective = objective;
+}
+
+/* The end test: largest slopes of the Lagrangian and residuals, both scaled as in the paper. */
+static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
+    const Problem *p = t->lanes.of;
+    V slope = SET(0.0), gap = SET(0.0), sum_y = SET(0.0), sum_z = SET(0.0), q[S];
+    for (int64_t k = 0; k <= p->N; k++) {
+        for (int i = 0; i < S; i++) q[i] = SET(0.0);
+        if (k < p->N) tgco_pull_back(t->y + (k + 1) * NX, t->f + k * NJ, q);
+        for (int i = k ? 0 : NX; i < (k < p->N ? S : NX); i++) {
+            V entry = q[i] + t->g[0][k * S + i];
+            if (i < NX) { entry -= t->y[k * NX + i]; sum_y += tgco_fabs(t->y[k * NX + i]); }
+            slope = most(tgco_fabs(entry), slope);
+        }
+    }
+    for (int64_t i = 0; i < p->N * NX; i++) gap = most(tgco_fabs(t->gap[i]), gap);
+    for (int64_t q = 0; q < t->rows; q++) { gap = most(tgco_fabs(t->r[q]), gap); sum_z += tgco_fabs(t->z[q]); }
+    V usual = SET(t->how->usual_multiplier), count = SET((double)(p->N * NX + t->rows));
+    V mean = (sum_y + sum_z) / count, mean_z = sum_z / SET((double)(t->rows ? t->rows : 1));
+    *dual = slope * usual / most(mean, usual);
+    *primal = gap;
+    *scale_z = usual / most(mean_z, usual);
+}
+
+static V complementarity(const Barrier *t, V mu) {
+    V worst = SET(0.0);
+    ROWS(t, 0, worst = most(tgco_fabs(t->s[q] * t->z[q] - mu), worst))
+    return worst;
+}
+

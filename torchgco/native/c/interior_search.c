@@ -1,0 +1,211 @@
+/* The interior point's filter and its line search (Waechter and Biegler 2006), with second-order corrections and a
+   watchdog. */
+
+/* The filter ------------------------------------------------------------------------------------------------------ */
+
+static int is_refused(const Track *k, int l, double theta, double phi) {
+    if (!(theta <= k->highest[l])) return 1;
+    for (int i = 0; i < k->pairs[l]; i++)
+        if (theta >= k->filter[l][i].theta && phi >= k->filter[l][i].phi) return 1;
+    return 0;
+}
+
+static void remember(const Barrier *t, Track *k, int l) {
+    const Interior *how = t->how;
+    Pair pair = {(1 - how->gain_theta) * k->theta[l], k->phi[l] - how->gain_phi * k->theta[l]};
+    int count = 0;
+    for (int i = 0; i < k->pairs[l]; i++) {
+        Pair old = k->filter[l][i];
+        if (old.theta < pair.theta || old.phi < pair.phi) k->filter[l][count++] = old;
+    }
+    if (count == PAIRS) { /* the oldest one is given up */
+        memmove(k->filter[l], k->filter[l] + 1, (PAIRS - 1) * sizeof(Pair));
+        count--;
+    }
+    k->filter[l][count] = pair;
+    k->pairs[l] = count + 1;
+}
+
+/* Whether a trial of lane l is accepted; `descends` where it is by the Armijo condition. `slope` is that of phi. */
+static int is_good(
+    const Barrier *t, const Track *k, int l, double alpha, double slope, double theta, double phi, int *descends) {
+    const Interior *how = t->how;
+    double old = k->theta[l], noise = 10 * __DBL_EPSILON__ * __builtin_fabs(k->phi[l]);
+    *descends = 0;
+    if (!(theta - theta == 0) || !(phi - phi == 0)) return 0;
+    if (k->restoring[l]) return theta <= (1 - how->armijo * alpha) * old;
+    if (is_refused(k, l, theta, phi)) return 0;
+    double gain = slope < 0 ? alpha * __builtin_pow(-slope, how->power_phi) : 0;
+    int switches = gain > how->switching * __builtin_pow(old, how->power_theta);
+    if (old <= k->lowest[l] && switches) {
+        *descends = 1;
+        return phi - k->phi[l] - noise <= how->armijo * alpha * slope;
+    }
+    return theta <= (1 - how->gain_theta) * old || phi - noise <= k->phi[l] - how->gain_phi * old;
+}
+
+/* The line search ------------------------------------------------------------------------------------------------- */
+
+/* The longest steps that leave a share 1 - tau of slacks and multipliers. */
+static void longest(const Barrier *t, V tau, V *primal, V *dual) {
+    *primal = *dual = SET(1.0);
+    ROWS(t, 0, {
+        V a = -tau * t->s[q] / t->ds[q], b = -tau * t->z[q] / t->dz[q];
+        *primal = tgco_choose((t->ds[q] < SET(0.0)) & (a < *primal), a, *primal);
+        *dual = tgco_choose((t->dz[q] < SET(0.0)) & (b < *dual), b, *dual);
+    })
+}
+
+/* The trial at step lengths alpha: its theta and phi. */
+static void attempt(Barrier *t, V alpha, V *theta, V *phi) {
+    Lanes *s = &t->lanes;
+    int64_t N = s->of->N;
+    for (int64_t i = 0; i < (N + 1) * NX; i++) s->Xn[i] = s->X[i] + alpha * t->dx[i];
+    for (int64_t i = 0; i < N * NU; i++) s->Un[i] = s->U[i] + alpha * t->du[i];
+    V cost = values(t, s->Xn, s->Un, t->cn, t->gapn);
+    /* A slack that the row leaves more room for takes it: theta and phi fall both. */
+    ROWS(t, 0, { V moved = t->s[q] + alpha * t->ds[q]; t->sn[q] = tgco_choose(-t->cn[q] > moved, -t->cn[q], moved); })
+    V sum = SET(0.0);
+    for (int64_t i = 0; i < N * NX; i++) sum += tgco_fabs(t->gapn[i]);
+    ROWS(t, 0, sum += tgco_fabs(t->cn[q] + t->sn[q]))
+    ROWS(t, 1, sum += tgco_fabs(t->cn[q]))
+    *theta = sum;
+    *phi = cost - t->mu * logarithms(t, t->sn);
+}
+
+/* The slope of phi along the step. */
+static V descent(const Barrier *t) {
+    const Problem *p = t->lanes.of;
+    V sum = SET(0.0);
+    for (int64_t k = 0; k <= p->N; k++) {
+        const V *slope = t->cost_slope + k * S;
+        for (int i = 0; i < NX; i++) sum += slope[i] * t->dx[k * NX + i];
+        if (k < p->N) for (int j = 0; j < NU; j++) sum += slope[NX + j] * t->du[k * NU + j];
+    }
+    ROWS(t, 0, sum -= t->mu * t->ds[q] / t->s[q])
+    return sum;
+}
+
+/* Second-order correction of the lanes `of`: a step that closes what the trial at alpha left, too. */
+static void correct(Barrier *t, I of, V alpha) {
+    for (int64_t i = 0; i < t->lanes.of->N * NX; i++)
+        t->aim[i] = tgco_choose(of, alpha * t->aim[i] + t->gapn[i], t->aim[i]);
+    ROWS(t, 0, t->r[q] = tgco_choose(of, alpha * t->r[q] + t->cn[q] + t->sn[q], t->r[q]))
+    ROWS(t, 1, t->r[q] = tgco_choose(of, alpha * t->r[q] + t->cn[q], t->r[q]))
+    expand(t);
+    solve(t);
+    solve_rows(t);
+}
+
+/* Back to the step for the iterate's own residuals. */
+static void uncorrect(Barrier *t) {
+    memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
+    residuals(t, t->c, t->s, t->r);
+    expand(t);
+    solve(t);
+    solve_rows(t);
+}
+
+static void accept(Barrier *t, I won, V alpha, V dual) {
+    Lanes *s = &t->lanes;
+    int64_t N = s->of->N;
+    V bound = SET(t->how->central), step = alpha;
+    for (int64_t i = 0; i < (N + 1) * NX; i++) {
+        s->X[i] = tgco_choose(won, s->Xn[i], s->X[i]);
+        t->y[i] = tgco_choose(won, t->y[i] + step * (t->yn[i] - t->y[i]), t->y[i]);
+    }
+    for (int64_t i = 0; i < N * NU; i++) s->U[i] = tgco_choose(won, s->Un[i], s->U[i]);
+    for (int64_t i = 0; i < N * NX; i++) t->gap[i] = tgco_choose(won, t->gapn[i], t->gap[i]);
+    ROWS(t, 1, t->z[q] = tgco_choose(won, t->z[q] + step * t->dz[q], t->z[q]))
+    ROWS(t, 0, {
+        V z = t->z[q] + dual * t->dz[q], center = t->mu / t->sn[q];
+        z = most(least(z, bound * center), center / bound);
+        t->z[q] = tgco_choose(won, z, t->z[q]);
+        t->s[q] = tgco_choose(won, t->sn[q], t->s[q]);
+    })
+    for (int64_t q = 0; q < t->rows; q++) t->c[q] = tgco_choose(won, t->cn[q], t->c[q]);
+}
+
+/* Keeps the iterate of the lanes `of`, or goes back to it. */
+static void keep(Barrier *t, I of, int back) {
+    const Lanes *s = &t->lanes;
+    int64_t N = s->of->N;
+    V *kept = t->kept;
+    struct { V *values; int64_t count; } parts[] = {
+        {s->X, (N + 1) * NX}, {t->y, (N + 1) * NX}, {s->U, N * NU}, {t->gap, N * NX},
+        {t->c, t->rows}, {t->s, t->rows}, {t->z, t->rows}};
+    for (int part = 0; part < (int)(sizeof parts / sizeof *parts); part++) {
+        V *values = parts[part].values;
+        for (int64_t i = 0; i < parts[part].count; i++, kept++)
+            if (back) values[i] = tgco_choose(of, *kept, values[i]); else *kept = tgco_choose(of, values[i], *kept);
+    }
+}
+
+/* Lanes whose steps have been short for long take some full ones on trial (the paper's watchdog). */
+static void watch(Barrier *t, Track *k, I moving, V slope, V full) {
+    I begins = moving & ~moving;
+    for (int l = 0; l < LANES; l++) {
+        if (!moving[l] || k->watching[l] || k->restoring[l] || k->shortened[l] < t->how->patience) continue;
+        begins[l] = k->watching[l] = -1;
+        k->slope[l] = slope[l]; k->alpha[l] = full[l];
+        k->ahead[l] = 0;
+    }
+    if (any(begins)) keep(t, begins, 0);
+}
+
+static void go_back(Barrier *t, Track *k, I of) {
+    keep(t, of, 1);
+    for (int l = 0; l < LANES; l++) if (of[l]) k->watching[l] = k->shortened[l] = 0;
+}
+
+/* Moves the lanes `moving` along their steps; returns those that found a step length. A lane moves as soon as it has
+   found it; what is computed for it from there on is not used. */
+static I search(Barrier *t, Track *k, I moving, V tau) {
+    const Interior *how = t->how;
+    V full, alpha, dual, theta, phi, slope = descent(t);
+    longest(t, tau, &full, &dual);
+    I none = moving & ~moving, open = moving, won = none, corrected = none;
+    alpha = full;
+    watch(t, k, moving, slope, full);
+    for (int tries = 0; any(open); tries++) {
+        attempt(t, alpha, &theta, &phi);
+        I good = none, again = none, undo = none, back = none;
+        for (int l = 0; l < LANES; l++) {
+            int descends, watching = k->watching[l] != 0;
+            if (!open[l]) continue;
+            double from = watching ? k->slope[l] : slope[l], length = watching ? k->alpha[l] : alpha[l];
+            int accepted = is_good(t, k, l, length, from, theta[l], phi[l], &descends);
+            if (watching && !accepted) {
+                int sound = theta[l] <= k->highest[l] && phi[l] - phi[l] == 0;
+                if (sound && k->ahead[l]++ < how->trials) { good[l] = -1; k->crawls[l] = 0; } else back[l] = -1;
+                continue;
+            }
+            if (accepted) {
+                if (watching) k->watching[l] = 0;
+                if (!descends && !k->restoring[l]) remember(t, k, l);
+                k->theta[l] = theta[l]; k->phi[l] = phi[l];
+                good[l] = -1;
+                k->crawls[l] = alpha[l] < how->crawl * full[l] && !watching ? -1 : 0;
+                k->shortened[l] = alpha[l] < full[l] && !watching ? k->shortened[l] + 1 : 0;
+            } else if (tries == 0 && how->corrects && !k->restoring[l] && theta[l] >= k->theta[l]) {
+                again[l] = -1;
+            } else {
+                undo[l] = corrected[l];
+                alpha[l] = 0.5 * (corrected[l] ? full[l] : alpha[l]);
+                if (alpha[l] < how->smallest) open[l] = 0;
+            }
+        }
+        if (any(good)) accept(t, good, alpha, dual);
+        if (any(back)) go_back(t, k, back);
+        won |= good | back;
+        open &= ~won;
+        if (!any(again) && !any(undo)) continue;
+        V p, d;
+        if (any(again)) correct(t, again, alpha); else uncorrect(t);
+        longest(t, tau, &p, &d);
+        alpha = tgco_choose(again, p, alpha);
+        dual = tgco_choose(again | undo, d, dual);
+        corrected = again;
+    }
+    return won;
+}
