@@ -12,6 +12,7 @@ from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import Status
 from torchgco.base.tree import put
+from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
@@ -81,6 +82,8 @@ class InteriorPoint(Solver):
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
+        if interior_of(call.problem) is None:
+            return self._without_kernels().run(call)
         session = Session(call, RAW)
         return session.finished(self.solved(session.call), self.violation_tolerance)
 
@@ -100,13 +103,15 @@ class InteriorPoint(Solver):
         check_tensor(X0, "X0", problem.x0)
         whole = with_controls_before(problem)
         session = Session(Call.checked(whole, U0, max_seconds=max_seconds), RAW)
+        if interior_of(session.call.problem) is None:
+            return self.solve(problem, U0, max_seconds=max_seconds)
         more = open_loop(session.call.problem, U0)[..., problem.n :]  # controls before, where their change is bounded
         end = self.solved(session.call, torch.cat((X0, more), dim=-1))
         found = session.finished(end, self.violation_tolerance)
         return found if whole is problem else found.of_first_states(problem.n)
 
     def solved(self, call: Call, X0: Tensor | None = None) -> SolveEnd:
-        """The solve without its verdict, in the units of the call.
+        """The solve without its verdict, in the units of the call, by native kernels.
 
         Args:
             X0: states to begin with, (B, N+1, n), of which the first isn't used; None: the rollout of the call's
@@ -114,8 +119,7 @@ class InteriorPoint(Solver):
         """
         problem = call.problem
         kernels = interior_of(problem)
-        if kernels is None:
-            return self._without_kernels().outer_loop(call)
+        assert kernels is not None
         rollout = open_loop(problem, call.U0)
         X = rollout if X0 is None else torch.cat((problem.x0.unsqueeze(1), X0[:, 1:]), dim=1)
         start = problem.x0.unsqueeze(1).expand_as(X)
@@ -151,7 +155,7 @@ class InteriorPoint(Solver):
             max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **FILTER,
         )  # fmt: skip
         X, U = followed(problem, X, U, out["gains"][..., :-1])
-        lam = tuple(_active(problem.constraints[i].sense, part, X, U, problem, i) for i, part in enumerate(multipliers))
+        lam = tuple(_active(*each, X, U) for each in zip(problem.constraints, multipliers, strict=True))
         fitted = Multipliers(lam, PENALTY * cost_unit(problem))
         found = Iterate(X, U, fitted, problem.cost.total(X, U), violation(problem, X, U))
         put(end.best, rows, found)
@@ -185,8 +189,8 @@ def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor,
     return X, U
 
 
-def _active(sense: str, lam: Tensor, X: Tensor, U: Tensor, problem: Problem, i: int) -> Tensor:
-    """The multipliers of a constraint, 0 where a row is inactive: there its slack exceeds them."""
-    if sense == "equality":
+def _active(constraint: Constraint, lam: Tensor, X: Tensor, U: Tensor) -> Tensor:
+    """The multipliers (B, K, p) of a constraint, 0 where a row is inactive: there its slack exceeds them."""
+    if constraint.sense == "equality":
         return lam
-    return torch.where(lam > -problem.constraints[i].value(X, U), lam, 0.0)
+    return torch.where(lam > -constraint.value(X, U), lam, 0.0)
