@@ -79,8 +79,8 @@ def gco(space: Space) -> Restarts:
             samples,
             IntoGoal(),
             _finish(space),
-            Converge(),
             ClearChords(),
+            Converge(),
         ),
     )
 
@@ -106,8 +106,8 @@ def gco_fast(space: Space) -> Restarts:
             FromSamples("unproposed"),
             IntoGoal(),
             _finish(space),
-            Converge(),
             ClearChords(),
+            Converge(),
         ),
     )
 

@@ -19,7 +19,7 @@ def test_an_option_is_changed_wherever_it_stands_and_nothing_else(space: int) ->
     other = with_option(solver, "ILQR.max_iterations", "doubled")
     for (name, old), (_, new) in zip(options(solver), options(other), strict=True):
         assert new == (2 * old if name == "ILQR.max_iterations" else old)
-    assert with_option(solver, "ClearChords.rounds", "doubled").passes[-1].rounds == 8
+    assert with_option(solver, "ClearChords.rounds", "doubled").passes[-2].rounds == 8
 
 
 def test_a_value_that_cannot_be_doubled_comes_nearer_to_one() -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.options import check_options
 from torchgco.base.status import Status
 from torchgco.base.tree import take
-from torchgco.lagrangian.quality import has_arrived, is_preferred
+from torchgco.lagrangian.quality import chord_clearance, has_arrived, is_preferred
 from torchgco.native.dispatch import interior_of
 from torchgco.search.attempts import Search
 from torchgco.solvers.contracts import Call
@@ -70,13 +70,18 @@ class Converge:
             self._keep(search, lost, self.solver.solved(whole.take(lost)))
 
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
-        """Keep solved trajectories, unless others arrive or cost less by more than a small violation is worth."""
+        """Keep solved trajectories, unless the old ones are better by more than a small violation is worth.
+
+        Better are those that arrive, that are clear between knots, or that cost less.
+        """
         problem, limit = search.call.problem.take(rows), search.solver.violation_tolerance
         old, new = take(search.best.end.best, rows), end.best
         arrives = has_arrived(problem, new.X) | ~has_arrived(problem, old.X)
         near = new.cost <= old.cost + WORTH * old.cost.abs()
         serves = is_preferred(problem, new, old, limit) | ((end.status == SOLVED) & arrives & near)
-        search.best.replace(rows, serves & torch.isfinite(new.cost), new, end)
+        clear = (chord_clearance(problem, new.X) >= 0) | ~(chord_clearance(problem, old.X) >= 0)
+        clear |= old.violation > limit
+        search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
 
 
 def _unsolved(search: Search) -> Tensor:
