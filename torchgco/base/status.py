@@ -18,11 +18,17 @@ class Status(IntEnum):
     INVALID_START = 7
     FEASIBLE = 8
     TIME_LIMIT = 9
+    UNBOUNDED = 10
 
     @property
     def sentence(self) -> str:
         return _SENTENCES[self]
 
+
+# Within a solve, users never see these.
+STOPPED = -1  # ended by guidance, for another attempt
+STALLED = -2  # neither the violation nor the cost of a feasible trajectory falls any more
+SOLVED = -3  # the optimality conditions hold to the solver's own tolerance
 
 _SENTENCES = {
     Status.RUNNING: "The solve has not ended.",
@@ -38,5 +44,7 @@ _SENTENCES = {
     Status.INFEASIBLE: "No iterate met the constraints, and nothing that was tried lowers the violation further; the "
     "least violated trajectory is returned. Another guess may still lead to a feasible one.",
     Status.TIME_LIMIT: "The time limit ended the solve before the trajectory was stationary or feasible.",
+    Status.UNBOUNDED: "The cost falls without end, so there is no optimum; bound the controls or states that grow, or "
+    "add a cost that keeps them small.",
     Status.INVALID_START: "The start lies inside an obstacle; nothing was solved.",
 }

@@ -1,0 +1,68 @@
+"""Costs that fall without end have a status of their own; rewards behind wide bounds don't."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco import ControlBounds, FunctionCost, FunctionDynamics, Problem, StateBounds, Status
+from torchgco.base.tree import take
+from torchgco.constraints.base import Constraint
+from torchgco.native.compiler import find_compiler
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+D, INF = torch.float64, torch.inf
+SOLVERS = "interior_point", "gco", "al_ilqr"
+
+
+def cart(x: Tensor, u: Tensor) -> Tensor:
+    return torch.stack((x[..., 1], u[..., 0]), dim=-1)
+
+
+def problem(stage, terminal, *constraints: Constraint) -> Problem:
+    x0 = torch.tensor([[-0.1, 0.0], [-0.2, 0.0]], dtype=D)
+    return Problem(FunctionDynamics(cart, 2, 1, 0.1), FunctionCost(stage, terminal), constraints, x0, 20)
+
+
+def linear(*constraints: Constraint) -> Problem:
+    return problem(lambda x, u: x[..., 0] + 0.5 * u[..., 0], lambda x: x[..., 0], *constraints)
+
+
+def away(*constraints: Constraint) -> Problem:
+    return problem(lambda x, u: 0.01 * u[..., 0].square() - x[..., 0].square(), lambda x: 0 * x[..., 0], *constraints)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("form", [linear, away], ids=["linear", "negative definite"])
+def test_costs_without_an_end(solver: str, form) -> None:
+    for free in ((), (ControlBounds(-INF, 5.0), StateBounds([-INF, -INF], [INF, 1e3]))):
+        given = form(*free)
+        found = torchgco.solve(given, torch.full((2, 20, 1), -0.1, dtype=D), solver)
+        assert found.statuses == [Status.UNBOUNDED] * 2, found
+        assert float(found.cost.max()) < -1e6
+    alone = torchgco.solve(given.take(torch.tensor([1])), torch.full((1, 20, 1), -0.1, dtype=D), solver)
+    assert torch.equal(alone.U, take(found, torch.tensor([1])).U)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_costs_that_end_far_below(solver: str) -> None:
+    """Linear and concave costs whose bounds are reached after a fall of many millions."""
+    wide = ControlBounds(-1e9, 1e9)
+    for form, guess in ((linear(wide), 0.0), (away(wide, StateBounds([-1e7, -INF], [1e7, INF])), -0.1)):
+        found = torchgco.solve(form, torch.full((2, 20, 1), guess, dtype=D), solver)
+        assert Status.UNBOUNDED not in found.statuses, found
+        assert float(found.cost.max()) < -1e8, found
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_reward_far_away(solver: str) -> None:
+    """The cost of the guess, and its slopes there, are tiny; the reward isn't, but it has an end."""
+
+    def reward(x: Tensor) -> Tensor:
+        return -(-0.5 * (x[..., 0] - 7.0).square()).exp()
+
+    form = problem(lambda x, u: reward(x) + 1e-14 * u[..., 0].square(), reward)
+    found = torchgco.solve(form, torch.full((2, 20, 1), 0.1, dtype=D), solver)
+    assert Status.UNBOUNDED not in found.statuses, found

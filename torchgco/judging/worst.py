@@ -1,0 +1,42 @@
+"""Which row of which constraint a trajectory violates most, and where its states are lost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint
+from torchgco.problem.problem import Problem
+
+NONE = -1  # the place of what isn't there
+
+
+def worst_rows(problem: Problem, X: Tensor, U: Tensor) -> dict[str, list[Any]]:
+    """The columns of `Solution.worst_rows` for X (B, N+1, n), U (B, N, m); NaN violates most."""
+    lost = ~torch.isfinite(X).all(-1)
+    first = torch.where(lost.any(-1), lost.long().argmax(-1), NONE)
+    largest = X.new_zeros(problem.B)
+    place = torch.full((3, problem.B), NONE, device=X.device)
+    for number, constraint in enumerate(problem.constraints):
+        rows = constraint.violation(X, U)
+        if rows.shape[0] == 0 or rows[0].numel() == 0:
+            continue
+        most, at = rows.nan_to_num(torch.inf, torch.inf).flatten(1).max(-1)
+        knots = torch.arange(problem.N + 1, device=X.device)[constraint.knots]
+        more = most > largest
+        found = torch.stack((torch.full_like(at, number), knots[at // rows.shape[-1]], at % rows.shape[-1]))
+        place, largest = torch.where(more, found, place), torch.where(more, most, largest)
+    where, knot, row = place.tolist()
+    names = [_name(problem.constraints[i]) if i != NONE else "" for i in where]
+    return {
+        "constraint": where, "name": names, "knot": knot, "row": row, "violation": largest.tolist(),
+        "lost_at": first.tolist(),
+    }  # fmt: skip
+
+
+def _name(constraint: Constraint) -> str:
+    """The user's name of a constraint, else its kind."""
+    given = getattr(constraint, "name", None)
+    return given if isinstance(given, str) and given != "constraint" else type(constraint).__name__

@@ -1,0 +1,49 @@
+"""Whether the violation of trajectories can't be lowered any further from where they are."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.base.status import Status
+from torchgco.lagrangian.expansion import linearise
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
+from torchgco.native.dispatch import cost_unit
+from torchgco.problem.problem import Problem
+from torchgco.solvers.ilqr import ILQR, descend
+from torchgco.solvers.riccati import backward
+
+HEAVY = 1e11  # penalty beside which a cost of one unit counts for nothing
+STUCK = 1e-3  # share of the squared violation that one Gauss-Newton step could save: about 1 where it can be closed
+LEAST = 1e-9  # regularisation of that step, as a share of the largest entry of its Hessians
+SEARCH = ILQR(max_iterations=200, tolerance=1e-12)
+
+
+def least_violation(problem: Problem, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Controls whose violation is locally least in squares, from U (B, N, m).
+
+    Returns:
+        X, U of the descent, and whether its end is a stationary point of the violation, (B,) bool. A problem without a
+        feasible trajectory ends at one; other problems may do so too, from some guesses.
+    """
+    cost_unit(problem)
+    given = Multipliers.zero(problem, HEAVY)
+    end, status = descend(SEARCH, Lagrangian(problem.in_cost_units(), given, None, phr=True), U)
+    failed = (status == Status.NON_FINITE) | (status == Status.NOT_POSITIVE_DEFINITE)
+    return end.X, end.U, ~failed & (left_to_close(problem, end.X, end.U) <= STUCK)
+
+
+def left_to_close(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The share (B,) of the squared violation that one Gauss-Newton step is predicted to save; NaN without any."""
+    s = problem.n + 1 + problem.m
+    H, squares = X.new_zeros(*X.shape[:2], s, s), X.new_zeros(X.shape[0])
+    for constraint in problem.constraints:
+        c = constraint.value(X, U)
+        if constraint.sense == "inequality":
+            c = c.clamp(min=0.0)
+        constraint.accumulate(X, U, c, (c != 0).to(c.dtype), H)
+        squares = squares + 0.5 * c.square().sum(-1).sum(-1)
+    H = H.transpose(0, 1)
+    step = backward(linearise(problem, X, U), H, LEAST * H.abs().amax(dim=(0, 2, 3)))
+    saved = -step.expected_change(torch.ones_like(squares)) / squares
+    return torch.where(step.failed, torch.nan, saved)
