@@ -5,3 +5,4 @@ from torchgco.constraints.base import FunctionConstraint as FunctionConstraint
 from torchgco.constraints.bounds import ControlBounds as ControlBounds
 from torchgco.constraints.bounds import RateBounds as RateBounds
 from torchgco.constraints.bounds import StateBounds as StateBounds
+from torchgco.constraints.separation import Separation as Separation

@@ -18,6 +18,9 @@ from torchgco.base.tree import PerElement
 from torchgco.base.values import asks_for_knot, bound_values
 from torchgco.costs.base import add_blocks
 
+CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
+TOUCH = 1.0 - CONTACT_FACTOR  # the same, as a share beneath the full surface
+
 Sense = Literal["inequality", "equality"]
 Knots = slice | Sequence[int] | Tensor
 
@@ -32,6 +35,11 @@ class Constraint(PerElement):
     sense: Sense = "inequality"
     geometric: bool = False
     knots: Any  # a slice, or an int64 tensor (K,), once bound
+
+    @property
+    def bare(self) -> Constraint:
+        """The constraint that a solver's form of it stands for; itself where it is none."""
+        return self
 
     def bind(self, dims: Dimensions) -> Self:
         """The constraint checked and shaped for one problem; called once, by Problem."""
@@ -85,7 +93,7 @@ def resolve_knots(knots: Knots, last: int, field: str, device: torch.device) -> 
         InputError: no knot, a repeated knot, a knot that is no whole number or outside 0..last.
     """
     try:
-        chosen = list(range(last + 1)[knots]) if isinstance(knots, slice) else [_whole(k) for k in knots]
+        chosen = list(range(last + 1)[knots]) if isinstance(knots, slice) else [whole(k) for k in knots]
     except (TypeError, ValueError):
         raise InputError(field, "a slice, or a list of whole numbers", shown(knots)) from None
     if not isinstance(knots, slice):
@@ -99,7 +107,7 @@ def resolve_knots(knots: Knots, last: int, field: str, device: torch.device) -> 
     return torch.tensor(chosen, device=device)
 
 
-def _whole(k: Any) -> int:
+def whole(k: Any) -> int:
     """An int, or an integer of NumPy or PyTorch; TypeError for all else, a mask's True among it."""
     if isinstance(k, bool) or (isinstance(k, Tensor) and k.dtype == torch.bool):
         raise TypeError

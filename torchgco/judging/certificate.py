@@ -21,11 +21,13 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape, check_tensor, computing_on
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance
 from torchgco.judging.judge import by_kind, segment_distance
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem, check_problem
 
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
@@ -36,19 +38,22 @@ ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) 
 class Certificate:
     """One value per problem, (B,); NaN for problems that were not asked for, and where X or U isn't finite."""
 
-    # Largest |x_{k+1} - step(x_k, u_k)| and |X_0 - x_0| over all states, in their units. A residual of rounding size
-    # (1e-12 in float64) proves that X is the planning model's rollout of U; it says nothing about the model's quality.
+    # Largest |x_{k+1} - step(x_k, u_k)| and, where the start isn't free, |X_0 - x_0| over all states, in their units. A
+    # residual of rounding size (1e-12 in float64) proves that X is the planning model's rollout of U; it says nothing
+    # about the model's quality.
     dynamics_residual: Tensor
     # Smallest distance to the surface of the full r_obs + r_veh (of a box: grown by r + r_veh, where r rounds it) from
     # the first knot to the last, or a lower bound of it, m; infinite without obstacles. At 0 or more, no obstacle is
-    # touched between the knots either, under the conditions that `certify` states.
+    # touched between the knots either, under the conditions that `certify` states. The same of positions that keep a
+    # distance, with both paths.
     clearance: Tensor
     # Largest excess over control and state bounds, in their units; 0 proves that they hold at every knot.
     bound_violation: Tensor
-    # Largest component of the Lagrangian's gradient with respect to U, with the multipliers (inequalities: at least 0)
-    # that make it smallest in the least-squares sense, as a share of the largest terms that cancel in the gradient of
-    # J_var with respect to the same control: no unit of cost or control changes it. Near 0 it proves a stationary point
-    # to first order, not a minimum, and says nothing about rows that are violated.
+    # Largest component of the Lagrangian's gradient with respect to U, and to what is free in the start, with the
+    # multipliers (inequalities: at least 0) that make it smallest in the least-squares sense, as a share of the largest
+    # terms that cancel in the gradient of J_var with respect to the same control: no unit of cost or control changes
+    # it. Near 0 it proves a stationary point to first order, not a minimum, and says nothing about rows that are
+    # violated.
     kkt_residual: Tensor
 
 
@@ -93,7 +98,7 @@ def _certified(problem: Problem, X: Tensor, U: Tensor, asked: Tensor) -> Certifi
     for b in (asked & finite).nonzero().flatten():
         # One at a time: no number depends on the other problems, and memory stays that of one problem.
         row = b.view(1)
-        part, x, u = problem.take(row), X[row], U[row]
+        part, x, u = within_horizons(problem.take(row)), X[row], U[row]
         columns[:, b] = torch.stack(
             (_dynamics_residual(part, x, u), _clearance(part, x, u), _bound_violation(part, x, u), _kkt(part, x, u))
         )
@@ -112,7 +117,10 @@ def frame_columns(certificate: Certificate) -> dict[str, Any]:
 
 def _dynamics_residual(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     gap = (X[:, 1:] - problem.along.step(X[:, :-1], U)).abs().amax()
-    return torch.maximum(gap, (X[:, 0] - problem.x0).abs().amax())
+    moved = (X[:, 0] - problem.x0).abs()
+    if problem.free_start is not None:
+        moved = moved.masked_fill(problem.free_start, 0.0)
+    return torch.maximum(gap, moved.amax())
 
 
 def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
@@ -127,12 +135,27 @@ def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 
 def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    nearest = X.new_full((), torch.inf)
+    nearest, states = X.new_full((), torch.inf), torch.arange(problem.n, device=X.device)
+    own = int(problem.stages[0])  # the chords after them are points
     for obstacles in problem.obstacles:
+        position = states[problem.position]
         if not bool(obstacles.absent.all()):
-            path = by_kind(CHORDS, obstacles)(obstacles, X[0]) - _bulge(problem, X, U).unsqueeze(-1)
-            nearest = torch.minimum(nearest, path[:, ~obstacles.absent[0]].amin())
+            path = by_kind(CHORDS, obstacles)(obstacles, X[0]) - _bulge(problem, X, U, position).unsqueeze(-1)
+            nearest = torch.minimum(nearest, path[:own, ~obstacles.absent[0]].amin())
+    for apart in (constraint.bare for constraint in problem.constraints):
+        if isinstance(apart, Separation):
+            nearest = torch.minimum(nearest, _separation(apart, problem, X, U))
     return nearest
+
+
+def _separation(apart: Separation, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """Smallest distance of a pair, or a lower bound of it, less the one to keep, (), m."""
+    bulges = [_bulge(problem, X, U, at) for at in apart.positions]
+    paths = []
+    for i, j in apart.pairs.tolist():
+        away = X[0][:, apart.positions[i]] - X[0][:, apart.positions[j]]
+        paths.append((segment_distance(away[:-1], away[1:]) - bulges[i] - bulges[j])[: int(problem.stages[0])])
+    return torch.stack(paths).amin() - apart.min_distance[0]
 
 
 def _sphere_chords(spheres: BoundSpheres, X: Tensor) -> Tensor:
@@ -152,28 +175,26 @@ def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
 
 # By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, or lower
 # bounds of them.
-CHORDS: dict[type[Obstacles], Callable[[Any, Tensor], Tensor]] = {
+CHORDS: dict[type[Constraint], Callable[[Any, Tensor], Tensor]] = {
     BoundSpheres: _sphere_chords,
     BoundBoxes: _box_chords,
 }
 
 
-def _bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """How far the path may leave the chord of each interval, (N,), m."""
+def _bulge(problem: Problem, X: Tensor, U: Tensor, at: Tensor) -> Tensor:
+    """How far the path of the states `at` (d,) may leave the chord of each interval, (N,), m."""
     dynamics = problem.along
     if dynamics.integrator not in ("midpoint", "rk4"):
         return X.new_zeros(problem.N)
     half = X[:, :-1] + 0.5 * dynamics.dt * dynamics.field(X[:, :-1], U)
-    samples = torch.stack([_acceleration(problem, x, U) for x in (X[:, :-1], half, X[:, 1:])])  # (3, N, d)
+    samples = torch.stack([_acceleration(problem, x, U, at) for x in (X[:, :-1], half, X[:, 1:])])  # (3, N, d)
     change = samples.diff(dim=0).norm(dim=-1).amax(0)
     return dynamics.dt**2 / 8.0 * (samples.norm(dim=-1).amax(0) + change)
 
 
-def _acceleration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """Second time derivative (N, d) of the position at x (1, N, n), u (1, N, m): d field_p / dx times field."""
-    at = problem.dynamics.position
-    assert at is not None  # or there would be no obstacles
-    d = at.stop - at.start
+def _acceleration(problem: Problem, X: Tensor, U: Tensor, at: Tensor) -> Tensor:
+    """Second time derivative (N, d) of the states `at` at x (1, N, n), u (1, N, m): d field_at / dx times field."""
+    d = len(at)
     twins = problem.along.take(torch.zeros(d, dtype=torch.int64, device=X.device))
     u = U.repeat(d, 1, 1)
     (slopes,) = gradients(lambda x: twins.field(x, u)[..., at].diagonal(dim1=0, dim2=2), X.repeat(d, 1, 1))
@@ -184,11 +205,13 @@ def _kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     cost = _local(problem.cost.total, X, U)
     active = _active_rows(problem, X, U)
     gX, gU = (torch.cat([cost[i], *(rows[i] for _, rows in active)]) for i in (0, 1))
-    reduced, terms = _reduced(problem, X, U, gX, gU)
-    slopes = reduced.flatten(1).cpu().numpy()
+    reduced, terms, start = _reduced(problem, X, U, gX, gU)
+    free = torch.zeros_like(X[0, 0], dtype=torch.bool) if problem.free_start is None else problem.free_start[0]
+    slopes = torch.cat((reduced.flatten(1), start[0][:, free]), dim=1).cpu().numpy()
     senses = [equality for equality, (rows, _) in active for _ in rows]
-    rest = X.new_tensor(_fit(slopes[0], slopes[1:], np.array(senses, dtype=bool))).abs().view_as(U[0]).amax(0)
-    scale = terms.amax(0)
+    rest = X.new_tensor(_fit(slopes[0], slopes[1:], np.array(senses, dtype=bool))).abs()
+    rest = torch.cat((rest[: U[0].numel()].view_as(U[0]).amax(0), rest[U[0].numel() :]))
+    scale = torch.cat((terms.amax(0), start[1][free]))
     scale = torch.maximum(scale, NEGLIGIBLE * scale.amax())
     return torch.where(rest > 0, rest / scale, 0.0).amax()
 
@@ -241,19 +264,23 @@ def _local(rows: Any, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
     return gX, gU
 
 
-def _reduced(problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor) -> tuple[Tensor, Tensor]:
+def _reduced(
+    problem: Problem, X: Tensor, U: Tensor, gX: Tensor, gU: Tensor
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
     """Total derivatives (q, N, m) with respect to U, by the adjoint recursion through the dynamics for q rows at once.
 
-    Also, for the first row, the sums (N, m) of the magnitudes of its terms.
+    Also, for the first row, the sums (N, m) of the magnitudes of its terms; and both with respect to the start, (q, n)
+    and (n,).
     """
     n, N = problem.n, problem.N
     twins = problem.along.take(torch.zeros(n, dtype=torch.int64, device=X.device))
     x, u = X[:, :-1].repeat(n, 1, 1), U.repeat(n, 1, 1)
     fx, fu = gradients(lambda x, u: twins.step(x, u).diagonal(dim1=0, dim2=2), x, u)  # (n, N, n), (n, N, m)
-    total, terms = torch.empty_like(gU), torch.empty_like(gU[0])
+    total, terms, of_start = torch.empty_like(gU), torch.empty_like(gU[0]), torch.empty_like(gX[0, 0])
     adjoint = gX[:, N]
     for k in range(N - 1, -1, -1):
         total[:, k] = gU[:, k] + adjoint @ fu[:, k]
         terms[k] = gU[0, k].abs() + adjoint[0].abs() @ fu[:, k].abs()
+        of_start = gX[0, k].abs() + adjoint[0].abs() @ fx[:, k].abs()
         adjoint = gX[:, k] + adjoint @ fx[:, k]
-    return total, terms
+    return total, terms, (adjoint, of_start)

@@ -15,10 +15,12 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape, computing_on, tensor
+from torchgco.constraints.base import CONTACT_FACTOR, Constraint
+from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.spheres import CONTACT_FACTOR, BoundSpheres
+from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem, check_problem
 
@@ -35,8 +37,8 @@ class Verdict:
     cost: Tensor  # J_var
     violation: Tensor  # largest violation of the planning problem, full radii; lengths in metres
     # Smallest distance, m, to a surface of 0.95 (r_obs + r_veh), of a box grown by 0.95 (r + r_veh), where r rounds it,
-    # at the knots; infinite without obstacles. A constraint given as a function has no distance: its rows count only as
-    # violations.
+    # at the knots; of positions that keep a distance from each other, above 0.95 of it; infinite without either. A
+    # constraint given as a function has no distance: its rows count only as violations.
     clearance_knots: Tensor
     clearance: Tensor  # the same along the straight segments between the knots
     goal_distance: Tensor  # m, last knot to goal, positions only
@@ -63,19 +65,26 @@ def near_best(cost: Any, best: Any) -> Any:
 
 
 def judge(
-    problem: Problem, U: Tensor, goal: Tensor | None = None, goal_radius: Tensor | float | None = None
+    problem: Problem,
+    U: Tensor,
+    goal: Tensor | None = None,
+    goal_radius: Tensor | float | None = None,
+    start: Tensor | None = None,
 ) -> Verdict:
-    """Judge controls U (B, N, m) by their rollout from x0.
+    """Judge controls U (B, N, m) by their rollout from the start.
 
     Args:
         problem: the planning problems, float64.
         U: controls; NaN where a solver returned none: such a problem is neither feasible nor reached.
         goal: positions (B, d) or (d,), m. None: the problem's goal.
         goal_radius: number or (B,), m, above 0. None: that of the problem's goal.
+        start: (B, n), the starts found, such as `solution.X[:, 0]`, where some are free. One that differs from x0 in a
+            component that isn't free is not feasible. None: x0, where none is free.
 
     Raises:
-        InputError: U, goal or radius don't fit the problem, the problem isn't float64, the dynamics have no position,
-            no goal is given and the problem has none, or obstacles are of a kind that can't be judged.
+        InputError: U, goal, radius or start don't fit the problem, the problem isn't float64, the dynamics have no
+            position, no goal is given and the problem has none, starts are free and none are given, or obstacles are of
+            a kind that can't be judged.
     """
     check_problem(problem)
     problem.check_controls(U, "U")
@@ -85,13 +94,35 @@ def judge(
         raise InputError("dynamics.position", "a model with a position", type(problem.dynamics).__name__)
     with computing_on(problem.x0.device):
         center, radius = _goal(problem, goal, goal_radius)
-        X = [problem.x0]
+        first = _start(problem, start)
+        X, moved = [first], _moved(problem, first)
         cost = torch.zeros_like(problem.x0[:, 0])
         for k in range(problem.N):
-            cost = cost + problem.cost.stage(X[-1], U[:, k], k)
-            X.append(problem.dynamics.at(k).step(X[-1], U[:, k]))
+            runs, x = k < problem.stages, X[-1]
+            cost = cost + torch.where(runs, problem.cost.stage(x, U[:, k], k), 0.0)
+            X.append(torch.where(runs.unsqueeze(-1), problem.dynamics.at(k).step(x, U[:, k]), x))
         cost = cost + problem.cost.terminal(X[-1])
-        return _verdict(problem, torch.stack(X, dim=1), U, cost, center, radius)
+        return _verdict(problem, torch.stack(X, dim=1), U, cost, center, radius, moved)
+
+
+def _start(problem: Problem, start: Any) -> Tensor:
+    """Where the rollout begins, (B, n)."""
+    free = problem.free_start
+    if start is None:
+        if free is not None and bool(free.any()):
+            raise InputError("start", "the starts found, such as solution.X[:, 0], as some are free", "None")
+        return problem.x0
+    start = tensor(start, "start", problem.x0)
+    check_shape(start, (problem.B, problem.n), "start")
+    return start
+
+
+def _moved(problem: Problem, start: Tensor) -> Tensor:
+    """The largest change (B,) of a component of the start that is given."""
+    if start is problem.x0:
+        return torch.zeros_like(start[:, 0])
+    change = (start - problem.x0).abs()
+    return (change if problem.free_start is None else change.masked_fill(problem.free_start, 0.0)).amax(-1)
 
 
 def _goal(problem: Problem, center: Any, radius: Any) -> tuple[Tensor, Tensor]:
@@ -120,14 +151,16 @@ def _own_goal(problem: Problem) -> Goal:
     return problem.goal
 
 
-def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor, radius: Tensor | float) -> Verdict:
+def _verdict(
+    problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor, radius: Tensor | float, moved: Tensor
+) -> Verdict:
     far = torch.full_like(cost, torch.inf)
-    clearance_knots, clearance, violation, others = far, far, torch.zeros_like(cost), torch.zeros_like(cost)
+    clearance_knots, clearance, violation, others = far, far, moved, torch.zeros_like(cost)
     for constraint in problem.constraints:
-        worst = constraint.worst(X, U)
+        worst = constraint.worst(X, U) if problem.horizon is None else _worst_within(problem, constraint, X, U)
         violation = torch.maximum(violation, worst)
-        if isinstance(constraint, Obstacles):
-            at_knots, between = by_kind(CLEARANCES, constraint)(constraint, X)
+        if isinstance(constraint, Obstacles | Separation):
+            at_knots, between = _clearances(problem, constraint, X)
             clearance_knots = torch.minimum(clearance_knots, at_knots)
             clearance = torch.minimum(clearance, between)
         else:
@@ -135,10 +168,38 @@ def _verdict(problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor,
     position = X[:, -1, problem.dynamics.position]
     goal_distance = (position - goal).square().sum(-1).sqrt()
     finite = torch.isfinite(X).flatten(1).all(-1)
-    feasible = finite & (clearance_knots >= 0) & (others <= OTHERS_WITHIN)
+    feasible = finite & (clearance_knots >= 0) & (others <= OTHERS_WITHIN) & (moved == 0)
     reached = feasible & (goal_distance < radius)
     sound = reached & (violation <= SUCCESS_VIOLATION) & (clearance >= 0)
     return Verdict(cost, violation, clearance_knots, clearance, goal_distance, feasible, reached, sound)
+
+
+def _worst_within(problem: Problem, constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
+    """The largest violation (B,) of rows within each horizon; a row of knot N alone is one of the last knot."""
+    rows, worst = constraint.violation(X, U), torch.zeros_like(X[:, 0, 0])
+    if rows.shape[2] == 0:
+        return worst
+    knots = torch.arange(problem.N + 1, device=X.device)[constraint.knots].tolist()
+    of = getattr(constraint, "of", "x" if constraint.holds_at(problem.N) else "xu")
+    for b, last in enumerate(problem.stages.tolist()):
+        within = [i for i, k in enumerate(knots) if k < last or (k == last and of == "x")]
+        if problem.N in knots and last not in knots:
+            within.append(knots.index(problem.N))
+        if within:
+            worst[b] = rows[b, within].max()
+    return worst
+
+
+def _clearances(problem: Problem, obstacles: Constraint, X: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest distances (B,) at the knots and between them; those of a horizon's own knots where horizons differ."""
+    measure = by_kind(CLEARANCES, obstacles)
+    if problem.horizon is None:
+        return measure(obstacles, X)
+    at_knots, between = torch.empty_like(X[:, 0, 0]), torch.empty_like(X[:, 0, 0])
+    for last in problem.horizon.unique().tolist():
+        rows = (problem.horizon == last).nonzero().flatten()
+        at_knots[rows], between[rows] = measure(obstacles.take(rows), X[rows, : last + 1])
+    return at_knots, between
 
 
 def sphere_clearance(spheres: BoundSpheres, X: Tensor) -> tuple[Tensor, Tensor]:
@@ -189,14 +250,29 @@ def box_clearance(boxes: BoundBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
     return at_knots, torch.minimum(between, at_knots)
 
 
+def separation_clearance(separation: Separation, X: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest distance (B,) of a pair, less 0.95 of that to keep, at the knots and along the segments between, m.
+
+    Both positions move along their segments at the same time; all knots count.
+    """
+    at_knots = between = torch.full_like(X[:, 0, 0], torch.inf)
+    for i, j in separation.pairs.tolist():
+        away = X[..., separation.positions[i]] - X[..., separation.positions[j]]
+        at_knots = torch.minimum(at_knots, away.norm(dim=-1).amin(-1))
+        between = torch.minimum(between, segment_distance(away[:, :-1], away[:, 1:]).amin(-1))
+    contact = CONTACT_FACTOR * separation.min_distance
+    return at_knots - contact, torch.minimum(between, at_knots) - contact
+
+
 # By kind of obstacles: smallest distances (B,) from X (B, N+1, n) to where bodies touch, at the knots and between them.
-CLEARANCES: dict[type[Obstacles], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
+CLEARANCES: dict[type[Constraint], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
     BoundSpheres: sphere_clearance,
     BoundBoxes: box_clearance,
+    Separation: separation_clearance,
 }
 
 
-def by_kind(measures: dict[type[Obstacles], Any], obstacles: Obstacles) -> Any:
+def by_kind(measures: dict[type[Constraint], Any], obstacles: Constraint) -> Any:
     """The function that measures obstacles of this kind.
 
     Raises:
@@ -223,11 +299,11 @@ def frame_columns(verdict: Verdict) -> dict[str, Any]:
     return {name: getattr(verdict, name).cpu().numpy() for name in names}
 
 
-def columns(problem: Problem, U: Tensor) -> dict[str, Any]:
+def columns(problem: Problem, U: Tensor, start: Tensor | None = None) -> dict[str, Any]:
     """What can be judged of controls U (B, N, m) without being given more than the problem, as columns of a table.
 
     `clearance` (m) where the problem has obstacles, `reached` where it has a goal; a problem of another precision is
-    judged in float64.
+    judged in float64; `start` as in `judge`.
 
     Raises:
         InputError: as `judge`.
@@ -235,14 +311,14 @@ def columns(problem: Problem, U: Tensor) -> dict[str, Any]:
     check_problem(problem)
     if problem.dynamics.position is None:
         return {}
-    names = ["clearance"] if problem.obstacles else []
+    names = ["clearance"] if any(isinstance(c, tuple(CLEARANCES)) for c in problem.constraints) else []
     names += ["reached"] if problem.goal is not None else []
     if not names:
         return {}
     problem.check_controls(U, "U")
     if problem.x0.dtype != torch.float64:
-        problem, U = problem.cast(torch.float64), U.double()
+        problem, U, start = problem.cast(torch.float64), U.double(), None if start is None else start.double()
     # Without a goal any will do, as only the clearance is read.
-    start, anywhere = problem.x0[:, problem.position], problem.goal is None
-    verdict = judge(problem, U, start, 1.0) if anywhere else judge(problem, U)
+    at = (problem.x0[:, problem.position], 1.0) if problem.goal is None else (None, None)
+    verdict = judge(problem, U, *at, start)
     return {name: getattr(verdict, name).cpu().numpy() for name in names}

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, Seconds, check_value
 from torchgco.base.shapes import MISTAKES, Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, cast
@@ -22,8 +22,11 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 from torchgco.obstacles.base import Obstacles, warn_of_small
 from torchgco.problem.border import check_constraint, check_cost, check_dynamics
+from torchgco.problem.free_start import chooses_position, moved_inside, start_mask
 from torchgco.problem.goal import Goal
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
+
+ROWS = "rows"  # marks the shapes of the constraints' rows among what a form keeps
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,13 @@ class Problem:
         goal: where the last knot should lie. None: derived from the cost, around the position in `Cost.goal` (the
             terminal reference of a quadratic cost) with 0.09 of the distance from the start as radius; no goal where
             the cost names none.
+        horizon: int64 (B,), from 1 to N: the number of stages of each problem, after which time stops for it; its
+            terminal cost and rows are those of its own last knot, and no obstacle counts later. None: all have N.
+            CasADi and missions take none, nor do costs with their own `total`.
+        free_start: which components of the start the solver chooses, bool, (n,) or (B, n). There x0 is a guess, which
+            is moved inside `StateBounds` that hold at knot 0. Other constraints hold at that knot where their `knots`
+            say so, obstacles wherever a position is free. The interior point, and so `gco`, finds the start, which
+            then is X[:, 0] of the solution; other solvers hold the guess. None: x0 is given.
 
     Raises:
         InputError: names the part at fault, what was expected and what was given. A start that is bad in one problem
@@ -50,6 +60,8 @@ class Problem:
     x0: Tensor
     N: int
     goal: Goal | None = None
+    horizon: Any = None
+    free_start: Any = None
 
     # A cache for everything that depends only on the problems' form (native kernels, say), shared by all subsets of a
     # batch.
@@ -66,6 +78,7 @@ class Problem:
         self._check_dynamics()
         object.__setattr__(self, "cost", self.cost.bind(dims))
         object.__setattr__(self, "constraints", tuple(c.bind(dims) for c in self.constraints))
+        object.__setattr__(self, "x0", moved_inside(self.x0, self.free_start, self.constraints))
         self._check_code(self.dynamics, self.cost, self.constraints)
         for i, part in enumerate(self.constraints):
             if isinstance(part, Obstacles):
@@ -88,7 +101,8 @@ class Problem:
 
     def _dimensions(self, x0: Tensor, dynamics: Dynamics | None = None) -> Dimensions:
         model = dynamics or self.dynamics
-        return Dimensions(x0.shape[0], self.N, self.n, self.m, getattr(model, "dt", None), model.position, x0)
+        first = 0 if chooses_position(self.free_start, model.position) else 1
+        return Dimensions(x0.shape[0], self.N, self.n, self.m, getattr(model, "dt", None), model.position, x0, first)
 
     @property
     def B(self) -> int:
@@ -106,6 +120,16 @@ class Problem:
     def along(self) -> Dynamics:
         """The dynamics of all stages together, for states (B, N, n) and controls (B, N, m)."""
         return self.dynamics.at(torch.arange(self.N, device=self.x0.device))
+
+    @property
+    def stages(self) -> Tensor:
+        """The number of stages of each problem, (B,) int64."""
+        return self.x0.new_full((self.B,), self.N, dtype=torch.int64) if self.horizon is None else self.horizon
+
+    @property
+    def running(self) -> Tensor:
+        """Which stages are a problem's own, (B, N) bool."""
+        return torch.arange(self.N, device=self.x0.device) < self.stages.unsqueeze(-1)
 
     @property
     def position(self) -> slice:
@@ -164,7 +188,17 @@ class Problem:
             goal = None if self.goal is None else self.goal.position
             changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position)
             changes = torch.maximum(changes, savings(slopes, curvatures))
-        return cost_scale(total, curvatures[:, :-1, self.n :], changes)
+        return cost_scale(total, curvatures[:, :-1, self.n :], changes, None if self.horizon is None else self.stages)
+
+    @property
+    def row_shapes(self) -> tuple[tuple[int, int], ...]:
+        """Knots and rows of every constraint; the same for all problems of a form."""
+        if ROWS not in self.form:
+            # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
+            one = self.take(slice(0, 1))
+            X, U = one.x0.new_zeros(one.B, self.N + 1, self.n), one.x0.new_zeros(one.B, self.N, self.m)
+            self.form[ROWS] = tuple(tuple(c.value(X, U).shape[1:]) for c in one.constraints)
+        return self.form[ROWS]
 
     @property
     def cost_unit(self) -> Tensor:
@@ -193,13 +227,20 @@ class Problem:
         return {f.name: getattr(self, f.name) for f in fields(self)} | {"form": {}}
 
     def take(self, index: Rows) -> Self:
-        """The problems in `index` (int64, (B',), or a slice); a row may occur more than once."""
+        """The problems in `index` (int64, (B',), or a slice); a row may occur more than once.
+
+        All of them in their order are this problem itself, with what is known of it.
+        """
+        if _is_whole(index, self.B):
+            return self
         parts = {
             "dynamics": self.dynamics.take(index),
             "cost": self.cost.take(index),
             "constraints": tuple(c.take(index) for c in self.constraints),
             "x0": self.x0[index],
             "goal": None if self.goal is None else self.goal.take(index),
+            "horizon": None if self.horizon is None else self.horizon[index],
+            "free_start": None if self.free_start is None else self.free_start[index],
         }
         return self._with(parts, form=self.form)
 
@@ -210,6 +251,18 @@ class Problem:
     def is_same(self, other: Problem) -> bool:
         """Whether both have the very same parts."""
         return all(getattr(self, f.name) is getattr(other, f.name) for f in fields(self))
+
+    def start_in(self, x: Tensor) -> Tensor:
+        """Starts (B, n): those of x (B, n) in the free components, and x0 in the others."""
+        return self.x0 if self.free_start is None else torch.where(self.free_start, x, self.x0)
+
+    def guessing(self, x: Tensor) -> Self:
+        """The same problems with other guesses of their free starts, `start_in` x (B, n)."""
+        return self._with({"x0": self.start_in(x)}, self.form)
+
+    def held_at(self, x: Tensor) -> Self:
+        """The same problems with starts that are given, `start_in` x (B, n); themselves where no start is free."""
+        return self if self.free_start is None else self._with({"x0": self.start_in(x), "free_start": None}, self.form)
 
     def grown(self, by: Tensor) -> Self:
         """The same problems with their obstacles grown by `by` (B,), m."""
@@ -253,7 +306,7 @@ class Problem:
             if [type(part) for part in bound] != [type(part) for part in self.constraints]:
                 kinds = ", ".join(type(part).__name__ for part in self.constraints)
                 raise InputError("constraints", f"the kinds {kinds}", ", ".join(type(part).__name__ for part in bound))
-            parts: dict[str, Any] = {"x0": x0, "constraints": bound}
+            parts: dict[str, Any] = {"x0": moved_inside(x0, self.free_start, bound), "constraints": bound}
             if dynamics is not None:
                 parts["dynamics"] = model
             if cost is not None:
@@ -299,8 +352,11 @@ class Problem:
         if self.x0.shape[1] != self.dynamics.n or self.x0.shape[0] < 1:
             raise InputError("x0", f"shape (B, {self.dynamics.n})", tuple(self.x0.shape))
         check_tensor(self.x0, "x0")
+        object.__setattr__(self, "free_start", start_mask(self.free_start, self.x0))
         if isinstance(self.N, bool) or not isinstance(self.N, int) or self.N < 1:
             raise InputError("N", "at least one stage, an int", repr(self.N))
+        if self.horizon is not None:
+            object.__setattr__(self, "horizon", checked_horizon(self.horizon, self.x0, self.N))
         if not callable(self.cost.goal):
             raise InputError("cost.goal", "a method, which no field may hide", type(self.cost.goal).__name__)
         if self.goal is not None and not isinstance(self.goal, Goal):
@@ -334,10 +390,35 @@ class Problem:
             raise InputError("dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", describe(after))
 
 
+def _is_whole(index: Rows, B: int) -> bool:
+    """Whether an index takes all B problems in their order."""
+    if isinstance(index, slice):
+        return index.indices(B) == (0, B, 1)
+    return index.numel() == B and (B == 1 or torch.equal(index, torch.arange(B, device=index.device)))
+
+
 def check_problem(problem: Any) -> None:
     """Raise InputError unless the argument is a Problem."""
     if not isinstance(problem, Problem):
         raise InputError("problem", "a Problem", _named(problem))
+
+
+def checked_horizon(horizon: Any, x0: Tensor, N: int) -> Tensor:
+    """Numbers of stages as an int64 tensor (B,) on the device of x0 (B, n).
+
+    Raises:
+        InputError: another shape, numbers that aren't whole or outside 1..N.
+    """
+    expected = f"whole numbers ({x0.shape[0]},) from 1 to N = {N}"
+    try:
+        given = torch.as_tensor(horizon, device=x0.device)
+    except MISTAKES as error:
+        raise InputError("horizon", expected, shown(horizon)) from error
+    if given.dtype == torch.bool or given.is_floating_point() or given.is_complex() or given.shape != x0.shape[:1]:
+        raise InputError("horizon", expected, describe(given))
+    if not bool(((given >= 1) & (given <= N)).all()):
+        raise InputError("horizon", expected, given.tolist())
+    return given.to(torch.int64)
 
 
 def _check_constraints(constraints: Any) -> None:

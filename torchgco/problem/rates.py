@@ -15,6 +15,7 @@ from torch import Tensor
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
+from torchgco.constraints.separation import Separation
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
@@ -22,7 +23,7 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 
 # Besides obstacles, which read the position alone: kinds that find their states and controls among others, too.
-IN_PLACE = (ControlBounds, StateBounds)
+IN_PLACE = (ControlBounds, StateBounds, Separation)
 FORM = "with controls before"  # what is kept with the form of the problem for this one
 
 
@@ -34,13 +35,14 @@ def with_controls_before(problem: Problem) -> Problem:
     bounds = next((c for c in problem.constraints if isinstance(c, RateBounds)), None)
     if bounds is None:
         return problem
-    n, controls, x0 = problem.n, bounds.controls, problem.x0
+    n, controls, x0, free = problem.n, bounds.controls, problem.x0, problem.free_start
     before = x0.new_zeros(1, problem.m) if bounds.previous is None else bounds.previous
     parts: dict[str, object] = {
         "dynamics": _Dynamics(problem.dynamics, controls),
         "cost": _cost(problem.cost, n, len(controls)),
         "constraints": tuple(_constraint(c, n) for c in problem.constraints),
         "x0": torch.cat((x0, before[:, controls].expand(problem.B, -1)), dim=-1),
+        "free_start": None if free is None else torch.nn.functional.pad(free, (0, len(controls))),
     }
     return problem._with(parts, form=problem.form.setdefault(FORM, {}))
 
@@ -157,6 +159,7 @@ class _Rows(Constraint):
     sense = property(lambda self: self.constraint.sense)  # type: ignore[assignment]
     geometric = property(lambda self: self.constraint.geometric)  # type: ignore[assignment]
     knots = property(lambda self: self.constraint.knots)  # type: ignore[assignment]
+    bare = property(lambda self: self.constraint.bare)  # type: ignore[assignment]
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self.constraint.value(X[..., : self.n], U)

@@ -20,7 +20,7 @@ class CostScale(NamedTuple):
     constant: Tensor  # in the cost of a whole trajectory; 0 where it doesn't dwarf the rest
 
 
-def cost_scale(total: Tensor, curvatures: Tensor, changes: Tensor | None) -> CostScale:
+def cost_scale(total: Tensor, curvatures: Tensor, changes: Tensor | None, stages: Tensor | None = None) -> CostScale:
     """The mean cost per stage of staying at the start at rest, without its constant.
 
     A thousandth of the controls' mean curvature is added; only this is left where the start is the goal.
@@ -30,8 +30,12 @@ def cost_scale(total: Tensor, curvatures: Tensor, changes: Tensor | None) -> Cos
         curvatures: diagonals of its Hessians in the controls, (B, N, m).
         changes: by how much the cost changes elsewhere, (B,). Where `total` is over `DWARFS` times as large, all but
             the change is a constant. None: the cost has none.
+        stages: how many of the N stages are a problem's own, (B,); None: all.
     """
-    N, m = curvatures.shape[1:]
+    (count, m), N = curvatures.shape[1:], curvatures.shape[1]
+    if stages is not None:
+        own = torch.arange(count, device=total.device) < stages.unsqueeze(-1)
+        curvatures, N = torch.where(own.unsqueeze(-1), curvatures, 0.0), stages
     # Contiguous and one axis at a time: the order of summation must not depend on the batch.
     curvature = curvatures.abs().contiguous().sum(-1).sum(-1) / (N * m)
     least, constant = LEAST_UNIT * curvature, torch.zeros_like(total)

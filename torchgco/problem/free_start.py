@@ -1,0 +1,48 @@
+"""Starts of which some components are variables: the mask that says which, and a guess that keeps its bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError, shown
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import StateBounds
+
+
+def start_mask(given: Any, x0: Tensor) -> Tensor | None:
+    """Which components of the starts x0 (B, n) are free, (B, n) bool; None where no mask is given.
+
+    Raises:
+        InputError: no mask (n,) or (B, n) of bool.
+    """
+    if given is None:
+        return None
+    (B, n), expected = x0.shape, f"a mask ({x0.shape[1]},) or {tuple(x0.shape)} of bool"
+    try:
+        mask = torch.as_tensor(given, device=x0.device)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError("free_start", expected, shown(given)) from None
+    if mask.dtype != torch.bool or tuple(mask.shape) not in ((n,), (B, n)):
+        raise InputError("free_start", expected, f"{mask.dtype} of shape {tuple(mask.shape)}")
+    return mask.expand(B, n).clone()
+
+
+def chooses_position(free: Tensor | None, position: slice | None) -> bool:
+    """Whether the position at the start is free in any problem of a batch."""
+    return free is not None and position is not None and bool(free[:, position].any())
+
+
+def moved_inside(x0: Tensor, free: Tensor | None, constraints: Sequence[Constraint]) -> Tensor:
+    """x0 (B, n) with its free components inside the state bounds of knot 0."""
+    if free is None:
+        return x0
+    for bounds in constraints:
+        if isinstance(bounds, StateBounds) and bounds.holds_at(0):
+            first = 0 if isinstance(bounds.knots, slice) else int((bounds.knots == 0).nonzero())
+            lower, upper = (bound[:, first if bound.shape[1] > 1 else 0] for bound in bounds.by_knot)
+            x0 = torch.where(free, torch.minimum(torch.maximum(x0, lower), upper), x0)
+    return x0

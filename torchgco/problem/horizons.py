@@ -1,0 +1,279 @@
+"""Problems of one batch with horizons of different length: after its own last knot, time stops for a problem.
+
+Its state is held, so that the last knot of the batch shows the state, and counts the terminal cost and rows, of its own
+last knot. Stages after it cost nothing but what draws their controls to rest, which nothing else depends on; rows of
+these knots, obstacles too, don't count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.base.autodiff import gradient_and_hessian
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import lead
+from torchgco.base.tree import is_users
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
+from torchgco.costs.base import Cost, WrappedCost, add_blocks
+from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.dynamics.base import Dynamics
+from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.problem import Problem
+from torchgco.problem.rates import with_controls_before
+
+FORM = "within horizons"  # what is kept with the form of the problem for this one
+OUT_OF_THE_WAY = -1.0  # of inequalities that don't count, as of absent obstacles
+
+
+def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
+    """The problem in the form that solvers work on; itself where it has neither horizons nor bounded rates.
+
+    Args:
+        joins_knots: rows of two knots stay as they are.
+    """
+    held = within_horizons(problem)
+    return held if joins_knots else with_controls_before(held)
+
+
+def within_horizons(problem: Problem) -> Problem:
+    """The problem with its states held from each problem's last knot on; itself where no horizons are given.
+
+    Constraints keep their places, rows and knots, and so multipliers their shapes.
+
+    Raises:
+        InputError: a cost or a constraint that can't end early, or has no row within some problem's horizon.
+    """
+    if problem.horizon is None or isinstance(problem.dynamics, _Dynamics):
+        return problem
+    running = problem.running
+    parts: dict[str, object] = {
+        "dynamics": _Dynamics(problem.dynamics, running.to(problem.x0.dtype)),
+        "cost": _cost(problem, running),
+        "constraints": tuple(_constraint(problem, i) for i in range(len(problem.constraints))),
+    }
+    return problem._with(parts, form=problem.form.setdefault(FORM, {}))
+
+
+def at_rest_after(problem: Problem, U: Tensor) -> Tensor:
+    """Controls U (B, N, m), after each problem's last stage those that cost nothing there."""
+    if problem.horizon is None:
+        return U
+    return torch.where(problem.running.unsqueeze(-1), U, _resting(problem))
+
+
+def _resting(problem: Problem) -> Tensor:
+    """Controls (B, N, m) at rest; the middle of their bounds where they aren't inside of these."""
+    rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
+    for bounds in problem.constraints:
+        if isinstance(bounds, ControlBounds):
+            held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
+            inside = (held > lower) & (held < upper)
+            rest = rest.clone()
+            rest[:, bounds.knots] = torch.where(inside, held, _between(held, lower, upper))
+    return rest
+
+
+def _between(held: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """The middle of bounds; one inside of the bound where there is only one."""
+    one = torch.where(torch.isfinite(lower), lower + 1.0, torch.where(torch.isfinite(upper), upper - 1.0, held))
+    return torch.where(torch.isfinite(upper - lower), 0.5 * (lower + upper), one)
+
+
+@dataclass(frozen=True)
+class _Dynamics(Dynamics):
+    """A model whose states are held after each problem's last stage."""
+
+    model: Dynamics
+    running: Tensor  # (B, N): 1 in the stages of a problem, 0 after them
+    k: Any = field(default=None, repr=False)  # the stage or the stages (K,), set by `at`
+
+    batched: ClassVar[tuple[str, ...]] = ("model", "running")
+
+    n = property(lambda self: self.model.n)  # type: ignore[assignment]
+    m = property(lambda self: self.model.m)  # type: ignore[assignment]
+    dt = property(lambda self: self.model.dt)  # type: ignore[assignment]
+    position = property(lambda self: self.model.position)  # type: ignore[assignment]
+    calls_function = property(lambda self: is_users(self.model))
+
+    def at(self, k: int | Tensor) -> Self:
+        return replace(self, model=self.model.at(k), k=k)
+
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        return torch.where(self._runs(x), self.model.step(x, u), x)
+
+    def jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        fx, fu = self.model.jacobians(x, u)
+        runs, one = self._runs(x).unsqueeze(-1), torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+        return torch.where(runs, fx, one), torch.where(runs, fu, 0.0)
+
+    def _runs(self, x: Tensor) -> Tensor:
+        if self.k is None:
+            raise InputError("dynamics", "a stage, as in `dynamics.at(k).step(x, u)`", "none")
+        return _of_stages(self.running, self.k, x[..., 0]).unsqueeze(-1) > 0
+
+
+def _of_stages(values: Tensor, k: int | Tensor, like: Tensor) -> Tensor:
+    """Values (B, N) of stage k or stages k (K,), shaped to fit `like` (B,), (B, S) or (B, K)."""
+    found = values[:, k]
+    return lead(found, like) if isinstance(k, int) else found  # type: ignore[return-value]
+
+
+def _cost(problem: Problem, running: Tensor) -> Cost:
+    cost, resting = problem.cost, _resting(problem)
+    if type(cost) is BoundQuadratic:
+        return _quadratic(cost, running, resting)
+    if type(cost).total is not Cost.total:
+        raise InputError("horizon", "a cost that is a sum over stages", f"{type(cost).__name__} with its own `total`")
+    X, U = problem.at_rest
+    first = cost.take(slice(None))
+    n, z = problem.n, torch.cat((X[:, 0], U[:, 0]), dim=-1)
+    _, H = gradient_and_hessian(lambda z: first.stage(z[..., :n], z[..., n:], 0), z)
+    weight = H.diagonal(dim1=-2, dim2=-1)[:, n:].abs()
+    weight = torch.where(torch.isfinite(weight) & (weight > 0), weight, 1.0)
+    kind = _Stages if type(cost).expand is Cost.expand else _OwnExpansion
+    return kind(cost, running.to(X.dtype), resting, weight)
+
+
+def _quadratic(cost: BoundQuadratic, running: Tensor, resting: Tensor) -> BoundQuadratic:
+    """The same cost with the weights of the controls alone after the last stages: a diagonal above 0."""
+    runs = running.unsqueeze(-1) if cost.diagonal else running[..., None, None]
+    parts: dict[str, Tensor | None] = {"u_ref": torch.where(running.unsqueeze(-1), cost.u_ref, resting)}
+    for name in ("Q", "H", "q", "r"):
+        value = getattr(cost, name)
+        own = running.unsqueeze(-1) if name in ("q", "r") else runs
+        parts[name] = None if value is None else torch.where(own, value, 0.0)
+    weights = cost.R if cost.diagonal else cost.R.diagonal(dim1=-2, dim2=-1)
+    weights = torch.where(weights > 0, weights, 1.0)
+    parts["R"] = torch.where(runs, cost.R, weights if cost.diagonal else torch.diag_embed(weights))
+    return replace(cost, **parts)
+
+
+@dataclass(frozen=True)
+class _Stages(WrappedCost):
+    """A cost whose stages after each problem's last one draw the controls to rest."""
+
+    running: Tensor  # (B, N): 1 in the stages of a problem, 0 after them
+    resting: Tensor  # (B, N, m)
+    weight: Tensor  # (B, m): curvatures of the first stage's cost, so that no scale depends on these stages
+
+    batched: ClassVar[tuple[str, ...]] = ("cost", "running", "resting", "weight")
+
+    def rest_controls(self, like: Tensor) -> Tensor:
+        return torch.where(self.running.unsqueeze(-1) > 0, self.cost.rest_controls(like), self.resting)
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        value, rest, weight = self.cost.stage(x, u, k), self.resting[:, k], self.weight
+        if u.dim() == 3:
+            weight = weight.unsqueeze(1)
+            rest = rest.unsqueeze(1) if isinstance(k, int) else rest
+        held = 0.5 * (weight * (u - rest).square()).sum(-1)
+        return torch.where(_of_stages(self.running, k, value) > 0, value, held)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return self.cost.terminal(x)
+
+
+class _OwnExpansion(_Stages):
+    """Where the cost has its own `expand`."""
+
+    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
+        self.cost.expand(X, U, H)
+        held, weight = torch.zeros_like(H[:, :-1]), self.weight.unsqueeze(1)
+        slope = weight * (U - self.resting)
+        add_blocks(held, X.shape[-1], None, slope, None, torch.diag_embed(weight.expand_as(slope)))
+        H[:, :-1] = torch.where(self.running[..., None, None] > 0, H[:, :-1], held)
+
+
+def counted(constraint: Constraint, horizon: Tensor, N: int) -> Tensor:
+    """At which of its knots a constraint counts for each problem, (B, K) bool.
+
+    Those up to the last knot, or of rows with controls the last stage; and knot N where it is the only one that comes
+    as late: it stands for the last knot of each problem.
+    """
+    knots = torch.arange(N + 1, device=horizon.device)[constraint.knots]
+    of_controls = getattr(constraint, "of", "x" if constraint.holds_at(N) else "xu") != "x"
+    last = horizon.unsqueeze(-1)
+    within = knots < last if of_controls else knots <= last
+    own = (knots == last).any(-1, keepdim=True)
+    return within | ((knots == N) & ~own)
+
+
+def _constraint(problem: Problem, i: int) -> Constraint:
+    constraint, horizon = problem.constraints[i], problem.horizon
+    assert horizon is not None
+    counts = counted(constraint, horizon, problem.N)
+    missing = ~counts.any(-1)
+    if counts.shape[1] > 0 and bool(missing.any()):
+        b = int(missing.nonzero()[0, 0])
+        raise InputError("horizon", f"a knot of constraints[{i}] within each", f"{int(horizon[b])} of problem {b}")
+    if isinstance(constraint, Obstacles):
+        return _obstacles(constraint, problem, i)
+    if isinstance(constraint, ControlBounds):
+        return constraint  # controls at rest are within them
+    if isinstance(constraint, StateBounds | RateBounds):
+        lower, upper = constraint.by_knot
+        each = counts.unsqueeze(-1)
+        return replace(
+            constraint, lower=torch.where(each, lower, -torch.inf), upper=torch.where(each, upper, torch.inf)
+        )
+    return _Rows(constraint, counts.to(problem.x0.dtype))
+
+
+def _obstacles(obstacles: Obstacles, problem: Problem, i: int) -> Obstacles:
+    """Obstacles that don't count after the last knots; those of knot N alone meet the state of the last knot there."""
+    horizon = problem.horizon
+    assert horizon is not None
+    late = torch.arange(problem.N + 1, device=horizon.device)[obstacles.knots].tolist()
+    if late == [problem.N] and not obstacles.moving:
+        return obstacles
+    if problem.N in late and not all(obstacles.holds_at(int(h)) for h in horizon.unique()):
+        raise InputError("horizon", f"last knots at which constraints[{i}] holds", horizon.unique().tolist())
+    if not isinstance(obstacles, BoundSpheres | BoundBoxes):
+        raise InputError("horizon", "obstacles that are Spheres, Boxes or Capsules", type(obstacles).__name__)
+    return obstacles.stopping_at(horizon)
+
+
+@dataclass(frozen=True)
+class _Rows(Constraint):
+    """A constraint whose rows count at some of its knots."""
+
+    constraint: Constraint
+    counts: Tensor  # (B, K): 1 where they count, else 0
+
+    batched: ClassVar[tuple[str, ...]] = ("constraint", "counts")
+
+    sense = property(lambda self: self.constraint.sense)  # type: ignore[assignment]
+    geometric = property(lambda self: self.constraint.geometric)  # type: ignore[assignment]
+    knots = property(lambda self: self.constraint.knots)  # type: ignore[assignment]
+    bare = property(lambda self: self.constraint.bare)  # type: ignore[assignment]
+    calls_function = property(lambda self: is_users(self.constraint))
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self._where(self.constraint.value(X, U), 0.0 if self.sense == "equality" else OUT_OF_THE_WAY)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        return self._where(self.constraint.violation(X, U), 0.0)
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        rows, knots = self.constraint.at(x, k), self.knots
+        place = k - knots.start if isinstance(knots, slice) else knots.tolist().index(k)
+        return torch.where(self.counts[:, place, None, None] > 0, rows, OUT_OF_THE_WAY)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        self.constraint.accumulate(X, U, self._where(g, 0.0), self._where(h, 0.0), H)
+
+    def grown(self, by: Tensor) -> Self:
+        return replace(self, constraint=self.constraint.grown(by))
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        return self.constraint.start_is_clear(x0)
+
+    def _where(self, rows: Tensor, other: float) -> Tensor:
+        return torch.where(self.counts.unsqueeze(-1) > 0, rows, other)
