@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 import torchgco
-from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem
+from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost
 from torchgco.native import kernels
-from torchgco.native.dispatch import EagerWarning, engine_of
+from torchgco.native.dispatch import EagerWarning, engine_of, measured
 
 D = torch.float64
 B, N = 3, 20
@@ -128,3 +128,19 @@ def test_values_of_another_problem_are_refused() -> None:
         Problem(problem(slice(0, 1)).dynamics, bound.cost, [], bound.x0[:1], N)
     with pytest.raises(InputError, match=r"constraint: value 'most': expected torch.float64 of shape"):
         Problem(bound.dynamics, bound.cost, [bound.constraints[1]], bound.x0, N - 5)
+
+
+def test_numbers_of_knots_are_as_precise_as_the_states() -> None:
+    """0.3 * k, with whole numbers k, is double where the states are, as in native code."""
+    constraint = FunctionConstraint(lambda x, k: x[..., :1] - (0.3 * k).unsqueeze(-1), "equality", knots=[7, 9])
+    for dtype in (torch.float64, torch.float32):
+        X = torch.zeros(1, 11, 1, dtype=dtype)
+        problem = Problem(
+            FunctionDynamics(lambda x, u: u, 1, 1, 0.1), QuadraticCost([1.0], [1.0], [0.0]), [constraint], X[:, 0], 10
+        )
+        rows = problem.constraints[0].value(X, X[:, :10])
+        assert rows.dtype == dtype
+        tolerance = 1e-15 if dtype == torch.float64 else 1e-6
+        assert abs(rows.flatten().tolist()[0] + 0.3 * 7) <= tolerance
+        assert abs(float(measured(problem, X, X[:, :10])[0]) - 0.3 * 9) <= tolerance
+    assert torch.get_default_dtype() == torch.float32

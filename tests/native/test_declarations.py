@@ -235,7 +235,7 @@ def test_a_constant_of_the_lifted_search_changes_both_kernels(name: str, value: 
 def test_every_option_reaches_the_library() -> None:
     """Each field has the value of the option, or of the constant, that bears its name."""
     inner = ILQR(tolerance=0.011, max_iterations=13, damp_below=0.17, line_search=LineSearch(back=2))
-    options, search = ilqr._native_options(inner), inner.line_search
+    options, search = ilqr.native_options(inner), inner.line_search
     want = {
         "rungs": len(search.ladder(False)), "back": 2, "max_iterations": 13, "accept_last": 0, "tolerance": 0.011,
         "absolute_tolerance": 0.0, "ratio_min": search.ratio_min, "ratio_max": search.ratio_max,
@@ -247,7 +247,7 @@ def test_every_option_reaches_the_library() -> None:
     assert {name: getattr(options, name) for name in Options.kinds if name != "ladder"} == want
     ladder = (ctypes.c_double * options.rungs).from_address(options.ladder)
     assert list(ladder) == search.ladder(False)
-    printed = ilqr._native_options(replace(inner, as_printed=True))
+    printed = ilqr.native_options(replace(inner, as_printed=True))
     assert (printed.tolerance, printed.absolute_tolerance, printed.damping, printed.accept_last) == (0.0, 0.011, 0, 1)
 
 

@@ -20,6 +20,7 @@ from torchgco import (
     Problem,
     QuadraticCost,
     RateBounds,
+    Separation,
     Spheres,
     StateBounds,
 )
@@ -118,7 +119,24 @@ def rates(seed: int) -> Problem:
     return with_controls_before(Problem(problem.dynamics, problem.cost, parts, problem.x0, problem.N))
 
 
-MAKERS = {"curved": curved, "obstacles": obstacles, "rates": rates}
+def apart(seed: int) -> Problem:
+    """Three points with drag in one state, two pairs of which keep a distance that differs between problems."""
+    N, random = 5, draw(seed)
+
+    def field(x: Tensor, u: Tensor) -> Tensor:
+        return u - 0.3 * x * x.square().sum(-1, keepdim=True)
+
+    aims = torch.tensor([1.5, 0.2, 0.0, -1.5, -0.2, 0.0], dtype=D)
+    return Problem(
+        FunctionDynamics(field, 6, 6, 0.3, position=slice(0, 2)),
+        QuadraticCost([9.0] * 6, [5.0] * 6, [9.0] * 6, aims),
+        [Separation([[0, 1], [3, 2], [5, 4]], 0.5 + 0.3 * random(B).abs(), [[0, 1], [2, 0]]), ControlBounds(-2.0, 2.0)],
+        torch.tensor([-1.2, 0, 0, 1.2, 1.2, -1.2], dtype=D) + 0.1 * random(B, 6),
+        N,
+    )
+
+
+MAKERS = {"curved": curved, "obstacles": obstacles, "rates": rates, "apart": apart}
 
 
 def guess(problem: Problem, seed: int) -> tuple[Tensor, Tensor]:

@@ -10,6 +10,7 @@ from tests.search.rows import varied
 from torchgco import ILQR, MPPI, AugmentedLagrangian, MultiStart, PathProposals, Polish, Problem, Restarts
 from torchgco.native.interior import InteriorEngine
 from torchgco.solvers import augmented_lagrangian, ilqr
+from torchgco.solvers.native_outer import NativeOuter
 
 BATCHES = {
     "planar": lambda: planar_batch(B=3, N=25, obstacles=9, seed=4),
@@ -46,6 +47,13 @@ def made(monkeypatch) -> list[int]:
 
     for module in (ilqr, augmented_lagrangian):
         monkeypatch.setattr(module, "advance", advance)
+
+    def passes(self, real=NativeOuter._run, **fields):
+        before = int(self.state.iterations.sum())
+        real(self, **fields)
+        made.append(int(self.state.iterations.sum()) - before)
+
+    monkeypatch.setattr(NativeOuter, "_run", passes)
 
     def step(self, *point, real=Polish._step):
         moved = real(self, *point)

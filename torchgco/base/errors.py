@@ -1,4 +1,4 @@
-"""The error for malformed input, and the warnings: guidance that can't be used, contacts, lengths too small."""
+"""The error for malformed input, and the warnings: unused guidance, held starts, contacts, lengths too small."""
 
 from __future__ import annotations
 
@@ -26,6 +26,10 @@ def shown(value: object) -> str:
 
 class GuidanceWarning(UserWarning):
     """Guidance, or a part of it, can't be used for a problem, which is solved without it."""
+
+
+class StartWarning(UserWarning):
+    """A start that may be free is held at its guess: the solver can't choose it."""
 
 
 class ScaleWarning(UserWarning):

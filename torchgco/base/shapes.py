@@ -115,6 +115,7 @@ class Dimensions:
     dt: float | None  # s, None for dynamics without a time step
     position: slice | None
     like: Tensor  # x0: dtype and device of everything
+    obstacles_from: int = 1  # the first knot at which obstacles hold: 0 where the position may be chosen there
 
 
 def space_of(dims: Dimensions, field: str) -> int:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
@@ -46,10 +46,24 @@ class Values(PerElement):
             if name in taken:
                 at_knot = value[:, k]
                 more[name] = at_knot[:, None] if isinstance(k, int) and x.dim() == 3 else at_knot
+        if "k" in more:
+            with whole_numbers_become(x.dtype):
+                return function(*arguments, **more)
         return function(*arguments, **more)
 
 
 NONE = Values()
+
+
+@contextmanager
+def whole_numbers_become(dtype: torch.dtype) -> Iterator[None]:
+    """Knots times a number, as in 0.3 * k, have this precision: PyTorch's default one for that is single."""
+    usual = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(usual)
 
 
 def bound_values(

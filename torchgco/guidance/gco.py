@@ -11,12 +11,12 @@ from torch import Tensor
 from torchgco.base.draws import DrawKey
 from torchgco.base.options import AtLeast, Count, Positive, check_options
 from torchgco.base.tree import put, take
-from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.native.dispatch import cost_unit
 from torchgco.problem.problem import Problem
+from torchgco.solvers.caught import active_counts, caught_knots
 from torchgco.solvers.contracts import Advice
 
 REACH = 0.02  # r_guide as a share of the distance to be flown; the paper's vehicles have radii of 0.017 and 0.03 of it

@@ -26,10 +26,7 @@ class Multipliers:
     @classmethod
     def zero(cls, problem: Problem, mu: float) -> Multipliers:
         """lam = 0 and the same penalty for all."""
-        # The first problem shows the shapes of all: evaluating a large batch only for its shapes takes long.
-        one = problem.take(slice(0, 1))
-        X, U = one.x0.new_zeros(one.B, problem.N + 1, problem.n), one.x0.new_zeros(one.B, problem.N, problem.m)
-        lam = tuple(X.new_zeros(problem.B, *c.value(X, U).shape[1:]) for c in one.constraints)
+        lam = tuple(problem.x0.new_zeros(problem.B, *shape) for shape in problem.row_shapes)
         return cls(lam, problem.x0.new_full((problem.B,), mu))
 
     def scaled(self, factor: Tensor) -> Multipliers:
@@ -69,6 +66,14 @@ def penalty_weights(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool)
         return rho.expand_as(c)
     idle = (lam + rho * c < 0) if phr else ((c < 0) & (lam == 0))
     return torch.where(idle, 0.0, rho)
+
+
+def binding(sense: Sense, c: Tensor, lam: Tensor) -> Tensor:
+    """The multipliers (B, K, p) of rows c that bind, 0 elsewhere: at a slack that exceeds them.
+
+    An interior point's multipliers are above 0 on all inequalities; lam times slack is tiny, and the larger one tells.
+    """
+    return lam if sense == "equality" else torch.where(lam > -c, lam, 0.0)
 
 
 def _penalty_value(sense: Sense, c: Tensor, lam: Tensor, mu: Tensor, phr: bool) -> Tensor:
@@ -127,11 +132,11 @@ class Lagrangian:
         return H.transpose(0, 1)
 
     def expand_optimality(self, X: Tensor, U: Tensor) -> Tensor:
-        """H (N+1, B, s, s) of J_var + lam'c, with the penalty's curvature on rows whose lam isn't 0."""
+        """H (N+1, B, s, s) of J_var + lam'c, with the penalty's curvature on the rows that bind (see `binding`)."""
         H = quadratise(self.problem, X, U)
         for constraint, lam in zip(self.problem.constraints, self.multipliers.lam, strict=True):
-            rho = torch.where(lam == 0, 0.0, self.multipliers.mu.view(-1, 1, 1))
-            constraint.accumulate(X, U, lam, rho.expand_as(lam), H)
+            binds = binding(constraint.sense, constraint.value(X, U), lam) != 0
+            constraint.accumulate(X, U, lam, torch.where(binds, self.multipliers.mu.view(-1, 1, 1), 0.0), H)
         return H.transpose(0, 1)
 
     def slack(self, X: Tensor, U: Tensor) -> Tensor:

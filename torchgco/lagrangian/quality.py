@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from torchgco.constraints.base import Constraint
 from torchgco.problem.goal import RADIUS_SHARE
 from torchgco.problem.problem import Problem
 
@@ -24,23 +26,12 @@ class Rated(Protocol):
     def violation(self) -> Tensor: ...
 
 
-def violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+def violation(constraints: Sequence[Constraint], X: Tensor, U: Tensor) -> Tensor:
     """The largest violation (B,): lengths in metres, all else in the units of its constraint."""
     worst = X.new_zeros(X.shape[0])
-    for constraint in problem.constraints:
+    for constraint in constraints:
         worst = torch.maximum(worst, constraint.worst(X, U))
     return worst
-
-
-def chord_clearance(problem: Problem, X: Tensor) -> Tensor:
-    """The smallest distance (B,) from the straight lines between knots to where bodies touch, m; negative in contact.
-
-    Infinite where there is no obstacle.
-    """
-    least = X.new_full(X.shape[:1], torch.inf)
-    for part in problem.obstacles:
-        least = torch.minimum(least, part.chord_clearance(X))
-    return least
 
 
 def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, limit: float) -> Tensor:

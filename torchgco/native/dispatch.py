@@ -9,14 +9,18 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.constraints.separation import Separation
 from torchgco.lagrangian import rollout
 from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.lagrangian.quality import violation
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kernels import native
 from torchgco.native.sampler import Sampler
+from torchgco.obstacles.base import TOUCH, Obstacles
+from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.border import check_eager
 from torchgco.problem.problem import Problem
 
@@ -129,11 +133,13 @@ def open_loop(problem: Problem, U: Tensor) -> Tensor:
 def followed(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """The rollout, X and U, that brings the problem's start back to X (B, N+1, n) by the feedback u = U + K (x - X).
 
+    Free components of the start are those of X.
     Gains K (B, N, m, n) that aren't finite count as 0.
     """
-    K, away, alpha = K.nan_to_num(0.0, 0.0, 0.0), problem.x0 - X[:, 0], torch.zeros_like(X[:, 0, 0])
+    start = problem.start_in(X[:, 0])
+    K, away, alpha = K.nan_to_num(0.0, 0.0, 0.0), start - X[:, 0], torch.zeros_like(X[:, 0, 0])
     U = torch.cat((U[:, :1] + (K[:, 0] * away.unsqueeze(1)).sum(-1).unsqueeze(1), U[:, 1:]), dim=1)
-    X, G = torch.cat((problem.x0.unsqueeze(1), X[:, 1:]), dim=1), torch.nn.functional.pad(K, (0, 1))
+    X, G = torch.cat((start.unsqueeze(1), X[:, 1:]), dim=1), torch.nn.functional.pad(K, (0, 1))
     engine = engine_of(problem)
     if engine is not None:
         return engine.closed_loop(problem, X, U, G)
@@ -149,7 +155,7 @@ def reproducible(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Ten
     engine = engine_of(problem)
     if engine is None:
         return X, U
-    other = engine.open_loop(problem, U + NUDGE * U.abs().amax(dim=1, keepdim=True))
+    other = engine.open_loop(problem.held_at(X[:, 0]), U + NUDGE * U.abs().amax(dim=1, keepdim=True))
     scale = X.abs().flatten(1).amax(-1).clamp(min=NUDGE)
     rows = (~((other - X).abs().flatten(1).amax(-1) <= AMPLIFIED * NUDGE * scale)).nonzero().flatten()
     if rows.numel() == 0:
@@ -164,3 +170,27 @@ def value(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]
     """J_var (B,) and L_M (B,)."""
     engine = engine_of(lagrangian.problem)
     return lagrangian.value(X, U) if engine is None else engine.value(lagrangian, X, U)
+
+
+def measured(problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
+    """The largest violation (B,) of trajectories, of all constraints or of `obstacles` alone (geometric ones)."""
+    engine = engine_of(problem)
+    if engine is not None and engine.measures:
+        return engine.violation(problem, X, U, obstacles)
+    return violation(problem.geometric if obstacles else problem.constraints, X, U)
+
+
+def chord_clearance(problem: Problem, X: Tensor, share: float = TOUCH) -> Tensor:
+    """Smallest distance (B,) from the straight lines between knots to obstacles, m, negative in contact.
+
+    Counted from a `share` of an obstacle's margin beneath its surface, by default from where bodies touch; infinite
+    without obstacles and positions that keep a distance.
+    """
+    engine, least = engine_of(problem), X.new_full(X.shape[:1], torch.inf)
+    parts = [part for part in (c.bare for c in problem.constraints) if isinstance(part, Obstacles | Separation)]
+    if engine is not None and any(type(part) is BoundSpheres for part in parts):
+        least = engine.chords(problem, X, 1.0 - share)
+        parts = [part for part in parts if type(part) is not BoundSpheres]
+    for part in parts:
+        least = torch.minimum(least, part.chord_clearance(X, share))
+    return least

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
+from torchgco.constraints.base import Constraint
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native import structures as c
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
@@ -49,6 +50,7 @@ class Engine:
         self.functions = {i: source for i, source in sources if source.size > 0}
         dense = quadratic is not None and not quadratic.diagonal
         boxes = any(type(constraint) is BoundBoxes for constraint in problem.constraints)
+        self.measures = all(type(part) in KINDS or _measured(part) for part in problem.constraints)
         self.form = Form(self.model, problem.dynamics.position, self.cost, dense, tuple(self.functions.items()), boxes)
         self.library = load(self.form.source(), STRUCTURES)
 
@@ -101,7 +103,7 @@ class Engine:
         if lagrangian is None:
             packed = self.packed(problem, **values, mu=none, constraints=0)
         else:
-            packed = self.terms(lagrangian, **values)
+            packed = self.terms(lagrangian, None, **values)
         packed.slopes, packed.curvatures = slopes, H
         self._run("tgco_expand", B, packed)
         return slopes, H
@@ -115,7 +117,7 @@ class Engine:
         """
         B = lagrangian.problem.B
         found, mu_r = _flags(B), torch.zeros_like(state["merit"])
-        packed = self.terms(lagrangian, **state, converged=found, regularisation=mu_r, limit=rounds, gain=gain)
+        packed = self.terms(lagrangian, None, **state, converged=found, regularisation=mu_r, limit=rounds, gain=gain)
         self._run("tgco_lift", B, packed)
         return found != 0
 
@@ -135,9 +137,25 @@ class Engine:
         out = {name: _flags(B) for name in ("status", "converged", "refused", "lost")}
         out |= {name: torch.zeros(B, dtype=torch.float64) for name in ("alpha", "used")}
         replicas = LANES // 2 ** (B - 1).bit_length() if B <= LANES else 1
-        packed = self.terms(lagrangian, **state, **out, options=options, limit=limit, replicas=replicas)
+        packed = self.terms(lagrangian, None, **state, **out, options=options, limit=limit, replicas=replicas)
         self._run("tgco_ilqr", B, packed)
         return out
+
+    def violation(self, problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
+        """The largest violation (B,) of trajectories, of problems that the library `measures`; of obstacles alone?"""
+        worst, name = X.new_empty(len(X)), "tgco_penetration" if obstacles else "tgco_violation"
+        self._run(name, len(X), self.packed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
+        return worst
+
+    def chords(self, problem: Problem, X: Tensor, scale: float) -> Tensor:
+        """The smallest distance (B,) of the lines between knots from spheres with radii times `scale`; or infinity."""
+        U, least = X.new_zeros(len(X), problem.N, problem.m), X.new_empty(len(X))
+        self._run("tgco_chords", len(X), self.packed(problem, X=X.contiguous(), U=U, merit=least, gain=scale))
+        return least
+
+    def outer_loop(self, outer: c.Outer, B: int) -> None:
+        """Passes of the outer loop, in place in the tensors that `outer` names."""
+        run(self.library.tgco_outer, B, LANES, outer)
 
     def _run(self, name: str, B: int, packed: c.Problem) -> None:
         run(getattr(self.library, name), B, LANES, packed)
@@ -150,12 +168,14 @@ class Engine:
             setattr(packed, name, value)
         return packed
 
-    def terms(self, lagrangian: Lagrangian, **values: Any) -> c.Problem:
-        """The same with the terms that the Lagrangian adds to the cost."""
+    def terms(self, lagrangian: Lagrangian, best: Multipliers | None = None, **values: Any) -> c.Problem:
+        """The same with the terms that the Lagrangian adds to the cost; `best` are those of an outer loop's best."""
         multipliers, phr = lagrangian.multipliers, lagrangian.phr
         rows = [constraint.copy() for constraint in self._fixed(lagrangian.problem)[1]]
         for row, lam in zip(rows, multipliers.lam, strict=True):
             row.lam = lam.contiguous()
+        for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
+            row.best = lam
         values |= {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": phr, **guide_of(lagrangian.penalty)}
         return self.packed(lagrangian.problem, **values)
 
@@ -169,10 +189,10 @@ class Engine:
         if problem.B == 0:
             return c.Problem(), [c.Constraint() for _ in problem.constraints]
         rows = []
-        for i, constraint in enumerate(problem.constraints):
+        for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
             source = self.functions.get(i)
             numbers = None if source is None else rows_numbers(problem, i, source)
-            rows.append(constraint_of(constraint, numbers, problem))
+            rows.append(constraint_of(constraint, shape, numbers, problem))
         packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows)
         if self.model.count > 0:
             packed.parameters = array(self.model.numbers(problem.B, problem.dynamics), knots=True)
@@ -202,6 +222,11 @@ def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> No
             done = [call.result() for call in calls]
     if not all(done):
         raise MemoryError("native kernels: no memory")
+
+
+def _measured(part: Constraint) -> bool:
+    """Whether violations are what the base class says of rows."""
+    return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
 
 
 def _flags(B: int) -> Tensor:

@@ -31,7 +31,8 @@ class InteriorEngine:
     def solve(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
     ) -> dict[str, Tensor]:
-        """States, controls, multipliers and barrier parameters in place; X begins with the problem's start.
+        """States, controls, multipliers and barrier parameters in place; X begins with the problem's start, or
+        a guess of what is free in it.
 
         Args:
             X, U: (B, N+1, n), (B, N, m), contiguous.
@@ -45,6 +46,7 @@ class InteriorEngine:
         B, N = problem.B, problem.N
         out = {"status": torch.zeros(B, dtype=torch.int32), "iterations": torch.zeros(B, dtype=torch.int64)}
         out["gains"] = X.new_zeros(B, N, problem.m, problem.n + 1)
+        free = problem.free_start
         ends = {name: X.new_zeros(B) for name in ("error", "theta")}
         rows = [constraint.copy() for constraint in self.engine._fixed(problem)[1]]
         for row, lam in zip(rows, multipliers, strict=True):
@@ -52,6 +54,9 @@ class InteriorEngine:
         packed = self.engine.packed(problem, X=X, U=U, constraint=rows, **out)
         run(
             self.library.tgco_interior, B, LANES,
-            Interior.complete(of=packed, barrier=barrier, **ends, **options),
+            Interior.complete(
+                of=packed, barrier=barrier, free_start=None if free is None else free.double().contiguous(),
+                **ends, **options,
+            ),
         )  # fmt: skip
         return out | ends

@@ -27,11 +27,14 @@ def quadratic_arrays(cost: Any) -> list[c.Array]:
     return [array(getattr(cost, field), knots=not name.endswith("_LAST")) for name, field in QUADRATIC.items()]
 
 
-def constraint_of(constraint: Constraint, numbers: Tensor | None, problem: Problem) -> c.Constraint:
-    """A constraint without multipliers; `numbers` (B|1, K|1, count) are those of a traced one."""
-    one = problem.take(slice(0, 1))
-    X, U = one.x0.unsqueeze(1).expand(-1, problem.N + 1, -1), one.x0.new_zeros(1, problem.N, problem.m)
-    _, knots, rows = constraint.take(slice(0, 1)).value(X, U).shape
+def constraint_of(
+    constraint: Constraint, shape: tuple[int, int], numbers: Tensor | None, problem: Problem
+) -> c.Constraint:
+    """A constraint without multipliers, with knots and rows as `shape` says.
+
+    `numbers` (B|1, K|1, count) are those of a traced one.
+    """
+    knots, rows = shape
     place = torch.full((problem.N + 1,), NOWHERE, dtype=torch.int32)
     if rows > 0:
         place[constraint.knots] = torch.arange(knots, dtype=torch.int32)
@@ -45,7 +48,10 @@ def constraint_of(constraint: Constraint, numbers: Tensor | None, problem: Probl
         own = _spheres(constraint)
     elif isinstance(constraint, BoundBoxes):
         own = {"bound": array(_box_numbers(constraint), knots=False)}
-    return c.Constraint(kind=kind, equality=constraint.sense == "equality", knots=knots, rows=rows, place=place, **own)
+    if isinstance(constraint, BoundSpheres | BoundBoxes) and constraint.stops is not None:
+        own["stops"] = array(constraint.stops.unsqueeze(-1), knots=False)
+    equality, geometric = constraint.sense == "equality", constraint.geometric
+    return c.Constraint(kind=kind, equality=equality, geometric=geometric, knots=knots, rows=rows, place=place, **own)
 
 
 def guide_of(guide: Penalty | None) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from enum import IntEnum
 from torch import Tensor
 
 from torchgco.base.draws import MURMUR_1, MURMUR_2, WEYL
-from torchgco.base.status import Status
+from torchgco.base.status import STALLED, STOPPED, Status
 from torchgco.native.declarations import Structure, fields
 from torchgco.obstacles.base import ABSENT
 
@@ -16,6 +16,7 @@ PAIRS = 64  # entries of a filter; the oldest are forgotten
 LONGEST_FALL = 50  # reductions of the barrier parameter in one iteration
 CONSTANTS = {
     "ABSENT": ABSENT, "NOWHERE": NOWHERE, "PAIRS": PAIRS, "LONGEST_FALL": LONGEST_FALL, "PARTS": 3,
+    "STOPPED": STOPPED, "STALLED": STALLED,
     **{name: f"{value & 0xFFFFFFFF:#x}u" for name, value in (
         ("MURMUR_1", MURMUR_1), ("MURMUR_2", MURMUR_2), ("WEYL", WEYL),
     )},
@@ -47,16 +48,17 @@ class Array(Structure):
 
 class Constraint(Structure):
     declared = (
-        ("int32_t", "kind equality rows"),  # rows of a knot
+        ("int32_t", "kind equality geometric rows"),  # rows of a knot
         ("const int32_t *", "place"),  # (N+1): index among the constraint's knots, or NOWHERE
         ("int64_t", "knots"),
-        ("double *", "lam"),  # (E, knots, rows)
+        ("double *", "lam best"),  # (E, knots, rows): multipliers, and those of the best iterate of an outer loop
         ("const int32_t *", "variable"),  # BOUNDS: (rows) index into [x, u]
         ("const double *", "sign"),  # BOUNDS: (rows) +1 for an upper bound, -1 for a lower one
         # BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ...); BOXES: see boxes.c.
         (Array, "bound"),
         (Array, "squares"),  # SPHERES: squared inflated radii (E, 1, rows), ABSENT where there is none
         (Array, "velocities"),  # SPHERES: as centres, or NULL
+        (Array, "stops"),  # SPHERES, BOXES: the last knot at which they count (E, 1, 1), or NULL
         ("double", "dt"),
     )
     _fields_ = fields(declared)
@@ -85,7 +87,7 @@ class Problem(Structure):
         ("double *", "alpha used"),  # (E): step length and mu_r of the last iteration
         ("double *", "gains"),  # (E, N, NU, NZ): what tgco_gains writes
         ("double *", "slopes curvatures"),  # (E, N+1, S), (E, N+1, S, S): what tgco_expand writes
-        ("const double *", "mu"),
+        ("double *", "mu"),
         ("int64_t *", "inner iterations rung"),
         ("int32_t *", "status converged refused lost"),
         (Array, "parameters"),  # of the model: (E, N, count)
@@ -95,6 +97,26 @@ class Problem(Structure):
         (Array, "center radius weight"),
         (Options, "options"),
         ("double", "gain"),  # share of L_M by which tgco_lift must lower it
+    )
+    _fields_ = fields(declared)
+
+
+class Outer(Structure):
+    """The outer loop of the augmented Lagrangian (see solvers.augmented_lagrangian)."""
+
+    declared = (
+        ("const Problem *", "of"),
+        ("int64_t *", "outer waited outcome"),  # (E): outcome is RUNNING until a problem ends
+        ("double *", "last_cost last_violation mark"),  # (E); mark (E, 2)
+        ("double *", "best_X best_U best_mu best_cost best_violation"),  # (E, ...)
+        ("const int64_t *", "base"),  # (E): outer iterations before this solve, for `single_after`
+        ("const double *", "goal near"),  # (E, DIM), (E); NULL: arrival doesn't count
+        ("int32_t", "solves updates"),  # whether a pass makes the inner solves, and the outer iterations of those ended
+        ("int64_t", "passes max_outer patience single_after"),  # -1: no patience, or never a single contact
+        ("int32_t", "ends stops"),  # stops: a caught iterate ends its problem's solve
+        ("double", "growth stalled_growth penalty_max tolerance halved settled"),  # stalled_growth: 0: none
+        ("int64_t", "lifted_steps"),
+        ("double", "lifted_gain"),
     )
     _fields_ = fields(declared)
 
@@ -122,6 +144,7 @@ class Interior(Structure):
     declared = (
         ("const Problem *", "of"),
         ("double *", "barrier error theta"),  # (E): mu, in and out; error of the end test and sum of residuals, out
+        ("const double *", "free_start"),  # (E, NX): 1 where a component of the start is a variable; NULL: nowhere
         ("int64_t", "max_iterations failures patience trials"),
         ("int32_t", "corrects warm"),
         ("double", "tolerance violation push steepest boundary central smallest restored"),
@@ -129,11 +152,12 @@ class Interior(Structure):
         ("double", "highest lowest gain_theta gain_phi armijo switching power_theta power_phi"),
         ("double", "shift_first shift_least shift_decay shift_growth shift_growth_first shift_max"),
         ("double", "shift_recovery recovery_decay recovery_growth shift_crawl crawl soft softest explodes"),
+        ("double", "pivot noise soft_growth soft_decay forced_growth"),
     )
     _fields_ = fields(declared)
 
 
-STRUCTURES = (Array, Constraint, Options, Problem, Sampling, Interior)
+STRUCTURES = (Array, Constraint, Options, Problem, Outer, Sampling, Interior)
 ENUMERATIONS = (Kind, Guide, Status, End)
 
 

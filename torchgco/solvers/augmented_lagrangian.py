@@ -11,24 +11,28 @@ from torch import Tensor
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtLeast, AtMost, Count, Positive, check_options
-from torchgco.base.status import Status
+from torchgco.base.status import STALLED, STOPPED, Status
 from torchgco.base.tree import copied, put, take
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, update_and_raise_penalty
 from torchgco.lagrangian.penalties import Penalty
-from torchgco.lagrangian.quality import is_preferred, violation
-from torchgco.native.dispatch import open_loop, value
+from torchgco.lagrangian.quality import is_preferred
+from torchgco.native.dispatch import engine_of, measured, open_loop, value
+from torchgco.native.engine import Engine
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
+from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.contracts import Advice, Call, Guidance, Progress, Solver
 from torchgco.solvers.ending import start_status
 from torchgco.solvers.history import Recorder
 from torchgco.solvers.ilqr import ILQR, advance
+from torchgco.solvers.native_outer import NativeOuter
 from torchgco.solvers.session import Session
-from torchgco.solvers.state import STALLED, STOPPED, Iterate, PassEnd, SolveEnd, State
+from torchgco.solvers.state import Iterate, PassEnd, SolveEnd, State
 
 PENALTY_MAX = 1e12  # ceiling of mu
 HALVED = 0.5  # of a violation: the least that an outer iteration with a growing penalty should give
 SETTLED = 1e-3  # share of J_var: a solve ends once an inner solve changes it by less and is feasible
+PASSES = 256  # problems times passes in one native call: between calls, an interrupt can end the solve
 HOLD = 2.0  # penalty on an abandoned trajectory, as a multiple of the extra cost of its replacement
 
 
@@ -125,6 +129,7 @@ class OuterLoop:
         self.result = SolveEnd.blank(call.problem, call.U0)
         self.stopped = 0  # problems that guidance has stopped
         self.limit = 1 if recorder is not None else solver.inner.max_iterations
+        self._native: NativeOuter | None = None  # of the running problems
 
     def begin(self, rows: Tensor) -> tuple[State, Tensor]:
         """Rollouts of the initial controls of the problems `rows`, and the statuses of invalid starts."""
@@ -156,6 +161,7 @@ class OuterLoop:
     def regroup(self, rows: Tensor) -> None:
         """Continue with these problems as the running ones."""
         self.problem = self._part(rows)
+        self._native = None
 
     def _part(self, rows: Tensor) -> Problem:
         """The problems `rows`, in their order; all of them are the whole, of which native kernels know more."""
@@ -163,7 +169,44 @@ class OuterLoop:
         return whole if rows.numel() == whole.B else whole.take(rows)
 
     def advance(self, s: State) -> Tensor:
-        """One inner solve of every running problem (one iteration by PyTorch or if recorded), then the outer update."""
+        """Inner solves of the running problems and the outer iterations after them; returns the statuses.
+
+        At least one inner solve each; by PyTorch, or if recorded, one iteration.
+        """
+        engine = engine_of(self.problem)
+        status = self._by_pytorch(s) if engine is None or not engine.measures else self._by_native(engine, s)
+        if self.call.late:
+            status[status == Status.RUNNING] = Status.TIME_LIMIT
+        return status
+
+    def _by_native(self, engine: Engine, s: State) -> Tensor:
+        """As `advance`: with one call of the library for all of it where nothing else has to look on."""
+        solver, stop = self.solver, self.guidance if isinstance(self.guidance, StopWhenCaught) else None
+        guided = self.guidance is not None and stop is None
+        if self._native is None or guided:  # guidance may have replaced tensors of the state
+            base = self.call.outer[s.rows]
+            self._native = NativeOuter(
+                engine, solver.inner, self.problem, s, stop, base, self.by_arrival,
+                max_outer=solver.max_outer_iterations, patience=-1 if solver.patience is None else solver.patience,
+                growth=solver.penalty_growth, stalled_growth=solver.stalled_growth or 0.0, penalty_max=PENALTY_MAX,
+                tolerance=solver.violation_tolerance, halved=HALVED, settled=SETTLED,
+            )  # fmt: skip
+        native = self._native
+        if self.recorder is not None:
+            self.recorder.add(self.problem, self.call.rows[s.rows], s, native.iterate())
+            native.update()
+        elif guided or self.call.callback is not None or self.call.deadline is not None:
+            native.run(1)
+        else:
+            native.run_half(PASSES)
+        status = native.outcome.clone()
+        going = (native.ended & (status == Status.RUNNING)).nonzero().flatten()
+        if guided and going.numel() > 0:
+            self._ask_guidance(self.problem, s, going, status)
+            self._begin_inner(self.problem, s, going)
+        return status
+
+    def _by_pytorch(self, s: State) -> Tensor:
         lagrangian = Lagrangian(self.problem, s.multipliers, s.penalty, self.rules.phr)
         end = advance(self.solver.inner, s, lagrangian, self.limit)
         if self.recorder is not None:
@@ -171,14 +214,12 @@ class OuterLoop:
         rows = end.ended.nonzero().flatten()
         if rows.numel() > 0:
             self._outer_iteration(s, rows, end)
-        if self.call.late:
-            end.status[end.status == Status.RUNNING] = Status.TIME_LIMIT
         return end.status
 
     def _outer_iteration(self, s: State, rows: Tensor, end: PassEnd) -> None:
         """Algorithm 4, lines 7-12, for the problems in `rows`, whose inner solve has ended."""
         solver, problem, X, U = self.solver, self.problem.take(rows), s.X[rows], s.U[rows]
-        worst = violation(problem, X, U)
+        worst = measured(problem, X, U)
         growth = torch.full_like(worst, solver.penalty_growth)
         if solver.stalled_growth is not None:
             growth = growth.masked_fill(worst > HALVED * s.last_violation[rows], solver.stalled_growth)
@@ -277,7 +318,7 @@ class OuterLoop:
         """Keep the best and the last iterate of the problems at `places` of the state."""
         problem, r, rows = self.problem.take(places), self.result, s.rows[places]
         X, U = s.X[places], s.U[places]
-        last = Iterate(X, U, take(s.multipliers, places), s.cost[places], violation(problem, X, U))
+        last = Iterate(X, U, take(s.multipliers, places), s.cost[places], measured(problem, X, U))
         best, known = copied(last), torch.isfinite(s.best.violation[places]).nonzero().flatten()
         put(best, known, take(take(s.best, places), known))
         put(r.last, rows, last)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
@@ -11,15 +12,15 @@ import torch
 from torch import Tensor
 
 from torchgco.base.draws import DrawKey
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, StartWarning
 from torchgco.base.options import Seconds, Seed, check_value
-from torchgco.base.shapes import computing_on, describe
+from torchgco.base.shapes import check_shape, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, take
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
-from torchgco.native.dispatch import cost_unit, current
+from torchgco.native.dispatch import cost_unit, current, open_loop
+from torchgco.problem.horizons import at_rest_after, for_solvers
 from torchgco.problem.problem import Problem, check_problem
-from torchgco.problem.rates import with_controls_before
 from torchgco.solution import Solution
 
 
@@ -54,6 +55,7 @@ class Call:
     warm: Multipliers | None
     callback: Callback | None
     deadline: float | None = None  # of `time.monotonic`, s; after it the solve ends with the best trajectory so far
+    X0: Tensor | None = None  # (B, N+1, n): states to begin with; None: those that U0 leads to
 
     @classmethod
     def checked(
@@ -95,9 +97,9 @@ class Call:
     def take(self, index: Rows) -> Self:
         """The same call for the problems in `index`."""
         warm = None if self.warm is None else take(self.warm, index)
-        U0, ids, rows, outer = take((self.U0, self.ids, self.rows, self.outer), index)
+        U0, ids, rows, outer, X0 = take((self.U0, self.ids, self.rows, self.outer, self.X0), index)
         part = self.problem.take(index)
-        return type(self)(part, U0, self.seed, ids, rows, outer, warm, self.callback, self.deadline)
+        return type(self)(part, U0, self.seed, ids, rows, outer, warm, self.callback, self.deadline, X0)
 
     def in_cost_units(self) -> tuple[Self, Tensor]:
         """The same call with costs and multipliers in units of `Problem.cost_unit`, and these units (B,)."""
@@ -132,6 +134,7 @@ class Solver:
         warm: Multipliers | None = None,
         callback: Callback | None = None,
         max_seconds: float | None = None,
+        X0: Tensor | None = None,
     ) -> Solution:
         """Solve every problem of the batch.
 
@@ -144,19 +147,54 @@ class Solver:
             callback: called with the progress after every pass.
             max_seconds: the batched solvers check the time after every pass; once it is over, they return the best
                 trajectories so far. Results then depend on the speed of the machine. The baselines ignore it.
+            X0: states to begin with (B, N+1, n), which U0 need not lead to, for solvers that `take_states`; where one
+                isn't finite, the problem begins with its start held. The first states are those of the problem, but
+                where these are free.
 
         Raises:
-            InputError: U0, ids or warm don't fit the problem, or an option of the solver doesn't.
+            InputError: U0, ids, warm or X0 don't fit the problem, or an option of the solver doesn't; X0 where the
+                solver can't begin with states.
         """
         check_problem(problem)
         with computing_on(problem.x0.device):
-            whole = problem if self.joins_knots else with_controls_before(problem)
-            found = self.run(Call.checked(whole, U0, seed, ids, warm, callback, max_seconds))
-            return found if whole is problem else found.of_first_states(problem.n)
+            if problem.B == 0:  # nothing to trace code with
+                Call.checked(problem, U0, seed, ids, warm, callback, max_seconds)
+                return Solution.empty(problem)
+            whole = for_solvers(problem, self.joins_knots)
+            if problem.horizon is not None:
+                problem.check_controls(U0)
+                U0 = at_rest_after(problem, U0)
+            call = Call.checked(whole, U0, seed, ids, warm, callback, max_seconds)
+            call = call if X0 is None else self._from_states(call, X0, problem)
+            if problem.free_start is not None and bool(problem.free_start.any()) and not self.frees_start(call.problem):
+                expected = "InteriorPoint, also within gco, does where there are native kernels (float64 on a CPU)"
+                held = f"free_start: the start is held at x0, as {type(self).__name__} doesn't choose it; {expected}"
+                warnings.warn(held, StartWarning, stacklevel=2)
+            found = self.run(call)
+            return found if whole is problem else found.of_first_states(problem.n, problem.horizon)
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
         raise NotImplementedError
+
+    def take_states(self, problem: Problem) -> bool:
+        """Whether `run` can begin these problems with states that their controls don't lead to."""
+        return False
+
+    def _from_states(self, call: Call, X0: Tensor, problem: Problem) -> Call:
+        """The call with states (B, N+1, n) of the user's problem to begin with; InputError where that can't be."""
+        check_tensor(X0, "X0", problem.x0)
+        check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
+        if not self.take_states(call.problem):
+            able = "interior_point or, without obstacles, gco, both with native kernels (float64 on a CPU); or ipopt"
+            raise InputError("X0", f"None, or a solver that can begin with states: {able}", type(self).__name__)
+        if call.problem is not problem:  # controls before, where their change is bounded
+            X0 = torch.cat((X0, open_loop(call.problem, call.U0)[..., problem.n :]), dim=-1)
+        return replace(call, X0=X0)
+
+    def frees_start(self, problem: Problem) -> bool:
+        """Whether `run` chooses the free components of these problems' starts; if not, they stay at x0."""
+        return False
 
     def prepare(self, problem: Problem) -> Solver:
         """The solver with everything built that this batch needs, so that a caller can time the solve alone."""

@@ -12,13 +12,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.base.status import Status
+from torchgco.base.status import SOLVED, STALLED, Status
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.dispatch import cost_unit, engine_of
 from torchgco.problem.problem import Problem
 from torchgco.solvers.riccati import BackwardPass, backward
-from torchgco.solvers.state import SOLVED, STALLED
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
 LEAST_COST = 1e-6  # the cost counts as at least this share of the cost of staying at the start

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchgco.lagrangian.quality import violation
+from torchgco.native.dispatch import measured
 from torchgco.problem.problem import Problem
 from torchgco.solvers.state import PassEnd, State
 
@@ -35,7 +35,7 @@ class Recorder:
             "merit": state.merit,
             "alpha": end.alpha,
             "regularisation": end.used,
-            "violation": violation(problem, state.X, state.U),
+            "violation": measured(problem, state.X, state.U),
             "guided": guided,
         }
         self._passes.append({name: value[~end.failed].clone() for name, value in row.items()})

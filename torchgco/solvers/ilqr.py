@@ -8,12 +8,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import Count, NonNegative, Share, check_options
-from torchgco.base.status import Status
+from torchgco.base.status import STALLED, Status
 from torchgco.base.tree import put, take
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.lagrangian.quality import violation
-from torchgco.native.dispatch import engine_of, open_loop, value
+from torchgco.native.dispatch import engine_of, measured, open_loop, value
 from torchgco.native.structures import End, Options
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
@@ -23,7 +22,7 @@ from torchgco.solvers.line_search import LineSearch
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.rules import PRINTED, STANDARD, Rules
 from torchgco.solvers.session import Session
-from torchgco.solvers.state import STALLED, InnerState, Iterate, PassEnd, SolveEnd
+from torchgco.solvers.state import InnerState, Iterate, PassEnd, SolveEnd
 
 ROUNDING = 1e-14  # share of L_M: a smaller expected change is rounding error
 # mu_r after a failed Cholesky (Algorithm 2, line 9): first value, growth factor, and the limit that ends a problem.
@@ -77,7 +76,7 @@ class ILQR(Solver):
         fixed = Multipliers.zero(problem, 0.0) if warm is None else warm
         lagrangian = Lagrangian(problem, fixed, None, phr=False)
         s, status = descend(self, lagrangian, session.call.U0, start_is_clear=problem.start_is_clear)
-        end = Iterate(s.X, s.U, fixed, s.cost, violation(problem, s.X, s.U))
+        end = Iterate(s.X, s.U, fixed, s.cost, measured(problem, s.X, s.U))
         # Multipliers are fixed: a trajectory that has converged and isn't feasible stays so.
         done = (status == Status.MAX_ITERATIONS) & (s.inner < self.max_iterations)
         status = torch.where(done, STALLED, status)
@@ -170,7 +169,7 @@ def advance(inner: ILQR, s: InnerState, lagrangian: Lagrangian, limit: int) -> P
     for name in ("X", "U", "cost", "merit", "regularisation", "inner", "iterations", "rung"):
         state[name] = getattr(s, name).clone(memory_format=torch.contiguous_format)
         setattr(s, name, state[name])
-    out = engine.inner_solve(lagrangian, state, _native_options(inner), limit)
+    out = engine.inner_solve(lagrangian, state, native_options(inner), limit)
     converged, stuck, lost = (out[name] != 0 for name in ("converged", "refused", "lost"))
     ended = out["status"] == End.ENDED
     failed = ~ended & (out["status"] != Status.RUNNING)
@@ -212,7 +211,8 @@ def descend(
     return found, status
 
 
-def _native_options(inner: ILQR) -> Options:
+def native_options(inner: ILQR) -> Options:
+    """The options in the structure that the library reads."""
     search, printed = inner.line_search, inner.as_printed
     ladder = torch.tensor(search.ladder(printed), dtype=torch.float64)
     return Options.complete(

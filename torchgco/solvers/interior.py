@@ -10,30 +10,31 @@ from torch import Tensor
 
 from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.shapes import check_shape, check_tensor
-from torchgco.base.status import Status
-from torchgco.base.tree import put
-from torchgco.constraints.base import Constraint
+from torchgco.base.status import SOLVED, STALLED, Status
+from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.lagrangian.quality import violation
-from torchgco.native.dispatch import cost_unit, followed, interior_of, open_loop
+from torchgco.lagrangian.quality import is_better
+from torchgco.native.dispatch import cost_unit, followed, interior_of, measured, open_loop
 from torchgco.native.interior import InteriorEngine
+from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, check_problem
-from torchgco.problem.rates import with_controls_before
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Progress, Solver
 from torchgco.solvers.ending import start_status
 from torchgco.solvers.ilqr import ILQR
+from torchgco.solvers.infeasible import least_violation
 from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
-from torchgco.solvers.state import SOLVED, Iterate, SolveEnd
+from torchgco.solvers.state import Iterate, SolveEnd
 
-PUSH = 1e-2  # least slack at the start, and how far guesses are moved inside of their bounds
+GAVE_UP = Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, Status.NOT_POSITIVE_DEFINITE, Status.NON_FINITE
 AT_ONCE = 256  # problems between two looks at the clock
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
 # Waechter and Biegler (2006), in whose words these have the names in brackets; where no name is given, ours.
 FILTER: dict[str, Any] = {
+    "push": 1e-2,  # least slack at the start, and how far guesses are moved inside of their bounds (kappa_1)
     "boundary": 0.99,  # share of the way to where a slack is 0 (tau_min)
     "central": 1e10,  # factor by which s z may leave mu (kappa_Sigma)
     "barrier_error": 10.0, "barrier_share": 0.2, "barrier_floor": 0.1,  # kappa_epsilon, kappa_mu; tolerance times this
@@ -46,9 +47,11 @@ FILTER: dict[str, Any] = {
     "patience": 10, "trials": 3,  # short steps before the watchdog, and its full steps
     "corrects": 1, "smallest": 1e-10,  # second-order corrections; least step length
     "steepest": 1.0,  # slope or curvature of the cost, to which it is scaled
+    "pivot": 1e-14, "noise": 10.0,  # least pivot, as a share of its entry; rounding of phi, in units of its last bit
     "soft": 1e-8, "softest": 1e-2, "explodes": 1e6,  # dual regularisation (delta_c), raised where multipliers explode
+    "soft_growth": 100.0, "soft_decay": 0.1,
     "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
-    "shift_recovery": 1e-3, "restored": 0.9, "failures": 6,
+    "shift_recovery": 1e-3, "forced_growth": 10.0, "restored": 0.9, "failures": 6,
 }  # fmt: skip
 
 
@@ -85,13 +88,22 @@ class InteriorPoint(Solver):
         if interior_of(call.problem) is None:
             return self._without_kernels().run(call)
         session = Session(call, RAW)
-        return session.finished(self.solved(session.call), self.violation_tolerance)
+        end = self._least_violated(session.call, self._no_worse(session.call, self.solved(session.call)))
+        return session.finished(end, self.violation_tolerance)
+
+    def frees_start(self, problem: Problem) -> bool:
+        """Where there are native kernels."""
+        return interior_of(problem) is not None
+
+    def take_states(self, problem: Problem) -> bool:
+        """Where there are native kernels."""
+        return interior_of(problem) is not None
 
     def solve_from(self, problem: Problem, X0: Tensor, U0: Tensor, max_seconds: float | None = None) -> Solution:
         """Solve from states that the controls need not lead to, such as waypoints; without kernels, from U0 alone.
 
         Args:
-            X0: (B, N+1, n); the first states are those of the problem, whatever is given.
+            X0: (B, N+1, n); the first states are those of the problem, whatever is given, but where these are free.
             U0: (B, N, m).
             max_seconds: as of `solve`.
 
@@ -101,34 +113,28 @@ class InteriorPoint(Solver):
         check_problem(problem)
         check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
         check_tensor(X0, "X0", problem.x0)
-        whole = with_controls_before(problem)
-        session = Session(Call.checked(whole, U0, max_seconds=max_seconds), RAW)
-        if interior_of(session.call.problem) is None:
-            return self.solve(problem, U0, max_seconds=max_seconds)
-        more = open_loop(session.call.problem, U0)[..., problem.n :]  # controls before, where their change is bounded
-        end = self.solved(session.call, torch.cat((X0, more), dim=-1))
-        found = session.finished(end, self.violation_tolerance)
-        return found if whole is problem else found.of_first_states(problem.n)
+        serves = self.take_states(for_solvers(problem))
+        return self.solve(problem, U0, max_seconds=max_seconds, X0=X0 if serves else None)
 
     def solved(self, call: Call, X0: Tensor | None = None) -> SolveEnd:
         """The solve without its verdict, in the units of the call, by native kernels.
 
         Args:
-            X0: states to begin with, (B, N+1, n), of which the first isn't used; None: the rollout of the call's
-                controls, or the start held where that is not finite.
+            X0: states to begin with, (B, N+1, n), of the first those components that are free; None: the call's, else
+                the rollout of its controls; the start held where these are not finite.
         """
-        problem = call.problem
+        problem, X0 = call.problem, call.X0 if X0 is None else X0
         kernels = interior_of(problem)
         assert kernels is not None
         rollout = open_loop(problem, call.U0)
-        X = rollout if X0 is None else torch.cat((problem.x0.unsqueeze(1), X0[:, 1:]), dim=1)
+        X = rollout if X0 is None else torch.cat((problem.start_in(X0[:, 0]).unsqueeze(1), X0[:, 1:]), dim=1)
         start = problem.x0.unsqueeze(1).expand_as(X)
         status = start_status(problem, start, problem.x0[:, 0], problem.start_is_clear)
         X = torch.where(torch.isfinite(X).flatten(1).all(-1).view(-1, 1, 1), X, start)
         end = SolveEnd.blank(problem, call.U0)
         end.best.X[:] = rollout  # where a solve never begins
         end.best.cost[:] = problem.cost.total(rollout, call.U0)
-        end.best.violation[:] = violation(problem, rollout, call.U0)
+        end.best.violation[:] = measured(problem, rollout, call.U0)
         end.status[:] = status
         rows = (status == Status.RUNNING).nonzero().flatten()
         for part in rows.split(AT_ONCE):
@@ -141,23 +147,52 @@ class InteriorPoint(Solver):
                 call.callback(Progress(1, call.rows[part], done, problem.B))
         return end
 
+    def _no_worse(self, call: Call, end: SolveEnd) -> SolveEnd:
+        """The same, but with the guess where a solve failed and its result is worse: less feasible, or costlier."""
+        problem, found = call.problem, end.best
+        X = open_loop(problem, call.U0)
+        cost, worst = problem.cost.total(X, call.U0), measured(problem, X, call.U0)
+        lost = ~(torch.isfinite(found.cost) & torch.isfinite(found.violation))
+        worse = is_better(cost, worst, found.cost, found.violation, self.violation_tolerance) | lost
+        rows = (worse & (end.status != SOLVED) & torch.isfinite(cost) & torch.isfinite(worst)).nonzero().flatten()
+        if rows.numel() > 0:
+            multipliers = take(found.multipliers, rows)
+            none = Multipliers(tuple(torch.zeros_like(lam) for lam in multipliers.lam), multipliers.mu)
+            put(found, rows, Iterate(X[rows], call.U0[rows], none, cost[rows], worst[rows]))
+        return end
+
+    def _least_violated(self, call: Call, end: SolveEnd) -> SolveEnd:
+        """The same, with STALLED where a solve failed and no step from its end lowers the violation any further."""
+        failed = torch.stack([end.status == status for status in GAVE_UP]).any(0)
+        rows = (failed & ~(end.best.violation <= self.violation_tolerance)).nonzero().flatten()
+        if rows.numel() == 0 or call.late:
+            return end
+        problem, old = call.problem.take(rows).held_at(end.best.X[rows, 0]), take(end.best, rows)
+        X, U, stuck = least_violation(problem, old.U)
+        violation = measured(problem, X, U)
+        stuck &= violation > self.violation_tolerance
+        less = (stuck & (violation < old.violation)).nonzero().flatten()
+        new = Iterate(X, U, old.multipliers, problem.cost.total(X, U), violation)
+        put(end.best, rows[less], take(new, less))
+        end.status[rows[stuck]] = STALLED
+        return end
+
     def _some(self, kernels: InteriorEngine, call: Call, X: Tensor, rows: Tensor, end: SolveEnd) -> None:
         """Solves problems, and puts how they ended into `end` at `rows`."""
         problem, warm = call.problem, call.warm
         if warm is None:
-            multipliers, mu, push = Multipliers.zero(problem, 1.0).lam, self.initial_barrier, PUSH
+            multipliers, mu, how = Multipliers.zero(problem, 1.0).lam, self.initial_barrier, FILTER
         else:
-            mu = push = self.warm_barrier
+            mu, how = self.warm_barrier, FILTER | {"push": self.warm_barrier}
             multipliers = tuple(lam.clone(memory_format=torch.contiguous_format) for lam in warm.lam)
-        X, U = (z.contiguous() for z in inside(problem, X, call.U0, push))
+        X, U = (z.contiguous() for z in inside(problem, X, call.U0, how["push"]))
         out = kernels.solve(
-            problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None), push=push,
-            max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **FILTER,
+            problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None),
+            max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **how,
         )  # fmt: skip
         X, U = followed(problem, X, U, out["gains"][..., :-1])
-        lam = tuple(_active(*each, X, U) for each in zip(problem.constraints, multipliers, strict=True))
-        fitted = Multipliers(lam, PENALTY * cost_unit(problem))
-        found = Iterate(X, U, fitted, problem.cost.total(X, U), violation(problem, X, U))
+        fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
+        found = Iterate(X, U, fitted, problem.cost.total(X, U), measured(problem, X, U))
         put(end.best, rows, found)
         put(end.last, rows, found)
         status = out["status"].long()
@@ -187,10 +222,3 @@ def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor,
             held = z[:, bounds.knots, :size]
             z[:, bounds.knots, :size] = torch.minimum(torch.maximum(held, lower + low), upper - high)
     return X, U
-
-
-def _active(constraint: Constraint, lam: Tensor, X: Tensor, U: Tensor) -> Tensor:
-    """The multipliers (B, K, p) of a constraint, 0 where a row is inactive: there its slack exceeds them."""
-    if constraint.sense == "equality":
-        return lam
-    return torch.where(lam > -constraint.value(X, U), lam, 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -43,5 +43,5 @@ class Rules:
 
 
 PRINTED = Rules(in_cost_units=False, phr=False, accept_last=True, damped=False, ends=False)
-RAW = Rules(in_cost_units=False, phr=True, accept_last=False, damped=True, ends=True)
 STANDARD = Rules(in_cost_units=True, phr=True, accept_last=False, damped=True, ends=True)
+RAW = replace(STANDARD, in_cost_units=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from torchgco.base.status import Status
+from torchgco.base.status import SOLVED, STOPPED, Status
 from torchgco.base.tree import take
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.dispatch import reproducible
@@ -13,7 +13,8 @@ from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import final_status, optimality
 from torchgco.solvers.history import Recorder
 from torchgco.solvers.rules import Rules
-from torchgco.solvers.state import STOPPED, SolveEnd
+from torchgco.solvers.state import SolveEnd
+from torchgco.solvers.unbounded import falls_without_end
 
 
 class Session:
@@ -45,13 +46,18 @@ class Session:
             lagrangian = Lagrangian(part, take(best.multipliers, rows), None, self.rules.phr)
             K[rows], d[rows], left[rows] = optimality(lagrangian, X[rows], U[rows])
             X[rows], U[rows] = reproducible(lagrangian.problem, X[rows], U[rows], K[rows])
+        if problem.free_start is not None:  # stationary for this start alone, unless the interior point chose it
+            left = torch.where(problem.free_start.any(-1) & (end.status != SOLVED), left.clamp(min=1.0), left)
         limit = Status.TIME_LIMIT if self.given.late else Status.MAX_ITERATIONS
         ended = torch.where(end.status == STOPPED, int(limit), end.status)
-        status = final_status(ended, left, best.violation, tolerance, bool(problem.constraints))
+        constrained = bool(problem.constraints) or problem.free_start is not None
+        status = final_status(ended, left, best.violation, tolerance, constrained)
         scaled, user = self.call is not self.given, self.given.problem
         constant = user.cost_scale.constant if scaled else torch.zeros_like(self.unit)
+        cost = user.cost.total(X, U)
+        status[falls_without_end(user, self.given.U0, X, U, cost, best.violation, tolerance)] = Status.UNBOUNDED
         return Solution(
-            X, U, K, d, best.multipliers.scaled(self.unit), user.cost.total(X, U), best.violation, status,
+            X, U, K, d, best.multipliers.scaled(self.unit), cost, best.violation, status,
             end.iterations, end.outer, end.guided,
             None if self.recorder is None else self.recorder.frame(self.unit, constant),
         )  # fmt: skip

@@ -12,11 +12,6 @@ from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.problem.problem import Problem
 
-# Users never see these as statuses.
-STOPPED = -1  # ended by guidance, for another attempt
-STALLED = -2  # neither the violation nor the cost of a feasible trajectory falls any more
-SOLVED = -3  # the optimality conditions hold to the solver's own tolerance
-
 
 @dataclass(frozen=True)
 class Iterate:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
+from torchgco.base.values import whole_numbers_become
 from torchgco.tracing.arrays import boxed
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.operations import OPERATIONS
@@ -157,7 +158,7 @@ class Traced:
     def _computed(self, index: Tensor) -> dict[Slot, Any]:
         """PyTorch's part, for one problem."""
         known: dict[Slot, Any] = {self._index: index} | self._captured
-        with torch.no_grad():
+        with torch.no_grad(), whole_numbers_become(torch.float64):
             for operation in self._plain:
                 operation.replay(operation.function, known)
         return known

@@ -4,8 +4,14 @@
    most boxes are too far away for more. Then the factor of each box, which turns a distance into a squared length, and
    at last the numbers of each box (box.h). */
 
-/* Row j at a knot, and its derivatives by position (DIM) unless `slopes` is NULL; an absent box is c = -1. */
-static inline V solid(const Constraint *con, const Rows *rows, int64_t j, const V *x, V *slopes) {
+/* Whether a box of this radius counts at knot k: none does where time has stopped. */
+static inline I is_here(const Constraint *con, const Rows *rows, V radius, int64_t k) {
+    I here = radius >= SET(0.0);
+    return con->stops.data ? here & (SET(k) <= rows->stops[0]) : here;
+}
+
+/* Row j at knot k, and its derivatives by position (DIM) unless `slopes` is NULL; an absent box is c = -1. */
+static inline V solid(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V *slopes) {
     const V *factors = rows->bound + con->rows * 2 * DIM, *box = factors + con->rows + j * BOX_NUMBERS;
     const V *axes = box + DIM, *half = BOX_HALF(box), radius = BOX_RADIUS(box);
     V factor = factors[j], zero = SET(0.0), local[DIM], away[DIM], square = zero, deepest = zero;
@@ -19,7 +25,7 @@ static inline V solid(const Constraint *con, const Rows *rows, int64_t j, const 
         deepest = tgco_choose(nearest[i], depth, deepest);
         for (int a = 0; a < i; a++) nearest[a] &= ~nearest[i];
     }
-    I outside = square > zero, here = radius >= zero;
+    I outside = square > zero, here = is_here(con, rows, radius, k);
     V distance = tgco_sqrt(tgco_choose(outside, square, SET(1.0)));
     V c = factor * (radius - tgco_choose(outside, distance, deepest));
     if (slopes) {
@@ -50,7 +56,7 @@ static inline V boxes_value(const Lanes *s, const Constraint *con, const Rows *r
     int pushed = any(rows->pushed[con->place[k]]);
     for (int64_t j = 0; j < con->rows; j++) {
         if (is_far(con, rows, j, x) && !(pushed && any(lam[j] != SET(0.0)))) continue;
-        V c = solid(con, rows, j, x, 0);
+        V c = solid(con, rows, j, k, x, 0);
         if (any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) total += worth(s, 0, c, lam[j]);
     }
     return total;
@@ -63,7 +69,7 @@ static inline void boxes_expand(
     V slopes[DIM], rho;
     for (int64_t j = 0; j < con->rows; j++) {
         if (is_far(con, rows, j, x) && !(pushed && any(lam[j] != SET(0.0)))) continue;
-        V c = solid(con, rows, j, x, slopes);
+        V c = solid(con, rows, j, k, x, slopes);
         if (!any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
         V slope = pull(s, 0, c, lam[j], &rho);
         for (int a = 0; a < DIM; a++) {

@@ -111,21 +111,19 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
     return limit & running;
 }
 
-/* Problems first, first + 1, ..., last - 1: up to `limit` iterations of each inner solve. Returns 0 without memory. */
-int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
-    if (!start(s, p)) return 0;
-    int replicas = p->replicas;
+/* Up to `limit` iterations of the inner solves of `count` problems, by their numbers. */
+static void inner_solves(Lanes *s, const int64_t *number, int64_t count) {
+    int replicas = s->of->replicas;
     I running = SET(0.0) != SET(0.0);
-    int64_t next = first;
+    int64_t next = 0;
     for (int e = 0; e < LANES; e += replicas) {
         /* Lanes without a problem repeat the first problem, so that all lanes hold finite numbers. */
-        int64_t element = next < last ? next : first;
+        int64_t element = number[next < count ? next : 0];
         for (int l = e; l < e + replicas; l++) {
             enter(s, l, element);
-            running[l] = next < last ? -1 : 0;
+            running[l] = next < count ? -1 : 0;
         }
-        if (next < last) next++;
+        if (next < count) next++;
     }
     while (any(running)) {
         int32_t status[LANES];
@@ -135,12 +133,21 @@ int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
             if (!ended[e]) continue;
             leave(s, e, status[e], converged[e] != 0, refused[e] != 0, lost[e] != 0);
             for (int l = e; l < e + replicas; l++) {
-                if (next < last) enter(s, l, next);
+                if (next < count) enter(s, l, number[next]);
                 else running[l] = 0;
             }
-            if (next < last) next++;
+            if (next < count) next++;
         }
     }
+}
+
+/* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
+int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    int64_t *number = in_order(first, last);
+    if (!number || !start(s, p)) { free(number); return 0; }
+    inner_solves(s, number, last - first);
+    free(number);
     finish(s);
     return 1;
 }

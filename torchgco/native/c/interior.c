@@ -88,9 +88,9 @@ static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V s
 static I factor_shifted(Barrier *t, const Track *k, I running, I anew) {
     const Interior *how = t->how;
     t->shift = tgco_choose(anew, k->forced, t->shift);
-    I lost = running & ~running;
+    I lost = running & ~running, open = running & anew; /* others had this shift before */
     for (;;) {
-        I bad = running & ~factor(t, 1) & ~lost;
+        I bad = open & ~factor(t, open);
         if (!any(bad)) break;
         V before = k->last, first = SET(how->shift_first), floor = SET(how->shift_least);
         V start = tgco_choose(before == SET(0.0), first, most(floor, before * SET(how->shift_decay)));
@@ -98,6 +98,7 @@ static I factor_shifted(Barrier *t, const Track *k, I running, I anew) {
         V next = tgco_choose(t->shift == SET(0.0), start, growth * t->shift);
         t->shift = tgco_choose(bad, next, t->shift);
         lost |= bad & (t->shift > SET(how->shift_max));
+        open = bad & ~lost;
     }
     return running & ~lost;
 }
@@ -110,7 +111,7 @@ static I soften(Barrier *t, const Track *k, I moving) {
         ROWS(t, 1, largest = most(tgco_fabs(t->z[q] + t->dz[q]), largest))
         I large = moving & (largest > SET(how->explodes)) & (t->soft < SET(how->softest));
         if (!any(large)) return moving;
-        t->soft = tgco_choose(large, SET(100.0) * t->soft, t->soft);
+        t->soft = tgco_choose(large, SET(how->soft_growth) * t->soft, t->soft);
         expand(t);
         moving = factor_shifted(t, k, moving, large);
         solve(t);
@@ -127,7 +128,7 @@ static I recover(Barrier *t, Track *k, I failed) {
         if (!failed[l]) continue;
         if (++k->failures[l] > how->failures) { lost[l] = -1; continue; }
         int seeks = k->theta[l] > how->violation && !k->restoring[l];
-        double harder = 10 * k->forced[l];
+        double harder = how->forced_growth * k->forced[l];
         k->forced[l] = harder < how->shift_recovery ? how->shift_recovery : harder;
         if (seeks) { k->restoring[l] = -1; k->entered[l] = k->theta[l]; t->objective[l] = 0; }
         else { k->restoring[l] = 0; t->objective[l] = 1; }
@@ -186,7 +187,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     V higher = tgco_choose(t->shift > floor, SET(how->recovery_growth) * t->shift, most(floor, k->last));
     lower = tgco_if(lower >= floor, lower);
     k->forced = tgco_choose(won & ~k->restoring, tgco_choose(k->crawls, higher, lower), k->forced);
-    t->soft = tgco_choose(won, most(SET(how->soft), SET(0.1) * t->soft), t->soft);
+    t->soft = tgco_choose(won, most(SET(how->soft), SET(how->soft_decay) * t->soft), t->soft);
     residuals(t, t->c, t->s, t->r);
     for (int l = 0; l < LANES; l++) if (won[l] && !k->restoring[l] && k->forced[l] == 0) k->failures[l] = 0;
     I lost = recover(t, k, moving & ~won);
@@ -218,6 +219,7 @@ static void enter_barrier(Barrier *t, int lane, int64_t e) {
     enter_problem(&t->lanes, lane, e);
     for (int64_t i = 0; i < (p->N + 1) * NX; i++) t->lanes.X[i][lane] = p->X[e * (p->N + 1) * NX + i];
     for (int64_t i = 0; i < p->N * NU; i++) t->lanes.U[i][lane] = p->U[e * p->N * NU + i];
+    if (t->is_free) for (int i = 0; i < NX; i++) t->is_free[i][lane] = t->how->free_start[e * NX + i];
 }
 
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
@@ -242,7 +244,7 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
         fresh &= ~fresh;
         if (any(ended)) { /* gains along the trajectories that leave, whatever the other lanes do */
             expand(t);
-            factor(t, 0);
+            factor(t, fresh);
         }
         for (int l = 0; l < LANES; l++) {
             if (!ended[l]) continue;

@@ -23,6 +23,7 @@ static int64_t shape(Barrier *t, V *memory) {
     t->cost_slope = cut(&m, (N + 1) * S);
     for (int part = 0; part < PARTS; part++) t->g[part] = cut(&m, (N + 1) * S);
     t->P = cut(&m, (N + 1) * NX * NX); t->p = cut(&m, (N + 1) * NX); t->L = cut(&m, N * NU * NU);
+    if (t->how->free_start) { t->is_free = cut(&m, NX); t->L_start = cut(&m, NX * NX); }
     t->dx = cut(&m, (N + 1) * NX); t->du = cut(&m, N * NU);
     t->c = cut(&m, rows); t->cn = cut(&m, rows); t->s = cut(&m, rows); t->sn = cut(&m, rows); t->z = cut(&m, rows);
     t->r = cut(&m, rows); t->ds = cut(&m, rows); t->dz = cut(&m, rows);
@@ -123,9 +124,10 @@ static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
     for (int64_t k = 0; k <= p->N; k++) {
         for (int i = 0; i < S; i++) q[i] = SET(0.0);
         if (k < p->N) tgco_pull_back(t->y + (k + 1) * NX, t->f + k * NJ, q);
-        for (int i = k ? 0 : NX; i < (k < p->N ? S : NX); i++) {
+        for (int i = k || t->is_free ? 0 : NX; i < (k < p->N ? S : NX); i++) {
             V entry = q[i] + t->g[0][k * S + i];
-            if (i < NX) { entry -= t->y[k * NX + i]; sum_y += tgco_fabs(t->y[k * NX + i]); }
+            if (!k && i < NX) entry = tgco_if(tgco_is(t->is_free[i]), entry); /* the start has no costate */
+            else if (i < NX) { entry -= t->y[k * NX + i]; sum_y += tgco_fabs(t->y[k * NX + i]); }
             slope = most(tgco_fabs(entry), slope);
         }
     }

@@ -15,6 +15,7 @@ typedef struct {
     V *H, *f;                    /* (N+1, S, S) upper triangles, (N, NJ) */
     V *cost_slope, *g[PARTS];    /* (N+1, S): cost; with J' of multipliers, of the condensed residuals, of 1 / s */
     V *P, *p, *L;                /* (N+1, NX, NX), (N+1, NX), (N, NU, NU): the Riccati recursion */
+    V *is_free, *L_start;        /* (NX): 1 where the start is free; (NX, NX): its factor. None where none is free */
     V *dx, *du;                  /* (N+1, NX), (N, NU) */
     V *c, *cn, *s, *sn, *z, *r, *ds, *dz; /* (rows): values, slacks, multipliers, residuals, and of trial and step */
     int64_t *first, rows;        /* the first row of each constraint, and how many there are */
@@ -44,7 +45,7 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, con
 #endif
 #if WITH_BOXES
     } else if (con->kind == BOXES) {
-        for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, x, 0);
+        for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, k, x, 0);
 #endif
     } else tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
 }
@@ -81,7 +82,7 @@ static inline void add_spheres(Barrier *t, int64_t i, int64_t k, const V *x) {
     for (int j = 0; j < con->rows; j++, q++) {
         V slopes[DIM], curvature[DIM * DIM], bend;
         sphere(con, rows, j, k, x, slopes);
-        bend = tgco_if(rows->squares[j] >= SET(0.0), SET(-2.0) * t->objective * t->z[q]);
+        bend = tgco_if(square_at(con, rows, j, k) >= SET(0.0), SET(-2.0) * t->objective * t->z[q]);
         for (int a = 0; a < DIM; a++) {
             slopes[a] *= SET(-2.0);
             for (int b = 0; b < DIM; b++) curvature[a * DIM + b] = a == b ? bend : SET(0.0);
@@ -93,12 +94,13 @@ static inline void add_spheres(Barrier *t, int64_t i, int64_t k, const V *x) {
 
 #if WITH_BOXES
 /* lam times the second derivatives of row j (DIM, DIM): distances bend around edges and corners, not along faces. */
-static inline void bend_box(const Constraint *con, const Rows *rows, int64_t j, const V *x, V lam, V *curvature) {
+static inline void bend_box(
+    const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V lam, V *curvature) {
     const V *factors = rows->bound + con->rows * 2 * DIM, *box = factors + con->rows + j * BOX_NUMBERS;
     V zero = SET(0.0), local[DIM], away[DIM], square = zero;
     seen_from(box, x + POSITION, local);
     for (int i = 0; i < DIM; i++) { away[i] = beyond(local[i], BOX_HALF(box)[i]); square += away[i] * away[i]; }
-    I bends = (square > zero) & (BOX_RADIUS(box) >= zero);
+    I bends = (square > zero) & is_here(con, rows, BOX_RADIUS(box), k);
     V inverse = tgco_if(bends, SET(1.0) / tgco_choose(bends, square, SET(1.0)));
     V weight = -lam * factors[j] * tgco_sqrt(inverse);
     for (int a = 0; a < DIM; a++) for (int b = 0; b < DIM; b++) {
@@ -118,8 +120,8 @@ static inline void add_boxes(Barrier *t, int64_t i, int64_t k, const V *x) {
     int64_t q = row_of(t, i, k);
     V slopes[DIM], curvature[DIM * DIM];
     for (int j = 0; j < con->rows; j++, q++) {
-        solid(con, rows, j, x, slopes);
-        bend_box(con, rows, j, x, t->objective * t->z[q], curvature);
+        solid(con, rows, j, k, x, slopes);
+        bend_box(con, rows, j, k, x, t->objective * t->z[q], curvature);
         add_row(t, k, q, slopes, curvature);
     }
 }
@@ -178,7 +180,7 @@ static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, con
     } else if (con->kind == BOXES) {
         for (int j = 0; j < con->rows; j++) {
             V slopes[DIM];
-            solid(con, rows, j, x, slopes);
+            solid(con, rows, j, k, x, slopes);
             out[j] = SET(0.0);
             for (int a = 0; a < DIM; a++) out[j] += slopes[a] * z[POSITION + a];
         }

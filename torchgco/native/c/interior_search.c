@@ -30,7 +30,7 @@ static void remember(const Barrier *t, Track *k, int l) {
 static int is_good(
     const Barrier *t, const Track *k, int l, double alpha, double slope, double theta, double phi, int *descends) {
     const Interior *how = t->how;
-    double old = k->theta[l], noise = 10 * __DBL_EPSILON__ * __builtin_fabs(k->phi[l]);
+    double old = k->theta[l], noise = how->noise * __DBL_EPSILON__ * __builtin_fabs(k->phi[l]);
     *descends = 0;
     if (!(theta - theta == 0) || !(phi - phi == 0)) return 0;
     if (k->restoring[l]) return theta <= (1 - how->armijo * alpha) * old;

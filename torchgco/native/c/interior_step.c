@@ -34,7 +34,8 @@ static void expand(Barrier *t) {
     for (int64_t k = 0; k <= p->N; k++) {
         const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
         V *H = t->H + k * S * S, *slope = t->cost_slope + k * S;
-        memset(H, 0, S * S * sizeof(V)); memset(slope, 0, S * sizeof(V));
+        for (int i = 0; i < S; i++) memset(H + i * S + i, 0, (S - i) * sizeof(V)); /* the lower triangle isn't used */
+        memset(slope, 0, S * sizeof(V));
         cost_expand(s, k, x, u, slope, H);
         for (int i = 0; i < S; i++) {
             slope[i] *= weight;
@@ -52,13 +53,35 @@ static void expand(Barrier *t) {
     }
 }
 
+/* The factor of the cost-to-go's curvature in the free components of the start, and the unit matrix in the others. */
+static I factor_start(Barrier *t) {
+    V *L = t->L_start, one = SET(1.0);
+    I good = one == one;
+    for (int j = 0; j < NX; j++) {
+        I own = tgco_is(t->is_free[j]);
+        V whole = tgco_choose(own, t->P[j * NX + j], one), pivot = whole;
+        for (int a = 0; a < j; a++) pivot -= L[j * NX + a] * L[j * NX + a];
+        good &= (pivot > SET(1e-14) * tgco_fabs(whole)) & finite(pivot);
+        V inverse = one / tgco_sqrt(pivot);
+        L[j * NX + j] = inverse;
+        for (int i = j + 1; i < NX; i++) {
+            V entry = tgco_if(own & tgco_is(t->is_free[i]), t->P[i * NX + j]);
+            for (int a = 0; a < j; a++) entry -= L[i * NX + a] * L[j * NX + a];
+            L[i * NX + j] = entry * inverse;
+        }
+    }
+    return good;
+}
+
 /* Factors L and gains K of the recursion with `shift` on the diagonal; where it isn't positive definite, the answer is
-   false. `hopeless`: it may stop where no lane is positive definite. */
-static I factor(Barrier *t, int hopeless) {
+   false. It stops as soon as it is false for all lanes of `open`, unless there are none: what it says of others then
+   is void. */
+static I factor(Barrier *t, I open) {
     Lanes *s = &t->lanes;
     int64_t N = s->of->N;
-    V T[S * NX], Q[S * S], Y[NU * NX];
+    V T[S * NX], Q[S * S], Y[NU * NX], pivots[NU];
     I good = SET(0.0) == SET(0.0);
+    int stops = any(open);
     const V *last = t->H + N * S * S;
     for (int i = 0; i < NX; i++) for (int j = i; j < NX; j++)
         t->P[(N * NX + i) * NX + j] = t->P[(N * NX + j) * NX + i] = last[i * S + j] + (i == j ? t->shift : SET(0.0));
@@ -69,35 +92,38 @@ static I factor(Barrier *t, int hopeless) {
         tgco_product(f, T, Q);
         for (int i = 0; i < S; i++) for (int j = i; j < S; j++) Q[i * S + j] += H[i * S + j];
         for (int i = 0; i < S; i++) Q[i * S + i] += t->shift;
+        factor_controls(Q, L, pivots);
         for (int j = 0; j < NU; j++) {
-            V *row = Y + j * NX, whole = Q[(NX + j) * S + NX + j], pivot = whole;
-            for (int i = 0; i < j; i++) pivot -= L[j * NU + i] * L[j * NU + i];
-            good &= (pivot > SET(1e-14) * tgco_fabs(whole)) & finite(pivot);
-            V inverse = SET(1.0) / tgco_sqrt(pivot);
-            L[j * NU + j] = inverse;
-            for (int i = j + 1; i < NU; i++) {
-                V entry = Q[(NX + j) * S + NX + i];
-                for (int a = 0; a < j; a++) entry -= L[i * NU + a] * L[j * NU + a];
-                L[i * NU + j] = entry * inverse;
-            }
-            for (int i = 0; i < NX; i++) row[i] = Q[i * S + NX + j];
-            for (int a = 0; a < j; a++) for (int i = 0; i < NX; i++) row[i] -= L[j * NU + a] * Y[a * NX + i];
-            for (int i = 0; i < NX; i++) row[i] *= inverse;
+            V whole = Q[(NX + j) * S + NX + j];
+            good &= (pivots[j] > SET(t->how->pivot) * tgco_fabs(whole)) & finite(pivots[j]);
+            for (int i = 0; i < NX; i++) Y[j * NX + i] = Q[i * S + NX + j];
         }
-        if (hopeless && !any(good)) return good;
-        for (int j = NU - 1; j >= 0; j--) {
-            V *row = K + j * NZ;
-            for (int i = 0; i < NX; i++) row[i] = -Y[j * NX + i];
-            for (int a = j + 1; a < NU; a++) for (int i = 0; i < NX; i++) row[i] -= L[a * NU + j] * K[a * NZ + i];
-            for (int i = 0; i < NX; i++) row[i] *= L[j * NU + j];
-        }
+        solve_lower(L, Y, NX, NX);
+        if (stops && !any(open & good)) return good;
+        for (int j = 0; j < NU; j++) for (int i = 0; i < NX; i++) K[j * NZ + i] = -Y[j * NX + i];
+        solve_upper(L, K, NZ, NX);
         for (int i = 0; i < NX; i++) for (int l = i; l < NX; l++) {
             V entry = Q[i * S + l];
             for (int j = 0; j < NU; j++) entry -= Y[j * NX + i] * Y[j * NX + l];
             P[i * NX + l] = P[l * NX + i] = entry;
         }
     }
-    return good;
+    return t->is_free ? good & factor_start(t) : good;
+}
+
+/* The step of the start that is the least of the quadratic cost-to-go. */
+static void solve_start(Barrier *t) {
+    const V *L = t->L_start;
+    V *d = t->dx;
+    for (int i = 0; i < NX; i++) {
+        d[i] = tgco_if(tgco_is(t->is_free[i]), -t->p[i]);
+        for (int a = 0; a < i; a++) d[i] -= L[i * NX + a] * d[a];
+        d[i] *= L[i * NX + i];
+    }
+    for (int i = NX - 1; i >= 0; i--) {
+        for (int a = i + 1; a < NX; a++) d[i] -= L[a * NX + i] * d[a];
+        d[i] = tgco_if(tgco_is(t->is_free[i]), d[i] * L[i * NX + i]);
+    }
 }
 
 /* The step in states, controls and costates that the factors give. */
@@ -121,18 +147,13 @@ static void solve(Barrier *t) {
             t->p[k * NX + i] = entry;
         }
         V d[NU];
-        for (int j = 0; j < NU; j++) {
-            d[j] = -q[NX + j];
-            for (int a = 0; a < j; a++) d[j] -= L[j * NU + a] * d[a];
-            d[j] *= L[j * NU + j];
-        }
-        for (int j = NU - 1; j >= 0; j--) {
-            for (int a = j + 1; a < NU; a++) d[j] -= L[a * NU + j] * d[a];
-            d[j] *= L[j * NU + j];
-            K[j * NZ + NX] = d[j];
-        }
+        for (int j = 0; j < NU; j++) d[j] = -q[NX + j];
+        solve_lower(L, d, 1, 1);
+        solve_upper(L, d, 1, 1);
+        for (int j = 0; j < NU; j++) K[j * NZ + NX] = d[j];
     }
     for (int i = 0; i < NX; i++) t->dx[i] = SET(0.0);
+    if (t->is_free) solve_start(t);
     for (int64_t k = 0; k < N; k++) {
         const V *K = s->G + k * NU * NZ, *P = t->P + (k + 1) * NX * NX;
         V *dx = t->dx + k * NX, *du = t->du + k * NU;

@@ -9,18 +9,24 @@ static inline V bound(const Constraint *con, const Rows *rows, int64_t j, int64_
 }
 
 #if DIM > 0
+/* The squared radius of sphere j at knot k; ABSENT without one, or where time has stopped. */
+static inline V square_at(const Constraint *con, const Rows *rows, int64_t j, int64_t k) {
+    if (!con->stops.data) return rows->squares[j];
+    return tgco_choose(SET(k) > rows->stops[0], SET(ABSENT), rows->squares[j]);
+}
+
 /* Row j of spheres at knot k, and the vector from the centre to the position (DIM); an absent sphere is c = -1. */
 static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V *away) {
     const V *o = rows->bound + j * DIM;
-    V square = SET(0.0);
-    I here = rows->squares[j] >= SET(0.0);
+    V square = SET(0.0), limit = square_at(con, rows, j, k);
+    I here = limit >= SET(0.0);
     for (int a = 0; a < DIM; a++) {
         away[a] = x[POSITION + a] - o[a];
         if (con->velocities.data) away[a] -= SET(k * con->dt) * rows->velocities[j * DIM + a];
         away[a] = tgco_if(here, away[a]);
         square += away[a] * away[a];
     }
-    return rows->squares[j] - square;
+    return limit - square;
 }
 
 /* Rows c of the spheres first, ..., last - 1 at knot k, and whether they add anything in any lane. */

@@ -27,7 +27,7 @@ static void roll(Lanes *s, V alpha, V *cost, V *merit) {
    (N, NX) is how far each step ends from the knot after it, NULL along a rollout. */
 static void backward(Lanes *s, const V *gap, V *linear, V *squares, V *lowest) {
     const Problem *p = s->of;
-    V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[NU * NU], Y[NU * NZ];
+    V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[NU * NU], Y[NU * NZ], pivots[NU];
     V sum = SET(0.0), square = SET(0.0), least = SET(__builtin_inf());
     int regular = any(s->mu_r > SET(0.0));
     memset(g, 0, sizeof g); memset(H, 0, sizeof H);
@@ -45,29 +45,17 @@ static void backward(Lanes *s, const V *gap, V *linear, V *squares, V *lowest) {
         if (gap) for (int i = 0; i < NX; i++) for (int j = 0; j < NX; j++) vector[i] += P[i * NX + j] * gap[k * NX + j];
         tgco_pull_back(vector, f, g);
         knot_expand(s, k, x, u, g, H);
-        /* Cholesky factor L of Quu + mu_r I (diagonal inverted), Y = L^-1 [Qux Qu], [K d] = -L^-T Y. */
+        /* L of Quu + mu_r I, Y = L^-1 [Qux Qu], [K d] = -L'^-1 Y. */
+        for (int j = 0; j < NU; j++) H[(NX + j) * S + NX + j] += s->mu_r;
+        factor_controls(H, L, pivots);
         for (int j = 0; j < NU; j++) {
-            V *row = Y + j * NZ, pivot = H[(NX + j) * S + NX + j] + s->mu_r;
-            for (int i = 0; i < j; i++) pivot -= L[j * NU + i] * L[j * NU + i];
-            least = tgco_choose((pivot < least) | (pivot != pivot), pivot, least);
-            V inverse = SET(1.0) / tgco_sqrt(pivot);
-            L[j * NU + j] = inverse;
-            for (int i = j + 1; i < NU; i++) {
-                V entry = H[(NX + j) * S + NX + i];
-                for (int a = 0; a < j; a++) entry -= L[i * NU + a] * L[j * NU + a];
-                L[i * NU + j] = entry * inverse;
-            }
-            for (int i = 0; i < NX; i++) row[i] = H[i * S + NX + j];
-            row[NX] = g[NX + j];
-            for (int a = 0; a < j; a++) for (int i = 0; i < NZ; i++) row[i] -= L[j * NU + a] * Y[a * NZ + i];
-            for (int i = 0; i < NZ; i++) row[i] *= inverse;
+            least = tgco_choose((pivots[j] < least) | (pivots[j] != pivots[j]), pivots[j], least);
+            for (int i = 0; i < NX; i++) Y[j * NZ + i] = H[i * S + NX + j];
+            Y[j * NZ + NX] = g[NX + j];
         }
-        for (int j = NU - 1; j >= 0; j--) {
-            V *row = G + j * NZ;
-            for (int i = 0; i < NZ; i++) row[i] = -Y[j * NZ + i];
-            for (int a = j + 1; a < NU; a++) for (int i = 0; i < NZ; i++) row[i] -= L[a * NU + j] * G[a * NZ + i];
-            for (int i = 0; i < NZ; i++) row[i] *= L[j * NU + j];
-        }
+        solve_lower(L, Y, NZ, NZ);
+        for (int i = 0; i < NU * NZ; i++) G[i] = -Y[i];
+        solve_upper(L, G, NZ, NZ);
         for (int j = 0; j < NU; j++) {
             sum += g[NX + j] * G[j * NZ + NX];
             square += G[j * NZ + NX] * G[j * NZ + NX];

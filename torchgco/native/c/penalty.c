@@ -16,7 +16,12 @@ static inline V worth(const Lanes *s, int equality, V c, V lam) {
 static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
     const Problem *p = s->of;
     V mu = s->mu;
-    if (p->optimality) { *rho = tgco_if(lam != SET(0.0), mu); return lam; }
+    if (p->optimality) { /* rows that bind, as lagrangian.binding has it */
+        I binds = lam != SET(0.0);
+        if (!equality) binds &= lam > -c;
+        *rho = tgco_if(binds, mu);
+        return lam;
+    }
     if (equality) { *rho = mu; return lam + mu * c; }
     I idle = p->phr ? lam + mu * c < SET(0.0) : (c < SET(0.0)) & (lam == SET(0.0));
     *rho = tgco_if(~idle, mu);

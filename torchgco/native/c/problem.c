@@ -16,7 +16,7 @@
 
 /* A constraint's multipliers and numbers. */
 typedef struct {
-    V *lam, *bound, *squares, *velocities;
+    V *lam, *bound, *squares, *velocities, *stops;
     I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
 } Rows;
 
@@ -78,6 +78,7 @@ static int64_t lay_out(Lanes *s, V *memory) {
         Rows rows = {0};
         rows.lam = cut(&m, c->knots * c->rows); rows.bound = cut(&m, length(&c->bound, c->knots));
         rows.squares = cut(&m, length(&c->squares, 1)); rows.velocities = cut(&m, length(&c->velocities, 1));
+        rows.stops = cut(&m, length(&c->stops, 1));
         rows.pushed = (I *)cut(&m, c->knots);
         if (memory) s->rows[i] = rows;
     }
@@ -96,6 +97,13 @@ static int start(Lanes *s, const Problem *p) {
     return 1;
 }
 
+/* The numbers first, ..., last - 1 of problems, to be freed; NULL without memory. */
+static int64_t *in_order(int64_t first, int64_t last) {
+    int64_t *number = malloc((last - first + 1) * sizeof *number);
+    for (int64_t i = 0; number && first + i < last; i++) number[i] = first + i;
+    return number;
+}
+
 static void finish(Lanes *s) { free(s->memory); free(s->rows); }
 
 /* Load problem e into a lane: first state, model, cost, and the numbers of its constraints. */
@@ -111,16 +119,24 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
         fill(s->rows[i].bound, &c->bound, c->knots, lane, e);
         fill(s->rows[i].squares, &c->squares, 1, lane, e);
         fill(s->rows[i].velocities, &c->velocities, 1, lane, e);
+        fill(s->rows[i].stops, &c->stops, 1, lane, e);
     }
+}
+
+/* Load problem e with its iterate. */
+static void enter_iterate(Lanes *s, int lane, int64_t e) {
+    const Problem *p = s->of;
+    int64_t N = p->N;
+    enter_problem(s, lane, e);
+    for (int64_t i = 0; i < (N + 1) * NX; i++) s->X[i][lane] = p->X[e * (N + 1) * NX + i];
+    for (int64_t i = 0; i < N * NU; i++) s->U[i][lane] = p->U[e * N * NU + i];
 }
 
 /* Load problem e with its iterate, multipliers and guide. */
 static void enter(Lanes *s, int lane, int64_t e) {
     const Problem *p = s->of;
     int64_t N = p->N;
-    enter_problem(s, lane, e);
-    for (int64_t i = 0; i < (N + 1) * NX; i++) s->X[i][lane] = p->X[e * (N + 1) * NX + i];
-    for (int64_t i = 0; i < N * NU; i++) s->U[i][lane] = p->U[e * N * NU + i];
+    enter_iterate(s, lane, e);
     fill(s->center, &p->center, N + 1, lane, e); fill(s->radius, &p->radius, N + 1, lane, e);
     if (p->guide != NO_GUIDE) s->weight[lane] = p->weight.data[e * p->weight.element];
     for (int64_t i = 0; i < p->constraints; i++) {

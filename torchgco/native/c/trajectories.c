@@ -120,27 +120,30 @@ int tgco_expand(const Problem *p, int64_t first, int64_t last) {
     return 1;
 }
 
-/* Up to `limit` Gauss-Newton steps in states and controls together, where rollouts diverge (solvers/lifted.py). The
+/* Up to `rounds` Gauss-Newton steps in states and controls together, where rollouts diverge (solvers/lifted.py). The
    first rollout that lowers L_M by the share `gain` replaces the iterate; `converged` says whether there was one. */
-int tgco_lift(const Problem *p, int64_t first, int64_t last) {
-    Lanes lanes, *s = &lanes;
+static int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, double gain) {
+    const Problem *p = s->of;
     int64_t N = p->N;
     V *gap = aligned_alloc(sizeof(V), N * NX * sizeof(V));
-    if (!gap || !start(s, p)) { free(gap); return 0; }
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) enter(s, l, e + l < last ? e + l : e);
+    if (!gap) return 0;
+    for (int64_t first = 0; first < count; first += LANES) {
+        int used = count - first < LANES ? (int)(count - first) : LANES;
+        for (int l = 0; l < LANES; l++) enter(s, l, number[first + (l < used ? l : 0)]);
+        s->mu_r = SET(0.0);
         I open = SET(0.0) == SET(0.0);
-        for (int64_t round = 0; round < p->limit && any(open); round++) {
+        for (int64_t round = 0; round < rounds && any(open); round++) {
             V linear, squares, lowest, cost, merit, sum = SET(0.0);
             gaps(s, gap);
             backward(s, gap, &linear, &squares, &lowest);
             if (round > 0) { /* the first gains are those that failed */
                 roll(s, SET(1.0), &cost, &merit);
-                I low = open & finite(merit) & (merit < s->merit - SET(p->gain) * tgco_fabs(s->merit));
-                for (int l = 0; l < LANES && e + l < last; l++) if (low[l]) {
-                    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[(e + l) * (N + 1) * NX + i] = s->Xn[i][l];
-                    for (int64_t i = 0; i < N * NU; i++) p->U[(e + l) * N * NU + i] = s->Un[i][l];
-                    p->cost[e + l] = cost[l]; p->merit[e + l] = merit[l]; p->converged[e + l] = 1;
+                I low = open & finite(merit) & (merit < s->merit - SET(gain) * tgco_fabs(s->merit));
+                for (int l = 0; l < used; l++) if (low[l]) {
+                    int64_t e = s->element[l];
+                    for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = s->Xn[i][l];
+                    for (int64_t i = 0; i < N * NU; i++) p->U[e * N * NU + i] = s->Un[i][l];
+                    p->cost[e] = cost[l]; p->merit[e] = merit[l]; p->converged[e] = 1;
                 }
                 open &= ~low;
             }
@@ -150,6 +153,16 @@ int tgco_lift(const Problem *p, int64_t first, int64_t last) {
         }
     }
     free(gap);
-    finish(s);
     return 1;
+}
+
+/* The same of problems first, ..., last - 1. */
+int tgco_lift(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    int64_t *number = in_order(first, last);
+    if (!number || !start(s, p)) { free(number); return 0; }
+    int done = lift(s, number, last - first, p->limit, p->gain);
+    free(number);
+    finish(s);
+    return done;
 }

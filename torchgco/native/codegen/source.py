@@ -43,9 +43,9 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
 """
 COST, BOXES = "quadratic.c", ("box.h", "boxes.c")  # or traced.c; left out where there are no boxes
 TERMS = ("problem.c", COST, "penalty.c", *BOXES, "knot.c")
-SOLVER = (*TERMS, "passes.c", "ilqr.c", "trajectories.c")
+SOLVER = (*TERMS, "cholesky.h", "passes.c", "ilqr.c", "trajectories.c", "outer.c")
 SAMPLER = (*TERMS, "normal.c", "mppi.c")
-INTERIOR = (*TERMS, *(f"interior{part}.c" for part in ("_rows", "_step", "_memory", "_search", "")))
+INTERIOR = (*TERMS, "cholesky.h", *(f"interior{part}.c" for part in ("_rows", "_step", "_memory", "_search", "")))
 
 
 _sources: dict[tuple[Any, ...], str] = {}  # reading and joining the files takes longer than a small solve

@@ -18,9 +18,8 @@ from torchgco.base.options import Count, NonNegative, Positive, check_options
 from torchgco.base.shapes import computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import copied, put
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.lagrangian.quality import chord_clearance, violation
-from torchgco.native.dispatch import current
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, binding
+from torchgco.native.dispatch import chord_clearance, current, measured
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.ending import final_status, optimality
@@ -86,11 +85,11 @@ class Polish:
         problem.check_controls(solution.U, "solution.U")
         solution.multipliers.check(problem)
         with computing_on(problem.x0.device):
-            return self._refined(current(problem), solution)
+            return self._refined(current(problem).held_at(solution.X[:, 0]), solution)
 
     def _refined(self, problem: Problem, solution: Solution) -> Solution:
         result = copied(replace(solution, trace=None, search=None))
-        near = (violation(problem, solution.X, solution.U) <= self.reach) & torch.isfinite(solution.cost)
+        near = (measured(problem, solution.X, solution.U) <= self.reach) & torch.isfinite(solution.cost)
         for b in (near & problem.start_is_clear).nonzero().flatten():
             rows = b.view(1)
             part, before = problem.take(rows), solution.take(rows)
@@ -108,7 +107,9 @@ class Polish:
 
     def _polished(self, problem: Problem, solution: Solution) -> tuple[Solution, int]:
         """The solution of one problem, `solution` itself if nothing better was found; and the number of steps."""
-        lam = torch.cat([solution.cost.new_zeros(0), *(part.flatten() for part in solution.multipliers.lam)])
+        X, U, pairs = solution.X, solution.U, zip(problem.constraints, solution.multipliers.lam, strict=True)
+        held = (binding(part.sense, part.value(X, U), lam).flatten() for part, lam in pairs)
+        lam = torch.cat([solution.cost.new_zeros(0), *held])
         first = best = now = _Point.at(problem, solution.X, solution.U, lam)
         weight, steps = 0.0, 0
         while steps < self.iterations:
@@ -163,7 +164,7 @@ class _Point:
         cost = float(problem.cost.total(X, U))
         slack = float((lam * model.c).abs().max()) / (1.0 + abs(cost)) if lam.numel() else 0.0
         clearance = float(chord_clearance(problem, X))
-        worst = float(violation(problem, X, U))
+        worst = float(measured(problem, X, U))
         return cls(model, lam, cost, worst, max(_slope(model, lam), slack), clearance)
 
     @cached_property

@@ -1,11 +1,14 @@
-"""Where a trajectory is caught: F_k and J (Equations 53, 54)."""
+"""Where a trajectory is caught: F_k and J (Equations 53, 54), and the end of its solve there."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import DrawKey
+from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.problem import Problem
+from torchgco.solvers.contracts import Advice
 
 
 def active_counts(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
@@ -33,3 +36,21 @@ def caught_knots(
     caught = active_counts(problem, X, U) >= least
     caught[:, 0] = caught[:, -1] = False
     return caught
+
+
+class StopWhenCaught:
+    """Guidance that ends the solve of a problem whose trajectory is caught between obstacles."""
+
+    def __init__(self, single_contact_after: int | None) -> None:
+        self.single_contact_after = single_contact_after
+
+    def suited(self, problem: Problem) -> StopWhenCaught:
+        """This guidance, which serves any problem."""
+        return self
+
+    def start(self, problem: Problem, X: Tensor) -> None:
+        """No penalty."""
+
+    def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
+        """Stop where a knot is caught."""
+        return Advice(None, stop=caught_knots(problem, X, U, key.outer, self.single_contact_after).any(-1))

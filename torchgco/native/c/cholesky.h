@@ -1,0 +1,36 @@
+/* The Cholesky factor of the controls' block of a stage's Hessian, and triangular systems with it. */
+
+/* L of L L' = H_uu, of whose upper triangle in H (S, S) is read; L's diagonal is inverted. Pivots go into `pivots`. */
+static inline void factor_controls(const V *H, V *L, V *pivots) {
+    for (int j = 0; j < NU; j++) {
+        V pivot = H[(NX + j) * S + NX + j];
+        for (int i = 0; i < j; i++) pivot -= L[j * NU + i] * L[j * NU + i];
+        pivots[j] = pivot;
+        V inverse = SET(1.0) / tgco_sqrt(pivot);
+        L[j * NU + j] = inverse;
+        for (int i = j + 1; i < NU; i++) {
+            V entry = H[(NX + j) * S + NX + i];
+            for (int a = 0; a < j; a++) entry -= L[i * NU + a] * L[j * NU + a];
+            L[i * NU + j] = entry * inverse;
+        }
+    }
+}
+
+/* Y = L^-1 Y for `count` columns of Y (NU, width). */
+static inline void solve_lower(const V *L, V *Y, int width, int count) {
+    for (int j = 0; j < NU; j++) {
+        V *row = Y + j * width;
+        for (int a = 0; a < j; a++) for (int i = 0; i < count; i++) row[i] -= L[j * NU + a] * Y[a * width + i];
+        for (int i = 0; i < count; i++) row[i] *= L[j * NU + j];
+    }
+}
+
+/* Y = L'^-1 Y for `count` columns of Y (NU, width). */
+static inline void solve_upper(const V *L, V *Y, int width, int count) {
+    for (int j = NU - 1; j >= 0; j--) {
+        V *row = Y + j * width;
+        for (int a = j + 1; a < NU; a++)
+            for (int i = 0; i < count; i++) row[i] -= L[a * NU + j] * Y[a * width + i];
+        for (int i = 0; i < count; i++) row[i] *= L[j * NU + j];
+    }
+}

@@ -1,0 +1,305 @@
+/* The outer loop of the augmented Lagrangian (Algorithm 1): inner solves of all problems, then multipliers, penalties
+   and the tests of the end, until each has ended. solvers/augmented_lagrangian.py does the same in PyTorch. */
+
+/* What a sweep over an iterate finds. */
+typedef struct {
+    V violation, touched; /* touched: rows in contact at a knot */
+    int update;           /* whether multipliers change */
+} Sweep;
+
+/* One row: its value c, by how much it is violated, and its multiplier. */
+static inline void note(const Lanes *s, const Constraint *con, V c, V violated, V *lam, I *pushed, Sweep *sweep) {
+    V zero = SET(0.0), worst = sweep->violation;
+    sweep->violation = tgco_choose((violated > worst) | (violated != violated), violated, worst); /* NaN stays */
+    sweep->touched += tgco_truth(c > zero);
+    if (!sweep->update) return;
+    V next = *lam + s->mu * c;
+    *lam = con->equality ? next : tgco_choose(next < zero, zero, next);
+    *pushed |= *lam != zero;
+}
+
+/* Rows of one knot of a constraint. */
+static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sweep *sweep) {
+    const Constraint *con = s->of->constraint + i;
+    const Rows *rows = s->rows + i;
+    int64_t place = con->place[k];
+    V *lam = rows->lam + place * con->rows, zero = SET(0.0);
+    I none = zero != zero, pushed = none;
+    if (con->kind == BOUNDS) {
+        for (int j = 0; j < con->rows; j++) {
+            V c = bound(con, rows, j, k, x, u);
+            note(s, con, c, tgco_choose(c < zero, zero, c), lam + j, &pushed, sweep);
+        }
+#if DIM > 0
+    } else if (con->kind == SPHERES) {
+        V c[BLOCK];
+        for (int64_t first = 0; first < con->rows; first += BLOCK) {
+            int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
+            if (!spheres(con, rows, first, last, k, x, c)) continue; /* no multiplier, and none to come */
+            for (int64_t j = first; j < last; j++) {
+                V value = c[j - first], square = square_at(con, rows, j, k);
+                V depth = tgco_sqrt(square) - tgco_sqrt(square - value);
+                note(s, con, value, tgco_choose(value <= zero, zero, depth), lam + j, &pushed, sweep);
+            }
+        }
+#endif
+#if WITH_BOXES
+    } else if (con->kind == BOXES) {
+        const V *factors = rows->bound + con->rows * 2 * DIM;
+        int known = any(rows->pushed[place]);
+        for (int64_t j = 0; j < con->rows; j++) {
+            if (is_far(con, rows, j, x) && !(known && any(lam[j] != zero))) continue;
+            V c = solid(con, rows, j, k, x, 0);
+            note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, &pushed, sweep);
+        }
+#endif
+    } else {
+        V c[MAX_ROWS];
+        tgco_rows((int)i, x, u, at(rows->bound, &con->bound, place), c);
+        for (int j = 0; j < con->rows; j++) {
+            V violated = con->equality ? tgco_fabs(c[j]) : tgco_choose(c[j] < zero, zero, c[j]);
+            note(s, con, c[j], violated, lam + j, &pushed, sweep);
+        }
+    }
+    if (sweep->update) rows->pushed[place] = pushed;
+}
+
+/* The largest violation of the iterates, of all rows or of obstacles alone, and whether one is caught: `least` rows of
+   obstacles or more in contact at a knot, start and end left out. */
+static V swept(Lanes *s, int obstacles, int update, V least, I *caught) {
+    int64_t N = s->of->N;
+    V zero = SET(0.0), worst = zero;
+    *caught = zero != zero;
+    for (int64_t k = 0; k <= N; k++) {
+        V contacts = zero;
+        for (int64_t i = 0; i < s->of->constraints; i++) {
+            const Constraint *con = s->of->constraint + i;
+            if (con->place[k] == NOWHERE || (obstacles && !con->geometric)) continue;
+            Sweep sweep = {worst, zero, update};
+            note_rows(s, i, k, s->X + k * NX, k < N ? s->U + k * NU : 0, &sweep);
+            worst = sweep.violation;
+            if (con->geometric) contacts += sweep.touched;
+        }
+        if (k > 0 && k < N) *caught |= contacts >= least;
+    }
+    return worst;
+}
+
+/* Whether a trajectory of problem e counts as feasible and arrived. */
+static int arrived(const Outer *o, int64_t e, double violation, const double *X) {
+    double square = 0;
+    if (!o->near || !(violation <= o->tolerance)) return 0;
+#if DIM > 0
+    const double *last = X + (e * (o->of->N + 1) + o->of->N) * NX + POSITION;
+    for (int a = 0; a < DIM; a++) square += (last[a] - o->goal[e * DIM + a]) * (last[a] - o->goal[e * DIM + a]);
+#endif
+    return __builtin_sqrt(square) <= o->near[e];
+}
+
+/* Whether the iterate of problem e replaces its best: `is_preferred` in lagrangian/quality.py. */
+static int preferred(const Outer *o, int64_t e, double violation) {
+    double cost = o->of->cost[e], before = o->best_violation[e];
+    int fits = violation <= o->tolerance, did = before <= o->tolerance;
+    int now = arrived(o, e, violation, o->of->X), then = arrived(o, e, before, o->best_X);
+    if (now != then) return now;
+    return fits ? !did || cost < o->best_cost[e] : !did && violation < before;
+}
+
+static void keep(const Outer *o, int64_t e, double violation) {
+    const Problem *p = o->of;
+    int64_t N = p->N;
+    memcpy(o->best_X + e * (N + 1) * NX, p->X + e * (N + 1) * NX, (N + 1) * NX * sizeof(double));
+    memcpy(o->best_U + e * N * NU, p->U + e * N * NU, N * NU * sizeof(double));
+    for (int64_t i = 0; i < p->constraints; i++) {
+        const Constraint *c = p->constraint + i;
+        int64_t size = c->knots * c->rows;
+        memcpy(c->best + e * size, c->lam + e * size, size * sizeof(double));
+    }
+    o->best_mu[e] = p->mu[e]; o->best_cost[e] = p->cost[e]; o->best_violation[e] = violation;
+}
+
+/* Why problem e ends after an inner solve that left `violation`; RUNNING where it goes on. */
+static int64_t tested(const Outer *o, int64_t e, double violation, int caught) {
+    const Problem *p = o->of;
+    double cost = p->cost[e], *mark = o->mark + 2 * e;
+    int fits = violation <= o->tolerance;
+    int cheaper = cost < mark[1] - o->settled * __builtin_fabs(mark[1]);
+    int progress = fits ? mark[0] > o->tolerance || cheaper : violation <= o->halved * mark[0];
+    if (progress) { mark[0] = violation; mark[1] = cost; }
+    o->waited[e] = progress ? 0 : o->waited[e] + 1;
+    int64_t why = RUNNING;
+    if (o->outer[e] >= o->max_outer) why = p->refused[e] ? LINE_SEARCH_FAILED : MAX_ITERATIONS;
+    if (o->patience >= 0 && o->waited[e] >= o->patience) why = STALLED;
+    int settled = __builtin_fabs(cost - o->last_cost[e]) <= o->settled * __builtin_fabs(cost);
+    if (o->ends && p->converged[e] && settled && fits) why = CONVERGED;
+    return why == RUNNING && o->stops && caught ? STOPPED : why;
+}
+
+/* Multipliers, penalty, best iterate and the tests of the end of up to LANES problems; then L_M of the next inner solve.
+   A problem that has failed only gets its violation. */
+static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int count, int failed) {
+    const Problem *p = s->of;
+    V least, total = SET(0.0), more = SET(0.0), part;
+    I caught;
+    for (int l = 0; l < LANES; l++) {
+        int64_t e = number[l < count ? l : 0];
+        enter(s, l, e);
+        least[l] = o->single_after >= 0 && o->base[e] + o->outer[e] + 1 >= o->single_after ? 1 : 2;
+    }
+    V violation = swept(s, 0, !failed, least, &caught);
+    for (int l = 0; l < count && !failed; l++) {
+        int64_t e = number[l];
+        double growth = o->growth;
+        if (o->stalled_growth > 0 && violation[l] > o->halved * o->last_violation[e]) growth = o->stalled_growth;
+        if (o->ends && violation[l] <= o->tolerance) growth = 1;
+        s->mu[l] *= growth;
+        if (s->mu[l] > o->penalty_max) s->mu[l] = o->penalty_max;
+        s->inverse_mu[l] = 1 / s->mu[l];
+        p->mu[e] = s->mu[l];
+        for (int64_t i = 0; i < p->constraints; i++) {
+            const Constraint *c = p->constraint + i;
+            double *lam = c->lam + e * c->knots * c->rows;
+            for (int64_t j = 0; j < c->knots * c->rows; j++) lam[j] = s->rows[i].lam[j][l];
+        }
+        if (preferred(o, e, violation[l])) keep(o, e, violation[l]);
+        o->outer[e]++;
+        o->outcome[e] = tested(o, e, violation[l], caught[l] != 0);
+        o->last_cost[e] = p->cost[e];
+    }
+    int going = 0;
+    for (int l = 0; l < count; l++) {
+        int64_t e = number[l];
+        o->last_violation[e] = violation[l];
+        going |= o->outcome[e] == RUNNING;
+        if (o->outcome[e] != RUNNING && !(o->best_violation[e] <= __DBL_MAX__)) keep(o, e, violation[l]);
+    }
+    if (!going) return;
+    for (int64_t k = 0; k <= p->N; k++) {
+        total += knot_value(s, k, s->X + k * NX, k < p->N ? s->U + k * NU : 0, &part);
+        more += part;
+    }
+    for (int l = 0; l < count; l++) {
+        int64_t e = number[l];
+        p->cost[e] = total[l]; p->merit[e] = total[l] + more[l];
+        p->regularisation[e] = 0; p->inner[e] = p->rung[e] = 0;
+    }
+}
+
+/* Inner solves of the `count` running problems, lifted where rollouts diverge; `some` has room for as many numbers.
+   Returns 0 without memory. */
+static int solve_all(Lanes *s, const Outer *o, const int64_t *running, int64_t count, int64_t *some) {
+    const Problem *p = s->of;
+    int64_t lost = 0;
+    inner_solves(s, running, count);
+    for (int64_t i = 0; i < count; i++) if (p->lost[running[i]]) some[lost++] = running[i];
+    if (lost && !lift(s, some, lost, o->lifted_steps, o->lifted_gain)) return 0;
+    for (int64_t i = 0; i < lost; i++) {
+        int64_t e = some[i];
+        if (!p->converged[e]) continue;
+        p->converged[e] = 0; p->regularisation[e] = 0;
+        if (p->inner[e] >= p->options.max_iterations) p->status[e] = ENDED;
+    }
+    return 1;
+}
+
+/* Outer iterations of the problems whose inner solve has ended, and the end of those where it failed. */
+static void update_all(Lanes *s, const Outer *o, const int64_t *running, int64_t count, int64_t *some) {
+    const Problem *p = s->of;
+    for (int failed = 0; failed < 2; failed++) {
+        int64_t chosen = 0;
+        for (int64_t i = 0; i < count; i++) {
+            int64_t e = running[i];
+            if (p->status[e] == RUNNING || (p->status[e] != ENDED) != failed) continue;
+            if (failed) o->outcome[e] = p->status[e];
+            some[chosen++] = e;
+        }
+        for (int64_t i = 0; i < chosen; i += LANES)
+            outer_update(s, o, some + i, chosen - i < LANES ? (int)(chosen - i) : LANES, failed);
+    }
+}
+
+/* Up to `passes` passes over the problems first, ..., last - 1 that have no outcome yet. Returns 0 without memory. */
+int tgco_outer(const Outer *o, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    Problem problem = *o->of;
+    int64_t *running = in_order(first, last), *some = in_order(first, last);
+    int begun = running && some && start(s, &problem), done = begun;
+    for (int64_t pass = 0; done && pass < o->passes; pass++) {
+        int64_t count = 0;
+        for (int64_t e = first; e < last; e++) if (o->outcome[e] == RUNNING) running[count++] = e;
+        if (count == 0) break;
+        problem.replicas = 1;
+        while (problem.replicas * 2 * count <= LANES) problem.replicas *= 2;
+        if (o->solves) done = solve_all(s, o, running, count, some);
+        if (o->updates && done) update_all(s, o, running, count, some);
+    }
+    if (begun) finish(s);
+    free(running); free(some);
+    return done;
+}
+
+static int violations(const Problem *p, int obstacles, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    I caught;
+    if (!start(s, p)) return 0;
+    for (int64_t e = first; e < last; e += LANES) {
+        for (int l = 0; l < LANES; l++) enter_iterate(s, l, e + l < last ? e + l : e);
+        V violation = swept(s, obstacles, 0, SET(0.0), &caught);
+        for (int l = 0; l < LANES && e + l < last; l++) p->merit[e + l] = violation[l];
+    }
+    finish(s);
+    return 1;
+}
+
+/* The largest violation of given trajectories, into `merit`. */
+int tgco_violation(const Problem *p, int64_t first, int64_t last) { return violations(p, 0, first, last); }
+
+/* The same of rows of obstacles alone. */
+int tgco_penetration(const Problem *p, int64_t first, int64_t last) { return violations(p, 1, first, last); }
+
+#if DIM > 0
+/* Squared distance of the origin from the segment that begins at a and goes along. */
+static inline V from_segment(const V *a, const V *along) {
+    V length = SET(0.0), toward = SET(0.0), square = SET(0.0);
+    for (int i = 0; i < DIM; i++) { length += along[i] * along[i]; toward -= a[i] * along[i]; }
+    V share = tgco_choose(length > SET(0.0), toward / length, SET(0.0));
+    share = tgco_choose(share < SET(0.0), SET(0.0), tgco_choose(share > SET(1.0), SET(1.0), share));
+    for (int i = 0; i < DIM; i++) { V gap = a[i] + share * along[i]; square += gap * gap; }
+    return square;
+}
+
+/* The smallest distance of the straight lines between knots from spheres whose radii are scaled by `gain`, into `merit`;
+   infinite without one. */
+int tgco_chords(const Problem *p, int64_t first, int64_t last) {
+    Lanes lanes, *s = &lanes;
+    if (!start(s, p)) return 0;
+    for (int64_t e = first; e < last; e += LANES) {
+        V least = SET(__builtin_inf());
+        for (int l = 0; l < LANES; l++) enter_iterate(s, l, e + l < last ? e + l : e);
+        for (int64_t i = 0; i < p->constraints; i++) {
+            const Constraint *con = p->constraint + i;
+            const Rows *rows = s->rows + i;
+            if (con->kind != SPHERES) continue;
+            for (int j = 0; j < con->rows; j++) {
+                V radius = SET(p->gain) * tgco_sqrt(rows->squares[j]), a[DIM], b[DIM], along[DIM], nearest = least;
+                I here = rows->squares[j] >= SET(0.0);
+                for (int64_t k = 0; k <= p->N; k++) {
+                    sphere(con, rows, j, k, s->X + k * NX, b);
+                    for (int d = 0; k > 0 && d < DIM; d++) along[d] = b[d] - a[d];
+                    if (k > 0) {
+                        V gap = tgco_sqrt(from_segment(a, along)) - radius;
+                        I closer = (gap < nearest) | (gap != gap); /* NaN stays */
+                        if (con->stops.data) closer &= SET(k) <= rows->stops[0];
+                        nearest = tgco_choose(closer, gap, nearest);
+                    }
+                    memcpy(a, b, sizeof a);
+                }
+                least = tgco_choose(here, nearest, least);
+            }
+        }
+        for (int l = 0; l < LANES && e + l < last; l++) p->merit[e + l] = least[l];
+    }
+    finish(s);
+    return 1;
+}
+#endif

@@ -1,0 +1,109 @@
+"""The outer loop by native kernels: the state of running problems in the structure that the library reads."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.base.status import Status
+from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.lagrangian.quality import goal_tolerance
+from torchgco.native.codegen.source import LANES
+from torchgco.native.engine import Engine
+from torchgco.native.structures import End, Outer
+from torchgco.problem.problem import Problem
+from torchgco.solvers.caught import StopWhenCaught
+from torchgco.solvers.ilqr import ILQR, native_options
+from torchgco.solvers.lifted import GAIN, LIFTED_STEPS
+from torchgco.solvers.state import PassEnd, State
+
+FLAGS, NUMBERS = ("status", "converged", "refused", "lost"), ("alpha", "used")
+
+
+class NativeOuter:
+    """Passes over the problems of a state, in place in its tensors, which it makes contiguous.
+
+    Args:
+        problem: the b running problems, `s` their state.
+        stop: where a caught iterate ends its problem's solve; None: nowhere.
+        base: (b,) outer iterations before this solve.
+        limits: options and constants of the outer loop by name; see `structures.Outer`.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        inner: ILQR,
+        problem: Problem,
+        s: State,
+        stop: StopWhenCaught | None,
+        base: Tensor,
+        by_arrival: bool,
+        **limits: float,
+    ) -> None:
+        self.engine, self.state, self.b = engine, s, problem.B
+        _make_contiguous(s)
+        b, rules = problem.B, inner.rules
+        self.out = {name: torch.zeros(b, dtype=torch.int32) for name in FLAGS}
+        self.out |= {name: torch.zeros(b, dtype=torch.float64) for name in NUMBERS}
+        self.outcome = torch.zeros(b, dtype=torch.int64)
+        m, best, after = s.multipliers, s.best, None if stop is None else stop.single_contact_after
+        packed = engine.terms(
+            Lagrangian(problem, m, s.penalty, rules.phr), best.multipliers, X=s.X, U=s.U, cost=s.cost, merit=s.merit,
+            regularisation=s.regularisation, inner=s.inner, iterations=s.iterations, rung=s.rung, **self.out,
+            options=native_options(inner), limit=inner.max_iterations, replicas=1,
+        )  # fmt: skip
+        near = goal_tolerance(problem) if by_arrival else None
+        goal = {} if near is None or problem.goal is None else {"goal": problem.goal.position, "near": near}
+        self.packed = packed
+        self.outer = Outer(
+            of=packed, outer=s.outer, waited=s.waited, outcome=self.outcome,
+            last_cost=s.last_cost, last_violation=s.last_violation, mark=s.mark,
+            best_X=best.X, best_U=best.U, best_mu=best.multipliers.mu, best_cost=best.cost,
+            best_violation=best.violation, base=base.contiguous(),
+            **{name: part.contiguous() for name, part in goal.items()},
+            passes=1, single_after=-1 if after is None else after, ends=rules.ends, stops=stop is not None,
+            lifted_steps=LIFTED_STEPS, lifted_gain=GAIN, **limits,
+        )  # fmt: skip
+
+    def run(self, passes: int) -> None:
+        """Up to `passes` inner solves of every problem, each with its outer iteration; until `outcome` says why."""
+        self._run(passes=passes, solves=1, updates=1)
+
+    def run_half(self, at_once: int) -> None:
+        """Passes until half of the problems have an outcome, of up to LANES all; at most `at_once` of them a call."""
+        while True:
+            running = int((self.outcome == Status.RUNNING).sum())
+            if running == 0 or (self.b > LANES and 2 * running <= self.b):
+                return
+            self.run(max(1, at_once // running))
+
+    def iterate(self) -> PassEnd:
+        """One iteration of every problem's inner solve, without the outer iteration of those that end with it."""
+        self.packed.limit = 1
+        self._run(passes=1, solves=1, updates=0)
+        status, ended = self.out["status"], self.ended
+        failed = ~ended & (status != Status.RUNNING)
+        why = torch.where(failed, status.long(), int(Status.RUNNING))
+        out = self.out
+        return PassEnd(ended, out["converged"] != 0, out["refused"] != 0, why, out["alpha"], out["used"], failed)
+
+    def update(self) -> None:
+        """The outer iterations of the problems whose inner solve has ended."""
+        self._run(passes=1, solves=0, updates=1)
+
+    @property
+    def ended(self) -> Tensor:
+        """(b,) bool: whether the inner solve of the last pass has ended."""
+        return self.out["status"] == End.ENDED
+
+    def _run(self, **fields: int) -> None:
+        for name, value in fields.items():
+            setattr(self.outer, name, value)
+        self.engine.outer_loop(self.outer, self.b)
+
+
+def _make_contiguous(s: State) -> None:
+    for name, value in vars(s).items():
+        if isinstance(value, Tensor):
+            setattr(s, name, value.contiguous())
