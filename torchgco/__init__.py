@@ -17,6 +17,7 @@ from torchgco.base.errors import ContactWarning as ContactWarning
 from torchgco.base.errors import GuidanceWarning as GuidanceWarning
 from torchgco.base.errors import InputError as InputError
 from torchgco.base.errors import ScaleWarning as ScaleWarning
+from torchgco.base.errors import StartWarning as StartWarning
 from torchgco.base.status import Status as Status
 from torchgco.base.version import VERSION
 from torchgco.baselines import Hold as Hold
@@ -25,6 +26,7 @@ from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
 from torchgco.constraints import FunctionConstraint as FunctionConstraint
 from torchgco.constraints import RateBounds as RateBounds
+from torchgco.constraints import Separation as Separation
 from torchgco.constraints import StateBounds as StateBounds
 from torchgco.costs import Cost as Cost
 from torchgco.costs import FunctionCost as FunctionCost
@@ -70,14 +72,14 @@ __all__ = [  # noqa: RUF022
     # the problem
     "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules", "ControlBounds",
-    "StateBounds", "RateBounds", "FirstStepRates", "FunctionConstraint", "FunctionCost",
+    "StateBounds", "RateBounds", "Separation", "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # solving it
     "solve", "Solution", "Status", "presets", "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR",
     "InteriorPoint", "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors
-    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "ScaleWarning",
+    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "ScaleWarning", "StartWarning",
 ]  # fmt: skip
 
 __version__ = VERSION

@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import computing_on
+from torchgco.base.shapes import check_shape, computing_on
 from torchgco.constraints import ControlBounds
 from torchgco.contact import warned_of_contact
 from torchgco.native.dispatch import current, open_loop
 from torchgco.presets import named
+from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, check_problem
-from torchgco.problem.rates import with_controls_before
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 
@@ -25,6 +25,7 @@ def solve(
     ids: Tensor | None = None,
     warm: Solution | None = None,
     max_seconds: float | None = None,
+    X0: Tensor | None = None,
 ) -> Solution:
     """Solve every problem of the batch.
 
@@ -37,12 +38,14 @@ def solve(
         solver: a solver, or the name of a preset (`torchgco.presets`). Default: "gco".
         seed, ids: the key of the random draws; ids are int64 (B,), by default 0..B-1.
         warm: an earlier solution of problems of this form: the solve starts from its multipliers and, without U0, from
-            its controls.
+            its controls; where starts are free, from its starts too.
         max_seconds: time after which the best trajectories so far are returned; see `Solver.solve`.
+        X0: states to begin with (B, N+1, n), such as waypoints; U0 need not lead to them. For `interior_point`, `ipopt`
+            and `fatrop`, and without obstacles `gco`. Default: those that U0 leads to.
 
     Raises:
-        InputError: U0, ids or warm don't fit the problem, no preset has this name, or an argument is of another kind or
-            out of its range.
+        InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
+            states X0, or an argument is of another kind or out of its range.
     """
     check_problem(problem)
     if warm is not None and not isinstance(warm, Solution):
@@ -54,13 +57,18 @@ def solve(
         raise InputError("solver", "a solver, such as presets.gco(problem), or the name of a preset", shown(solver))
     if U0 is None and warm is not None:
         U0 = warm.U
+        if problem.free_start is not None:
+            check_shape(warm.X, (problem.B, problem.N + 1, problem.n), "warm.X")
+            problem = problem.guessing(warm.X[:, 0])
+    elif U0 is None and problem.B == 0:
+        U0 = problem.x0.new_zeros(0, problem.N, problem.m)
     elif U0 is None:
-        whole = with_controls_before(problem)
+        whole = for_solvers(problem)
         traced = current(whole)
         problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
         U0 = _guess(problem, traced)
     multipliers = None if warm is None else warm.multipliers
-    found = solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds)
+    found = solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds, X0=X0)
     return warned_of_contact(problem, found)
 
 

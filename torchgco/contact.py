@@ -41,7 +41,7 @@ def touches(problem: Problem, solution: Solution) -> Tensor:
     if rows.numel() == 0:
         return found
     nearest = torch.full_like(solution.cost[rows], torch.inf)
-    for part in problem.obstacles:
+    for part in problem.constraints:
         if isinstance(part, tuple(CLEARANCES)):
             nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(part.take(rows), solution.X[rows])[1])
     found[rows] = nearest < 0

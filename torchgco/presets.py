@@ -28,6 +28,7 @@ from torchgco.search import (
     Refine,
     Restarts,
     Solve,
+    Starts,
 )
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Solver
@@ -81,6 +82,7 @@ def gco(space: Space) -> Restarts:
             _finish(space),
             ClearChords(),
             Converge(),
+            Starts(),
         ),
     )
 
@@ -89,7 +91,7 @@ def gco_fast(space: Space) -> Restarts:
     """One attempt along the shortest path, tracked from rest."""
     solve, proposals, _ = _parts(space)
     guidance = _guidance(space)
-    follow = replace(proposals.follow[0], initial_offsets=(), arrive=proposals.follow[0].paces[:1], iterations=10)
+    follow = replace(_from_rest(space, proposals.follow[0]), iterations=10)
     one = replace(proposals, num_paths=1, follow=(follow,), relax_iterations=0, relax_top=None, refine=Refine())
     closer = replace(one, when="unproposed", roadmaps=(), follow=(_closer(follow),))
     guidance = replace(guidance, sampler=replace(guidance.sampler, samples=64, rounds=10))
@@ -113,13 +115,17 @@ def gco_fast(space: Space) -> Restarts:
 
 
 def gco_max(space: Space) -> Restarts:
-    """The passes of `gco`, then more for every caught problem: sixteen refined candidates, and more samples."""
+    """The passes of `gco`, then more for every caught problem: sixteen refined candidates, and more samples.
+
+    Without obstacles: more starts.
+    """
     solver = gco(space)
     *_, proposals, samples = _parts(space)
     many = replace(proposals, when="caught", num_paths=16, relax_top=None, refine=Refine(top=16))
     closer = replace(many, when="unproposed", roadmaps=(), follow=(_closer(many.follow[0]),))
     more = (many, closer, FromProposal(), IntoGoal(), replace(samples, when="caught"), IntoGoal())
-    return replace(solver, passes=(*solver.passes[:-3], *more, *solver.passes[-3:]))
+    *begin, finish, chords, converge, starts = solver.passes
+    return replace(solver, passes=(*begin, *more, finish, chords, converge, replace(starts, when="all")))
 
 
 def gco_paper(space: Space) -> AugmentedLagrangian:
@@ -176,7 +182,7 @@ def fatrop_guided(space: Space) -> GuidedCasADi:
     """FATROP from the cheapest of four tracked candidates; guesses that penetrate an obstacle are accepted."""
     _, proposals, _ = _parts(space)
     relaxed = 0 if _in_the_plane(space) else 20  # in the plane, relaxed candidates fall back into the trap
-    follow = replace(proposals.follow[0], initial_offsets=(), arrive=proposals.follow[0].paces[:1], pace=None)
+    follow = replace(_from_rest(space, proposals.follow[0]), pace=None)
     first = replace(
         proposals, num_paths=4, follow=(follow,), relax_iterations=relaxed, relax_top=None, refine=Refine(),
         max_penetration=1.0,
@@ -215,15 +221,22 @@ def named(name: str, space: Space) -> Solver:
 def _parts(space: Space) -> tuple[Solve, PathProposals, FromSamples]:
     """The passes of `gco` that the others are made of: the first solve, the first proposals, and samples."""
     if _in_the_plane(space):
-        follow = Follow(initial_offsets=OFFSETS, depart=0.1, arrive=(0.8, 0.6))
+        follow = Follow(initial_offsets=OFFSETS, depart=0.1, arrive=0.6, stiffness=(200.0,))
         roadmaps = (Roadmap(max_overlap=0.02),)
         proposals = PathProposals(
-            roadmaps=roadmaps, num_paths=12, follow=(follow,), relax_iterations=40, refine=Refine(top=8)
+            roadmaps=roadmaps, num_paths=6, follow=(follow,), relax_iterations=40, refine=Refine(top=8)
         )
         return Solve(single_contact_after=3), proposals, FromSamples(redraws=2)
     follow = Follow(arrive=0.9, pace=1.75, smoothing=0.16, tube=None, stiffness=(200.0,), iterations=10)
     proposals = PathProposals(roadmaps=(Roadmap(num_halton=128),), num_paths=6, follow=(follow,), relax_top=3)
     return Solve(single_contact_after=6), proposals, FromSamples(redraws=3)
+
+
+def _from_rest(space: Space, follow: Follow) -> Follow:
+    """Follows each path once, from rest: in the plane later and in two solves, as no other candidate stands in."""
+    if _in_the_plane(space):
+        follow = replace(follow, initial_offsets=(), arrive=0.8, stiffness=(20.0, 200.0))
+    return follow
 
 
 def _closer(follow: Follow) -> Follow:

@@ -14,10 +14,11 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.files import read_arrays, write_whole
-from torchgco.base.shapes import check_device
+from torchgco.base.shapes import check_device, check_shape
 from torchgco.base.status import Status
 from torchgco.base.tree import take
 from torchgco.judging.judge import columns as judged
+from torchgco.judging.worst import worst_rows
 from torchgco.lagrangian.lagrangian import Multipliers
 
 if TYPE_CHECKING:
@@ -95,6 +96,15 @@ class Solution:
     guided: Tensor  # (B,) int64, outer iterations with guidance on
     trace: pd.DataFrame | None = None  # a row per problem and iteration, where the solver records
     search: SearchRecord | None = None  # paths, candidates and passes, where a solver with passes records
+    horizon: Tensor | None = None  # (B,) int64: stages of each problem, after which its state is held; None: N
+
+    @classmethod
+    def empty(cls, problem: Problem) -> Solution:
+        """That of a batch without problems."""
+        X, U = problem.x0.new_zeros(0, problem.N + 1, problem.n), problem.x0.new_zeros(0, problem.N, problem.m)
+        number, count = X.new_zeros(0), torch.zeros(0, dtype=torch.int64, device=X.device)
+        K = X.new_zeros(0, problem.N, problem.m, problem.n)
+        return cls(X, U, K, U, Multipliers.zero(problem, 0.0), number, number, count, count, count, count)
 
     @property
     def statuses(self) -> list[Status]:
@@ -105,10 +115,11 @@ class Solution:
         """The problems in `index` (records are left behind)."""
         return take(replace(self, trace=None, search=None), index)
 
-    def of_first_states(self, n: int) -> Solution:
-        """The same with the first n states alone, of which K is then the feedback."""
+    def of_first_states(self, n: int, horizon: Tensor | None = None) -> Solution:
+        """The same with the first n states alone, of which K is then the feedback, and with these horizons."""
         search = None if self.search is None else self.search.of_first_states(n)
-        return replace(self, X=self.X[..., :n].contiguous(), K=self.K[..., :n].contiguous(), search=search)
+        X, K = self.X[..., :n].contiguous(), self.K[..., :n].contiguous()
+        return replace(self, X=X, K=K, search=search, horizon=horizon)
 
     def __repr__(self) -> str:
         B, N, m = self.U.shape
@@ -119,7 +130,7 @@ class Solution:
         return f"Solution(B={B}, N={N}, n={self.X.shape[-1]}, m={m}: {ended}; {costs})"
 
     def to_frame(self, problem: Problem | None = None) -> pd.DataFrame:
-        """One row per problem: status, cost, violation and the iteration counts.
+        """One row per problem: status, cost, violation and the iteration counts; the horizon where they differ.
 
         Args:
             problem: the problem that was solved. With it come the columns of `judge.columns`, from a re-simulation:
@@ -134,14 +145,35 @@ class Solution:
         columns: dict[str, Any] = {"status": [s.name for s in self.statuses]}
         for name in ("cost", "violation", "iterations", "outer_iterations", "guided"):
             columns[name] = getattr(self, name).cpu().numpy()
+        if self.horizon is not None:
+            columns["horizon"] = self.horizon.cpu().numpy()
         if problem is not None:
-            columns |= judged(problem, self.U)
+            columns |= judged(problem, self.U, None if problem.free_start is None else self.X[:, 0])
         return pd.DataFrame(columns).rename_axis("element")
+
+    def worst_rows(self, problem: Problem) -> pd.DataFrame:
+        """One row per problem: which constraint is violated most, and where states were lost.
+
+        `constraint`, its place in `problem.constraints`, with its `name` or kind; `knot` and `row` of the largest
+        `violation`, m for lengths; all are -1, "" and 0 where nothing is violated. `lost_at` is the first knot whose
+        state isn't finite, -1 where all are: there a model or its integrator fails, for which a smaller time step or
+        other controls at the stage before may help.
+
+        Raises:
+            InputError: a problem of another form.
+        """
+        import pandas as pd
+
+        check_shape(self.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
+        check_shape(self.U, (problem.B, problem.N, problem.m), "problem: solution.U")
+        return pd.DataFrame(worst_rows(problem, self.X, self.U)).rename_axis("element")
 
     def save(self, path: str | Path) -> None:
         """Write an npz: all of it or, if interrupted, nothing."""
         arrays = {f.name: getattr(self, f.name).cpu().numpy() for f in fields(self) if f.name in _TENSORS}
         arrays["mu"] = self.multipliers.mu.cpu().numpy()
+        if self.horizon is not None:
+            arrays["horizon"] = self.horizon.cpu().numpy()
         for i, lam in enumerate(self.multipliers.lam):
             arrays[f"lam{i}"] = lam.cpu().numpy()
         write_whole(path, lambda file: np.savez_compressed(file, **arrays))
@@ -156,7 +188,7 @@ class Solution:
         where = check_device(device)
         arrays = read_arrays(path, "path", "a solution file", {*_TENSORS, "mu"})
         count = next(i for i in range(len(arrays)) if f"lam{i}" not in arrays)
-        names = (*_TENSORS, "mu", *(f"lam{i}" for i in range(count)))
+        names = (*_TENSORS, "mu", *(f"lam{i}" for i in range(count)), *(["horizon"] if "horizon" in arrays else []))
         strange = [name for name in names if arrays[name].dtype.kind not in "iuf"]
         if strange:
             raise InputError("path", "a solution file", f"{path}, where {strange[0]} holds no numbers")
@@ -165,7 +197,8 @@ class Solution:
             raise InputError("path", "a solution file", f"{path}, whose arrays have other shapes")
         tensors: dict[str, Any] = {name: torch.from_numpy(arrays[name]).to(where) for name in names}
         lam = tuple(tensors[f"lam{i}"] for i in range(count))
-        return cls(multipliers=Multipliers(lam, tensors["mu"]), **{name: tensors[name] for name in _TENSORS})
+        own = {name: tensors[name] for name in _TENSORS}
+        return cls(multipliers=Multipliers(lam, tensors["mu"]), horizon=tensors.get("horizon"), **own)
 
 
-_TENSORS = tuple(f.name for f in fields(Solution) if f.name not in ("multipliers", "trace", "search"))
+_TENSORS = tuple(f.name for f in fields(Solution) if f.name not in ("multipliers", "trace", "search", "horizon"))

@@ -245,7 +245,7 @@ def test_bad_calls_are_named() -> None:
     with pytest.raises(InputError, match="ids"):
         CasADiSolver().solve(problem, U0, ids=torch.arange(3))
     with pytest.raises(InputError, match="problem"):
-        CasADiSolver().prepare(problem).solve(problem.take(torch.tensor([0, 1])), U0)
+        CasADiSolver().prepare(problem).solve(problem.take(torch.tensor([1, 0])), U0)
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)

@@ -64,7 +64,7 @@ def test_the_problem_is_the_one_that_is_judged() -> None:
     torch.testing.assert_close(torch.from_numpy(states), X, rtol=1e-9, atol=1e-9)
     constant = 0.5 * R * DT * 4 * HOVER**2 * problem.N
     torch.testing.assert_close(problem.cost.total(X, U) + constant, torch.from_numpy(cost), rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(violation(problem, X, U), torch.from_numpy(worst), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(violation(problem.constraints, X, U), torch.from_numpy(worst), rtol=1e-9, atol=1e-9)
     assert worst.min() > 1.0
 
 

@@ -45,7 +45,8 @@ def choose(levels: tuple[float, ...], monkeypatch, share: float, **options) -> S
     """The choice among given trajectories, all caught, none improved; `share` is the goal tolerance."""
     problem, U0, local = given(monkeypatch)
     monkeypatch.setattr("torchgco.lagrangian.quality.GOAL_TOLERANCE", share)
-    monkeypatch.setattr("torchgco.search.passes.caught_knots", lambda problem, X, *_: torch.ones_like(X[..., 0]) > 0)
+    monkeypatch.setattr("torchgco.solvers.caught.caught_knots", lambda problem, X, *_: torch.ones_like(X[..., 0]) > 0)
+    monkeypatch.setattr("torchgco.solvers.augmented_lagrangian.engine_of", lambda problem: None)  # which tests it in C
     last = ()  # no clearing of chords: trajectories here do collide
     return restarts(local, None, Given(levels=levels), len(levels), last=last, **options).solve(problem, U0)
 

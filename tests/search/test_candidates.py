@@ -7,7 +7,7 @@ import torch
 from tests.search.cup import QUICK, controls, cup
 from torchgco import Problem
 from torchgco.lagrangian.rollout import open_loop
-from torchgco.roadmap.scene import chord_penetration
+from torchgco.native.dispatch import chord_clearance
 from torchgco.search.candidates import Candidates
 
 
@@ -74,6 +74,6 @@ def test_the_penetration_of_a_chord() -> None:
     X = torch.zeros(1, 3, 6, dtype=torch.float64)
     X[0, :, 0] = torch.tensor([-5.0, 5.0, 6.0])
     X[0, :, 1] = 0.1  # through the middle of the third disc
-    torch.testing.assert_close(chord_penetration(problem, X), torch.tensor([0.2], dtype=torch.float64))
+    torch.testing.assert_close(chord_clearance(problem, X, 0.0), torch.tensor([-0.2], dtype=torch.float64))
     X[0, :, 1] = 5.0
-    assert float(chord_penetration(problem, X)) < 0
+    assert float(chord_clearance(problem, X, 0.0)) > 0

@@ -21,8 +21,7 @@ from torchgco import (
     presets,
     solve,
 )
-from torchgco.lagrangian.quality import chord_clearance
-from torchgco.native.dispatch import open_loop
+from torchgco.native.dispatch import chord_clearance, open_loop
 from torchgco.native.kernels import use_native
 from torchgco.search import ClearChords, Converge
 

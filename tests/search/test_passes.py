@@ -24,7 +24,7 @@ from torchgco import (
     Spheres,
     presets,
 )
-from torchgco.search import ClearChords, Converge, Finish, FromProposal, FromSamples, IntoGoal, Refine, Solve
+from torchgco.search import ClearChords, Converge, Finish, FromProposal, FromSamples, IntoGoal, Refine, Solve, Starts
 from torchgco.search.passes import Pass
 from torchgco.search.table import COLUMNS
 from torchgco.solvers.interior import InteriorPoint
@@ -54,11 +54,16 @@ def around_one(*passes: Pass) -> Solution:
     return Restarts(replace(LOCAL, guidance=SAMPLING), passes).solve(problem, U0)
 
 
-def unfinished(*passes: Pass, problem: Problem | None = None) -> Solution:
+def unfinished(*passes: Pass, problem: Problem | None = None, limit: int = 20) -> Solution:
     """The fastest slide to a point, which the local solver's limits cut off; or another problem."""
     problem = brachistochrone() if problem is None else problem
-    local = replace(presets.gco(problem).local, guidance=None)
+    local = replace(presets.gco(problem).local, guidance=None, max_outer_iterations=limit)
     return Restarts(local, passes).solve(problem, problem.x0.new_zeros(problem.B, problem.N, problem.m))
+
+
+def cut_off(*passes: Pass) -> Solution:
+    """The slide with half of the outer iterations."""
+    return unfinished(*passes, limit=10)
 
 
 def parked(*passes: Pass) -> Solution:
@@ -73,6 +78,7 @@ def around_corners(*passes: Pass) -> Solution:
     return Restarts(local, passes).solve(problem, problem.x0.new_zeros(problem.B, problem.N, problem.m))
 
 
+AGAIN, FIRST = Starts(2, "all"), (Converge(when="first"), Solve())
 LONG = Finish(AugmentedLagrangian(ILQR(max_iterations=50), max_outer_iterations=30, patience=8))
 ALONG = (Solve(), PATHS, FromProposal())
 # For every field: the problems, the rows before, the row, another value, the rows after.
@@ -84,9 +90,14 @@ FIELDS: dict[tuple[type, str], tuple[Any, tuple[Pass, ...], Pass, Any, tuple[Pas
     (PathProposals, "max_gap"): (at_gates, (Solve(), PATHS), COSTLY, 1e9, (FromProposal(),)),
     (FromSamples, "when"): (at_gates, ALONG, FromSamples("unproposed", redraws=1), "caught", ()),
     (FromSamples, "redraws"): (at_gates, (Solve(),), DRAWN, 2, ()),
+    (Starts, "count"): (parked, FIRST, AGAIN, 3, ()),
+    (Starts, "when"): (unfinished, FIRST, AGAIN, "unsolved", ()),
+    (Starts, "bend"): (unfinished, FIRST, AGAIN, 0.3, ()),
+    (Starts, "change"): (parked, FIRST, AGAIN, 0.2, ()),
+    (Starts, "solver"): (parked, FIRST, AGAIN, InteriorPoint(initial_barrier=1.0), ()),
     (Converge, "solver"): (unfinished, (Solve(),), Converge(), InteriorPoint(tolerance=1e-2), ()),
     (Converge, "when"): (unfinished, (Solve(),), Converge(), "first", ()),
-    (Finish, "solver"): (unfinished, (Solve(),), LONG, replace(LONG.solver, penalty_growth=5.0), ()),
+    (Finish, "solver"): (cut_off, (Solve(),), LONG, replace(LONG.solver, penalty_growth=5.0), ()),
     (Finish, "change"): (parked, (Solve(),), LONG, 0.3, ()),
     (ClearChords, "solver"): (around_corners, (Solve("end"),), ClearChords(), InteriorPoint(tolerance=1e-2), ()),
     (ClearChords, "rounds"): (around_corners, (Solve("end"),), ClearChords(), 1, ()),
@@ -151,7 +162,8 @@ def test_a_list_of_rows_is_a_table() -> None:
         (lambda: Solve(single_contact_after=1.5), "solve.single_contact_after"),
         (lambda: FromSamples(when="far"), "samples.when"), (lambda: FromSamples(redraws=-1), "samples.redraws"),
         (lambda: Finish(change=0.0), "finish.change"), (lambda: Finish(solver=ILQR()), "finish.solver"),
-        (lambda: ClearChords(rounds=0), "chords.rounds"),
+        (lambda: ClearChords(rounds=0), "chords.rounds"), (lambda: Starts(count=0), "starts.count"),
+        (lambda: Starts(when="solved"), "starts.when"), (lambda: Starts(bend=0.0), "starts.bend"),
     ],
 )  # fmt: skip
 def test_options_out_of_range_are_named(make: Any, field: str) -> None:
@@ -189,7 +201,7 @@ def test_rows_that_differ_are_shown_differently() -> None:
         varied(PATHS, tube=None), varied(PATHS, arrive=(0.9, 0.8)), varied(PATHS, smoothing=0.3),
         varied(PATHS, stiffness=(7.0,)),
         FromSamples(), FromSamples(redraws=2), FromSamples("caught"), Finish(), LONG, ClearChords(), ClearChords(9),
-        FromProposal(), IntoGoal(),
+        FromProposal(), IntoGoal(), Starts(), Starts(4), Starts(when="all"), Starts(bend=0.1), Starts(change=0.3),
     ]  # fmt: skip
     table = Restarts(passes=(Solve(), PATHS, *rows)).table().iloc[2:]
     assert len(table) == len(rows) and not table.duplicated().any()

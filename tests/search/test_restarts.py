@@ -35,13 +35,14 @@ from torchgco import (
     Status,
     judge,
 )
+from torchgco.base.status import STOPPED
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.search import Follow, FromSamples
-from torchgco.search.passes import SEED_STEP, StopWhenCaught
+from torchgco.search.passes import SEED_STEP
 from torchgco.search.proposals import Round
+from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.state import STOPPED
 
 
 def arrived(solve: Solve) -> Tensor:

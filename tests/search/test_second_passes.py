@@ -14,9 +14,9 @@ from torchgco.lagrangian.rollout import open_loop
 from torchgco.roadmap.scene import has_paths
 from torchgco.search import Converge, Follow
 from torchgco.search.following import Paths, followed
-from torchgco.search.passes import StopWhenCaught
 from torchgco.search.proposals import Proposal, propose
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
+from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.ilqr import ILQR, descend
 
 LAYOUTS = 4

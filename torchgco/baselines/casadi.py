@@ -81,6 +81,14 @@ class CasADiSolver(Solver):
         """From U0 and its rollout; X is the rollout of the controls found. Raises the errors of `prepare`, too."""
         return self.prepare(call.problem).run(call)
 
+    def frees_start(self, problem: Problem) -> bool:
+        """Where the same components are free in all problems."""
+        return True
+
+    def take_states(self, problem: Problem) -> bool:
+        """Always."""
+        return True
+
     def _options(self, problem: Problem, program: Program) -> dict[str, Any]:
         """Options of the plugin and of CasADi around it; neither prints."""
         quiet = {"print_time": False, "show_eval_warnings": False}
@@ -112,12 +120,20 @@ class PreparedCasADi(Solver):
 
     joins_knots: ClassVar[bool] = True
 
+    def frees_start(self, problem: Problem) -> bool:
+        """As the solver."""
+        return True
+
+    def take_states(self, problem: Problem) -> bool:
+        """As the solver."""
+        return True
+
     def run(self, call: Call) -> Solution:
         """As `CasADiSolver.run`; InputError for another problem than the prepared one."""
         problem, U0 = call.problem, call.U0
         if not problem.is_same(self.problem):
             raise InputError("problem", "the one that was prepared", "another")
-        X0 = open_loop(problem.dynamics, problem.x0, U0)
+        X0 = open_loop(problem.dynamics, problem.x0, U0) if call.X0 is None else call.X0
         return self._all(torch.where(torch.isfinite(X0), X0, problem.x0.unsqueeze(1)), U0, call.callback)
 
     def of(self, problem: Problem) -> PreparedCasADi:
@@ -145,18 +161,18 @@ class PreparedCasADi(Solver):
         """Every problem of the batch in turn; problems with an invalid start are left out."""
         problem = self.problem
         valid = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
-        U, ends = U0.clone(), [(Status.CONVERGED, 0)] * problem.B
+        U, start, ends = U0.clone(), problem.x0.clone(), [(Status.CONVERGED, 0)] * problem.B
         for b in range(problem.B):
             if bool(valid[b]):
-                U[b], ends[b] = self._one(b, X0[b], U0[b])
+                start[b], U[b], ends[b] = self._one(b, X0[b], U0[b])
             if callback is not None:
                 rows = torch.arange(b, b + int(valid[b]), device=U.device)
                 callback(Progress(b + 1, rows, b + 1, problem.B))
-        solution = rolled_out(problem, U, self.solver.violation_tolerance, iterations=0)
+        solution = rolled_out(problem.held_at(start), U, self.solver.violation_tolerance, iterations=0)
         return _with_ends(solution, ends)
 
-    def _one(self, b: int, X0: Tensor, U0: Tensor) -> tuple[Tensor, _End]:
-        """Controls (N, m) of problem b, and how it ended."""
+    def _one(self, b: int, X0: Tensor, U0: Tensor) -> tuple[Tensor, Tensor, _End]:
+        """The start (n,) and the controls (N, m) of problem b, and how it ended."""
         n, size = X0.shape[-1], self.program.variables.numel()
         p = self.program.values(self.problem, b)
         lower, upper = self.program.limits.bounds(p, size)
@@ -170,12 +186,13 @@ class PreparedCasADi(Solver):
         except RuntimeError as error:  # crossed bounds, for example; the other problems are still solved
             if "option" in str(error).lower():  # FATROP reads its options only here
                 raise _refused(self.solver.plugin, error) from error
-            return U0, (Status.LINE_SEARCH_FAILED, 0)
+            return X0[0], U0, (Status.LINE_SEARCH_FAILED, 0)
         v = torch.from_numpy(np.array(found["x"]).reshape(-1)[:-n]).to(U0)
         iterations = int(stats["iter_count"])
         at_limit = iterations >= self.solver.max_iterations
         failed = Status.MAX_ITERATIONS if at_limit else Status.LINE_SEARCH_FAILED
-        return v.view(U0.shape[0], -1)[:, n:], (Status.CONVERGED if stats["success"] else failed, iterations)
+        v = v.view(U0.shape[0], -1)
+        return v[0, :n], v[:, n:], (Status.CONVERGED if stats["success"] else failed, iterations)
 
 
 def _refused(plugin: str, error: RuntimeError) -> InputError:

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchgco.base.options import Positive, check_options
 from torchgco.base.status import Status
 from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.rollout import open_loop
+from torchgco.native.dispatch import measured
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
@@ -41,7 +41,7 @@ class Hold(Solver):
 def rolled_out(problem: Problem, U: Tensor, violation_tolerance: float, iterations: int) -> Solution:
     """A solution without gains or multipliers from controls that no local solver refined: FEASIBLE at best."""
     X = open_loop(problem.dynamics, problem.x0, U)
-    cost, worst = problem.cost.total(X, U), violation(problem, X, U)
+    cost, worst = problem.cost.total(X, U), measured(problem, X, U)
     status = torch.full((problem.B,), int(Status.FEASIBLE), device=U.device)
     status[worst > violation_tolerance] = Status.INFEASIBLE
     status[~problem.start_is_clear] = Status.INVALID_START

@@ -13,7 +13,8 @@ from torchgco.base.options import Count, Positive, check_options
 from torchgco.baselines.hold import rolled_out
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_sampler
-from torchgco.lagrangian.quality import is_better, violation
+from torchgco.lagrangian.quality import is_better
+from torchgco.native.dispatch import measured
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 
@@ -57,7 +58,7 @@ class IteratedMPPI(Solver):
         best_cost = best_violation = torch.full_like(problem.x0[:, 0], torch.inf)
         for i in range(self.iterations):
             X, U = sampler.improve(problem, U, DrawKey(call.seed, ids, torch.full_like(ids, i)))
-            cost, worst = problem.cost.total(X, U), violation(problem, X, U)
+            cost, worst = problem.cost.total(X, U), measured(problem, X, U)
             better = is_better(cost, worst, best_cost, best_violation, self.violation_tolerance)
             best = torch.where(better.view(-1, 1, 1), U, best)
             best_cost = torch.where(better, cost, best_cost)

@@ -33,6 +33,7 @@ class Program:
     equality: list[bool]
     path_rows: list[int]  # number of rows of each knot 0..N, without x_{k+1} - step(x_k, u_k)
     limits: _Limits
+    free: list[bool]  # which components of x_0 are variables
     sources: tuple[Traced, ...]
 
     def values(self, problem: Problem, b: int) -> np.ndarray:
@@ -49,7 +50,10 @@ class Program:
         """
         step, cost, constraints = _traces(problem)
         sources = (step, cost, *constraints)
-        if [source.fingerprint() for source in sources] != [source.fingerprint() for source in self.sources]:
+        same = self.free == _free(problem)
+        if not same or [source.fingerprint() for source in sources] != [
+            source.fingerprint() for source in self.sources
+        ]:
             raise InputError("problem", "one of the form that was prepared", "another form")
         return replace(self, sources=sources)
 
@@ -77,8 +81,10 @@ def transcribe(problem: Problem) -> Program:
     """The program of a batch.
 
     Raises:
-        InputError: a part that can't be traced, or that uses an operation without a counterpart in CasADi.
+        InputError: a part that can't be traced, or that uses an operation without a counterpart in CasADi; horizons.
     """
+    if problem.horizon is not None:
+        raise InputError("horizon", "None for CasADi: a solve for each length", "horizons of each problem")
     N, n, m = problem.N, problem.n, problem.m
     step, cost, constraints = _traces(problem)
     sources = (step, cost, *constraints)
@@ -91,7 +97,8 @@ def transcribe(problem: Problem) -> Program:
     X, U = np.stack([_elements(z) for z in x])[None], np.stack([_elements(z) for z in u])[None]
 
     at_knot: list[list[tuple[ca.SX, bool]]] = [[] for _ in range(N + 1)]  # rows, and whether each is an equality
-    at_knot[0] = [(row, True) for row in _elements(x[0] - start)]
+    free = _free(problem)
+    at_knot[0] = [(row, True) for row, is_free in zip(_elements(x[0] - start), free, strict=True) if not is_free]
     for constraint, traced, p in zip(problem.constraints, constraints, own[2:], strict=True):
         values = traced(_elements(p), X, U)[0]
         for k, rows in zip(_knots(constraint.knots, N), values, strict=True):
@@ -106,8 +113,17 @@ def transcribe(problem: Problem) -> Program:
         equality += [is_equality for _, is_equality in gap + at_knot[k]]
     return Program(
         variables, parameters, _column(cost(_elements(own[1]), X, U)), _column(rows), equality,
-        [len(knot) for knot in at_knot], limits, sources,
+        [len(knot) for knot in at_knot], limits, free, sources,
     )  # fmt: skip
+
+
+def _free(problem: Problem) -> list[bool]:
+    """Which components of the start are variables; InputError unless they are the same in all problems."""
+    if problem.free_start is None:
+        return [False] * problem.n
+    if bool((problem.free_start != problem.free_start[0]).any()):
+        raise InputError("free_start", "for CasADi the same components in all problems", "different ones")
+    return problem.free_start[0].tolist()
 
 
 def _traces(problem: Problem) -> tuple[Traced, Traced, list[Traced]]:

@@ -108,6 +108,8 @@ class _Flight:
         self.planner = mission.planner if mission.latency == 0 else replace(mission.planner, first_step=False)
         if problem.goal is None:
             raise InputError("goal", "a Goal in the problem", None)
+        if problem.horizon is not None:
+            raise InputError("horizon", "None for a mission, which replans over N stages", "horizons of each problem")
         mission.check(problem.dynamics)
         if problem.x0.dtype != torch.float64:
             raise InputError("x0", "torch.float64 for a mission", problem.x0.dtype)

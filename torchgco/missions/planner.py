@@ -16,7 +16,6 @@ from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
-from torchgco.lagrangian.quality import violation
 from torchgco.missions.planning_problem import (
     Margin,
     acceleration,
@@ -26,7 +25,7 @@ from torchgco.missions.planning_problem import (
     follows,
     planning_state,
 )
-from torchgco.native.dispatch import followed, open_loop, value
+from torchgco.native.dispatch import followed, measured, open_loop, value
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
@@ -261,7 +260,7 @@ class _Solve:
         X = open_loop(part, U[rows])
         former = replace(
             plan.take(rows), X=X, U=U[rows], K=shifted(before.K[rows]), multipliers=take(multipliers, rows),
-            cost=part.cost.total(X, U[rows]), violation=violation(part, X, U[rows]),
+            cost=part.cost.total(X, U[rows]), violation=measured(part, X, U[rows]),
             shifted=torch.ones_like(rows, dtype=torch.bool),
         )  # fmt: skip
         self._replace(plan, rows, former)

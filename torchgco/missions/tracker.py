@@ -16,8 +16,8 @@ from torchgco.costs import QuadraticCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.quadrotor import GRAVITY, Airframe, RotorTracking
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted, update_and_raise_penalty
-from torchgco.lagrangian.quality import violation
 from torchgco.missions.constraints import ThrustSum
+from torchgco.native.dispatch import measured
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
 from torchgco.solvers.ilqr import ILQR, descend
@@ -117,7 +117,7 @@ class Tracker:
             found, _ = descend(self.inner, Lagrangian(problem, multipliers, None, self.inner.rules.phr), U)
             U = found.U
             multipliers = update_and_raise_penalty(problem, found.X, U, multipliers, growth, PENALTY_MAX)
-        return Tracking(problem, U[:, 0], violation(problem, found.X, U), U, multipliers)
+        return Tracking(problem, U[:, 0], measured(problem, found.X, U), U, multipliers)
 
     def _reference(self, x: Tensor, reference: Reference, offset: float) -> tuple[Tensor, Tensor]:
         """The states (B, N+1, 7) and thrust accelerations (B, N) at knots 1..N that are tracked."""

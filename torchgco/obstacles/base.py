@@ -5,15 +5,16 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import reduce
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import ScaleWarning
+from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
+from torchgco.constraints.base import TOUCH as TOUCH
 from torchgco.constraints.base import Constraint, Sense
 
-CONTACT_FACTOR = 0.95  # bodies touch at this share of r_obs + r_veh; planners keep the full distance (Table 3)
 ADMITTED = 1e-3  # m: the violation up to which solvers and judge call a trajectory feasible, unless options say else
 ABSENT = -1.0  # in C: stands for a length of an absent obstacle, or the square of one, which are never negative
 TINY = 1e-12  # what is divided by is at least this: lengths and their squares in the search for paths
@@ -70,6 +71,8 @@ class Obstacles(Constraint):
 
         inflated                              its form as spheres or boxes: without it no path is sought
         moving, chord_clearance, later        where its obstacles move
+        stops                                 the last knot at which they count, where horizons differ
+        chosen                                some of its obstacles: without it none is left out of a search
         sizes, start_is_clear                 where the margins don't say enough
 
     The judge and the certificate measure distances by separate code, to which a kind is added in `judge.CLEARANCES` and
@@ -83,6 +86,7 @@ class Obstacles(Constraint):
     vehicle_radius: Tensor  # (B,), m
     position: slice
     dt: float
+    stops: Tensor | None = None  # (B,): the last knot at which they count, and move; None: all of `knots`
 
     @property
     def moving(self) -> bool:
@@ -114,19 +118,34 @@ class Obstacles(Constraint):
         """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""
         return None
 
-    def chord_clearance(self, X: Tensor) -> Tensor:
-        """Smallest distance (B,) from the straight lines between knots to where bodies touch, m; negative in contact.
+    def chosen(self, at: Tensor) -> Obstacles:
+        """The same kind with the obstacles at places (B, M') alone; -1 stands for an absent one."""
+        raise NotImplementedError
 
-        Infinite where there is no obstacle. Obstacles that move override this.
+    def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
+        """Smallest distance (B,) from the straight lines between knots to obstacles, m; negative inside of them.
+
+        Counted from a `share` of the margin beneath the full surface, by default from where bodies touch; infinite
+        where there is no obstacle. Obstacles that move override this.
         """
         p = X[..., self.position]
-        touch = (1.0 - CONTACT_FACTOR) * self.margins
-        return least(self.segment_clearance(p[:, :-1], p[:, 1:]) + touch.unsqueeze(1))
+        return least(self.segment_clearance(p[:, :-1], p[:, 1:]) + (share * self.margins).unsqueeze(1))
 
     def start_is_clear(self, x0: Tensor) -> Tensor:
         """False where the vehicle touches an obstacle at the start, (B,)."""
         distance = self.signed_distance(x0[:, None, self.position], x0.new_zeros(1))[:, 0]
         return (distance >= (CONTACT_FACTOR - 1.0) * self.margins).all(-1)
+
+    def counted(self, rows: Tensor, other: float, count: int) -> Tensor:
+        """Rows (B, K, M) of `count` knots in all, with `other` where a problem's time has stopped."""
+        if self.stops is None:
+            return rows
+        knots = torch.arange(count, device=rows.device)[self.knots]
+        return rows.masked_fill((knots > self.stops.unsqueeze(-1)).unsqueeze(-1), other)
+
+    def stopping_at(self, knots: Tensor) -> Self:
+        """The same obstacles, which don't count, and don't move, after each problem's knot (B,)."""
+        raise NotImplementedError
 
     def times(self, X: Tensor) -> Tensor:
         """t = k dt (K,) at the constraint's knots, s."""
@@ -148,6 +167,12 @@ def least(distances: Tensor) -> Tensor:
     if distances.shape[1] == 0 or distances.shape[2] == 0:
         return distances.new_full(distances.shape[:1], torch.inf)
     return distances.flatten(1).amin(-1)
+
+
+def picked(values: Tensor, at: Tensor) -> Tensor:
+    """Values (B, M, ...) at places (B, M'), those of the first where a place is -1."""
+    index = at.clamp(min=0).view(*at.shape, *([1] * (values.dim() - 2)))
+    return values.gather(1, index.expand(*at.shape, *values.shape[2:]))
 
 
 def marked(lengths: Tensor, absent: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
-from torchgco.obstacles.base import Obstacles, least
+from torchgco.obstacles.base import ABSENT, Obstacles, least, picked
 from torchgco.obstacles.box_geometry import Cuboids, from_quaternions, segment_distance, signed_distance
 from torchgco.obstacles.inputs import dimension, own_radii, per_problem, points, rows, vehicle_radii
 
@@ -75,7 +75,7 @@ class Boxes(Constraint):
             raise InputError("boxes.half_sizes", expected, half[wrong][0].tolist())
         axes = _axes(self.rotations, absent, d, dims)
         vehicle = vehicle_radii(self.vehicle_radius, "boxes.vehicle_radius", dims)
-        knots = slice(1, dims.N + 1) if self.knots is None else self.knots
+        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
         knots = resolve_knots(knots, dims.N, "boxes.knots", half.device)
         return BoundBoxes.prepare(centers, half, axes, absent, radii, vehicle, knots, dims)
 
@@ -94,9 +94,10 @@ class BoundBoxes(Obstacles):
     knots: Any
     position: slice
     dt: float
+    stops: Tensor | None = None  # (B,)
 
     batched: ClassVar[tuple[str, ...]] = (
-        "centers", "half_sizes", "axes", "absent", "vehicle_radius", "inflated_radii", "depths",
+        "centers", "half_sizes", "axes", "absent", "vehicle_radius", "inflated_radii", "depths", "stops",
     )  # fmt: skip
 
     @classmethod
@@ -130,13 +131,15 @@ class BoundBoxes(Obstacles):
         return self.depths
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self._rows(X[:, self.knots, self.position])
+        return self.counted(self._rows(X[:, self.knots, self.position]), ABSENT, X.shape[1])
 
     def at(self, x: Tensor, k: int) -> Tensor:
-        return self._rows(x[..., self.position])
+        rows = self._rows(x[..., self.position])
+        return rows if self.stops is None else rows.masked_fill((k > self.stops)[:, None, None], ABSENT)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         n, at = X.shape[-1], self.position
+        g, h = self.counted(g, 0.0, X.shape[1]), self.counted(h, 0.0, X.shape[1])
         cp = -2.0 * self.depths[:, None, :, None] * self.inflated().normals(X[:, self.knots, at])
         gradient = (g.unsqueeze(-2) @ cp).squeeze(-2)
         H[:, self.knots, at, n] += gradient
@@ -146,7 +149,8 @@ class BoundBoxes(Obstacles):
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """Depth beneath the full surface, (B, K, M), m."""
         p = X[:, self.knots, self.position]
-        return (-self.signed_distance(p, self.times(X))).clamp(min=0.0)
+        depth = (-self.signed_distance(p, self.times(X))).clamp(min=0.0)
+        return self.counted(depth, 0.0, X.shape[1])
 
     def worst(self, X: Tensor, U: Tensor) -> Tensor:
         parts = self._parts(X.shape[1])
@@ -178,6 +182,17 @@ class BoundBoxes(Obstacles):
         more = torch.where(self.absent, 0.0, by.unsqueeze(-1))
         inflated, depths = self.inflated_radii + more, self.depths + more
         return replace(self, vehicle_radius=self.vehicle_radius + by, inflated_radii=inflated, depths=depths)
+
+    def chosen(self, at: Tensor) -> BoundBoxes:
+        absent = (at < 0) | picked(self.absent, at)
+        names = ("centers", "half_sizes", "axes", "inflated_radii", "depths")
+        parts = {name: picked(getattr(self, name), at) for name in names}
+        for name in ("centers", "half_sizes", "inflated_radii", "depths"):
+            parts[name] = parts[name].masked_fill(absent.view(*absent.shape, *([1] * (parts[name].dim() - 2))), 0.0)
+        return replace(self, absent=absent, **parts)
+
+    def stopping_at(self, knots: Tensor) -> Self:
+        return replace(self, stops=knots.to(self.centers.dtype))
 
     def inflated(self) -> Cuboids:
         return Cuboids(self.centers, self.inflated_radii, self.absent, self.axes, self.half_sizes)

@@ -56,7 +56,7 @@ class Capsules(Constraint):
             raise InputError("capsules.radii", "radii above 0 m", 0.0)
         half, axes = _single_side(ends - starts, absent)
         vehicle = vehicle_radii(self.vehicle_radius, "capsules.vehicle_radius", dims)
-        knots = slice(1, dims.N + 1) if self.knots is None else self.knots
+        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
         knots = resolve_knots(knots, dims.N, "capsules.knots", starts.device)
         return BoundBoxes.prepare(0.5 * (starts + ends), half, axes, absent, radii, vehicle, knots, dims)
 

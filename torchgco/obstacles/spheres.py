@@ -16,8 +16,8 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, space_of
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.obstacles.base import ABSENT, TOUCH, Obstacles, Solids, least, picked
 from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
-from torchgco.obstacles.base import Obstacles, Solids, least
 from torchgco.obstacles.inputs import own_radii, per_problem, points, vehicle_radii
 
 
@@ -62,7 +62,7 @@ class Spheres(Constraint):
                 raise InputError("obstacles.velocities", "finite velocities of every sphere", "NaN or infinity")
         if velocities is not None and dims.dt is None:
             raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
-        knots = slice(1, dims.N + 1) if self.knots is None else self.knots
+        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
         return BoundSpheres.prepare(
             torch.where(absent.unsqueeze(-1), 0.0, centers),
             torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1)),
@@ -90,9 +90,10 @@ class BoundSpheres(Obstacles):
     weights: Tensor  # (B, r, M): c = q @ weights
     first: Tensor  # (B, M, 1 + d [+ d]): 1, o, and v where they move
     second: Tensor  # (B, M, d d [* 3]): o o', and o v' + v o', v v' where they move
+    stops: Tensor | None = None  # (B,)
 
     batched: ClassVar[tuple[str, ...]] = (
-        "centers", "inflated_radii", "velocities", "absent", "vehicle_radius", "weights", "first", "second",
+        "centers", "inflated_radii", "velocities", "absent", "vehicle_radius", "weights", "first", "second", "stops",
     )  # fmt: skip
 
     @classmethod
@@ -130,16 +131,18 @@ class BoundSpheres(Obstacles):
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         p = X[:, self.knots, self.position]
-        return torch.bmm(self._features(p, self._times(X)), self.weights)
+        return self.counted(torch.bmm(self._features(p, self._times(X)), self.weights), ABSENT, X.shape[1])
 
     def at(self, x: Tensor, k: int) -> Tensor:
         p = x[..., self.position]
-        return torch.bmm(self._features(p, x.new_tensor(k * self.dt)), self.weights)
+        rows = torch.bmm(self._features(p, x.new_tensor(k * self.dt)), self.weights)
+        return rows if self.stops is None else rows.masked_fill((k > self.stops)[:, None, None], ABSENT)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         # With c_p = -2 (p - o):  sum g c_p = 2 (sum g o - p sum g),  sum h c_p c_p' = 4 sum h (o - p)(o - p)'.
         p = X[:, self.knots, self.position]
         d, n, t = p.shape[-1], X.shape[-1], self._times(X)
+        g, h = self.counted(g, 0.0, X.shape[1]), self.counted(h, 0.0, X.shape[1])
         g_sum, g_o = self._first_moments(g, t, d)
         h_sum, h_o = self._first_moments(h, t, d)
         h_oo = self._second_moment(h, t, d)
@@ -153,7 +156,8 @@ class BoundSpheres(Obstacles):
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
         """Penetration depth r_obs + r_veh - |p_obs - p|, m, by plain differences."""
-        return (self.inflated_radii.unsqueeze(1) - self.gaps(X)).clamp(min=0.0)
+        depth = (self.inflated_radii.unsqueeze(1) - self.gaps(X)).clamp(min=0.0)
+        return self.counted(depth, 0.0, X.shape[1])
 
     def gaps(self, X: Tensor) -> Tensor:
         """Distance |p_obs,i(k) - p_k| (B, K, M), m; infinite where absent."""
@@ -184,22 +188,37 @@ class BoundSpheres(Obstacles):
     def later(self, t: float) -> BoundSpheres:
         if self.velocities is None:
             return self
-        return self.prepare(
+        moved = self.prepare(
             self.centers + t * self.velocities, self.inflated_radii, self.velocities, self.absent, self.vehicle_radius,
             self.knots, self.position, self.dt,
         )  # fmt: skip
+        return replace(moved, stops=self.stops)
+
+    def chosen(self, at: Tensor) -> BoundSpheres:
+        absent = (at < 0) | picked(self.absent, at)
+        centers = torch.where(absent.unsqueeze(-1), 0.0, picked(self.centers, at))
+        radii = torch.where(absent, 0.0, picked(self.inflated_radii, at))
+        velocities = None
+        if self.velocities is not None:
+            velocities = torch.where(absent.unsqueeze(-1), 0.0, picked(self.velocities, at))
+        some = self.prepare(centers, radii, velocities, absent, self.vehicle_radius, self.knots, self.position, self.dt)
+        return replace(some, stops=self.stops)
 
     def inflated(self) -> Solids | None:
         return None if self.moving else Solids(self.centers, self.inflated_radii, self.absent)
 
-    def chord_clearance(self, X: Tensor) -> Tensor:
+    def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
         o = self.centers.unsqueeze(1)
         if self.velocities is not None:
-            t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device) * self.dt
-            o = o + t.view(1, -1, 1, 1) * self.velocities.unsqueeze(1)
+            t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device)
+            t = t.unsqueeze(0) if self.stops is None else torch.minimum(t, self.stops.unsqueeze(-1))
+            o = o + (t * self.dt)[..., None, None] * self.velocities.unsqueeze(1)
         away = X[:, :, None, self.position] - o
-        gap = _from_origin(away[:, :-1], away.diff(dim=1)) - CONTACT_FACTOR * self.inflated_radii.unsqueeze(1)
+        gap = _from_origin(away[:, :-1], away.diff(dim=1)) - (1.0 - share) * self.inflated_radii.unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
+
+    def stopping_at(self, knots: Tensor) -> Self:
+        return replace(self, stops=knots.to(self.centers.dtype))
 
     def _gaps(self, p: Tensor, t: Tensor) -> Tensor:
         """Distances (B, K, M) of points p (B, K, d) from the centres at times t (K, 1); infinite where absent."""

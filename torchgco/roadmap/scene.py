@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from torchgco.obstacles.base import Obstacles, Solids, least
+from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Inflated, Scene
@@ -85,22 +85,6 @@ def arrives(problem: Problem, X: Tensor) -> Tensor:
     assert problem.goal is not None
     first = problem.goal.distance(problem.x0[:, at]).view(-1, *([1] * (X.dim() - 3)))
     return problem.goal.distance(X[..., -1, at]) <= FALLEN_BACK * first
-
-
-def penetration(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """The deepest penetration of a trajectory into an obstacle at the knots, (B,), m."""
-    rows = [c.worst(X, U) for c in problem.geometric]
-    return torch.stack(rows).amax(0)
-
-
-def chord_penetration(problem: Problem, X: Tensor, share: float = 0.0) -> Tensor:
-    """The deepest penetration of the segments between the knots of X (B, N+1, n) into obstacles, (B,), m.
-
-    Counted from a `share` of an obstacle's margin beneath its surface; at most 0 where no segment lies deeper.
-    """
-    p = X[..., problem.position]
-    gaps = [c.segment_clearance(p[:, :-1], p[:, 1:]) + share * c.margins.unsqueeze(1) for c in problem.obstacles]
-    return -torch.stack([least(gap) for gap in gaps]).amin(0)
 
 
 def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:

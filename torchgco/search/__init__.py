@@ -12,3 +12,4 @@ from torchgco.search.passes import IntoGoal as IntoGoal
 from torchgco.search.passes import Solve as Solve
 from torchgco.search.proposals import PathProposals as PathProposals
 from torchgco.search.restarts import Restarts as Restarts
+from torchgco.search.starts import Starts as Starts

@@ -9,6 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from torchgco.base.status import STOPPED
 from torchgco.base.tree import copied, put, take
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import has_arrived, is_preferred
@@ -18,7 +19,7 @@ from torchgco.solution import SearchRecord
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress
 from torchgco.solvers.history import Recorder
-from torchgco.solvers.state import STOPPED, Iterate, SolveEnd
+from torchgco.solvers.state import Iterate, SolveEnd
 
 CLOSE = 2.0  # times the goal tolerance: trajectories that end nearer are attracted to the goal
 

@@ -13,7 +13,7 @@ from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.tree import put, take
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import Penalty
-from torchgco.native.dispatch import value
+from torchgco.native.dispatch import chord_clearance, measured, value
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -123,7 +123,7 @@ class Candidates:
         """The deepest penetration of each live candidate into an obstacle, (B * count,), m."""
         depth = torch.zeros_like(self.R)
         for rows in self.parts():
-            depth[rows] = seen.penetration(self.of(rows), self.X[rows], self.U[rows])
+            depth[rows] = measured(self.of(rows), self.X[rows], self.U[rows], obstacles=True)
         return depth
 
     def solved(
@@ -165,7 +165,7 @@ class Candidates:
             callback=lambda progress: self.watch(progress.finished, progress.total),
         )  # fmt: skip
         good = (end.violation <= refine.violation) & seen.arrives(part, end.X)
-        good &= seen.chord_penetration(part, end.X, refine.cut) <= 0.0
+        good &= chord_clearance(part, end.X, refine.cut) >= 0.0
         won = rows[good]
         X, U, cost = self.X.clone(), self.U.clone(), torch.full_like(self.unit, torch.inf)
         X[won], U[won], cost[won] = end.X[good], end.U[good], end.cost[good]

@@ -12,13 +12,14 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import Count, check_options
+from torchgco.base.status import SOLVED
 from torchgco.base.tree import take
-from torchgco.lagrangian.quality import chord_clearance, has_arrived, violation
-from torchgco.native.dispatch import interior_of
+from torchgco.lagrangian.quality import has_arrived
+from torchgco.native.dispatch import chord_clearance, interior_of, measured
 from torchgco.search.attempts import Search
 from torchgco.search.converge import continued
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.state import SOLVED, SolveEnd
+from torchgco.solvers.state import SolveEnd
 
 MARGIN = 1.1  # times the missing clearance: by how much obstacles grow in a round
 MIN_GROWTH = 0.1  # and at least this share of the allowed violation: solves differ by as much
@@ -76,7 +77,7 @@ class ClearChords:
         Returns where they did, and their clearances.
         """
         best, problem = search.best, search.call.problem.take(rows)
-        found = replace(new.best, violation=violation(problem, new.best.X, new.best.U))
+        found = replace(new.best, violation=measured(problem, new.best.X, new.best.U))
         clearance = chord_clearance(problem, found.X)
         serves = (found.violation <= search.solver.violation_tolerance) & (clearance > least)
         serves &= has_arrived(problem, found.X) | ~has_arrived(problem, take(best.end.best, rows).X)

@@ -9,14 +9,15 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import check_options
-from torchgco.base.status import Status
+from torchgco.base.status import SOLVED, Status
 from torchgco.base.tree import take
-from torchgco.lagrangian.quality import chord_clearance, has_arrived, is_preferred
-from torchgco.native.dispatch import interior_of
+from torchgco.lagrangian.quality import has_arrived, is_preferred
+from torchgco.native.dispatch import chord_clearance, interior_of
+from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
-from torchgco.solvers.state import SOLVED, Iterate, SolveEnd
+from torchgco.solvers.state import Iterate, SolveEnd
 
 WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
 
@@ -46,16 +47,26 @@ class Converge:
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         problem = search.call.problem
-        if problem.B == 0 or not problem.constraints or interior_of(problem) is None:
+        if problem.B == 0 or not self.serves(problem):
             return
         if self.when == "last":
             self._tighten(search)
-        elif not problem.geometric and not search.begun:
+        elif self.begins(problem) and not search.begun:
             search.begin(self.solver.solved(search.call))
             if search.record is not None:
                 search.record.passes[-1][2].extend(search.call.rows.tolist())
             rows = _unsolved(search)
             search.best.improve(rows, search.call.take(rows))
+
+    @staticmethod
+    def serves(problem: Problem) -> bool:
+        """Whether these problems have more to them than AL-iLQR's inner solver, and native kernels."""
+        return bool(problem.constraints or problem.free_start is not None) and interior_of(problem) is not None
+
+    @classmethod
+    def begins(cls, problem: Problem) -> bool:
+        """Whether the first solve of these problems is one by the interior point: they have no obstacles, too."""
+        return not problem.geometric and cls.serves(problem)
 
     def _tighten(self, search: Search) -> None:
         best, rows = search.best, _unsolved(search)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import Positive, check_options
-from torchgco.base.status import Status
+from torchgco.base.status import STALLED, STOPPED, Status
 from torchgco.base.tree import take
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
@@ -19,7 +19,7 @@ from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX, AugmentedLagrangian
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.state import STALLED, STOPPED, Iterate
+from torchgco.solvers.state import Iterate
 
 KNOTS = 10  # of the noise that changes stalled controls
 SURE = 10.0  # times what outweighs the cost
@@ -70,7 +70,7 @@ class Finish:
 
     def _from_changed(self, call: Call, best: Iterate) -> Call:
         key = DrawKey(call.seed, call.ids, torch.full_like(call.ids, STREAM))
-        U = best.U + self.change * _half_ranges(call.problem, best.U) * smooth_normal(key, KNOTS, best.U)
+        U = best.U + self.change * half_ranges(call.problem, best.U) * smooth_normal(key, KNOTS, best.U)
         return replace(call, U0=U, warm=self._balanced(call.problem, U))
 
     def _balanced(self, problem: Problem, U: Tensor) -> Multipliers:
@@ -90,7 +90,7 @@ def _from_best(call: Call, best: Iterate) -> Call:
     return replace(call, U0=best.U, warm=best.multipliers)
 
 
-def _half_ranges(problem: Problem, U: Tensor) -> Tensor:
+def half_ranges(problem: Problem, U: Tensor) -> Tensor:
     """Half the range of each control between its bounds, (B, 1, m); 1 or the largest control where it is unbounded."""
     half = U.abs().amax(1, keepdim=True).clamp(min=1.0)
     for bounds in problem.constraints:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -13,6 +12,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.options import AtLeast, Below, Count, Positive, check_options
 from torchgco.base.shapes import check_shape, tensor
+from torchgco.base.tree import take
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
 from torchgco.problem.problem import Problem
@@ -117,7 +117,8 @@ class Follow:
             offsets = tensor(self.initial_offsets, "follow.initial_offsets", rest)
             check_shape(offsets, (len(self.initial_offsets), m), "follow.initial_offsets")
             reach = seen.control_reach(problem, rest, offsets)
-            starts[:, 1:, : math.ceil(OFFSET_LASTS * N)] += (reach * offsets).unsqueeze(2)
+            first = torch.arange(N, device=rest.device) < (OFFSET_LASTS * problem.stages).ceil().unsqueeze(-1)
+            starts[:, 1:] += torch.where(first[:, None, :, None], (reach * offsets).unsqueeze(2), 0.0)
         return starts
 
     def track(self, candidates: Candidates, paths: Paths, free: Free | None) -> Candidates:
@@ -130,7 +131,7 @@ class Follow:
             shares = (free.share.unsqueeze(-1) * paths.stretch()).nan_to_num(torch.inf)
             latest = self.pace * shares.flatten().repeat_interleave(paces)
             arrive = torch.minimum(arrive, latest.clamp(min=self.depart + SHORTEST))
-        center = followed(path, self.depart, arrive, self.smoothing, candidates.problem.N, paths.obstacles, paths.R)
+        center = self._centers(path, arrive, candidates.problem, paths)
         problem = torch.arange(candidates.problem.B, device=path.device).repeat_interleave(K * paces) * candidates.count
         number = torch.arange(candidates.live.numel(), device=path.device)
         place = number // (candidates.count // K) * paces + number % paces  # of each candidate's path and pace
@@ -141,6 +142,19 @@ class Follow:
             candidates = candidates.solved(inner_solver(self.iterations), TRACK_PENALTY, penalty, place)
         return candidates
 
+    def _centers(self, path: Tensor, arrive: Tensor, problem: Problem, paths: Paths) -> Tensor:
+        """Where the candidates are at every knot, (B K, N+1, d): along each path within the horizon of its problem."""
+        N, each = problem.N, path.shape[0] // max(1, problem.B)
+        center = path[:, -1:].repeat(1, N + 1, 1)
+        for horizon in problem.stages.unique().tolist():
+            rows = (problem.stages == horizon).nonzero().flatten()
+            some = (rows.unsqueeze(-1) * each + torch.arange(each, device=path.device)).flatten()
+            near, R = take(paths.obstacles, rows), paths.R[rows]
+            along = followed(path[some], self.depart, arrive[some], self.smoothing, horizon, near, R)
+            center[some, : horizon + 1] = along
+            center[some, horizon + 1 :] = along[:, -1:]
+        return center
+
 
 def unconstrained(problem: Problem, rest: Tensor, iterations: int) -> Free:
     """The trajectories without constraints, from the controls `rest` (B, N, m)."""
@@ -148,7 +162,7 @@ def unconstrained(problem: Problem, rest: Tensor, iterations: int) -> Free:
     assert problem.goal is not None
     left = problem.goal.distance(end.X[..., problem.position])
     near = left <= LAST_PART * left[:, :1]
-    share = near.to(torch.int8).argmax(-1).to(left) / problem.N
+    share = near.to(torch.int8).argmax(-1).to(left) / problem.stages
     return Free(end.cost, torch.where(near.any(-1), share, torch.inf), end.iterations)
 
 

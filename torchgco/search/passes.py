@@ -11,11 +11,9 @@ from typing import Literal, TypeAlias
 
 import torch
 
-from torchgco.base.draws import DrawKey
 from torchgco.base.options import Count, Natural, check_options
 from torchgco.base.status import Status
 from torchgco.base.tree import put, take
-from torchgco.guidance.detection import caught_knots
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.lagrangian.quality import goal_tolerance
 from torchgco.native.dispatch import cost_unit
@@ -25,7 +23,8 @@ from torchgco.search.chords import ClearChords
 from torchgco.search.converge import Converge
 from torchgco.search.finish import Finish
 from torchgco.search.proposals import PathProposals
-from torchgco.solvers.contracts import Advice
+from torchgco.search.starts import Starts
+from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.state import SolveEnd
 
 WITHIN = 0.95  # share of the goal tolerance to which trajectories are attracted
@@ -155,27 +154,9 @@ class FromSamples:
         search.best.improve(rows, call, guidance=search.guidance, guide_first=True)
 
 
-Pass: TypeAlias = Solve | PathProposals | FromProposal | IntoGoal | FromSamples | Converge | Finish | ClearChords
-
-
-class StopWhenCaught:
-    """Guidance that ends the solve of a problem whose trajectory is caught between obstacles."""
-
-    def __init__(self, single_contact_after: int | None) -> None:
-        self.single_contact_after = single_contact_after
-
-    def suited(self, problem: Problem) -> StopWhenCaught:
-        """This guidance, which serves any problem."""
-        return self
-
-    def start(self, problem: Problem, X: torch.Tensor) -> None:
-        """No penalty."""
-
-    def update(
-        self, problem: Problem, X: torch.Tensor, U: torch.Tensor, penalty: GuideRegion | None, key: DrawKey
-    ) -> Advice:
-        """Stop where a knot is caught."""
-        return Advice(None, stop=caught_knots(problem, X, U, key.outer, self.single_contact_after).any(-1))
+Pass: TypeAlias = (
+    Solve | PathProposals | FromProposal | IntoGoal | FromSamples | Converge | Finish | ClearChords | Starts
+)
 
 
 def _goal_region(problem: Problem) -> GuideRegion:

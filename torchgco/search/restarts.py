@@ -10,13 +10,16 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_options
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
+from torchgco.native.dispatch import interior_of
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Late, Search
 from torchgco.search.chords import ClearChords
 from torchgco.search.converge import Converge
 from torchgco.search.finish import Finish
+from torchgco.search.nearby import Nearby, merged
 from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Pass, Solve
 from torchgco.search.proposals import PathProposals
+from torchgco.search.starts import Starts
 from torchgco.search.suitability import suited_paths
 from torchgco.search.table import rows_of
 from torchgco.solution import Solution
@@ -59,15 +62,32 @@ class Restarts(Solver):
 
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
         """The passes but the last solves, as the next plan continues this one; and the local solver, unguided."""
-        passes = tuple(one for one in self.passes if not isinstance(one, Converge | Finish))
+        passes = tuple(one for one in self.passes if not isinstance(one, Converge | Finish | Starts))
         return replace(self, passes=passes), replace(self.local, guidance=None, max_outer_iterations=rounds)
+
+    def frees_start(self, problem: Problem) -> bool:
+        """Where a pass is the interior point's, and there are native kernels."""
+        return any(isinstance(one, Converge) for one in self.passes) and interior_of(problem) is not None
+
+    def take_states(self, problem: Problem) -> bool:
+        """Where the first solve is the interior point's: without obstacles, where there are native kernels."""
+        first = any(isinstance(one, Converge) and one.when == "first" for one in self.passes)
+        return first and Converge.begins(problem)
 
     def in_slots(self, slots: int) -> Restarts:
         """The same solver with at most `slots` problems at a time."""
         return replace(self, local=self.local.in_slots(slots))
 
     def run(self, call: Call) -> Solution:
-        """Solve a checked call."""
+        """Solve a checked call: with the obstacles nearby where many are far, then with all where that won't do."""
+        near = Nearby.of(call)
+        if near is None:
+            return self._solved(call)
+        found = near.solution(self._solved(near.call))
+        rows = near.wrong(found)
+        return found if rows.numel() == 0 else merged(found, rows, self._solved(call.take(rows)))
+
+    def _solved(self, call: Call) -> Solution:
         solver = self.local
         session = Session(call, solver.inner.rules, solver.record)
         passes, guidance = self._suited(session.call.problem)

@@ -10,6 +10,7 @@ from torchgco.search.finish import Finish
 from torchgco.search.following import Follow
 from torchgco.search.passes import FromProposal, FromSamples, IntoGoal, Pass, Solve
 from torchgco.search.proposals import PathProposals
+from torchgco.search.starts import Starts
 
 COLUMNS = ("pass", "problems", "paths", "how they are followed", "relaxed", "refined", "accepted")
 PROBLEMS = {
@@ -54,6 +55,10 @@ def _described(one: Pass) -> dict[str, str]:
             inner, outer = one.solver.inner.max_iterations, one.solver.max_outer_iterations
             limits = f"{outer} x {inner} iterations"
             return {"problems": f"cut off by a limit, or stalled: {limits}"}
+        case Starts():
+            problems = "all" if one.when == "all" else "unsolved at first"
+            spread = f"bent by {one.bend:g}, controls by {one.change:g}"
+            return {"problems": f"{problems}, without obstacles: {one.count} starts, {spread}: interior point"}
         case ClearChords():
             return {
                 "problems": f"touching an obstacle between two knots: {one.rounds} rounds",

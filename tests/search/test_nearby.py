@@ -1,0 +1,88 @@
+"""Obstacles far from every way change nothing: neither the answer nor, by much, the work; those that matter do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.problems import assert_same_bits, planar_batch, quick_gco
+from torchgco import Boxes, Problem, Solution, Spheres, judge
+from torchgco.search.nearby import Nearby
+from torchgco.solvers.contracts import Call
+
+B, FAR = 3, 40
+
+
+def of(centers: torch.Tensor, inflated: torch.Tensor, vehicle: torch.Tensor) -> Spheres:
+    """Spheres of inflated radii, absent where these are 0."""
+    absent = inflated == 0
+    radii = (inflated - vehicle[:, None]).masked_fill(absent, torch.nan)
+    return Spheres(centers.masked_fill(absent.unsqueeze(-1), torch.nan), radii, vehicle)
+
+
+def planar(kind: str, far: float, near: int = 9) -> tuple[Problem, Problem, torch.Tensor]:
+    """A batch, and the same with many more obstacles at a distance of the way."""
+    problem, U0 = planar_batch(B=B, N=25, obstacles=near, seed=4)
+    spheres = problem.obstacles[0]
+    angle = torch.arange(FAR) * 0.1
+    ring = far * torch.stack((angle.cos(), angle.sin()), dim=-1).expand(B, -1, -1).to(spheres.centers)
+    vehicle = spheres.vehicle_radius
+    if kind == "spheres":
+        radii = torch.cat((spheres.inflated_radii, vehicle[:, None] + 0.05 + 0.0 * ring[..., 0]), dim=1)
+        more = [of(torch.cat((spheres.centers, ring), dim=1), radii, vehicle)]
+    else:
+        more = [spheres, Boxes(ring, torch.full_like(ring, 0.05), vehicle_radius=vehicle)]
+    rest = [part for part in problem.constraints if part is not spheres]
+    return replace(problem, constraints=[spheres, *rest]), replace(problem, constraints=[*more, *rest]), U0
+
+
+def trajectories(solution: Solution) -> tuple[torch.Tensor, ...]:
+    return solution.X, solution.U, solution.cost, solution.status, solution.iterations
+
+
+@pytest.mark.parametrize("kind", ["spheres", "boxes"])
+def test_far_obstacles_change_no_bit(kind: str) -> None:
+    few, many, U0 = planar(kind, 9.0)
+    solver = quick_gco(few)
+    one, two = solver.solve(few, U0, seed=3), solver.solve(many, U0, seed=3)
+    if kind == "spheres":
+        for a, b in zip(trajectories(one), trajectories(two), strict=True):
+            assert torch.equal(a, b)
+    shapes = [part.value(two.X, two.U).shape for part in many.constraints]
+    assert [lam.shape for lam in two.multipliers.lam] == shapes
+    again = solver.solve(many, two.U, seed=3, warm=two.multipliers)  # multipliers of all obstacles are taken
+    assert bool((again.violation <= 1e-3).all())
+    assert bool(judge(many, two.U).feasible.all())
+
+
+def test_the_result_does_not_depend_on_problems_that_keep_all() -> None:
+    """In a batch with a problem whose obstacles are near, the others leave theirs out all the same."""
+    _, many, U0 = planar("spheres", 9.0)
+    spheres = many.obstacles[0]
+    centers = spheres.centers.clone()
+    centers[1, -FAR:] *= 0.1  # around the start and the way
+    centers[1, -FAR:, 1] += 2.0
+    near = replace(
+        many, constraints=[of(centers, spheres.inflated_radii, spheres.vehicle_radius), *many.constraints[1:]]
+    )
+    solver, every = quick_gco(many), torch.arange(B)
+    whole = solver.solve(near, U0, seed=3, ids=every)
+    for b in range(B):
+        rows = torch.tensor([b])
+        assert_same_bits(solver.solve(near.take(rows), U0[rows], seed=3, ids=every[rows]), whole.take(rows))
+
+
+def test_a_way_through_obstacles_that_were_left_out_is_sought_again() -> None:
+    """Where the trajectory leads through them, they are all obstacles of a second search."""
+    few, many, U0 = planar("spheres", 9.0)
+    call = Call.checked(many, U0)
+    near = Nearby.of(call)
+    assert near is not None and near.call.problem.obstacles[0].centers.shape[1] < FAR
+    found = near.solution(quick_gco(few).solve(near.call.problem, U0, seed=3))
+    assert near.wrong(found).numel() == 0
+    X = found.X.clone()
+    X[1, 12, :2] = many.obstacles[0].centers[1, -1]  # over one of the far ones
+    assert near.wrong(replace(found, X=X)).tolist() == [1]
+    assert Nearby.of(Call.checked(few, U0)) is None

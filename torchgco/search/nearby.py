@@ -1,0 +1,125 @@
+"""Obstacles far from every sensible way are left out of a search, and looked at again at its end.
+
+Time, memory and the answer then depend on the obstacles between start and goal, not on those of the whole world.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchgco.base.tree import put
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.native.dispatch import chord_clearance, measured
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.problem import ROWS, Problem
+from torchgco.solution import SearchRecord, Solution
+from torchgco.solvers.contracts import Call
+
+DETOUR = math.sqrt(2.0)  # ways this many times as long as the straight one stay within half of its length from it
+FEWER = 0.5  # share of a problem's obstacles that must be far, for leaving any out
+
+
+class Nearby:
+    """A call without the obstacles that no way up to `DETOUR` times as long as the straight one touches.
+
+    Args:
+        given: the call with all of them.
+        places: of each constraint, which obstacles (B, M') are kept, -1 where there are fewer; None where all are.
+    """
+
+    def __init__(self, given: Call, places: list[Tensor | None]) -> None:
+        self.given, self.places = given, places
+        parts = zip(given.problem.constraints, places, strict=True)
+        constraints = tuple(c if at is None or not isinstance(c, Obstacles) else c.chosen(at) for c, at in parts)
+        problem = given.problem._with({"constraints": constraints}, form=dict(given.problem.form))
+        problem.form.pop(ROWS, None)
+        warm = given.warm
+        if warm is not None:
+            warm = replace(warm, lam=tuple(map(_gathered, warm.lam, places)))
+        self.call = replace(given, problem=problem, warm=warm)
+
+    @classmethod
+    def of(cls, call: Call) -> Nearby | None:
+        """None where every problem keeps all obstacles: there are few far ones, or none can be told far."""
+        problem = call.problem
+        kept = [_near(problem, part) if isinstance(part, Obstacles) else None for part in problem.constraints]
+        known = [part for part in kept if part is not None]
+        if not known or problem.B == 0:
+            return None
+        present = [~part.absent for part in problem.constraints if isinstance(part, Obstacles)]
+        near = torch.stack([part.sum(-1) for part in known]).sum(0)
+        worth = near <= (1.0 - FEWER) * torch.stack([part.sum(-1) for part in present]).sum(0)
+        if not bool(worth.any()):
+            return None
+        return cls(call, [None if part is None else _places(part | ~worth.unsqueeze(-1)) for part in kept])
+
+    def solution(self, found: Solution) -> Solution:
+        """The solution with multipliers, all zero, of the obstacles that were left out."""
+        shapes = (lam.shape[1:] for lam in Multipliers.zero(self.given.problem, 0.0).lam)
+        lam = tuple(map(_scattered, found.multipliers.lam, self.places, shapes))
+        return replace(found, multipliers=replace(found.multipliers, lam=lam))
+
+    def wrong(self, found: Solution) -> Tensor:
+        """The problems (b,) whose trajectories are worse with the obstacles that were left out."""
+        whole, part = self.given.problem, self.call.problem
+        deeper = measured(whole, found.X, found.U, obstacles=True) > measured(part, found.X, found.U, obstacles=True)
+        cut = chord_clearance(whole, found.X) < chord_clearance(part, found.X).clamp(max=0.0)
+        return (deeper | cut).nonzero().flatten()
+
+
+def merged(first: Solution, rows: Tensor, again: Solution) -> Solution:
+    """The first solution with the problems in `rows` solved again; iterations of both count, and both are recorded."""
+    iterations = first.iterations[rows] + again.iterations
+    whole = replace(first, trace=None, search=None)
+    put(whole, rows, replace(again, trace=None, search=None, iterations=iterations))
+    trace, search = first.trace, first.search
+    if trace is not None and again.trace is not None:
+        import pandas as pd
+
+        trace = pd.concat((trace[~trace["element"].isin(again.trace["element"])], again.trace))
+        trace = trace.sort_values(["element", "attempt", "iteration"], ignore_index=True)
+    if search is not None and again.search is not None:
+        joined = (search.passes + again.search.passes, again.search.caught, search.comparisons)
+        search = SearchRecord(*joined[:2], joined[2] + again.search.comparisons)
+    return replace(whole, trace=trace, search=search)
+
+
+def _near(problem: Problem, part: Obstacles) -> Tensor | None:
+    """Which obstacles (B, M) a sensible way may touch; None for a kind that can't say, or without a goal."""
+    solids = part.inflated()
+    unsaid = type(part).chosen is Obstacles.chosen
+    if problem.goal is None or unsaid or solids is None or solids.absent.shape[1] == 0:
+        return None
+    start, goal = problem.x0[:, problem.position], problem.goal.position
+    straight = (goal - start).square().sum(-1).sqrt().unsqueeze(-1)
+    reach = solids.extent.square().sum(-1).sqrt() + solids.radii
+    way = sum((solids.centers - end.unsqueeze(1)).square().sum(-1).sqrt() - reach for end in (start, goal))
+    return ~solids.absent & (way <= DETOUR * straight)
+
+
+def _places(kept: Tensor) -> Tensor:
+    """Places (B, M') of the true ones of (B, M), in their order, -1 after them; at least one column."""
+    count = max(1, int(kept.sum(-1).max()))
+    order = (~kept).to(torch.int8).argsort(dim=-1, stable=True)[:, :count]
+    return order.masked_fill(~kept.gather(1, order), -1)
+
+
+def _gathered(lam: Tensor, at: Tensor | None) -> Tensor:
+    """The rows of lam (B, K, M) at places (B, M'); 0 where there is none."""
+    if at is None:
+        return lam
+    index = at.clamp(min=0).unsqueeze(1).expand(-1, lam.shape[1], -1)
+    return lam.gather(2, index).masked_fill((at < 0).unsqueeze(1), 0.0)
+
+
+def _scattered(lam: Tensor, at: Tensor | None, shape: torch.Size) -> Tensor:
+    """The rows of lam (B, K, M') put at places (B, M') of zeros (B, K, M)."""
+    if at is None:
+        return lam
+    whole = lam.new_zeros(lam.shape[0], *shape)
+    index = at.clamp(min=0).unsqueeze(1).expand(-1, lam.shape[1], -1)
+    return whole.scatter_add(2, index, lam.masked_fill((at < 0).unsqueeze(1), 0.0))
