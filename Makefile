@@ -77,6 +77,7 @@ worlds: $(PEERS)
 	$(BIN)/python -m benchmarks.outside.barn --write
 	$(BIN)/python -m benchmarks.outside.maze --write --fatrop 8
 	$(BIN)/python -m benchmarks.outside.navigation --write
+	$(BIN)/python -m benchmarks.outside.jaxipm --write
 
 benchmark: $(PEERS)
 	$(MAKE) $(ACADOS)/.ready || echo "acados can't be installed here: the tables will say so."

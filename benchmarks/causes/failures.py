@@ -25,11 +25,11 @@ from benchmarks.lib.families import FAMILIES, Family
 from benchmarks.lib.page import origin, put
 from torchgco import compose, judge
 from torchgco.base.draws import DrawKey
-from torchgco.guidance.detection import active_counts, caught_knots
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.mppi import MPPI
 from torchgco.lagrangian.quality import violation
 from torchgco.problem.problem import Problem
+from torchgco.solvers.caught import active_counts, caught_knots
 
 LAST = 3  # outer iterations that decide the cause
 CAUSES = {
@@ -71,7 +71,7 @@ class Witness:
         at = problem.dynamics.position
         frame = {
             "id": key.ids, "outer": key.outer, "cost": problem.cost.total(X, U),
-            "violation": violation(problem, X, U), "caught": caught.any(-1),
+            "violation": violation(problem.constraints, X, U), "caught": caught.any(-1),
         }  # fmt: skip
         for name in ("near", "deep", "ends", "moved", "crosses"):
             frame[name] = torch.full_like(frame["cost"], torch.nan)

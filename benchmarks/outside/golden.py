@@ -31,7 +31,7 @@ def counted(problem: Problem, U: Tensor) -> dict[str, Tensor]:
     """Cost, violation and KKT residual (B,) along a rollout."""
     X = open_loop(problem.dynamics, problem.x0, U)
     residual = certify(problem, X, U).kkt_residual
-    return {"cost": problem.cost.total(X, U), "violation": violation(problem, X, U), "residual": residual}
+    return {"cost": problem.cost.total(X, U), "violation": violation(problem.constraints, X, U), "residual": residual}
 
 
 def ratios(own: pd.DataFrame, peer: pd.DataFrame) -> str:

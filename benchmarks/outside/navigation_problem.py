@@ -139,6 +139,19 @@ def recount(x0: np.ndarray, U: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 
     No code is shared with the problem or the solvers. The violation is in m, m/s, rad/s, and shares of hovering speed.
     """
+    X = rolled(x0, U)
+    squares = (np.array(RADII) + VEHICLE) ** 2 * (1 + GROWTH * DT * np.arange(N)[:, None])
+    apart = np.linalg.norm(X[:, :N, None, :2] - np.array(CENTERS), axis=-1)
+    worst = [
+        (np.sqrt(squares) - apart).max((1, 2)),
+        (np.abs(X[..., [0, 1, 2, 7, 8, 9, 10, 11, 12]]) - BOUND).max((1, 2)),
+        np.maximum(SLOWEST / HOVER - U, U - FASTEST / HOVER).max((1, 2)),
+    ]
+    return (X**2 @ np.array(WEIGHTS)).sum(-1), np.maximum(0.0, np.max(worst, axis=0)), X
+
+
+def rolled(x0: np.ndarray, U: np.ndarray) -> np.ndarray:
+    """States (B, N+1, 13) from x0 (B, 13) by controls U (B, N, 4), in NumPy: a second version of `quadrotor`."""
     J, X = np.array(INERTIA), [x0]
     down = np.array([[0.0, 0.0, 1.0]])
     for k in range(N):
@@ -153,12 +166,4 @@ def recount(x0: np.ndarray, U: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
         torque = np.c_[ARM * f @ [1, -1, -1, 1], ARM * f @ [1, 1, -1, -1], TORQUE / THRUST * f @ [-1, 1, -1, 1]]
         torque += np.c_[-spin * w[:, 1], spin * w[:, 0], 0 * spin]
         X.append(x + DT * np.c_[v, dq, dv, (torque - np.cross(w, w * J)) / J])
-    X = np.stack(X, axis=1)
-    squares = (np.array(RADII) + VEHICLE) ** 2 * (1 + GROWTH * DT * np.arange(N)[:, None])
-    apart = np.linalg.norm(X[:, :N, None, :2] - np.array(CENTERS), axis=-1)
-    worst = [
-        (np.sqrt(squares) - apart).max((1, 2)),
-        (np.abs(X[..., [0, 1, 2, 7, 8, 9, 10, 11, 12]]) - BOUND).max((1, 2)),
-        np.maximum(SLOWEST / HOVER - U, U - FASTEST / HOVER).max((1, 2)),
-    ]
-    return (X**2 @ np.array(WEIGHTS)).sum(-1), np.maximum(0.0, np.max(worst, axis=0)), X
+    return np.stack(X, axis=1)
