@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
 
 from tests.problems import planar_batch
-from torchgco import MPPI, AugmentedLagrangian, InputError, Solution
+from torchgco import (
+    MPPI,
+    AugmentedLagrangian,
+    ControlBounds,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    InputError,
+    Problem,
+    RateBounds,
+    Solution,
+    StateBounds,
+)
 from torchgco.baselines import Hold, IteratedMPPI
+from torchgco.lagrangian.rollout import open_loop
 
 
 def test_save_and_load(tmp_path) -> None:
@@ -20,7 +33,8 @@ def test_save_and_load(tmp_path) -> None:
     loaded = Solution.load(tmp_path / "deep" / "solution.npz")
     for f in fields(Solution):
         if f.name not in ("multipliers", "trace", "search"):
-            assert torch.equal(getattr(loaded, f.name), getattr(solution, f.name)), f.name
+            mine, given = getattr(loaded, f.name), getattr(solution, f.name)
+            assert (mine is None and given is None) or torch.equal(mine, given), f.name
     assert torch.equal(loaded.multipliers.mu, solution.multipliers.mu)
     assert all(torch.equal(a, b) for a, b in zip(loaded.multipliers.lam, solution.multipliers.lam, strict=True))
     frame = loaded.to_frame()
@@ -38,3 +52,51 @@ def test_hold_and_iterated_mppi() -> None:
     torch.testing.assert_close(held.X, problem.x0.unsqueeze(1).expand_as(held.X), rtol=0, atol=1e-12)
     flown = IteratedMPPI(sampler=MPPI(samples=50, covariance=25.0), iterations=5).solve(problem, U0)
     assert bool((flown.cost < held.cost).all()) and flown.iterations.tolist() == [5, 5]
+
+
+def cart(*constraints, B: int = 2, N: int = 8) -> Problem:
+    """A point on a line; its speed squared drives it away."""
+    dynamics = FunctionDynamics(lambda x, u: torch.stack((x[..., 1], u[..., 0] + x[..., 1] ** 3), dim=-1), 2, 1, 0.1)
+    cost = FunctionCost(lambda x, u: u[..., 0] ** 2, lambda x: 0 * x[..., 0])
+    return Problem(dynamics, cost, constraints, torch.zeros(B, 2, dtype=torch.float64), N)
+
+
+def flown(problem: Problem, U: torch.Tensor) -> Solution:
+    """Rollouts of given controls, whatever they violate."""
+    held = Hold().solve(problem, torch.zeros_like(U))
+    return replace(held, X=open_loop(problem.dynamics, problem.x0, U), U=U)
+
+
+def test_the_worst_row_of_each_problem() -> None:
+    late = FunctionConstraint(lambda x: x - 5.0, "equality", knots=[3, 7], name="late")
+    rates = RateBounds(torch.tensor([[-0.05], [-1e3]], dtype=torch.float64), 1e3)
+    problem = cart(ControlBounds(-9.0, 9.0), late, StateBounds([-1.0, -1.0], [1.0, torch.inf]), rates, B=2)
+    U = torch.zeros(2, 8, 1, dtype=torch.float64)
+    U[0, 7] = -29.0  # 20 below its bound, and 28.95 too fast a fall
+    found = flown(problem, U).worst_rows(problem)
+    X = open_loop(problem.dynamics, problem.x0, U)
+    for i, place in enumerate(found.constraint):
+        largest = torch.stack([part.worst(X, U) for part in problem.constraints])[:, i]
+        assert place == int(largest.argmax()) and found.violation[i] == float(largest.max())
+        rows = problem.constraints[place].violation(X, U)[i]
+        knots = list(range(9)[part]) if isinstance(part := problem.constraints[place].knots, slice) else part.tolist()
+        assert rows[knots.index(found.knot[i]), found.row[i]] == rows.max()
+    assert found.loc[1, ["constraint", "name", "knot", "row"]].tolist() == [1, "late", 3, 0]
+    assert found.loc[0, ["constraint", "name", "knot"]].tolist() == [3, "RateBounds", 7]
+    assert found.lost_at.tolist() == [-1, -1]
+    easy = cart(ControlBounds(-9.0, 9.0))
+    none = flown(easy, 0 * U).worst_rows(easy)
+    assert none.constraint.tolist() == [-1, -1] and none.violation.tolist() == [0, 0] and none.name.tolist() == ["", ""]
+    with pytest.raises(InputError, match="problem"):
+        flown(easy, 0 * U).worst_rows(cart(ControlBounds(-9.0, 9.0), N=9))
+
+
+def test_the_knot_at_which_states_are_lost() -> None:
+    """A cubic that no step of 0.1 s can follow: speeds overflow after a jump at stage 3, and X says from which knot."""
+    problem = cart(StateBounds([-1.0, -1.0], [1.0, 1.0]))
+    U = torch.zeros(2, 8, 1, dtype=torch.float64)
+    U[1, 3] = 1e60
+    solution = flown(problem, U)
+    found, finite = solution.worst_rows(problem), torch.isfinite(solution.X).all(-1)
+    assert found.lost_at[0] == -1 and found.lost_at[1] == int(finite[1].long().sum()) and found.lost_at[1] in (4, 5, 6)
+    assert found.violation[1] == torch.inf and found.name[1] == "StateBounds" and found.knot[1] == found.lost_at[1]
