@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
 from typing import Any
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 import torchgco
 from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost
+from torchgco.base.values import NONE
 from torchgco.native import kernels
 from torchgco.native.dispatch import EagerWarning, engine_of, measured
 
@@ -68,6 +70,25 @@ def test_sums_are_those_of_a_loop() -> None:
             samples = U[:, :5]  # (B, S, m)
             rows = made.constraints[1].values.call(made.constraints[1].function, samples, k=k)
             torch.testing.assert_close(rows[b], samples[b, :, :1] - THRUSTS[b, k], rtol=0, atol=0)
+
+
+def test_functions_of_the_knot_leave_pytorchs_precision_as_it_was() -> None:
+    """With threads, too, one of which ends while the other's function runs."""
+    running, ended = threading.Event(), threading.Event()
+
+    def waits(x: Tensor, k: int) -> Tensor:
+        running.set()
+        ended.wait(timeout=0.2)
+        return x * k
+
+    x = torch.zeros(1, 1, dtype=D)
+    slow = threading.Thread(target=lambda: NONE.call(waits, x, k=1))
+    fast = threading.Thread(target=lambda: (running.wait(), NONE.call(lambda x, k: x * k, x, k=1), ended.set()))
+    slow.start()
+    fast.start()
+    slow.join()
+    fast.join()
+    assert torch.get_default_dtype() is torch.float32
 
 
 def test_new_values_need_no_new_kernel() -> None:

@@ -183,6 +183,13 @@ def test_rows_that_join_knots_are_for_ipopt_alone() -> None:
         CasADiSolver("fatrop").solve(problem, U0)
 
 
+def test_horizons_of_each_problem_are_refused() -> None:
+    problem, U0 = three_problems()
+    with pytest.raises(InputError) as caught:
+        CasADiSolver("ipopt").solve(replace(problem, horizon=[problem.N - 1] * problem.B), U0)
+    assert caught.value.field == "horizon"
+
+
 def test_a_function_that_cannot_be_traced_names_its_part() -> None:
     problem, U0 = with_constraints(FunctionConstraint(lambda x: torch.erfinv(x[..., :1])))
     with pytest.raises(InputError, match=r"constraints\[0\].*erfinv"):

@@ -235,6 +235,7 @@ PROBLEMS = {
     "constraints": unknown,
     "goal": lambda: replace(far(), cost=Effort(), goal=None),
     "x0": lambda: far().cast(torch.float32),
+    "horizon": lambda: replace(far(), horizon=[far().N] * far().B),
 }
 FIELDS = {
     "mission.duration": {"duration": 0.0},

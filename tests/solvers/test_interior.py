@@ -314,7 +314,7 @@ def test_flights_at_the_cost_of_ipopt() -> None:
 
 
 def test_infeasible_problems_end_so_and_disturb_no_other() -> None:
-    """Targets farther than the speed limit lets one fly, and targets above the ceiling."""
+    """Targets farther than the speed limit lets one fly, and targets above the ceiling: limits and targets share it."""
     target, ceiling = torch.full((9,), 1.1, dtype=D), torch.full((9,), INF, dtype=D)
     target[2], target[6], ceiling[3], ceiling[8] = 4.0, 2.5, 0.5, 0.9
     problem = flights(9, target, ceiling)
@@ -325,8 +325,23 @@ def test_infeasible_problems_end_so_and_disturb_no_other() -> None:
     assert_same_bits(together.take(good), solved(problem.take(good)))
     for b in failed:
         reach = float(problem.x0[b, 0] + DT * (problem.x0[b, 1] + (problem.N - 1) * FAST))
-        least = float(target[b]) - reach if b in (2, 6) else 0.5 * float(target[b] - ceiling[b])
-        assert 0.99 * least <= float(together.violation[b]) <= 2.02 * least + 0.02
+        lacks = float(target[b]) - (reach if b in (2, 6) else float(ceiling[b]))
+        least = lacks / (1 + DT * (problem.N - 1)) if b in (2, 6) else 0.5 * lacks
+        assert 0.99 * least <= float(together.violation[b]) <= 1.01 * lacks + 0.02
+
+
+@pytest.mark.parametrize(("speed", "status"), [(FAST, Status.CONVERGED), (FAST + 0.02, Status.INFEASIBLE)])
+def test_a_given_start_stays_where_it_is(speed: float, status: Status) -> None:
+    """With bounds at knot 0, too: on its bound it is no worse than without them, outside of it no solution exists."""
+    free = flights(4)
+    bounded = StateBounds([-INF, -0.3], [INF, FAST], knots=range(free.N + 1))
+    x0 = torch.stack((free.x0[:, 0], torch.full((4,), speed, dtype=D)), dim=-1)
+    problem = Problem(free.dynamics, free.cost, [*free.constraints[:2], bounded], x0, free.N)
+    solution = solved(problem)
+    assert solution.statuses == [status] * 4 and torch.equal(solution.X[:, 0], x0)
+    if status is Status.CONVERGED:
+        expected = solved(Problem(free.dynamics, free.cost, free.constraints, x0, free.N))
+        torch.testing.assert_close(solution.cost, expected.cost, rtol=1e-6, atol=0)
 
 
 def test_an_equality_given_twice_does_no_harm_and_two_that_contradict_each_other_end() -> None:

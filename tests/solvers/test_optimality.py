@@ -197,7 +197,7 @@ def test_solve_hands_the_problem_to_that_solver(monkeypatch) -> None:
     solve(problem, seed=3)
     ((solver, guess, options),) = calls
     assert solver == compose(["scenario=planar_trap", "model=planar"]).solver
-    assert torch.equal(guess, U0) and options == {"seed": 3, "ids": None, "warm": None, "max_seconds": None}
+    assert torch.equal(guess, U0) and options == {"seed": 3} | dict.fromkeys(("ids", "warm", "max_seconds", "X0"))
 
 
 def test_offsets_are_for_two_controls() -> None:

@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from threading import RLock
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
@@ -17,6 +18,7 @@ from torchgco.base.shapes import Dimensions, tensor
 from torchgco.base.tree import PerElement
 
 Knot = int | Tensor | None
+_default = RLock()
 BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 
 
@@ -57,13 +59,17 @@ NONE = Values()
 
 @contextmanager
 def whole_numbers_become(dtype: torch.dtype) -> Iterator[None]:
-    """Knots times a number, as in 0.3 * k, have this precision: PyTorch's default one for that is single."""
-    usual = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(usual)
+    """Knots times a number, as in 0.3 * k, have this precision: PyTorch's default one for that is single.
+
+    PyTorch has one default precision for all threads: of functions of the knot, one runs at a time.
+    """
+    with _default:
+        usual = torch.get_default_dtype()
+        torch.set_default_dtype(dtype)
+        try:
+            yield
+        finally:
+            torch.set_default_dtype(usual)
 
 
 def bound_values(

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchgco.base.autodiff import gradient_and_hessian
 from torchgco.base.shapes import Dimensions, lead
 from torchgco.base.tree import PerElement
+from torchgco.base.values import whole_numbers_become
 
 
 class Cost(PerElement):
@@ -55,14 +56,16 @@ class Cost(PerElement):
     def total(self, X: Tensor, U: Tensor) -> Tensor:
         """J_var (B,) of trajectories X (B, N+1, n), U (B, N, m)."""
         k = torch.arange(U.shape[1], device=U.device)
-        return self.stage(X[:, :-1], U, k).sum(-1) + self.terminal(X[:, -1])
+        with whole_numbers_become(X.dtype):
+            return self.stage(X[:, :-1], U, k).sum(-1) + self.terminal(X[:, -1])
 
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         """Write gradient and Hessian at X, U into the homogeneous blocks H (B, N+1, s, s), order [x, 1, u]."""
         n, N = X.shape[-1], U.shape[1]
         H.zero_()
-        k = torch.arange(N, device=U.device)
-        g, h = gradient_and_hessian(lambda z: self.stage(z[..., :n], z[..., n:], k), torch.cat((X[:, :-1], U), dim=-1))
+        k, z = torch.arange(N, device=U.device), torch.cat((X[:, :-1], U), dim=-1)
+        with whole_numbers_become(X.dtype):
+            g, h = gradient_and_hessian(lambda z: self.stage(z[..., :n], z[..., n:], k), z)
         add_blocks(H[:, :-1], n, g[..., :n], g[..., n:], h[..., :n, :n], h[..., n:, n:], h[..., n:, :n])
         g, h = gradient_and_hessian(self.terminal, X[:, -1])
         add_blocks(H[:, -1], n, g, None, h, None)

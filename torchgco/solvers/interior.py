@@ -185,7 +185,8 @@ class InteriorPoint(Solver):
         else:
             mu, how = self.warm_barrier, FILTER | {"push": self.warm_barrier}
             multipliers = tuple(lam.clone(memory_format=torch.contiguous_format) for lam in warm.lam)
-        X, U = (z.contiguous() for z in inside(problem, X, call.U0, how["push"]))
+        X, U = inside(problem, X, call.U0, how["push"])
+        X[:, 0] = problem.start_in(X[:, 0])  # a given start isn't moved
         out = kernels.solve(
             problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None),
             max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **how,
@@ -209,7 +210,7 @@ class InteriorPoint(Solver):
 
 def inside(problem: Problem, X: Tensor, U: Tensor, push: float) -> tuple[Tensor, Tensor]:
     """X (B, N+1, n) and U (B, N, m) moved inside of their bounds, by a share `push` of their size or range at most."""
-    X, U = X.clone(), U.clone()
+    X, U = (z.clone(memory_format=torch.contiguous_format) for z in (X, U))
     for bounds in problem.constraints:
         if isinstance(bounds, ControlBounds | StateBounds):
             z = U if bounds.of == "u" else X
