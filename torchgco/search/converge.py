@@ -10,11 +10,12 @@ from torch import Tensor
 
 from torchgco.base.options import check_options
 from torchgco.base.status import SOLVED, Status
-from torchgco.base.tree import take
+from torchgco.base.tree import put, take
 from torchgco.lagrangian.quality import has_arrived, is_preferred
 from torchgco.native.dispatch import chord_clearance, interior_of
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
+from torchgco.search.nearby import Nearby
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.state import Iterate, SolveEnd
@@ -101,5 +102,13 @@ def _unsolved(search: Search) -> Tensor:
 
 
 def continued(solver: InteriorPoint, call: Call, start: Iterate) -> SolveEnd:
-    """Solves of a call from trajectories, with their multipliers."""
-    return solver.solved(replace(call, U0=start.U, warm=start.multipliers), start.X)
+    """Solves of a call from trajectories, with their multipliers, among the obstacles near these."""
+    call = replace(call, U0=start.U, warm=start.multipliers)
+    near = Nearby.along(call, start.X)
+    if near is None:
+        return solver.solved(call, start.X)
+    found = solver.solved(near.call, start.X)
+    wrong, end = near.wrong(found.best), near.end(found)
+    if wrong.numel() > 0:
+        put(end, wrong, solver.solved(call.take(wrong), start.X[wrong]))
+    return end

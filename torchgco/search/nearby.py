@@ -1,11 +1,13 @@
 """Obstacles far from every sensible way are left out of a search, and looked at again at its end.
 
-Time, memory and the answer then depend on the obstacles between start and goal, not on those of the whole world.
+Time, memory and the answer then depend on the obstacles between start and goal, not on those of the whole world. Where a
+trajectory is only refined, those far from it are left out.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -14,10 +16,11 @@ from torch import Tensor
 from torchgco.base.tree import put
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.dispatch import chord_clearance, measured
-from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.problem.problem import ROWS, Problem
 from torchgco.solution import SearchRecord, Solution
 from torchgco.solvers.contracts import Call
+from torchgco.solvers.state import Iterate, SolveEnd
 
 DETOUR = math.sqrt(2.0)  # ways this many times as long as the straight one stay within half of its length from it
 FEWER = 0.5  # share of a problem's obstacles that must be far, for leaving any out
@@ -45,25 +48,41 @@ class Nearby:
     @classmethod
     def of(cls, call: Call) -> Nearby | None:
         """None where every problem keeps all obstacles: there are few far ones, or none can be told far."""
+        return cls._where(call, lambda part, solids: _on_the_way(call.problem, solids))
+
+    @classmethod
+    def along(cls, call: Call, X: Tensor) -> Nearby | None:
+        """A call without the obstacles that are farther from X (B, N+1, n) than a mean one is thick; None as for `of`."""
+        return cls._where(call, lambda part, solids: _beside(X[:, :, part.position], solids))
+
+    @classmethod
+    def _where(cls, call: Call, near: Callable[[Obstacles, Solids], Tensor | None]) -> Nearby | None:
         problem = call.problem
-        kept = [_near(problem, part) if isinstance(part, Obstacles) else None for part in problem.constraints]
+        kept = [_kept(part, near) if isinstance(part, Obstacles) else None for part in problem.constraints]
         known = [part for part in kept if part is not None]
         if not known or problem.B == 0:
             return None
         present = [~part.absent for part in problem.constraints if isinstance(part, Obstacles)]
-        near = torch.stack([part.sum(-1) for part in known]).sum(0)
-        worth = near <= (1.0 - FEWER) * torch.stack([part.sum(-1) for part in present]).sum(0)
+        few = torch.stack([part.sum(-1) for part in known]).sum(0)
+        worth = few <= (1.0 - FEWER) * torch.stack([part.sum(-1) for part in present]).sum(0)
         if not bool(worth.any()):
             return None
         return cls(call, [None if part is None else _places(part | ~worth.unsqueeze(-1)) for part in kept])
 
     def solution(self, found: Solution) -> Solution:
         """The solution with multipliers, all zero, of the obstacles that were left out."""
-        shapes = (lam.shape[1:] for lam in Multipliers.zero(self.given.problem, 0.0).lam)
-        lam = tuple(map(_scattered, found.multipliers.lam, self.places, shapes))
-        return replace(found, multipliers=replace(found.multipliers, lam=lam))
+        return replace(found, multipliers=self._whole(found.multipliers))
 
-    def wrong(self, found: Solution) -> Tensor:
+    def end(self, found: SolveEnd) -> SolveEnd:
+        """The same of a solve without its verdict."""
+        best, last = (replace(part, multipliers=self._whole(part.multipliers)) for part in (found.best, found.last))
+        return replace(found, best=best, last=last)
+
+    def _whole(self, multipliers: Multipliers) -> Multipliers:
+        shapes = self.given.problem.row_shapes
+        return replace(multipliers, lam=tuple(map(_scattered, multipliers.lam, self.places, shapes)))
+
+    def wrong(self, found: Solution | Iterate) -> Tensor:
         """The problems (b,) whose trajectories are worse with the obstacles that were left out."""
         whole, part = self.given.problem, self.call.problem
         deeper = measured(whole, found.X, found.U, obstacles=True) > measured(part, found.X, found.U, obstacles=True)
@@ -88,17 +107,35 @@ def merged(first: Solution, rows: Tensor, again: Solution) -> Solution:
     return replace(whole, trace=trace, search=search)
 
 
-def _near(problem: Problem, part: Obstacles) -> Tensor | None:
-    """Which obstacles (B, M) a sensible way may touch; None for a kind that can't say, or without a goal."""
+def _kept(part: Obstacles, near: Callable[[Obstacles, Solids], Tensor | None]) -> Tensor | None:
+    """Which obstacles (B, M) are near; None for a kind that can't say."""
     solids = part.inflated()
-    unsaid = type(part).chosen is Obstacles.chosen
-    if problem.goal is None or unsaid or solids is None or solids.absent.shape[1] == 0:
+    if type(part).chosen is Obstacles.chosen or solids is None or solids.absent.shape[1] == 0:
+        return None
+    return near(part, solids)
+
+
+def _on_the_way(problem: Problem, solids: Solids) -> Tensor | None:
+    """Which obstacles (B, M) a sensible way may touch; None without a goal."""
+    if problem.goal is None:
         return None
     start, goal = problem.x0[:, problem.position], problem.goal.position
     straight = (goal - start).square().sum(-1).sqrt().unsqueeze(-1)
     reach = solids.extent.square().sum(-1).sqrt() + solids.radii
     way = sum((solids.centers - end.unsqueeze(1)).square().sum(-1).sqrt() - reach for end in (start, goal))
     return ~solids.absent & (way <= DETOUR * straight)
+
+
+def _beside(p: Tensor, solids: Solids) -> Tensor:
+    """Which obstacles (B, M) are nearer to points p (B, K, d) than the mean obstacle's least half length, by axis."""
+    reach = solids.extent + solids.radii.unsqueeze(-1)
+    present = (~solids.absent).to(p.dtype)
+    margin = (reach.amin(-1) * present).sum(-1) / present.sum(-1).clamp(min=1.0)
+    near = ~solids.absent.unsqueeze(1)
+    for a in range(p.shape[-1]):
+        away = (p[:, :, None, a] - solids.centers[:, None, :, a]).abs()
+        near = near & ~(away > (reach[..., a] + margin.unsqueeze(-1)).unsqueeze(1))  # NaN counts as near
+    return near.any(1)
 
 
 def _places(kept: Tensor) -> Tensor:
@@ -116,7 +153,7 @@ def _gathered(lam: Tensor, at: Tensor | None) -> Tensor:
     return lam.gather(2, index).masked_fill((at < 0).unsqueeze(1), 0.0)
 
 
-def _scattered(lam: Tensor, at: Tensor | None, shape: torch.Size) -> Tensor:
+def _scattered(lam: Tensor, at: Tensor | None, shape: tuple[int, ...]) -> Tensor:
     """The rows of lam (B, K, M') put at places (B, M') of zeros (B, K, M)."""
     if at is None:
         return lam
