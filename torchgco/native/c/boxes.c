@@ -54,9 +54,7 @@ static inline int is_far(const Constraint *con, const Rows *rows, int64_t j, con
 static inline V boxes_value(const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
     const V *lam = rows->lam + con->place[k] * con->rows;
     int pushed = any(rows->pushed[con->place[k]]);
-    Listed listed = near(con, rows, k, x);
-    for (int64_t i = 0; i < listed.count; i++) {
-        int64_t j = listed.row[i];
+    for (int64_t j = 0; j < con->rows; j++) {
         if (is_far(con, rows, j, x) && !(pushed && any(lam[j] != SET(0.0)))) continue;
         V c = solid(con, rows, j, k, x, 0);
         if (any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) total += worth(s, 0, c, lam[j]);
@@ -69,9 +67,7 @@ static inline void boxes_expand(
     const V *lam = rows->lam + con->place[k] * con->rows;
     int pushed = any(rows->pushed[con->place[k]]);
     V slopes[DIM], rho;
-    Listed listed = near(con, rows, k, x);
-    for (int64_t i = 0; i < listed.count; i++) {
-        int64_t j = listed.row[i];
+    for (int64_t j = 0; j < con->rows; j++) {
         if (is_far(con, rows, j, x) && !(pushed && any(lam[j] != SET(0.0)))) continue;
         V c = solid(con, rows, j, k, x, slopes);
         if (!any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;

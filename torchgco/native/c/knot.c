@@ -9,6 +9,12 @@ static inline V bound(const Constraint *con, const Rows *rows, int64_t j, int64_
 }
 
 #if DIM > 0
+/* The squared radius of sphere j at knot k; ABSENT without one, or where time has stopped. */
+static inline V square_at(const Constraint *con, const Rows *rows, int64_t j, int64_t k) {
+    if (!con->stops.data) return rows->squares[j];
+    return tgco_choose(SET(k) > rows->stops[0], SET(ABSENT), rows->squares[j]);
+}
+
 /* Row j of spheres at knot k, and the vector from the centre to the position (DIM); an absent sphere is c = -1. */
 static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V *away) {
     const V *o = rows->bound + j * DIM;
@@ -23,27 +29,25 @@ static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64
     return limit - square;
 }
 
-/* Rows c of `count` spheres at knot k, and whether they add anything in any lane. */
+/* Rows c of the spheres first, ..., last - 1 at knot k, and whether they add anything in any lane. */
 static inline int spheres(
-    const Constraint *con, const Rows *rows, const int32_t *row, int64_t count, int64_t k, const V *x, V *c) {
+    const Constraint *con, const Rows *rows, int64_t first, int64_t last, int64_t k, const V *x, V *c) {
     I matters = rows->pushed[con->place[k]];
-    for (int64_t i = 0; i < count; i++) {
+    for (int64_t j = first; j < last; j++) {
         V away[DIM];
-        c[i] = sphere(con, rows, row[i], k, x, away);
-        matters |= ~(c[i] <= SET(0.0)); /* NaN matters */
+        c[j - first] = sphere(con, rows, j, k, x, away);
+        matters |= ~(c[j - first] <= SET(0.0)); /* NaN matters */
     }
     return any(matters);
 }
 
 static inline V spheres_value(const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
     const V *lam = rows->lam + con->place[k] * con->rows;
-    Listed listed = near(con, rows, k, x);
     V c[BLOCK];
-    for (int64_t first = 0; first < listed.count; first += BLOCK) {
-        const int32_t *row = listed.row + first;
-        int64_t count = listed.count - first < BLOCK ? listed.count - first : BLOCK;
-        if (!spheres(con, rows, row, count, k, x, c)) continue;
-        for (int64_t i = 0; i < count; i++) total += worth(s, 0, c[i], lam[row[i]]);
+    for (int64_t first = 0; first < con->rows; first += BLOCK) {
+        int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
+        if (!spheres(con, rows, first, last, k, x, c)) continue;
+        for (int64_t j = first; j < last; j++) total += worth(s, 0, c[j - first], lam[j]);
     }
     return total;
 }
@@ -51,15 +55,12 @@ static inline V spheres_value(const Lanes *s, const Constraint *con, const Rows 
 static inline void spheres_expand(
     const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V *g, V *H) {
     const V *lam = rows->lam + con->place[k] * con->rows;
-    Listed listed = near(con, rows, k, x);
     V c[BLOCK], away[DIM], rho;
-    for (int64_t first = 0; first < listed.count; first += BLOCK) {
-        const int32_t *row = listed.row + first;
-        int64_t count = listed.count - first < BLOCK ? listed.count - first : BLOCK;
-        if (!spheres(con, rows, row, count, k, x, c)) continue;
-        for (int64_t i = 0; i < count; i++) {
-            int64_t j = row[i];
-            if (!any(~(c[i] <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
+    for (int64_t first = 0; first < con->rows; first += BLOCK) {
+        int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
+        if (!spheres(con, rows, first, last, k, x, c)) continue;
+        for (int64_t j = first; j < last; j++) {
+            if (!any(~(c[j - first] <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
             V slope = pull(s, 0, sphere(con, rows, j, k, x, away), lam[j], &rho);
             for (int a = 0; a < DIM; a++) {
                 g[POSITION + a] -= SET(2.0) * slope * away[a];

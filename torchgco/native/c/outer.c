@@ -32,15 +32,12 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
         }
 #if DIM > 0
     } else if (con->kind == SPHERES) {
-        Listed listed = near(con, rows, k, x);
         V c[BLOCK];
-        for (int64_t first = 0; first < listed.count; first += BLOCK) {
-            const int32_t *row = listed.row + first;
-            int64_t count = listed.count - first < BLOCK ? listed.count - first : BLOCK;
-            if (!spheres(con, rows, row, count, k, x, c)) continue; /* no multiplier, and none to come */
-            for (int64_t m = 0; m < count; m++) {
-                int64_t j = row[m];
-                V value = c[m], square = square_at(con, rows, j, k);
+        for (int64_t first = 0; first < con->rows; first += BLOCK) {
+            int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
+            if (!spheres(con, rows, first, last, k, x, c)) continue; /* no multiplier, and none to come */
+            for (int64_t j = first; j < last; j++) {
+                V value = c[j - first], square = square_at(con, rows, j, k);
                 V depth = tgco_sqrt(square) - tgco_sqrt(square - value);
                 note(s, con, value, tgco_choose(value <= zero, zero, depth), lam + j, &pushed, sweep);
             }
@@ -50,9 +47,7 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
     } else if (con->kind == BOXES) {
         const V *factors = rows->bound + con->rows * 2 * DIM;
         int known = any(rows->pushed[place]);
-        Listed listed = near(con, rows, k, x);
-        for (int64_t m = 0; m < listed.count; m++) {
-            int64_t j = listed.row[m];
+        for (int64_t j = 0; j < con->rows; j++) {
             if (is_far(con, rows, j, x) && !(known && any(lam[j] != zero))) continue;
             V c = solid(con, rows, j, k, x, 0);
             note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, &pushed, sweep);

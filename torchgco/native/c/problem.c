@@ -13,14 +13,11 @@
 
 #define S (NX + NU)
 #define NZ (NX + 1)
-#define FEW 32 /* obstacles of a constraint that cost no more than lists of the near ones */
 
 /* A constraint's multipliers and numbers. */
 typedef struct {
     V *lam, *bound, *squares, *velocities, *stops;
     I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
-    V *from, *margin;      /* (knots, DIM), (DIM): positions that the lists below were made at, and how far these hold */
-    int32_t *near, *count; /* (knots, rows), (knots): near obstacles, see near.c; of a few, all, as (rows) */
 } Rows;
 
 /* The working data of a group of lanes. */
@@ -65,15 +62,7 @@ static inline const V *cost_at(const Lanes *s, int i, int64_t k) {
 /* The model's own numbers at stage k. */
 static inline const V *model_at(const Lanes *s, int64_t k) { return at(s->parameters, &s->of->parameters, k); }
 
-#if DIM > 0
-static void begin_lists(const Constraint *con, Rows *rows, int lane); /* near.c */
-#endif
-
 static V *cut(V **memory, int64_t count) { V *part = *memory; *memory += count; return part; }
-
-static int32_t *numbers(V **memory, int64_t count) {
-    return (int32_t *)cut(memory, (count * sizeof(int32_t) + sizeof(V) - 1) / sizeof(V));
-}
 
 static int64_t lay_out(Lanes *s, V *memory) {
     const Problem *p = s->of;
@@ -91,12 +80,6 @@ static int64_t lay_out(Lanes *s, V *memory) {
         rows.squares = cut(&m, length(&c->squares, 1)); rows.velocities = cut(&m, length(&c->velocities, 1));
         rows.stops = cut(&m, length(&c->stops, 1));
         rows.pushed = (I *)cut(&m, c->knots);
-        if (c->kind == SPHERES || c->kind == BOXES) {
-            int64_t lists = c->rows > FEW ? c->knots : 1;
-            rows.from = cut(&m, c->knots * DIM); rows.margin = cut(&m, DIM);
-            rows.near = numbers(&m, lists * c->rows); rows.count = numbers(&m, c->knots);
-            if (memory && lists == 1) for (int j = 0; j < c->rows; j++) rows.near[j] = j;
-        }
         if (memory) s->rows[i] = rows;
     }
     return m - memory;
@@ -137,9 +120,6 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
         fill(s->rows[i].squares, &c->squares, 1, lane, e);
         fill(s->rows[i].velocities, &c->velocities, 1, lane, e);
         fill(s->rows[i].stops, &c->stops, 1, lane, e);
-#if DIM > 0
-        if (s->rows[i].from) begin_lists(c, s->rows + i, lane);
-#endif
     }
 }
 

@@ -42,7 +42,7 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
 }
 """
 COST, BOXES = "quadratic.c", ("box.h", "boxes.c")  # or traced.c; left out where there are no boxes
-TERMS = ("problem.c", COST, "penalty.c", "near.c", *BOXES, "knot.c")
+TERMS = ("problem.c", COST, "penalty.c", *BOXES, "knot.c")
 SOLVER = (*TERMS, "cholesky.h", "passes.c", "ilqr.c", "trajectories.c", "outer.c")
 SAMPLER = (*TERMS, "normal.c", "mppi.c")
 INTERIOR = (*TERMS, "cholesky.h", *(f"interior{part}.c" for part in ("_rows", "_step", "_memory", "_search", "")))
