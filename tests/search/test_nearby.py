@@ -8,9 +8,13 @@ import pytest
 import torch
 
 from tests.problems import assert_same_bits, planar_batch, quick_gco
-from torchgco import Boxes, Problem, Solution, Spheres, judge
+from torchgco import Boxes, InteriorPoint, Problem, Solution, Spheres, judge
+from torchgco.native.compiler import find_compiler
+from torchgco.search import nearby
+from torchgco.search.converge import continued
 from torchgco.search.nearby import Nearby
 from torchgco.solvers.contracts import Call
+from torchgco.solvers.state import Iterate, SolveEnd
 
 B, FAR = 3, 40
 
@@ -86,3 +90,29 @@ def test_a_way_through_obstacles_that_were_left_out_is_sought_again() -> None:
     X[1, 12, :2] = many.obstacles[0].centers[1, -1]  # over one of the far ones
     assert near.wrong(replace(found, X=X)).tolist() == [1]
     assert Nearby.of(Call.checked(few, U0)) is None
+
+
+# Refining -------------------------------------------------------------------------------------------------------------
+
+
+def refined(problem: Problem, U0: torch.Tensor, solution: Solution) -> SolveEnd:
+    start = Iterate(solution.X, solution.U, solution.multipliers, solution.cost, solution.violation)
+    return continued(InteriorPoint(), Call.checked(problem, U0), start)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("kind", ["spheres", "boxes"])
+@pytest.mark.parametrize("enough", [True, False], ids=["the near ones", "too few"])
+def test_a_trajectory_is_refined_among_the_obstacles_near_it(kind: str, enough: bool, monkeypatch) -> None:
+    """Whatever is left out, the end is that among all: where too few are looked at, the others are hit and count."""
+    _, many, U0 = planar(kind, 9.0)
+    start = replace(quick_gco(many).solve(many, U0, seed=3), search=None, trace=None)
+    if not enough:
+        monkeypatch.setattr(nearby, "_beside", lambda p, solids: torch.zeros_like(solids.absent))
+    found = refined(many, U0, start)
+    monkeypatch.setattr(Nearby, "along", classmethod(lambda cls, call, X: None))
+    whole = refined(many, U0, start)
+    torch.testing.assert_close(found.best.cost, whole.best.cost, rtol=1e-6, atol=0)
+    assert torch.equal(found.status, whole.status) and float(found.best.violation.max()) <= 1e-6
+    for mine, theirs in zip(found.best.multipliers.lam, whole.best.multipliers.lam, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-4)
