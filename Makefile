@@ -8,7 +8,7 @@
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
-#              make paper: the paper's figures, tables and missions by our solvers, in docs/paper and docs/paper.md
+#              make paper: the paper's figures, tables and missions by our solvers, in benchmarks/results/paper.md
 # make test    the tests; test-all: also the tests that kill processes or fly whole studies; test-slurm: those that start a
 #              SLURM on this machine (as root; needs Debian's slurm-wlm and munge); robustness: those of wrong input, kills and
 #              random examples, with tables of what was tried and of mutants; versions: the tests of the wheel with the oldest and the
@@ -93,7 +93,7 @@ figures: $(RUNTIME)
 	$(BIN)/python docs/figures.py
 
 paper: $(RUNTIME)
-	$(BIN)/python docs/paper_figures.py --outputs docs/paper $(ARGS)
+	$(BIN)/python -m benchmarks.paper $(ARGS)
 
 lint: $(DEV)
 	$(BIN)/ruff check .

@@ -21,7 +21,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from torch import Tensor
 
-from torchgco import Problem, Solution, compose, presets
+from benchmarks.lib.recorded import solve
+from torchgco import Problem, Solution, presets
 from torchgco.plotting.style import INK, PALETTE, save, tidy
 from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, MARGIN, NEIGHBOURS, NODES, Roadmap, halton
 from torchgco.roadmap.scene import scene_of
@@ -31,20 +32,9 @@ from torchgco.solution import Fate
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "algorithm.md"
-FAMILY, LAYOUT = "planar_trap", 0
+LAYOUT = 0
 STONE, EDGE, PALE = "#CFC8BA", "#A39B8B", "#C8C8C8"
 SIZE, DPI = (4.6, 3.7), 110
-
-
-def solve(layout: int) -> tuple[Problem, Solution, Layouts]:
-    """Solve one layout by `gco`, which records its search."""
-    data = ROOT / "benchmarks" / "data" / f"{FAMILY}.npz"
-    words = ["scenario=layouts", f"scenario.path={data}", "model=planar", "device.threads=1"]
-    setup = compose([*words, "solver.local.record=true"])
-    layouts = setup.layouts().take([layout])
-    task = setup.task(layouts)
-    solution = setup.solver.solve(task.problem, task.U0, seed=setup.seed, ids=torch.as_tensor(layouts.ids))
-    return task.problem, solution, layouts
 
 
 def draw(problem: Problem, solution: Solution, layouts: Layouts) -> dict[str, Figure]:
@@ -144,7 +134,7 @@ def _edges(problem: Problem) -> list[np.ndarray]:
 
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python docs/figures.py", description="Draw the figures of algorithm.md.")
-    parser.add_argument("--layout", type=int, default=LAYOUT, help=f"of the 32 of {FAMILY}")
+    parser.add_argument("--layout", type=int, default=LAYOUT, help="of the 32 of planar_trap")
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / "figures")
     asked = parser.parse_args(words)
     for name, figure in draw(*solve(asked.layout)).items():

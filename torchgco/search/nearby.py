@@ -1,7 +1,7 @@
 """Obstacles far from every sensible way are left out of a search, and looked at again at its end.
 
-Time, memory and the answer then depend on the obstacles between start and goal, not on those of the whole world. Where a
-trajectory is only refined, those far from it are left out.
+Time, memory and the answer then depend on the obstacles between start and goal, not on those of the whole world. Where
+a trajectory is only refined, those far from it are left out.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Nearby:
 
     @classmethod
     def along(cls, call: Call, X: Tensor) -> Nearby | None:
-        """A call without the obstacles that are farther from X (B, N+1, n) than a mean one is thick; None as for `of`."""
+        """A call without the obstacles farther from X (B, N+1, n) than a mean one is thick; None as for `of`."""
         return cls._where(call, lambda part, solids: _beside(X[:, :, part.position], solids))
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Figures 3 to 5 and A1 to A3 and Table A4 of docs/paper.md: the paper's planar problem."""
+"""Figures 3 to 5 and A1 to A3 and Table A4 of paper.md: the paper's planar problem."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from paper_runs import Solve, Step
 
+from benchmarks.paper.runs import Solve, Step
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.style import INK, PALETTE, legend, panels, tidy
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
-import paper_settings as settings
-from paper_runs import FOREST_LAYOUT
-from paper_settings import Ours
 from torch import Tensor
 
+from benchmarks.paper import settings
+from benchmarks.paper.runs import FOREST_LAYOUT
+from benchmarks.paper.settings import Ours
 from torchgco import AugmentedLagrangian
 from torchgco.dynamics import Planar, QuadrotorPlanning
 from torchgco.experiments.config.build import Setup

@@ -1,4 +1,4 @@
-"""Figures 6 and 7 of docs/paper.md: first plans of the quadrotor, and their costs iteration by iteration."""
+"""Figures 6 and 7 of paper.md: first plans of the quadrotor, and their costs iteration by iteration."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from paper_runs import Solve
 
+from benchmarks.paper.runs import Solve
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.convergence import convergence_figure
 from torchgco.plotting.style import legend, tidy

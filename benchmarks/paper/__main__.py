@@ -1,8 +1,8 @@
-"""python docs/paper_figures.py: the paper's figures from runs of our solvers, Table A4, a table of missions, and our
+"""python -m benchmarks.paper: the paper's figures from runs of our solvers, Table A4, a table of missions, and our
 settings against the paper's tables, line by line.
 
-Figures, animations and tables go to `--outputs`, Table A4 and the missions also into the page. The page of docs/paper
-is docs/paper.md; any other folder gets a copy of it.
+Figures, animations and tables go to `--outputs`, Table A4 and the missions also into the page. The page of
+benchmarks/results/paper is benchmarks/results/paper.md; any other folder gets a copy of it.
 """
 
 from __future__ import annotations
@@ -13,21 +13,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import paper_flights
-import paper_mission
-import paper_planar
-import paper_quadrotor
-import paper_tables
 from matplotlib.figure import Figure
-from paper_runs import Solve, planar, quadrotor
 from PIL import Image
 
+from benchmarks.lib import RESULTS
 from benchmarks.lib.page import put_between
 from benchmarks.lib.provenance import provenance
+from benchmarks.paper import flights, missions, planar_figures, quadrotor_figures, tables
+from benchmarks.paper.runs import Solve, planar, quadrotor
 from torchgco.plotting.style import save
 
-ROOT = Path(__file__).resolve().parents[1]
-FOLDER, PAGE = ROOT / "docs" / "paper", ROOT / "docs" / "paper.md"
+FOLDER, PAGE = RESULTS / "paper", RESULTS / "paper.md"
 DPI = 110
 ROUNDING = 5  # of the 255 shades of a colour
 DRAWS = (0, 112)  # of the two trials: 112 is the only one of 0 to 191 that passes below the circles
@@ -38,47 +34,47 @@ TABLES = "tables.csv"
 PARTS = ("tables", "planar", "quadrotor", "mission")
 
 
-def planar_figures(trials: Sequence[Solve], alone: Solve) -> dict[str, Callable[[], Figure]]:
+def planar_drawings(trials: Sequence[Solve], alone: Solve) -> dict[str, Callable[[], Figure]]:
     """What to draw of the planar problem, by the names of the files."""
     return {
-        "figure-03": lambda: paper_planar.caught(alone, trials[0]),
-        "figure-04": lambda: paper_planar.result(trials[0]),
-        "figure-05": lambda: paper_planar.evolution(trials[0]),
-        "figure-A1": lambda: paper_planar.distinct(trials),
-        "figure-A2": lambda: paper_planar.histories(trials),
-        "figure-A3": lambda: paper_planar.evolution(trials[1]),
+        "figure-03": lambda: planar_figures.caught(alone, trials[0]),
+        "figure-04": lambda: planar_figures.result(trials[0]),
+        "figure-05": lambda: planar_figures.evolution(trials[0]),
+        "figure-A1": lambda: planar_figures.distinct(trials),
+        "figure-A2": lambda: planar_figures.histories(trials),
+        "figure-A3": lambda: planar_figures.evolution(trials[1]),
     }
 
 
-def quadrotor_figures(solves: Sequence[Solve]) -> dict[str, Callable[[], Figure]]:
+def quadrotor_drawings(solves: Sequence[Solve]) -> dict[str, Callable[[], Figure]]:
     """What to draw of the quadrotor's first plans, by the names of the files."""
     return {
-        "figure-06": lambda: paper_quadrotor.plans(solves),
-        "figure-07": lambda: paper_quadrotor.costs(solves),
+        "figure-06": lambda: quadrotor_figures.plans(solves),
+        "figure-07": lambda: quadrotor_figures.costs(solves),
     }
 
 
 def write_table(trials: Sequence[Solve], outputs: Path, page: Path) -> None:
     """Table A4 as a file, and between its marks in the page."""
-    rows = paper_planar.table(trials, DRAWS)
+    rows = planar_figures.table(trials, DRAWS)
     outputs.mkdir(parents=True, exist_ok=True)
     rows.to_csv(outputs / "table-A4.csv", index=False)
-    put_between(page, *MARKS, f"{_head()}\n\n{paper_planar.markdown(rows)}")
+    put_between(page, *MARKS, f"{_head()}\n\n{planar_figures.markdown(rows)}")
 
 
 def fly(outputs: Path, page: Path, duration: float) -> dict[str, Callable[[], Figure]]:
     """Fly the missions, write their table and the animations; what to draw of them."""
-    flights = paper_flights.fly(duration=duration)
-    rows = paper_mission.table(flights)
+    flown = flights.fly(duration=duration)
+    rows = missions.table(flown)
     outputs.mkdir(parents=True, exist_ok=True)
     rows.to_csv(outputs / "missions.csv", index_label="quantity")
-    put_between(page, *MISSION_MARKS, f"{_head()}\n\n{paper_mission.markdown(rows)}")
-    paper_mission.animate(flights, outputs)
-    return paper_mission.figures(flights)
+    put_between(page, *MISSION_MARKS, f"{_head()}\n\n{missions.markdown(rows)}")
+    missions.animate(flown, outputs)
+    return missions.figures(flown)
 
 
 def page_of(outputs: Path) -> Path:
-    """The page that shows the pictures of a folder; a new copy with its own links, but for docs/paper."""
+    """The page that shows the pictures of a folder; a new copy with its own links, but for that of the results."""
     if outputs.resolve() == FOLDER:
         return PAGE
     outputs.mkdir(parents=True, exist_ok=True)
@@ -101,7 +97,7 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python docs/paper_figures.py", description="Draw the figures of paper.md.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.paper", description="Draw the figures of paper.md.")
     parser.add_argument("--outputs", type=Path, default=FOLDER)
     parser.add_argument("--page", type=Path, help="where the tables go; by default the page of --outputs")
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS, help="by default all")
@@ -112,13 +108,13 @@ def main(words: Sequence[str] | None = None) -> int:
     drawings: dict[str, Callable[[], Figure]] = {}
     if "tables" in asked.parts:
         asked.outputs.mkdir(parents=True, exist_ok=True)
-        paper_tables.frame(paper_tables.tables()).to_csv(asked.outputs / TABLES, index=False)
+        tables.frame(tables.tables()).to_csv(asked.outputs / TABLES, index=False)
     if "planar" in asked.parts:
         trials = [planar("gco_paper", number, asked.stages) for number in DRAWS]
-        drawings |= planar_figures(trials, planar("al_ilqr", 0, asked.stages))
+        drawings |= planar_drawings(trials, planar("al_ilqr", 0, asked.stages))
         write_table(trials, asked.outputs, page)
     if "quadrotor" in asked.parts:
-        drawings |= quadrotor_figures([quadrotor(name) for name in SOLVERS])
+        drawings |= quadrotor_drawings([quadrotor(name) for name in SOLVERS])
     if "mission" in asked.parts:
         drawings |= fly(asked.outputs, page, asked.duration)
     for name, make in drawings.items():

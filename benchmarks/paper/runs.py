@@ -1,4 +1,4 @@
-"""Solves for the figures of docs/paper.md, with the state that guidance got after every inner solve and its answer."""
+"""Solves for the figures of paper.md, with the state that guidance got after every inner solve and its answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures 8 to 12, A4 and A5 of docs/paper.md: the paper's mission, flown with three planners, and two animations."""
+"""Figures 8 to 12, A4 and A5 of paper.md: the paper's mission, flown with three planners, and two animations."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from figures import solve
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
-from paper_flights import Flight
 
+from benchmarks.lib.recorded import solve
+from benchmarks.paper.flights import Flight
 from torchgco.plotting import missions as draw
 from torchgco.plotting import trajectory
 from torchgco.plotting.animation import Picture, mission_animation, planar_animation

@@ -1,4 +1,4 @@
-"""The missions behind Figures 8 to 12, A4 and A5 of docs/paper.md: flights with three planners, and their times."""
+"""The missions behind Figures 8 to 12, A4 and A5 of paper.md: flights with three planners, and their times."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from paper_runs import FOREST, FOREST_LAYOUT, PAPERS_LOOP, Sampling, Witness
 
+from benchmarks.paper.runs import FOREST, FOREST_LAYOUT, PAPERS_LOOP, Sampling, Witness
 from torchgco import compose
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.contact import Contact

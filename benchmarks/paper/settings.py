@@ -1,13 +1,13 @@
-"""What the figures of docs/paper.md are made with: the problems and the mission that the paper's tables describe."""
+"""What the figures of paper.md are made with: the problems and the mission that the paper's tables describe."""
 
 from __future__ import annotations
 
 from functools import cached_property
 
 import torch
-from paper_runs import FOREST, FOREST_LAYOUT, PAPERS_LOOP
 from torch import Tensor
 
+from benchmarks.paper.runs import FOREST, FOREST_LAYOUT, PAPERS_LOOP
 from torchgco import compose
 from torchgco.constraints import ControlBounds
 from torchgco.costs.quadratic import BoundQuadratic
