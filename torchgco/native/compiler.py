@@ -58,6 +58,8 @@ def find_compiler() -> Compiler | None:
 def build(source: str, flags: Sequence[str] = ()) -> ctypes.CDLL:
     """The library that `source` is compiled to; names it exports begin with tgco_.
 
+    The words of TORCHGCO_CFLAGS are further flags, the last of all: "-O1" compiles in a third of the time, for tests.
+
     Args:
         source: one file of C11.
         flags: further flags. They come last, so that -O2 here replaces the -O3 of `FLAGS`.
@@ -67,7 +69,8 @@ def build(source: str, flags: Sequence[str] = ()) -> ctypes.CDLL:
             written or loaded.
     """
     compiler = find_compiler()
-    known = (source, tuple(flags), compiler)
+    flags = (*flags, *shlex.split(os.environ.get("TORCHGCO_CFLAGS", "")))
+    known = (source, flags, compiler)
     # No lock: two threads that compile the same source do no harm, and a lock held across a fork would.
     if known not in _loaded:
         if compiler is None:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from torchgco.base.files import PART, write_whole
 
-FILES = 200  # at most; the least recently used are removed
+FILES = 1000  # at most, some 150 MB; the least recently used are removed
 _ABANDONED = 3600.0  # s after which a half-written file belongs to a process that was killed
 _OURS = re.compile(r"[0-9a-f]{32}-[0-9a-f]{32}\.[a-z]+")
 
