@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.options import check_value
 from torchgco.base.shapes import check_shape, computing_on
 from torchgco.constraints import ControlBounds
 from torchgco.contact import warned_of_contact
@@ -26,6 +29,7 @@ def solve(
     warm: Solution | None = None,
     max_seconds: float | None = None,
     X0: Tensor | None = None,
+    record: bool = False,
 ) -> Solution:
     """Solve every problem of the batch.
 
@@ -42,6 +46,8 @@ def solve(
         max_seconds: time after which the best trajectories so far are returned; see `Solver.solve`.
         X0: states to begin with (B, N+1, n), such as waypoints; U0 need not lead to them. For `interior_point`, `ipopt`
             and `fatrop`, and without obstacles `gco`. Default: those that U0 leads to.
+        record: keep `solution.trace` and, of `gco`, `solution.search`, where the solver can: `solution.explain` then
+            says more. The results are the same.
 
     Raises:
         InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
@@ -51,6 +57,7 @@ def solve(
     if warm is not None and not isinstance(warm, Solution):
         raise InputError("warm", "a Solution, or None", type(warm).__name__)
     solver = "gco" if solver is None else solver
+    name = solver if isinstance(solver, str) else None
     if isinstance(solver, str):
         solver = named(solver, problem)
     if not isinstance(solver, Solver):
@@ -68,7 +75,10 @@ def solve(
         problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
         U0 = _guess(problem, traced)
     multipliers = None if warm is None else warm.multipliers
+    solver = solver.recording() if check_value(record, bool, "record") else solver
     found = solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds, X0=X0)
+    if name is not None and found.account is not None:
+        found = replace(found, account=found.account.of_preset(name))
     return warned_of_contact(problem, found)
 
 

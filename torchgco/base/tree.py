@@ -75,6 +75,13 @@ def copied(tree: Any) -> Any:
     return tree
 
 
+def spread(values: Tensor, rows: Tensor) -> Tensor:
+    """Values (b,) at their places `rows` (b,) in a batch; 0 at the others."""
+    whole = values.new_zeros(int(rows.max()) + 1)
+    whole[rows] = values
+    return whole
+
+
 def put(tree: Any, index: Tensor, rows: Any) -> None:
     """Write `rows` into rows `index` of every tensor of `tree`, in place; the two have the same structure."""
     if isinstance(tree, Tensor):
