@@ -40,5 +40,6 @@ def worst_rows(problem: Problem, X: Tensor, U: Tensor) -> dict[str, list[Any]]:
 def kind_of(constraint: Constraint) -> str:
     """The user's name of a constraint, else its kind as a user writes it."""
     given = getattr(constraint, "name", None)
-    named = isinstance(given, str) and given != "constraint"
-    return given if named else type(constraint).__name__.removeprefix("Bound")
+    if isinstance(given, str) and given != "constraint":
+        return given
+    return type(constraint).__name__.removeprefix("Bound")
