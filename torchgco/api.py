@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -18,6 +20,9 @@ from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def solve(
@@ -80,6 +85,26 @@ def solve(
     if name is not None and found.account is not None:
         found = replace(found, account=found.account.of_preset(name))
     return warned_of_contact(problem, found)
+
+
+def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:
+    """The scene with the trajectories, then states and controls over time, with their bounds dashed.
+
+    In space obstacles are cut at the height, in the side view at the y, that the first trajectory has there; crosses
+    mark contact, between the knots too. Bounds far from all values are left out. A notebook shows the figure;
+    `figure.savefig("name.pdf")` writes it.
+
+    Args:
+        problem, solution: as solved.
+        b: the place of a problem in the batch, or several; None: the first six. Those with the same obstacles and goal
+            share a scene.
+
+    Raises:
+        InputError: a place that isn't there, or a solution of other problems.
+    """
+    from torchgco.plotting.problems import solution_figure  # matplotlib takes a second to load
+
+    return solution_figure(problem, solution, b)
 
 
 def _guess(problem: Problem, whole: Problem) -> Tensor:
