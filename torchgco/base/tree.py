@@ -8,10 +8,12 @@ from typing import Any, ClassVar, Self, TypeAlias
 import torch
 from torch import Tensor
 
+from torchgco.base.brief import Brief
+
 Rows: TypeAlias = Tensor | slice
 
 
-class PerElement:
+class PerElement(Brief):
     """Mixin for problem parts that may hold one value per problem.
 
     A subclass names its tensor fields with a batch axis: in `batched` those where it always has length B; in

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
+from torchgco.base.brief import Brief
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError, StartWarning
 from torchgco.base.options import Seconds, Seed, check_value
@@ -116,7 +117,7 @@ def check_ids(ids: Any, problem: Problem) -> None:
         raise InputError("ids", f"an int64 tensor ({problem.B},) on {device}", describe(ids))
 
 
-class Solver:
+class Solver(Brief):
     """A solver for batches of problems. Its fields are its options; it keeps no state between calls.
 
     Attributes:
