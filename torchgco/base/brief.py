@@ -20,7 +20,7 @@ class Brief:
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
         if "__repr__" not in cls.__dict__:  # what is there already, a dataclass doesn't replace
-            cls.__repr__ = super(cls, cls).__repr__
+            cls.__repr__ = super(cls, cls).__repr__  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
         return brief(self)

@@ -61,9 +61,10 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
     wide = WIDTH / len(maps) if maps else WIDTH
     high = max((one.height(wide) for one in maps), default=0.0)
     figure = Figure(figsize=(WIDTH, high + PANEL * rows + 0.35), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(high, PANEL * rows)) if maps else (None, figure)
-    if upper is not None:
-        for part, one in zip(np.atleast_1d(upper.subfigures(1, len(maps))), maps, strict=True):
+    lower: Figure | SubFigure = figure
+    if maps:
+        upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(high, PANEL * rows))[:, 0]
+        for part, one in zip(upper.subfigures(1, len(maps), squeeze=False)[0], maps, strict=True):
             one.draw(part)
     _histories(lower, problem, courses, unit)
     look: dict[str, Any] = {"fontsize": TEXT, "frameon": False, "ncols": min(3, len(courses) + 1)}
@@ -161,7 +162,7 @@ class _Map:
         hidden = [i for i in range(self.box.shape[1]) if i not in plane]
         at = float(lead[:, hidden[0]].mean()) if hidden and len(lead) else 0.0
         for part in self.world.others:
-            x, y, apart = distances(part, *self.box, plane, at)
+            x, y, apart = distances(part, self.box[0], self.box[1], plane, at)
             if bool((apart < 0).any()):
                 ax.contourf(x, y, apart, levels=[-np.inf, 0.0], colors=[STONE], zorder=0.3)
         for course in self.courses:
@@ -238,7 +239,7 @@ def _limits(ax: Axes, problem: Problem, courses: list[Course], values: list[np.n
                 near = np.isfinite(row) & (row >= low - NEAR * span) & (row <= high + NEAR * span)
                 if near.any():
                     t = course.t[: len(row)]
-                    mark = {"marker": "_"} if near.sum() == 1 else {}
+                    mark: dict[str, Any] = {"marker": "_"} if near.sum() == 1 else {}
                     ax.plot(
                         t, np.where(near, row, np.nan), color=LIMIT, linestyle="--", linewidth=0.9, zorder=1, **mark
                     )
