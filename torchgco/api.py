@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -18,8 +18,10 @@ from torchgco.native.dispatch import current, open_loop
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, check_problem
+from torchgco.search import Restarts
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
+from torchgco.solvers.watching import Watcher
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,6 +37,7 @@ def solve(
     max_seconds: float | None = None,
     X0: Tensor | None = None,
     record: bool = False,
+    verbose: bool | None = None,
 ) -> Solution:
     """Solve every problem of the batch.
 
@@ -53,6 +56,8 @@ def solve(
             and `fatrop`, and without obstacles `gco`. Default: those that U0 leads to.
         record: keep `solution.trace` and, of `gco`, `solution.search`, where the solver can: `solution.explain` then
             says more. The results are the same.
+        verbose: True: a line on stdout for every row of the solver's table that worked on some problem, and one at the
+            end. None: in a terminal and in a notebook a bar on stderr, once it takes 2 s; False: nothing.
 
     Raises:
         InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
@@ -63,28 +68,44 @@ def solve(
         raise InputError("warm", "a Solution, or None", type(warm).__name__)
     solver = "gco" if solver is None else solver
     name = solver if isinstance(solver, str) else None
-    if isinstance(solver, str):
-        solver = named(solver, problem)
-    if not isinstance(solver, Solver):
-        raise InputError("solver", "a solver, such as presets.gco(problem), or the name of a preset", shown(solver))
-    if U0 is None and warm is not None:
-        U0 = warm.U
-        if problem.free_start is not None:
-            check_shape(warm.X, (problem.B, problem.N + 1, problem.n), "warm.X")
-            problem = problem.guessing(warm.X[:, 0])
-    elif U0 is None and problem.B == 0:
-        U0 = problem.x0.new_zeros(0, problem.N, problem.m)
-    elif U0 is None:
-        whole = for_solvers(problem)
-        traced = current(whole)
-        problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
-        U0 = _guess(problem, traced)
+    solver = _solver(solver, problem, check_value(record, bool, "record"))
+    if U0 is None:
+        problem, U0 = _start(problem, warm)
     multipliers = None if warm is None else warm.multipliers
-    solver = solver.recording() if check_value(record, bool, "record") else solver
-    found = solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds, X0=X0)
+    verbose = check_value(verbose, bool | None, "verbose")
+    watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
+    more: dict[str, Any] = {"callback": watcher} if watcher.shows else {}
+    try:
+        found = solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds, X0=X0, **more)
+        watcher.end(found)
+    finally:
+        watcher.close()
     if name is not None and found.account is not None:
         found = replace(found, account=found.account.of_preset(name))
     return warned_of_contact(problem, found)
+
+
+def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:
+    """The solver, or that of a preset's name, which records where it is asked to."""
+    made = named(solver, problem) if isinstance(solver, str) else solver
+    if not isinstance(made, Solver):
+        raise InputError("solver", "a solver, such as presets.gco(problem), or the name of a preset", shown(solver))
+    return made.recording() if record else made
+
+
+def _start(problem: Problem, warm: Solution | None) -> tuple[Problem, Tensor]:
+    """Controls (B, N, m) to begin with where none are given, and the problem with the guess of its free starts."""
+    if warm is not None:
+        if problem.free_start is not None:
+            check_shape(warm.X, (problem.B, problem.N + 1, problem.n), "warm.X")
+            problem = problem.guessing(warm.X[:, 0])
+        return problem, warm.U
+    if problem.B == 0:
+        return problem, problem.x0.new_zeros(0, problem.N, problem.m)
+    whole = for_solvers(problem)
+    traced = current(whole)
+    problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
+    return problem, _guess(problem, traced)
 
 
 def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:

@@ -41,10 +41,12 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_a_tiny_limit_leaves_finite_trajectories(name: str, clock: list[int]) -> None:
     problem, U0 = planar_batch(B=5, N=30, obstacles=9, seed=4)
     solver, passes = SOLVERS[name](problem), []
-    full = solver.solve(problem, U0, seed=3, callback=lambda progress: passes.append(progress.passes))
+    full = solver.solve(problem, U0, seed=3, callback=lambda now: now.row or passes.append(now.passes))
     assert not clock  # nobody looks at a clock without a limit
     cut = []
-    solution = solver.solve(problem, U0, seed=3, max_seconds=0.5, callback=lambda progress: cut.append(progress.passes))
+    solution = solver.solve(
+        problem, U0, seed=3, max_seconds=0.5, callback=lambda now: now.row or cut.append(now.passes)
+    )
     assert len(cut) == 1 < len(passes)
     assert set(solution.statuses) <= ENDS and Status.TIME_LIMIT in solution.statuses
     assert Status.TIME_LIMIT not in full.statuses
@@ -72,7 +74,7 @@ def test_attempts_stop(name: str, clock: list[int]) -> None:
     solver, passes = SOLVERS[name](problem), []
     for limit in (1.5, 6.5, None):
         seen: list[int] = []
-        solver.solve(problem, U0, seed=3, max_seconds=limit, callback=lambda _, seen=seen: seen.append(1))
+        solver.solve(problem, U0, seed=3, max_seconds=limit, callback=lambda now, seen=seen: now.row or seen.append(1))
         passes.append(len(seen))
     assert passes[0] == 2 < passes[1] < passes[2] and passes[1] <= 8
 

@@ -27,7 +27,15 @@ def notice(text: str) -> None:
     if LOG.isEnabledFor(logging.INFO):
         LOG.info(text)
         return
-    in_terminal = sys.stderr is not None and sys.stderr.isatty()
+    if watched():
+        print(f"{CLEAR if _in_terminal() else ''}torchgco: {text}", file=sys.stderr, flush=True)
+
+
+def watched() -> bool:
+    """Whether somebody watches stderr: in a terminal and in interactive Python, but not from worker processes."""
     speaks = multiprocessing.parent_process() is None if _speaks is None else _speaks
-    if speaks and (in_terminal or hasattr(sys, "ps1")):
-        print(f"{CLEAR if in_terminal else ''}torchgco: {text}", file=sys.stderr, flush=True)
+    return speaks and (_in_terminal() or hasattr(sys, "ps1"))
+
+
+def _in_terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty()

@@ -17,7 +17,7 @@ from torchgco.roadmap.scene import has_paths
 from torchgco.search.proposals import PathProposals, Round
 from torchgco.solution import SearchRecord, Standing
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
-from torchgco.solvers.contracts import Call, Callback, Guidance, Progress
+from torchgco.solvers.contracts import Call, Callback, Guidance, Progress, RowEnd
 from torchgco.solvers.history import Recorder
 from torchgco.solvers.state import Iterate, SolveEnd
 
@@ -37,6 +37,7 @@ class Best:
     ) -> None:
         self.call, self.solver, self.recorder, self.record = call, solver, recorder, record
         self.end = copied(first)
+        self.worked = torch.ones_like(call.ids, dtype=torch.bool)  # (B,): on which problems the present pass has
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
 
     def arrived(self, tolerances: float = 1.0) -> Tensor:
@@ -84,6 +85,7 @@ class Best:
         """New trajectories of `rows` where a mask (b,) says so, and the counts of their solves."""
         if self.record is not None:
             self.record.passes[-1][2].extend(self.call.rows[rows].tolist())
+        self.worked[rows] = True
         chosen = where.nonzero().flatten()
         put(self.end.best, rows[chosen], take(trajectories, chosen))
         self.end.status[rows[chosen]] = new.status[chosen]
@@ -160,12 +162,19 @@ class Search:
 
     def next_pass(self, number: int, name: str) -> None:
         """Count the passes in the records."""
+        if self.begun:
+            self.best.worked.zero_()
         if self.recorder is not None and self.record is not None:
             self.recorder.attempt += number > 1
             self.record.passes.append((number, name, []))
 
-    def end_pass(self) -> None:
-        """Record the best trajectories after a pass."""
+    def end_pass(self, number: int, name: str) -> None:
+        """Report a pass that worked on some problem, and record the best trajectories after it."""
+        if self.call.callback is not None and self.begun and bool(self.best.worked.any()):
+            best = self.best
+            fits = best.end.best.violation <= self.solver.violation_tolerance
+            row = RowEnd(number, name, *(int(rows.sum()) for rows in (best.worked, fits, best.arrived())))
+            self.call.callback(Progress(0, self.call.rows[:0], best.finished, self.call.problem.B, row=row))
         if self.record is None:
             return
         if not self.begun:
@@ -213,7 +222,8 @@ class Search:
             begun = Round(problem, proposals.at_once, watch, places, self.record) if rows.numel() > 0 else None
             self._round = None if begun is None else (rows, begun)
         if self._round is not None:
-            self._round[1].improve(proposals)
+            rows, begun = self._round
+            self.best.worked[rows[begun.improve(proposals)]] = True
 
     def take_round(self) -> tuple[Tensor, Round] | None:
         """The problems of the round of proposals, and the round; it is over."""

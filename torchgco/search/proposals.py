@@ -116,11 +116,12 @@ class PathProposals:
         """How many problems are looked at together."""
         return max(1, PATHS_AT_ONCE // (self.num_paths * max(1, len(self.roadmaps))))
 
-    def improve(self, part: Part, watch: Watch) -> None:
-        """Better proposals for the problems of `part` that this pass looks at, in place."""
+    def improve(self, part: Part, watch: Watch) -> Tensor:
+        """Better proposals for the problems of `part` that this pass looks at, in place; returns these, (b,)."""
         rows = self._rows(part)
         for some in rows.split(self.at_once if self.roadmaps else max(1, rows.numel())):
             self._improve(part, some, watch)
+        return rows
 
     def _rows(self, part: Part) -> Tensor:
         """The problems (b,) of `part` that this pass looks at."""
@@ -259,10 +260,10 @@ class Round:
         self.rows = everyone.split(at_once)
         self.parts = [Part(scaled.take(rows), self.rest[rows], places[rows], record) for rows in self.rows]
 
-    def improve(self, proposals: PathProposals) -> None:
-        """One more pass."""
-        for part in self.parts:
-            proposals.improve(part, self.watch)
+    def improve(self, proposals: PathProposals) -> Tensor:
+        """One more pass; returns the problems (b,) that it looked at."""
+        worked = [rows[proposals.improve(part, self.watch)] for rows, part in zip(self.rows, self.parts, strict=True)]
+        return torch.cat(worked)
 
     def result(self) -> Proposal:
         """The proposals so far, in the problem's own units."""

@@ -102,16 +102,19 @@ class Restarts(Solver):
 
     def _run(self, search: Search, passes: Sequence[Pass | None]) -> None:
         """All passes, until the time is over."""
-        try:
-            for number, one in enumerate(passes, start=1):
-                if search.begun and search.call.late:
-                    return
-                search.next_pass(number, type(self.passes[number - 1]).__name__)
+        for number, one in enumerate(passes, start=1):
+            if search.begun and search.call.late:
+                return
+            name, late = type(self.passes[number - 1]).__name__, False
+            search.next_pass(number, name)
+            try:
                 if one is not None:
                     one.run(search)
-                search.end_pass()
-        except Late:
-            search.end_pass()
+            except Late:
+                late = True
+            search.end_pass(number, name)
+            if late:
+                return
 
     def _suited(self, problem: Problem) -> tuple[Sequence[Pass | None], Guidance | None]:
         """The passes, None for those that can't serve these problems, and the guidance, None where it can't.

@@ -27,10 +27,22 @@ from torchgco.solution import Solution
 
 
 @dataclass(frozen=True)
+class RowEnd:
+    """What a row of a solver's table has done, and how all problems stand after it."""
+
+    number: int  # of the row, from 1
+    name: str
+    worked: int  # problems that it worked on
+    feasible: int
+    arrived: int  # feasible, and at the goal
+
+
+@dataclass(frozen=True)
 class Progress:
     """The argument of a callback: after every pass, or after every problem where a solver takes one at a time.
 
-    While candidates along paths are solved, it is called too, with `candidates` instead of a state.
+    While candidates along paths are solved, it is called too, with `candidates` instead of a state; and after each row
+    of a solver's table that worked on some problem, with `row`.
     """
 
     passes: int
@@ -39,6 +51,7 @@ class Progress:
     total: int
     state: Any = None  # the running state of a batched solver, after the pass
     candidates: tuple[int, int] | None = None  # how many are solved, and of how many
+    row: RowEnd | None = None
 
 
 Callback = Callable[[Progress], None]
