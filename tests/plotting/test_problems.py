@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +23,8 @@ from torchgco.constraints.base import Constraint
 from torchgco.obstacles import Obstacles
 from torchgco.plotting.problems import LIMIT
 from torchgco.plotting.world import distances, world_of
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def flown(problem: Problem, U0: Tensor | None = None) -> Solution:
@@ -143,6 +148,20 @@ def test_without_a_position_there_are_histories_alone_and_without_a_step_knots()
     problem = Problem(Counter(), cost, [], torch.zeros(1, 1).double(), 5)
     axes = axes_of(torchgco.plot(problem, flown(problem)))
     assert len(axes) == 2 and axes[0].get_xlabel() == "knot"
+
+
+def test_notebooks_show_the_figure_without_pyplot() -> None:
+    """In a process of its own: whoever has loaded pyplot has figures shown by its backend."""
+    code = """
+import sys, torch, torchgco
+from IPython.core.formatters import DisplayFormatter
+from tests.problems import planar_batch
+problem, U0 = planar_batch(B=1, N=10, obstacles=1)
+data, _ = DisplayFormatter().format(torchgco.plot(problem, torchgco.solve(problem, U0, solver="hold")))
+print(data["image/png"][:4], "matplotlib.pyplot" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.strip() == r"b'\x89PNG' False"
 
 
 def test_wrong_places_and_solutions_are_refused() -> None:

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchgco.plotting.bodies import Plane
-from torchgco.plotting.style import INK, TEXT, TITLE, legend_columns, tidy
+from torchgco.plotting.style import INK, TEXT, TITLE, NotebookFigure, legend_columns, tidy
 
 WIDTH = 12.4  # inches, of a figure with columns enough; the others leave room
 TITLED, LEFT, RIGHT, FOOT, GAP = 0.3, 0.6, 0.15, 0.3, 0.2
@@ -35,7 +35,7 @@ def grid(
     wide = LEFT + columns * (width + GAP) - GAP + RIGHT
     heights = [[width * span[plane[1]] / span[0] for plane in planes] for span in spans]
     high = sum(TITLED + sum(row) + GAP * len(planes) for row in heights) + FOOT
-    figure = Figure(figsize=(wide, high))
+    figure = NotebookFigure(figsize=(wide, high))
     axes, top = [], high
     for row, box in enumerate(boxes):
         top -= TITLED

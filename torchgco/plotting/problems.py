@@ -19,7 +19,7 @@ from torchgco.constraints import ControlBounds, Separation, StateBounds
 from torchgco.plotting.bodies import ABOVE, Plane
 from torchgco.plotting.layouts import SIDE, STONE, draw_obstacles, draw_targets
 from torchgco.plotting.scene import contacts, flown, passes, view
-from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, tidy
+from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, NotebookFigure, tidy
 from torchgco.plotting.world import World, distances, world_of
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.problem.times import times
@@ -60,7 +60,7 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
     rows = ceil((problem.n + problem.m) / COLUMNS)
     wide = WIDTH / len(maps) if maps else WIDTH
     high = max((one.height(wide) for one in maps), default=0.0)
-    figure = Figure(figsize=(WIDTH, high + PANEL * rows + 0.35), layout="constrained")
+    figure = NotebookFigure(figsize=(WIDTH, high + PANEL * rows + 0.35), layout="constrained")
     lower: Figure | SubFigure = figure
     if maps:
         upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(high, PANEL * rows))[:, 0]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from io import BytesIO
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
@@ -38,6 +39,16 @@ KNOWN: dict[str, tuple[str, Dash]] = {
 }  # fmt: skip
 INK, FAINT = "#333333", "#BBBBBB"
 SMALL, TEXT, TITLE = 8, 9, 10  # points
+IN_NOTEBOOKS = 80  # dots per inch
+
+
+class NotebookFigure(Figure):
+    """A figure that notebooks show, also where nobody has loaded pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        held = BytesIO()
+        _save_png(self, held, IN_NOTEBOOKS)
+        return held.getvalue()
 
 
 def solver_colours(solvers: Iterable[str]) -> dict[str, str]:
@@ -69,7 +80,7 @@ def panels(count: int, columns: int, size: tuple[float, float], share: bool = Fa
     columns = min(columns, count)
     rows = ceil(count / columns)
     # The extra height is the legend's.
-    figure = Figure(figsize=(columns * size[0], rows * size[1] + 0.5), layout="constrained")
+    figure = NotebookFigure(figsize=(columns * size[0], rows * size[1] + 0.5), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=share, sharey=share)
     axes = list(grid.flat)
     for spare in axes[count:]:
