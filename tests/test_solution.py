@@ -41,6 +41,10 @@ def test_save_and_load(tmp_path) -> None:
     assert list(frame.status) == [s.name for s in solution.statuses] and frame.cost.tolist() == solution.cost.tolist()
     with pytest.raises(InputError, match="path"):
         Solution.load(tmp_path / "absent.npz")
+    (tmp_path / "code.py").write_text("import torchgco")
+    with pytest.raises(InputError, match="another format") as refused:
+        Solution.load(tmp_path / "code.py")
+    assert "unsafe" not in str(refused.value) and "allow_pickle" not in str(refused.value)
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(InputError, match="path"):
         Solution.load(tmp_path / "other.npz")

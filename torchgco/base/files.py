@@ -75,6 +75,8 @@ def read_arrays(
         raise
     except Exception as error:  # damaged bytes make numpy, zipfile and zlib raise nearly anything
         reason = (str(error).splitlines() or [type(error).__name__])[0]
+        if "pickle" in reason:  # NumPy's words recommend to load it all the same
+            reason = "of another format, or with Python objects"
         raise InputError(field, "a readable npz file without pickles", f"{path} ({reason})") from None
     if missing := sorted(set(needed) - set(arrays)):
         raise InputError(field, kind, f"{path} without {missing}")
