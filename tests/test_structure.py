@@ -15,6 +15,7 @@ LAYERS = [
     ["obstacles"],
     ["problem"],
     ["lagrangian", "judging"],
+    ["explaining"],
     ["solution", "native"],
     ["solvers", "roadmap", "contact"],
     ["guidance", "missions", "scenarios"],

@@ -83,9 +83,9 @@ def layout_grid(
         here = {solver: row[i] for solver, row in flights.items()}
         lead = passes(scene, i, _leading(scene, i, [flight.path for flight in here.values()]))
         for ax, plane in zip(axes[i], planes, strict=True):
-            drawn |= _obstacles(ax, scene, i, lead, plane)
+            drawn |= draw_obstacles(ax, scene, i, lead, plane)
             drawn |= _paths(ax, scene, i, here, plane)
-            _targets(ax, scene, i, plane)
+            draw_targets(ax, scene, i, plane)
         axes[i][0].set_title(f"layout {scene.ids[i]}", fontsize=TITLE, loc="left", color=INK)
     put_head(figure, _title(trials), _handles(scene, flights, drawn))
     return figure
@@ -141,7 +141,7 @@ def _leading(scene: Scene, i: int, paths: list[np.ndarray]) -> np.ndarray:
     return np.linspace(scene.start[i], scene.goal[i], 100)
 
 
-def _obstacles(ax: Axes, scene: Scene, i: int, lead: list[Pass], plane: Plane) -> set[str]:
+def draw_obstacles(ax: Axes, scene: Scene, i: int, lead: list[Pass], plane: Plane) -> set[str]:
     """Draw a layout's obstacles; returns the kinds of drawn shapes, for the legend."""
     own, grown, near = [], [], []
     moving = False
@@ -209,7 +209,7 @@ def _marker(kind: str) -> dict[str, Any]:
     return {"linestyle": "none", **shapes[kind]}
 
 
-def _targets(ax: Axes, scene: Scene, i: int, plane: Plane) -> None:
+def draw_targets(ax: Axes, scene: Scene, i: int, plane: Plane) -> None:
     """The start under the flights' marks, the goal over them."""
     start, goal = scene.start[i][list(plane)], scene.goal[i][list(plane)]
     look: dict[str, Any] = {"color": INK, "linestyle": "none", "markeredgecolor": "white", "markeredgewidth": 0.5}

@@ -17,7 +17,7 @@ from torchgco.native.dispatch import chord_clearance
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
 from torchgco.search.proposals import PathProposals, Round
-from torchgco.solution import SearchRecord
+from torchgco.solution import SearchRecord, Standing
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress
 from torchgco.solvers.history import Recorder
@@ -194,13 +194,28 @@ class Search:
             self.recorder.attempt += number > 1
             self.record.passes.append((number, name, []))
 
-    def finish_record(self) -> SearchRecord | None:
-        """The record, at the end of the search."""
-        if self.record is not None:
-            rows = (self.caught.status == STOPPED).nonzero().flatten()
-            self.record.caught = self.call.rows[rows], self.caught.last.X[rows]
-            self.record.passes = [(number, name, sorted(set(worked))) for number, name, worked in self.record.passes]
-        return self.record
+    def end_pass(self) -> None:
+        """Record the best trajectories after a pass."""
+        if self.record is None:
+            return
+        if not self.begun:
+            self.record.standings.append(None)
+            return
+        problem, best = self.call.problem, self.best.end.best
+        away = torch.full_like(best.cost, torch.nan)
+        if problem.goal is not None:
+            away = problem.goal.distance(best.X[:, -1, problem.position])
+        held = best.cost.clone(), best.violation.clone()
+        self.record.standings.append(Standing(self.call.rows, *held, away, self.best.arrived()))
+
+    def finish_record(self, unit: Tensor, constant: Tensor) -> SearchRecord | None:
+        """The record, at the end of the search, with costs times a unit, plus a constant, both by place."""
+        if self.record is None:
+            return None
+        rows = (self.caught.status == STOPPED).nonzero().flatten()
+        self.record.caught = self.call.rows[rows], self.caught.last.X[rows]
+        self.record.passes = [(number, name, sorted(set(worked))) for number, name, worked in self.record.passes]
+        return self.record.in_costs(unit, constant)
 
     def rows(self, when: str) -> Tensor:
         """The problems (b,) that a word describes, all among those that were caught.
