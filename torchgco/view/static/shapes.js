@@ -1,0 +1,212 @@
+// All obstacles of a layout in one draw call: rounded boxes. A sphere has no sides, a capsule one, a sharp box no radius.
+// A kind of obstacles that isn't made of rounded boxes gets its own mesh here.
+import * as THREE from "./three.module.min.js";
+
+const MANY = 60; // shapes from which on each has fewer corners
+const LONG = 0.35; // shapes longer than this share of the scene along an axis are cut where the scene ends
+
+/** The rounded box with half sides `corner` and radius 1 of `offset`: every vertex is half * corner + radius * offset. */
+function solid(steps) {
+  const corners = [];
+  const offsets = [];
+  const index = [];
+  const ring = quarterTurns(4, steps);
+  const levels = [];
+  for (const up of [-1, 1]) {
+    for (let i = 0; i <= steps; i++) levels.push({ up, angle: ((up < 0 ? i - steps : i) / steps) * 0.5 * Math.PI });
+  }
+  for (const { up, angle } of levels) {
+    for (const { x, y, sx, sy } of ring) {
+      corners.push(sx, sy, up);
+      offsets.push(Math.cos(angle) * x, Math.cos(angle) * y, Math.sin(angle));
+    }
+  }
+  const count = ring.length;
+  for (let level = 0; level + 1 < levels.length; level++) {
+    for (let i = 0; i < count; i++) {
+      const a = level * count + i;
+      const b = level * count + ((i + 1) % count);
+      index.push(a, b, b + count, a, b + count, a + count);
+    }
+  }
+  const quarter = steps + 1; // the first corner of each quarter
+  const top = (levels.length - 1) * count;
+  index.push(top, top + quarter, top + 2 * quarter, top, top + 2 * quarter, top + 3 * quarter);
+  index.push(0, 2 * quarter, quarter, 0, 3 * quarter, 2 * quarter);
+  return { corners, offsets, normals: offsets, index };
+}
+
+/** The same for the plane: a prism, rounded in the plane alone, with a lid. */
+function prism(steps) {
+  const corners = [];
+  const offsets = [];
+  const normals = [];
+  const index = [];
+  const ring = quarterTurns(4, steps);
+  for (const up of [-1, 1]) {
+    for (const { x, y, sx, sy } of ring) {
+      corners.push(sx, sy, up);
+      offsets.push(x, y, 0);
+      normals.push(x, y, 0);
+    }
+  }
+  const count = ring.length;
+  for (let i = 0; i < count; i++) {
+    const next = (i + 1) % count;
+    index.push(i, next, count + next, i, count + next, count + i);
+    corners.push(ring[i].sx, ring[i].sy, 1);
+    offsets.push(ring[i].x, ring[i].y, 0);
+    normals.push(0, 0, 1);
+    if (i > 1) index.push(2 * count, 2 * count + i - 1, 2 * count + i);
+  }
+  return { corners, offsets, normals, index };
+}
+
+/** Directions around z with both ends of each quarter, and the signs of its corner. */
+function quarterTurns(quarters, steps) {
+  const found = [];
+  for (let quarter = 0; quarter < quarters; quarter++) {
+    const middle = (quarter + 0.5) * 0.5 * Math.PI;
+    for (let i = 0; i <= steps; i++) {
+      const angle = (quarter + i / steps) * 0.5 * Math.PI;
+      const signs = { sx: Math.sign(Math.cos(middle)), sy: Math.sign(Math.sin(middle)) };
+      found.push({ x: Math.cos(angle), y: Math.sin(angle), ...signs });
+    }
+  }
+  return found;
+}
+
+const VERTEX = `
+attribute vec3 corner; attribute vec3 middle; attribute vec3 sides; attribute float radius;
+attribute vec4 turn; attribute vec3 velocity; attribute vec3 cut;
+uniform float time; uniform float grown;
+varying vec3 vPlace; varying vec3 vCut;
+vec3 turned(vec4 q, vec3 v) { return v + 2.0 * cross(q.yzw, cross(q.yzw, v) + q.x * v); }
+`;
+const PLACE = `
+vec3 transformed = middle + time * velocity + turned(turn, corner * sides + (radius + grown) * position);
+vPlace = transformed; vCut = cut;
+`;
+const FRAGMENT = `
+uniform vec3 low; uniform vec3 high; uniform vec3 inside;
+varying vec3 vPlace; varying vec3 vCut;
+`;
+const CUT = `
+if (any(greaterThan(vCut * max(low - vPlace, vPlace - high), vec3(0.0)))) discard;
+`;
+
+/** A material for the shapes; its uniforms are shared by all of a scene. */
+function material(kind, options, uniforms) {
+  const made = new THREE[kind]({ side: THREE.DoubleSide, ...options });
+  made.onBeforeCompile = (shader) => {
+    Object.assign(shader.uniforms, uniforms);
+    shader.vertexShader = (VERTEX + shader.vertexShader)
+      .replace("#include <beginnormal_vertex>", "vec3 objectNormal = turned(turn, normal);")
+      .replace("#include <begin_vertex>", PLACE);
+    shader.fragmentShader = (FRAGMENT + shader.fragmentShader)
+      .replace("#include <clipping_planes_fragment>", CUT)
+      .replace("#include <opaque_fragment>", "if (!gl_FrontFacing) outgoingLight = inside;\n#include <opaque_fragment>");
+  };
+  return made;
+}
+
+/** The obstacles of a layout as meshes, and the numbers that the scene changes later. */
+export function obstacles(parts, space, colours) {
+  const group = new THREE.Group();
+  const uniforms = {
+    time: { value: 0 }, low: { value: space.low }, high: { value: space.high }, inside: { value: colours.inside },
+  };
+  const mine = { ...uniforms, grown: { value: 0 } };
+  const solidMaterial = material("MeshLambertMaterial", { color: colours.obstacle }, mine);
+  const shadow = material("MeshDepthMaterial", { depthPacking: THREE.RGBADepthPacking }, mine);
+  const around = { ...uniforms, grown: { value: space.radius } };
+  const hull = { color: colours.obstacle, transparent: true, opacity: 0.18, depthWrite: false };
+  const grownMaterial = material("MeshLambertMaterial", hull, around);
+  const shells = [];
+  for (const part of parts) {
+    const geometry = geometryOf(part, space);
+    const mesh = new THREE.Mesh(geometry, solidMaterial);
+    mesh.castShadow = mesh.receiveShadow = true;
+    mesh.customDepthMaterial = shadow;
+    const shell = new THREE.Mesh(geometry, grownMaterial);
+    shell.visible = false;
+    shells.push(shell);
+    for (const one of [mesh, shell]) {
+      one.frustumCulled = false;
+      group.add(one);
+    }
+  }
+  const until = Math.min(...parts.map((part) => part.until ?? Infinity), Infinity);
+  return {
+    group,
+    moving: parts.some((part) => part.velocity),
+    setTime: (t) => (uniforms.time.value = Math.min(t, until)),
+    setGrown: (on) => shells.forEach((shell) => (shell.visible = on)),
+    setSeeThrough: (on) => {
+      solidMaterial.transparent = on;
+      solidMaterial.opacity = on ? 0.3 : 1;
+      solidMaterial.depthWrite = !on;
+      solidMaterial.needsUpdate = true;
+    },
+    dispose: () => {
+      [solidMaterial, shadow, grownMaterial].forEach((one) => one.dispose());
+      group.children.forEach((mesh) => mesh.geometry.dispose());
+    },
+  };
+}
+
+function geometryOf(part, space) {
+  const steps = part.count > MANY ? 3 : 6;
+  const template = space.flat ? prism(2 * steps) : solid(steps);
+  const geometry = new THREE.InstancedBufferGeometry();
+  geometry.instanceCount = part.count;
+  geometry.setIndex(template.index);
+  geometry.setAttribute("position", new THREE.Float32BufferAttribute(template.offsets, 3));
+  geometry.setAttribute("normal", new THREE.Float32BufferAttribute(template.normals, 3));
+  geometry.setAttribute("corner", new THREE.Float32BufferAttribute(template.corners, 3));
+  const rows = instances(part, space);
+  for (const [name, size] of Object.entries({ middle: 3, sides: 3, radius: 1, turn: 4, velocity: 3, cut: 3 })) {
+    geometry.setAttribute(name, new THREE.InstancedBufferAttribute(rows[name], size));
+  }
+  return geometry;
+}
+
+/** Numbers per shape, in space also where they are given in the plane. */
+export function instances(part, space) {
+  const row = (array, k) => (array ? Math.min(k, array.rows - 1) * array.width : 0);
+  const sizes = { middle: 3, sides: 3, radius: 1, turn: 4, velocity: 3, cut: 3 };
+  const found = Object.fromEntries(
+    Object.entries(sizes).map(([name, size]) => [name, new Float32Array(size * part.count)]),
+  );
+  const direction = new THREE.Vector3();
+  const quaternion = new THREE.Quaternion();
+  for (let k = 0; k < part.count; k++) {
+    for (let i = 0; i < (space.flat ? 2 : 3); i++) {
+      found.middle[3 * k + i] = part.center.data[row(part.center, k) + i] + space.middle[i];
+      found.sides[3 * k + i] = part.half.data[row(part.half, k) + i];
+      if (part.velocity) found.velocity[3 * k + i] = part.velocity.data[row(part.velocity, k) + i];
+    }
+    if (space.flat) {
+      found.middle[3 * k + 2] = found.sides[3 * k + 2] = 0.5 * space.height;
+    }
+    found.radius[k] = part.radius.data[row(part.radius, k)];
+    found.turn.set(turnOf(part.turn, row(part.turn, k)), 4 * k);
+    const [w, x, y, z] = found.turn.subarray(4 * k, 4 * k + 4);
+    quaternion.set(x, y, z, w);
+    const reach = [0, 0, 0];
+    for (let i = 0; i < 3; i++) {
+      direction.set(0, 0, 0).setComponent(i, found.sides[3 * k + i]).applyQuaternion(quaternion);
+      direction.toArray().forEach((value, axis) => (reach[axis] += Math.abs(value)));
+    }
+    const long = reach.map((value) => (value + found.radius[k] > LONG * space.size && !space.flat ? 1 : 0));
+    found.cut.set(long, 3 * k);
+  }
+  return found;
+}
+
+function turnOf(turn, at) {
+  if (!turn) return [1, 0, 0, 0];
+  if (turn.width === 4) return turn.data.subarray(at, at + 4);
+  const half = 0.5 * turn.data[at];
+  return [Math.cos(half), 0, 0, Math.sin(half)];
+}
