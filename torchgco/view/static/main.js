@@ -12,6 +12,15 @@ import { build, by, showLayout, showSearch, showTime } from "./panel.js";
 const SLOW = 1 / 31; // s a frame, above which the picture gets coarser while it moves
 const COARSEST = 0.4; // pixels of the picture per pixel of the screen
 
+/** Whether pictures are computed without a graphics card: smooth edges would cost half of the time. */
+function software() {
+  const context = document.createElement("canvas").getContext("webgl2");
+  const names = context?.getExtension("WEBGL_debug_renderer_info");
+  const name = names ? context.getParameter(names.UNMASKED_RENDERER_WEBGL) : "";
+  context?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
+
 class Page {
   constructor(head) {
     this.head = head;
@@ -20,7 +29,7 @@ class Page {
     this.asked = asked;
     this.still = asked.has("picture"); // nothing but the picture, as fine as can be
     document.body.classList.toggle("picture", this.still);
-    this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: true, preserveDrawingBuffer: true });
+    this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: !software() });
     this.renderer.shadowMap.enabled = this.still;
     this.scene = new THREE.Scene();
     this.sun = lights(this.scene);
@@ -43,8 +52,7 @@ class Page {
   }
 
   get colours() {
-    const chosen = this.dark.matches ? DARK : LIGHT;
-    return { ...chosen, inside: new THREE.Color(chosen.inside) };
+    return this.dark.matches ? DARK : LIGHT;
   }
 
   async start() {
@@ -108,10 +116,10 @@ class Page {
     const { scene, layout, colours } = this;
     scene.background = new THREE.Color(colours.sky);
     this.space = spaceOf(layout, this.head);
-    this.obstacles = obstacles(layout.obstacles, this.space, colours);
+    this.obstacles = obstacles(layout.obstacles, this.space, colours, this.still);
     this.flights = new Flights(layout, this.head, this.space);
     this.search = layout.search ? new Search(layout.search, this.space) : null;
-    this.around = surroundings(layout, this.space, colours);
+    this.around = surroundings(layout, this.space, colours, this.still);
     aim(this.sun, this.space);
     scene.add(this.obstacles.group, this.flights.group, this.around);
     if (this.search) scene.add(this.search.group);
@@ -287,4 +295,5 @@ class Page {
 export async function start() {
   const page = new Page(await part("head"));
   await page.start();
+  window.pageUnderTest = page;
 }

@@ -1,12 +1,13 @@
 // Light, ground, start and goal of a layout, and how large it is.
 import * as THREE from "./three.module.min.js";
 import { point } from "./data.js";
+import { SUN } from "./shapes.js";
 
 const SIDEWAYS = 0.25; // shares of the scene's size that are kept around the trajectories
 const UPWARDS = 0.1;
 
-export const LIGHT = { sky: 0xf7f8f9, obstacle: 0xcfc3ae, inside: 0x8f8470, ground: 0xe9ebee, line: 0xc9ced6 };
-export const DARK = { sky: 0x16191d, obstacle: 0x8d8676, inside: 0x4a463d, ground: 0x20242a, line: 0x3a414b };
+export const LIGHT = { sky: 0xf7f8f9, obstacle: 0xcfc3ae, ground: 0xe9ebee, line: 0xc9ced6 };
+export const DARK = { sky: 0x16191d, obstacle: 0x8d8676, ground: 0x20242a, line: 0x3a414b };
 
 /** The box around start, goal and the trajectories that end well, and the room in which long obstacles are shown. */
 export function spaceOf(layout, head) {
@@ -43,17 +44,17 @@ export function lights(scene) {
 export function aim(sun, space) {
   const middle = space.low.clone().add(space.high).multiplyScalar(0.5);
   sun.target.position.copy(middle);
-  sun.position.copy(middle).add(new THREE.Vector3(-0.5, -0.8, 1.7).multiplyScalar(space.size));
+  sun.position.copy(middle).add(SUN.clone().multiplyScalar(2 * space.size));
   const reach = 0.9 * space.size;
   Object.assign(sun.shadow.camera, { left: -reach, right: reach, top: reach, bottom: -reach, near: 0.1, far: 5 * space.size });
   sun.shadow.camera.updateProjectionMatrix();
 }
 
 /** Ground with lines at round distances, start and goal. */
-export function surroundings(layout, space, colours) {
+export function surroundings(layout, space, colours, still) {
   const group = new THREE.Group();
   const floor = space.flat ? 0 : space.low.z;
-  group.add(...ground(space, floor, colours));
+  group.add(...ground(space, floor, colours, still));
   if (layout.start) group.add(mark(layout.start, space, new THREE.BoxGeometry(1, 1, 1), colours));
   if (layout.goal) {
     group.add(mark(layout.goal, space, new THREE.OctahedronGeometry(0.8), colours));
@@ -62,21 +63,19 @@ export function surroundings(layout, space, colours) {
   return group;
 }
 
-function ground(space, floor, colours) {
+function ground(space, floor, colours, still) {
   const step = 10 ** Math.floor(Math.log10(space.size / 4));
   const width = step * Math.ceil((1.6 * space.size) / step);
   const middle = space.box.getCenter(new THREE.Vector3());
   const at = [step * Math.round(middle.x / step), step * Math.round(middle.y / step)];
-  const plane = new THREE.Mesh(
-    new THREE.PlaneGeometry(2 * width, 2 * width),
-    new THREE.MeshLambertMaterial({ color: colours.ground, side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: 2 }),
-  );
+  const look = { color: colours.ground, side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: 2 };
+  const paint = still ? new THREE.MeshLambertMaterial(look) : new THREE.MeshBasicMaterial(look);
+  const plane = new THREE.Mesh(new THREE.PlaneGeometry(2 * width, 2 * width), paint);
   plane.receiveShadow = true;
   plane.position.set(at[0], at[1], floor - 0.002 * space.size);
   const lines = new THREE.GridHelper(2 * width, Math.round((2 * width) / step), colours.line, colours.line);
   lines.rotation.x = 0.5 * Math.PI;
   lines.position.set(at[0], at[1], floor - 0.001 * space.size);
-  plane.userData.step = step;
   return [plane, lines];
 }
 

@@ -3,7 +3,8 @@
 import * as THREE from "./three.module.min.js";
 
 const MANY = 60; // shapes from which on each has fewer corners
-const LONG = 0.35; // shapes longer than this share of the scene along an axis are cut where the scene ends
+const LONG = 0.35; // half sides longer than this share of the scene are cut where the scene ends
+export const SUN = new THREE.Vector3(-0.25, -0.4, 0.88).normalize();
 
 /** The rounded box with half sides `corner` and radius 1 of `offset`: every vertex is half * corner + radius * offset. */
 function solid(steps) {
@@ -76,81 +77,85 @@ function quarterTurns(quarters, steps) {
   return found;
 }
 
-const VERTEX = `
+// Long shapes end where the scene does: their corners are moved there, which leaves a flat end.
+const SHAPE = `
 attribute vec3 corner; attribute vec3 middle; attribute vec3 sides; attribute float radius;
 attribute vec4 turn; attribute vec3 velocity; attribute vec3 cut;
-uniform float time; uniform float grown;
-varying vec3 vPlace; varying vec3 vCut;
+uniform float time; uniform float grown; uniform vec3 low; uniform vec3 high;
 vec3 turned(vec4 q, vec3 v) { return v + 2.0 * cross(q.yzw, cross(q.yzw, v) + q.x * v); }
+vec3 whole() { return middle + time * velocity + turned(turn, corner * sides + (radius + grown) * position); }
+vec3 placed(vec3 p) { return mix(p, clamp(p, low, high), cut); }
+vec3 faced(vec3 p) {
+  vec3 over = cut * (step(high, p) - step(p, low));
+  return dot(over, over) > 0.0 ? normalize(over) : turned(turn, normal);
+}
 `;
-const PLACE = `
-vec3 transformed = middle + time * velocity + turned(turn, corner * sides + (radius + grown) * position);
-vPlace = transformed; vCut = cut;
-`;
-const FRAGMENT = `
-uniform vec3 low; uniform vec3 high; uniform vec3 inside;
-varying vec3 vPlace; varying vec3 vCut;
-`;
-const CUT = `
-if (any(greaterThan(vCut * max(low - vPlace, vPlace - high), vec3(0.0)))) discard;
-`;
+// Light is computed at the corners alone: without a graphics card every pixel counts.
+const PLAIN = {
+  vertexShader: `${SHAPE}
+    uniform vec3 colour; uniform vec3 sun; varying vec3 shade;
+    void main() {
+      vec3 p = whole();
+      vec3 n = faced(p);
+      vec3 light = mix(vec3(0.42, 0.40, 0.38), vec3(0.66, 0.67, 0.69), 0.5 + 0.5 * n.z) + 0.5 * max(0.0, dot(n, sun));
+      shade = pow(colour * light, vec3(1.0 / 2.2));
+      gl_Position = projectionMatrix * viewMatrix * vec4(placed(p), 1.0);
+    }`,
+  fragmentShader: "uniform float opacity; varying vec3 shade; void main() { gl_FragColor = vec4(shade, opacity); }",
+};
 
-/** A material for the shapes; its uniforms are shared by all of a scene. */
-function material(kind, options, uniforms) {
-  const made = new THREE[kind]({ side: THREE.DoubleSide, ...options });
+function plain(colour, opacity, uniforms) {
+  const own = { colour: { value: colour }, opacity: { value: opacity }, sun: { value: SUN } };
+  const made = new THREE.ShaderMaterial({ ...PLAIN, uniforms: { ...uniforms, ...own } });
+  made.transparent = opacity < 1;
+  made.depthWrite = opacity === 1;
+  return made;
+}
+
+/** A material of three.js for the shapes, with shadows, for pictures that stand still. */
+function shaded(kind, options, uniforms) {
+  const made = new THREE[kind](options);
   made.onBeforeCompile = (shader) => {
     Object.assign(shader.uniforms, uniforms);
-    shader.vertexShader = (VERTEX + shader.vertexShader)
-      .replace("#include <beginnormal_vertex>", "vec3 objectNormal = turned(turn, normal);")
-      .replace("#include <begin_vertex>", PLACE);
-    shader.fragmentShader = (FRAGMENT + shader.fragmentShader)
-      .replace("#include <clipping_planes_fragment>", CUT)
-      .replace("#include <opaque_fragment>", "if (!gl_FrontFacing) outgoingLight = inside;\n#include <opaque_fragment>");
+    shader.vertexShader = (SHAPE + shader.vertexShader)
+      .replace("#include <beginnormal_vertex>", "vec3 objectNormal = faced(whole());")
+      .replace("#include <begin_vertex>", "vec3 transformed = placed(whole());");
   };
   return made;
 }
 
 /** The obstacles of a layout as meshes, and the numbers that the scene changes later. */
-export function obstacles(parts, space, colours) {
+export function obstacles(parts, space, colours, still) {
   const group = new THREE.Group();
-  const uniforms = {
-    time: { value: 0 }, low: { value: space.low }, high: { value: space.high }, inside: { value: colours.inside },
-  };
-  const mine = { ...uniforms, grown: { value: 0 } };
-  const solidMaterial = material("MeshLambertMaterial", { color: colours.obstacle }, mine);
-  const shadow = material("MeshDepthMaterial", { depthPacking: THREE.RGBADepthPacking }, mine);
-  const around = { ...uniforms, grown: { value: space.radius } };
-  const hull = { color: colours.obstacle, transparent: true, opacity: 0.18, depthWrite: false };
-  const grownMaterial = material("MeshLambertMaterial", hull, around);
+  const uniforms = { time: { value: 0 }, low: { value: space.low }, high: { value: space.high }, grown: { value: 0 } };
+  const colour = new THREE.Color(colours.obstacle);
+  const solids = still ? shaded("MeshLambertMaterial", { color: colour }, uniforms) : plain(colour, 1, uniforms);
+  const clear = plain(colour, 0.3, uniforms);
+  const hull = plain(colour, 0.18, { ...uniforms, grown: { value: space.radius } });
+  const shadow = shaded("MeshDepthMaterial", { depthPacking: THREE.RGBADepthPacking }, uniforms);
+  const meshes = [];
   const shells = [];
   for (const part of parts) {
     const geometry = geometryOf(part, space);
-    const mesh = new THREE.Mesh(geometry, solidMaterial);
+    const mesh = new THREE.Mesh(geometry, solids);
     mesh.castShadow = mesh.receiveShadow = true;
     mesh.customDepthMaterial = shadow;
-    const shell = new THREE.Mesh(geometry, grownMaterial);
+    const shell = new THREE.Mesh(geometry, hull);
     shell.visible = false;
+    meshes.push(mesh);
     shells.push(shell);
-    for (const one of [mesh, shell]) {
-      one.frustumCulled = false;
-      group.add(one);
-    }
   }
+  group.add(...meshes, ...shells);
+  group.children.forEach((one) => (one.frustumCulled = false));
   const until = Math.min(...parts.map((part) => part.until ?? Infinity), Infinity);
   return {
     group,
-    moving: parts.some((part) => part.velocity),
     setTime: (t) => (uniforms.time.value = Math.min(t, until)),
     setGrown: (on) => shells.forEach((shell) => (shell.visible = on)),
-    setSeeThrough: (on) => {
-      solidMaterial.transparent = on;
-      solidMaterial.opacity = on ? 0.3 : 1;
-      solidMaterial.depthWrite = !on;
-      solidMaterial.needsUpdate = true;
-    },
+    setSeeThrough: (on) => meshes.forEach((mesh) => (mesh.material = on ? clear : solids)),
     dispose: () => {
-      [solidMaterial, shadow, grownMaterial].forEach((one) => one.dispose());
-      group.children.forEach((mesh) => mesh.geometry.dispose());
+      [solids, clear, hull, shadow].forEach((one) => one.dispose());
+      meshes.forEach((mesh) => mesh.geometry.dispose());
     },
   };
 }
@@ -178,28 +183,31 @@ export function instances(part, space) {
   const found = Object.fromEntries(
     Object.entries(sizes).map(([name, size]) => [name, new Float32Array(size * part.count)]),
   );
-  const direction = new THREE.Vector3();
-  const quaternion = new THREE.Quaternion();
   for (let k = 0; k < part.count; k++) {
     for (let i = 0; i < (space.flat ? 2 : 3); i++) {
       found.middle[3 * k + i] = part.center.data[row(part.center, k) + i] + space.middle[i];
       found.sides[3 * k + i] = part.half.data[row(part.half, k) + i];
       if (part.velocity) found.velocity[3 * k + i] = part.velocity.data[row(part.velocity, k) + i];
     }
-    if (space.flat) {
-      found.middle[3 * k + 2] = found.sides[3 * k + 2] = 0.5 * space.height;
-    }
+    if (space.flat) found.middle[3 * k + 2] = found.sides[3 * k + 2] = 0.5 * space.height;
     found.radius[k] = part.radius.data[row(part.radius, k)];
     found.turn.set(turnOf(part.turn, row(part.turn, k)), 4 * k);
-    const [w, x, y, z] = found.turn.subarray(4 * k, 4 * k + 4);
-    quaternion.set(x, y, z, w);
-    const reach = [0, 0, 0];
-    for (let i = 0; i < 3; i++) {
-      direction.set(0, 0, 0).setComponent(i, found.sides[3 * k + i]).applyQuaternion(quaternion);
-      direction.toArray().forEach((value, axis) => (reach[axis] += Math.abs(value)));
-    }
-    const long = reach.map((value) => (value + found.radius[k] > LONG * space.size && !space.flat ? 1 : 0));
-    found.cut.set(long, 3 * k);
+    if (!space.flat) found.cut.set(cuts(found, k, space), 3 * k);
+  }
+  return found;
+}
+
+/** 1 for the axes along which shape k is long and straight, else 0: only then does a moved corner leave it straight. */
+function cuts({ sides, radius, turn }, k, space) {
+  const [w, x, y, z] = turn.subarray(4 * k, 4 * k + 4);
+  const quaternion = new THREE.Quaternion(x, y, z, w);
+  const found = [0, 0, 0];
+  for (let i = 0; i < 3; i++) {
+    const half = sides[3 * k + i];
+    if (half + radius[k] <= LONG * space.size) continue;
+    const along = new THREE.Vector3().setComponent(i, 1).applyQuaternion(quaternion).toArray().map(Math.abs);
+    const axis = along.indexOf(Math.max(...along));
+    if (along[axis] > 0.99999 && half > 0) found[axis] = 1;
   }
   return found;
 }
