@@ -51,7 +51,8 @@ class Socket:
     def send(self, text: str) -> None:
         data, mask = text.encode(), os.urandom(4)
         size = len(data)
-        length = bytes([0x80 | size]) if size < 126 else struct.pack("!BH" if size < 2**16 else "!BQ", 0xFE if size < 2**16 else 0xFF, size)
+        length = struct.pack("!BH", 0xFE, size) if size < 2**16 else struct.pack("!BQ", 0xFF, size)
+        length = bytes([0x80 | size]) if size < 126 else length
         masked = bytes(byte ^ mask[i % 4] for i, byte in enumerate(data))
         self.raw.sendall(b"\x81" + length + mask + masked)
 
@@ -182,12 +183,17 @@ def browser(program: str) -> Iterator[Callable[[], Tab]]:
                 time.sleep(0.05)
             port = int(mark.read_text().split()[0])
 
+            tabs: list[Tab] = []
+
             def tab() -> Tab:
                 request = urllib.request.Request(f"http://127.0.0.1:{port}/json/new?about:blank", method="PUT")
                 with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
-                    return Tab(json.load(answer)["webSocketDebuggerUrl"])
+                    tabs.append(Tab(json.load(answer)["webSocketDebuggerUrl"]))
+                return tabs[-1]
 
             yield tab
+            for one in tabs:
+                one.socket.raw.close()
         finally:
             process.terminate()
             process.wait(timeout=PATIENCE)

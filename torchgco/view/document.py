@@ -120,14 +120,12 @@ class SearchPart:
     guides: Sequence[tuple[str, np.ndarray, np.ndarray]] = ()
 
     def packed(self, packing: Packing) -> dict[str, Any]:
-        return {
-            "passes": list(self.passes),
-            "rounds": [{"name": name, "lines": [_line(packing, line) for line in lines]} for name, lines in self.rounds],
-            "guides": [
-                {"name": name, "balls": packing.put(balls), "sample": packing.put(sample, steps=True)}
-                for name, balls, sample in self.guides
-            ],
-        }
+        rounds = [{"name": name, "lines": [_line(packing, line) for line in lines]} for name, lines in self.rounds]
+        guides = [
+            {"name": name, "balls": packing.put(balls), "sample": packing.put(sample, steps=True)}
+            for name, balls, sample in self.guides
+        ]
+        return {"passes": list(self.passes), "rounds": rounds, "guides": guides}
 
 
 def _line(packing: Packing, line: Line) -> dict[str, Any]:

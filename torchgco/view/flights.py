@@ -112,8 +112,15 @@ def whole(X: np.ndarray) -> np.ndarray:
 
 
 def flights_of(
-    problem: Problem, look: Look, X: Tensor, U: Tensor, solver: str, results: list[str], rows: list[Rows],
-    admitted: float, touching: np.ndarray,
+    problem: Problem,
+    look: Look,
+    X: Tensor,
+    U: Tensor,
+    solver: str,
+    results: list[str],
+    rows: list[Rows],
+    admitted: float,
+    touching: np.ndarray,
 ) -> list[Flight]:
     """The trajectories X (B, N+1, n), U (B, N, m) of one solver.
 

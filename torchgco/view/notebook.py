@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from html import escape
-from pathlib import Path
-
 import numpy as np
 
 from torchgco.base.errors import InputError
-from torchgco.base.files import write_whole
+from torchgco.base.html import HtmlPage
 from torchgco.base.shapes import check_shape
 from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import ADMITTED
@@ -21,33 +17,8 @@ from torchgco.view.page import page
 from torchgco.view.searches import search_of
 from torchgco.view.vehicles import look_of
 
-HEIGHT = 560  # pixels of the page in a notebook
 
-
-@dataclass(frozen=True)
-class Shown:
-    """A page; a notebook shows it, and `save` writes it into a file that needs neither notebook nor network.
-
-    Args:
-        html: the text of the whole page.
-    """
-
-    html: str
-
-    def _repr_html_(self) -> str:
-        frame = f'width="100%" height="{HEIGHT}" style="border:0" title="Trajectories among obstacles"'
-        return f'<iframe srcdoc="{escape(self.html)}" {frame}></iframe>'
-
-    def __repr__(self) -> str:
-        return f"Shown({len(self.html) / 1e6:.2f} MB of HTML; .save(path) writes it)"
-
-    def save(self, path: str | Path) -> Path:
-        """Write the page: all of it or, if interrupted, nothing."""
-        write_whole(path, lambda file: file.write(self.html.encode()))
-        return Path(path)
-
-
-def show(problem: Problem, solution: Solution, name: str = "solution") -> Shown:
+def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPage:
     """The page of a batch of problems, a layout each, with their trajectories, and the search where it was recorded.
 
     Raises:
@@ -56,9 +27,9 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> Shown:
     check_problem(problem)
     check_shape(solution.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
     check_shape(solution.U, (problem.B, problem.N, problem.m), "problem: solution.U")
-    where = problem.position
-    if where.stop - where.start not in (2, 3):
-        raise InputError("dynamics.position", "a position in the plane or in space", f"{where.stop - where.start} states")
+    dimension = problem.position.stop - problem.position.start
+    if dimension not in (2, 3):
+        raise InputError("dynamics.position", "a position in the plane or in space", f"{dimension} states")
     if problem.B == 0:
         raise InputError("problem", "at least one problem to show", "an empty batch")
     look, rows, results, touching = look_of(problem.dynamics), *_told(problem, solution)
@@ -66,12 +37,12 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> Shown:
     radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
     document = Document(
         title="torchgco", about=f"{problem.B} problems, {problem.N} stages" if problem.B > 1 else f"{problem.N} stages",
-        dimension=where.stop - where.start, dt=float(problem.dynamics.dt), look=look, radius=radius, solvers=[name],
+        dimension=dimension, dt=float(problem.dynamics.dt), look=look, radius=radius, solvers=[name],
         constraints=[constraint_name(part) for part in problem.constraints],
     )  # fmt: skip
     for b, flight in enumerate(flights):
         document.add(f"problem {b}", problem, b, [flight], search_of(solution, problem, b))
-    return Shown(page(document))
+    return HtmlPage(page(document), "Trajectories among obstacles")
 
 
 def _told(problem: Problem, solution: Solution) -> tuple[list[Rows], list[str], np.ndarray]:
@@ -99,4 +70,3 @@ def constraint_name(part: Constraint) -> str:
     """The user's name of a constraint, else its kind, as `worst_rows` has it."""
     given = getattr(part, "name", None)
     return given if isinstance(given, str) and given != "constraint" else type(part).__name__.removeprefix("Bound")
-

@@ -75,9 +75,7 @@ def _spheres(part: BoundSpheres, b: int) -> Shapes:
     moves = part.velocities is not None and bool(part.velocities[b].any())
     velocity = _rows(part.velocities, b, here) if moves and part.velocities is not None else None
     stop = None if part.stops is None else float(part.stops[b]) * part.dt
-    return Shapes(
-        center, np.zeros((1, center.shape[1])), radius - float(part.vehicle_radius[b]), None, velocity, stop
-    )
+    return Shapes(center, np.zeros((1, center.shape[1])), radius - float(part.vehicle_radius[b]), None, velocity, stop)
 
 
 def _boxes(part: BoundBoxes, b: int) -> Shapes:

@@ -22,7 +22,6 @@ from torchgco.experiments.results.records import DONE, LAYOUTS, MANIFEST, MISSIO
 from torchgco.experiments.results.runs import read_trials
 from torchgco.judging.judge import OTHERS_WITHIN
 from torchgco.lagrangian.rollout import open_loop
-from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts, Vehicle
 from torchgco.view.document import Document

@@ -85,6 +85,7 @@ export class Flights {
       group.add(line, ghost);
     }
     const body = vehicle(this.head.body, this.head.radius || 0.012 * this.space.size, colour, this.space.flat);
+    body.add(dot(colour));
     group.add(body, ...this.marks(flight, points));
     const plan = flight.plan ? this.planned(flight, colour) : null;
     if (plan) group.add(plan);
@@ -159,6 +160,14 @@ export class Flights {
       if (one.material) one.material.dispose();
     });
   }
+}
+
+/** A dot that shows where a vehicle is behind obstacles, too. */
+function dot(colour) {
+  const look = { color: colour, size: 7, sizeAttenuation: false, transparent: true, opacity: 0.75, depthTest: false };
+  const made = new THREE.Points(new THREE.BufferGeometry().setFromPoints([new THREE.Vector3()]), new THREE.PointsMaterial(look));
+  made.renderOrder = 7;
+  return made;
 }
 
 /** The quaternion between two knots: the shorter way, as both signs mean the same. */

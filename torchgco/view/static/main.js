@@ -1,6 +1,6 @@
 // The page: what is chosen, and the loop that draws it.
 import * as THREE from "./three.module.min.js";
-import { part } from "./data.js";
+import { half, part } from "./data.js";
 import { obstacles } from "./shapes.js";
 import { Orbit } from "./camera.js";
 import { DARK, LIGHT, aim, lights, spaceOf, surroundings } from "./scenery.js";
@@ -10,6 +10,7 @@ import { linesOf, pick, showHover } from "./hover.js";
 import { build, by, showLayout, showSearch, showTime } from "./panel.js";
 
 const SLOW = 1 / 31; // s a frame, above which the picture gets coarser while it moves
+const TOLD = 100; // ms between two updates of the text while playing
 const COARSEST = 0.4; // pixels of the picture per pixel of the screen
 
 /** Whether pictures are computed without a graphics card: smooth edges would cost half of the time. */
@@ -148,7 +149,7 @@ class Page {
     const { start, goal } = this.layout;
     const middle = this.space.box.getCenter(new THREE.Vector3());
     const ahead = start && goal ? Math.atan2(goal[1] - start[1], goal[0] - start[0]) : 0;
-    const radius = 0.5 * Math.max(size, 0.5 * high.distanceTo(low)) * 1.08;
+    const radius = 0.5 * Math.max(size, 0.5 * high.distanceTo(low)) * 0.95;
     const views = {
       perspective: [ahead - 0.5 * Math.PI - 0.45, flat ? 1.0 : 0.5],
       above: [-0.5 * Math.PI, 1.57],
@@ -203,7 +204,7 @@ class Page {
     this.playing = on;
     this.spent = [];
     if (!on) this.setRatio(this.finest);
-    showTime(this.time, this.flights.duration, on);
+    this.tell();
     this.redraw();
   }
 
@@ -212,10 +213,18 @@ class Page {
     this.obstacles.setTime(this.time);
     this.flights.setTime(this.time);
     if (this.shown.follow) this.follow();
+    this.redraw();
+    const now = performance.now();
+    if (this.playing && now - (this.told ?? 0) < TOLD) return; // text costs more than the picture
+    this.told = now;
+    this.tell();
+  }
+
+  tell() {
     const [first] = this.flights.all;
     if (first) this.canvas.dataset.vehicle = first.body.position.toArray().map((value) => value.toFixed(3)).join(" ");
+    this.canvas.dataset.frames = this.frames;
     showTime(this.time, this.flights.duration, this.playing);
-    this.redraw();
   }
 
   follow() {
@@ -288,12 +297,12 @@ class Page {
     this.stale = false;
     this.renderer.render(this.scene, this.orbit.camera);
     this.frames += 1;
-    this.canvas.dataset.frames = this.frames;
   }
 }
 
 export async function start() {
   const page = new Page(await part("head"));
   await page.start();
-  window.pageUnderTest = page;
+  window.torchgcoView = page; // for scripts, such as those that take pictures
+  page.half = half;
 }

@@ -7,14 +7,14 @@ const LONG = 0.35; // half sides longer than this share of the scene are cut whe
 export const SUN = new THREE.Vector3(-0.25, -0.4, 0.88).normalize();
 
 /** The rounded box with half sides `corner` and radius 1 of `offset`: every vertex is half * corner + radius * offset. */
-function solid(steps) {
+function solid(steps, rings) {
   const corners = [];
   const offsets = [];
   const index = [];
   const ring = quarterTurns(4, steps);
   const levels = [];
   for (const up of [-1, 1]) {
-    for (let i = 0; i <= steps; i++) levels.push({ up, angle: ((up < 0 ? i - steps : i) / steps) * 0.5 * Math.PI });
+    for (let i = 0; i <= rings; i++) levels.push({ up, angle: ((up < 0 ? i - rings : i) / rings) * 0.5 * Math.PI });
   }
   for (const { up, angle } of levels) {
     for (const { x, y, sx, sy } of ring) {
@@ -82,12 +82,17 @@ const SHAPE = `
 attribute vec3 corner; attribute vec3 middle; attribute vec3 sides; attribute float radius;
 attribute vec4 turn; attribute vec3 velocity; attribute vec3 cut;
 uniform float time; uniform float grown; uniform vec3 low; uniform vec3 high;
+#ifdef STRAIGHT
+#define turned(q, v) (v)
+#else
 vec3 turned(vec4 q, vec3 v) { return v + 2.0 * cross(q.yzw, cross(q.yzw, v) + q.x * v); }
+#endif
 vec3 whole() { return middle + time * velocity + turned(turn, corner * sides + (radius + grown) * position); }
 vec3 placed(vec3 p) { return mix(p, clamp(p, low, high), cut); }
 vec3 faced(vec3 p) {
+  vec3 n = turned(turn, normal);
   vec3 over = cut * (step(high, p) - step(p, low));
-  return dot(over, over) > 0.0 ? normalize(over) : turned(turn, normal);
+  return dot(over, n) > 0.001 ? normalize(over) : n;
 }
 `;
 // Light is computed at the corners alone: without a graphics card every pixel counts.
@@ -104,9 +109,10 @@ const PLAIN = {
   fragmentShader: "uniform float opacity; varying vec3 shade; void main() { gl_FragColor = vec4(shade, opacity); }",
 };
 
-function plain(colour, opacity, uniforms) {
+function plain(colour, opacity, uniforms, straight) {
   const own = { colour: { value: colour }, opacity: { value: opacity }, sun: { value: SUN } };
   const made = new THREE.ShaderMaterial({ ...PLAIN, uniforms: { ...uniforms, ...own } });
+  if (straight) made.defines.STRAIGHT = true;
   made.transparent = opacity < 1;
   made.depthWrite = opacity === 1;
   return made;
@@ -129,9 +135,10 @@ export function obstacles(parts, space, colours, still) {
   const group = new THREE.Group();
   const uniforms = { time: { value: 0 }, low: { value: space.low }, high: { value: space.high }, grown: { value: 0 } };
   const colour = new THREE.Color(colours.obstacle);
-  const solids = still ? shaded("MeshLambertMaterial", { color: colour }, uniforms) : plain(colour, 1, uniforms);
-  const clear = plain(colour, 0.3, uniforms);
-  const hull = plain(colour, 0.18, { ...uniforms, grown: { value: space.radius } });
+  const straight = parts.every((part) => !part.turn);
+  const solids = still ? shaded("MeshLambertMaterial", { color: colour }, uniforms) : plain(colour, 1, uniforms, straight);
+  const clear = plain(colour, 0.3, uniforms, straight);
+  const hull = plain(colour, 0.18, { ...uniforms, grown: { value: space.radius } }, straight);
   const shadow = shaded("MeshDepthMaterial", { depthPacking: THREE.RGBADepthPacking }, uniforms);
   const meshes = [];
   const shells = [];
@@ -161,8 +168,8 @@ export function obstacles(parts, space, colours, still) {
 }
 
 function geometryOf(part, space) {
-  const steps = part.count > MANY ? 3 : 6;
-  const template = space.flat ? prism(2 * steps) : solid(steps);
+  const [steps, rings] = part.count > MANY ? [3, 2] : [6, 5];
+  const template = space.flat ? prism(2 * steps) : solid(steps, rings);
   const geometry = new THREE.InstancedBufferGeometry();
   geometry.instanceCount = part.count;
   geometry.setIndex(template.index);
