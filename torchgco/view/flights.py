@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -85,7 +86,7 @@ def violated(problem: Problem, X: Tensor, U: Tensor, admitted: float) -> Knots:
     return Knots(torch.where(worst < 0, 0.0, most).cpu().numpy(), worst.cpu().numpy())
 
 
-def contacts(obstacles: list[Obstacles], path: np.ndarray, dt: float) -> np.ndarray:
+def contacts(obstacles: Sequence[Obstacles], path: np.ndarray, dt: float) -> np.ndarray:
     """Places (C, d) where a path (K, d) touches obstacles of a batch of one: the deepest of each contact.
 
     Bodies touch at CONTACT_FACTOR of their radii, as the judge has it; between the knots the path is straight.
