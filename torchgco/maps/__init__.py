@@ -1,0 +1,4 @@
+"""Maps as obstacles: occupancy grids and clouds of points."""
+
+from torchgco.maps.grid import OccupancyGrid as OccupancyGrid
+from torchgco.maps.points import PointCloud as PointCloud
