@@ -70,4 +70,3 @@ def _count(source: Source, shape: Any) -> int:
     if not all(isinstance(side, int) and not isinstance(side, bool) and side >= 0 for side in shape):
         source.refuse("sides of the array, whole numbers", shape)
     return math.prod(shape)
-

@@ -15,7 +15,7 @@ from torchgco.maps.files.rotated import rotated
 from torchgco.maps.files.source import Source, check_far, made
 from torchgco.maps.grid import OccupancyGrid
 
-MOST_YAML = 2**16  # bytes
+MOST_YAML = 2**14  # bytes
 YAML = "a map_server yaml file with image, resolution, origin, negate, occupied_thresh and free_thresh"
 MODES = ("trinary", "scale", "raw")
 FULL = 2.0 * math.pi + 1e-3  # rad

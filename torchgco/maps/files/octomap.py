@@ -7,6 +7,7 @@ so this reader is a small one of its own.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 
@@ -43,7 +44,7 @@ def read_octomap(source: Source) -> OccupancyGrid:
     source.limit(size, MOST_NODES, "nodes of a tree")
     cursor = Cursor(source, raw, expected, at)
     binary = source.path.suffix.lower() == ".bt"
-    leaves, nodes = _binary_tree(cursor) if binary else _tree(cursor, MORE[kind])
+    leaves, nodes = _binary_tree(cursor, size) if binary else _tree(cursor, MORE[kind])
     if nodes != size:
         source.refuse(f"a tree of {size:,} nodes", f"{nodes:,}")
     if not len(leaves.sides):
@@ -97,28 +98,32 @@ def _header(source: Source, raw: bytes, expected: str) -> tuple[str, int, float,
     return found["id"], int(found["size"]), resolution, at
 
 
-def _binary_tree(cursor: Cursor) -> tuple[Leaves, int]:
+def _binary_tree(cursor: Cursor, size: int) -> tuple[Leaves, int]:
     """Leaves and number of nodes of a bt file: two bytes per inner node, its eight children two bits each."""
-    words = np.frombuffer(cursor.data[cursor.at : cursor.at + cursor.left // 2 * 2], "<u2").tolist()
+    count = min(cursor.left // 2, size)
+    words = np.frombuffer(cursor.data[cursor.at : cursor.at + 2 * count], "<u2").tolist()
     inner: list[tuple[int, int, int, int, int]] = []
     open_: list[tuple[int, int, int, int]] = [(0, 0, 0, DEPTH)] if words else []
     while open_:
         x, y, z, level = open_.pop()
-        if len(inner) >= len(words) or len(inner) >= MOST_NODES:
+        if len(inner) >= count:
             break
         word = words[len(inner)]
-        inner.append((x, y, z, level, word))
         if level == 0:
-            cursor.source.refuse(f"a tree of depth {DEPTH}", f"a deeper one at byte {cursor.at + 2 * len(inner) - 2:,}")
+            cursor.source.refuse(f"a tree of depth {DEPTH}", f"a deeper one at byte {cursor.at + 2 * len(inner):,}")
+        inner.append((x, y, z, level, word))
         half = 1 << (level - 1)
         for child in (7, 6, 5, 4, 3, 2, 1, 0):  # the first is read first, from the end of the list
             if (word >> 2 * child) & 3 == INNER:
                 open_.append((x + half * (child & 1), y + half * (child >> 1 & 1), z + half * (child >> 2), level - 1))
-    cursor.take(2 * len(inner) + (1 if open_ else 0), "nodes")
-    if open_ or cursor.left:
-        expected = f"{cursor.expected}, and ends with the tree's last node"
-        cursor.source.refuse(expected, f"{cursor.left:,} more bytes" if cursor.left else "a cut tree")
+    if open_ or 2 * len(inner) < cursor.left:
+        _refuse_end(cursor, bool(open_), cursor.at + 2 * len(inner))
     return _children(np.array(inner, np.int64).reshape(-1, 5))
+
+
+def _refuse_end(cursor: Cursor, cut: bool, at: int) -> NoReturn:
+    expected = f"{cursor.expected}, and ends with its tree's last node"
+    cursor.source.refuse(expected, f"a tree that is cut at byte {at:,}" if cut else f"a tree that ends at byte {at:,}")
 
 
 def _children(inner: np.ndarray) -> tuple[Leaves, int]:
@@ -160,8 +165,7 @@ def _tree(cursor: Cursor, more: int) -> tuple[Leaves, int]:
                     open_.append((*corner, level - 1))
         node += 1
     if open_ or node < count or rest:
-        expected = f"{cursor.expected}, and ends with the tree's last node"
-        cursor.source.refuse(expected, "a cut tree" if open_ else f"bytes after byte {cursor.at + node * row.itemsize:,}")
+        _refuse_end(cursor, bool(open_), cursor.at + node * row.itemsize)
     found = np.array(leaves, np.int64).reshape(-1, 5)
     chosen = odds[found[:, 4]]
     if not np.isfinite(chosen).all():

@@ -106,7 +106,7 @@ def _header(source: Source, raw: bytes) -> Header:
     return Header(names, types, counts, points, data, at, lines)
 
 
-def _binary(cursor: Cursor, header: Header, wanted: list[int]) -> np.ndarray:
+def _binary(cursor: Cursor, header: Header, wanted: list[int]) -> list[np.ndarray]:
     """One point after the other."""
     offsets = np.cumsum([0, *(t.itemsize * c for t, c in zip(header.types, header.counts, strict=True))]).tolist()
     data = cursor.take(header.points * header.point, f"{header.points:,} points")
@@ -119,10 +119,10 @@ def _binary(cursor: Cursor, header: Header, wanted: list[int]) -> np.ndarray:
         }
     )
     rows = np.frombuffer(data, layout)
-    return np.stack([rows[f"{i}"].astype(np.float64) for i in wanted], 1)
+    return [rows[f"{i}"] for i in wanted]
 
 
-def _compressed(cursor: Cursor, header: Header, wanted: list[int]) -> np.ndarray:
+def _compressed(cursor: Cursor, header: Header, wanted: list[int]) -> list[np.ndarray]:
     """LZF of all values of the first field, then all of the second, ..."""
     packed, size = cursor.number("I", "compressed size"), cursor.number("I", "size")
     if size != header.points * header.point:
@@ -132,8 +132,7 @@ def _compressed(cursor: Cursor, header: Header, wanted: list[int]) -> np.ndarray
     data = unpack(cursor.source, cursor.take(packed, "compressed points"), size, at)
     lengths = [t.itemsize * c * header.points for t, c in zip(header.types, header.counts, strict=True)]
     starts = np.cumsum([0, *lengths]).tolist()
-    fields = [np.frombuffer(data, header.types[i], header.points, starts[i]) for i in wanted]
-    return np.stack([field.astype(np.float64) for field in fields], 1)
+    return [np.frombuffer(data, header.types[i], header.points, starts[i]) for i in wanted]
 
 
 def unpack(source: Source, data: memoryview, size: int, at: int = 0) -> bytearray:

@@ -55,7 +55,7 @@ def read_ply(source: Source) -> np.ndarray:
         cursor.take(element.count * _row(element, order).itemsize, f"the table {shown(element.name)}")
     layout = _row(vertices, order)
     rows = np.frombuffer(cursor.take(vertices.count * layout.itemsize, f"{vertices.count:,} vertices"), layout)
-    return finite_points(source, np.stack([rows[f"{i}"].astype(np.float64) for i in wanted], 1))
+    return finite_points(source, [rows[f"{i}"] for i in wanted])
 
 
 def _row(element: Element, order: str) -> np.dtype:
@@ -66,12 +66,14 @@ def _text(
     source: Source, text: bytes, vertices: Element, before: list[Element], wanted: list[int], lines: int
 ) -> np.ndarray:
     """Vertices of a file as text: a line each, after those of the tables before."""
-    rows = text.splitlines(keepends=True)
+    source.limit(text.count(b"\n"), 2 * MOST_POINTS, "lines")
+    ends = np.flatnonzero(np.frombuffer(text + b"\n", np.uint8) == ord("\n")) + 1
+    starts = np.concatenate([[0], ends])
     first = sum(element.count for element in before)
-    rows = rows[first : first + vertices.count]
-    if len(rows) < vertices.count:
-        source.refuse(f"{vertices.count:,} lines of vertices", f"{len(rows):,}")
-    points = columns_of(source, b"".join(rows), wanted, PLY, lines + first + 1)
+    if len(ends) < first + vertices.count:
+        source.refuse(f"{first + vertices.count:,} lines after the header", f"{len(ends):,}")
+    held = text[starts[first] : starts[first + vertices.count]]
+    points = columns_of(source, held, wanted, PLY, lines + first + 1)
     if len(points) != vertices.count:
         source.refuse(f"{vertices.count:,} vertices", f"{len(points):,}")
     return points

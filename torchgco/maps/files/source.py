@@ -6,7 +6,7 @@ import os
 import stat
 import struct
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ MOST_TEXT = 2**28  # bytes of points written as text
 MOST_CELLS = 2**27  # of a grid: 512 x 512 x 512
 MOST_POINTS = 2**25
 FARTHEST = 1e7  # m, of any coordinate: what lies farther has another unit
+LETTERS = 150  # of a path in an error
 LEAST = 1e-6  # m, of a cell
 
 
@@ -44,7 +45,9 @@ class Source:
 
     def refuse(self, expected: str, got: object) -> NoReturn:
         """Raise InputError, which names the file before what came."""
-        raise InputError(self.field, expected, f"{self.path}: {got}")
+        path = str(self.path)
+        path = path if len(path) <= LETTERS else f"...{path[-LETTERS:]}"  # so that an error has room for the rest
+        raise InputError(self.field, expected, f"{path}: {got}")
 
     def size(self, expected: str) -> int:
         """Bytes of a regular file.
@@ -122,9 +125,14 @@ class Cursor:
         return bytes(self.take(count, what)).decode("utf-8", "replace")
 
 
-def finite_points(source: Source, points: np.ndarray) -> np.ndarray:
-    """Points (P, d) as float64, without rows that aren't finite: sensors write those where nothing came back."""
-    points = np.asarray(points, np.float64)
+def finite_points(source: Source, points: np.ndarray | list[np.ndarray]) -> np.ndarray:
+    """Points (P, d), or d arrays of coordinates, as float64, without rows that aren't finite.
+
+    Sensors write such rows where nothing came back.
+    """
+    with np.errstate(invalid="ignore"):  # some kinds of NaN
+        points = np.stack([p.astype(np.float64) for p in points], 1) if isinstance(points, list) else points
+        points = np.asarray(points, np.float64)
     kept = np.isfinite(points).all(1)
     if not kept.any():
         source.refuse("at least one point of finite coordinates", f"{len(points):,} points, none of them finite")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from io import BytesIO
 
 import numpy as np
@@ -32,12 +33,16 @@ def _bare(line: bytes) -> bytes:
     return line.split(b"#", 1)[0].strip(b",; \t\r\n")
 
 
-def columns_of(source: Source, text: bytes, wanted: range | list[int], expected: str, first_line: int = 1) -> np.ndarray:
+def columns_of(
+    source: Source, text: bytes, wanted: range | list[int], expected: str, first_line: int = 1
+) -> np.ndarray:
     """Numbers (P, columns) of lines of text; a line that lacks one is an InputError that names it."""
     source.limit(text.count(b"\n") + 1, MOST_POINTS, "lines of points")
     text = text.translate(bytes.maketrans(b",;\t", b"   "))
     try:
-        return np.loadtxt(BytesIO(text), np.float64, usecols=list(wanted), ndmin=2, encoding="ascii")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of no lines at all: no points then
+            return np.loadtxt(BytesIO(text), np.float64, usecols=list(wanted), ndmin=2, encoding="latin1")
     except Exception:  # NumPy counts lines without comments and empty ones, and raises several kinds
         line = _wrong_line(text, wanted)
         source.refuse(expected, f"{line[1]} in line {first_line + line[0]:,}" if line else "no numbers")
@@ -48,7 +53,7 @@ def _wrong_line(text: bytes, wanted: range | list[int]) -> tuple[int, str] | Non
         words = _bare(line).split()
         try:
             if words:
-                [float(words[column].decode("ascii")) for column in wanted]
+                [float(words[column].decode("latin1")) for column in wanted]
         except (ValueError, IndexError):
             said = b" ".join(words)[:60].decode("ascii", "replace")
             return index, f"'{said}'"
