@@ -12,6 +12,7 @@ import numpy as np
 
 from torchgco.base.errors import InputError, shown
 from torchgco.maps.files.arrays import read_npy, read_npz
+from torchgco.maps.files.bags.bag import METADATA, read_bag
 from torchgco.maps.files.images import read_image
 from torchgco.maps.files.map_server import read_map_server
 from torchgco.maps.files.octomap import read_octomap
@@ -37,6 +38,7 @@ class Format:
 
 
 IMAGE = Format(read_image, ("resolution", "origin", "height"))
+BAG = Format(read_bag, ("topic",))
 FORMATS = {
     ".npz": Format(read_npz),
     ".npy": Format(read_npy, ("resolution", "origin", "height")),
@@ -50,6 +52,9 @@ FORMATS = {
     ".ply": Format(read_ply),
     ".bt": Format(read_octomap),
     ".ot": Format(read_octomap),
+    ".bag": BAG,
+    ".mcap": BAG,
+    ".db3": BAG,
 }
 
 
@@ -103,6 +108,8 @@ def _find(path: Any, field: str) -> tuple[Source, Format]:
         raise InputError(f"{field}.path", "the path of a map", shown(path))
     source = Source(Path(path), field)
     ending = source.path.suffix.lower()
+    if ending not in FORMATS and (source.path / METADATA).is_file():
+        return source, BAG
     if ending not in FORMATS:
         raise InputError(f"{field}.path", f"a file that ends with {', '.join(FORMATS)}", path)
     return source, FORMATS[ending]
