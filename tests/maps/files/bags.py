@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import shutil
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,8 @@ def messages(types: Any, ros1: bool, **changed: Any) -> dict[str, list[Any]]:
 
 
 ALL = ("/map", "/points", "/said")
-FOLDER = TemporaryDirectory(prefix="bags-")  # until the tests end
+FOLDER = Path(mkdtemp(prefix="bags-"))
+atexit.register(shutil.rmtree, FOLDER, ignore_errors=True)
 
 
 def bag(kind: str, topics: tuple[str, ...] = ALL) -> tuple[str, bytes]:
@@ -61,7 +63,7 @@ def bag(kind: str, topics: tuple[str, ...] = ALL) -> tuple[str, bytes]:
 
 @cache
 def _bag(kind: str, topics: tuple[str, ...]) -> tuple[str, bytes]:
-    place = Path(FOLDER.name) / f"{kind}{'-'.join(topics)}".replace("/", "").replace(" ", "-")
+    place = FOLDER / f"{kind}{'-'.join(topics)}".replace("/", "").replace(" ", "-")
     ros1 = kind.startswith("bag")
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     if ros1:
@@ -90,7 +92,7 @@ def write(target: Path, kind: str, topics: tuple[str, ...] = ALL) -> Path:
     """A bag in this folder; its path."""
     name, data = bag("db3" if kind == "folder" else kind, topics)
     if kind == "folder":
-        shutil.copytree(Path(FOLDER.name) / name.removesuffix(".db3"), target / "bag")
+        shutil.copytree(FOLDER / name.removesuffix(".db3"), target / "bag")
         return target / "bag"
     (target / name).write_bytes(data)
     return target / name

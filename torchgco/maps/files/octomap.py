@@ -145,7 +145,8 @@ def _tree(cursor: Cursor, more: int) -> tuple[Leaves, int]:
     count, rest = divmod(cursor.left, row.itemsize)
     cursor.source.limit(count, MOST_NODES, "nodes of a tree")
     rows = np.frombuffer(cursor.data[cursor.at : cursor.at + count * row.itemsize], row)
-    children, odds = rows["children"].tolist(), rows["log_odds"].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # some kinds of NaN, refused below
+        children, odds = rows["children"].tolist(), rows["log_odds"].astype(np.float64)
     leaves: list[tuple[int, int, int, int, int]] = []
     open_: list[tuple[int, int, int, int]] = [(0, 0, 0, DEPTH)] if count else []
     node = 0

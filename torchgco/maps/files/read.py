@@ -12,7 +12,6 @@ import numpy as np
 
 from torchgco.base.errors import InputError, shown
 from torchgco.maps.files.arrays import read_npy, read_npz
-from torchgco.maps.files.bags.bag import METADATA, read_bag
 from torchgco.maps.files.images import read_image
 from torchgco.maps.files.map_server import read_map_server
 from torchgco.maps.files.octomap import read_octomap
@@ -37,8 +36,16 @@ class Format:
     options: tuple[str, ...] = ()
 
 
+def _read_bag(source: Source, topic: str | None) -> OccupancyGrid | np.ndarray:
+    """Imported late: some builds of Python lack what packed bags and SQLite need."""
+    from torchgco.maps.files.bags.bag import read_bag
+
+    return read_bag(source, topic)
+
+
+METADATA = "metadata.yaml"  # is in the folder of each bag of ROS 2
 IMAGE = Format(read_image, ("resolution", "origin", "height"))
-BAG = Format(read_bag, ("topic",))
+BAG = Format(_read_bag, ("topic",))
 FORMATS = {
     ".npz": Format(read_npz),
     ".npy": Format(read_npy, ("resolution", "origin", "height")),

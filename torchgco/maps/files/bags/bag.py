@@ -13,7 +13,6 @@ from torchgco.maps.files.source import Source
 from torchgco.maps.grid import OccupancyGrid
 
 CONTAINERS = {".bag": ros1.last_message, ".mcap": mcap.last_message, ".db3": sqlite.last_message}
-METADATA = "metadata.yaml"  # is in the folder of each bag of ROS 2
 
 
 def read_bag(source: Source, topic: str | None) -> OccupancyGrid | np.ndarray:
