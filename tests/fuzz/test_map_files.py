@@ -28,6 +28,7 @@ VALUES = st.one_of(
     st.none(),
     st.lists(st.floats(), max_size=4),
 )
+LENGTHS = st.one_of(st.none(), st.sampled_from([0.1, 1.0]), st.floats())
 KINDS = [np.float64, np.float32, np.int64, np.uint8, np.bool_, np.complex128, "U3", "M8[s]", ">i2"]
 
 
@@ -85,12 +86,14 @@ def test_any_keys_of_map_server(changed: dict[str, Any], tmp_path: Path) -> None
 
 
 @settings(max_examples=examples(500), suppress_health_check=list(HealthCheck))
-@given(data=st.data(), height=st.one_of(st.none(), st.floats()), resolution=st.one_of(st.none(), st.floats()))
+@given(data=st.data(), height=LENGTHS, resolution=LENGTHS)
 @pytest.mark.filterwarnings("ignore:.*:RuntimeWarning")
 def test_any_array(data: st.DataObject, height: float | None, resolution: float | None, tmp_path: Path) -> None:
     shape = data.draw(arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4))
     with np.errstate(all="ignore"):
-        array = data.draw(arrays.arrays(float, shape)).astype(data.draw(st.sampled_from(KINDS)))
+        array = data.draw(arrays.arrays(float, shape, elements=st.one_of(st.floats(-9, 9), st.floats()))).astype(
+            data.draw(st.sampled_from(KINDS))
+        )
     options = {"height": height, "resolution": resolution, "radius": data.draw(st.sampled_from([None, 0.1]))}
     attempt("arrays of maps", samples.write(tmp_path, "a.npy", samples.npy(array)), options)
     raw = samples.npz(occupied=array, resolution=resolution or 1.0)

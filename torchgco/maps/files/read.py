@@ -13,6 +13,7 @@ import numpy as np
 from torchgco.base.errors import InputError, shown
 from torchgco.maps.files.arrays import read_npy, read_npz
 from torchgco.maps.files.images import read_image
+from torchgco.maps.files.layer import checked_layer, flat
 from torchgco.maps.files.map_server import read_map_server
 from torchgco.maps.files.octomap import read_octomap
 from torchgco.maps.files.pcd import read_pcd
@@ -73,6 +74,7 @@ def read(
     origin: Any = None,
     height: float | None = None,
     topic: str | None = None,
+    layer: Any = None,
     field: str = "map",
 ) -> OccupancyGrid | PointCloud:
     """The map in a file: a grid, or a cloud where the file holds points. What has no unit is in metres.
@@ -84,6 +86,8 @@ def read(
         origin: lowest corner of the first cell, m, by default 0: for images, and cells or heights in npy files.
         height: makes an image or numbers (X, Y) in an npy file a heightmap: metres of white above black, or of 1.
         topic: of a bag's map; not needed where only one topic has maps.
+        layer: heights (low, high), m: of a map of space, what lies between them is seen from above, as a map of the
+            plane.
         field: what errors call the file and these arguments: `<field>.path`, `<field>.resolution`.
 
     Raises:
@@ -102,6 +106,8 @@ def read(
         if origin.shape not in ((2,), (3,)) or not (np.abs(origin) <= FARTHEST).all():
             raise InputError(f"{field}.origin", f"2 or 3 coordinates within {FARTHEST:g} m", shown(origin.tolist()))
     found = format.reader(source, **{name: given[name] for name in format.options})
+    if layer is not None:
+        found = flat(source, found, checked_layer(layer, f"{field}.layer"), radius)
     if isinstance(found, OccupancyGrid):
         if radius is not None:
             raise InputError(f"{field}.radius", f"none: {source.path} holds cells, no points", radius)
