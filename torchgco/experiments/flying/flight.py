@@ -48,6 +48,7 @@ class Plan:
         repair: damaged files are redone.
         figures: figures are drawn when all is flown.
         explain: layouts that the solver under study failed on are solved again with a record, and explained.
+        view: a page of the study is written then.
         jobs: how many jobs share the layouts; None: one, which flies all.
         job: the one that this process is, 0..jobs-1; None where it flies all.
 
@@ -61,6 +62,7 @@ class Plan:
     repair: bool
     figures: bool
     explain: bool
+    view: bool
     jobs: Count | None
     job: Any
 

@@ -27,6 +27,7 @@ from torchgco.experiments.flying.workers import Shared, run_all
 from torchgco.experiments.reports.explained import explained
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
 from torchgco.experiments.reports.report import write_report
+from torchgco.experiments.reports.view import write_view
 from torchgco.experiments.results.identity import (
     Manifest,
     closed_loop,
@@ -120,6 +121,8 @@ def _fly_and_report(study: _Study, records: Records, show: Callable[[str], None]
     if study.plan.explain:
         show(explained(study.setup, study.layouts, read_trials(folder / TRIALS)))
     show(f"\nTable, arrays and figures: {folder}")
+    if study.plan.view:
+        show(f"Page: {write_view(folder)}")
     trials = pd.read_parquet(folder / TRIALS)
     if (trials["status"] == Status.INVALID_START.name).all():
         raise InputError("scenario", "a layout whose start is outside its obstacles", "none")
