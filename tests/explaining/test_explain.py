@@ -82,6 +82,8 @@ def test_it_counts_the_fates_of_the_candidates(recorded: Solution) -> None:
     assert sum(counted) == candidates and "1 proposed" in line
     closed = block(recorded.explain(CLOSED), "Passes")
     assert any("found no path to the goal" in line for line in closed)
+    assert "no path to the goal was found" in block(recorded.explain(CLOSED), "What to try")[0]
+    assert not any("no path" in line for line in block(recorded.explain(SHORT), "What to try"))
 
 
 def test_it_names_the_knots_and_obstacles_of_the_caught_trajectory(recorded: Solution) -> None:

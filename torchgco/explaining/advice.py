@@ -39,6 +39,7 @@ class Facts:
         reached: None where there is no goal, or none that can be judged.
         goal_distance: m, of the last knot.
         clearance: m, between knots too; None where it can't be judged.
+        pathless: whether the record shows searches for paths, none of which found any.
         could_record: whether the solver can record more than it did.
     """
 
@@ -49,6 +50,7 @@ class Facts:
     reached: bool | None = None
     goal_distance: float | None = None
     clearance: float | None = None
+    pathless: bool = False
     could_record: bool = False
 
 
@@ -57,6 +59,8 @@ def advice(facts: Facts) -> list[str]:
     found = list[str]()
     if facts.among_obstacles and facts.seeks_paths is False and not (facts.status in FITS and facts.reached):
         found.append('solver="gco", the default, which seeks paths around obstacles on a roadmap.')
+    if facts.pathless and not facts.reached:
+        found.append("A look at the scene (torchgco.plot): no path to the goal was found between the obstacles.")
     if facts.status in FITS and facts.clearance is not None and facts.clearance < 0:
         found.append("A smaller dt, or a larger vehicle_radius: constraints hold at the knots alone.")
     if facts.status in FITS and facts.reached is False:

@@ -13,7 +13,7 @@ from torchgco.base.shapes import check_shape
 from torchgco.base.status import Status
 from torchgco.explaining.account import Account
 from torchgco.explaining.advice import Facts, advice
-from torchgco.explaining.passes import iterations_told, passes_told
+from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
 from torchgco.explaining.places import caught_told, number, place_told
 from torchgco.explaining.record import SearchRecord
 from torchgco.judging.judge import columns as judged
@@ -132,6 +132,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
         reached=bool(verdict["reached"]) if "reached" in verdict else None,
         goal_distance=one.goal_distance,
         clearance=float(verdict["clearance"]) if "clearance" in verdict else None,
+        pathless=solved.search is not None and is_pathless(solved.search, b),
         could_record=could,
     )
 

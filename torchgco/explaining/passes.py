@@ -72,6 +72,12 @@ def iterations_told(trace: pd.DataFrame, b: int) -> list[str]:
     return [f"{left} outer iterations before these", *lines[-OUTER:]] if left > 0 else lines
 
 
+def is_pathless(record: SearchRecord, b: int) -> bool:
+    """Whether paths were sought for the problem at place b, and none was found."""
+    fates = [one.fate[one.rows == b] for one in record.comparisons if bool((one.rows == b).any())]
+    return bool(fates) and all(bool((fate == Fate.ABSENT).all()) for fate in fates)
+
+
 class _Standing(tuple[float, float, float, bool]):
     """Cost, violation, distance to the goal and arrival of one problem's best trajectory."""
 
