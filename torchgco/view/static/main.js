@@ -65,6 +65,8 @@ class Page {
     this.resize();
     await this.choose(this.firstLayout());
     this.setTime(Number(this.asked.get("time") ?? 0));
+    if (this.asked.has("cut")) by("cut").value = this.asked.get("cut");
+    this.cut(Number(by("cut").value));
     if (this.asked.has("camera")) this.placeCamera(this.asked.get("camera").split(",").map(Number));
     this.draw();
     this.canvas.dataset.first = Math.round(performance.now());
@@ -117,6 +119,7 @@ class Page {
     const { scene, layout, colours } = this;
     scene.background = new THREE.Color(colours.sky);
     this.space = spaceOf(layout, this.head);
+    if (this.still) scene.fog = new THREE.Fog(colours.sky, 0.7 * this.space.size, 2.2 * this.space.size);
     this.obstacles = obstacles(layout.obstacles, this.space, colours, this.still);
     this.flights = new Flights(layout, this.head, this.space);
     this.search = layout.search ? new Search(layout.search, this.space) : null;

@@ -143,7 +143,7 @@ export function obstacles(parts, space, colours, still) {
   const meshes = [];
   const shells = [];
   for (const part of parts) {
-    const geometry = geometryOf(part, space);
+    const geometry = geometryOf(part, space, still);
     const mesh = new THREE.Mesh(geometry, solids);
     mesh.castShadow = mesh.receiveShadow = true;
     mesh.customDepthMaterial = shadow;
@@ -167,8 +167,8 @@ export function obstacles(parts, space, colours, still) {
   };
 }
 
-function geometryOf(part, space) {
-  const [steps, rings] = part.count > MANY ? [3, 2] : [6, 5];
+function geometryOf(part, space, still) {
+  const [steps, rings] = still ? [10, 8] : part.count > MANY ? [3, 2] : [6, 5];
   const template = space.flat ? prism(2 * steps) : solid(steps, rings);
   const geometry = new THREE.InstancedBufferGeometry();
   geometry.instanceCount = part.count;
