@@ -1,6 +1,6 @@
 """README's first picture: a mission through a wood in perspective, taken from its page by a headless Chromium.
 
-    python -m benchmarks.picture          # flies the mission, and writes benchmarks/woods.jpg
+python -m benchmarks.picture          # flies the mission, and writes benchmarks/woods.jpg
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from tests.experiments.commands import HOLD
 from tests.view.test_packing import read
 from torchgco.experiments.reports import view
 
-WORDS = [*HOLD, "study.figures=false", "study.view=true"]
+WORDS = [*HOLD, "study.figures=false", "study.view=true", "study.figure=one"]
 MISSION = [
     "experiment=mission", "solver=hold", "mission.duration=0.2", "scenario.num_obstacles=3", "study.layouts=2",
     "study.workers=1", "study.figures=false", "hydra.run.dir=flown",
@@ -30,6 +30,7 @@ def test_a_study_writes_its_page_and_the_command_writes_it_again(run, tmp_path, 
     code, out, err = run("scenario=yard", *WORDS, "hydra.run.dir=study")
     page = tmp_path / "study" / "view.html"
     assert code == 0 and f"Page: {page}" in out, err
+    assert sorted(path.name for path in (tmp_path / "study" / "figures").iterdir()) == ["study.pdf", "study.png"]
     head, first = part(page, "head"), part(page, "part-0")
     assert [solver["name"] for solver in head["solvers"]] == ["hold"] and len(head["layouts"]) == 4
     assert head["body"] == "car" and head["dimension"] == 2
@@ -46,6 +47,8 @@ def test_a_study_writes_its_page_and_the_command_writes_it_again(run, tmp_path, 
 
 
 def test_missions_show_track_and_plan(run, tmp_path) -> None:
+    code, _, err = run(*MISSION, "study.figure=two")
+    assert code == 2 and "study.figure: expected null for missions" in err
     code, _, err = run(*MISSION)
     assert code == 0, err
     assert view.main([str(tmp_path / "flown")]) == 0

@@ -11,10 +11,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
-from typing import IO
+from typing import IO, Literal
 from zlib import crc32
 
 import pandas as pd
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -121,13 +122,18 @@ def _setting(name: str, value: object) -> str:
     return f"{words} {value:g}" if isinstance(value, float) else f"{words} {value}"
 
 
-def save(figure: Figure, path: str | os.PathLike[str] | IO[bytes], dpi: int = 150) -> Path | None:
+def save(
+    figure: Figure, path: str | os.PathLike[str] | IO[bytes], dpi: int = 150, form: Literal["png", "pdf"] = "png"
+) -> Path | None:
     """Write the figure, in the format that the ending of `path` names, into a folder made if need be.
 
-    An open file instead of a path gets a PNG; nothing is returned then.
+    An open file instead of a path gets the format `form`; nothing is returned then. A PDF holds its text as text, and
+    no date: the same figure has the same bytes.
     """
     if not isinstance(path, str | os.PathLike):
-        figure.savefig(path, format="png", dpi=dpi, facecolor="white")
+        with rc_context({"pdf.fonttype": 42}):
+            dateless = {"CreationDate": None} if form == "pdf" else None
+            figure.savefig(path, format=form, dpi=dpi, facecolor="white", metadata=dateless)
         return None
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

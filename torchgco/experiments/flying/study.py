@@ -152,7 +152,8 @@ def _report(study: _Study, folder: Path) -> str:
     """Write the report of a finished study, and return it as text."""
     if study.setup.mission is not None:
         return write_mission_report(folder, study.setup, figures=study.plan.figures)
-    return write_report(folder, lambda flown: _trajectories(study, flown), figures=study.plan.figures)
+    plan = study.plan
+    return write_report(folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure)
 
 
 def _study(config: DictConfig, recompose: Recompose) -> _Study:
@@ -169,7 +170,10 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
         solvers={name: settings_of(held) for name, held in configs.items()},
         layouts=layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(configuration)),
     )
-    return _Study(setup, plan_of(setup), layouts, solvers, manifest)
+    plan = plan_of(setup)
+    if setup.mission is not None and plan.figure is not None:
+        raise InputError("study.figure", "null for missions, which have figures of their own", plan.figure)
+    return _Study(setup, plan, layouts, solvers, manifest)
 
 
 def check_mission(mission: Mission, task: Task) -> None:
