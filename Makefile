@@ -115,12 +115,12 @@ $(RUNTIME): pyproject.toml constraints.txt | $(BIN)/python
 	touch $@
 
 $(DEV): pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) -e '.[dev,plants,cluster]'
+	$(INSTALL) -e '.[dev,plants,cluster,maps]'
 	@$(COMPILER)
 	touch $@ $(RUNTIME)
 
 $(PEERS): pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) -e '.[dev,plants,cluster,peers]'
+	$(INSTALL) -e '.[dev,plants,cluster,maps,peers]'
 	@$(COMPILER)
 	touch $@ $(RUNTIME) $(DEV)
 

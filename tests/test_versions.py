@@ -39,7 +39,7 @@ def test_other_lines_have_the_newest_versions(versions) -> None:
     assert {line.python for line in lines.values()} == {"3.11", "3.12", "3.13"}
     for line in lines.values():
         found = versions.requirements(line, Path("/wheels/torchgco.whl"), PROJECT)
-        assert found[0].startswith("torchgco[plants] @ ") and not any("==" in requirement for requirement in found)
+        assert found[0].startswith("torchgco[plants,maps] @ ") and not any("==" in requirement for requirement in found)
 
 
 def test_an_interpreter_is_tried_before_it_counts(versions, monkeypatch, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from tests.reference.interior import Array, Point, Program, begin, moved, newton
 from torchgco import (
     Boxes,
     ControlBounds,
+    Field,
     FunctionConstraint,
     FunctionCost,
     FunctionDynamics,
@@ -24,6 +25,7 @@ from torchgco import (
     Spheres,
     StateBounds,
 )
+from torchgco.maps import OccupancyGrid
 from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import interior_of
 from torchgco.problem.rates import with_controls_before
@@ -31,7 +33,7 @@ from torchgco.solvers.interior import FILTER
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
-    pytest.mark.filterwarnings("ignore::torchgco.ContactWarning"),
+    pytest.mark.filterwarnings("ignore::torchgco.ContactWarning"), pytest.mark.usefixtures("as_shipped"),
 ]
 
 B, D = 9, torch.float64  # one problem more than lanes
@@ -41,11 +43,6 @@ PLAIN = FILTER | {
     "corrects": 0, "crawl": 0.0, "explodes": 1e300, "patience": 100, "tolerance": 1e-6, "violation": 1e-6, "push": 1e-2,
     "steepest": 100.0,
 }  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def cache() -> None:
-    """Use the user's cache folder: libraries are compiled once for all tests of this file."""
 
 
 def draw(seed: int) -> Callable[..., Tensor]:
@@ -136,7 +133,16 @@ def apart(seed: int) -> Problem:
     )
 
 
-MAKERS = {"curved": curved, "obstacles": obstacles, "rates": rates, "apart": apart}
+def maps(seed: int) -> Problem:
+    """Maps of their own, one of them empty, among which the rows bend from node to node."""
+    plain, rng = obstacles(seed), np.random.default_rng(seed)
+    cells = rng.random((B, 8, 8)) < 0.08
+    cells[1] = False
+    field = Field(OccupancyGrid(cells, plain.x0[:, :2].numpy() + np.array([0.1, -1.6]), 0.4), 0.15)
+    return Problem(plain.dynamics, plain.cost, [field, plain.constraints[1]], plain.x0, plain.N)
+
+
+MAKERS = {"curved": curved, "obstacles": obstacles, "rates": rates, "apart": apart, "maps": maps}
 
 
 def guess(problem: Problem, seed: int) -> tuple[Tensor, Tensor]:

@@ -91,9 +91,9 @@ def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mappi
     here, drawn = {solver: row[i] for solver, row in flights.items()}, set()
     lead = passes(scene, i, _leading(scene, i, [flight.path for flight in here.values()]))
     for plane, ax in axes.items():
-        drawn |= _obstacles(ax, scene, i, lead, plane)
+        drawn |= draw_obstacles(ax, scene, i, lead, plane)
         drawn |= _paths(ax, scene, i, here, plane)
-        _targets(ax, scene, i, plane)
+        draw_targets(ax, scene, i, plane)
     return drawn
 
 
@@ -147,7 +147,7 @@ def _leading(scene: Scene, i: int, paths: list[np.ndarray]) -> np.ndarray:
     return np.linspace(scene.start[i], scene.goal[i], 100)
 
 
-def _obstacles(ax: Axes, scene: Scene, i: int, lead: list[Pass], plane: Plane) -> set[str]:
+def draw_obstacles(ax: Axes, scene: Scene, i: int, lead: list[Pass], plane: Plane) -> set[str]:
     """Draw a layout's obstacles; returns the kinds of drawn shapes, for the legend."""
     own, grown, near = [], [], []
     moving = False
@@ -215,7 +215,7 @@ def _marker(kind: str) -> dict[str, Any]:
     return {"linestyle": "none", **shapes[kind]}
 
 
-def _targets(ax: Axes, scene: Scene, i: int, plane: Plane) -> None:
+def draw_targets(ax: Axes, scene: Scene, i: int, plane: Plane) -> None:
     """The start under the flights' marks, the goal over them."""
     start, goal = scene.start[i][list(plane)], scene.goal[i][list(plane)]
     look: dict[str, Any] = {"color": INK, "linestyle": "none", "markeredgecolor": "white", "markeredgewidth": 0.5}

@@ -48,6 +48,7 @@ class Plan:
         repair: damaged files are redone.
         figures: figures are drawn when all is flown.
         figure: columns of a paper that a figure of the whole study spans, drawn then; None: no such figure.
+        explain: layouts that the solver under study failed on are solved again with a record, and explained.
         view: a page of the study is written then.
         jobs: how many jobs share the layouts; None: one, which flies all.
         job: the one that this process is, 0..jobs-1; None where it flies all.
@@ -62,6 +63,7 @@ class Plan:
     repair: bool
     figures: bool
     figure: Literal["one", "two"] | None
+    explain: bool
     view: bool
     jobs: Count | None
     job: Any

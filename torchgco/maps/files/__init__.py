@@ -1,0 +1,8 @@
+"""Maps from files: docs/map-files.md lists the formats.
+
+Files of others are data only: no pickles, no code, no memory taken before sizes are checked. A wrong, cut or hostile
+file is one InputError with its name.
+"""
+
+from torchgco.maps.files.read import FORMATS as FORMATS
+from torchgco.maps.files.read import read as read

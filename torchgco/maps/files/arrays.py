@@ -1,0 +1,72 @@
+"""npz and npy: NumPy's arrays, never its pickles."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from torchgco.base.files import read_arrays
+from torchgco.maps.files.heights import above_ground
+from torchgco.maps.files.source import MOST_BYTES, MOST_POINTS, Source, finite_points, made
+from torchgco.maps.grid import OccupancyGrid
+
+NPZ = "a map with occupied (X, Y[, Z]), origin (d,) and resolution"
+NPY = "an npy file of numbers, without pickles"
+HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+def read_npz(source: Source) -> OccupancyGrid:
+    """The grid of the arrays `occupied`, `origin` and `resolution`; others are for `scenario=map`."""
+    source.size(NPZ)
+    arrays = read_arrays(source.path, source.field, NPZ, ("occupied", "origin", "resolution"), MOST_BYTES)
+    occupied, origin = arrays["occupied"], arrays["origin"]
+    if origin.shape != (occupied.ndim,):  # one grid per problem isn't for files
+        source.refuse("origin (d,) for occupied (X, Y[, Z])", f"{origin.shape} for {occupied.shape}")
+    return made(source, occupied, origin, arrays["resolution"])
+
+
+def read_npy(
+    source: Source, resolution: float | None, origin: np.ndarray | None, height: float | None
+) -> OccupancyGrid | np.ndarray:
+    """Bools (X, Y[, Z]) as a grid; with `height`, numbers (X, Y) as heights in it; else points (P, 2 or 3)."""
+    array = _array(source)
+    if height is not None:
+        if array.ndim != 2 or array.dtype.kind not in "iuf":
+            source.refuse("heights (X, Y), numbers", f"{array.dtype} of shape {array.shape}")
+        return above_ground(source, np.asarray(array, np.float64) * height, resolution, origin)
+    if array.dtype == np.bool_:
+        if array.ndim not in (2, 3) or not array.size:
+            source.refuse("occupied cells (X, Y[, Z])", f"shape {array.shape}")
+        source.needs("resolution", resolution, "the side of a cell, m")
+        return made(source, array, np.zeros(array.ndim) if origin is None else origin, resolution)
+    if array.ndim != 2 or array.shape[1] not in (2, 3) or array.dtype.kind not in "iuf":
+        expected = "points (P, 2 or 3), numbers, or cells (X, Y[, Z]), bools"
+        source.refuse(expected, f"{array.dtype} of shape {array.shape}")
+    source.limit(len(array), MOST_POINTS, "points")
+    return finite_points(source, array)
+
+
+def _array(source: Source) -> np.ndarray:
+    """The array; its size is compared with the file's before memory is taken."""
+    size = source.size(NPY)
+    source.limit(size, MOST_BYTES, "bytes")
+    with source.library(NPY), open(source.path, "rb") as file:
+        version = np.lib.format.read_magic(file)
+        if version not in HEADERS:
+            source.refuse(f"{NPY}, version 1.0 or 2.0", version)
+        shape, fortran, dtype = HEADERS[version](file)
+        count, at = _count(source, shape), file.tell()
+        if dtype.hasobject or dtype.kind not in "biuf":
+            source.refuse(NPY, dtype)
+        if count * dtype.itemsize != size - at:
+            source.refuse(f"{count * dtype.itemsize:,} bytes of numbers from byte {at:,}", f"{size - at:,} bytes")
+        flat = np.fromfile(file, dtype, count)
+    return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
+
+
+def _count(source: Source, shape: Any) -> int:
+    if not all(isinstance(side, int) and not isinstance(side, bool) and side >= 0 for side in shape):
+        source.refuse("sides of the array, whole numbers", shape)
+    return math.prod(shape)

@@ -1,0 +1,128 @@
+"""Bags of ROS 1, version 2.0. The format: http://wiki.ros.org/Bags/Format/2.0."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+
+from torchgco.base.errors import shown
+from torchgco.maps.files.bags.container import MOST_RECORDS, Message, choose, unpack
+from torchgco.maps.files.source import Cursor, Source
+
+BAG = "a bag of ROS 1, version 2.0"
+FIRST = b"#ROSBAG V2.0\n"
+MESSAGE, INDEX, CHUNK, CONNECTION = 2, 4, 5, 7  # kinds of records
+MOST_HEADER = 2**16  # bytes
+MOST_CONNECTION = 2**24  # bytes, mostly the definition of its messages
+Time = tuple[int, int]  # seconds, nanoseconds
+
+
+@dataclass
+class Chunk:
+    """Messages that were packed together: where, how, and the latest time of each connection."""
+
+    at: int
+    packed: int
+    compression: str
+    size: int
+    latest: dict[int, Time] = field(default_factory=dict)
+
+
+def last_message(source: Source, topic: str | None) -> Message:
+    """The last message of the topic, or of the only one that has maps.
+
+    Raises:
+        InputError: no such bag, one without an index, damage, no such topic.
+    """
+    with source.opened(BAG) as (data, size):
+        cursor = Cursor(source, data, BAG)
+        if bytes(cursor.take(min(size, len(FIRST)), "its first line")) != FIRST:
+            source.refuse(f"{BAG}, which begins with {FIRST.decode().strip()}", "another beginning")
+        connections, chunks = _walk(cursor)
+        if not connections:
+            source.refuse(f"{BAG} with an index (`rosbag reindex` makes one)", "none")
+        name = choose(source, dict(connections.values()), topic)
+        ids = {id for id, (other, _) in connections.items() if other == name}
+        latest = [max((time for id, time in chunk.latest.items() if id in ids), default=None) for chunk in chunks]
+        times = [time for time in latest if time is not None]
+        if not times:
+            source.refuse(f"{BAG} with messages of {name}", "none")
+        chunk = chunks[latest.index(max(times))]
+        cursor.at = chunk.at
+        packed = cursor.take(chunk.packed, "a chunk")
+        data = _last(source, unpack(source, packed, chunk.compression, chunk.size, chunk.at), ids, chunk.at)
+    return Message(dict(connections.values())[name], data, "ros1")
+
+
+def _walk(cursor: Cursor) -> tuple[dict[int, tuple[str, str]], list[Chunk]]:
+    """Topic and type of each connection, and the chunks, whose messages aren't looked at."""
+    connections: dict[int, tuple[str, str]] = {}
+    chunks: list[Chunk] = []
+    for _ in range(MOST_RECORDS):
+        if not cursor.left:
+            return connections, chunks
+        header, length = _header(cursor), cursor.number("I", "a record's length")
+        kind, after = header.get(b"op", b""), cursor.at + length
+        if length > cursor.left:
+            cursor.take(length, "a record")
+        if kind == bytes([CHUNK]):
+            compression = header.get(b"compression", b"none").decode("ascii", "replace")
+            chunks.append(Chunk(cursor.at, length, compression, _number(cursor, header, b"size")))
+        elif kind == bytes([INDEX]) and chunks and length >= 12:
+            cursor.at = after - 12  # entries are in the order of time
+            time = (cursor.number("I", "a time"), cursor.number("I", "a time"))
+            chunks[-1].latest[_number(cursor, header, b"conn")] = time
+        elif kind == bytes([CONNECTION]):
+            cursor.source.limit(length, MOST_CONNECTION, "bytes of a connection")
+            fields = _fields(cursor, bytes(cursor.take(length, "a connection")))
+            topic, type = (
+                held.get(key, b"").decode("utf-8", "replace") for held, key in ((header, b"topic"), (fields, b"type"))
+            )
+            connections[_number(cursor, header, b"conn")] = (topic, type)
+        cursor.at = after
+    cursor.source.refuse(f"at most {MOST_RECORDS:,} records", "more")
+
+
+def _last(source: Source, chunk: bytes | memoryview, ids: set[int], at: int) -> memoryview:
+    """The last message of these connections in an unpacked chunk."""
+    inside = Cursor(source, chunk, f"a sound chunk at byte {at:,}")
+    found = None
+    while inside.left:
+        header = _header(inside)
+        data = inside.take(inside.number("I", "a record's length"), "a record")
+        if header.get(b"op") == bytes([MESSAGE]) and _number(inside, header, b"conn") in ids:
+            found = data
+    if found is None:
+        source.refuse("the message that the index names", f"none in the chunk at byte {at:,}")
+    return found
+
+
+def _header(cursor: Cursor) -> dict[bytes, bytes]:
+    length = cursor.number("I", "a header's length")
+    cursor.source.limit(length, MOST_HEADER, "bytes of a header")
+    return _fields(cursor, bytes(cursor.take(length, "a header")))
+
+
+def _fields(cursor: Cursor, data: bytes) -> dict[bytes, bytes]:
+    """Values by name: each has a length, then `name=value`."""
+    found: dict[bytes, bytes] = {}
+    at = 0
+    while at < len(data):
+        length = int.from_bytes(data[at : at + 4], "little")
+        name, sign, value = data[at + 4 : at + 4 + length].partition(b"=")
+        if at + 4 + length > len(data) or not sign:
+            cursor.source.refuse(
+                f"{cursor.expected} with fields name=value", f"{shown(name[:40])} before byte {cursor.at:,}"
+            )
+        found[name] = value
+        at += 4 + length
+    return found
+
+
+def _number(cursor: Cursor, header: dict[bytes, bytes], name: bytes) -> int:
+    value = header.get(name, b"")
+    if len(value) != 4:
+        cursor.source.refuse(
+            f"{cursor.expected} with {name.decode()} in each header", f"none before byte {cursor.at:,}"
+        )
+    return struct.unpack("<I", value)[0]

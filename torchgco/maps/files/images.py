@@ -1,0 +1,69 @@
+"""Images of floor plans and of heights: png, pgm, ppm and bmp, read by Pillow."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from torchgco.maps.files.heights import above_ground
+from torchgco.maps.files.source import Source, made
+from torchgco.maps.grid import OccupancyGrid
+
+MOST_PIXELS = 2**26  # 8192 x 8192
+IMAGE = "a png, pgm, ppm or bmp image"
+KINDS = ("PNG", "PPM", "BMP")  # Pillow tries no other decoder
+DARK = 0.5  # of a floor plan: darker pixels are occupied
+
+
+def read_image(
+    source: Source, resolution: float | None, origin: np.ndarray | None, height: float | None
+) -> OccupancyGrid:
+    """A floor plan, dark where it is occupied; with `height`, the heights of the ground, white at `height` metres.
+
+    The lower left pixel is the first cell, x goes to the right and y up.
+    """
+    beside = next((name for e in (".yaml", ".yml") if (name := source.path.with_suffix(e)).exists()), None)
+    source.needs("resolution", resolution, "the side of a pixel, m" + (f" (or the path {beside})" if beside else ""))
+    brightness, alpha = load(source)
+    if height is not None:
+        return above_ground(source, turned(brightness).astype(np.float64) * height, resolution, origin)
+    if alpha is not None:
+        brightness = brightness * alpha + (1.0 - alpha)  # on white paper
+    return made(source, turned(brightness < DARK), np.zeros(2) if origin is None else origin, resolution)
+
+
+def turned(rows: np.ndarray) -> np.ndarray:
+    """Pixels (rows, columns) from the top as cells (X, Y) from the lower left."""
+    return rows[::-1].T
+
+
+def load(source: Source) -> tuple[np.ndarray, np.ndarray | None]:
+    """Brightness (rows, columns) in [0, 1], the mean of the colours, float32, and opacity likewise or None.
+
+    Raises:
+        InputError: no such image, a damaged one, or one of more than `MOST_PIXELS`.
+    """
+    from PIL import Image
+
+    source.size(IMAGE)
+    with source.library(IMAGE), open(source.path, "rb") as file, Image.open(file, formats=KINDS) as image:
+        source.limit(image.width * image.height, MOST_PIXELS, f"pixels ({image.width:,} x {image.height:,} here)")
+        image.load()
+        return _levels(source, image)
+
+
+def _levels(source: Source, image: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    if image.mode.startswith("I"):  # 16 bits
+        numbers = np.asarray(image)
+        if numbers.size and (numbers.min() < 0 or numbers.max() > 65535):
+            source.refuse(f"{IMAGE} of 8 or 16 bits", f"a brightness of {numbers.max()}")
+        return numbers.astype(np.float32) / np.float32(65535.0), None
+    if image.mode in ("1", "L") and "transparency" not in image.info:
+        return np.asarray(image.convert("L")).astype(np.float32) / np.float32(255.0), None
+    if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
+        source.refuse(f"{IMAGE} of 8 or 16 bits", f"Pillow's mode {image.mode}")
+    opaque = image.mode in ("RGB", "P") and "transparency" not in image.info
+    colours = np.asarray(image.convert("RGB" if opaque else "RGBA"))
+    brightness = colours[..., :3].mean(-1, dtype=np.float32) / np.float32(255.0)
+    return brightness, None if opaque else colours[..., 3].astype(np.float32) / np.float32(255.0)

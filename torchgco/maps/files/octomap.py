@@ -1,0 +1,178 @@
+"""OctoMap's bt (free, occupied) and ot (probabilities) files.
+
+The format: OctoMap 1.10, OcTreeBaseImpl and OccupancyOcTreeBase. Its library reads by recursion in C++ without a bound,
+so this reader is a small one of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NoReturn
+
+import numpy as np
+
+from torchgco.base.errors import shown
+from torchgco.maps.files.source import MOST_CELLS, Cursor, Source, made
+from torchgco.maps.grid import OccupancyGrid
+
+DEPTH = 16  # of OctoMap's trees: the root has a side of 2**16 cells, with the frame's origin in its middle
+MOST_NODES = 2**24
+FIRST_LINES = {".bt": "# Octomap OcTree binary file", ".ot": "# Octomap OcTree file"}
+MORE = {"OcTree": 0, "ColorOcTree": 3, "OcTreeStamped": 4}  # bytes of a node in an ot file after its log-odds
+LINES, LETTERS = 64, 4096
+FREE, OCCUPIED, INNER = 1, 2, 3  # a child in a bt file, two bits
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """Cubes of the tree: lowest cell (L, 3) from the root's corner, side in cells (L,), probability (L,)."""
+
+    lowest: np.ndarray
+    sides: np.ndarray
+    values: np.ndarray
+
+
+def read_octomap(source: Source) -> OccupancyGrid:
+    """The smallest grid around all known leaves, unknown between them; probabilities of an ot file are kept.
+
+    Raises:
+        InputError: another header, a tree that is cut, has nodes more or fewer than the header says, or no leaf.
+    """
+    expected = f"an OctoMap file, which begins with '{FIRST_LINES[source.path.suffix.lower()]}'"
+    raw = source.bytes(expected)
+    kind, size, resolution, at = _header(source, raw, expected)
+    source.limit(size, MOST_NODES, "nodes of a tree")
+    cursor = Cursor(source, raw, expected, at)
+    binary = source.path.suffix.lower() == ".bt"
+    leaves, nodes = _binary_tree(cursor, size) if binary else _tree(cursor, MORE[kind])
+    if nodes != size:
+        source.refuse(f"a tree of {size:,} nodes", f"{nodes:,}")
+    if not len(leaves.sides):
+        source.refuse("a map with a known cell", "an empty tree")
+    low, high = leaves.lowest.min(0), (leaves.lowest + leaves.sides[:, None]).max(0)
+    source.limit(int(np.prod(high - low, dtype=np.float64)), MOST_CELLS, f"cells ({' x '.join(map(str, high - low))})")
+    cells = np.full(tuple(high - low), np.nan, np.float32)
+    for side in np.unique(leaves.sides).tolist():
+        chosen = leaves.sides == side
+        _fill(cells, leaves.lowest[chosen] - low, side, leaves.values[chosen])
+    return made(source, cells, (low - 2 ** (DEPTH - 1)) * resolution, resolution)
+
+
+def _fill(cells: np.ndarray, lowest: np.ndarray, side: int, values: np.ndarray) -> None:
+    if side == 1:
+        cells[tuple(lowest.T)] = values
+        return
+    for (i, j, k), value in zip(lowest.tolist(), values, strict=True):
+        cells[i : i + side, j : j + side, k : k + side] = value
+
+
+def _header(source: Source, raw: bytes, expected: str) -> tuple[str, int, float, int]:
+    """Kind of tree, number of nodes, side of a cell, and the byte after the header."""
+    found: dict[str, str] = {}
+    at = 0
+    for line in range(LINES):
+        end = raw.find(b"\n", at, at + LETTERS)
+        text = raw[at : max(end, at)].decode("utf-8", "replace").strip()
+        if end < 0 or (line == 0 and not text.startswith(FIRST_LINES[source.path.suffix.lower()])):
+            source.refuse(expected, f"{shown(raw[at : at + 40])} at byte {at:,}")
+        at = end + 1
+        if text == "data":
+            break
+        if text and not text.startswith("#"):
+            key, _, value = text.partition(" ")
+            if key not in ("id", "size", "res") or key in found:
+                source.refuse(f"{expected}, then id, size, res and data", f"{shown(text[:60])} in line {line + 1}")
+            found[key] = value.strip()
+    if set(found) != {"id", "size", "res"}:
+        source.refuse(f"{expected}, then id, size, res and data", f"only {', '.join(found) or 'none of them'}")
+    if found["id"] not in MORE:
+        source.refuse(f"a tree of {', '.join(MORE)}", shown(found["id"]))
+    if not found["size"].isascii() or not found["size"].isdigit() or len(found["size"]) > 12:
+        source.refuse("a whole number of nodes", shown(found["size"]))
+    try:
+        resolution = float(found["res"])
+    except ValueError:
+        resolution = np.nan
+    if not 0.0 < resolution < np.inf:
+        source.refuse("res, a length > 0 m", shown(found["res"]))
+    return found["id"], int(found["size"]), resolution, at
+
+
+def _binary_tree(cursor: Cursor, size: int) -> tuple[Leaves, int]:
+    """Leaves and number of nodes of a bt file: two bytes per inner node, its eight children two bits each."""
+    count = min(cursor.left // 2, size)
+    words = np.frombuffer(cursor.data[cursor.at : cursor.at + 2 * count], "<u2").tolist()
+    inner: list[tuple[int, int, int, int, int]] = []
+    open_: list[tuple[int, int, int, int]] = [(0, 0, 0, DEPTH)] if words else []
+    while open_:
+        x, y, z, level = open_.pop()
+        if len(inner) >= count:
+            break
+        word = words[len(inner)]
+        if level == 0:
+            cursor.source.refuse(f"a tree of depth {DEPTH}", f"a deeper one at byte {cursor.at + 2 * len(inner):,}")
+        inner.append((x, y, z, level, word))
+        half = 1 << (level - 1)
+        for child in (7, 6, 5, 4, 3, 2, 1, 0):  # the first is read first, from the end of the list
+            if (word >> 2 * child) & 3 == INNER:
+                open_.append((x + half * (child & 1), y + half * (child >> 1 & 1), z + half * (child >> 2), level - 1))
+    if open_ or 2 * len(inner) < cursor.left:
+        _refuse_end(cursor, bool(open_), cursor.at + 2 * len(inner))
+    return _children(np.array(inner, np.int64).reshape(-1, 5))
+
+
+def _refuse_end(cursor: Cursor, cut: bool, at: int) -> NoReturn:
+    expected = f"{cursor.expected}, and ends with its tree's last node"
+    cursor.source.refuse(expected, f"a tree that is cut at byte {at:,}" if cut else f"a tree that ends at byte {at:,}")
+
+
+def _children(inner: np.ndarray) -> tuple[Leaves, int]:
+    """The leaves among the children of inner nodes (I, 5): lowest cell, level, word."""
+    child = np.arange(8)
+    kinds = inner[:, 4:] >> 2 * child & 3
+    node, which = np.nonzero((kinds == FREE) | (kinds == OCCUPIED))
+    side = 1 << (inner[node, 3] - 1)
+    corner = np.stack([which & 1, which >> 1 & 1, which >> 2], 1) * side[:, None]
+    values = (kinds[node, which] == OCCUPIED).astype(np.float32)
+    return Leaves(inner[node, :3] + corner, side, values), len(node) + len(inner)
+
+
+def _tree(cursor: Cursor, more: int) -> tuple[Leaves, int]:
+    """Leaves and number of nodes of an ot file: log-odds, a colour or time, and a bit for each child that there is."""
+    row = np.dtype([("log_odds", "<f4"), ("more", f"V{more}"), ("children", "u1")])
+    if not more:
+        row = np.dtype([("log_odds", "<f4"), ("children", "u1")])
+    count, rest = divmod(cursor.left, row.itemsize)
+    cursor.source.limit(count, MOST_NODES, "nodes of a tree")
+    rows = np.frombuffer(cursor.data[cursor.at : cursor.at + count * row.itemsize], row)
+    with np.errstate(invalid="ignore"):  # some kinds of NaN, refused below
+        children, odds = rows["children"].tolist(), rows["log_odds"].astype(np.float64)
+    leaves: list[tuple[int, int, int, int, int]] = []
+    open_: list[tuple[int, int, int, int]] = [(0, 0, 0, DEPTH)] if count else []
+    node = 0
+    while open_ and node < count:
+        x, y, z, level = open_.pop()
+        bits = children[node]
+        if not bits:
+            leaves.append((x, y, z, level, node))
+        elif level == 0:
+            at = cursor.at + node * row.itemsize
+            cursor.source.refuse(f"a tree of depth {DEPTH}", f"a deeper one at byte {at:,}")
+        else:
+            half = 1 << (level - 1)
+            for child in (7, 6, 5, 4, 3, 2, 1, 0):
+                if bits >> child & 1:
+                    corner = (x + half * (child & 1), y + half * (child >> 1 & 1), z + half * (child >> 2))
+                    open_.append((*corner, level - 1))
+        node += 1
+    if open_ or node < count or rest:
+        _refuse_end(cursor, bool(open_), cursor.at + node * row.itemsize)
+    found = np.array(leaves, np.int64).reshape(-1, 5)
+    chosen = odds[found[:, 4]]
+    if not np.isfinite(chosen).all():
+        cursor.source.refuse("finite log-odds of leaves", f"{chosen[~np.isfinite(chosen)][0]}")
+    return Leaves(found[:, :3], 1 << found[:, 3], _probability(chosen)), count
+
+
+def _probability(log_odds: np.ndarray) -> np.ndarray:
+    return (1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0)))).astype(np.float32)

@@ -1,0 +1,133 @@
+"""A map from a file, by the ending of its name."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchgco.base.errors import InputError, shown
+from torchgco.maps.files.arrays import read_npy, read_npz
+from torchgco.maps.files.images import read_image
+from torchgco.maps.files.layer import checked_layer, flat
+from torchgco.maps.files.map_server import read_map_server
+from torchgco.maps.files.octomap import read_octomap
+from torchgco.maps.files.pcd import read_pcd
+from torchgco.maps.files.ply import read_ply
+from torchgco.maps.files.source import FARTHEST, LEAST, Source
+from torchgco.maps.files.text import read_xyz
+from torchgco.maps.grid import OccupancyGrid, coordinates, number
+from torchgco.maps.points import PointCloud
+
+
+@dataclass(frozen=True)
+class Format:
+    """How the files of one ending are read.
+
+    Args:
+        reader: returns a grid, or points (P, d).
+        options: those of `read` that the reader takes.
+    """
+
+    reader: Callable[..., OccupancyGrid | np.ndarray]
+    options: tuple[str, ...] = ()
+
+
+def _read_bag(source: Source, topic: str | None) -> OccupancyGrid | np.ndarray:
+    """Imported late: some builds of Python lack what packed bags and SQLite need."""
+    from torchgco.maps.files.bags.bag import read_bag
+
+    return read_bag(source, topic)
+
+
+METADATA = "metadata.yaml"  # is in the folder of each bag of ROS 2
+IMAGE = Format(read_image, ("resolution", "origin", "height"))
+BAG = Format(_read_bag, ("topic",))
+FORMATS = {
+    ".npz": Format(read_npz),
+    ".npy": Format(read_npy, ("resolution", "origin", "height")),
+    ".yaml": Format(read_map_server),
+    ".yml": Format(read_map_server),
+    ".png": IMAGE,
+    ".pgm": IMAGE,
+    ".bmp": IMAGE,
+    ".xyz": Format(read_xyz),
+    ".pcd": Format(read_pcd),
+    ".ply": Format(read_ply),
+    ".bt": Format(read_octomap),
+    ".ot": Format(read_octomap),
+    ".bag": BAG,
+    ".mcap": BAG,
+    ".db3": BAG,
+}
+
+
+def read(
+    path: str | os.PathLike[str],
+    *,
+    resolution: float | None = None,
+    radius: float | None = None,
+    origin: Any = None,
+    height: float | None = None,
+    topic: str | None = None,
+    layer: Any = None,
+    field: str = "map",
+) -> OccupancyGrid | PointCloud:
+    """The map in a file: a grid, or a cloud where the file holds points. What has no unit is in metres.
+
+    Args:
+        path: a file of one of `FORMATS`; of ROS 2 also a bag's folder.
+        resolution: side of a cell, m: for images, and cells or heights in npy files, which don't state theirs.
+        radius: of the ball around each point, m: for files of points.
+        origin: lowest corner of the first cell, m, by default 0: for images, and cells or heights in npy files.
+        height: makes an image or numbers (X, Y) in an npy file a heightmap: metres of white above black, or of 1.
+        topic: of a bag's map; not needed where only one topic has maps.
+        layer: heights (low, high), m: of a map of space, what lies between them is seen from above, as a map of the
+            plane.
+        field: what errors call the file and these arguments: `<field>.path`, `<field>.resolution`.
+
+    Raises:
+        InputError: another ending, no such file, one that is damaged or too large, an argument that is missing, out of
+            range, or not for this kind of file.
+    """
+    source, format = _find(path, field)
+    given = {"resolution": resolution, "origin": origin, "height": height, "topic": topic}
+    for name, value in given.items():
+        if value is not None and name not in format.options:
+            raise InputError(f"{field}.{name}", f"none: a {source.path.suffix} file has no use for it", shown(value))
+    for name, value in (("resolution", resolution), ("radius", radius), ("height", height)):
+        _check_length(value, f"{field}.{name}", least=0.0 if name == "radius" else LEAST)
+    if origin is not None:
+        given["origin"] = origin = coordinates(origin, f"{field}.origin")
+        if origin.shape not in ((2,), (3,)) or not (np.abs(origin) <= FARTHEST).all():
+            raise InputError(f"{field}.origin", f"2 or 3 coordinates within {FARTHEST:g} m", shown(origin.tolist()))
+    found = format.reader(source, **{name: given[name] for name in format.options})
+    if layer is not None:
+        found = flat(source, found, checked_layer(layer, f"{field}.layer"), radius)
+    if isinstance(found, OccupancyGrid):
+        if radius is not None:
+            raise InputError(f"{field}.radius", f"none: {source.path} holds cells, no points", radius)
+        return found
+    source.needs("radius", radius, "the radius of the ball around each point, m")
+    return PointCloud(found, radius)
+
+
+def _find(path: Any, field: str) -> tuple[Source, Format]:
+    if not isinstance(path, (str, os.PathLike)) or not str(path):
+        raise InputError(f"{field}.path", "the path of a map", shown(path))
+    source = Source(Path(path), field)
+    ending = source.path.suffix.lower()
+    if ending not in FORMATS and (source.path / METADATA).is_file():
+        return source, BAG
+    if ending not in FORMATS:
+        raise InputError(f"{field}.path", f"a file that ends with {', '.join(FORMATS)}", path)
+    return source, FORMATS[ending]
+
+
+def _check_length(value: Any, field: str, least: float) -> None:
+    if value is not None and not least <= number(value, field) <= FARTHEST:
+        raise InputError(field, f"a length from {least:g} to {FARTHEST:g} m", shown(value))
