@@ -8,8 +8,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.view.scenes import DT, RADIUS, SOLVERS, N, problem, trajectories
-from torchgco import Boxes, Planar, Problem, QuadraticCost
+from torchgco import Boxes, Field, FunctionDynamics, Planar, Problem, QuadraticCost
+from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.view.cells import merged
 from torchgco.view.flights import contacts, violated, whole
 from torchgco.view.shapes import SHAPES, Shapes, once, shapes_of, turns
 
@@ -73,6 +75,40 @@ def test_a_kind_that_is_added_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     assert seen is not None and np.allclose(seen.half, part.half_sizes[0])  # type: ignore[attr-defined]
     monkeypatch.setitem(SHAPES, BoundBoxes, lambda part, b: other)
     assert shapes_of(part, 0) is other
+
+
+@pytest.mark.parametrize("shape", [(7,), (6, 9), (5, 6, 7), (1, 1, 1)])
+def test_occupied_cells_are_filled_once(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(4)
+    for share in (0.0, 0.3, 0.8, 1.0):
+        cells, filled = rng.random(shape) < share, np.zeros(shape, dtype=int)
+        for low, high in zip(*merged(cells), strict=True):
+            filled[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] += 1
+        np.testing.assert_array_equal(filled, cells)
+    assert len(merged(np.ones(shape, dtype=bool))[0]) == 1
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_cells_and_points_of_maps_are_drawn_where_they_are(batch: bool) -> None:
+    rng = np.random.default_rng(5)
+    cells = rng.random((2, 6, 5, 4) if batch else (6, 5, 4)) < 0.2
+    origin = rng.uniform(-1, 1, (2, 3) if batch else 3)
+    x0 = torch.zeros(2, 3, dtype=torch.float64)
+    dynamics = FunctionDynamics(lambda x, u: u, n=3, m=3, dt=DT, position=slice(0, 3))
+    cost = QuadraticCost(Q=[0.0] * 3, R=[1.0] * 3, Qf=[1.0] * 3, x_ref=[8.0, 0, 0])
+
+    def drawn(source: OccupancyGrid | PointCloud) -> Shapes:
+        found = shapes_of(Problem(dynamics, cost, [Field(DistanceField.of(source), 0.1)], x0, 4).obstacles[0], 1)
+        assert found is not None
+        return found
+
+    shapes = drawn(OccupancyGrid(cells, origin, 0.2))
+    own, lowest = (cells[1], origin[1]) if batch else (cells, origin)
+    for index in np.ndindex(own.shape):
+        inside = distance(shapes, lowest + 0.2 * (np.array(index) + 0.5), 0.0).min(initial=1.0) < 0
+        assert inside == own[index]
+    points = rng.uniform(-1, 1, (2, 9, 3) if batch else (9, 3))
+    np.testing.assert_allclose(drawn(PointCloud(points, 0.3)).center, points[1] if batch else points)
 
 
 def test_violations_are_those_of_the_worst_constraint_at_each_knot() -> None:

@@ -60,7 +60,7 @@ def _told(problem: Problem, solution: Solution) -> tuple[list[Rows], list[str], 
         at = worst.loc[b]
         held += [("worst", f"{at['name']}, knot {at['knot']}: {at['violation']:.2g}")] if at["constraint"] >= 0 else []
         rows.append(held)
-        good = bool(row["violation"] <= ADMITTED)
+        good = bool(row["violation"] <= ADMITTED and not row.get("clearance", 0.0) < 0)
         results.append("reached" if good and row.get("reached", False) else "feasible" if good else "failed")
     clearance = frame["clearance"].to_numpy() if "clearance" in frame else np.full(problem.B, -np.inf)
     return rows, results, ~(clearance >= 0)

@@ -147,29 +147,43 @@ export function obstacles(parts, space, colours, still) {
     const mesh = new THREE.Mesh(geometry, solids);
     mesh.castShadow = mesh.receiveShadow = true;
     mesh.customDepthMaterial = shadow;
-    const shell = new THREE.Mesh(geometry, hull);
-    shell.visible = false;
     meshes.push(mesh);
-    shells.push(shell);
   }
-  group.add(...meshes, ...shells);
-  group.children.forEach((one) => (one.frustumCulled = false));
+  const add = (...more) => {
+    more.forEach((one) => (one.frustumCulled = false));
+    group.add(...more);
+  };
+  add(...meshes);
   const until = Math.min(...parts.map((part) => part.until ?? Infinity), Infinity);
   return {
     group,
     setTime: (t) => (uniforms.time.value = Math.min(t, until)),
-    setGrown: (on) => shells.forEach((shell) => (shell.visible = on)),
+    setGrown: (on) => {
+      if (on && !shells.length) {
+        shells.push(...parts.map((part) => new THREE.Mesh(geometryOf(part, space, still, true), hull)));
+        add(...shells);
+      }
+      shells.forEach((shell) => (shell.visible = on));
+    },
     setSeeThrough: (on) => meshes.forEach((mesh) => (mesh.material = on ? clear : solids)),
     dispose: () => {
       [solids, clear, hull, shadow].forEach((one) => one.dispose());
-      meshes.forEach((mesh) => mesh.geometry.dispose());
+      [...meshes, ...shells].forEach((mesh) => mesh.geometry.dispose());
     },
   };
 }
 
-function geometryOf(part, space, still) {
+/** The six sides of sharp boxes, such as the cells of a map. */
+function sharp() {
+  const box = new THREE.BoxGeometry(2, 2, 2);
+  const corners = [...box.attributes.position.array];
+  return { corners, offsets: corners.map(() => 0), normals: [...box.attributes.normal.array], index: [...box.index.array] };
+}
+
+function geometryOf(part, space, still, grown) {
   const [steps, rings] = still ? [10, 8] : part.count > MANY ? [3, 2] : [6, 5];
-  const template = space.flat ? prism(2 * steps) : solid(steps, rings);
+  const edged = !grown && part.radius.data.every((radius) => radius === 0);
+  const template = edged ? sharp() : space.flat ? prism(2 * steps) : solid(steps, rings);
   const geometry = new THREE.InstancedBufferGeometry();
   geometry.instanceCount = part.count;
   geometry.setIndex(template.index);
