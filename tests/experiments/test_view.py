@@ -61,6 +61,24 @@ def test_missions_show_track_and_plan(run, tmp_path) -> None:
         np.testing.assert_allclose(flight["plan"], held["plan"][0, 1, :count], atol=2e-3)
 
 
+def test_the_search_is_shown_where_it_is_asked_for(run, tmp_path, capsys) -> None:
+    words = ["study.layouts=2", "study.workers=1", "study.figures=false", "hydra.run.dir=sought"]
+    code, _, err = run("scenario=planar_trap", *words, "study.baselines=[al_ilqr]")
+    assert code == 0, err
+    assert view.main([str(tmp_path / "sought"), "--search", "0", "0"]) == 0
+    page = tmp_path / "sought" / "view.html"
+    assert part(page, "part-1")["search"] is None
+    search = part(page, "part-0")["search"]
+    assert search["passes"][0].startswith("gco: ") and search["rounds"]
+    texts = [line["text"] for line in search["rounds"][0]["lines"]]
+    assert any(text.startswith("path 1: ") for text in texts) and any("proposed" in text for text in texts)
+    for line in search["rounds"][0]["lines"]:
+        assert len(line["points"]) > 1 and np.isfinite(line["points"]).all()
+    capsys.readouterr()
+    assert view.main([str(tmp_path / "sought"), "--search", "7"]) == 2
+    assert "--search: expected numbers of layouts of the study, got 7" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [

@@ -73,7 +73,8 @@ export class Flights {
     const group = new THREE.Group();
     const points = this.points(flight.path);
     const paint = new THREE.MeshLambertMaterial({ color: colour });
-    const line = tube(points, this.thick, paint);
+    // The first is the thinnest: one of the same course shows at its sides.
+    const line = tube(points, (flight.solver === 0 ? 1 : 1.4) * this.thick, paint);
     if (line) {
       // Seen through whatever stands before it.
       const ghost = new THREE.Mesh(
@@ -99,7 +100,7 @@ export class Flights {
     const paint = new THREE.MeshLambertMaterial({ color: BAD });
     for (const [first, last] of runs(flight.violated.map(([k]) => k))) {
       const piece = points.slice(Math.max(0, first - 1), last + 2);
-      const red = piece.length > 1 ? tube(piece, 1.5 * this.thick, paint) : null;
+      const red = piece.length > 1 ? tube(piece, 1.8 * this.thick, paint) : null;
       if (red) found.push(red);
     }
     if (flight.contacts.length) {
