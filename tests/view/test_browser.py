@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from tests.view.browser import Tab, browser, found
-from tests.view.scenes import DT, SOLVERS, WORDS, N, document, trajectories
+from tests.view.scenes import DT, SOLVERS, UNEVEN, WORDS, N, document, trajectories
 from torchgco.plotting.style import solver_colours
 from torchgco.view.document import Line, SearchPart
 from torchgco.view.page import page
@@ -140,6 +140,19 @@ def test_a_click_changes_the_layout(tab: Tab) -> None:
     assert (np.abs(pixels(tab) - before).max(axis=-1) > 30).sum() > 200
     tab.click("#next")
     tab.wait(f"{PICTURE}.dataset.layout === '0'")
+
+
+def test_stages_may_differ_in_length(tab: Tab) -> None:
+    tab.click("#chips button:nth-child(2)")
+    tab.wait(f"{PICTURE}.dataset.layout === '1' && torchgcoView.flights.times")
+    assert "of 2.00 s" in tab.evaluate("document.getElementById('clock').textContent")
+    X = trajectories()[SOLVERS[0]][1].numpy()
+    tab.evaluate(f"torchgcoView.setTime({0.5 * (UNEVEN[20] + UNEVEN[21])})")
+    np.testing.assert_allclose(vehicle(tab), 0.5 * (X[20] + X[21]), atol=2e-3)
+    tab.evaluate(f"{PICTURE}.focus()")
+    for key, k in ((".", 21), (".", 22), (",", 21)):
+        tab.press(key)
+        np.testing.assert_allclose(vehicle(tab), X[k], atol=2e-3)
 
 
 def test_keys_play_step_and_choose(tab: Tab) -> None:

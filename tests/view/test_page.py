@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from tests.view.scenes import WORDS, document, problem, solution, trajectories
+from tests.view.test_packing import part
 from torchgco import FunctionDynamics, InputError, Problem, QuadraticCost, Solution
 from torchgco.base.html import HtmlPage
 from torchgco.view.page import MODULES, STATIC, THREE, page
@@ -108,6 +112,23 @@ def test_what_cannot_be_shown_is_refused(held: tuple[Problem, Solution]) -> None
     still = Problem(swing, QuadraticCost(Q=[1.0, 0], R=[1.0], Qf=[1.0, 0], x_ref=[0, 0]), [], task.x0[:, :2], 5)
     with pytest.raises(InputError, match="a model with a position"):
         solution(still, task.x0.new_zeros(2, 6, 2), task.x0.new_zeros(2, 5, 1)).show(still)
+
+
+def test_times_of_knots_are_kept_where_stages_differ() -> None:
+    step, x0 = torch.tensor([0.1, 0.3, 0.2, 0.4]).double().view(1, 4, 1), torch.zeros(2, 2, dtype=torch.float64)
+
+    def shown(function: Any, values: Any = None, **more: Any) -> dict[str, Any]:
+        dynamics = FunctionDynamics(function, 2, 2, 0.5, "none", slice(0, 2), knot_values=values)
+        task = Problem(dynamics, QuadraticCost([0.0] * 2, [1.0] * 2, [1.0] * 2, [1.0, 0]), [], x0, 4, **more)
+        found = replace(solution(task, x0.new_zeros(2, 5, 2), x0.new_zeros(2, 4, 2)), **more)
+        return part(found.show(task).html, "part-1")
+
+    uneven = shown(lambda x, u, dt: x + dt * u, {"dt": step})
+    np.testing.assert_allclose(uneven["times"], [0, 0.1, 0.4, 0.6, 1.0], atol=2e-4)
+    even = shown(lambda x, u: x + 0.5 * u)
+    assert even["times"] is None and len(even["flights"][0]["path"]) == 5
+    shorter = shown(lambda x, u: x + 0.5 * u, horizon=torch.tensor([4, 3]))
+    assert len(shorter["flights"][0]["path"]) == 4
 
 
 def test_numbers_in_a_page_of_states_that_are_lost() -> None:

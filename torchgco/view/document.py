@@ -48,9 +48,19 @@ class Document:
     parts: list[str] = field(default_factory=list)
 
     def add(
-        self, label: str, problem: Problem, b: int, flights: Sequence[Flight], search: SearchPart | None = None
+        self,
+        label: str,
+        problem: Problem,
+        b: int,
+        flights: Sequence[Flight],
+        search: SearchPart | None = None,
+        times: np.ndarray | None = None,
     ) -> None:
-        """Add a layout: problem b of a batch, and its trajectories in the order of the solvers, where there are any."""
+        """Add a layout: problem b of a batch, and its trajectories in the order of the solvers, where there are any.
+
+        Args:
+            times: (N+1,) of the knots, s; None: multiples of `dt`.
+        """
         packing, at = Packing(), problem.position
         start = problem.x0[b, at].detach().cpu().double().numpy()
         goal = None if problem.goal is None else problem.goal.position[b].cpu().double().numpy()
@@ -62,6 +72,7 @@ class Document:
             "obstacles": [shape.packed(packing, middle) for shape in self._shapes(problem.obstacles, b)],
             "flights": [flight.packed(packing, names.index(flight.solver)) for flight in flights],
             "search": None if search is None else search.packed(packing),
+            "times": None if times is None else packing.put(times, steps=True),
         }  # fmt: skip
         self.labels.append({"label": label, "results": {flight.solver: flight.result for flight in flights}})
         self.parts.append(packing.sealed(part))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -46,6 +46,14 @@ class Flight:
     contacts: np.ndarray
     plan: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
+
+    def until(self, last: int) -> Flight:
+        """The same up to a knot."""
+        kept = slice(0, last + 1)
+        attitude = None if self.attitude is None else self.attitude[kept]
+        return replace(
+            self, path=self.path[kept], attitude=attitude, violation=self.violation[kept], worst=self.worst[kept]
+        )
 
     def packed(self, packing: Packing, number_of: int) -> dict[str, Any]:
         """As the page reads it, under the number of its solver."""
@@ -130,7 +138,7 @@ def flights_of(
         admitted: the violation up to which nothing is marked.
         touching: (B,) bool: where contact is looked for.
     """  # fmt: skip
-    knots, found, dt = violated(problem, X, U, admitted), [], float(problem.dynamics.dt)
+    knots, found, dt = violated(problem, X, U, admitted), [], getattr(problem.dynamics, "dt", None) or 1.0
     states = X.detach().cpu().double().numpy()
     for b in range(problem.B):
         kept = whole(states[b])

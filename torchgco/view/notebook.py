@@ -10,6 +10,7 @@ from torchgco.base.shapes import check_shape
 from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.times import times
 from torchgco.solution import Solution
 from torchgco.view.document import Document
 from torchgco.view.flights import Rows, flights_of
@@ -34,15 +35,37 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPa
         raise InputError("problem", "at least one problem to show", "an empty batch")
     look, rows, results, touching = look_of(problem.dynamics), *_told(problem, solution)
     flights = flights_of(problem, look, solution.X, solution.U, name, results, rows, ADMITTED, touching)
-    radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
+    t_of, dt = _times(problem, solution)
+    N, radius = problem.N, max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
     document = Document(
         title="torchgco", about=f"{problem.B} problems, {problem.N} stages" if problem.B > 1 else f"{problem.N} stages",
-        dimension=dimension, dt=float(problem.dynamics.dt), look=look, radius=radius, solvers=[name],
+        dimension=dimension, dt=dt, look=look, radius=radius, solvers=[name],
         constraints=[constraint_name(part) for part in problem.constraints],
     )  # fmt: skip
     for b, flight in enumerate(flights):
-        document.add(f"problem {b}", problem, b, [flight], search_of(solution, problem, b))
+        last = N if solution.horizon is None else int(solution.horizon[b])
+        t = None if t_of is None else t_of[b, : last + 1]
+        document.add(f"problem {b}", problem, b, [flight.until(last)], search_of(solution, problem, b), t)
     return HtmlPage(page(document), "Trajectories among obstacles")
+
+
+def _times(problem: Problem, solution: Solution) -> tuple[np.ndarray | None, float]:
+    """The times of the knots (B, N+1), s, and the length of a stage; None where all stages are of this length.
+
+    Of dynamics without a time step, stages count as 1 s.
+    """
+    dt = getattr(problem.dynamics, "dt", None) or 1.0
+    try:
+        t = solution.t
+    except InputError:  # the solution doesn't know its problem
+        try:
+            t = times(problem)
+        except InputError:
+            return None, dt
+    held = t.detach().cpu().double().numpy()
+    held = np.broadcast_to(held, (problem.B, problem.N + 1))
+    even = np.minimum(np.arange(problem.N + 1), np.reshape(problem.stages.cpu().numpy(), (-1, 1))) * dt
+    return (None, dt) if np.allclose(held, even, rtol=0, atol=1e-9 * dt) else (held, dt)
 
 
 def _told(problem: Problem, solution: Solution) -> tuple[list[Rows], list[str], np.ndarray]:

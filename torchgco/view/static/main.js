@@ -213,7 +213,7 @@ class Page {
 
   setTime(t) {
     this.time = Math.min(Math.max(0, t), this.flights.duration);
-    this.obstacles.setTime(this.time);
+    this.obstacles.setTime(this.flights.knotsAt(this.time) * this.head.dt); // they count in steps of equal length
     this.flights.setTime(this.time);
     if (this.shown.follow) this.follow();
     this.redraw();
@@ -243,17 +243,25 @@ class Page {
     const steps = { ",": -1, ".": 1 };
     const layouts = { n: 1, p: -1 };
     if (event.key === " ") this.play(!this.playing);
-    else if (event.key in steps) this.setTime(this.time + steps[event.key] * this.head.dt);
+    else if (event.key in steps) this.stepKnot(steps[event.key]);
     else if (event.key in layouts) this.actions().step(layouts[event.key]);
     else return;
     event.preventDefault();
+  }
+
+  /** To the next knot, or the one before. */
+  stepKnot(change) {
+    const at = this.flights.knotsAt(this.time);
+    const near = Math.round(at);
+    const from = Math.abs(at - near) < 1e-3 ? near : change > 0 ? Math.floor(at) : Math.ceil(at);
+    this.setTime(this.flights.timeOf(Math.min(this.flights.knots, Math.max(0, from + change))));
   }
 
   hover(event) {
     if (this.orbit.held || !this.flights) return;
     const { clientWidth, clientHeight } = this.canvas;
     const found = pick(this.flights, this.orbit.camera, event.offsetX, event.offsetY, clientWidth, clientHeight);
-    showHover(by("hover"), found && linesOf(found, this.head), event.offsetX, event.offsetY, clientWidth);
+    showHover(by("hover"), found && linesOf(found, this.flights), event.offsetX, event.offsetY, clientWidth);
   }
 
   resize() {
