@@ -50,7 +50,7 @@ class Shapes:
 
     def packed(self, packing: Packing, middle: np.ndarray) -> dict[str, Any]:
         """As the page reads them; centres count from `middle` (d,), near which half precision is finest."""
-        held: dict[str, Any] = {"count": len(self.center), "until": self.until}
+        held: dict[str, Any] = {"count": len(self.center), "until": self.until, "middle": middle.tolist()}
         arrays = {"center": self.center - middle, "half": self.half, "radius": self.radius, "turn": self.turn}
         arrays["velocity"] = self.velocity
         return held | {name: packing.put(once(part)) for name, part in arrays.items() if part is not None}

@@ -105,6 +105,7 @@ class Page {
   async choose(number) {
     this.number = number;
     const layout = await part(`part-${number}`);
+    layout.obstacles = await Promise.all(layout.obstacles.map((one) => ("shared" in one ? part(`map-${one.shared}`) : one)));
     if (number !== this.number) return;
     this.layout = layout;
     showLayout(layout, number, this.head, this.visible, this.actions());

@@ -224,7 +224,7 @@ export function instances(part, space) {
   );
   for (let k = 0; k < part.count; k++) {
     for (let i = 0; i < (space.flat ? 2 : 3); i++) {
-      found.middle[3 * k + i] = part.center.data[row(part.center, k) + i] + space.middle[i];
+      found.middle[3 * k + i] = part.center.data[row(part.center, k) + i] + part.middle[i];
       found.sides[3 * k + i] = part.half.data[row(part.half, k) + i];
       if (part.velocity) found.velocity[3 * k + i] = part.velocity.data[row(part.velocity, k) + i];
     }
