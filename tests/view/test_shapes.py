@@ -12,8 +12,9 @@ from torchgco import Boxes, Field, FunctionDynamics, Planar, Problem, QuadraticC
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.view.cells import merged
-from torchgco.view.flights import contacts, violated, whole
+from torchgco.view.flights import contacts, flights_of, violated, whole
 from torchgco.view.shapes import SHAPES, Shapes, once, shapes_of, turns
+from torchgco.view.vehicles import Look
 
 
 def distance(shapes: Shapes, p: np.ndarray, t: float) -> np.ndarray:
@@ -123,6 +124,17 @@ def test_violations_are_those_of_the_worst_constraint_at_each_knot() -> None:
         worst = int(np.argmax(depth)) if max(depth) > 1e-3 else -1
         assert knots.worst[0, k] == worst
         np.testing.assert_allclose(knots.violation[0, k], max(depth) if worst >= 0 else 0.0, atol=1e-9)
+
+
+def test_the_worst_constraint_is_named_in_the_table() -> None:
+    task, X = problem(1), trajectories(1)[SOLVERS[1]]
+    (flight,) = flights_of(task, Look(), X, X.new_zeros(1, N, 3), "one", ["failed"], [[]], 1e-3, np.array([False]))
+    ((label, text),) = flight.rows
+    # The straight line meets the centre of the sphere at (3, 0, 0): 0.8 m + 0.3 m deep, at knot 15.
+    assert label == "worst" and text == "Spheres, knot 15: 1.1 m"
+    good = trajectories(1)[SOLVERS[0]]
+    (flight,) = flights_of(task, Look(), good, X.new_zeros(1, N, 3), "one", ["reached"], [[]], 1e-3, np.array([True]))
+    assert flight.rows == [] and len(flight.contacts) == 0
 
 
 def test_contact_is_marked_once_where_it_is_deepest() -> None:

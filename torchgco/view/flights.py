@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.view.packing import LARGEST, Packing, number
@@ -114,6 +115,22 @@ def contacts(obstacles: Sequence[Obstacles], path: np.ndarray, dt: float) -> np.
     return places[[run[depth.numpy()[run].argmax()] for run in runs if len(run)]]
 
 
+def constraint_name(part: Constraint) -> str:
+    """The user's name of a constraint, else its kind, as `worst_rows` has it."""
+    given = getattr(part, "name", None)
+    return given if isinstance(given, str) and given != "constraint" else type(part).__name__.removeprefix("Bound")
+
+
+def worst_row(problem: Problem, violation: np.ndarray, worst: np.ndarray) -> Rows:
+    """Which constraint is violated most, where and by how much, from the violations (K,) at the knots."""
+    k = int(violation.argmax()) if len(violation) else 0
+    if not len(violation) or worst[k] < 0:
+        return []
+    part = problem.constraints[worst[k]]
+    unit = " m" if isinstance(part, Obstacles) else ""
+    return [("worst", f"{constraint_name(part)}, knot {k}: {violation[k]:.2g}{unit}")]
+
+
 def whole(X: np.ndarray) -> np.ndarray:
     """The knots (K, n) of states (N+1, n) before the first that isn't finite, or is too far to be drawn."""
     good = np.isfinite(X).all(axis=1) & (np.abs(np.nan_to_num(X)) < LARGEST).all(axis=1)
@@ -137,20 +154,17 @@ def flights_of(
         results, rows: of each problem, as in `Flight`.
         admitted: the violation up to which nothing is marked.
         touching: (B,) bool: where contact is looked for.
-    """  # fmt: skip
+    """
     knots, found, dt = violated(problem, X, U, admitted), [], getattr(problem.dynamics, "dt", None) or 1.0
     states = X.detach().cpu().double().numpy()
     for b in range(problem.B):
         kept = whole(states[b])
         path, at = kept[:, problem.position], slice(0, len(kept))
         places = path[:0]
+        bad, which = knots.violation[b, at], knots.worst[b, at]
         if touching[b] and len(path):
             part = problem.take(torch.tensor([b], device=X.device))
             places = contacts(part.obstacles, path, dt)
-        found.append(
-            Flight(
-                solver, path, look.attitude(kept), results[b], rows[b], knots.violation[b, at], knots.worst[b, at],
-                places,
-            )
-        )  # fmt: skip
+        told = [*rows[b], *worst_row(problem, bad, which)]
+        found.append(Flight(solver, path, look.attitude(kept), results[b], told, bad, which, places))
     return found

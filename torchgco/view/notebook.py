@@ -7,13 +7,12 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.base.html import HtmlPage
 from torchgco.base.shapes import check_shape
-from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
 from torchgco.view.document import Document
-from torchgco.view.flights import Rows, flights_of
+from torchgco.view.flights import Rows, constraint_name, flights_of
 from torchgco.view.page import page
 from torchgco.view.searches import search_of
 from torchgco.view.vehicles import look_of
@@ -74,22 +73,13 @@ def _told(problem: Problem, solution: Solution) -> tuple[list[Rows], list[str], 
         frame = solution.to_frame(problem)
     except InputError:  # obstacles of a kind that can't be judged
         frame = solution.to_frame()
-    worst = solution.worst_rows(problem)
     rows, results = [], []
-    for b, row in enumerate(frame.to_dict("records")):
+    for row in frame.to_dict("records"):
         held: Rows = [("status", str(row["status"])), ("cost", f"{row['cost']:.6g}")]
         held += [("clearance", f"{row['clearance']:.3f} m")] if np.isfinite(row.get("clearance", np.nan)) else []
         held += [("violation", f"{row['violation']:.2g}"), ("iterations", str(row["iterations"]))]
-        at = worst.loc[b]
-        held += [("worst", f"{at['name']}, knot {at['knot']}: {at['violation']:.2g}")] if at["constraint"] >= 0 else []
         rows.append(held)
         good = bool(row["violation"] <= ADMITTED and not row.get("clearance", 0.0) < 0)
         results.append("reached" if good and row.get("reached", False) else "feasible" if good else "failed")
     clearance = frame["clearance"].to_numpy() if "clearance" in frame else np.full(problem.B, -np.inf)
     return rows, results, ~(clearance >= 0)
-
-
-def constraint_name(part: Constraint) -> str:
-    """The user's name of a constraint, else its kind, as `worst_rows` has it."""
-    given = getattr(part, "name", None)
-    return given if isinstance(given, str) and given != "constraint" else type(part).__name__.removeprefix("Bound")

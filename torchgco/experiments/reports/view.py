@@ -26,8 +26,7 @@ from torchgco.lagrangian.rollout import open_loop
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts, Vehicle
 from torchgco.view.document import Document, SearchPart
-from torchgco.view.flights import Flight, Rows, contacts, flights_of, whole
-from torchgco.view.notebook import constraint_name
+from torchgco.view.flights import Flight, Rows, constraint_name, contacts, flights_of, whole
 from torchgco.view.page import page
 from torchgco.view.vehicles import Look, look_of
 
@@ -98,12 +97,11 @@ def study_page(folder: Path, searched: Sequence[int] = ()) -> str:
 
 def _document(study: Study, problem: Problem, look: Look) -> Document:
     solvers, configuration = list(study.manifest.solvers), study.manifest.configuration
-    scenario = study.layouts.name if configuration["scenario"].get("path") else configuration["scenario"]["name"]
     at = problem.position
     radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=study.vehicle.radius)
     count = f"{study.layouts.count} layouts" if study.layouts.count > 1 else "1 layout"
     return Document(
-        title=f"{scenario}: {', '.join(solvers)}",
+        title=f"{study.trials['scenario'].iloc[0]}: {', '.join(solvers)}",
         about=f"{count}, {study.vehicle.name}, seed {configuration['seed']}, {problem.N} stages of "
         f"{problem.dynamics.dt:g} s",
         dimension=at.stop - at.start, dt=float(problem.dynamics.dt), look=look, radius=radius, solvers=solvers,
