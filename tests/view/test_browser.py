@@ -246,3 +246,11 @@ def test_a_damaged_page_says_so(opened: Tab, file: Path, tmp_path: Path) -> None
     broken.write_text(text[:at] + "AAAA" + text[at + 4 :])
     opened.open(broken)
     assert "can't be shown" in opened.evaluate("document.getElementById('message').innerText")
+
+
+def test_a_browser_without_webgl_is_told_so(opened: Tab, file: Path) -> None:
+    source = "HTMLCanvasElement.prototype.getContext = () => null"
+    script = opened.call("Page.addScriptToEvaluateOnNewDocument", source=source)
+    opened.open(file)
+    assert "no WebGL 2" in opened.evaluate("document.getElementById('message').innerText")
+    opened.call("Page.removeScriptToEvaluateOnNewDocument", **script)

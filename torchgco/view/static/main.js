@@ -16,9 +16,10 @@ const COARSEST = 0.4; // pixels of the picture per pixel of the screen
 /** Whether pictures are computed without a graphics card: smooth edges would cost half of the time. */
 function software() {
   const context = document.createElement("canvas").getContext("webgl2");
-  const names = context?.getExtension("WEBGL_debug_renderer_info");
+  if (!context) throw new Error("the browser offers no WebGL 2");
+  const names = context.getExtension("WEBGL_debug_renderer_info");
   const name = names ? context.getParameter(names.UNMASKED_RENDERER_WEBGL) : "";
-  context?.getExtension("WEBGL_lose_context")?.loseContext();
+  context.getExtension("WEBGL_lose_context")?.loseContext();
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
