@@ -146,6 +146,11 @@ def test_contact_is_marked_once_where_it_is_deepest() -> None:
     assert abs(found[1][0] - 6.0) < 0.6
     assert len(contacts(task.obstacles, path - [0, 0, 5.0], DT)) == 0
     assert contacts(task.obstacles, path[:0], DT).shape == (0, 3)
+    assert len(contacts(task.obstacles, path[:1], DT)) == 0
+    long = np.array([[0.0, 0.2, 0], [6.0, 0.2, 0]])  # both knots are clear of the sphere at rest
+    np.testing.assert_allclose(contacts(task.obstacles[:1], long, DT), [[3.0, 0.2, 0]])
+    below = long - np.array([0.0, 2.2, 0.0])
+    np.testing.assert_allclose(contacts(task.obstacles[1:], below, DT), [[4.5, -2, 0]])
 
 
 def test_a_path_ends_where_it_is_lost() -> None:

@@ -104,15 +104,29 @@ def contacts(obstacles: Sequence[Obstacles], path: np.ndarray, dt: float) -> np.
         return path
     fine = np.linspace(0, len(path) - 1, BETWEEN * (len(path) - 1) + 1)
     places = np.stack([np.interp(fine, np.arange(len(path)), column) for column in path.T], axis=-1)
-    p, t = torch.from_numpy(places).unsqueeze(0), torch.from_numpy(dt * fine)
     depth = torch.full((len(places),), -torch.inf, dtype=torch.float64)
     for part in obstacles:
+        at = _near(part, path, dt)
+        p, t = torch.from_numpy(places[at]).unsqueeze(0), torch.from_numpy(dt * fine[at])
         distance = part.signed_distance(p, t) + (1.0 - CONTACT_FACTOR) * part.margins.unsqueeze(1)
-        if distance.shape[-1] > 0:
-            depth = torch.maximum(depth, -distance[0].amin(-1))
+        if distance.numel() > 0:
+            depth[at] = torch.maximum(depth[at], -distance[0].amin(-1))
     touching = np.flatnonzero(depth.numpy() > 0)
     runs = np.split(touching, np.flatnonzero(np.diff(touching) > 1) + 1)
     return places[[run[depth.numpy()[run].argmax()] for run in runs if len(run)]]
+
+
+def _near(part: Obstacles, path: np.ndarray, dt: float) -> np.ndarray:
+    """Which places of `contacts` can touch these obstacles: none between knots that are farther than from each other."""
+    places, segments = np.arange(BETWEEN * (len(path) - 1) + 1), len(path) - 1
+    if part.moving or segments == 0:
+        return places
+    knots = part.signed_distance(torch.from_numpy(path).unsqueeze(0), torch.arange(len(path)) * dt)[0]
+    if knots.numel() == 0:
+        return places[:0]
+    clear = knots.amin(-1).numpy()
+    near = np.minimum(clear[:-1], clear[1:]) < np.linalg.norm(np.diff(path, axis=0), axis=1)
+    return places[np.append(near.repeat(BETWEEN), near[-1]) | np.append(False, near.repeat(BETWEEN))]
 
 
 def constraint_name(part: Constraint) -> str:

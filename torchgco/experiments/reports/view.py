@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 import numpy as np
 import pandas as pd
 import torch
+from tqdm import tqdm
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import vehicle_of
@@ -32,6 +33,7 @@ from torchgco.view.vehicles import Look, look_of
 
 NAME = "view.html"
 BATCH = 64  # layouts whose trajectories are measured at once
+SLOW = 256  # layouts from which on a bar shows how far the page is
 QUADROTOR = Look("quadrotor", quaternion=slice(6, 10))  # of a mission's plant
 
 
@@ -116,6 +118,7 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
     if numbers != study.layouts.ids.tolist():
         raise damaged(study.folder / SOLUTIONS, "has other layouts")
     document, rows = None, study.rows
+    bar = tqdm(total=study.layouts.count, unit="layout", leave=False, disable=study.layouts.count < SLOW)
     for places, problem in study.batches():
         look = look_of(problem.dynamics)
         document = document or _document(study, problem, look)
@@ -129,6 +132,8 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
         for b, number in enumerate(ids):
             held = [flights[b] for flights in flown if len(flights[b].path)]
             document.add(f"layout {number}", problem, b, held, found.get(number))
+        bar.update(len(ids))
+    bar.close()
     assert document is not None
     return document
 
