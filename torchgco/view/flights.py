@@ -117,7 +117,7 @@ def contacts(obstacles: Sequence[Obstacles], path: np.ndarray, dt: float) -> np.
 
 
 def _near(part: Obstacles, path: np.ndarray, dt: float) -> np.ndarray:
-    """Which places of `contacts` can touch these obstacles: none between knots that are farther than from each other."""
+    """Which places of `contacts` may touch these obstacles: none between knots that are farther away than apart."""
     places, segments = np.arange(BETWEEN * (len(path) - 1) + 1), len(path) - 1
     if part.moving or segments == 0:
         return places
