@@ -102,6 +102,7 @@ def contacts(obstacles: Sequence[Obstacles], path: np.ndarray, dt: float) -> np.
     """
     if len(path) == 0:
         return path
+    path = np.array(path, dtype=float)  # a table's own array may not be written to, which PyTorch warns of
     fine = np.linspace(0, len(path) - 1, BETWEEN * (len(path) - 1) + 1)
     places = np.stack([np.interp(fine, np.arange(len(path)), column) for column in path.T], axis=-1)
     depth = torch.full((len(places),), -torch.inf, dtype=torch.float64)
