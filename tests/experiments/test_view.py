@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from tests.experiments.commands import HOLD
-from tests.view.test_packing import read
+from tests.view.test_packing import part
 from torchgco.experiments.reports import view
 
-WORDS = [*HOLD, "study.figures=false", "study.view=true"]
+WORDS = [*HOLD, "study.figures=false", "study.view=true", "study.figure=one"]
 MISSION = [
     "experiment=mission", "solver=hold", "mission.duration=0.2", "scenario.num_obstacles=3", "study.layouts=2",
     "study.workers=1", "study.figures=false", "hydra.run.dir=flown",
 ]  # fmt: skip
 
 
-def part(page: Path, name: str):
-    text = page.read_text()
-    at = text.index(f'id="{name}"')
-    return read(text[text.index(">", at) + 1 : text.index("</script>", at)])
-
-
 def test_a_study_writes_its_page_and_the_command_writes_it_again(run, tmp_path, capsys) -> None:
     code, out, err = run("scenario=yard", *WORDS, "hydra.run.dir=study")
     page = tmp_path / "study" / "view.html"
     assert code == 0 and f"Page: {page}" in out, err
-    head, first = part(page, "head"), part(page, "part-0")
+    assert sorted(path.name for path in (tmp_path / "study" / "figures").iterdir()) == ["study.pdf", "study.png"]
+    head, first = part(page.read_text(), "head"), part(page.read_text(), "part-0")
     assert [solver["name"] for solver in head["solvers"]] == ["hold"] and len(head["layouts"]) == 4
     assert head["body"] == "car" and head["dimension"] == 2
     held = np.load(tmp_path / "study" / "layouts.npz")
@@ -46,16 +40,36 @@ def test_a_study_writes_its_page_and_the_command_writes_it_again(run, tmp_path, 
 
 
 def test_missions_show_track_and_plan(run, tmp_path) -> None:
+    code, _, err = run(*MISSION, "study.figure=two")
+    assert code == 2 and "study.figure: expected null for missions" in err
     code, _, err = run(*MISSION)
     assert code == 0, err
     assert view.main([str(tmp_path / "flown")]) == 0
     page = tmp_path / "flown" / "view.html"
-    assert part(page, "head")["mission"] is True and part(page, "head")["body"] == "quadrotor"
-    (flight,) = part(page, "part-1")["flights"]
+    assert part(page.read_text(), "head")["mission"] is True and part(page.read_text(), "head")["body"] == "quadrotor"
+    (flight,) = part(page.read_text(), "part-1")["flights"]
     count = len(flight["path"])
     assert count >= 2 and flight["attitude"].shape == (count, 4) and len(flight["notes"]) == count
     with np.load(tmp_path / "flown" / "plans.npz") as held:
         np.testing.assert_allclose(flight["plan"], held["plan"][0, 1, :count], atol=2e-3)
+
+
+def test_the_search_is_shown_where_it_is_asked_for(run, tmp_path, capsys) -> None:
+    words = ["study.layouts=2", "study.workers=1", "study.figures=false", "hydra.run.dir=sought"]
+    code, _, err = run("scenario=planar_trap", *words, "study.baselines=[al_ilqr]")
+    assert code == 0, err
+    assert view.main([str(tmp_path / "sought"), "--search", "0", "0"]) == 0
+    page = tmp_path / "sought" / "view.html"
+    assert part(page.read_text(), "part-1")["search"] is None
+    search = part(page.read_text(), "part-0")["search"]
+    assert search["passes"][0].startswith("gco: ") and search["rounds"]
+    texts = [line["text"] for line in search["rounds"][0]["lines"]]
+    assert any(text.startswith("path 1: ") for text in texts) and any("proposed" in text for text in texts)
+    for line in search["rounds"][0]["lines"]:
+        assert len(line["points"]) > 1 and np.isfinite(line["points"]).all()
+    capsys.readouterr()
+    assert view.main([str(tmp_path / "sought"), "--search", "7"]) == 2
+    assert "--search: expected numbers of layouts of the study, got 7" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

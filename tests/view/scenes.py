@@ -14,6 +14,7 @@ from torchgco.view.vehicles import Look
 N, RADIUS, DT = 40, 0.3, 0.1
 SOLVERS = ("gco", "al_ilqr")
 WORDS = '<img src=x onerror="document.title=1"></script>'  # what no page may run
+UNEVEN = 2.0 * (torch.linspace(0, 1, N + 1, dtype=torch.float64) ** 2).numpy()  # s, of the knots of layout 1
 GOOD, BAD = "reached", "failed"
 
 
@@ -69,5 +70,6 @@ def document(layouts: int = 3, search: SearchPart | None = None, mission: bool =
         ["spheres", WORDS, "trunks"], mission=mission,
     )  # fmt: skip
     for b in range(layouts):
-        held.add(f"layout {b} {WORDS}", task, b, [flights[b] for flights in flown], search)
+        times = UNEVEN if b == 1 else None
+        held.add(f"layout {b} {WORDS}", task, b, [flights[b] for flights in flown], search, times)
     return held

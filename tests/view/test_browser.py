@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from tests.view.browser import Tab, browser, found
-from tests.view.scenes import DT, SOLVERS, WORDS, N, document, trajectories
+from tests.view.scenes import DT, SOLVERS, UNEVEN, WORDS, N, document, trajectories
 from torchgco.plotting.style import solver_colours
 from torchgco.view.document import Line, SearchPart
 from torchgco.view.page import page
@@ -142,6 +142,19 @@ def test_a_click_changes_the_layout(tab: Tab) -> None:
     tab.wait(f"{PICTURE}.dataset.layout === '0'")
 
 
+def test_stages_may_differ_in_length(tab: Tab) -> None:
+    tab.click("#chips button:nth-child(2)")
+    tab.wait(f"{PICTURE}.dataset.layout === '1' && torchgcoView.flights.times")
+    assert "of 2.00 s" in tab.evaluate("document.getElementById('clock').textContent")
+    X = trajectories()[SOLVERS[0]][1].numpy()
+    tab.evaluate(f"torchgcoView.setTime({0.5 * (UNEVEN[20] + UNEVEN[21])})")
+    np.testing.assert_allclose(vehicle(tab), 0.5 * (X[20] + X[21]), atol=2e-3)
+    tab.evaluate(f"{PICTURE}.focus()")
+    for key, k in ((".", 21), (".", 22), (",", 21)):
+        tab.press(key)
+        np.testing.assert_allclose(vehicle(tab), X[k], atol=2e-3)
+
+
 def test_keys_play_step_and_choose(tab: Tab) -> None:
     tab.evaluate(f"{PICTURE}.focus()")
     tab.press(".")
@@ -233,3 +246,11 @@ def test_a_damaged_page_says_so(opened: Tab, file: Path, tmp_path: Path) -> None
     broken.write_text(text[:at] + "AAAA" + text[at + 4 :])
     opened.open(broken)
     assert "can't be shown" in opened.evaluate("document.getElementById('message').innerText")
+
+
+def test_a_browser_without_webgl_is_told_so(opened: Tab, file: Path) -> None:
+    source = "HTMLCanvasElement.prototype.getContext = () => null"
+    script = opened.call("Page.addScriptToEvaluateOnNewDocument", source=source)
+    opened.open(file)
+    assert "no WebGL 2" in opened.evaluate("document.getElementById('message').innerText")
+    opened.call("Page.removeScriptToEvaluateOnNewDocument", **script)

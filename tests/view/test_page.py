@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from tests.view.scenes import WORDS, document, problem, solution, trajectories
-from torchgco import FunctionDynamics, InputError, Problem, QuadraticCost, Solution
+from tests.view.scenes import DT, WORDS, document, problem, solution, trajectories
+from tests.view.test_packing import part
+from torchgco import Field, FunctionDynamics, InputError, Problem, QuadraticCost, Solution
 from torchgco.base.html import HtmlPage
+from torchgco.maps import DistanceField, OccupancyGrid
 from torchgco.view.page import MODULES, STATIC, THREE, page
 
 # As the npm package three 0.185.1 has them in its folder `build`.
@@ -110,7 +115,45 @@ def test_what_cannot_be_shown_is_refused(held: tuple[Problem, Solution]) -> None
         solution(still, task.x0.new_zeros(2, 6, 2), task.x0.new_zeros(2, 5, 1)).show(still)
 
 
+def test_times_of_knots_are_kept_where_stages_differ() -> None:
+    step, x0 = torch.tensor([0.1, 0.3, 0.2, 0.4]).double().view(1, 4, 1), torch.zeros(2, 2, dtype=torch.float64)
+
+    def shown(function: Any, values: Any = None, **more: Any) -> dict[str, Any]:
+        dynamics = FunctionDynamics(function, 2, 2, 0.5, "none", slice(0, 2), knot_values=values)
+        task = Problem(dynamics, QuadraticCost([0.0] * 2, [1.0] * 2, [1.0] * 2, [1.0, 0]), [], x0, 4, **more)
+        found = replace(solution(task, x0.new_zeros(2, 5, 2), x0.new_zeros(2, 4, 2)), **more)
+        return part(found.show(task).html, "part-1")
+
+    uneven = shown(lambda x, u, dt: x + dt * u, {"dt": step})
+    np.testing.assert_allclose(uneven["times"], [0, 0.1, 0.4, 0.6, 1.0], atol=2e-4)
+    even = shown(lambda x, u: x + 0.5 * u)
+    assert even["times"] is None and len(even["flights"][0]["path"]) == 5
+    shorter = shown(lambda x, u: x + 0.5 * u, horizon=torch.tensor([4, 3]))
+    assert len(shorter["flights"][0]["path"]) == 4
+
+
 def test_numbers_in_a_page_of_states_that_are_lost() -> None:
     task, X = problem(1), trajectories(1)["gco"]
     X[:, 3:] = torch.nan
     assert "part-0" in solution(task, X).show(task).html
+
+
+def test_layouts_with_the_same_map_share_it() -> None:
+    cells = np.random.default_rng(0).random((2, 20, 20, 10)) < 0.3
+    x0 = torch.zeros(3, 3, dtype=torch.float64)
+    dynamics = FunctionDynamics(lambda x, u: u, n=3, m=3, dt=DT, position=slice(0, 3))
+    cost = QuadraticCost(Q=[0.0] * 3, R=[1.0] * 3, Qf=[1.0] * 3, x_ref=[2.0, 0, 0])
+    grids = OccupancyGrid(cells[[0, 1, 0]], [-1.0, -2, -1], 0.2)
+    task = Problem(dynamics, cost, [Field(DistanceField.of(grids), 0.1)], x0, 4)
+    text = solution(task, x0.new_zeros(3, 5, 3)).show(task).html
+    assert [part(text, f"part-{b}")["obstacles"] for b in range(3)] == [
+        [{"shared": 0}],
+        [{"shared": 1}],
+        [{"shared": 0}],
+    ]
+    held = part(text, "map-1")
+    low = held["center"] + held["middle"] - held["half"] - [-1.0, -2, -1]
+    filled = np.zeros(cells.shape[1:], dtype=int)
+    for first, sides in zip(np.round(low / 0.2).astype(int), np.round(held["half"] / 0.1).astype(int), strict=True):
+        filled[tuple(slice(a, a + n) for a, n in zip(first, sides, strict=True))] += 1
+    np.testing.assert_array_equal(filled, cells[1])

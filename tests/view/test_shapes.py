@@ -8,10 +8,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.view.scenes import DT, RADIUS, SOLVERS, N, problem, trajectories
-from torchgco import Boxes, Planar, Problem, QuadraticCost
+from torchgco import Boxes, Field, FunctionDynamics, Planar, Problem, QuadraticCost
+from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.view.flights import contacts, violated, whole
+from torchgco.view.cells import merged
+from torchgco.view.flights import contacts, flights_of, violated, whole
 from torchgco.view.shapes import SHAPES, Shapes, once, shapes_of, turns
+from torchgco.view.vehicles import Look
 
 
 def distance(shapes: Shapes, p: np.ndarray, t: float) -> np.ndarray:
@@ -75,6 +78,40 @@ def test_a_kind_that_is_added_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shapes_of(part, 0) is other
 
 
+@pytest.mark.parametrize("shape", [(7,), (6, 9), (5, 6, 7), (1, 1, 1)])
+def test_occupied_cells_are_filled_once(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(4)
+    for share in (0.0, 0.3, 0.8, 1.0):
+        cells, filled = rng.random(shape) < share, np.zeros(shape, dtype=int)
+        for low, high in zip(*merged(cells), strict=True):
+            filled[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] += 1
+        np.testing.assert_array_equal(filled, cells)
+    assert len(merged(np.ones(shape, dtype=bool))[0]) == 1
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_cells_and_points_of_maps_are_drawn_where_they_are(batch: bool) -> None:
+    rng = np.random.default_rng(5)
+    cells = rng.random((2, 6, 5, 4) if batch else (6, 5, 4)) < 0.2
+    origin = rng.uniform(-1, 1, (2, 3) if batch else 3)
+    x0 = torch.zeros(2, 3, dtype=torch.float64)
+    dynamics = FunctionDynamics(lambda x, u: u, n=3, m=3, dt=DT, position=slice(0, 3))
+    cost = QuadraticCost(Q=[0.0] * 3, R=[1.0] * 3, Qf=[1.0] * 3, x_ref=[8.0, 0, 0])
+
+    def drawn(source: OccupancyGrid | PointCloud) -> Shapes:
+        found = shapes_of(Problem(dynamics, cost, [Field(DistanceField.of(source), 0.1)], x0, 4).obstacles[0], 1)
+        assert found is not None
+        return found
+
+    shapes = drawn(OccupancyGrid(cells, origin, 0.2))
+    own, lowest = (cells[1], origin[1]) if batch else (cells, origin)
+    for index in np.ndindex(own.shape):
+        inside = distance(shapes, lowest + 0.2 * (np.array(index) + 0.5), 0.0).min(initial=1.0) < 0
+        assert inside == own[index]
+    points = rng.uniform(-1, 1, (2, 9, 3) if batch else (9, 3))
+    np.testing.assert_allclose(drawn(PointCloud(points, 0.3)).center, points[1] if batch else points)
+
+
 def test_violations_are_those_of_the_worst_constraint_at_each_knot() -> None:
     task, X = problem(2), trajectories(2)[SOLVERS[1]]
     U = X.new_zeros(2, N, 3)
@@ -89,6 +126,17 @@ def test_violations_are_those_of_the_worst_constraint_at_each_knot() -> None:
         np.testing.assert_allclose(knots.violation[0, k], max(depth) if worst >= 0 else 0.0, atol=1e-9)
 
 
+def test_the_worst_constraint_is_named_in_the_table() -> None:
+    task, X = problem(1), trajectories(1)[SOLVERS[1]]
+    (flight,) = flights_of(task, Look(), X, X.new_zeros(1, N, 3), "one", ["failed"], [[]], 1e-3, np.array([False]))
+    ((label, text),) = flight.rows
+    # The straight line meets the centre of the sphere at (3, 0, 0): 0.8 m + 0.3 m deep, at knot 15.
+    assert label == "worst" and text == "Spheres, knot 15: 1.1 m"
+    good = trajectories(1)[SOLVERS[0]]
+    (flight,) = flights_of(task, Look(), good, X.new_zeros(1, N, 3), "one", ["reached"], [[]], 1e-3, np.array([True]))
+    assert flight.rows == [] and len(flight.contacts) == 0
+
+
 def test_contact_is_marked_once_where_it_is_deepest() -> None:
     task = problem(1)
     path = np.stack((np.linspace(0, 8, 81), np.full(81, 0.2), np.zeros(81)), axis=-1)
@@ -98,6 +146,11 @@ def test_contact_is_marked_once_where_it_is_deepest() -> None:
     assert abs(found[1][0] - 6.0) < 0.6
     assert len(contacts(task.obstacles, path - [0, 0, 5.0], DT)) == 0
     assert contacts(task.obstacles, path[:0], DT).shape == (0, 3)
+    assert len(contacts(task.obstacles, path[:1], DT)) == 0
+    long = np.array([[0.0, 0.2, 0], [6.0, 0.2, 0]])  # both knots are clear of the sphere at rest
+    np.testing.assert_allclose(contacts(task.obstacles[:1], long, DT), [[3.0, 0.2, 0]])
+    below = long - np.array([0.0, 2.2, 0.0])
+    np.testing.assert_allclose(contacts(task.obstacles[1:], below, DT), [[4.5, -2, 0]])
 
 
 def test_a_path_ends_where_it_is_lost() -> None:

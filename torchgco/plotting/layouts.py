@@ -32,7 +32,7 @@ INFEASIBLE, SHORT = "infeasible", "feasible, short of the goal"
 
 
 @dataclass(frozen=True)
-class _Flight:
+class Flight:
     """One solver's trajectory through one layout."""
 
     path: np.ndarray  # (N+1, d) m
@@ -74,27 +74,33 @@ def layout_grid(
     scene = scene_of(layouts)
     columns = columns or (4 if scene.dimension == 2 else 3)
     count = min(count, columns * rows)
-    flights = _flights(scene, {solver: states[:count] for solver, states in paths.items()}, trials)
-    boxes = _views(scene, flights, count, min(columns, count))
+    flights = flights_of(scene, {solver: states[:count] for solver, states in paths.items()}, trials)
+    boxes = views(scene, flights, count, min(columns, count))
     planes = (ABOVE,) if scene.dimension == 2 else (ABOVE, SIDE)
     figure, axes = grid(boxes, count, min(columns, count), planes)
     drawn: set[str] = set()
     for i in range(count):
-        here = {solver: row[i] for solver, row in flights.items()}
-        lead = passes(scene, i, _leading(scene, i, [flight.path for flight in here.values()]))
-        for ax, plane in zip(axes[i], planes, strict=True):
-            drawn |= draw_obstacles(ax, scene, i, lead, plane)
-            drawn |= _paths(ax, scene, i, here, plane)
-            draw_targets(ax, scene, i, plane)
+        drawn |= draw_layout(dict(zip(planes, axes[i], strict=True)), scene, i, flights)
         axes[i][0].set_title(f"layout {scene.ids[i]}", fontsize=TITLE, loc="left", color=INK)
     put_head(figure, _title(trials), _handles(scene, flights, drawn))
     return figure
 
 
-def _flights(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFrame) -> dict[str, list[_Flight]]:
+def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mapping[str, list[Flight]]) -> set[str]:
+    """Draw layout i from one side or several; returns the kinds of drawn shapes and marks, for the legend."""
+    here, drawn = {solver: row[i] for solver, row in flights.items()}, set()
+    lead = passes(scene, i, _leading(scene, i, [flight.path for flight in here.values()]))
+    for plane, ax in axes.items():
+        drawn |= draw_obstacles(ax, scene, i, lead, plane)
+        drawn |= _paths(ax, scene, i, here, plane)
+        draw_targets(ax, scene, i, plane)
+    return drawn
+
+
+def flights_of(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFrame) -> dict[str, list[Flight]]:
     table = trials.drop_duplicates(["solver", "layout"]).set_index(["solver", "layout"])
     verdicts = table[["feasible", "reached"]].astype("boolean").fillna(False)
-    found: dict[str, list[_Flight]] = {}
+    found: dict[str, list[Flight]] = {}
     for solver, states in paths.items():
         found[solver] = []
         for i, X in enumerate(states):
@@ -105,7 +111,7 @@ def _flights(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFrame
             path = X[:, : scene.dimension]
             moved = np.linalg.norm(flown(path) - scene.start[i], axis=-1).max(initial=0.0)
             still = len(flown(path)) > 1 and bool(moved < STILL * _way(scene, i))
-            found[solver].append(_Flight(path, end, contacts(scene, i, path), still))
+            found[solver].append(Flight(path, end, contacts(scene, i, path), still))
     return found
 
 
@@ -114,7 +120,7 @@ def _way(scene: Scene, i: int) -> float:
     return float(np.linalg.norm(scene.goal[i] - scene.start[i]))
 
 
-def _views(scene: Scene, flights: Mapping[str, list[_Flight]], count: int, columns: int) -> list[np.ndarray]:
+def views(scene: Scene, flights: Mapping[str, list[Flight]], count: int, columns: int) -> list[np.ndarray]:
     """Lower and upper corners (2, d), m, of the maps in each row of panels; x is the same in all rows."""
     boxes = []
     for first in range(0, count, columns):
@@ -175,7 +181,7 @@ def draw_obstacles(ax: Axes, scene: Scene, i: int, lead: list[Pass], plane: Plan
     return {kind for kind, held in shapes.items() if held} | ({"moving"} if moving else set())
 
 
-def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, _Flight], plane: Plane) -> set[str]:
+def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, Flight], plane: Plane) -> set[str]:
     """Draw the flights, the first over the others; returns the kinds of drawn marks, for the legend."""
     colours, drawn = solver_colours(flights), set()
     for level, (solver, flight) in enumerate(reversed(list(flights.items()))):
@@ -226,7 +232,7 @@ def _title(trials: pd.DataFrame) -> str:
     return ", ".join([*tasks[:1], *(f"seed {seed}" for seed in seeds[:1])]) if len(tasks) == 1 else ""
 
 
-def _handles(scene: Scene, flights: Mapping[str, list[_Flight]], drawn: set[str]) -> list[Artist]:
+def _handles(scene: Scene, flights: Mapping[str, list[Flight]], drawn: set[str]) -> list[Artist]:
     """Entries of the legend, for what is drawn alone."""
     handles: list[Artist] = []
     colours = solver_colours(flights)

@@ -12,11 +12,12 @@ from io import BytesIO
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
-from typing import IO
+from typing import IO, Literal
 from zlib import crc32
 
 import numpy as np
 import pandas as pd
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -135,13 +136,20 @@ def _setting(name: str, value: object) -> str:
     return f"{words} {value:g}" if isinstance(value, float) else f"{words} {value}"
 
 
-def save(figure: Figure, path: str | os.PathLike[str] | IO[bytes], dpi: int = 150) -> Path | None:
+def save(
+    figure: Figure, path: str | os.PathLike[str] | IO[bytes], dpi: int = 150, form: Literal["png", "pdf"] = "png"
+) -> Path | None:
     """Write the figure, in the format that the ending of `path` names, into a folder made if need be.
 
-    An open file instead of a path gets a PNG; nothing is returned then.
+    An open file instead of a path gets the format `form`; nothing is returned then. A PDF holds its text as text, and
+    no date: the same figure has the same bytes.
     """
     if not isinstance(path, str | os.PathLike):
-        _save_png(figure, path, dpi)
+        if form == "png":
+            _save_png(figure, path, dpi)
+        else:
+            with rc_context({"pdf.fonttype": 42}):
+                figure.savefig(path, format=form, facecolor="white", metadata={"CreationDate": None})
         return None
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,10 @@ from torchgco.plotting.style import solver_colours
 from torchgco.problem.problem import Problem
 from torchgco.view.flights import Flight
 from torchgco.view.packing import Packing, number
-from torchgco.view.shapes import shapes_of
+from torchgco.view.shapes import Shapes, shapes_of
 from torchgco.view.vehicles import Look
+
+SHARED = 500  # obstacles of one kind from which on layouts with the same ones share them
 
 
 @dataclass
@@ -46,25 +49,48 @@ class Document:
     notes: list[str] = field(default_factory=list)
     labels: list[dict[str, Any]] = field(default_factory=list)
     parts: list[str] = field(default_factory=list)
+    maps: dict[bytes, str] = field(default_factory=dict)  # parts that layouts share, by what they hold
 
     def add(
-        self, label: str, problem: Problem, b: int, flights: Sequence[Flight], search: SearchPart | None = None
+        self,
+        label: str,
+        problem: Problem,
+        b: int,
+        flights: Sequence[Flight],
+        search: SearchPart | None = None,
+        times: np.ndarray | None = None,
     ) -> None:
-        """Add a layout: problem b of a batch, and its trajectories in the order of the solvers, where there are any."""
+        """Add a layout: problem b of a batch, and its trajectories in the order of the solvers, where there are any.
+
+        Args:
+            times: (N+1,) of the knots, s; None: multiples of `dt`.
+        """
         packing, at = Packing(), problem.position
         start = problem.x0[b, at].detach().cpu().double().numpy()
         goal = None if problem.goal is None else problem.goal.position[b].cpu().double().numpy()
         middle = start if goal is None else 0.5 * (start + goal)
         names = list(self.solvers)
         part: dict[str, Any] = {
-            "middle": _numbers(middle), "start": _numbers(start), "goal": None if goal is None else _numbers(goal),
+            "start": _numbers(start), "goal": None if goal is None else _numbers(goal),
             "goal_radius": None if problem.goal is None else number(problem.goal.radius[b]),
-            "obstacles": [shape.packed(packing, middle) for shape in self._shapes(problem.obstacles, b)],
+            "obstacles": [self._placed(packing, shape, middle) for shape in self._shapes(problem.obstacles, b)],
             "flights": [flight.packed(packing, names.index(flight.solver)) for flight in flights],
             "search": None if search is None else search.packed(packing),
+            "times": None if times is None else packing.put(times, steps=True),
         }  # fmt: skip
         self.labels.append({"label": label, "results": {flight.solver: flight.result for flight in flights}})
         self.parts.append(packing.sealed(part))
+
+    def _placed(self, packing: Packing, shapes: Shapes, middle: np.ndarray) -> dict[str, Any]:
+        """Obstacles in the layout's part; many of them, as of a map, in a part that layouts of equal ones share."""
+        if len(shapes.center) < SHARED:
+            return shapes.packed(packing, middle)
+        own = Packing()
+        text = own.sealed(shapes.packed(own, 0.5 * (shapes.center.min(axis=0) + shapes.center.max(axis=0))))
+        places = list(self.maps)
+        key = sha256(text.encode()).digest()
+        self.maps.setdefault(key, text)
+        return {"shared": places.index(key) if key in places else len(places)}
 
     def _shapes(self, obstacles: Sequence[Obstacles], b: int) -> list[Any]:
         found = []

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.view.packing import LARGEST, Packing, number
@@ -46,6 +47,14 @@ class Flight:
     contacts: np.ndarray
     plan: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
+
+    def until(self, last: int) -> Flight:
+        """The same up to a knot."""
+        kept = slice(0, last + 1)
+        attitude = None if self.attitude is None else self.attitude[kept]
+        return replace(
+            self, path=self.path[kept], attitude=attitude, violation=self.violation[kept], worst=self.worst[kept]
+        )
 
     def packed(self, packing: Packing, number_of: int) -> dict[str, Any]:
         """As the page reads it, under the number of its solver."""
@@ -93,17 +102,48 @@ def contacts(obstacles: Sequence[Obstacles], path: np.ndarray, dt: float) -> np.
     """
     if len(path) == 0:
         return path
+    path = np.array(path, dtype=float)  # a table's own array may not be written to, which PyTorch warns of
     fine = np.linspace(0, len(path) - 1, BETWEEN * (len(path) - 1) + 1)
     places = np.stack([np.interp(fine, np.arange(len(path)), column) for column in path.T], axis=-1)
-    p, t = torch.from_numpy(places).unsqueeze(0), torch.from_numpy(dt * fine)
     depth = torch.full((len(places),), -torch.inf, dtype=torch.float64)
     for part in obstacles:
+        at = _near(part, path, dt)
+        p, t = torch.from_numpy(places[at]).unsqueeze(0), torch.from_numpy(dt * fine[at])
         distance = part.signed_distance(p, t) + (1.0 - CONTACT_FACTOR) * part.margins.unsqueeze(1)
-        if distance.shape[-1] > 0:
-            depth = torch.maximum(depth, -distance[0].amin(-1))
+        if distance.numel() > 0:
+            depth[at] = torch.maximum(depth[at], -distance[0].amin(-1))
     touching = np.flatnonzero(depth.numpy() > 0)
     runs = np.split(touching, np.flatnonzero(np.diff(touching) > 1) + 1)
     return places[[run[depth.numpy()[run].argmax()] for run in runs if len(run)]]
+
+
+def _near(part: Obstacles, path: np.ndarray, dt: float) -> np.ndarray:
+    """Which places of `contacts` may touch these obstacles: none between knots that are farther away than apart."""
+    places, segments = np.arange(BETWEEN * (len(path) - 1) + 1), len(path) - 1
+    if part.moving or segments == 0:
+        return places
+    knots = part.signed_distance(torch.from_numpy(path).unsqueeze(0), torch.arange(len(path)) * dt)[0]
+    if knots.numel() == 0:
+        return places[:0]
+    clear = knots.amin(-1).numpy()
+    near = np.minimum(clear[:-1], clear[1:]) < np.linalg.norm(np.diff(path, axis=0), axis=1)
+    return places[np.append(near.repeat(BETWEEN), near[-1]) | np.append(False, near.repeat(BETWEEN))]
+
+
+def constraint_name(part: Constraint) -> str:
+    """The user's name of a constraint, else its kind, as `worst_rows` has it."""
+    given = getattr(part, "name", None)
+    return given if isinstance(given, str) and given != "constraint" else type(part).__name__.removeprefix("Bound")
+
+
+def worst_row(problem: Problem, violation: np.ndarray, worst: np.ndarray) -> Rows:
+    """Which constraint is violated most, where and by how much, from the violations (K,) at the knots."""
+    k = int(violation.argmax()) if len(violation) else 0
+    if not len(violation) or worst[k] < 0:
+        return []
+    part = problem.constraints[worst[k]]
+    unit = " m" if isinstance(part, Obstacles) else ""
+    return [("worst", f"{constraint_name(part)}, knot {k}: {violation[k]:.2g}{unit}")]
 
 
 def whole(X: np.ndarray) -> np.ndarray:
@@ -129,20 +169,17 @@ def flights_of(
         results, rows: of each problem, as in `Flight`.
         admitted: the violation up to which nothing is marked.
         touching: (B,) bool: where contact is looked for.
-    """  # fmt: skip
-    knots, found, dt = violated(problem, X, U, admitted), [], float(problem.dynamics.dt)
+    """
+    knots, found, dt = violated(problem, X, U, admitted), [], getattr(problem.dynamics, "dt", None) or 1.0
     states = X.detach().cpu().double().numpy()
     for b in range(problem.B):
         kept = whole(states[b])
         path, at = kept[:, problem.position], slice(0, len(kept))
         places = path[:0]
+        bad, which = knots.violation[b, at], knots.worst[b, at]
         if touching[b] and len(path):
             part = problem.take(torch.tensor([b], device=X.device))
             places = contacts(part.obstacles, path, dt)
-        found.append(
-            Flight(
-                solver, path, look.attitude(kept), results[b], rows[b], knots.violation[b, at], knots.worst[b, at],
-                places,
-            )
-        )  # fmt: skip
+        told = [*rows[b], *worst_row(problem, bad, which)]
+        found.append(Flight(solver, path, look.attitude(kept), results[b], told, bad, which, places))
     return found

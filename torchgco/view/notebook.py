@@ -7,12 +7,12 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.base.html import HtmlPage
 from torchgco.base.shapes import check_shape
-from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.times import times
 from torchgco.solution import Solution
 from torchgco.view.document import Document
-from torchgco.view.flights import Rows, flights_of
+from torchgco.view.flights import Rows, constraint_name, flights_of
 from torchgco.view.page import page
 from torchgco.view.searches import search_of
 from torchgco.view.vehicles import look_of
@@ -34,15 +34,37 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPa
         raise InputError("problem", "at least one problem to show", "an empty batch")
     look, rows, results, touching = look_of(problem.dynamics), *_told(problem, solution)
     flights = flights_of(problem, look, solution.X, solution.U, name, results, rows, ADMITTED, touching)
-    radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
+    t_of, dt = _times(problem, solution)
+    N, radius = problem.N, max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=0.0)
     document = Document(
         title="torchgco", about=f"{problem.B} problems, {problem.N} stages" if problem.B > 1 else f"{problem.N} stages",
-        dimension=dimension, dt=float(problem.dynamics.dt), look=look, radius=radius, solvers=[name],
+        dimension=dimension, dt=dt, look=look, radius=radius, solvers=[name],
         constraints=[constraint_name(part) for part in problem.constraints],
     )  # fmt: skip
     for b, flight in enumerate(flights):
-        document.add(f"problem {b}", problem, b, [flight], search_of(solution, problem, b))
+        last = N if solution.horizon is None else int(solution.horizon[b])
+        t = None if t_of is None else t_of[b, : last + 1]
+        document.add(f"problem {b}", problem, b, [flight.until(last)], search_of(solution, problem, b), t)
     return HtmlPage(page(document), "Trajectories among obstacles")
+
+
+def _times(problem: Problem, solution: Solution) -> tuple[np.ndarray | None, float]:
+    """The times of the knots (B, N+1), s, and the length of a stage; None where all stages are of this length.
+
+    Of dynamics without a time step, stages count as 1 s.
+    """
+    dt = getattr(problem.dynamics, "dt", None) or 1.0
+    try:
+        t = solution.t
+    except InputError:  # the solution doesn't know its problem
+        try:
+            t = times(problem)
+        except InputError:
+            return None, dt
+    held = t.detach().cpu().double().numpy()
+    held = np.broadcast_to(held, (problem.B, problem.N + 1))
+    even = np.minimum(np.arange(problem.N + 1), np.reshape(problem.stages.cpu().numpy(), (-1, 1))) * dt
+    return (None, dt) if np.allclose(held, even, rtol=0, atol=1e-9 * dt) else (held, dt)
 
 
 def _told(problem: Problem, solution: Solution) -> tuple[list[Rows], list[str], np.ndarray]:
@@ -51,22 +73,13 @@ def _told(problem: Problem, solution: Solution) -> tuple[list[Rows], list[str], 
         frame = solution.to_frame(problem)
     except InputError:  # obstacles of a kind that can't be judged
         frame = solution.to_frame()
-    worst = solution.worst_rows(problem)
     rows, results = [], []
-    for b, row in enumerate(frame.to_dict("records")):
+    for row in frame.to_dict("records"):
         held: Rows = [("status", str(row["status"])), ("cost", f"{row['cost']:.6g}")]
         held += [("clearance", f"{row['clearance']:.3f} m")] if np.isfinite(row.get("clearance", np.nan)) else []
         held += [("violation", f"{row['violation']:.2g}"), ("iterations", str(row["iterations"]))]
-        at = worst.loc[b]
-        held += [("worst", f"{at['name']}, knot {at['knot']}: {at['violation']:.2g}")] if at["constraint"] >= 0 else []
         rows.append(held)
-        good = bool(row["violation"] <= ADMITTED)
+        good = bool(row["violation"] <= ADMITTED and not row.get("clearance", 0.0) < 0)
         results.append("reached" if good and row.get("reached", False) else "feasible" if good else "failed")
     clearance = frame["clearance"].to_numpy() if "clearance" in frame else np.full(problem.B, -np.inf)
     return rows, results, ~(clearance >= 0)
-
-
-def constraint_name(part: Constraint) -> str:
-    """The user's name of a constraint, else its kind, as `worst_rows` has it."""
-    given = getattr(part, "name", None)
-    return given if isinstance(given, str) and given != "constraint" else type(part).__name__.removeprefix("Bound")

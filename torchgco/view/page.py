@@ -27,6 +27,7 @@ def page(document: Document) -> str:
     scripts += [_text(name, _inert((STATIC / name).read_text()), "module") for name in MODULES]
     data = [_text("head", document.head(), "data")]
     data += [_text(f"part-{i}", part, "data") for i, part in enumerate(document.parts)]
+    data += [_text(f"map-{i}", text, "data") for i, text in enumerate(document.maps.values())]
     values = {
         "title": escape(document.title),
         "policy": POLICY,

@@ -18,7 +18,7 @@ def search_of(solution: Solution, problem: Problem, b: int) -> SearchPart | None
     record = solution.search
     if record is None:
         return None
-    passes = [f"{name}" for _, name, rows in record.passes if b in rows]
+    passes = [name for _, name, rows in record.passes if b in rows]
     rounds = []
     for one in record.comparisons:
         for i in (one.rows == b).nonzero().flatten().tolist():

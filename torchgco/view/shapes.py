@@ -16,10 +16,13 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from torchgco.maps.field import BoundField
+from torchgco.maps.points import PointCloud
 from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.view.cells import merged
 from torchgco.view.packing import Packing
 
 STRAIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no turn
@@ -47,7 +50,7 @@ class Shapes:
 
     def packed(self, packing: Packing, middle: np.ndarray) -> dict[str, Any]:
         """As the page reads them; centres count from `middle` (d,), near which half precision is finest."""
-        held: dict[str, Any] = {"count": len(self.center), "until": self.until}
+        held: dict[str, Any] = {"count": len(self.center), "until": self.until, "middle": middle.tolist()}
         arrays = {"center": self.center - middle, "half": self.half, "radius": self.radius, "turn": self.turn}
         arrays["velocity"] = self.velocity
         return held | {name: packing.put(once(part)) for name, part in arrays.items() if part is not None}
@@ -94,8 +97,20 @@ def _solids(part: Obstacles, solids: Solids, b: int) -> Shapes:
     return Shapes(center, _rows(solids.half_sizes, b, here), radius, turns(_rows(solids.axes, b, here)))
 
 
+def _map(part: BoundField, b: int) -> Shapes:
+    """The occupied cells of a grid, or the balls of a cloud; unknown cells aren't drawn, whatever they count as."""
+    field, g = part.field, int(part.which[b])
+    if isinstance(field.source, PointCloud):
+        points = field.source.clouds()[g]
+        return Shapes(points, np.zeros((1, field.d)), np.array([field.source.radius]))
+    grid = field.source
+    low, high = merged(grid.is_occupied if grid.batch is None else grid.is_occupied[g])
+    center = np.broadcast_to(grid.origin, (max(1, grid.batch or 1), field.d))[g] + 0.5 * grid.resolution * (low + high)
+    return Shapes(center, 0.5 * grid.resolution * (high - low), np.zeros(1))
+
+
 # What the page draws for obstacles of each kind, once bound to a problem, and the place of a problem in its batch.
-SHAPES: dict[type[Obstacles], ShapesOf] = {BoundSpheres: _spheres, BoundBoxes: _boxes}
+SHAPES: dict[type[Obstacles], ShapesOf] = {BoundSpheres: _spheres, BoundBoxes: _boxes, BoundField: _map}
 
 
 def shapes_of(part: Obstacles, b: int) -> Shapes | None:

@@ -209,6 +209,11 @@ def solver_of(config: DictConfig) -> Any:
     return _instantiate(config.solver, "solver", leave_out="name")
 
 
+def solver_from(settings: Mapping[str, Any]) -> Any:
+    """A solver from its resolved settings in plain dicts, as study.json holds them."""
+    return _instantiate(OmegaConf.create(dict(settings)), "solver", leave_out="name")
+
+
 def vehicle_of(configuration: Mapping[str, Any]) -> Vehicle:
     """The planning model of a study, from its resolved configuration in plain dicts."""
     return _instantiate(OmegaConf.create(dict(configuration["model"]["vehicle"])), "model.vehicle")

@@ -47,6 +47,7 @@ class Plan:
         workers: processes; None: as many as the cores allow.
         repair: damaged files are redone.
         figures: figures are drawn when all is flown.
+        figure: columns of a paper that a figure of the whole study spans, drawn then; None: no such figure.
         explain: layouts that the solver under study failed on are solved again with a record, and explained.
         view: a page of the study is written then.
         jobs: how many jobs share the layouts; None: one, which flies all.
@@ -61,6 +62,7 @@ class Plan:
     workers: Annotated[int, Within(1, MAX_PROCESSES)] | None
     repair: bool
     figures: bool
+    figure: Literal["one", "two"] | None
     explain: bool
     view: bool
     jobs: Count | None

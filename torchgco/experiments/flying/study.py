@@ -156,7 +156,8 @@ def _report(study: _Study, folder: Path) -> str:
     """Write the report of a finished study, and return it as text."""
     if study.setup.mission is not None:
         return write_mission_report(folder, study.setup, figures=study.plan.figures)
-    return write_report(folder, lambda flown: _trajectories(study, flown), figures=study.plan.figures)
+    plan = study.plan
+    return write_report(folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure)
 
 
 def _study(config: DictConfig, recompose: Recompose) -> _Study:
@@ -168,6 +169,8 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
         check_mission(setup.mission, task)
         if plan.explain:
             raise InputError("study.explain", "false in missions: single solves can be explained", True)
+        if plan.figure is not None:
+            raise InputError("study.figure", "null for missions, which have figures of their own", plan.figure)
     configs = _rivals(config, recompose)
     solvers = {name: setup.solver if held is config else solver_of(held) for name, held in configs.items()}
     configuration = {"version": VERSION, **plain(config)}

@@ -33,6 +33,7 @@ from torchgco.plotting.distributions import clearance_figure, is_spread, violati
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
 from torchgco.plotting.rates import rates_figure
+from torchgco.plotting.study_figure import Columns, study_figure
 from torchgco.plotting.style import save
 from torchgco.plotting.sweeps import sweep_figure
 from torchgco.scenarios.layouts import Layouts
@@ -42,18 +43,24 @@ FACETS = 6  # most tasks that have panels of their own; more are pooled over the
 Arrays = Mapping[str, np.ndarray]
 
 
-def write_report(folder: Path, trajectories: Callable[[Arrays], Arrays] | None = None, figures: bool = True) -> str:
+def write_report(
+    folder: Path,
+    trajectories: Callable[[Arrays], Arrays] | None = None,
+    figures: bool = True,
+    printed: Columns | None = None,
+) -> str:
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
     Args:
         trajectories: states for the picture of the layouts, X (L, N+1, n) by solver in the order of `layouts.npz`, from
             the arrays of `solutions.npz`; None: no such picture.
         figures: False: tables alone.
+        printed: columns of a paper that a figure of the whole study spans, study.pdf; None: no such figure.
 
     Raises:
         InputError: the table is missing, unreadable or empty, or the trajectories don't fit the layouts.
     """
-    return _written(folder, read_trials(folder / TRIALS), trajectories, figures=figures)
+    return _written(folder, read_trials(folder / TRIALS), trajectories, figures=figures, printed=printed)
 
 
 def _written(
@@ -62,15 +69,20 @@ def _written(
     trajectories: Callable[[Arrays], Arrays] | None = None,
     form: str = "table",
     figures: bool = True,
+    printed: Columns | None = None,
 ) -> str:
     parts = parts_of(trials)
     write_tables(folder, parts)
     held = _figures(parts) if figures else {}
-    if figures and trajectories is not None:
+    if (figures or printed) and trajectories is not None:
         layouts = Layouts.load(folder / LAYOUTS).arrays()
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
             states = trajectories(solutions)
-        held["layouts"] = lambda: layout_grid(layouts, states, trials)
+        if figures:
+            held["layouts"] = lambda: layout_grid(layouts, states, trials)
+        if printed:
+            for form in ("png", "pdf"):
+                held[f"study.{form}"] = lambda: study_figure(layouts, states, trials, parts[0].summary, printed)
     draw({name: partial(_draw, folder, name, figure) for name, figure in held.items()})
     return format_report(parts, form)
 
@@ -83,7 +95,9 @@ def _figures(parts: Sequence[Part]) -> Drawings:
 
 
 def _draw(folder: Path, name: str, figure: Callable[[], Figure]) -> None:
-    write(folder / "figures" / f"{name}.png", lambda file: save(figure(), file))
+    ending = "pdf" if name.endswith(".pdf") else "png"
+    path = folder / "figures" / f"{name.removesuffix(f'.{ending}')}.{ending}"
+    write(path, lambda file: save(figure(), file, dpi=300 if name == "study.png" else 150, form=ending))
 
 
 def drawings(part: Part) -> Drawings:

@@ -11,11 +11,13 @@ from typing import Any, NoReturn
 import numpy as np
 import pandas as pd
 import torch
+from tqdm import tqdm
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import vehicle_of
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.mission_report import PLANS
+from torchgco.experiments.reports.searched import searches
 from torchgco.experiments.results.files import damaged, write
 from torchgco.experiments.results.identity import Manifest
 from torchgco.experiments.results.records import DONE, LAYOUTS, MANIFEST, MISSION, SOLUTIONS, TRIALS, read_manifest
@@ -24,14 +26,14 @@ from torchgco.judging.judge import OTHERS_WITHIN
 from torchgco.lagrangian.rollout import open_loop
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts, Vehicle
-from torchgco.view.document import Document
-from torchgco.view.flights import Flight, Rows, contacts, flights_of, whole
-from torchgco.view.notebook import constraint_name
+from torchgco.view.document import Document, SearchPart
+from torchgco.view.flights import Flight, Rows, constraint_name, contacts, flights_of, whole
 from torchgco.view.page import page
 from torchgco.view.vehicles import Look, look_of
 
 NAME = "view.html"
 BATCH = 64  # layouts whose trajectories are measured at once
+SLOW = 256  # layouts from which on a bar shows how far the page is
 QUADROTOR = Look("quadrotor", quaternion=slice(6, 10))  # of a mission's plant
 
 
@@ -76,20 +78,32 @@ class Study:
         return {(row["solver"], row["layout"]): row for row in self.trials.to_dict("records")}  # type: ignore[misc]
 
 
-def study_page(folder: Path) -> str:
-    """The page of a finished study. Raises InputError as `Study.read` does."""
+def study_page(folder: Path, searched: Sequence[int] = ()) -> str:
+    """The page of a finished study, with the search on the layouts of some numbers, which are solved again.
+
+    Raises:
+        InputError: as `Study.read`; a number of no layout, or one of a mission.
+    """
     study = Study.read(folder)
-    return page(_missions(study) if study.missions else _trajectories(study))
+    missing = sorted(set(searched) - set(study.layouts.ids.tolist()))
+    if missing:
+        raise InputError("--search", "numbers of layouts of the study", missing[0])
+    if study.missions:
+        if searched:
+            raise InputError("--search", "a study of single trajectories", "one of missions")
+        return page(_missions(study))
+    seed = study.manifest.configuration["seed"]
+    parts = searches(study.vehicle, study.layouts, study.manifest.solvers, seed, searched) if searched else {}
+    return page(_trajectories(study, parts))
 
 
 def _document(study: Study, problem: Problem, look: Look) -> Document:
     solvers, configuration = list(study.manifest.solvers), study.manifest.configuration
-    scenario = study.layouts.name if configuration["scenario"].get("path") else configuration["scenario"]["name"]
     at = problem.position
     radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=study.vehicle.radius)
     count = f"{study.layouts.count} layouts" if study.layouts.count > 1 else "1 layout"
     return Document(
-        title=f"{scenario}: {', '.join(solvers)}",
+        title=f"{study.trials['scenario'].iloc[0]}: {', '.join(solvers)}",
         about=f"{count}, {study.vehicle.name}, seed {configuration['seed']}, {problem.N} stages of "
         f"{problem.dynamics.dt:g} s",
         dimension=at.stop - at.start, dt=float(problem.dynamics.dt), look=look, radius=radius, solvers=solvers,
@@ -97,13 +111,14 @@ def _document(study: Study, problem: Problem, look: Look) -> Document:
     )  # fmt: skip
 
 
-def _trajectories(study: Study) -> Document:
+def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
     """Single trajectories, rolled out from the controls that the study kept."""
     with np.load(study.folder / SOLUTIONS, allow_pickle=False) as held:
         names, numbers, controls = held["solver"].tolist(), held["layout"].tolist(), held["U"]
     if numbers != study.layouts.ids.tolist():
         raise damaged(study.folder / SOLUTIONS, "has other layouts")
     document, rows = None, study.rows
+    bar = tqdm(total=study.layouts.count, unit="layout", leave=False, disable=study.layouts.count < SLOW)
     for places, problem in study.batches():
         look = look_of(problem.dynamics)
         document = document or _document(study, problem, look)
@@ -115,7 +130,10 @@ def _trajectories(study: Study) -> Document:
             said = [result_of(row) for row in here], [told(row) for row in here]
             flown.append(flights_of(problem, look, X, U, name, *said, OTHERS_WITHIN, touching))
         for b, number in enumerate(ids):
-            document.add(f"layout {number}", problem, b, [flights[b] for flights in flown if len(flights[b].path)])
+            held = [flights[b] for flights in flown if len(flights[b].path)]
+            document.add(f"layout {number}", problem, b, held, found.get(number))
+        bar.update(len(ids))
+    bar.close()
     assert document is not None
     return document
 
@@ -198,15 +216,17 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="torchgco-view", description="A page of a study, to be turned around: one HTML file.")
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a finished study")
     parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {NAME} in RUN")
+    words = "solve the layouts of these numbers again, and show the search"
+    parser.add_argument("--search", metavar="N", type=int, nargs="+", default=[], help=words)
     return parser
 
 
-def write_view(folder: Path, output: Path | None = None) -> Path:
-    """Write the page of a finished study; returns where it lies. Raises InputError as `Study.read` does."""
+def write_view(folder: Path, output: Path | None = None, searched: Sequence[int] = ()) -> Path:
+    """Write the page of a finished study; returns where it lies. Raises InputError as `study_page` does."""
     path = folder / NAME if output is None else output
     if path.is_dir():
         raise InputError("--output", "a file", f"{path}, which is a folder")
-    text = study_page(folder)
+    text = study_page(folder, searched)
     write(path, lambda file: file.write(text.encode()))
     return path
 
@@ -216,7 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def work() -> int:
         options = _parser().parse_args(arguments)
-        path = write_view(options.run, options.output)
+        path = write_view(options.run, options.output, list(dict.fromkeys(options.search)))
         say(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
         return 0
 

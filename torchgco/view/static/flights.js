@@ -53,11 +53,25 @@ export class Flights {
     this.thick = 0.0035 * space.size;
     this.all = layout.flights.filter((flight) => flight.path.rows > 0).map((flight) => this.built(flight));
     this.knots = Math.max(1, ...this.all.map((one) => one.flight.path.rows - 1));
+    this.times = layout.times ? layout.times.data : null;
   }
 
   /** Seconds from the first knot to the last of the longest flight. */
   get duration() {
-    return this.knots * this.head.dt;
+    return this.timeOf(this.knots);
+  }
+
+  /** The time of a knot, s. */
+  timeOf(k) {
+    return this.times ? this.times[Math.min(k, this.times.length - 1)] : k * this.head.dt;
+  }
+
+  /** How many knots have passed at a time, s; between two knots it is no whole number. */
+  knotsAt(t) {
+    if (!this.times) return t / this.head.dt;
+    const next = this.times.findIndex((time) => time > t);
+    if (next <= 0) return next === 0 ? 0 : this.times.length - 1;
+    return next - 1 + (t - this.times[next - 1]) / (this.times[next] - this.times[next - 1]);
   }
 
   place(x, y, z) {
@@ -73,7 +87,8 @@ export class Flights {
     const group = new THREE.Group();
     const points = this.points(flight.path);
     const paint = new THREE.MeshLambertMaterial({ color: colour });
-    const line = tube(points, this.thick, paint);
+    // The first is the thinnest: one of the same course shows at its sides.
+    const line = tube(points, (flight.solver === 0 ? 1 : 1.4) * this.thick, paint);
     if (line) {
       // Seen through whatever stands before it.
       const ghost = new THREE.Mesh(
@@ -99,7 +114,7 @@ export class Flights {
     const paint = new THREE.MeshLambertMaterial({ color: BAD });
     for (const [first, last] of runs(flight.violated.map(([k]) => k))) {
       const piece = points.slice(Math.max(0, first - 1), last + 2);
-      const red = piece.length > 1 ? tube(piece, 1.5 * this.thick, paint) : null;
+      const red = piece.length > 1 ? tube(piece, 1.8 * this.thick, paint) : null;
       if (red) found.push(red);
     }
     if (flight.contacts.length) {
@@ -131,7 +146,7 @@ export class Flights {
 
   /** Move all vehicles to a time, s. */
   setTime(t) {
-    const knots = t / this.head.dt;
+    const knots = this.knotsAt(t);
     for (const { flight, body, line, plan } of this.all) {
       const place = this.place(...between(flight.path, knots));
       body.position.copy(place);

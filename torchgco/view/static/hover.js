@@ -20,9 +20,10 @@ export function pick(flights, camera, x, y, width, height) {
 }
 
 /** The lines of the hover: solver and time, what the table says, and what is violated at this knot. */
-export function linesOf({ name, flight, points, k }, head) {
+export function linesOf({ name, flight, points, k }, flights) {
+  const { head } = flights;
   const place = points[k].toArray().slice(0, head.dimension);
-  const lines = [`${name}, knot ${k}, t = ${(k * head.dt).toFixed(2)} s`];
+  const lines = [`${name}, knot ${k}, t = ${flights.timeOf(k).toFixed(2)} s`];
   lines.push(`at (${place.map((value) => value.toFixed(2)).join(", ")}) m`);
   lines.push(...flight.rows.map(([label, text]) => `${label}: ${text}`));
   const here = flight.violated.find(([knot]) => knot === k);

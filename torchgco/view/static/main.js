@@ -16,9 +16,10 @@ const COARSEST = 0.4; // pixels of the picture per pixel of the screen
 /** Whether pictures are computed without a graphics card: smooth edges would cost half of the time. */
 function software() {
   const context = document.createElement("canvas").getContext("webgl2");
-  const names = context?.getExtension("WEBGL_debug_renderer_info");
+  if (!context) throw new Error("the browser offers no WebGL 2");
+  const names = context.getExtension("WEBGL_debug_renderer_info");
   const name = names ? context.getParameter(names.UNMASKED_RENDERER_WEBGL) : "";
-  context?.getExtension("WEBGL_lose_context")?.loseContext();
+  context.getExtension("WEBGL_lose_context")?.loseContext();
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
@@ -65,6 +66,8 @@ class Page {
     this.resize();
     await this.choose(this.firstLayout());
     this.setTime(Number(this.asked.get("time") ?? 0));
+    if (this.asked.has("cut")) by("cut").value = this.asked.get("cut");
+    this.cut(Number(by("cut").value));
     if (this.asked.has("camera")) this.placeCamera(this.asked.get("camera").split(",").map(Number));
     this.draw();
     this.canvas.dataset.first = Math.round(performance.now());
@@ -103,6 +106,7 @@ class Page {
   async choose(number) {
     this.number = number;
     const layout = await part(`part-${number}`);
+    layout.obstacles = await Promise.all(layout.obstacles.map((one) => ("shared" in one ? part(`map-${one.shared}`) : one)));
     if (number !== this.number) return;
     this.layout = layout;
     showLayout(layout, number, this.head, this.visible, this.actions());
@@ -117,6 +121,7 @@ class Page {
     const { scene, layout, colours } = this;
     scene.background = new THREE.Color(colours.sky);
     this.space = spaceOf(layout, this.head);
+    if (this.still) scene.fog = new THREE.Fog(colours.sky, 0.7 * this.space.size, 2.2 * this.space.size);
     this.obstacles = obstacles(layout.obstacles, this.space, colours, this.still);
     this.flights = new Flights(layout, this.head, this.space);
     this.search = layout.search ? new Search(layout.search, this.space) : null;
@@ -210,7 +215,7 @@ class Page {
 
   setTime(t) {
     this.time = Math.min(Math.max(0, t), this.flights.duration);
-    this.obstacles.setTime(this.time);
+    this.obstacles.setTime(this.flights.knotsAt(this.time) * this.head.dt); // they count in steps of equal length
     this.flights.setTime(this.time);
     if (this.shown.follow) this.follow();
     this.redraw();
@@ -240,17 +245,25 @@ class Page {
     const steps = { ",": -1, ".": 1 };
     const layouts = { n: 1, p: -1 };
     if (event.key === " ") this.play(!this.playing);
-    else if (event.key in steps) this.setTime(this.time + steps[event.key] * this.head.dt);
+    else if (event.key in steps) this.stepKnot(steps[event.key]);
     else if (event.key in layouts) this.actions().step(layouts[event.key]);
     else return;
     event.preventDefault();
+  }
+
+  /** To the next knot, or the one before. */
+  stepKnot(change) {
+    const at = this.flights.knotsAt(this.time);
+    const near = Math.round(at);
+    const from = Math.abs(at - near) < 1e-3 ? near : change > 0 ? Math.floor(at) : Math.ceil(at);
+    this.setTime(this.flights.timeOf(Math.min(this.flights.knots, Math.max(0, from + change))));
   }
 
   hover(event) {
     if (this.orbit.held || !this.flights) return;
     const { clientWidth, clientHeight } = this.canvas;
     const found = pick(this.flights, this.orbit.camera, event.offsetX, event.offsetY, clientWidth, clientHeight);
-    showHover(by("hover"), found && linesOf(found, this.head), event.offsetX, event.offsetY, clientWidth);
+    showHover(by("hover"), found && linesOf(found, this.flights), event.offsetX, event.offsetY, clientWidth);
   }
 
   resize() {

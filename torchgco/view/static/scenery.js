@@ -25,8 +25,7 @@ export function spaceOf(layout, head) {
   const margin = new THREE.Vector3(SIDEWAYS, SIDEWAYS, UPWARDS).multiplyScalar(size).addScalar(head.radius);
   const low = box.min.clone().sub(margin);
   const high = box.max.clone().add(margin);
-  const middle = layout.middle.length > 2 ? layout.middle : [...layout.middle, 0];
-  return { flat, box, size, low, high, middle, radius: head.radius, height: 0.05 * size, top: high.z };
+  return { flat, box, size, low, high, radius: head.radius, height: 0.05 * size, top: high.z };
 }
 
 export function lights(scene) {

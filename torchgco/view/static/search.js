@@ -48,7 +48,7 @@ export class Search {
   guided({ balls, sample }) {
     const found = [];
     const shape = new THREE.SphereGeometry(1, 16, 12);
-    const paint = new THREE.MeshLambertMaterial({ color: 0xcc79a7, transparent: true, opacity: 0.2, depthWrite: false });
+    const paint = new THREE.MeshLambertMaterial({ color: 0xcc79a7, transparent: true, opacity: 0.45, depthWrite: false });
     const meshes = new THREE.InstancedMesh(shape, paint, balls.rows);
     const matrix = new THREE.Matrix4();
     for (let k = 0; k < balls.rows; k++) {

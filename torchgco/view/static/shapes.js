@@ -6,12 +6,15 @@ const MANY = 60; // shapes from which on each has fewer corners
 const LONG = 0.35; // half sides longer than this share of the scene are cut where the scene ends
 export const SUN = new THREE.Vector3(-0.25, -0.4, 0.88).normalize();
 
-/** The rounded box with half sides `corner` and radius 1 of `offset`: every vertex is half * corner + radius * offset. */
-function solid(steps, rings) {
+/** The rounded box with half sides `corner` and radius 1 of `offset`: every vertex is half * corner + radius * offset.
+ *
+ * With a single side, along z, as of trunks and spheres, the corners around z are one: fewer points do.
+ */
+function solid(steps, rings, single) {
   const corners = [];
   const offsets = [];
   const index = [];
-  const ring = quarterTurns(4, steps);
+  const ring = single ? circle(3 * steps + 1) : quarterTurns(4, steps);
   const levels = [];
   for (const up of [-1, 1]) {
     for (let i = 0; i <= rings; i++) levels.push({ up, angle: ((up < 0 ? i - rings : i) / rings) * 0.5 * Math.PI });
@@ -30,6 +33,7 @@ function solid(steps, rings) {
       index.push(a, b, b + count, a, b + count, a + count);
     }
   }
+  if (single) return { corners, offsets, normals: offsets, index };
   const quarter = steps + 1; // the first corner of each quarter
   const top = (levels.length - 1) * count;
   index.push(top, top + quarter, top + 2 * quarter, top, top + 2 * quarter, top + 3 * quarter);
@@ -37,13 +41,13 @@ function solid(steps, rings) {
   return { corners, offsets, normals: offsets, index };
 }
 
-/** The same for the plane: a prism, rounded in the plane alone, with a lid. */
-function prism(steps) {
+/** The same for the plane, and for trunks that are cut: a prism, rounded in the plane alone, with a lid. */
+function prism(steps, single) {
   const corners = [];
   const offsets = [];
   const normals = [];
   const index = [];
-  const ring = quarterTurns(4, steps);
+  const ring = single ? circle(3 * steps + 1) : quarterTurns(4, steps);
   for (const up of [-1, 1]) {
     for (const { x, y, sx, sy } of ring) {
       corners.push(sx, sy, up);
@@ -61,6 +65,12 @@ function prism(steps) {
     if (i > 1) index.push(2 * count, 2 * count + i - 1, 2 * count + i);
   }
   return { corners, offsets, normals, index };
+}
+
+/** Directions around z. */
+function circle(count) {
+  const angles = Array.from({ length: count }, (_, i) => (2 * Math.PI * i) / count);
+  return angles.map((angle) => ({ x: Math.cos(angle), y: Math.sin(angle), sx: 0, sy: 0 }));
 }
 
 /** Directions around z with both ends of each quarter, and the signs of its corner. */
@@ -143,40 +153,62 @@ export function obstacles(parts, space, colours, still) {
   const meshes = [];
   const shells = [];
   for (const part of parts) {
-    const geometry = geometryOf(part, space);
+    const geometry = geometryOf(part, space, still);
     const mesh = new THREE.Mesh(geometry, solids);
     mesh.castShadow = mesh.receiveShadow = true;
     mesh.customDepthMaterial = shadow;
-    const shell = new THREE.Mesh(geometry, hull);
-    shell.visible = false;
     meshes.push(mesh);
-    shells.push(shell);
   }
-  group.add(...meshes, ...shells);
-  group.children.forEach((one) => (one.frustumCulled = false));
+  const add = (...more) => {
+    more.forEach((one) => (one.frustumCulled = false));
+    group.add(...more);
+  };
+  add(...meshes);
   const until = Math.min(...parts.map((part) => part.until ?? Infinity), Infinity);
   return {
     group,
     setTime: (t) => (uniforms.time.value = Math.min(t, until)),
-    setGrown: (on) => shells.forEach((shell) => (shell.visible = on)),
+    setGrown: (on) => {
+      if (on && !shells.length) {
+        shells.push(...parts.map((part) => new THREE.Mesh(geometryOf(part, space, still, true), hull)));
+        add(...shells);
+      }
+      shells.forEach((shell) => (shell.visible = on));
+    },
     setSeeThrough: (on) => meshes.forEach((mesh) => (mesh.material = on ? clear : solids)),
     dispose: () => {
       [solids, clear, hull, shadow].forEach((one) => one.dispose());
-      meshes.forEach((mesh) => mesh.geometry.dispose());
+      [...meshes, ...shells].forEach((mesh) => mesh.geometry.dispose());
     },
   };
 }
 
-function geometryOf(part, space) {
-  const [steps, rings] = part.count > MANY ? [3, 2] : [6, 5];
-  const template = space.flat ? prism(2 * steps) : solid(steps, rings);
+/** The six sides of sharp boxes, such as the cells of a map. */
+function sharp() {
+  const box = new THREE.BoxGeometry(2, 2, 2);
+  const corners = [...box.attributes.position.array];
+  return { corners, offsets: corners.map(() => 0), normals: [...box.attributes.normal.array], index: [...box.index.array] };
+}
+
+/** The simplest solid that all shapes of a part can be made of. */
+function templateOf(part, { sides, cut }, flat, still, grown) {
+  const [steps, rings] = still ? [10, 8] : part.count > MANY ? [3, 2] : [6, 5];
+  if (!grown && part.radius.data.every((radius) => radius === 0)) return sharp();
+  if (flat) return prism(2 * steps);
+  const single = sides.every((half, i) => i % 3 === 2 || half === 0);
+  const flatEnds = single && cut.every((long, i) => i % 3 !== 2 || long === 1);
+  return flatEnds && !grown ? prism(steps, true) : solid(steps, rings, single);
+}
+
+function geometryOf(part, space, still, grown) {
+  const rows = instances(part, space);
+  const template = templateOf(part, rows, space.flat, still, grown);
   const geometry = new THREE.InstancedBufferGeometry();
   geometry.instanceCount = part.count;
   geometry.setIndex(template.index);
   geometry.setAttribute("position", new THREE.Float32BufferAttribute(template.offsets, 3));
   geometry.setAttribute("normal", new THREE.Float32BufferAttribute(template.normals, 3));
   geometry.setAttribute("corner", new THREE.Float32BufferAttribute(template.corners, 3));
-  const rows = instances(part, space);
   for (const [name, size] of Object.entries({ middle: 3, sides: 3, radius: 1, turn: 4, velocity: 3, cut: 3 })) {
     geometry.setAttribute(name, new THREE.InstancedBufferAttribute(rows[name], size));
   }
@@ -192,7 +224,7 @@ export function instances(part, space) {
   );
   for (let k = 0; k < part.count; k++) {
     for (let i = 0; i < (space.flat ? 2 : 3); i++) {
-      found.middle[3 * k + i] = part.center.data[row(part.center, k) + i] + space.middle[i];
+      found.middle[3 * k + i] = part.center.data[row(part.center, k) + i] + part.middle[i];
       found.sides[3 * k + i] = part.half.data[row(part.half, k) + i];
       if (part.velocity) found.velocity[3 * k + i] = part.velocity.data[row(part.velocity, k) + i];
     }
