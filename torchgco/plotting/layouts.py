@@ -18,6 +18,7 @@ from matplotlib.patches import Circle, Patch
 from torchgco.base.errors import InputError
 from torchgco.plotting.bodies import ABOVE, Plane
 from torchgco.plotting.grid import grid, put_head
+from torchgco.plotting.maps import draw_map
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, passes, scene_of, view
 from torchgco.plotting.style import INK, SMALL, TITLE, solver_colours, solver_dash, tasks_of
 
@@ -81,9 +82,13 @@ def layout_grid(
     drawn: set[str] = set()
     for i in range(count):
         here = {solver: row[i] for solver, row in flights.items()}
-        lead = passes(scene, i, _leading(scene, i, [flight.path for flight in here.values()]))
+        path = _leading(scene, i, [flight.path for flight in here.values()])
+        lead = passes(scene, i, path)
         for ax, plane in zip(axes[i], planes, strict=True):
             drawn |= _obstacles(ax, scene, i, lead, plane)
+            if scene.map is not None:
+                draw_map(ax, scene.map, flown(path), plane, scene.margin, {"facecolor": STONE, "edgecolor": EDGE})
+                drawn |= {"own", "grown"} if scene.margin > 0 else {"own"}
             drawn |= _paths(ax, scene, i, here, plane)
             _targets(ax, scene, i, plane)
         axes[i][0].set_title(f"layout {scene.ids[i]}", fontsize=TITLE, loc="left", color=INK)
