@@ -24,9 +24,31 @@ from torchgco.obstacles.base import Solids
 
 Array = NDArray[np.float64]
 
+NEXT = 2  # nodes around start and goal from which a way may begin
 KEPT = 8  # maps whose clearances are kept, the most recent ones, by field
 AROUND = 2.0  # vehicle's radii, and at least so many spacings, that the lattice extends beyond a map
+BESIDE = 1.3  # times as large as they are, spheres and boxes beside a map lie within the lattice
 LARGEST = 2**24  # nodes of a lattice; one that would need more doesn't extend to start and goal
+
+
+@dataclass(frozen=True, eq=False)
+class Clearances:
+    """Distances to contact at the nodes of one map for one vehicle, m, negative where it would touch."""
+
+    values: NDArray[np.float32]
+
+    @cached_property
+    def rooms(self) -> NDArray[np.int32]:
+        """Numbers of the connected regions of free nodes; 0 where blocked."""
+        return np.asarray(label(self.values > 0, np.ones([3] * self.values.ndim))[0])
+
+    @cached_property
+    def marks(self) -> NDArray[np.int64]:
+        """A node (M, d) of each connected region of blocked nodes."""
+        regions = np.asarray(label(self.values < 0, np.ones([3] * self.values.ndim))[0])
+        _, first = np.unique(regions, return_index=True)
+        nodes = np.stack(np.unravel_index(first, regions.shape), axis=-1)
+        return nodes[regions.flat[first] > 0]
 
 
 @dataclass(frozen=True)
@@ -34,22 +56,35 @@ class Lattice:
     """Clearances of one problem.
 
     Args:
-        clearance: distances to contact at the nodes of a map, m, negative where the vehicle would touch.
+        map: the clearances of the finest map.
         origin: the first node, (d,), m.
         spacing: of the nodes, m.
-        fields: all maps, of this problem alone, and the clearance of `clearance` alone doesn't know the others.
+        others: the other maps, of this problem alone.
         solids: spheres and boxes beside, of this problem alone.
     """
 
-    clearance: NDArray[np.float32]
+    map: Clearances
     origin: Array
     spacing: float
     others: tuple[BoundField, ...]
     solids: tuple[Solids, ...]
 
     @property
+    def clearance(self) -> NDArray[np.float32]:
+        """At the nodes."""
+        return self.map.values
+
+    @property
     def d(self) -> int:
         return len(self.origin)
+
+    def may_join(self, ends: Array) -> bool:
+        """Whether free nodes next to two points (2, d) are connected; what is beside the map may still part them."""
+        rooms = []
+        for node in self.node(ends):
+            near = tuple(slice(max(0, i - NEXT), i + NEXT + 1) for i in node)
+            rooms.append(set(np.unique(self.map.rooms[near]).tolist()) - {0})
+        return bool(rooms[0] & rooms[1])
 
     def position(self, nodes: NDArray[np.int64]) -> Array:
         """Where nodes (..., d) are, m."""
@@ -106,10 +141,7 @@ class Lattice:
     @cached_property
     def marks(self) -> NDArray[np.int64]:
         """A node of each blocked region of a map in the plane, and the nodes next to the middles of what is beside."""
-        regions, _count = label(self.clearance < 0, np.ones((3, 3)))
-        _, first = np.unique(regions, return_index=True)
-        nodes = np.stack(np.unravel_index(first, regions.shape), axis=-1)
-        found = [nodes[regions.flat[first] > 0]]
+        found = [self.map.marks]
         for part in self.solids:
             found.append(self.node(part.centers[0][~part.absent[0]].numpy()))
         return np.concatenate(found).astype(np.int64)
@@ -118,32 +150,40 @@ class Lattice:
 def lattice_of(fields: Sequence[BoundField], solids: Sequence[Solids], ends: Array) -> Lattice:
     """The clearances of one problem among maps, with spheres and boxes beside, for a way between two points (2, d)."""
     first, *others = (field for field in sorted(fields, key=lambda one: -one.field.values[0].size))
-    clearance, pad = _clearance(first, ends)
-    origin = first.origins[0].numpy() - first.field.spacing * pad
     present = tuple(part for part in solids if not bool(part.absent.all()))
+    points = [ends]
+    for part in present:
+        here, reach = ~part.absent[0], part.extent[0] + part.radii[0].unsqueeze(-1)
+        points += [(part.centers[0] + side * BESIDE * reach)[here].numpy() for side in (-1.0, 1.0)]
+    clearance, pad = _clearance(first, np.concatenate(points))
+    origin = first.origins[0].numpy() - first.field.spacing * pad
     return Lattice(clearance, origin, first.field.spacing, tuple(others), present)
 
 
-def _clearance(field: BoundField, ends: Array) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Clearances at the nodes of a field's map and around it, and how many nodes lie before its first one."""
+def _clearance(field: BoundField, points: Array) -> tuple[Clearances, NDArray[np.int64]]:
+    """Clearances at the nodes of a field's map and around it, and how many nodes lie before its first one.
+
+    Args:
+        points: (P, d) that lie within, unless that takes too many nodes.
+    """
     R, which = float(field.vehicle_radius[0]), int(field.which[0])
     h, shape = field.field.spacing, np.array(field.field.values.shape[1:])
     room = int(np.ceil(max(AROUND * R / h, AROUND)))
     low, high = np.full(len(shape), room), np.full(len(shape), room)
-    reach = np.floor((ends - field.origins[0].numpy()) / h)
+    reach = np.floor((points - field.origins[0].numpy()) / h)
     before, after = np.maximum(low, room - reach.min(0)), np.maximum(high, reach.max(0) + room - shape + 1)
     if np.prod(before + shape + after) <= max(LARGEST, np.prod(shape + 2.0 * room)):
         low, high = before.astype(int), after.astype(int)
     key = (which, R, *low, *high)
     kept = _kept.setdefault(field.field, {})
     if key not in kept:
-        kept[key] = _measured(field, which, R, low, high)
+        kept[key] = Clearances(_measured(field, which, R, low, high))
         while len(kept) > KEPT:
             del kept[next(iter(kept))]
     return kept[key], low
 
 
-_kept: WeakKeyDictionary[Any, dict[tuple[float, ...], NDArray[np.float32]]] = WeakKeyDictionary()
+_kept: WeakKeyDictionary[Any, dict[tuple[float, ...], Clearances]] = WeakKeyDictionary()
 
 
 def _measured(field: BoundField, which: int, R: float, low: Any, high: Any) -> NDArray[np.float32]:

@@ -22,7 +22,7 @@ from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.lattice import Array, Blocks, Lattice, blocks_of, lattice_of
 from torchgco.roadmap.search import HOPS
 
-BLOCKS = (2**15, 2**20)  # of a first search, and of a second one where the first finds no path
+BLOCKS = (2**13, 2**16, 2**20)  # of a first search, and of further ones where there is no path yet
 MARGIN = 0.5  # vehicle's radii within which an edge costs up to double
 LONGEST = 2.0  # times as dear as the cheapest one other paths in the plane may be
 ROUNDS = 4  # of drawing taut, at most, and the gain in length, as a share, below which there is no further one
@@ -121,8 +121,8 @@ class Ways:
 
 def paths(lattice: Lattice, ends: Array, price: Price, count: int, unit: float, corners: int) -> list[Array]:
     """Up to `count` taut paths (P, d), P <= corners, between two points (2, d), the cheapest first."""
-    if float(lattice.segments(ends[:1], ends[1:])[0]) > MARGIN * unit and count == 1:
-        return [ends]
+    if not lattice.may_join(ends):
+        return []
     for most in BLOCKS:
         ways = Ways(lattice, blocks_of(lattice, most), ends, price, unit)
         found = _in_the_plane(ways, count) if lattice.d == 2 else _in_space(ways, count, unit)
