@@ -12,10 +12,18 @@ from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for processes that tests start
+# Most tests spend more time in the compiler than in what it has made; see `as_shipped`.
+os.environ.setdefault("TORCHGCO_CFLAGS", "-O1")
 torch.set_num_threads(1)
 # In the background of a shell Ctrl-C is ignored, also by all processes that tests start and interrupt.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Native kernels compiled as for users, for tests of bits and of agreement between kernels."""
+    monkeypatch.delenv("TORCHGCO_CFLAGS", raising=False)
 
 
 @pytest.fixture(params=["native", "eager"])

@@ -29,7 +29,7 @@ from benchmarks.speed import __main__ as speed
 from torchgco import Problem
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
-from torchgco.experiments.reports import report
+from torchgco.experiments.reports import report, view
 from torchgco.judging.certificate import CHORDS
 from torchgco.judging.judge import CLEARANCES
 from torchgco.native.compiler import find_compiler
@@ -95,6 +95,8 @@ def accept(command: str) -> None:
     elif program == "torchgco-report":
         options = report._parser().parse_args(words)
         assert options.folders
+    elif program == "torchgco-view":
+        view._parser().parse_args(words)
     elif program == "make":
         accept_make(words)
     elif program == "python":

@@ -16,10 +16,12 @@ LAYERS = [
     ["maps"],
     ["problem"],
     ["lagrangian", "judging"],
+    ["explaining"],
     ["solution", "native"],
     ["solvers", "roadmap", "contact"],
     ["guidance", "missions", "scenarios"],
     ["search", "plotting"],
+    ["view"],
     ["baselines"],
     ["presets"],
     ["api", "experiments"],
@@ -129,7 +131,13 @@ def test_c_files_are_short(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= 600
 
 
-@pytest.mark.parametrize("room", ["experiments", "plotting", "scenarios"])
+@pytest.mark.parametrize("path", sorted((PACKAGE / "view" / "static").iterdir()), ids=lambda p: p.name)
+def test_files_of_the_page_are_short(path: Path) -> None:
+    lines = path.read_text().splitlines()
+    assert len(lines) <= 450 and max(map(len, lines)) <= 140
+
+
+@pytest.mark.parametrize("room", ["experiments", "plotting", "scenarios", "view"])
 def test_docstrings_list_arguments_in_sections(room: str) -> None:
     """As Google's style has them: names in columns would be run together by the API reference."""
     for path in sorted((PACKAGE / room).rglob("*.py")):

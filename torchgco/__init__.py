@@ -12,6 +12,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from torchgco import presets as presets
+from torchgco.api import plot as plot
 from torchgco.api import solve as solve
 from torchgco.base.errors import ContactWarning as ContactWarning
 from torchgco.base.errors import GuidanceWarning as GuidanceWarning
@@ -80,8 +81,8 @@ __all__ = [  # noqa: RUF022
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "Solution", "Status", "presets", "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR",
-    "InteriorPoint", "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
+    "solve", "Solution", "plot", "Status", "presets", "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian",
+    "ILQR", "InteriorPoint", "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors

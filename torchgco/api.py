@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.options import check_value
 from torchgco.base.shapes import check_shape, computing_on
 from torchgco.constraints import ControlBounds
 from torchgco.contact import warned_of_contact
@@ -15,6 +20,9 @@ from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def solve(
@@ -26,6 +34,7 @@ def solve(
     warm: Solution | None = None,
     max_seconds: float | None = None,
     X0: Tensor | None = None,
+    record: bool = False,
 ) -> Solution:
     """Solve every problem of the batch.
 
@@ -42,6 +51,8 @@ def solve(
         max_seconds: time after which the best trajectories so far are returned; see `Solver.solve`.
         X0: states to begin with (B, N+1, n), such as waypoints; U0 need not lead to them. For `interior_point`, `ipopt`
             and `fatrop`, and without obstacles `gco`. Default: those that U0 leads to.
+        record: keep `solution.trace` and, of `gco`, `solution.search`, where the solver can: `solution.explain` then
+            says more. The results are the same.
 
     Raises:
         InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
@@ -51,6 +62,7 @@ def solve(
     if warm is not None and not isinstance(warm, Solution):
         raise InputError("warm", "a Solution, or None", type(warm).__name__)
     solver = "gco" if solver is None else solver
+    name = solver if isinstance(solver, str) else None
     if isinstance(solver, str):
         solver = named(solver, problem)
     if not isinstance(solver, Solver):
@@ -68,8 +80,31 @@ def solve(
         problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
         U0 = _guess(problem, traced)
     multipliers = None if warm is None else warm.multipliers
+    solver = solver.recording() if check_value(record, bool, "record") else solver
     found = solver.solve(problem, U0, seed=seed, ids=ids, warm=multipliers, max_seconds=max_seconds, X0=X0)
+    if name is not None and found.account is not None:
+        found = replace(found, account=found.account.of_preset(name))
     return warned_of_contact(problem, found)
+
+
+def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:
+    """The scene with the trajectories, then states and controls over time, with their bounds dashed.
+
+    In space obstacles are cut at the height, in the side view at the y, that the first trajectory has there; crosses
+    mark contact, between the knots too. Bounds far from all values are left out. A notebook shows the figure;
+    `figure.savefig("name.pdf")` writes it.
+
+    Args:
+        problem, solution: as solved.
+        b: the place of a problem in the batch, or several; None: the first six. Those with the same obstacles and goal
+            share a scene.
+
+    Raises:
+        InputError: a place that isn't there, or a solution of other problems.
+    """
+    from torchgco.plotting.problems import solution_figure  # matplotlib takes a second to load
+
+    return solution_figure(problem, solution, b)
 
 
 def _guess(problem: Problem, whole: Problem) -> Tensor:

@@ -125,7 +125,8 @@ def gco_max(space: Space) -> Restarts:
     closer = replace(many, when="unproposed", roadmaps=(), follow=(_closer(many.follow[0]),))
     more = (many, closer, FromProposal(), IntoGoal(), replace(samples, when="caught"), IntoGoal())
     *begin, finish, chords, converge, starts = solver.passes
-    return replace(solver, passes=(*begin, *more, finish, chords, converge, replace(starts, when="all")))
+    # What `gco` would return is cleared first: a cheaper trajectory that can't be cleared gives way to it again.
+    return replace(solver, passes=(*begin, chords, *more, finish, chords, converge, replace(starts, when="all")))
 
 
 def gco_paper(space: Space) -> AugmentedLagrangian:

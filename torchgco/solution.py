@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, fields, replace
-from enum import IntEnum
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,12 @@ from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.shapes import check_device, check_shape
 from torchgco.base.status import Status
 from torchgco.base.tree import take
+from torchgco.explaining.account import Account
+from torchgco.explaining.explain import Explanation, explanation
+from torchgco.explaining.record import Comparison as Comparison
+from torchgco.explaining.record import Fate as Fate
+from torchgco.explaining.record import SearchRecord as SearchRecord
+from torchgco.explaining.record import Standing as Standing
 from torchgco.judging.judge import columns as judged
 from torchgco.judging.worst import worst_rows
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -24,57 +31,8 @@ from torchgco.lagrangian.lagrangian import Multipliers
 if TYPE_CHECKING:
     import pandas as pd
 
+    from torchgco.base.html import HtmlPage
     from torchgco.problem.problem import Problem
-
-
-class Fate(IntEnum):
-    """What became of a candidate trajectory along a path."""
-
-    ABSENT = 0  # its path is of the same homotopy class as a shorter one, or there is none
-    TRACKED = 1  # dropped as tracked: others were cheaper
-    UNSOUND = 2  # relaxed, but too deep in an obstacle, or away from the goal
-    RELAXED = 3  # dropped as relaxed: others were cheaper
-    FAILED = 4  # refined, but without a good end
-    REFINED = 5  # refined, but not the cheapest
-    PROPOSED = 6
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """One comparison of candidates along paths for b problems, K paths and C candidates each."""
-
-    number: int  # of the pass in the solver's table, from 1
-    rows: Tensor  # (b,) int64: places in the batch
-    paths: Tensor  # (b, K, P, d): corners, m
-    classes: Tensor  # (b, K) int64: the first path of the same homotopy class
-    path: Tensor  # (b, C) int64: which path each candidate follows
-    fate: Tensor  # (b, C) int64, see Fate
-    tracked: Tensor  # (b, C, N+1, n): states after tracking
-    relaxed: Tensor  # (b, C, N+1, n): after relaxing; NaN for candidates dropped before
-    refined: Tensor  # (b, C, N+1, n): after refining; NaN for candidates dropped before
-    cost: Tensor  # (b, C): as refined, infinite without a good end; NaN for candidates that weren't refined
-
-
-@dataclass
-class SearchRecord:
-    """What the passes of a search did, kept where the local solver records.
-
-    Attributes:
-        passes: (number of the pass, its name, places in the batch of the problems that it worked on), in their order.
-        caught: places in the batch (b,), and states (b, N+1, n) of the trajectories that were caught.
-        comparisons: of candidates along paths.
-    """
-
-    passes: list[tuple[int, str, list[int]]] = field(default_factory=list)
-    caught: tuple[Tensor, Tensor] | None = None
-    comparisons: list[Comparison] = field(default_factory=list)
-
-    def of_first_states(self, n: int) -> SearchRecord:
-        """The same with the first n states alone."""
-        caught = None if self.caught is None else (self.caught[0], self.caught[1][..., :n])
-        names = "tracked", "relaxed", "refined"
-        each = [replace(one, **{name: getattr(one, name)[..., :n] for name in names}) for one in self.comparisons]
-        return SearchRecord(self.passes, caught, each)
 
 
 @dataclass(frozen=True)
@@ -97,6 +55,7 @@ class Solution:
     trace: pd.DataFrame | None = None  # a row per problem and iteration, where the solver records
     search: SearchRecord | None = None  # paths, candidates and passes, where a solver with passes records
     horizon: Tensor | None = None  # (B,) int64: stages of each problem, after which its state is held; None: N
+    account: Account | None = None  # the problem and the solver, for `t` and `explain`; of a loaded one the times alone
 
     @classmethod
     def empty(cls, problem: Problem) -> Solution:
@@ -105,6 +64,31 @@ class Solution:
         number, count = X.new_zeros(0), torch.zeros(0, dtype=torch.int64, device=X.device)
         K = X.new_zeros(0, problem.N, problem.m, problem.n)
         return cls(X, U, K, U, Multipliers.zero(problem, 0.0), number, number, count, count, count, count)
+
+    @property
+    def t(self) -> Tensor:
+        """Times of the knots, s: (N+1,), or (B, N+1) where horizons or stages differ; see `problem.times`.
+
+        Raises:
+            InputError: the model has no time step, or this solution doesn't know its problem: a user's own, or a file's
+                without times.
+        """
+        return (self.account or Account()).times()
+
+    def explain(self, b: int = 0, problem: Problem | None = None) -> Explanation:
+        """What happened to problem b, in words: the result, where it was caught, the passes, why it ended, what to try.
+
+        With a record (`torchgco.solve(..., record=True)`) it says what each pass of the search did, and what became of
+        the candidates.
+
+        Args:
+            b: place in the batch.
+            problem: the problems that were solved, for a solution that no longer knows them, such as a loaded one.
+
+        Raises:
+            InputError: no such place, or a problem of another form.
+        """
+        return explanation(self, b, problem)
 
     @property
     def statuses(self) -> list[Status]:
@@ -168,12 +152,23 @@ class Solution:
         check_shape(self.U, (problem.B, problem.N, problem.m), "problem: solution.U")
         return pd.DataFrame(worst_rows(problem, self.X, self.U)).rename_axis("element")
 
+    def show(self, problem: Problem) -> HtmlPage:
+        """A page of the trajectories that one turns around, in a notebook or, with `.save(path)`, as an HTML file.
+
+        Raises:
+            InputError: a problem of another form, an empty one, or dynamics without a position in 2-D or 3-D.
+        """
+        # By name: it is a layer above this one, and slow to load.
+        return import_module("torchgco.view.notebook").show(problem, self)
+
     def save(self, path: str | Path) -> None:
         """Write an npz: all of it or, if interrupted, nothing."""
         arrays = {f.name: getattr(self, f.name).cpu().numpy() for f in fields(self) if f.name in _TENSORS}
         arrays["mu"] = self.multipliers.mu.cpu().numpy()
         if self.horizon is not None:
             arrays["horizon"] = self.horizon.cpu().numpy()
+        with suppress(InputError):  # dynamics without a time step
+            arrays["t"] = self.t.cpu().numpy()
         for i, lam in enumerate(self.multipliers.lam):
             arrays[f"lam{i}"] = lam.cpu().numpy()
         write_whole(path, lambda file: np.savez_compressed(file, **arrays))
@@ -188,17 +183,20 @@ class Solution:
         where = check_device(device)
         arrays = read_arrays(path, "path", "a solution file", {*_TENSORS, "mu"})
         count = next(i for i in range(len(arrays)) if f"lam{i}" not in arrays)
-        names = (*_TENSORS, "mu", *(f"lam{i}" for i in range(count)), *(["horizon"] if "horizon" in arrays else []))
+        more = [name for name in ("horizon", "t") if name in arrays]
+        names = (*_TENSORS, "mu", *(f"lam{i}" for i in range(count)), *more)
         strange = [name for name in names if arrays[name].dtype.kind not in "iuf"]
         if strange:
             raise InputError("path", "a solution file", f"{path}, where {strange[0]} holds no numbers")
-        ranks = {"X": 3, "U": 3, "K": 4, "d": 3}
+        ranks = {"X": 3, "U": 3, "K": 4, "d": 3, "t": arrays["t"].ndim if "t" in arrays else 1}
         if any(arrays[name].ndim != ranks.get(name, 3 if name.startswith("lam") else 1) for name in names):
             raise InputError("path", "a solution file", f"{path}, whose arrays have other shapes")
         tensors: dict[str, Any] = {name: torch.from_numpy(arrays[name]).to(where) for name in names}
         lam = tuple(tensors[f"lam{i}"] for i in range(count))
         own = {name: tensors[name] for name in _TENSORS}
-        return cls(multipliers=Multipliers(lam, tensors["mu"]), horizon=tensors.get("horizon"), **own)
+        account = Account(t=tensors["t"]) if "t" in tensors else None
+        return cls(multipliers=Multipliers(lam, tensors["mu"]), horizon=tensors.get("horizon"), account=account, **own)
 
 
-_TENSORS = tuple(f.name for f in fields(Solution) if f.name not in ("multipliers", "trace", "search", "horizon"))
+_OTHERS = ("multipliers", "trace", "search", "horizon", "account")
+_TENSORS = tuple(f.name for f in fields(Solution) if f.name not in _OTHERS)

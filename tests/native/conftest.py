@@ -1,4 +1,4 @@
-"""Each test has an empty cache folder and no loaded library."""
+"""An empty cache folder and no loaded library, for tests of compiling and keeping."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 from torchgco.native import compiler
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def cache(tmp_path: Path, monkeypatch) -> Path:
     monkeypatch.setenv("TORCHGCO_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(compiler, "_loaded", {})

@@ -19,6 +19,8 @@ from torchgco.native import compiler, kernels, store
 from torchgco.native.compiler import NativeError, build, find_compiler
 from torchgco.native.dispatch import engine_of
 
+pytestmark = pytest.mark.usefixtures("cache")
+
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 

@@ -36,11 +36,6 @@ pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 
 @pytest.fixture(autouse=True)
-def cache() -> None:
-    """Use the user's cache folder: libraries are compiled once for all tests of this file."""
-
-
-@pytest.fixture(autouse=True)
 def native_again() -> Iterator[None]:
     yield
     kernels.use_native(True)

@@ -38,14 +38,11 @@ from torchgco.solvers.ilqr import advance
 from torchgco.solvers.riccati import BackwardPass, backward
 from torchgco.solvers.state import PassEnd, State
 
+pytestmark = pytest.mark.usefixtures("as_shipped")
+
 DAMPED = ILQR()
 BRIEF = replace(DAMPED, line_search=LineSearch(back=2))
 PRINTED = ILQR(as_printed=True, tolerance=0.1, max_iterations=15)
-
-
-@pytest.fixture(autouse=True)
-def cache() -> None:
-    """Use the user's cache folder: libraries are compiled once for all tests of this file."""
 
 
 @pytest.fixture(autouse=True)

@@ -33,7 +33,7 @@ from torchgco.solvers.interior import FILTER
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
-    pytest.mark.filterwarnings("ignore::torchgco.ContactWarning"),
+    pytest.mark.filterwarnings("ignore::torchgco.ContactWarning"), pytest.mark.usefixtures("as_shipped"),
 ]
 
 B, D = 9, torch.float64  # one problem more than lanes
@@ -43,11 +43,6 @@ PLAIN = FILTER | {
     "corrects": 0, "crawl": 0.0, "explodes": 1e300, "patience": 100, "tolerance": 1e-6, "violation": 1e-6, "push": 1e-2,
     "steepest": 100.0,
 }  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def cache() -> None:
-    """Use the user's cache folder: libraries are compiled once for all tests of this file."""
 
 
 def draw(seed: int) -> Callable[..., Tensor]:

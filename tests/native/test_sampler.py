@@ -20,12 +20,9 @@ from torchgco.guidance import mppi
 from torchgco.native import dispatch, kernels
 from torchgco.native.compiler import find_compiler
 
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
-
-
-@pytest.fixture(autouse=True)
-def cache() -> None:
-    """Use the user's cache folder: libraries are compiled once for all tests of this file."""
+pytestmark = [
+    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"), pytest.mark.usefixtures("as_shipped")
+]
 
 
 @pytest.fixture(autouse=True)

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from torchgco.base.errors import InputError
@@ -66,6 +67,18 @@ def test_obstacles_that_move_are_seen_to_move(tmp_path: Path) -> None:
     rest, _ = pictures(mission_animation(frame, plans, course(0.0), PERIOD, tmp_path / "a.gif"))
     moving, _ = pictures(mission_animation(frame, plans, course(-5.0), PERIOD, tmp_path / "b.gif"))
     assert changed(moving[0], moving[-1]) > 2 * changed(rest[0], rest[-1])
+
+
+def test_what_stays_is_drawn_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And each picture is what the axes drawn anew would show."""
+    drawn = list[object]()
+    whole = Figure.draw
+    monkeypatch.setattr(Figure, "draw", lambda self, renderer: drawn.append(self) or whole(self, renderer))
+    frame, plans = flown(41)
+    found, _ = pictures(mission_animation(frame, plans, course(0.5), PERIOD, tmp_path / "a.gif"))
+    assert len(found) > 8 and len(drawn) <= 2
+    alone, _ = pictures(mission_animation(frame, plans[-1:].repeat(41, 0), course(0.5), PERIOD, tmp_path / "b.gif"))
+    assert changed(found[-1], alone[-1]) == 0 and changed(found[2], alone[2]) > 0  # nothing of a plan before is left
 
 
 def test_colours_stay_those_of_the_drawing(tmp_path: Path) -> None:

@@ -82,6 +82,16 @@ def test_growth_counts_from_the_clearance_that_the_last_solve_missed() -> None:
     assert bool(judge(problem, solve(problem, solver=solver).U).sound.all())
 
 
+def test_more_effort_loses_no_clear_trajectory() -> None:
+    """In this maze `gco_max` finds a cheaper trajectory than `gco`, which touches a wall and can't be cleared."""
+    setup = compose(["scenario=mazes", "scenario.walls=3", "seed=21"])
+    task = setup.task(setup.layouts(4))
+    problem = task.problem.take(torch.tensor([3]))
+    less, more = solve(problem), solve(problem, solver="gco_max")
+    assert bool(judge(problem, less.U).sound.all()) and bool(judge(problem, more.U).sound.all())
+    assert bool((more.cost <= 1.001 * less.cost).all())
+
+
 def test_a_problem_is_cleared_alike_in_every_batch() -> None:
     problem = corners()
     whole = solve(problem)

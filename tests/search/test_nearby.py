@@ -116,3 +116,27 @@ def test_a_trajectory_is_refined_among_the_obstacles_near_it(kind: str, enough: 
     assert torch.equal(found.status, whole.status) and float(found.best.violation.max()) <= 1e-6
     for mine, theirs in zip(found.best.multipliers.lam, whole.best.multipliers.lam, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-4)
+
+
+def test_both_searches_are_recorded_and_the_second_is_told(monkeypatch) -> None:
+    _, many, U0 = planar("spheres", 9.0)
+    wrong, solver = Nearby.wrong, quick_gco(many)
+
+    def second(self: Nearby, found: Solution | Iterate) -> torch.Tensor:
+        return torch.tensor([1]) if isinstance(found, Solution) else wrong(self, found)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Nearby, "wrong", second)
+        found = solver.recording().solve(many, U0, seed=3)
+    search, rows = found.search, len(solver.passes)
+    assert search is not None and search.caught is not None and len(search.standings) == 2 * rows
+    last = search.standings[-1]
+    assert last is not None and last.rows.tolist() == [1] and float(last.cost[0]) == pytest.approx(float(found.cost[1]))
+    assert len(set(search.caught[0].tolist())) == len(search.caught[0])
+    first = solver.recording().solve(many.take(torch.tensor([0, 2])), U0[:2], seed=3, ids=torch.tensor([0, 2])).search
+    assert first is not None and first.caught is not None
+    alone = {[0, 2][i] for i in first.caught[0].tolist()}
+    assert {i for i in search.caught[0].tolist() if i != 1} == alone  # the second search drops none of the first
+    assert {one.again for one in search.comparisons if 1 in one.rows} == {False, True}
+    assert "solved again with all obstacles" in found.explain(1) and "again with all" not in found.explain(0)
+    assert found.explain(1).count("\n  3 Solve") == found.explain(0).count("\n  3 Solve") == 1

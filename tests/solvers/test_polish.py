@@ -44,7 +44,8 @@ BATCHES = {
     "planar": lambda: planar_batch(B=4, N=30, obstacles=5, seed=4),
     "quadrotor": lambda: quadrotor_batch(B=3, N=30, obstacles=6, seed=0),
 }
-FIELDS = tuple(f.name for f in fields(Solution) if f.name not in ("multipliers", "trace", "search", "horizon"))
+OTHERS = ("multipliers", "trace", "search", "horizon", "account")
+FIELDS = tuple(f.name for f in fields(Solution) if f.name not in OTHERS)
 
 
 @cache

@@ -8,10 +8,12 @@ from typing import Any, ClassVar, Self, TypeAlias
 import torch
 from torch import Tensor
 
+from torchgco.base.brief import Brief
+
 Rows: TypeAlias = Tensor | slice
 
 
-class PerElement:
+class PerElement(Brief):
     """Mixin for problem parts that may hold one value per problem.
 
     A subclass names its tensor fields with a batch axis: in `batched` those where it always has length B; in
@@ -73,6 +75,13 @@ def copied(tree: Any) -> Any:
     if is_dataclass(tree) and not isinstance(tree, type):
         return replace(tree, **{f.name: copied(getattr(tree, f.name)) for f in fields(tree)})
     return tree
+
+
+def spread(values: Tensor, rows: Tensor) -> Tensor:
+    """Values (b,) at their places `rows` (b,) in a batch; 0 at the others."""
+    whole = values.new_zeros(int(rows.max()) + 1)
+    whole[rows] = values
+    return whole
 
 
 def put(tree: Any, index: Tensor, rows: Any) -> None:

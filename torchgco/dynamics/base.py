@@ -84,7 +84,8 @@ class FunctionDynamics(Dynamics):
 
     Args:
         dt: s, the same for all stages. Stages of different length: integrator="none", a function that makes a whole
-            step, and its lengths in `knot_values`; obstacles that move then still count in steps of dt.
+            step, and its lengths in `knot_values`, named "dt" for `Solution.t`; obstacles that move then still count in
+            steps of dt.
         values: numbers per problem by name, (B, ...), which the function takes as arguments of these names, shaped to
             fit x: (B, ...), or (B, 1, ...) where x has an axis of knots or samples. Numbers that change from solve to
             solve belong here: with another captured number the code is compiled again.

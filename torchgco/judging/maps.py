@@ -46,7 +46,7 @@ class Solid:
             return np.zeros(len(points), bool)
         with np.errstate(invalid="ignore"):
             place = np.floor((points - self.origin) / (2 * self.half))
-        within = ((place >= 0) & (place < self.cells.shape)).all(-1)
+        within = np.all((place >= 0) & (place < self.cells.shape), axis=-1)
         index = np.where(within[:, None], place, 0).astype(int)
         return within & np.asarray(self.cells)[tuple(index.T)]
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint
+from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem
 
 NONE = -1  # the place of what isn't there
@@ -19,7 +20,7 @@ def worst_rows(problem: Problem, X: Tensor, U: Tensor) -> dict[str, list[Any]]:
     first = torch.where(lost.any(-1), lost.long().argmax(-1), NONE)
     largest = X.new_zeros(problem.B)
     place = torch.full((3, problem.B), NONE, device=X.device)
-    for number, constraint in enumerate(problem.constraints):
+    for number, constraint in enumerate(within_horizons(problem).constraints):
         rows = constraint.violation(X, U)
         if rows.shape[0] == 0 or rows[0].numel() == 0:
             continue
@@ -29,14 +30,16 @@ def worst_rows(problem: Problem, X: Tensor, U: Tensor) -> dict[str, list[Any]]:
         found = torch.stack((torch.full_like(at, number), knots[at // rows.shape[-1]], at % rows.shape[-1]))
         place, largest = torch.where(more, found, place), torch.where(more, most, largest)
     where, knot, row = place.tolist()
-    names = [_name(problem.constraints[i]) if i != NONE else "" for i in where]
+    names = [kind_of(problem.constraints[i]) if i != NONE else "" for i in where]
     return {
         "constraint": where, "name": names, "knot": knot, "row": row, "violation": largest.tolist(),
         "lost_at": first.tolist(),
     }  # fmt: skip
 
 
-def _name(constraint: Constraint) -> str:
-    """The user's name of a constraint, else its kind."""
+def kind_of(constraint: Constraint) -> str:
+    """The user's name of a constraint, else its kind as a user writes it."""
     given = getattr(constraint, "name", None)
-    return given if isinstance(given, str) and given != "constraint" else type(constraint).__name__
+    if isinstance(given, str) and given != "constraint":
+        return given
+    return type(constraint).__name__.removeprefix("Bound")

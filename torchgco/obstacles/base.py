@@ -10,7 +10,9 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
+from torchgco.base.brief import brief
 from torchgco.base.errors import ScaleWarning
+from torchgco.base.shapes import MISTAKES
 from torchgco.constraints.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.constraints.base import TOUCH as TOUCH
 from torchgco.constraints.base import Constraint, Sense
@@ -87,6 +89,16 @@ class Obstacles(Constraint):
     position: slice
     dt: float
     stops: Tensor | None = None  # (B,): the last knot at which they count, and move; None: all of `knots`
+
+    def __repr__(self) -> str:
+        try:
+            present = (~self.absent).sum(-1)
+            B, (least, most) = len(present), (int(f(present)) if len(present) else 0 for f in (torch.min, torch.max))
+        except MISTAKES:  # of a user's kind that isn't bound yet
+            return brief(self)
+        count = f"{most}" if least == most else f"{least} to {most}"
+        moving = ", moving" if self.moving else ""
+        return f"{type(self).__name__.removeprefix('Bound')}({count} each of {B} problems{moving})"
 
     @property
     def moving(self) -> bool:

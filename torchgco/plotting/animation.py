@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
 from torchgco.base.errors import InputError
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.course import VEHICLE, VIEWS, Course, draw_instant, flight, positions
+from torchgco.plotting.course import VEHICLE, VIEWS, Course, draw_instant, draw_still, flight, positions
 from torchgco.plotting.missions import check_plans
-from torchgco.plotting.style import INK, PALETTE, tidy
+from torchgco.plotting.style import INK, PALETTE, TITLE, tidy
 
 FPS = 5
 MAX_FRAMES = 100  # frames of a mission
@@ -67,16 +67,19 @@ def mission_animation(
     figure = Figure(figsize=(7.0, 6.2 * float(spans.sum()) + 1.1), layout="constrained")
     axes = list(figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": spans.tolist()}))
 
-    def show(step: int) -> None:
+    for ax, plane in zip(axes, VIEWS, strict=True):
+        draw_still(ax, course, plane)
+        draw.frame(ax, low.tolist(), high.tolist(), plane)
+        tidy(ax, "", grid=None)
+    axes[0].set_xlabel("")
+
+    def show(step: int) -> str:
         for ax, plane in zip(axes, VIEWS, strict=True):
-            ax.clear()
             draw_instant(ax, course, t[step], track[: step + 1], plans[step], period, plane)
-            draw.frame(ax, low.tolist(), high.tolist(), plane)
-            tidy(ax, f"{title}  {t[step]:.1f} s".strip() if plane == draw.ABOVE else "", grid=None)
-        axes[0].set_xlabel("")
+        return f"{title}  {t[step]:.1f} s".strip()
 
     last = steps[-1:] * min(FPS, MAX_FRAMES - len(steps))  # the end stays for a second
-    return _write(figure, show, [*steps, *last], path)
+    return _write(axes, show, [*steps, *last], path)
 
 
 def planar_animation(
@@ -108,16 +111,17 @@ def planar_animation(
     figure = Figure(figsize=(5.0, 4.4 * float((high - low)[1] / (high - low)[0]) + 0.8), layout="constrained")
     ax = figure.subplots()
 
-    def show(i: int) -> None:
-        ax.clear()
-        draw.draw_obstacles(ax, centers, inflated_radii - vehicle_radius, vehicle_radius)
+    draw.draw_obstacles(ax, centers, inflated_radii - vehicle_radius, vehicle_radius)
+    draw.frame(ax, low.tolist(), high.tolist())
+    tidy(ax, "", grid=None)
+
+    def show(i: int) -> str:
         draw.draw_ends(ax, *ends, goal_radius)
         _trajectories(ax, iterates[i], centers, inflated_radii)
-        draw.frame(ax, low.tolist(), high.tolist())
-        tidy(ax, iterates[i].title, grid=None)
+        return iterates[i].title
 
     frames = [i for i, picture in enumerate(iterates) for _ in range(max(1, round(picture.seconds * FPS)))]
-    return _write(figure, show, frames, path)
+    return _write([ax], show, frames, path)
 
 
 def _trajectories(ax: Axes, picture: Picture, centers: np.ndarray, radii: np.ndarray) -> None:
@@ -133,36 +137,43 @@ def _trajectories(ax: Axes, picture: Picture, centers: np.ndarray, radii: np.nda
         ax.plot(*path.T, color=PALETTE[i % len(PALETTE)], linewidth=0.7, zorder=3)
 
 
-def _write(figure: Figure, show: Callable[[int], None], frames: Sequence[int], path: Path) -> Path:
-    """Write a GIF of `show(i)` for i in frames; equal neighbours are drawn once."""
+def _write(axes: Sequence[Axes], show: Callable[[int], str], frames: Sequence[int], path: Path) -> Path:
+    """Write a GIF of `show(i)` for i in frames, which adds what changes to axes and returns the title of the first.
+
+    What the axes hold before is drawn once; equal neighbours are drawn once. All pictures have one palette without
+    dithering: neighbours then differ only where something moved.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    writer = PillowWriter(fps=FPS)
-    show(frames[0])
+    figure = axes[0].figure
+    assert isinstance(figure, Figure)
+    figure.set_dpi(DPI)
+    canvas, title = FigureCanvasAgg(figure), axes[0].set_title("Mg", fontsize=TITLE, loc="left", color=INK)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # the axes stay where they are
-    with writer.saving(figure, str(path), DPI):
-        shown = frames[0]
-        for i in frames:
-            if i != shown:
-                show(i)
-                shown = i
-            writer.grab_frame(facecolor="white")
-    _reduce(path)
-    return path
-
-
-def _reduce(path: Path) -> None:
-    """Give all pictures of a GIF one palette without dithering: neighbours then differ only where something moved."""
+    title.set_animated(True)
+    canvas.draw()
+    still = canvas.copy_from_bbox(figure.bbox)
     palette = Image.new("P", (1, 1))
     palette.putpalette(_palette())
-    with Image.open(path) as gif:
-        pictures, durations = [], []
-        for i in range(getattr(gif, "n_frames", 1)):
-            gif.seek(i)
-            pictures.append(gif.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE))
-            durations.append(gif.info["duration"])
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=True)
+    pictures = list[Image.Image]()
+    for i, before in zip(frames, [None, *frames], strict=False):
+        if i == before:
+            pictures.append(pictures[-1])
+            continue
+        canvas.restore_region(still)
+        held = [set(ax.get_children()) for ax in axes]
+        title.set_text(show(i))
+        for ax, known in zip(axes, held, strict=True):
+            new = [artist for artist in ax.get_children() if artist not in known]
+            for artist in sorted(new, key=lambda artist: artist.get_zorder()):
+                ax.draw_artist(artist)
+                artist.remove()
+        axes[0].draw_artist(title)
+        drawn = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+        pictures.append(drawn.quantize(palette=palette, dither=Image.Dither.NONE))
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=1000 // FPS, loop=0, optimize=True)
+    return path
 
 
 def _palette() -> list[int]:

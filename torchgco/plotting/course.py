@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,10 +72,15 @@ class Course:
         return low, high
 
 
+def draw_still(ax: Axes, course: Course, plane: draw.Plane) -> None:
+    """The obstacles that look alike at all times: spheres at rest."""
+    _draw_bodies(ax, course, [body for body in course.bodies if _is_still(body)], 0.0, 0.0, plane)
+
+
 def draw_instant(
     ax: Axes, course: Course, t: float, track: np.ndarray, plan: np.ndarray, period: float, plane: draw.Plane
 ) -> None:
-    """Obstacles at time t, s, the track flown so far (T, 3) with the vehicle at its end, and the plan (N+1, 3).
+    """Other obstacles at time t, s, the track flown so far (T, 3) with the vehicle at its end, and the plan (N+1, 3).
 
     Spheres are shown whole; boxes and capsules are cut where the vehicle is, as they may be higher or wider than the
     view.
@@ -82,7 +88,8 @@ def draw_instant(
     Args:
         period: of the plan's knots, s; knots inside an obstacle at their own time are crossed.
     """
-    _draw_bodies(ax, course, t, float(np.delete(track[-1], plane)[0]), plane)
+    changing = [body for body in course.bodies if not _is_still(body)]
+    _draw_bodies(ax, course, changing, t, float(np.delete(track[-1], plane)[0]), plane)
     draw.draw_ends(ax, track[0], course.goal, course.goal_radius, plane)
     ax.plot(*track[:, plane].T, color=INK, linewidth=1.4, zorder=3)
     infeasible = course.infeasible(plan, t + period * np.arange(len(plan)))
@@ -91,17 +98,21 @@ def draw_instant(
     ax.add_patch(Circle(at, course.vehicle_radius, facecolor=VEHICLE, edgecolor=INK, linewidth=0.8, zorder=6))
 
 
-def _draw_bodies(ax: Axes, course: Course, t: float, at: float, plane: draw.Plane) -> None:
-    """The obstacles at time t, s, filled, and outlined at the vehicle's radius; `at` is its hidden coordinate, m."""
+def _is_still(body: Body) -> bool:
+    return isinstance(body, Ball) and not body.moving
+
+
+def _draw_bodies(ax: Axes, course: Course, bodies: Sequence[Body], t: float, at: float, plane: draw.Plane) -> None:
+    """Obstacles at time t, s, filled, and outlined at the vehicle's radius; `at` is its hidden coordinate, m."""
     full: dict[str, Any] = {"facecolor": draw.STONE, "linewidth": 0.5, "alpha": 0.6}
     grown: dict[str, Any] = {"facecolor": "none", "linewidth": 0.7, "linestyle": "--"}
     for margin, look in ((0.0, full), (course.vehicle_radius, grown)):
         shapes = [
             body.outline(margin, plane, t) if isinstance(body, Ball) else body.section(plane, at, margin, t)
-            for body in course.bodies
+            for body in bodies
         ]
-        seen = PolyCollection([shape for shape in shapes if shape is not None], edgecolor=draw.EDGE, zorder=0, **look)
-        ax.add_collection(seen, autolim=False)
+        if seen := [shape for shape in shapes if shape is not None]:
+            ax.add_collection(PolyCollection(seen, edgecolor=draw.EDGE, zorder=0, **look), autolim=False)
 
 
 def flight(frame: pd.DataFrame, *columns: str) -> dict[str, np.ndarray]:

@@ -85,12 +85,12 @@ def layout_grid(
         path = _leading(scene, i, [flight.path for flight in here.values()])
         lead = passes(scene, i, path)
         for ax, plane in zip(axes[i], planes, strict=True):
-            drawn |= _obstacles(ax, scene, i, lead, plane)
+            drawn |= draw_obstacles(ax, scene, i, lead, plane)
             if scene.map is not None:
                 draw_map(ax, scene.map, flown(path), plane, scene.margin, {"facecolor": STONE, "edgecolor": EDGE})
                 drawn |= {"own", "grown"} if scene.margin > 0 else {"own"}
             drawn |= _paths(ax, scene, i, here, plane)
-            _targets(ax, scene, i, plane)
+            draw_targets(ax, scene, i, plane)
         axes[i][0].set_title(f"layout {scene.ids[i]}", fontsize=TITLE, loc="left", color=INK)
     put_head(figure, _title(trials), _handles(scene, flights, drawn))
     return figure
@@ -146,7 +146,7 @@ def _leading(scene: Scene, i: int, paths: list[np.ndarray]) -> np.ndarray:
     return np.linspace(scene.start[i], scene.goal[i], 100)
 
 
-def _obstacles(ax: Axes, scene: Scene, i: int, lead: list[Pass], plane: Plane) -> set[str]:
+def draw_obstacles(ax: Axes, scene: Scene, i: int, lead: list[Pass], plane: Plane) -> set[str]:
     """Draw a layout's obstacles; returns the kinds of drawn shapes, for the legend."""
     own, grown, near = [], [], []
     moving = False
@@ -214,7 +214,7 @@ def _marker(kind: str) -> dict[str, Any]:
     return {"linestyle": "none", **shapes[kind]}
 
 
-def _targets(ax: Axes, scene: Scene, i: int, plane: Plane) -> None:
+def draw_targets(ax: Axes, scene: Scene, i: int, plane: Plane) -> None:
     """The start under the flights' marks, the goal over them."""
     start, goal = scene.start[i][list(plane)], scene.goal[i][list(plane)]
     look: dict[str, Any] = {"color": INK, "linestyle": "none", "markeredgecolor": "white", "markeredgewidth": 0.5}

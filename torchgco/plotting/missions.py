@@ -22,7 +22,7 @@ from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.outcome import Outcome
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.course import POSITION, VEHICLE, VIEWS, Course, draw_instant, flight, positions
+from torchgco.plotting.course import POSITION, VEHICLE, VIEWS, Course, draw_instant, draw_still, flight, positions
 from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, legend, panels, solver_colours, tasks_of, tidy
 
 Frames = Mapping[str, pd.DataFrame]  # by solver
@@ -126,6 +126,7 @@ def snapshots_figure(
         if not 0 <= step < len(t):
             raise InputError("steps", f"0 to {len(t) - 1}", step)
         for ax, plane, view in zip(row, VIEWS, ("above", "the side"), strict=True):
+            draw_still(ax, course, plane)
             draw_instant(ax, course, t[step], track[: step + 1], plans[step], period, plane)
             draw.frame(ax, low.tolist(), high.tolist(), plane)
             tidy(ax, f"{t[step]:.2f} s, from {view}", grid=None)

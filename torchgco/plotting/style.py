@@ -14,10 +14,13 @@ from pathlib import Path
 from typing import IO
 from zlib import crc32
 
+import numpy as np
 import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 # Okabe and Ito's colours, distinct for colour-blind readers too; their yellow is lost on white paper.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -127,9 +130,26 @@ def save(figure: Figure, path: str | os.PathLike[str] | IO[bytes], dpi: int = 15
     An open file instead of a path gets a PNG; nothing is returned then.
     """
     if not isinstance(path, str | os.PathLike):
-        figure.savefig(path, format="png", dpi=dpi, facecolor="white")
+        _save_png(figure, path, dpi)
         return None
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dpi, facecolor="white")
+    if path.suffix == ".png":
+        _save_png(figure, path, dpi)
+    else:
+        figure.savefig(path, dpi=dpi, facecolor="white")
     return path
+
+
+def _save_png(figure: Figure, path: Path | IO[bytes], dpi: int) -> None:
+    """As `savefig`, which draws everything once more than it is seen, to lay the axes out."""
+    own, colour = figure.dpi, figure.get_facecolor()
+    figure.set_dpi(dpi)
+    figure.set_facecolor("white")
+    try:
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()).save(path, format="png", dpi=(dpi, dpi))
+    finally:
+        figure.set_dpi(own)
+        figure.set_facecolor(colour)

@@ -25,6 +25,7 @@ from torchgco.problem.border import check_constraint, check_cost, check_dynamics
 from torchgco.problem.free_start import chooses_position, moved_inside, start_mask
 from torchgco.problem.goal import Goal
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, savings
+from torchgco.problem.summary import summary
 
 ROWS = "rows"  # marks the shapes of the constraints' rows among what a form keeps
 
@@ -103,6 +104,9 @@ class Problem:
         model = dynamics or self.dynamics
         first = 0 if chooses_position(self.free_start, model.position) else 1
         return Dimensions(x0.shape[0], self.N, self.n, self.m, getattr(model, "dt", None), model.position, x0, first)
+
+    def __repr__(self) -> str:
+        return summary(self)
 
     @property
     def B(self) -> int:

@@ -13,9 +13,11 @@ from torchgco.base.status import STOPPED
 from torchgco.base.tree import copied, put, take
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import has_arrived, is_preferred
+from torchgco.native.dispatch import chord_clearance
+from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
 from torchgco.search.proposals import PathProposals, Round
-from torchgco.solution import SearchRecord
+from torchgco.solution import SearchRecord, Standing
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress
 from torchgco.solvers.history import Recorder
@@ -37,6 +39,7 @@ class Best:
     ) -> None:
         self.call, self.solver, self.recorder, self.record = call, solver, recorder, record
         self.end = copied(first)
+        self.spare: dict[int, SolveEnd] = {}  # by problem: the best clear trajectory that a cheaper one has replaced
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
 
     def arrived(self, tolerances: float = 1.0) -> Tensor:
@@ -77,8 +80,35 @@ class Best:
     def keep(self, rows: Tensor, new: SolveEnd) -> None:
         """Keep the better of the old and the new trajectories of `rows`: arrived, then feasible, then cheapest."""
         problem, limit = self.call.problem.take(rows), self.solver.violation_tolerance
-        old = take(self.end.best, rows)
-        self.replace(rows, is_preferred(problem, new.best, old, limit), new.best, new)
+        old = take(self.end, rows)
+        preferred = is_preferred(problem, new.best, old.best, limit)
+        self._spare(problem, rows, preferred, old, new)
+        self.replace(rows, preferred, new.best, new)
+
+    def _spare(self, problem: Problem, rows: Tensor, preferred: Tensor, old: SolveEnd, new: SolveEnd) -> None:
+        """Remember those of two trajectories that lose by their cost alone to one that touches between two knots."""
+        limit = self.solver.violation_tolerance
+        fits = (old.best.violation <= limit) & (new.best.violation <= limit)
+        fits &= has_arrived(problem, old.best.X) == has_arrived(problem, new.best.X)
+        if not bool(fits.any()):
+            return
+        before, now = (chord_clearance(problem, end.best.X) >= 0 for end in (old, new))
+        for at in (fits & (before != now) & (before == preferred)).nonzero().flatten():
+            one = take(old if bool(preferred[at]) else new, at.unsqueeze(0))
+            kept = self.spare.setdefault(int(rows[at]), one)
+            if bool(one.best.cost < kept.best.cost):
+                self.spare[int(rows[at])] = one
+
+    def restore(self, rows: Tensor, touching: Tensor) -> None:
+        """Take back the clear trajectories that cheaper ones of `rows` have replaced.
+
+        That is where these are still `touching` an obstacle, (b,) bool, or have become dearer by keeping clear.
+        """
+        for row, touches in zip(rows.tolist(), touching.tolist(), strict=True):
+            one = self.spare.pop(row, None)
+            if one is not None and (touches or bool(one.best.cost < self.end.best.cost[row])):
+                put(self.end.best, rows.new_tensor([row]), one.best)
+                self.end.status[row] = one.status
 
     def replace(self, rows: Tensor, where: Tensor, trajectories: Iterate, new: SolveEnd) -> None:
         """New trajectories of `rows` where a mask (b,) says so, and the counts of their solves."""
@@ -164,13 +194,28 @@ class Search:
             self.recorder.attempt += number > 1
             self.record.passes.append((number, name, []))
 
-    def finish_record(self) -> SearchRecord | None:
-        """The record, at the end of the search."""
-        if self.record is not None:
-            rows = (self.caught.status == STOPPED).nonzero().flatten()
-            self.record.caught = self.call.rows[rows], self.caught.last.X[rows]
-            self.record.passes = [(number, name, sorted(set(worked))) for number, name, worked in self.record.passes]
-        return self.record
+    def end_pass(self) -> None:
+        """Record the best trajectories after a pass."""
+        if self.record is None:
+            return
+        if not self.begun:
+            self.record.standings.append(None)
+            return
+        problem, best = self.call.problem, self.best.end.best
+        away = torch.full_like(best.cost, torch.nan)
+        if problem.goal is not None:
+            away = problem.goal.distance(best.X[:, -1, problem.position])
+        held = best.cost.clone(), best.violation.clone()
+        self.record.standings.append(Standing(self.call.rows, *held, away, self.best.arrived()))
+
+    def finish_record(self, unit: Tensor, constant: Tensor) -> SearchRecord | None:
+        """The record, at the end of the search, with costs times a unit, plus a constant, both by place."""
+        if self.record is None:
+            return None
+        rows = (self.caught.status == STOPPED).nonzero().flatten()
+        self.record.caught = self.call.rows[rows], self.caught.last.X[rows]
+        self.record.passes = [(number, name, sorted(set(worked))) for number, name, worked in self.record.passes]
+        return self.record.in_costs(unit, constant)
 
     def rows(self, when: str) -> Tensor:
         """The problems (b,) that a word describes, all among those that were caught.

@@ -31,7 +31,8 @@ class ClearChords:
 
     Obstacles grow by 1.1 times the clearance that the last solve missed, or a little more, and the solve continues from
     the best trajectory. A trajectory is replaced where the new one is feasible for the obstacles as they are, has
-    arrived if the old one had, and keeps more clearance between the knots. Openings may leave no room for it.
+    arrived if the old one had, and keeps more clearance between the knots. Openings may leave no room for it: there a
+    dearer trajectory of the passes before that is clear is taken back.
 
     Args:
         rounds: solves at most, each with larger obstacles than the one before.
@@ -52,10 +53,10 @@ class ClearChords:
         best, problem, limit = search.best, search.call.problem, search.solver.violation_tolerance
         clearance = chord_clearance(problem, best.end.best.X)
         by, now = torch.zeros_like(clearance), clearance.clone()
-        rows = ((best.end.best.violation <= limit) & (clearance < 0)).nonzero().flatten()
+        rows = touching = ((best.end.best.violation <= limit) & (clearance < 0)).nonzero().flatten()
         for _ in range(self.rounds):
             if rows.numel() == 0:
-                return
+                break
             best.next_attempt()
             by[rows] += (-MARGIN * now[rows]).clamp(min=MIN_GROWTH * limit)
             old = take(best.end.best, rows)
@@ -70,6 +71,7 @@ class ClearChords:
                 now[rows] = torch.where(too, clear, now[rows])
             clearance[rows] = torch.where(serves, now[rows], clearance[rows])
             rows = rows[clearance[rows] < 0]
+        best.restore(touching, clearance[touching] < 0)
 
     def _kept(self, search: Search, rows: Tensor, new: SolveEnd, least: Tensor) -> tuple[Tensor, Tensor]:
         """Where new trajectories of `rows` serve, with more clearance than `least`, they replace the best.

@@ -18,7 +18,7 @@ from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.dispatch import chord_clearance, measured
 from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.problem.problem import ROWS, Problem
-from torchgco.solution import SearchRecord, Solution
+from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.state import Iterate, SolveEnd
 
@@ -102,8 +102,7 @@ def merged(first: Solution, rows: Tensor, again: Solution) -> Solution:
         trace = pd.concat((trace[~trace["element"].isin(again.trace["element"])], again.trace))
         trace = trace.sort_values(["element", "attempt", "iteration"], ignore_index=True)
     if search is not None and again.search is not None:
-        joined = (search.passes + again.search.passes, again.search.caught, search.comparisons)
-        search = SearchRecord(*joined[:2], joined[2] + again.search.comparisons)
+        search = search.followed_by(again.search)
     return replace(whole, trace=trace, search=search)
 
 

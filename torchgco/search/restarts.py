@@ -74,6 +74,10 @@ class Restarts(Solver):
         first = any(isinstance(one, Converge) and one.when == "first" for one in self.passes)
         return first and Converge.begins(problem)
 
+    def recording(self) -> Restarts:
+        """The same solver, which keeps the record of its search and of every iteration."""
+        return replace(self, local=self.local.recording())
+
     def in_slots(self, slots: int) -> Restarts:
         """The same solver with at most `slots` problems at a time."""
         return replace(self, local=self.local.in_slots(slots))
@@ -94,7 +98,7 @@ class Restarts(Solver):
         search = Search(session.call, solver, passes, guidance, session.recorder)
         self._run(search, passes)
         solution = session.finished(search.best.end, solver.violation_tolerance, solver.slots)
-        return replace(solution, search=search.finish_record())
+        return replace(solution, search=search.finish_record(*session.scales))
 
     def _run(self, search: Search, passes: Sequence[Pass | None]) -> None:
         """All passes, until the time is over."""
@@ -105,8 +109,9 @@ class Restarts(Solver):
                 search.next_pass(number, type(self.passes[number - 1]).__name__)
                 if one is not None:
                     one.run(search)
+                search.end_pass()
         except Late:
-            return
+            search.end_pass()
 
     def _suited(self, problem: Problem) -> tuple[Sequence[Pass | None], Guidance | None]:
         """The passes, None for those that can't serve these problems, and the guidance, None where it can't.

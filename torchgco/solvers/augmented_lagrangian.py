@@ -77,6 +77,10 @@ class AugmentedLagrangian(Solver):
     def __post_init__(self) -> None:
         check_options(self, "solver")
 
+    def recording(self) -> AugmentedLagrangian:
+        """The same solver, which keeps the history of every problem."""
+        return replace(self, record=True)
+
     def in_slots(self, slots: int) -> AugmentedLagrangian:
         """The same solver with at most `slots` problems at a time."""
         return replace(self, slots=slots)

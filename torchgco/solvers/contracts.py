@@ -11,11 +11,13 @@ from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
+from torchgco.base.brief import Brief
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError, StartWarning
 from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import check_shape, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, take
+from torchgco.explaining.account import Account
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.native.dispatch import cost_unit, current, open_loop
@@ -115,7 +117,7 @@ def check_ids(ids: Any, problem: Problem) -> None:
         raise InputError("ids", f"an int64 tensor ({problem.B},) on {device}", describe(ids))
 
 
-class Solver:
+class Solver(Brief):
     """A solver for batches of problems. Its fields are its options; it keeps no state between calls.
 
     Attributes:
@@ -159,7 +161,7 @@ class Solver:
         with computing_on(problem.x0.device):
             if problem.B == 0:  # nothing to trace code with
                 Call.checked(problem, U0, seed, ids, warm, callback, max_seconds)
-                return Solution.empty(problem)
+                return replace(Solution.empty(problem), account=Account(problem, self))
             whole = for_solvers(problem, self.joins_knots)
             if problem.horizon is not None:
                 problem.check_controls(U0)
@@ -171,7 +173,8 @@ class Solver:
                 held = f"free_start: the start is held at x0, as {type(self).__name__} doesn't choose it; {expected}"
                 warnings.warn(held, StartWarning, stacklevel=2)
             found = self.run(call)
-            return found if whole is problem else found.of_first_states(problem.n, problem.horizon)
+            found = found if whole is problem else found.of_first_states(problem.n, problem.horizon)
+            return replace(found, account=Account(problem, self))
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
@@ -198,6 +201,10 @@ class Solver:
 
     def prepare(self, problem: Problem) -> Solver:
         """The solver with everything built that this batch needs, so that a caller can time the solve alone."""
+        return self
+
+    def recording(self) -> Solver:
+        """The same solver, which keeps a record of what it does, where it can; `Solution.explain` tells it."""
         return self
 
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:

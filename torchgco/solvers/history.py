@@ -43,8 +43,8 @@ class Recorder:
     def frame(self, unit: Tensor, constant: Tensor) -> pd.DataFrame:
         """The table, sorted by element (the problem), attempt and iteration.
 
-        `unit` (B,) is the unit that costs were divided by, `constant` (B,) what was subtracted from them before; the
-        table holds the costs as they were.
+        By place in the batch, `unit` is the unit that costs were divided by, `constant` what was subtracted from them
+        before; the table holds the costs as they were.
         """
         import pandas as pd
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from torchgco.base.status import SOLVED, STOPPED, Status
-from torchgco.base.tree import take
+from torchgco.base.tree import spread, take
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.dispatch import reproducible
 from torchgco.solution import Solution
@@ -31,6 +32,16 @@ class Session:
         self.call, self.unit = rules.in_units(given)
         self.recorder = Recorder() if record else None
 
+    @property
+    def constant(self) -> Tensor:
+        """What was taken from each problem's cost, (B,)."""
+        return torch.zeros_like(self.unit) if self.call is self.given else self.given.problem.cost_scale.constant
+
+    @property
+    def scales(self) -> tuple[Tensor, Tensor]:
+        """Units and constants of the costs, by place in the batch that the user passed."""
+        return spread(self.unit, self.call.rows), spread(self.constant, self.call.rows)
+
     def finished(self, end: SolveEnd, tolerance: float, slots: int | None = None) -> Solution:
         """The best trajectories with gains and statuses, in the user's units.
 
@@ -52,12 +63,11 @@ class Session:
         ended = torch.where(end.status == STOPPED, int(limit), end.status)
         constrained = bool(problem.constraints) or problem.free_start is not None
         status = final_status(ended, left, best.violation, tolerance, constrained)
-        scaled, user = self.call is not self.given, self.given.problem
-        constant = user.cost_scale.constant if scaled else torch.zeros_like(self.unit)
+        user = self.given.problem
         cost = user.cost.total(X, U)
         status[falls_without_end(user, self.given.U0, X, U, cost, best.violation, tolerance)] = Status.UNBOUNDED
         return Solution(
             X, U, K, d, best.multipliers.scaled(self.unit), cost, best.violation, status,
             end.iterations, end.outer, end.guided,
-            None if self.recorder is None else self.recorder.frame(self.unit, constant),
+            None if self.recorder is None else self.recorder.frame(*self.scales),
         )  # fmt: skip

@@ -47,6 +47,8 @@ class Plan:
         workers: processes; None: as many as the cores allow.
         repair: damaged files are redone.
         figures: figures are drawn when all is flown.
+        explain: layouts that the solver under study failed on are solved again with a record, and explained.
+        view: a page of the study is written then.
         jobs: how many jobs share the layouts; None: one, which flies all.
         job: the one that this process is, 0..jobs-1; None where it flies all.
 
@@ -59,6 +61,8 @@ class Plan:
     workers: Annotated[int, Within(1, MAX_PROCESSES)] | None
     repair: bool
     figures: bool
+    explain: bool
+    view: bool
     jobs: Count | None
     job: Any
 

@@ -24,8 +24,10 @@ from torchgco.experiments.flying.flight import Flight, Plan, fly, plan_of, prepa
 from torchgco.experiments.flying.mission_flight import FEW, MissionFlight
 from torchgco.experiments.flying.progress import LAYOUT, Bar, Lines
 from torchgco.experiments.flying.workers import Shared, run_all
+from torchgco.experiments.reports.explained import explained
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
 from torchgco.experiments.reports.report import write_report
+from torchgco.experiments.reports.view import write_view
 from torchgco.experiments.results.identity import (
     Manifest,
     closed_loop,
@@ -37,6 +39,7 @@ from torchgco.experiments.results.identity import (
 )
 from torchgco.experiments.results.provenance import recorded
 from torchgco.experiments.results.records import DONE, JUDGED, TRIALS, Records
+from torchgco.experiments.results.runs import read_trials
 from torchgco.experiments.results.success import sound, with_success
 from torchgco.lagrangian.rollout import open_loop
 from torchgco.missions import Mission
@@ -115,7 +118,11 @@ def _fly_and_report(study: _Study, records: Records, show: Callable[[str], None]
         _finish(study, records, rows, np.stack([U for _, U in flown]))
     show(_report(study, folder))
     records.close()
+    if study.plan.explain:
+        show(explained(study.setup, study.layouts, read_trials(folder / TRIALS)))
     show(f"\nTable, arrays and figures: {folder}")
+    if study.plan.view:
+        show(f"Page: {write_view(folder)}")
     trials = pd.read_parquet(folder / TRIALS)
     if (trials["status"] == Status.INVALID_START.name).all():
         raise InputError("scenario", "a layout whose start is outside its obstacles", "none")
@@ -156,8 +163,11 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
     setup = build(config)
     layouts = setup.layouts()
     task = setup.vehicle.task(layouts.take([0]))  # raises where model and layouts don't fit
+    plan = plan_of(setup)
     if setup.mission is not None:
         check_mission(setup.mission, task)
+        if plan.explain:
+            raise InputError("study.explain", "false in missions: single solves can be explained", True)
     configs = _rivals(config, recompose)
     solvers = {name: setup.solver if held is config else solver_of(held) for name, held in configs.items()}
     configuration = {"version": VERSION, **plain(config)}
@@ -166,7 +176,7 @@ def _study(config: DictConfig, recompose: Recompose) -> _Study:
         solvers={name: settings_of(held) for name, held in configs.items()},
         layouts=layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(configuration)),
     )
-    return _Study(setup, plan_of(setup), layouts, solvers, manifest)
+    return _Study(setup, plan, layouts, solvers, manifest)
 
 
 def check_mission(mission: Mission, task: Task) -> None:

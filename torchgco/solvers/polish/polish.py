@@ -88,7 +88,7 @@ class Polish:
             return self._refined(current(problem).held_at(solution.X[:, 0]), solution)
 
     def _refined(self, problem: Problem, solution: Solution) -> Solution:
-        result = copied(replace(solution, trace=None, search=None))
+        result = copied(replace(solution, trace=None, search=None, account=None))
         near = (measured(problem, solution.X, solution.U) <= self.reach) & torch.isfinite(solution.cost)
         for b in (near & problem.start_is_clear).nonzero().flatten():
             rows = b.view(1)
@@ -97,7 +97,7 @@ class Polish:
             if after is not before:
                 put(result, rows, after)
             result.iterations[rows] = before.iterations + steps
-        return replace(result, trace=solution.trace, search=solution.search)
+        return replace(result, trace=solution.trace, search=solution.search, account=solution.account)
 
     def check(self, problem: Problem) -> None:
         """Raise InputError for a problem that isn't float64: its rounding exceeds any useful tolerance."""

@@ -1,0 +1,235 @@
+"""The page in a headless Chromium: what it shows, and what it does when it is asked."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.view.browser import Tab, browser, found
+from tests.view.scenes import DT, SOLVERS, WORDS, N, document, trajectories
+from torchgco.plotting.style import solver_colours
+from torchgco.view.document import Line, SearchPart
+from torchgco.view.page import page
+
+pytestmark = pytest.mark.skipif(found() is None, reason="there is no Chromium")
+SIZE = (900, 600)
+PICTURE = "document.getElementById('picture')"
+RED = (208, 32, 32)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    corners = np.array([[0.0, 0, 0], [3, -1.4, 0], [8, 0, 0]])
+    lines = [Line(corners, "path", 0, "", "path 1: 8.3 m"), Line(corners + 0.2, "refined", 1, "proposed", WORDS)]
+    balls = np.array([[3.0, -1.4, 0, 0.36], [4.0, -1.4, 0, 0.36]])
+    search = SearchPart(["Solve", "PathProposals"], [("pass 4, 1 candidate", lines)], [("outer 2", balls, corners)])
+    path = tmp_path_factory.mktemp("page") / "view.html"
+    path.write_text(page(document(search=search)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def opened(file: Path) -> Iterator[Tab]:
+    program = found()
+    assert program is not None
+    with browser(program) as new:
+        tab = new()
+        tab.size(*SIZE)
+        yield tab
+
+
+@pytest.fixture
+def tab(opened: Tab, file: Path) -> Iterator[Tab]:
+    opened.dark(False)
+    opened.errors.clear()
+    opened.requests.clear()
+    opened.open(file)
+    yield opened
+    assert opened.errors == []
+    assert [url for url in opened.requests if not url.startswith(("file:", "blob:null/", "about:"))] == []
+
+
+def pixels(tab: Tab) -> np.ndarray:
+    """The canvas as (height, width, 3)."""
+    width, height = tab.evaluate(f"[{PICTURE}.clientWidth, {PICTURE}.clientHeight]")
+    whole = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
+    return np.asarray(whole)[:height, :width].astype(int)
+
+
+def alike(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+    """Where the hue of a picture is that of a colour, in light and in shadow."""
+    wanted = np.array(colour) / np.linalg.norm(colour)
+    length = np.linalg.norm(picture, axis=-1)
+    return (picture @ wanted > 0.985 * length) & (length > 60)
+
+
+def stony(picture: np.ndarray) -> np.ndarray:
+    """Where a picture has the warm grey of obstacles; the ground is a cold one."""
+    return picture[..., 0] > 1.06 * picture[..., 2]
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def place(tab: Tab, point: list[float]) -> tuple[float, float]:
+    """Where a point of space is seen, in pixels of the canvas."""
+    script = f"""(() => {{ const {{ orbit, space, flights }} = torchgcoView;
+      const seen = flights.all[0].points[0].clone().set(...{json.dumps(point)}).project(orbit.camera);
+      return [(0.5 + 0.5 * seen.x) * {PICTURE}.clientWidth, (0.5 - 0.5 * seen.y) * {PICTURE}.clientHeight]; }})()"""
+    x, y = tab.evaluate(script)
+    return x, y
+
+
+def vehicle(tab: Tab) -> np.ndarray:
+    return np.array([float(word) for word in tab.evaluate(f"{PICTURE}.dataset.vehicle").split()])
+
+
+def test_the_picture_shows_obstacles_and_both_trajectories(tab: Tab) -> None:
+    tab.click("#view-above")
+    picture = pixels(tab)
+    for name, colour in solver_colours(SOLVERS).items():
+        X = trajectories()[name][0].numpy()
+        assert alike(picture, rgb(colour)).sum() > 150, name
+        if name == SOLVERS[0]:
+            for k in (8, 30):
+                x, y = map(round, place(tab, X[k].tolist()))
+                assert alike(picture[y - 3 : y + 4, x - 3 : x + 4], rgb(colour)).any(), (name, k)
+    for center in ([3.0, 0, 0.8], [6.0, 2.5, 0.5], [4.5, -2, 0.8], [5.5, -3, 0.9]):
+        x, y = map(round, place(tab, center))
+        assert stony(picture[y - 8 : y + 9, x - 8 : x + 9]).mean() > 0.4, center
+
+
+def test_violations_are_red_and_go_with_their_solver(tab: Tab) -> None:
+    tab.click("#view-above")
+    with_both = alike(pixels(tab), RED).sum()
+    tab.click("#solvers .solver:nth-child(2) input")
+    assert with_both > 40 and alike(pixels(tab), RED).sum() < 0.1 * with_both
+
+
+def test_the_slider_moves_the_vehicle_and_the_obstacles(tab: Tab) -> None:
+    tab.click("#view-above")
+    before, picture = vehicle(tab), pixels(tab)
+    tab.evaluate("(() => { const t = document.getElementById('time'); t.value = 2; "
+                 "t.dispatchEvent(new Event('input', { bubbles: true })); })()")  # fmt: skip
+    X = trajectories()[SOLVERS[0]][0].numpy()
+    np.testing.assert_allclose(vehicle(tab), X[round(2 / DT)], atol=2e-3)
+    assert np.linalg.norm(vehicle(tab) - before) > 1
+    assert "2.00 of 4.00 s" in tab.evaluate("document.getElementById('clock').textContent")
+    after = pixels(tab)
+    x, y = map(round, place(tab, [6.0, 1.5, 0.5]))  # where the moving sphere is at 2 s
+    spot = np.s_[y - 4 : y + 5, x - 4 : x + 5]
+    assert stony(after[spot]).mean() > 0.6 > 0.3 > stony(picture[spot]).mean()
+
+
+def test_a_click_changes_the_layout(tab: Tab) -> None:
+    assert tab.evaluate(f"{PICTURE}.dataset.layout") == "0"
+    before = pixels(tab)
+    tab.click("#chips button:nth-child(3)")
+    tab.wait(f"{PICTURE}.dataset.layout === '2' && torchgcoView.layout.flights[0].rows[1][1] === '3'")
+    tab.click("#time")
+    X = trajectories()[SOLVERS[0]][2].numpy()
+    np.testing.assert_allclose(vehicle(tab), X[N // 2], atol=0.3)
+    assert (np.abs(pixels(tab) - before).max(axis=-1) > 30).sum() > 200
+    tab.click("#next")
+    tab.wait(f"{PICTURE}.dataset.layout === '0'")
+
+
+def test_keys_play_step_and_choose(tab: Tab) -> None:
+    tab.evaluate(f"{PICTURE}.focus()")
+    tab.press(".")
+    tab.press(".")
+    np.testing.assert_allclose(vehicle(tab), trajectories()[SOLVERS[0]][0, 2].numpy(), atol=2e-3)
+    tab.press("n")
+    tab.wait(f"{PICTURE}.dataset.layout === '1'")
+    azimuth = tab.evaluate("torchgcoView.orbit.azimuth")
+    tab.press("ArrowRight")
+    assert tab.evaluate("torchgcoView.orbit.azimuth") != azimuth
+    before = vehicle(tab)
+    tab.press(" ")
+    assert tab.evaluate("document.getElementById('play').getAttribute('aria-pressed')") == "true"
+    tab.wait(f"{PICTURE}.dataset.vehicle.split(' ')[0] > {before[0] + 0.1}")
+    tab.press(" ")
+    assert tab.evaluate("torchgcoView.playing") is False
+
+
+def test_dragging_turns_the_picture(tab: Tab) -> None:
+    before = pixels(tab)
+    tab.mouse("mousePressed", 300, 300, button="left", buttons=1, clickCount=1)
+    tab.mouse("mouseMoved", 380, 320, button="left", buttons=1)
+    tab.mouse("mouseReleased", 380, 320, button="left", clickCount=1)
+    assert (np.abs(pixels(tab) - before).max(axis=-1) > 30).mean() > 0.02
+
+
+def test_the_hover_tells_what_is_under_the_pointer(tab: Tab) -> None:
+    tab.click("#view-above")
+    x, y = place(tab, trajectories()[SOLVERS[1]][0, 15].tolist())  # inside the sphere
+    tab.mouse("mouseMoved", x, y)
+    told = tab.wait("!document.getElementById('hover').hidden && document.getElementById('hover').innerText")
+    assert "al_ilqr, knot 15, t = 1.50 s" in told and f"status: {WORDS}" in told
+    assert "here violated: spheres by" in told
+    tab.mouse("mouseMoved", 5, 5)
+    assert tab.evaluate("document.getElementById('hover').hidden")
+
+
+def test_the_search_is_shown_on_demand(tab: Tab) -> None:
+    tab.click("#view-above")
+    before = pixels(tab)
+    tab.click("#searched")
+    assert (np.abs(pixels(tab) - before).max(axis=-1) > 25).sum() > 100
+    told = tab.evaluate("document.getElementById('search').innerText")
+    assert all(word in told for word in ("pass 4, 1 candidate", "PathProposals", "path 1: 8.3 m", WORDS))
+    tab.click("#searched")
+    assert (np.abs(pixels(tab) - before).max(axis=-1) > 25).sum() < 20
+
+
+def test_views_of_obstacles(tab: Tab) -> None:
+    pictures = [pixels(tab)]
+    for name in ("#grown", "#through", "#follow"):
+        tab.click(name)
+        pictures.append(pixels(tab))
+    for view in ("#view-side", "#view-behind", "#view-perspective"):
+        tab.click(view)
+        pictures.append(pixels(tab))
+    assert all((np.abs(a - b).max(axis=-1) > 8).sum() > 300 for a, b in pairwise(pictures))
+
+
+def test_light_and_dark(tab: Tab) -> None:
+    light = pixels(tab)
+    tab.dark(True)
+    tab.wait("torchgcoView.scene.background.getHex() === 0x16191d")
+    dark = pixels(tab)
+    assert light[:20].mean() > 200 > 80 > dark[:20].mean()
+    assert tab.evaluate("getComputedStyle(document.body).color") == "rgb(232, 234, 237)"
+
+
+def test_nothing_of_the_data_ran(tab: Tab) -> None:
+    assert tab.evaluate("document.title") == WORDS
+    assert tab.evaluate("document.querySelectorAll('img, #panel script').length") == 0
+    assert WORDS in tab.evaluate("document.getElementById('layout').innerText")
+    assert WORDS in tab.evaluate("document.getElementById('solvers').innerText")
+
+
+def test_half_precision_is_read_as_numpy_writes_it(tab: Tab) -> None:
+    bits = np.random.default_rng(0).integers(0, 2**16, 300, dtype=np.uint16)
+    bits[:6] = 0, 1, 0x8001, 0x7BFF, 0x3C00, 0x0400
+    values = bits.view(np.float16)
+    finite = np.isfinite(values)
+    script = "torchgcoView.half.map ? null : " + json.dumps(bits[finite].tolist()) + ".map(torchgcoView.half)"
+    np.testing.assert_array_equal(np.array(tab.evaluate(script)), values[finite].astype(float))
+
+
+def test_a_damaged_page_says_so(opened: Tab, file: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.html"
+    text = file.read_text()
+    at = text.index('id="part-0"') + 60
+    broken.write_text(text[:at] + "AAAA" + text[at + 4 :])
+    opened.open(broken)
+    assert "can't be shown" in opened.evaluate("document.getElementById('message').innerText")

@@ -1,0 +1,106 @@
+"""What is drawn is where the obstacles are, and marks are where they are touched."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from tests.view.scenes import DT, RADIUS, SOLVERS, N, problem, trajectories
+from torchgco import Boxes, Planar, Problem, QuadraticCost
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.view.flights import contacts, violated, whole
+from torchgco.view.shapes import SHAPES, Shapes, once, shapes_of, turns
+
+
+def distance(shapes: Shapes, p: np.ndarray, t: float) -> np.ndarray:
+    """Distances (M,) of a point from the surfaces of the shapes as the page draws them."""
+    M, d = shapes.center.shape
+    center = shapes.center + (0 if shapes.velocity is None else t * shapes.velocity)
+    if shapes.turn is None:
+        axes = np.tile(np.eye(d), (M, 1, 1))
+    elif d == 2:
+        c, s = np.cos(shapes.turn), np.sin(shapes.turn)
+        axes = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
+    else:
+        axes = Rotation.from_quat(shapes.turn[:, [1, 2, 3, 0]]).as_matrix().transpose(0, 2, 1)
+    over = np.abs(np.einsum("mij,mj->mi", axes, p - center)) - shapes.half
+    return np.linalg.norm(over.clip(min=0), axis=1) + over.max(axis=1).clip(max=0) - shapes.radius
+
+
+def test_every_kind_is_drawn_where_it_is() -> None:
+    task, rng = problem(2), np.random.default_rng(1)
+    for part in task.obstacles:
+        shapes = shapes_of(part, 1)
+        assert shapes is not None and len(shapes.center) == int((~part.absent[1]).sum())
+        for p, t in zip(rng.uniform(-3, 9, (40, 3)), rng.uniform(0, 4, 40), strict=True):
+            there = part.signed_distance(torch.from_numpy(p).expand(2, 1, 3), torch.tensor([t]).double())[1, 0]
+            there = there[~part.absent[1]].numpy() + RADIUS
+            np.testing.assert_allclose(distance(shapes, p, t), there, atol=1e-9)
+
+
+def test_turned_boxes_in_the_plane() -> None:
+    cost = QuadraticCost(Q=[0.0] * 6, R=[1.0] * 2, Qf=[1.0] * 6, x_ref=[1.0, 0, 0, 0, 0, 0])
+    boxes = Boxes([[0.5, 0.2], [0.1, 0.9]], [[0.3, 0.1], [0.2, 0.2]], 0.05, rotations=[0.7, -2.0], radii=[0.1, 0.0])
+    task = Problem(Planar(), cost, [boxes], torch.zeros(1, 6, dtype=torch.float64), 5)
+    shapes = shapes_of(task.obstacles[0], 0)
+    assert shapes is not None
+    for p in np.random.default_rng(2).uniform(-1, 1, (20, 2)):
+        there = task.obstacles[0].signed_distance(torch.from_numpy(p).view(1, 1, 2), torch.zeros(1))[0, 0].numpy()
+        np.testing.assert_allclose(distance(shapes, p, 0.0), there + 0.05, atol=1e-9)
+
+
+def test_quaternions_of_any_turn() -> None:
+    turned = Rotation.random(200, random_state=3).as_matrix()
+    half = Rotation.from_rotvec(np.pi * np.eye(3)).as_matrix()  # where a component of the quaternion is 0
+    for matrices in (turned, half):
+        found = turns(matrices.transpose(0, 2, 1))
+        assert found is not None
+        np.testing.assert_allclose(Rotation.from_quat(found[:, [1, 2, 3, 0]]).as_matrix(), matrices, atol=1e-12)
+    assert turns(np.tile(np.eye(3), (4, 1, 1))) is None
+
+
+def test_equal_rows_are_kept_once() -> None:
+    assert once(np.ones((5, 2))).shape == (1, 2) and once(np.eye(2)).shape == (2, 2)
+
+
+def test_a_kind_that_is_added_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    part = problem(1).obstacles[1]
+    other = Shapes(np.zeros((1, 3)), np.ones((1, 3)), np.zeros(1))
+    monkeypatch.delitem(SHAPES, BoundBoxes)
+    seen = shapes_of(part, 0)  # as the search for paths sees boxes
+    assert seen is not None and np.allclose(seen.half, part.half_sizes[0])  # type: ignore[attr-defined]
+    monkeypatch.setitem(SHAPES, BoundBoxes, lambda part, b: other)
+    assert shapes_of(part, 0) is other
+
+
+def test_violations_are_those_of_the_worst_constraint_at_each_knot() -> None:
+    task, X = problem(2), trajectories(2)[SOLVERS[1]]
+    U = X.new_zeros(2, N, 3)
+    knots = violated(task, X, U, 1e-3)
+    for k in range(N + 1):
+        depth = [
+            float((-part.signed_distance(X[:1, k : k + 1], torch.tensor([k * DT])).amin()).clamp(min=0)) if k else 0.0
+            for part in task.obstacles
+        ]
+        worst = int(np.argmax(depth)) if max(depth) > 1e-3 else -1
+        assert knots.worst[0, k] == worst
+        np.testing.assert_allclose(knots.violation[0, k], max(depth) if worst >= 0 else 0.0, atol=1e-9)
+
+
+def test_contact_is_marked_once_where_it_is_deepest() -> None:
+    task = problem(1)
+    path = np.stack((np.linspace(0, 8, 81), np.full(81, 0.2), np.zeros(81)), axis=-1)
+    found = contacts(task.obstacles, path, DT)
+    # The sphere at (3, 0, 0), and the moving one at (6, 2.5 - 0.5 t, 0), which is there at t = 6.
+    assert len(found) == 2 and np.allclose(found[0], [3.0, 0.2, 0.0])
+    assert abs(found[1][0] - 6.0) < 0.6
+    assert len(contacts(task.obstacles, path - [0, 0, 5.0], DT)) == 0
+    assert contacts(task.obstacles, path[:0], DT).shape == (0, 3)
+
+
+def test_a_path_ends_where_it_is_lost() -> None:
+    X = np.arange(12.0).reshape(4, 3)
+    X[2, 1] = np.nan
+    assert len(whole(X)) == 2 and len(whole(np.array([[0.0], [1e7]]))) == 1

@@ -1,0 +1,85 @@
+"""What a solution keeps of its solve, to explain it: the problem, the solver, and the times of the knots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.tree import PerElement, Rows
+from torchgco.problem.problem import Problem
+from torchgco.problem.times import times
+
+
+class Account(PerElement):
+    """The problem that was solved, and the solver; no dataclass, so that nothing is copied with a solution's tensors.
+
+    Of a solution that was loaded or sent to another process, only the times of the knots are left.
+
+    Args:
+        problem: as the user gave it.
+        solver: that solved it.
+        name: of the preset that the user named; None: the solver's class.
+        rows: the problems (b,) of the account; None: all.
+        t: times, where the problem isn't there.
+    """
+
+    def __init__(
+        self,
+        problem: Problem | None = None,
+        solver: Any = None,
+        name: str | None = None,
+        rows: Tensor | None = None,
+        t: Tensor | None = None,
+    ) -> None:
+        self._whole, self.solver, self._name, self._rows, self._t = problem, solver, name, rows, t
+
+    @property
+    def problem(self) -> Problem | None:
+        """The problems of the account; taken from the batch only when they are asked for."""
+        return self._whole if self._whole is None or self._rows is None else self._whole.take(self._rows)
+
+    @property
+    def name(self) -> str | None:
+        """What solved the problem; None where that isn't known."""
+        return type(self.solver).__name__ if self._name is None and self.solver is not None else self._name
+
+    def of_preset(self, name: str) -> Account:
+        """The same, solved by a preset of this name."""
+        return Account(self._whole, self.solver, name, self._rows, self._t)
+
+    def times(self) -> Tensor:
+        """The times of the knots, (N+1,) or (b, N+1), s.
+
+        Raises:
+            InputError: dynamics without a time step, or no times in the file that was loaded.
+        """
+        if self._whole is not None:
+            t = times(self._whole)
+        elif self._t is not None:
+            t = self._t
+        else:
+            raise InputError("solution", "one that knows its times: solved here, or saved with them", "a loaded one")
+        return t if self._rows is None or t.dim() == 1 else t[self._rows]
+
+    def take(self, index: Rows) -> Account:
+        """The account of some problems."""
+        if isinstance(index, slice):
+            count = 0 if self._whole is None else self._whole.B
+            rows = torch.arange(count) if self._rows is None else self._rows
+            index = rows[index] if self._whole is not None else index
+            rows = index if isinstance(index, Tensor) else None
+        else:
+            index = index.nonzero().flatten() if index.dtype == torch.bool else index
+            rows = index if self._rows is None else self._rows[index]
+        return Account(self._whole, self.solver, self._name, rows, self._t)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Times and name alone: a problem may hold functions that no other process can read."""
+        try:
+            t = self.times()
+        except InputError:
+            t = None
+        return {"_whole": None, "solver": None, "_name": self.name, "_rows": None, "_t": t}

@@ -1,0 +1,80 @@
+"""What to try where a problem ended badly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+from torchgco.base.status import Status
+
+FITS = (Status.CONVERGED, Status.FEASIBLE)
+LIMITS = ("max_outer_iterations", "max_iterations", "iterations", "rounds", "starts", "budget")  # options of solvers
+DEEP = 2  # parts of a solver within each other in which limits are looked for
+MANY = 3  # limits that are named
+
+BY_STATUS = {
+    Status.FEASIBLE: "More iterations lower the cost: torchgco.solve(problem, warm=solution), or higher "
+    "limits{limits}; torchgco.Polish() refines float64 solutions.",
+    Status.MAX_ITERATIONS: "Higher limits{limits}, or torchgco.solve(problem, warm=solution), which goes on from here.",
+    Status.LINE_SEARCH_FAILED: "Units in which states, controls and costs are of similar size; no kinks (abs, clamp) "
+    "in dynamics, cost and constraints.",
+    Status.NOT_POSITIVE_DEFINITE: "A small weight on every control, as R > 0 of a QuadraticCost.",
+    Status.NON_FINITE: 'Another U0, bounds on the controls, a smaller dt, or integrator="rk4".',
+    Status.INFEASIBLE: "Another guess U0, a longer horizon N, wider bounds; or loosen the row named above, to see "
+    "whether it is what makes the problem infeasible.",
+    Status.TIME_LIMIT: 'A larger max_seconds, or solver="gco_fast".',
+    Status.UNBOUNDED: "Bounds on what grows, or a cost that keeps it small.",
+    Status.INVALID_START: "A start x0 outside the obstacles, whose radii here include the vehicle's.",
+}
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of one problem and its result.
+
+    Args:
+        seeks_paths: whether the solver looks for ways around obstacles; None: unknown.
+        among_obstacles: whether there are any.
+        reached: None where there is no goal, or none that can be judged.
+        goal_distance: m, of the last knot.
+        clearance: m, between knots too; None where it can't be judged.
+        could_record: whether the solver can record more than it did.
+    """
+
+    status: Status
+    solver: Any = None
+    seeks_paths: bool | None = None
+    among_obstacles: bool = False
+    reached: bool | None = None
+    goal_distance: float | None = None
+    clearance: float | None = None
+    could_record: bool = False
+
+
+def advice(facts: Facts) -> list[str]:
+    """Sentences, the most useful first; none where nothing is amiss."""
+    found = list[str]()
+    if facts.among_obstacles and facts.seeks_paths is False and not (facts.status in FITS and facts.reached):
+        found.append('solver="gco", the default, which seeks paths around obstacles on a roadmap.')
+    if facts.status in FITS and facts.clearance is not None and facts.clearance < 0:
+        found.append("A smaller dt, or a larger vehicle_radius: constraints hold at the knots alone.")
+    if facts.status in FITS and facts.reached is False:
+        found.append("A longer horizon N, or a larger terminal weight: the trajectory stops short of the goal.")
+    elif facts.status in BY_STATUS:
+        limits = [f"{name}={value}" for name, value in limits_of(facts.solver)][:MANY]
+        found.append(BY_STATUS[facts.status].format(limits=f" ({', '.join(limits)})" if limits else ""))
+    if not (facts.status in FITS and facts.reached is not False) and facts.could_record:
+        found.append("torchgco.solve(..., record=True), after which explain tells what each pass did.")
+    return found
+
+
+def limits_of(solver: Any, prefix: str = "", deep: int = 0) -> Iterator[tuple[str, Any]]:
+    """The options of a solver that limit its work, with those of its parts: names as in `dataclasses.replace`."""
+    if not is_dataclass(solver):
+        return
+    for name in LIMITS:
+        if isinstance(value := getattr(solver, name, None), int) and not isinstance(value, bool):
+            yield f"{prefix}{name}", value
+    for field in fields(solver) if deep < DEEP else ():
+        yield from limits_of(getattr(solver, field.name), f"{prefix}{field.name}.", deep + 1)

@@ -1,0 +1,199 @@
+"""What happened to one problem of a batch, in words: the text of `Solution.explain`."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError, shown
+from torchgco.base.shapes import check_shape
+from torchgco.base.status import Status
+from torchgco.explaining.account import Account
+from torchgco.explaining.advice import Facts, advice
+from torchgco.explaining.passes import iterations_told, passes_told
+from torchgco.explaining.places import caught_told, number, place_told
+from torchgco.explaining.record import SearchRecord
+from torchgco.judging.judge import columns as judged
+from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.horizons import within_horizons
+from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.times import times
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WIDTH = 110  # letters of a line
+
+
+class Solved(Protocol):
+    """What is read of a solution."""
+
+    X: Tensor
+    U: Tensor
+    cost: Tensor
+    violation: Tensor
+    status: Tensor
+    iterations: Tensor
+    outer_iterations: Tensor
+    guided: Tensor
+    trace: pd.DataFrame | None
+    search: SearchRecord | None
+    account: Account | None
+
+
+class Explanation(str):
+    """A text that notebooks and consoles show as it is, line by line."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+def explanation(solution: Any, b: int, problem: Problem | None = None, what: str | None = None) -> Explanation:
+    """What happened to the problem at place b of a solution; see `Solution.explain`. `what` names it, by default b."""
+    solved: Solved = solution
+    B = solved.U.shape[0]
+    if isinstance(b, bool) or not isinstance(b, int) or not 0 <= b < B:
+        raise InputError("b", f"the place of a problem, 0 to {B - 1}", shown(b))
+    account = solved.account or Account()
+    whole = account.problem if problem is None else problem
+    if problem is not None:
+        check_problem(problem)
+        check_shape(solved.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
+        check_shape(solved.U, (problem.B, problem.N, problem.m), "problem: solution.U")
+    one = None if whole is None else _One(whole, solved, b)
+    facts = _facts(solved, b, account, one)
+    by = f" by {account.name}" if account.name else ""
+    parts = [
+        ("", [f"{what or f'Problem {b} of {B}'}, solved{by}: {facts.status.name}."]),
+        ("Result", _result(solved, b, facts, one)),
+        ("Caught", _caught(solved, b, one)),
+        ("Passes", _passes(solved, b, account)),
+        ("Iterations", _iterations(solved, b)),
+        ("Why it ended", [facts.status.sentence]),
+        ("What to try", advice(facts)),
+    ]
+    return Explanation("\n".join(_block(title, lines) for title, lines in parts if lines))
+
+
+class _One:
+    """One problem of the batch, with its trajectory and the times of its knots."""
+
+    def __init__(self, whole: Problem, solved: Solved, b: int) -> None:
+        rows = torch.tensor([b], device=whole.x0.device)
+        self.rows, self.problem = rows, whole.take(rows)
+        self.X, self.U = solved.X[rows], solved.U[rows]
+        self.held = within_horizons(self.problem)
+        self.t: Tensor | None = None
+        try:
+            t = times(self.problem)
+            self.t = t if t.dim() == 1 else t[0]
+        except InputError:  # dynamics without a time step
+            pass
+
+    @property
+    def lost_at(self) -> int | None:
+        """The first knot whose state isn't finite."""
+        lost = (~torch.isfinite(self.X[0]).all(-1)).nonzero().flatten()
+        return int(lost[0]) if lost.numel() else None
+
+    @property
+    def goal_distance(self) -> float | None:
+        problem = self.problem
+        if problem.goal is None:
+            return None
+        return float(problem.goal.distance(self.X[:, -1, problem.position])[0])
+
+    def verdict(self) -> dict[str, Any]:
+        """`clearance` and `reached` by the judge, where it knows them."""
+        start = None if self.problem.free_start is None else self.X[:, 0]
+        try:
+            return {name: column[0] for name, column in judged(self.problem, self.U, start).items()}
+        except InputError:  # obstacles of a kind that can't be judged
+            return {}
+
+
+def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
+    solver, status = account.solver, Status(int(solved.status[b]))
+    recording = getattr(solver, "recording", None)
+    could = solved.trace is None and recording is not None and recording() is not solver
+    if one is None:
+        return Facts(status, solver, could_record=could)
+    verdict = one.verdict()
+    return Facts(
+        status=status,
+        solver=solver,
+        seeks_paths=None if solver is None else hasattr(solver, "passes"),
+        among_obstacles=bool(one.problem.obstacles),
+        reached=bool(verdict["reached"]) if "reached" in verdict else None,
+        goal_distance=one.goal_distance,
+        clearance=float(verdict["clearance"]) if "clearance" in verdict else None,
+        could_record=could,
+    )
+
+
+def _result(solved: Solved, b: int, facts: Facts, one: _One | None) -> list[str]:
+    counts = f"{int(solved.iterations[b])} iterations"
+    if outer := int(solved.outer_iterations[b]):
+        counts += f", {outer} outer iteration{'s' if outer > 1 else ''}"
+    if guided := int(solved.guided[b]):
+        counts += f", {guided} of them guided"
+    lines = [f"cost {number(float(solved.cost[b]))}, violation {number(float(solved.violation[b]))}, after {counts}"]
+    if one is None:
+        return lines
+    if one.lost_at is not None:
+        lines.append(f"the state at knot {one.lost_at} isn't finite: the stage before it is where the model fails")
+        return lines
+    worst = place_told(one.problem, one.X, one.U, one.t)
+    lines.append("no constraint is violated" if worst is None else f"violated most: {worst}")
+    if facts.clearance is not None and facts.clearance < float("inf"):
+        side = "touches an obstacle" if facts.clearance < 0 else "clear of obstacles"
+        lines.append(f"{side}: {number(facts.clearance)} m to contact, between the knots too")
+    if facts.goal_distance is not None and one.problem.goal is not None:
+        radius = float(one.problem.goal.radius[0])
+        near = facts.goal_distance < radius
+        within = "reached" if facts.reached else "not judged" if facts.reached is None else "not reached"
+        within = "not reached, as constraints are violated" if near and facts.reached is False else within
+        away = f"{number(facts.goal_distance)} m from it, radius {number(radius)} m"
+        lines.append(f"goal {within}: the last knot is {away}")
+    return lines
+
+
+def _caught(solved: Solved, b: int, one: _One | None) -> list[str]:
+    """Where the first solve was caught, where that is recorded; else where the returned trajectory is."""
+    if one is None:
+        return []
+    if solved.search is not None and solved.search.caught is not None:
+        rows, X = solved.search.caught
+        at = (rows == b).nonzero().flatten()
+        if at.numel() == 0:
+            return ["no: the first solve wasn't stopped between obstacles"]
+        told = caught_told(one.held, X[at], one.U, one.t)
+        return [f"the first solve was stopped {told}" if told else "the first solve was stopped between obstacles"]
+    if one.lost_at is not None:
+        return []
+    told = caught_told(one.held, one.X, one.U, one.t, ADMITTED)
+    return [f"the returned trajectory lies {told}"] if told else []
+
+
+def _passes(solved: Solved, b: int, account: Account) -> list[str]:
+    if solved.search is None:
+        return []
+    table = getattr(account.solver, "table", None)
+    return passes_told(solved.search, b, {} if table is None else table()["problems"].to_dict())
+
+
+def _iterations(solved: Solved, b: int) -> list[str]:
+    return [] if solved.search is not None or solved.trace is None else iterations_told(solved.trace, b)
+
+
+def _block(title: str, lines: list[str]) -> str:
+    if not title:
+        return "\n".join(lines)
+    first = f"{title}: "
+    wrapped = [textwrap.fill(line, WIDTH, initial_indent="  ", subsequent_indent="    ") for line in lines]
+    return "\n".join([first.rstrip(), *wrapped])

@@ -1,0 +1,104 @@
+"""Knots, rows and obstacles in words: where a trajectory is caught, and which row it violates most."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchgco.constraints.base import Constraint
+from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.judging.worst import NONE, kind_of, worst_rows
+from torchgco.obstacles.base import Obstacles
+from torchgco.problem.problem import Problem
+
+SHOWN = 4  # runs of knots, or obstacles, that are named
+
+
+def number(value: float) -> str:
+    """A number with as many digits as a reader compares."""
+    return f"{value:,.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
+
+
+def listed(words: Sequence[object], most: int = SHOWN) -> str:
+    """The first of some words, and how many follow."""
+    more = f" and {len(words) - most} more" if len(words) > most else ""
+    return ", ".join(map(str, words[:most])) + more
+
+
+def knots_told(knots: Sequence[int], t: Tensor | None) -> str:
+    """Knots as runs, with their times t (N+1,), s, where these are known."""
+    runs: list[list[int]] = []
+    for k in knots:
+        if runs and runs[-1][-1] == k - 1:
+            runs[-1].append(k)
+        else:
+            runs.append([k])
+
+    def told(run: list[int]) -> str:
+        ends = run[:1] if len(run) == 1 else [run[0], run[-1]]
+        seconds = "" if t is None else f" (t = {' to '.join(f'{float(t[k]):.3g}' for k in ends)} s)"
+        return " to ".join(map(str, ends)) + seconds
+
+    return f"knot{'s' if len(knots) > 1 else ''} {listed([told(run) for run in runs])}"
+
+
+def caught_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None, depth: float = 0.0) -> str | None:
+    """Where X (1, N+1, n), U (1, N, m) lies deeper than `depth`, m, in obstacles; None where it doesn't.
+
+    Knots inside two obstacles or more are told first: there their gradients can cancel. Start and end are left out.
+    """
+    counts = torch.zeros(problem.N + 1, dtype=torch.int64)
+    rows: list[tuple[int, Tensor]] = []
+    for i, constraint in enumerate(problem.constraints):
+        if constraint.geometric:
+            deep = (constraint.violation(X, U)[0] > depth).cpu()
+            inside = torch.zeros(problem.N + 1, deep.shape[-1], dtype=torch.bool)
+            inside[constraint.knots] = deep
+            inside[0] = inside[-1] = False
+            counts += inside.sum(-1)
+            rows.append((i, inside))
+    for least, words in ((2, "inside two obstacles or more, whose gradients can cancel"), (1, "inside an obstacle")):
+        knots = (counts >= least).nonzero().flatten().tolist()
+        if knots:
+            named = [
+                f"{listed(which)} of {constraint_told(problem.constraints[i], i)}"
+                for i, inside in rows
+                if (which := inside[knots].any(0).nonzero().flatten().tolist())
+            ]
+            return f"{words}, at {knots_told(knots, t)}: number {'; '.join(named)}"
+    return None
+
+
+def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str | None:
+    """The row that X (1, N+1, n), U (1, N, m) violates most; None where it violates none."""
+    worst = {name: column[0] for name, column in worst_rows(problem, X, U).items()}
+    if worst["constraint"] == NONE:
+        return None
+    constraint = problem.constraints[worst["constraint"]]
+    length = " m" if constraint.geometric else ""
+    where = knots_told([worst["knot"]], t)
+    row = row_told(constraint, worst["row"])
+    return f"{constraint_told(constraint, worst['constraint'])}, {row}{where}, by {number(worst['violation'])}{length}"
+
+
+def constraint_told(constraint: Constraint, i: int) -> str:
+    """A constraint by its place, and its name or kind."""
+    return f"constraints[{i}] ({kind_of(constraint)})"
+
+
+def row_told(constraint: Constraint, row: int) -> str:
+    """A row of a constraint: which obstacle, or which bound of which component."""
+    if isinstance(constraint, Obstacles):
+        return f"obstacle {row}, "
+    if isinstance(constraint, ControlBounds | StateBounds):
+        above, below = (_places(constraint, part) for part in (constraint.above, constraint.below))
+        side, component = ("upper", above[row]) if row < len(above) else ("lower", below[row - len(above)])
+        return f"{side} bound of {'control' if constraint.of == 'u' else 'state'} {component}, "
+    return f"row {row}, "
+
+
+def _places(bounds: ControlBounds | StateBounds, part: Any) -> list[int]:
+    return torch.arange(bounds.lower.shape[-1])[part].tolist()

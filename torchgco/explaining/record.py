@@ -1,0 +1,97 @@
+"""The record of a search: what every row of a solver's table did, kept where the local solver records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+
+class Fate(IntEnum):
+    """What became of a candidate trajectory along a path."""
+
+    ABSENT = 0  # its path is of the same homotopy class as a shorter one, or there is none
+    TRACKED = 1  # dropped as tracked: others were cheaper
+    UNSOUND = 2  # relaxed, but too deep in an obstacle, or away from the goal
+    RELAXED = 3  # dropped as relaxed: others were cheaper
+    FAILED = 4  # refined, but without a good end
+    REFINED = 5  # refined, but not the cheapest
+    PROPOSED = 6
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One comparison of candidates along paths for b problems, K paths and C candidates each."""
+
+    number: int  # of the pass in the solver's table, from 1
+    rows: Tensor  # (b,) int64: places in the batch
+    paths: Tensor  # (b, K, P, d): corners, m
+    classes: Tensor  # (b, K) int64: the first path of the same homotopy class
+    path: Tensor  # (b, C) int64: which path each candidate follows
+    fate: Tensor  # (b, C) int64, see Fate
+    tracked: Tensor  # (b, C, N+1, n): states after tracking
+    relaxed: Tensor  # (b, C, N+1, n): after relaxing; NaN for candidates dropped before
+    refined: Tensor  # (b, C, N+1, n): after refining; NaN for candidates dropped before
+    cost: Tensor  # (b, C): J_var as refined, infinite without a good end; NaN for candidates that weren't refined
+    again: bool = False  # in a second search, with the obstacles that the first one left out
+
+
+@dataclass(frozen=True)
+class Standing:
+    """The best trajectories of b problems after a pass."""
+
+    rows: Tensor  # (b,) int64: places in the batch
+    cost: Tensor  # (b,): J_var
+    violation: Tensor  # (b,): metres for lengths
+    goal_distance: Tensor  # (b,), m, of the last knot; NaN without a goal
+    arrived: Tensor  # (b,) bool: feasible, and within the solver's tolerance of the goal
+
+
+@dataclass
+class SearchRecord:
+    """What the passes of a search did, kept where the local solver records.
+
+    Attributes:
+        passes: (number of the pass, its name, places in the batch of the problems that it worked on), in their order.
+        caught: places in the batch (b,), and states (b, N+1, n) of the trajectories that were caught.
+        comparisons: of candidates along paths.
+        standings: of every entry of `passes`; None before the first solve. Where some problems were solved again with
+            obstacles that a first search had left out, passes and standings of that second search follow.
+    """
+
+    passes: list[tuple[int, str, list[int]]] = field(default_factory=list)
+    caught: tuple[Tensor, Tensor] | None = None
+    comparisons: list[Comparison] = field(default_factory=list)
+    standings: list[Standing | None] = field(default_factory=list)
+
+    def of_first_states(self, n: int) -> SearchRecord:
+        """The same with the first n states alone."""
+        caught = None if self.caught is None else (self.caught[0], self.caught[1][..., :n])
+        names = "tracked", "relaxed", "refined"
+        each = [replace(one, **{name: getattr(one, name)[..., :n] for name in names}) for one in self.comparisons]
+        return replace(self, caught=caught, comparisons=each)
+
+    def in_costs(self, unit: Tensor, constant: Tensor) -> SearchRecord:
+        """The same with costs times a unit, plus a constant, both by place in the batch: those of the user."""
+        standings = [
+            one and replace(one, cost=one.cost * unit[one.rows] + constant[one.rows]) for one in self.standings
+        ]
+        each = [
+            replace(one, cost=one.cost * unit[one.rows].unsqueeze(-1) + constant[one.rows].unsqueeze(-1))
+            for one in self.comparisons
+        ]
+        return replace(self, comparisons=each, standings=standings)
+
+    def followed_by(self, again: SearchRecord) -> SearchRecord:
+        """Both as one, where `again` is of some of these problems, solved a second time."""
+        caught, late = self.caught, again.caught
+        if caught is not None and late is not None:
+            solved = torch.cat([torch.as_tensor(rows) for _, _, rows in again.passes]).to(caught[0])
+            stays = ~torch.isin(caught[0], solved)
+            caught = torch.cat((caught[0][stays], late[0])), torch.cat((caught[1][stays], late[1]))
+        more = [replace(one, again=True) for one in again.comparisons]
+        return SearchRecord(
+            self.passes + again.passes, caught, self.comparisons + more, self.standings + again.standings
+        )

@@ -1,0 +1,249 @@
+"""A problem and its solution: the scene with the trajectories, and states and controls over time with their limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.lines import Line2D
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import check_shape
+from torchgco.constraints import ControlBounds, Separation, StateBounds
+from torchgco.plotting.bodies import ABOVE, Plane
+from torchgco.plotting.layouts import SIDE, STONE, draw_obstacles, draw_targets
+from torchgco.plotting.scene import contacts, flown, passes, view
+from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, tidy
+from torchgco.plotting.world import World, distances, world_of
+from torchgco.problem.problem import Problem, check_problem
+from torchgco.problem.times import times
+from torchgco.solution import Solution
+
+WIDTH = 9.0  # inches
+COLUMNS = 4  # of histories
+PANEL = 1.45  # inches, the height of a history
+TALLEST = 4.2  # inches, the height of a scene
+FEW = 6  # problems that are shown where none are named
+NEAR = 1.0  # spans of the data within which a limit is shown
+LIMIT = "#C62828"
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """The trajectory of one problem."""
+
+    b: int
+    X: np.ndarray  # (N+1, n)
+    U: np.ndarray  # (N, m)
+    t: np.ndarray  # (N+1,)
+    paths: tuple[np.ndarray, ...]  # (N+1, d) each: of the position, and of further ones that keep apart
+    colour: str
+    label: str
+
+
+def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:
+    """The figure of `torchgco.plot`; see there."""
+    check_problem(problem)
+    check_shape(solution.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
+    check_shape(solution.U, (problem.B, problem.N, problem.m), "problem: solution.U")
+    courses, unit = _courses(problem, solution, _places(b, problem.B))
+    at = problem.dynamics.position
+    planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if at is None else at.stop - at.start, ())
+    shared = [courses] if _is_shared(problem, courses) else [[course] for course in courses]
+    maps = [_Map.of(problem, group, planes) for group in shared] if planes else []
+    rows = ceil((problem.n + problem.m) / COLUMNS)
+    wide = WIDTH / len(maps) if maps else WIDTH
+    high = max((one.height(wide) for one in maps), default=0.0)
+    figure = Figure(figsize=(WIDTH, high + PANEL * rows + 0.35), layout="constrained")
+    lower: Figure | SubFigure = figure
+    if maps:
+        upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(high, PANEL * rows))[:, 0]
+        for part, one in zip(upper.subfigures(1, len(maps), squeeze=False)[0], maps, strict=True):
+            one.draw(part)
+    _histories(lower, problem, courses, unit)
+    look: dict[str, Any] = {"fontsize": TEXT, "frameon": False, "ncols": min(3, len(courses) + 1)}
+    lines = [Line2D([], [], color=course.colour, label=course.label) for course in courses]
+    lines.append(Line2D([], [], color=LIMIT, linestyle="--", linewidth=0.9, label="bound, where it is near"))
+    figure.legend(handles=lines, loc="outside upper left", **look)
+    return figure
+
+
+def _places(b: Any, B: int) -> list[int]:
+    """The places of the problems to show."""
+    places = list(range(min(B, FEW))) if b is None else [b] if isinstance(b, int) else b
+    whole = isinstance(places, Sequence) and all(isinstance(i, int) and not isinstance(i, bool) for i in places)
+    if not whole or not places or any(not 0 <= i < B for i in places):
+        raise InputError("b", f"the place of a problem, 0 to {B - 1}, or a list of some", b)
+    return list(dict.fromkeys(places))
+
+
+def _courses(problem: Problem, solution: Solution, places: list[int]) -> tuple[list[Course], str]:
+    """The trajectories, each up to its own last knot, and the unit of t: s, or knots of a model without time step."""
+    try:
+        t, unit = times(problem), "t [s]"
+    except InputError:
+        t, unit = torch.arange(problem.N + 1, device=problem.x0.device), "knot"
+    found = []
+    for i, b in enumerate(places):
+        last = int(problem.stages[b])
+        X, U = (part[b].detach().cpu().double().numpy() for part in (solution.X, solution.U))
+        label = f"problem {b}: {solution.statuses[b].name}, cost {float(solution.cost[b]):.6g}"
+        at = (t if t.dim() == 1 else t[b]).cpu().double().numpy()
+        X, U, at = X[: last + 1], U[:last], at[: last + 1]
+        paths = tuple(X[:, part] for part in _positions(problem))
+        found.append(Course(b, X, U, at, paths, PALETTE[i % len(PALETTE)], label))
+    return found, unit
+
+
+def _positions(problem: Problem) -> list[list[int]]:
+    """The states of the position, and of those of other vehicles that keep a distance from it."""
+    at = problem.dynamics.position
+    if at is None:
+        return []
+    found = [list(range(at.start, at.stop))]
+    for part in problem.constraints:
+        if isinstance(part, Separation):
+            found += [states for states in part.positions.tolist() if states not in found]
+    return found
+
+
+def _is_shared(problem: Problem, courses: list[Course]) -> bool:
+    """Whether one scene serves all: they have the same obstacles and goals."""
+    rows = torch.tensor([course.b for course in courses], device=problem.x0.device)
+    parts = [getattr(part.take(rows), name) for part in problem.obstacles for name in part.batched]
+    parts += [] if problem.goal is None else [problem.goal.position[rows]]
+    held = [part for part in parts if isinstance(part, torch.Tensor)]
+    return all(torch.equal(part.nan_to_num(), part[:1].expand_as(part).nan_to_num()) for part in held)
+
+
+@dataclass(frozen=True, eq=False)
+class _Map:
+    """A scene with the trajectories in it."""
+
+    world: World
+    courses: list[Course]
+    planes: tuple[Plane, ...]
+    box: np.ndarray  # (2, d): lower and upper corner, m
+
+    @classmethod
+    def of(cls, problem: Problem, courses: list[Course], planes: tuple[Plane, ...]) -> _Map:
+        world = world_of(problem, courses[0].b)
+        paths = [flown(path) for course in courses for path in course.paths]
+        boxes = [view(scene, [0], paths, []) for scene in world.scenes]
+        return cls(world, courses, planes, np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]]))
+
+    @property
+    def shares(self) -> list[float]:
+        """The heights of the planes, in widths."""
+        span = self.box[1] - self.box[0]
+        return [float(span[plane[1]] / span[0]) for plane in self.planes]
+
+    def height(self, wide: float) -> float:
+        """Inches, for a width in inches."""
+        return min(TALLEST, wide * sum(self.shares)) + 0.45 * len(self.planes)
+
+    def draw(self, figure: SubFigure) -> None:
+        """Draw each plane into axes of its own."""
+        ratios = {"height_ratios": self.shares}
+        axes = figure.subplots(len(self.planes), 1, squeeze=False, gridspec_kw=ratios)[:, 0]
+        for ax, plane in zip(axes, self.planes, strict=True):
+            self._plane(ax, plane)
+
+    def _plane(self, ax: Axes, plane: Plane) -> None:
+        lead = flown(self.courses[0].paths[0])
+        for scene in self.world.scenes:
+            draw_obstacles(ax, scene, 0, passes(scene, 0, lead), plane)
+        hidden = [i for i in range(self.box.shape[1]) if i not in plane]
+        at = float(lead[:, hidden[0]].mean()) if hidden and len(lead) else 0.0
+        for part in self.world.others:
+            x, y, apart = distances(part, self.box[0], self.box[1], plane, at)
+            if bool((apart < 0).any()):
+                ax.contourf(x, y, apart, levels=[-np.inf, 0.0], colors=[STONE], zorder=0.3)
+        for course in self.courses:
+            look: dict[str, Any] = {"color": course.colour, "linewidth": 1.2, "marker": ".", "markersize": 3}
+            for path in course.paths:
+                ax.plot(*flown(path)[:, plane].T, zorder=3, **look)
+            touched = np.concatenate([contacts(scene, 0, course.paths[0]) for scene in self.world.scenes])
+            cross: dict[str, Any] = {"marker": "X", "markeredgecolor": "white", "markersize": 8, "linestyle": "none"}
+            ax.plot(*touched[:, plane].T, color=course.colour, zorder=4, **cross)
+        draw_targets(ax, self.world.first, 0, plane)
+        for course in self.courses[1:]:
+            start: dict[str, Any] = {"marker": "s", "markersize": 5, "markeredgecolor": "white", "markeredgewidth": 0.5}
+            ax.plot(*course.paths[0][:1, plane].T, color=INK, zorder=2.5, linestyle="none", **start)
+        ax.set(xlim=self.box[:, plane[0]], ylim=self.box[:, plane[1]], aspect="equal")
+        ax.set(xlabel="x [m]" if plane == self.planes[-1] else "", ylabel=f"{'xyz'[plane[1]]} [m]")
+        words = {ABOVE: "from above", SIDE: "from the side"}
+        tidy(
+            ax,
+            f"{words[plane]}, obstacles cut where problem {self.courses[0].b} flies" if len(self.planes) > 1 else "",
+            grid=None,
+        )
+
+
+def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Course], unit: str) -> None:
+    """A panel for each state and control."""
+    count = problem.n + problem.m
+    rows = ceil(count / COLUMNS)
+    axes = list(figure.subplots(rows, min(COLUMNS, count), squeeze=False, sharex=True).flat)
+    names = _names(problem)
+    for i, ax in enumerate(axes[:count]):
+        state, j = i < problem.n, i if i < problem.n else i - problem.n
+        values = []
+        for course in courses:
+            series = (course.X if state else course.U)[:, j]
+            values.append(series)
+            look: dict[str, Any] = {} if state else {"drawstyle": "steps-post"}
+            t = course.t if state else course.t[:-1]
+            ax.plot(t, series, color=course.colour, linewidth=1.2, **look)
+        _limits(ax, problem, courses, values, state, j)
+        tidy(ax, names[i])
+        ax.title.set_fontsize(TEXT)
+        ax.tick_params(labelsize=SMALL - 1)
+        if i + COLUMNS >= count:
+            ax.set_xlabel(unit, fontsize=SMALL)
+            ax.tick_params(labelbottom=True)
+    for ax in axes[count:]:
+        ax.remove()
+
+
+def _names(problem: Problem) -> list[str]:
+    """Titles of the histories: coordinates of the position by letter, other states and controls by number."""
+    at = problem.dynamics.position
+    place = range(0) if at is None else range(at.start, at.stop)
+    states = [
+        f"{'xyz'[j - place.start]} [m]" if j in place and len(place) <= 3 else f"x[{j}]" for j in range(problem.n)
+    ]
+    return [*states, *(f"u[{j}]" for j in range(problem.m))]
+
+
+def _limits(ax: Axes, problem: Problem, courses: list[Course], values: list[np.ndarray], state: bool, j: int) -> None:
+    """Dashed lines at the bounds of a component, of those that are near its values: far ones would flatten these."""
+    finite = np.concatenate([series[np.isfinite(series)] for series in values])
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    span = max(high - low, 1e-3 * max(abs(low), abs(high), 1e-9))
+    count = problem.N + 1 if state else problem.N
+    ends = [low, high]
+    for part in problem.constraints:
+        if not isinstance(part, StateBounds if state else ControlBounds) or j >= part.lower.shape[-1]:
+            continue
+        for bound in part.over(count):
+            for course in courses:
+                row = bound[course.b if bound.shape[0] > 1 else 0, :, j].cpu().double().numpy()
+                row = np.broadcast_to(row, (count,))[: len(course.X if state else course.U)]
+                near = np.isfinite(row) & (row >= low - NEAR * span) & (row <= high + NEAR * span)
+                if near.any():
+                    t = course.t[: len(row)]
+                    mark: dict[str, Any] = {"marker": "_"} if near.sum() == 1 else {}
+                    ax.plot(
+                        t, np.where(near, row, np.nan), color=LIMIT, linestyle="--", linewidth=0.9, zorder=1, **mark
+                    )
+                    ends += [float(row[near].min()), float(row[near].max())]
+    edge = 0.06 * max(max(ends) - min(ends), span)
+    if finite.size:
+        ax.set_ylim(min(ends) - edge, max(ends) + edge)

@@ -1,0 +1,92 @@
+"""The obstacles of a problem in the form that maps show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.plotting.bodies import Ball, Body, Box, Plane
+from torchgco.plotting.scene import Scene
+from torchgco.problem.problem import Problem
+
+GRID = 160  # points along x at which the distance from other kinds of obstacles is looked at
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """The scenes of one problem, one for each radius of the vehicle, and its obstacles of other kinds.
+
+    Args:
+        scenes: at least one; all have the same start and goal.
+        others: bound obstacles that are neither spheres nor boxes, of this problem alone.
+    """
+
+    scenes: tuple[Scene, ...]
+    others: tuple[Obstacles, ...]
+
+    @property
+    def first(self) -> Scene:
+        return self.scenes[0]
+
+
+def world_of(problem: Problem, b: int) -> World:
+    """The obstacles, the start and the goal of problem b.
+
+    Raises:
+        InputError: dynamics without a position.
+    """
+    one = problem.take(torch.tensor([b], device=problem.x0.device))
+    by_radius: dict[float, list[Body]] = {}
+    others = []
+    for part in one.obstacles:
+        if isinstance(part, BoundSpheres | BoundBoxes):
+            by_radius.setdefault(float(part.vehicle_radius[0]), []).extend(_bodies(part))
+        else:
+            others.append(part)
+    start = one.x0[:, one.position].cpu().numpy()
+    goal, radius = np.full_like(start, np.nan), np.nan
+    if one.goal is not None:
+        goal, radius = one.goal.position.cpu().numpy(), float(one.goal.radius[0])
+    dt = float(getattr(one.dynamics, "dt", None) or 0.0)
+    scenes = [
+        Scene((tuple(held),), start, goal, vehicle, radius, dt, np.array([b]))
+        for vehicle, held in (by_radius or {0.0: []}).items()
+    ]
+    return World(tuple(scenes), tuple(others))
+
+
+def _bodies(part: BoundSpheres | BoundBoxes) -> list[Body]:
+    centers, radii = part.centers[0].cpu().numpy(), (part.inflated_radii[0] - part.vehicle_radius[0]).cpu().numpy()
+    here = np.flatnonzero(~part.absent[0].cpu().numpy())
+    if isinstance(part, BoundSpheres):
+        moves = np.zeros_like(centers) if part.velocities is None else part.velocities[0].cpu().numpy()
+        return [Ball(centers[i], float(radii[i]), moves[i]) for i in here]
+    halves, axes = part.half_sizes[0].cpu().numpy(), part.axes[0].cpu().numpy()
+    return [Box(centers[i], halves[i], axes[i], max(0.0, float(radii[i]))) for i in here]
+
+
+def distances(part: Obstacles, low: np.ndarray, high: np.ndarray, plane: Plane, at: float) -> tuple[np.ndarray, ...]:
+    """Grids (V, W) of two coordinates in a plane, m, and the least signed distance there from obstacles at t = 0.
+
+    Args:
+        low, high: corners (d,), m, of what is seen.
+        at: the hidden coordinate, m.
+    """
+    first, second = plane
+    like = part.vehicle_radius
+    wide, high_ = (high - low)[[first, second]]
+    x, y = np.meshgrid(
+        np.linspace(low[first], high[first], GRID),
+        np.linspace(low[second], high[second], max(2, round(GRID * float(high_ / wide)))),
+    )
+    points = np.full((x.size, len(low)), at)
+    points[:, first], points[:, second] = x.ravel(), y.ravel()
+    p = torch.as_tensor(points, dtype=like.dtype, device=like.device).unsqueeze(0)
+    apart = part.signed_distance(p, p.new_zeros(p.shape[1]))[0]
+    least = apart.amin(-1) if apart.shape[-1] else torch.full_like(p[0, :, 0], torch.inf)
+    return x, y, least.cpu().numpy().reshape(x.shape)

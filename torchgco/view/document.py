@@ -1,0 +1,133 @@
+"""What a page shows: layouts, each with its obstacles and the trajectories flown through it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from torchgco.base.version import VERSION
+from torchgco.obstacles.base import Obstacles
+from torchgco.plotting.style import solver_colours
+from torchgco.problem.problem import Problem
+from torchgco.view.flights import Flight
+from torchgco.view.packing import Packing, number
+from torchgco.view.shapes import shapes_of
+from torchgco.view.vehicles import Look
+
+
+@dataclass
+class Document:
+    """A page in the making; lengths in metres, times in seconds.
+
+    Args:
+        title: of the page.
+        about: a line below it.
+        dimension: of space, 2 or 3.
+        dt: between two knots.
+        look: of the vehicle.
+        radius: of the vehicle, 0 where there are no obstacles.
+        solvers: their names, the one under study first.
+        constraints: names of the problem's constraints, in their order.
+        mission: whether the trajectories are flights in closed loop.
+    """
+
+    title: str
+    about: str
+    dimension: int
+    dt: float
+    look: Look
+    radius: float
+    solvers: Sequence[str]
+    constraints: Sequence[str] = ()
+    mission: bool = False
+    notes: list[str] = field(default_factory=list)
+    labels: list[dict[str, Any]] = field(default_factory=list)
+    parts: list[str] = field(default_factory=list)
+
+    def add(
+        self, label: str, problem: Problem, b: int, flights: Sequence[Flight], search: SearchPart | None = None
+    ) -> None:
+        """Add a layout: problem b of a batch, and its trajectories in the order of the solvers, where there are any."""
+        packing, at = Packing(), problem.position
+        start = problem.x0[b, at].detach().cpu().double().numpy()
+        goal = None if problem.goal is None else problem.goal.position[b].cpu().double().numpy()
+        middle = start if goal is None else 0.5 * (start + goal)
+        names = list(self.solvers)
+        part: dict[str, Any] = {
+            "middle": _numbers(middle), "start": _numbers(start), "goal": None if goal is None else _numbers(goal),
+            "goal_radius": None if problem.goal is None else number(problem.goal.radius[b]),
+            "obstacles": [shape.packed(packing, middle) for shape in self._shapes(problem.obstacles, b)],
+            "flights": [flight.packed(packing, names.index(flight.solver)) for flight in flights],
+            "search": None if search is None else search.packed(packing),
+        }  # fmt: skip
+        self.labels.append({"label": label, "results": {flight.solver: flight.result for flight in flights}})
+        self.parts.append(packing.sealed(part))
+
+    def _shapes(self, obstacles: Sequence[Obstacles], b: int) -> list[Any]:
+        found = []
+        for part in obstacles:
+            shapes = shapes_of(part, b)
+            if shapes is None:
+                note = f"not drawn: {type(part).__name__}"
+                self.notes += [] if note in self.notes else [note]
+            elif len(shapes.center):
+                found.append(shapes)
+        return found
+
+    def head(self) -> str:
+        """What holds for all layouts, compressed."""
+        colours = solver_colours(self.solvers)
+        text = {
+            "title": self.title, "about": self.about, "dimension": self.dimension, "dt": number(self.dt),
+            "body": self.look.body, "radius": number(self.radius), "mission": self.mission, "version": VERSION,
+            "solvers": [{"name": name, "colour": colours[name]} for name in self.solvers],
+            "constraints": list(self.constraints), "layouts": self.labels, "notes": self.notes,
+        }  # fmt: skip
+        return Packing().sealed(text)
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    return [number(value) for value in values]
+
+
+@dataclass(frozen=True)
+class Line:
+    """A path or a trajectory of a search: corners (K, d), m, and what is said about it."""
+
+    points: np.ndarray
+    kind: str  # "path", "caught", "tracked", "relaxed" or "refined"
+    group: int  # its homotopy class
+    fate: str
+    text: str
+
+
+@dataclass(frozen=True)
+class SearchPart:
+    """A search for ways around obstacles, as the page shows it on demand.
+
+    Args:
+        passes: what each pass of the solver did, in words.
+        rounds: a name and its lines for each comparison of candidates, in their order.
+        guides: balls (K, d + 1), centre and radius, and the sampled trajectory (K', d), of each outer iteration with
+            guidance on.
+    """
+
+    passes: Sequence[str]
+    rounds: Sequence[tuple[str, Sequence[Line]]]
+    guides: Sequence[tuple[str, np.ndarray, np.ndarray]] = ()
+
+    def packed(self, packing: Packing) -> dict[str, Any]:
+        rounds = [{"name": name, "lines": [_line(packing, line) for line in lines]} for name, lines in self.rounds]
+        guides = [
+            {"name": name, "balls": packing.put(balls), "sample": packing.put(sample, steps=True)}
+            for name, balls, sample in self.guides
+        ]
+        return {"passes": list(self.passes), "rounds": rounds, "guides": guides}
+
+
+def _line(packing: Packing, line: Line) -> dict[str, Any]:
+    held = {"kind": line.kind, "group": line.group, "fate": line.fate, "text": line.text}
+    return held | {"points": packing.put(line.points, steps=True)}

@@ -1,0 +1,74 @@
+"""The record of a search (`Solution.search`) as the page shows it on demand."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+from torchgco.problem.problem import Problem
+from torchgco.solution import Comparison, Fate, SearchRecord, Solution
+from torchgco.view.document import Line, SearchPart
+from torchgco.view.flights import whole
+
+STEPS = ("tracked", "relaxed", "refined")
+
+
+def search_of(solution: Solution, problem: Problem, b: int) -> SearchPart | None:
+    """What the search did for problem b; None where there is no record."""
+    record = solution.search
+    if record is None:
+        return None
+    passes = [f"{name}" for _, name, rows in record.passes if b in rows]
+    rounds = []
+    for one in record.comparisons:
+        for i in (one.rows == b).nonzero().flatten().tolist():
+            lines = [*_caught(record, problem, b), *_paths(one, i), *_candidates(one, problem, i)]
+            rounds.append((f"pass {one.number}, {_candidates_in(one, i)} candidates", lines))
+    return SearchPart(passes, rounds)
+
+
+def _candidates_in(one: Comparison, i: int) -> int:
+    return int((one.fate[i] != int(Fate.ABSENT)).sum())
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().double().numpy()
+
+
+def _caught(record: SearchRecord, problem: Problem, b: int) -> list[Line]:
+    if record.caught is None:
+        return []
+    rows, states = record.caught
+    found = (rows == b).nonzero().flatten().tolist()
+    return [Line(whole(_array(states[i]))[:, problem.position], "caught", 0, "", "") for i in found]
+
+
+def _paths(one: Comparison, i: int) -> list[Line]:
+    """The paths of the roadmap that are there, each in its homotopy class."""
+    found = []
+    for path in range(one.paths.shape[1]):
+        corners = whole(_array(one.paths[i, path]))
+        if len(corners) > 1:
+            group = int(one.classes[i, path])
+            length = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
+            same = "" if group == path else f", of the class of path {group + 1}"
+            found.append(Line(corners, "path", group, "", f"path {path + 1}: {length:.2f} m{same}"))
+    return found
+
+
+def _candidates(one: Comparison, problem: Problem, i: int) -> list[Line]:
+    """The trajectories of each candidate after each step that it reached; its fate is told once, with the last."""
+    found = []
+    for c in range(one.fate.shape[1]):
+        fate = Fate(int(one.fate[i, c]))
+        if fate == Fate.ABSENT:
+            continue
+        path, cost = int(one.path[i, c]), float(one.cost[i, c])
+        steps = {step: whole(_array(getattr(one, step)[i, c]))[:, problem.position] for step in STEPS}
+        reached = [step for step, points in steps.items() if len(points) > 1]
+        told = f"candidate {c + 1} along path {path + 1}: {fate.name.lower()}"
+        told += f", cost {cost:.6g}" if np.isfinite(cost) else ""
+        for step in reached:
+            text = told if step == reached[-1] else ""
+            found.append(Line(steps[step], step, int(one.classes[i, path]), fate.name.lower(), text))
+    return found

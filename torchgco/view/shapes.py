@@ -1,0 +1,132 @@
+"""Obstacles as the page draws them: boxes, rounded outwards by a radius. A sphere is one without sides.
+
+A kind of obstacles of your own is drawn once `SHAPES` has a function for it:
+
+    SHAPES[Shore] = lambda shore, b: Shapes(center, half, radius)  # of problem b, as numpy arrays
+
+Without one it is drawn as the search for paths sees it (`Obstacles.inflated`), and else not at all; the page says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from torchgco.obstacles.base import Obstacles, Solids
+from torchgco.obstacles.box_geometry import Cuboids
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.view.packing import Packing
+
+STRAIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no turn
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """M rounded boxes; lengths in metres. An array of one row stands for M equal rows, which takes less room.
+
+    Args:
+        center: (M, d) at t = 0.
+        half: (M | 1, d): half the sides' lengths before rounding; zero: a sphere, or a disc in the plane.
+        radius: (M | 1,) by which they are rounded.
+        turn: (M | 1, 4) unit quaternions [w, x, y, z], or (M | 1,) angles in the plane; None: sides along the axes.
+        velocity: (M | 1, d), m/s; None: at rest.
+        until: s, when they stop to move and to count; None: never.
+    """
+
+    center: np.ndarray
+    half: np.ndarray
+    radius: np.ndarray
+    turn: np.ndarray | None = None
+    velocity: np.ndarray | None = None
+    until: float | None = None
+
+    def packed(self, packing: Packing, middle: np.ndarray) -> dict[str, Any]:
+        """As the page reads them; centres count from `middle` (d,), near which half precision is finest."""
+        held: dict[str, Any] = {"count": len(self.center), "until": self.until}
+        arrays = {"center": self.center - middle, "half": self.half, "radius": self.radius, "turn": self.turn}
+        arrays["velocity"] = self.velocity
+        return held | {name: packing.put(once(part)) for name, part in arrays.items() if part is not None}
+
+
+ShapesOf = Callable[[Any, int], Shapes]
+
+
+def once(rows: np.ndarray) -> np.ndarray:
+    """Equal rows as a single one."""
+    return rows[:1] if len(rows) > 1 and bool((rows == rows[0]).all()) else rows
+
+
+def _here(part: Obstacles, b: int) -> np.ndarray:
+    return (~part.absent[b]).nonzero().flatten().cpu().numpy()
+
+
+def _rows(values: Tensor, b: int, here: np.ndarray) -> np.ndarray:
+    return values[b].detach().cpu().double().numpy()[here]
+
+
+def _spheres(part: BoundSpheres, b: int) -> Shapes:
+    here = _here(part, b)
+    center, radius = _rows(part.centers, b, here), _rows(part.inflated_radii, b, here)
+    moves = part.velocities is not None and bool(part.velocities[b].any())
+    velocity = _rows(part.velocities, b, here) if moves and part.velocities is not None else None
+    stop = None if part.stops is None else float(part.stops[b]) * part.dt
+    return Shapes(center, np.zeros((1, center.shape[1])), radius - float(part.vehicle_radius[b]), None, velocity, stop)
+
+
+def _boxes(part: BoundBoxes, b: int) -> Shapes:
+    here = _here(part, b)
+    radius = (_rows(part.inflated_radii, b, here) - float(part.vehicle_radius[b])).clip(min=0.0)
+    axes = _rows(part.axes, b, here)
+    return Shapes(_rows(part.centers, b, here), _rows(part.half_sizes, b, here), radius, turns(axes))
+
+
+def _solids(part: Obstacles, solids: Solids, b: int) -> Shapes:
+    here = (~solids.absent[b]).nonzero().flatten().cpu().numpy()
+    center = _rows(solids.centers, b, here)
+    radius = (_rows(solids.radii, b, here) - float(part.vehicle_radius[b])).clip(min=0.0)
+    if not isinstance(solids, Cuboids):
+        return Shapes(center, np.zeros((1, center.shape[1])), radius)
+    return Shapes(center, _rows(solids.half_sizes, b, here), radius, turns(_rows(solids.axes, b, here)))
+
+
+# What the page draws for obstacles of each kind, once bound to a problem, and the place of a problem in its batch.
+SHAPES: dict[type[Obstacles], ShapesOf] = {BoundSpheres: _spheres, BoundBoxes: _boxes}
+
+
+def shapes_of(part: Obstacles, b: int) -> Shapes | None:
+    """The obstacles of problem b; None where nobody says how they look."""
+    for kind, shapes in SHAPES.items():
+        if isinstance(part, kind):
+            return shapes(part, b)
+    solids = part.inflated()
+    return None if solids is None else _solids(part, solids, b)
+
+
+def turns(axes: np.ndarray) -> np.ndarray | None:
+    """Angles (M,), or unit quaternions (M, 4), of sides along the rows of axes (M, d, d); None where all are straight.
+
+    The quaternion is read off the largest of its squared components, which no small divisor spoils (Shepperd, 1978).
+    """
+    if bool((np.abs(axes - np.eye(axes.shape[-1])) < 1e-9).all()):
+        return None
+    if axes.shape[-1] == 2:
+        return np.arctan2(axes[:, 0, 1], axes[:, 0, 0])
+    R = axes.transpose(0, 2, 1)  # columns: where the axes of space are turned to
+    diagonal = np.stack([R[:, i, i] for i in range(3)], axis=-1)
+    trace = diagonal.sum(axis=-1)
+    squares = np.concatenate((1.0 + trace[:, None], 1.0 + 2.0 * diagonal - trace[:, None]), axis=-1)  # 4 q_i^2
+    odd = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=-1)  # 4 q_0 q_i
+    even = R + R.transpose(0, 2, 1)  # 4 q_i q_j off the diagonal
+    products = np.empty((len(R), 4, 4))
+    products[:, 0, 0], products[:, 0, 1:], products[:, 1:, 0] = squares[:, 0], odd, odd
+    products[:, 1:, 1:] = even
+    for i in range(3):
+        products[:, i + 1, i + 1] = squares[:, i + 1]
+    largest = squares.argmax(axis=-1)
+    found = products[np.arange(len(R)), largest]
+    return found / np.linalg.norm(found, axis=-1, keepdims=True)

@@ -1,0 +1,227 @@
+// All obstacles of a layout in one draw call: rounded boxes. A sphere has no sides, a capsule one, a sharp box no radius.
+// A kind of obstacles that isn't made of rounded boxes gets its own mesh here.
+import * as THREE from "./three.module.min.js";
+
+const MANY = 60; // shapes from which on each has fewer corners
+const LONG = 0.35; // half sides longer than this share of the scene are cut where the scene ends
+export const SUN = new THREE.Vector3(-0.25, -0.4, 0.88).normalize();
+
+/** The rounded box with half sides `corner` and radius 1 of `offset`: every vertex is half * corner + radius * offset. */
+function solid(steps, rings) {
+  const corners = [];
+  const offsets = [];
+  const index = [];
+  const ring = quarterTurns(4, steps);
+  const levels = [];
+  for (const up of [-1, 1]) {
+    for (let i = 0; i <= rings; i++) levels.push({ up, angle: ((up < 0 ? i - rings : i) / rings) * 0.5 * Math.PI });
+  }
+  for (const { up, angle } of levels) {
+    for (const { x, y, sx, sy } of ring) {
+      corners.push(sx, sy, up);
+      offsets.push(Math.cos(angle) * x, Math.cos(angle) * y, Math.sin(angle));
+    }
+  }
+  const count = ring.length;
+  for (let level = 0; level + 1 < levels.length; level++) {
+    for (let i = 0; i < count; i++) {
+      const a = level * count + i;
+      const b = level * count + ((i + 1) % count);
+      index.push(a, b, b + count, a, b + count, a + count);
+    }
+  }
+  const quarter = steps + 1; // the first corner of each quarter
+  const top = (levels.length - 1) * count;
+  index.push(top, top + quarter, top + 2 * quarter, top, top + 2 * quarter, top + 3 * quarter);
+  index.push(0, 2 * quarter, quarter, 0, 3 * quarter, 2 * quarter);
+  return { corners, offsets, normals: offsets, index };
+}
+
+/** The same for the plane: a prism, rounded in the plane alone, with a lid. */
+function prism(steps) {
+  const corners = [];
+  const offsets = [];
+  const normals = [];
+  const index = [];
+  const ring = quarterTurns(4, steps);
+  for (const up of [-1, 1]) {
+    for (const { x, y, sx, sy } of ring) {
+      corners.push(sx, sy, up);
+      offsets.push(x, y, 0);
+      normals.push(x, y, 0);
+    }
+  }
+  const count = ring.length;
+  for (let i = 0; i < count; i++) {
+    const next = (i + 1) % count;
+    index.push(i, next, count + next, i, count + next, count + i);
+    corners.push(ring[i].sx, ring[i].sy, 1);
+    offsets.push(ring[i].x, ring[i].y, 0);
+    normals.push(0, 0, 1);
+    if (i > 1) index.push(2 * count, 2 * count + i - 1, 2 * count + i);
+  }
+  return { corners, offsets, normals, index };
+}
+
+/** Directions around z with both ends of each quarter, and the signs of its corner. */
+function quarterTurns(quarters, steps) {
+  const found = [];
+  for (let quarter = 0; quarter < quarters; quarter++) {
+    const middle = (quarter + 0.5) * 0.5 * Math.PI;
+    for (let i = 0; i <= steps; i++) {
+      const angle = (quarter + i / steps) * 0.5 * Math.PI;
+      const signs = { sx: Math.sign(Math.cos(middle)), sy: Math.sign(Math.sin(middle)) };
+      found.push({ x: Math.cos(angle), y: Math.sin(angle), ...signs });
+    }
+  }
+  return found;
+}
+
+// Long shapes end where the scene does: their corners are moved there, which leaves a flat end.
+const SHAPE = `
+attribute vec3 corner; attribute vec3 middle; attribute vec3 sides; attribute float radius;
+attribute vec4 turn; attribute vec3 velocity; attribute vec3 cut;
+uniform float time; uniform float grown; uniform vec3 low; uniform vec3 high;
+#ifdef STRAIGHT
+#define turned(q, v) (v)
+#else
+vec3 turned(vec4 q, vec3 v) { return v + 2.0 * cross(q.yzw, cross(q.yzw, v) + q.x * v); }
+#endif
+vec3 whole() { return middle + time * velocity + turned(turn, corner * sides + (radius + grown) * position); }
+vec3 placed(vec3 p) { return mix(p, clamp(p, low, high), cut); }
+vec3 faced(vec3 p) {
+  vec3 n = turned(turn, normal);
+  vec3 over = cut * (step(high, p) - step(p, low));
+  return dot(over, n) > 0.001 ? normalize(over) : n;
+}
+`;
+// Light is computed at the corners alone: without a graphics card every pixel counts.
+const PLAIN = {
+  vertexShader: `${SHAPE}
+    uniform vec3 colour; uniform vec3 sun; varying vec3 shade;
+    void main() {
+      vec3 p = whole();
+      vec3 n = faced(p);
+      vec3 light = mix(vec3(0.42, 0.40, 0.38), vec3(0.66, 0.67, 0.69), 0.5 + 0.5 * n.z) + 0.5 * max(0.0, dot(n, sun));
+      shade = pow(colour * light, vec3(1.0 / 2.2));
+      gl_Position = projectionMatrix * viewMatrix * vec4(placed(p), 1.0);
+    }`,
+  fragmentShader: "uniform float opacity; varying vec3 shade; void main() { gl_FragColor = vec4(shade, opacity); }",
+};
+
+function plain(colour, opacity, uniforms, straight) {
+  const own = { colour: { value: colour }, opacity: { value: opacity }, sun: { value: SUN } };
+  const made = new THREE.ShaderMaterial({ ...PLAIN, uniforms: { ...uniforms, ...own } });
+  if (straight) made.defines.STRAIGHT = true;
+  made.transparent = opacity < 1;
+  made.depthWrite = opacity === 1;
+  return made;
+}
+
+/** A material of three.js for the shapes, with shadows, for pictures that stand still. */
+function shaded(kind, options, uniforms) {
+  const made = new THREE[kind](options);
+  made.onBeforeCompile = (shader) => {
+    Object.assign(shader.uniforms, uniforms);
+    shader.vertexShader = (SHAPE + shader.vertexShader)
+      .replace("#include <beginnormal_vertex>", "vec3 objectNormal = faced(whole());")
+      .replace("#include <begin_vertex>", "vec3 transformed = placed(whole());");
+  };
+  return made;
+}
+
+/** The obstacles of a layout as meshes, and the numbers that the scene changes later. */
+export function obstacles(parts, space, colours, still) {
+  const group = new THREE.Group();
+  const uniforms = { time: { value: 0 }, low: { value: space.low }, high: { value: space.high }, grown: { value: 0 } };
+  const colour = new THREE.Color(colours.obstacle);
+  const straight = parts.every((part) => !part.turn);
+  const solids = still ? shaded("MeshLambertMaterial", { color: colour }, uniforms) : plain(colour, 1, uniforms, straight);
+  const clear = plain(colour, 0.3, uniforms, straight);
+  const hull = plain(colour, 0.18, { ...uniforms, grown: { value: space.radius } }, straight);
+  const shadow = shaded("MeshDepthMaterial", { depthPacking: THREE.RGBADepthPacking }, uniforms);
+  const meshes = [];
+  const shells = [];
+  for (const part of parts) {
+    const geometry = geometryOf(part, space);
+    const mesh = new THREE.Mesh(geometry, solids);
+    mesh.castShadow = mesh.receiveShadow = true;
+    mesh.customDepthMaterial = shadow;
+    const shell = new THREE.Mesh(geometry, hull);
+    shell.visible = false;
+    meshes.push(mesh);
+    shells.push(shell);
+  }
+  group.add(...meshes, ...shells);
+  group.children.forEach((one) => (one.frustumCulled = false));
+  const until = Math.min(...parts.map((part) => part.until ?? Infinity), Infinity);
+  return {
+    group,
+    setTime: (t) => (uniforms.time.value = Math.min(t, until)),
+    setGrown: (on) => shells.forEach((shell) => (shell.visible = on)),
+    setSeeThrough: (on) => meshes.forEach((mesh) => (mesh.material = on ? clear : solids)),
+    dispose: () => {
+      [solids, clear, hull, shadow].forEach((one) => one.dispose());
+      meshes.forEach((mesh) => mesh.geometry.dispose());
+    },
+  };
+}
+
+function geometryOf(part, space) {
+  const [steps, rings] = part.count > MANY ? [3, 2] : [6, 5];
+  const template = space.flat ? prism(2 * steps) : solid(steps, rings);
+  const geometry = new THREE.InstancedBufferGeometry();
+  geometry.instanceCount = part.count;
+  geometry.setIndex(template.index);
+  geometry.setAttribute("position", new THREE.Float32BufferAttribute(template.offsets, 3));
+  geometry.setAttribute("normal", new THREE.Float32BufferAttribute(template.normals, 3));
+  geometry.setAttribute("corner", new THREE.Float32BufferAttribute(template.corners, 3));
+  const rows = instances(part, space);
+  for (const [name, size] of Object.entries({ middle: 3, sides: 3, radius: 1, turn: 4, velocity: 3, cut: 3 })) {
+    geometry.setAttribute(name, new THREE.InstancedBufferAttribute(rows[name], size));
+  }
+  return geometry;
+}
+
+/** Numbers per shape, in space also where they are given in the plane. */
+export function instances(part, space) {
+  const row = (array, k) => (array ? Math.min(k, array.rows - 1) * array.width : 0);
+  const sizes = { middle: 3, sides: 3, radius: 1, turn: 4, velocity: 3, cut: 3 };
+  const found = Object.fromEntries(
+    Object.entries(sizes).map(([name, size]) => [name, new Float32Array(size * part.count)]),
+  );
+  for (let k = 0; k < part.count; k++) {
+    for (let i = 0; i < (space.flat ? 2 : 3); i++) {
+      found.middle[3 * k + i] = part.center.data[row(part.center, k) + i] + space.middle[i];
+      found.sides[3 * k + i] = part.half.data[row(part.half, k) + i];
+      if (part.velocity) found.velocity[3 * k + i] = part.velocity.data[row(part.velocity, k) + i];
+    }
+    if (space.flat) found.middle[3 * k + 2] = found.sides[3 * k + 2] = 0.5 * space.height;
+    found.radius[k] = part.radius.data[row(part.radius, k)];
+    found.turn.set(turnOf(part.turn, row(part.turn, k)), 4 * k);
+    if (!space.flat) found.cut.set(cuts(found, k, space), 3 * k);
+  }
+  return found;
+}
+
+/** 1 for the axes along which shape k is long and straight, else 0: only then does a moved corner leave it straight. */
+function cuts({ sides, radius, turn }, k, space) {
+  const [w, x, y, z] = turn.subarray(4 * k, 4 * k + 4);
+  const quaternion = new THREE.Quaternion(x, y, z, w);
+  const found = [0, 0, 0];
+  for (let i = 0; i < 3; i++) {
+    const half = sides[3 * k + i];
+    if (half + radius[k] <= LONG * space.size) continue;
+    const along = new THREE.Vector3().setComponent(i, 1).applyQuaternion(quaternion).toArray().map(Math.abs);
+    const axis = along.indexOf(Math.max(...along));
+    if (along[axis] > 0.99999 && half > 0) found[axis] = 1;
+  }
+  return found;
+}
+
+function turnOf(turn, at) {
+  if (!turn) return [1, 0, 0, 0];
+  if (turn.width === 4) return turn.data.subarray(at, at + 4);
+  const half = 0.5 * turn.data[at];
+  return [Math.cos(half), 0, 0, Math.sin(half)];
+}
