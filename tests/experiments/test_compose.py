@@ -56,7 +56,7 @@ def scenes() -> dict[str, tuple[str, list[str]]]:
 
 
 def test_every_scenario_has_a_model_that_the_matrix_names() -> None:
-    assert set(MODEL) | {"layouts"} == set(options_of("scenario")) and set(OF_MODEL) == set(options_of("model"))
+    assert set(MODEL) | {"layouts", "map"} == set(options_of("scenario")) and set(OF_MODEL) == set(options_of("model"))
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)

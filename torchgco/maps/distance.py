@@ -15,7 +15,7 @@ from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.lookup import Lattice, distances
 from torchgco.maps.points import PointCloud
 
-FINE = 2**22  # nodes, at most, of fields with two nodes per cell and axis where `refine` doesn't say
+FINE = 2**23  # nodes, at most, of fields with two nodes per cell and axis where `refine` doesn't say
 NODES = 2**30  # of one field
 FAR = 1e6  # m: the distance where nothing is occupied
 MARGIN = 2  # nodes around the points of a cloud

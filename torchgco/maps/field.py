@@ -165,8 +165,9 @@ class BoundField(Obstacles):
         near = ~self.absent & (bound < gap.amin(-1, keepdim=True) + self.field.spacing) if gap.numel() > 0 else gap > 0
         steps = (along / (STEPS * self.field.spacing)).ceil()
         i, e = (near & (steps > 1)).nonzero(as_tuple=True)
-        most = AT_ONCE // (int(steps[i, e].amax()) + 1) if len(i) > 0 else 1
-        for rows, segments in zip(i.split(max(1, most)), e.split(max(1, most)), strict=True):
+        most = max(1, AT_ONCE // (int(steps[i, e].amax()) + 1)) if len(i) > 0 else 1
+        for first in range(0, len(i), most):
+            rows, segments = i[first : first + most], e[first : first + most]
             ends = a[rows, segments], b[rows, segments]
             gap[rows, segments] = self._between(rows, *ends, steps[rows, segments])
         return torch.where(near | self.absent, gap, bound).unsqueeze(-1)

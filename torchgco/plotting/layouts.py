@@ -18,6 +18,7 @@ from matplotlib.patches import Circle, Patch
 from torchgco.base.errors import InputError
 from torchgco.plotting.bodies import ABOVE, Plane
 from torchgco.plotting.grid import grid, put_head
+from torchgco.plotting.maps import draw_map
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, passes, scene_of, view
 from torchgco.plotting.style import INK, SMALL, TITLE, solver_colours, solver_dash, tasks_of
 
@@ -89,9 +90,13 @@ def layout_grid(
 def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mapping[str, list[Flight]]) -> set[str]:
     """Draw layout i from one side or several; returns the kinds of drawn shapes and marks, for the legend."""
     here, drawn = {solver: row[i] for solver, row in flights.items()}, set()
-    lead = passes(scene, i, _leading(scene, i, [flight.path for flight in here.values()]))
+    path = _leading(scene, i, [flight.path for flight in here.values()])
+    lead = passes(scene, i, path)
     for plane, ax in axes.items():
         drawn |= draw_obstacles(ax, scene, i, lead, plane)
+        if scene.map is not None:
+            draw_map(ax, scene.map, flown(path), plane, scene.margin, {"facecolor": STONE, "edgecolor": EDGE})
+            drawn |= {"own", "grown"} if scene.margin > 0 else {"own"}
         drawn |= _paths(ax, scene, i, here, plane)
         draw_targets(ax, scene, i, plane)
     return drawn

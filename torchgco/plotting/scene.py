@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.plotting.bodies import Body, bodies
+from torchgco.scenarios.stored_maps import map_of
 
 Arrays = Mapping[str, np.ndarray]
 SLACK = 0.12  # share of the scene's size by which obstacles and flights that miss the goal may widen a map
@@ -28,6 +30,7 @@ class Scene:
         goal_radius: nan where unknown.
         dt: s, 0 where unknown: moving obstacles are then drawn where they start.
         ids: (L,) index of each layout in its file or generator.
+        map: of all layouts, or None.
     """
 
     bodies: tuple[tuple[Body, ...], ...]
@@ -37,6 +40,7 @@ class Scene:
     goal_radius: float
     dt: float
     ids: np.ndarray
+    map: DistanceField | None = None
 
     @property
     def dimension(self) -> int:
@@ -67,6 +71,7 @@ def scene_of(layouts: Arrays) -> Scene:
         goal_radius=float(layouts.get("goal_radius", np.nan)),
         dt=float(layouts.get("dt", 0.0)),
         ids=np.asarray(layouts.get("layout", np.arange(count))),
+        map=map_of(layouts),
     )
 
 
@@ -129,6 +134,8 @@ def view(scene: Scene, shown: Iterable[int], whole: list[np.ndarray], others: li
     ring = np.nan_to_num(scene.goal_radius)
     ends = [scene.start[shown], scene.goal[shown] - ring, scene.goal[shown] + ring]
     edges = [_extent(body, scene.margin) for i in shown for body in scene.bodies[i] if not body.moving]
+    if scene.map is not None:
+        edges.append(np.stack([scene.map.origin[0], scene.map.upper[0]]))
     corners = _corners([*whole, *ends])
     if corners is None:
         corners = _corners(edges)

@@ -4,6 +4,7 @@ from torchgco.scenarios.base import Scenario
 from torchgco.scenarios.crossing import Crossing
 from torchgco.scenarios.files import LayoutFile
 from torchgco.scenarios.layouts import Layouts, concatenate
+from torchgco.scenarios.maps import MapFile
 from torchgco.scenarios.mazes import Mazes
 from torchgco.scenarios.planar import PlanarRandom, PlanarTrap
 from torchgco.scenarios.quadrotor import Forest, ForestMoving, Walls
@@ -17,6 +18,7 @@ __all__ = [
     "ForestMoving",
     "LayoutFile",
     "Layouts",
+    "MapFile",
     "Mazes",
     "PlanarRandom",
     "PlanarTrap",

@@ -17,7 +17,9 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.options import Natural, check_value
-from torchgco.scenarios import checks
+from torchgco.maps.distance import DistanceField
+from torchgco.scenarios import checks, stored_maps
+from torchgco.scenarios.stored_maps import map_arrays, map_of
 from torchgco.solvers.memory import free_memory
 
 # Arrays of a file, in the order of the fields of Layouts. `layout` holds the ids, if they are not 0..L-1.
@@ -47,6 +49,8 @@ class Layouts:
             axes of space, NaN where absent; None: sides along the axes.
         box_radii: (L, K) m by which boxes are rounded outwards, NaN where absent; None: sharp boxes. Where above 0,
             half sides may be 0: a capsule has one side above 0.
+        map: the distance field of a map that all layouts share, or None. In a file: the arrays `map_occupied`,
+            `map_origin` and `map_resolution`, or `map_points` and `map_radius`, and `map_unknown`.
         name: of the family, or the stem of the file.
         ids: (L,) int64, index of each layout in its file or generator; 0..L-1 unless given.
 
@@ -69,6 +73,7 @@ class Layouts:
     box_half_sizes: np.ndarray | None = None
     box_rotations: np.ndarray | None = None
     box_radii: np.ndarray | None = None
+    map: DistanceField | None = None
     name: str = "layouts"
     ids: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  # empty stands for 0..L-1
 
@@ -95,6 +100,8 @@ class Layouts:
         put("control_upper", upper)
         put("best_cost", checks.best_cost(self.best_cost, len(centers)))
         put("ids", checks.ids(self.ids, len(centers)))
+        if self.map is not None and (self.map.d != self.dimension or self.map.batch is not None):
+            raise InputError("layouts.map", f"one map for all, {self.dimension}-D as centers", f"a {self.map.d}-D one")
         check_value(self.name, str, "layouts.name")
 
     @property
@@ -110,6 +117,7 @@ class Layouts:
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays that a file of these layouts holds, by name, without those that are None."""
         held = {name: np.asarray(getattr(self, name)) for name in NAMED if getattr(self, name) is not None}
+        held |= {} if self.map is None else map_arrays(self.map)
         if not np.array_equal(self.ids, np.arange(self.count)):
             held[IDS] = self.ids
         return held
@@ -166,12 +174,13 @@ class Layouts:
         for name in REQUIRED:
             if name not in held:
                 raise InputError(f"layouts.{name}", f"this array in {path}", f"only {sorted(held)}")
-        known = (*NAMED, IDS)
+        known = (*NAMED, *stored_maps.NAMES, IDS)
         for name in held:
             if name not in known:
                 raise InputError(f"layouts.{name}", f"only {', '.join(known)}", f"this one in {path}")
         ids = held.pop(IDS, np.empty(0, np.int64))
-        return cls(**held, name=path.stem, ids=ids)  # type: ignore[arg-type]
+        there = {name: held.pop(name) for name in stored_maps.NAMES if name in held}
+        return cls(**held, map=map_of(there), name=path.stem, ids=ids)  # type: ignore[arg-type]
 
 
 def _without_spheres(held: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -214,9 +223,17 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
         radii=np.concatenate([part.radii for part in parts]),
         **{name: None if column[0] is None else np.concatenate(column) for name, column in columns.items()},
         **shared,
+        map=_shared_map(parts),
         name="+".join(dict.fromkeys(part.name for part in parts)),
         ids=np.concatenate([part.ids for part in parts]),
     )
+
+
+def _shared_map(parts: Sequence[Layouts]) -> DistanceField | None:
+    first = parts[0].map
+    if any(part.map is not first for part in parts):
+        raise InputError("layouts.map", "the same in all parts", "others")
+    return first
 
 
 def _joined_boxes(parts: Sequence[Layouts]) -> dict[str, list[Any]]:

@@ -17,6 +17,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.base import Dynamics
+from torchgco.maps.field import Field
 from torchgco.obstacles.boxes import Boxes
 from torchgco.obstacles.spheres import Spheres
 from torchgco.problem.goal import Goal
@@ -130,6 +131,8 @@ class Vehicle:
             )
             radius = _given(layouts.vehicle_radius, self.radius)
             constraints.append(Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns, radii))
+        if layouts.map is not None:
+            constraints.append(Field(layouts.map, _given(layouts.vehicle_radius, self.radius)))
         cost = QuadraticCost(
             Q=tensor(list(self.state_weight)), R=tensor(list(self.control_weight)),
             Qf=tensor(list(self.terminal_weight)), x_ref=tensor(goal).unsqueeze(1),

@@ -68,7 +68,8 @@ class Setup:
             field = "model.vehicle.stages" if first.stages is None else "scenario.stages"
             got = f"{N} stages with {bodies} obstacles, {_gigabytes(problem)} or more"
             raise InputError(field, f"a problem that fits into the free memory, {_gigabytes(free)}", got)
-        flights = count * (sum(held.nbytes for held in first.arrays().values()) + 8 * N * dynamics.m)
+        own = replace(first, map=None).arrays()  # all layouts share a map
+        flights = count * (sum(held.nbytes for held in own.values()) + 8 * N * dynamics.m)
         if flights > free:
             got = f"{count}, {_gigabytes(flights)} or more"
             raise InputError("study.layouts", f"layouts that fit into the free memory, {_gigabytes(free)}", got)
@@ -141,7 +142,9 @@ def build(config: DictConfig) -> Setup:
     """
     check(plain(config))
     if OmegaConf.is_missing(config.scenario, "path"):
-        raise InputError("scenario.path", "the layout file: add scenario.path=FILE.npz", "none")
+        of_map = str(config.scenario.get("_target_")).endswith("MapFile")
+        wanted = "the map: add scenario.path=FILE" if of_map else "the layout file: add scenario.path=FILE.npz"
+        raise InputError("scenario.path", wanted, "none")
     device, dtype = _device(config.device)
     setup = Setup(
         config=config,

@@ -29,6 +29,7 @@ from torchgco.scenarios import (
     Forest,
     ForestMoving,
     LayoutFile,
+    MapFile,
     Mazes,
     PlanarRandom,
     PlanarTrap,
@@ -94,6 +95,7 @@ def register() -> None:
     register_resolver("torchgco.drawn", _drawn)
     register_resolver("torchgco.options", _help)
     _store("scenario", "layouts", _fields_of(LayoutFile))
+    _store("scenario", "map", _fields_of(MapFile))
     for family in FAMILIES:
         made = family()
         (model,) = (name for name, space in BUILT_IN.items() if space == (made.dimension, made.states))

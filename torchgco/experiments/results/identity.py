@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchgco.scenarios import Layouts
 from torchgco.scenarios.layouts import BOXES
+from torchgco.scenarios.stored_maps import map_arrays
 
 ARITHMETIC = ("name", "dtype", "kernels")  # keys of `device` that decide results
 # Keys of `model.vehicle` that layouts may override, and by which of their fields.
@@ -124,6 +125,12 @@ def _digest_of(normal: Any) -> str:
     return sha256(json.dumps(normal, sort_keys=True, default=str).encode()).hexdigest()[:DIGITS]
 
 
+def _digest_of_array(value: np.ndarray) -> str:
+    """Of a large array: its bytes, type and shape."""
+    head = f"{value.dtype.str} {value.shape}".encode()
+    return sha256(head + np.ascontiguousarray(value).tobytes()).hexdigest()[:DIGITS]
+
+
 def layout_digests(
     layouts: Layouts, vehicle: Mapping[str, Any], loop: Mapping[str, Any] | None = None
 ) -> dict[int, str]:
@@ -141,6 +148,8 @@ def layout_digests(
     for key, field in OVERRULED.items():
         given = getattr(layouts, field)
         shared[key] = vehicle.get(key) if given is None else given
+    if layouts.map is not None:
+        shared["map"] = {name: _digest_of_array(value) for name, value in map_arrays(layouts.map).items()}
     shared = _normal(shared)  # once for all layouts: a study may have thousands
     moves = layouts.velocities is not None and bool(np.nan_to_num(layouts.velocities).any())
     codes = {}

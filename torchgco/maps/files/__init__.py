@@ -4,5 +4,6 @@ Files of others are data only: no pickles, no code, no memory taken before sizes
 file is one InputError with its name.
 """
 
+from torchgco.maps.files.arrays import read_task as read_task
 from torchgco.maps.files.read import FORMATS as FORMATS
 from torchgco.maps.files.read import read as read

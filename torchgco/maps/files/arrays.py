@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from torchgco.maps.files.source import MOST_BYTES, MOST_POINTS, Source, finite_p
 from torchgco.maps.grid import OccupancyGrid
 
 NPZ = "a map with occupied (X, Y[, Z]), origin (d,) and resolution"
+TASK = ("start", "goal", "vehicle_radius", "goal_radius")
 NPY = "an npy file of numbers, without pickles"
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -25,6 +27,14 @@ def read_npz(source: Source) -> OccupancyGrid:
     if origin.shape != (occupied.ndim,):  # one grid per problem isn't for files
         source.refuse("origin (d,) for occupied (X, Y[, Z])", f"{origin.shape} for {occupied.shape}")
     return made(source, occupied, origin, arrays["resolution"])
+
+
+def read_task(path: Path) -> dict[str, np.ndarray]:
+    """What an npz file says of the flight beside its map: start, goal (d,), vehicle_radius, goal_radius, m."""
+    if path.suffix.lower() != ".npz":
+        return {}
+    arrays = read_arrays(path, "scenario.path", NPZ, room=MOST_BYTES)
+    return {name: arrays[name] for name in TASK if name in arrays}
 
 
 def read_npy(

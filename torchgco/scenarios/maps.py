@@ -1,0 +1,154 @@
+"""Flights on the map in a file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchgco.base.errors import InputError, shown
+from torchgco.base.options import Seed, check_options, check_value
+from torchgco.maps.distance import DistanceField, Unknown
+from torchgco.maps.files import read, read_task
+from torchgco.maps.grid import coordinates
+from torchgco.scenarios import checks
+from torchgco.scenarios.base import MAX_DRAWS, Scenario, generator
+from torchgco.scenarios.layouts import Layouts
+
+VEHICLE_RADIUS, GOAL_RADIUS = 0.25, 0.3  # m, where neither the command nor the file says them
+CLEAR = 1.2  # drawn places are as free as for a vehicle of this many radii
+APART = 0.4  # share of the free space's diagonal that drawn starts and goals are apart, at least
+
+
+@dataclass(frozen=True)
+class MapFile(Scenario):
+    """A map read from a file by `torchgco.maps.read`, at once; its layouts differ by start and goal.
+
+    Starts and goals that neither the command nor an npz file gives are drawn: uniformly from the largest connected
+    space that is free for the vehicle, at least 0.4 of its diagonal apart, else as far as can be.
+
+    Args:
+        path, resolution, radius, origin, height, topic, layer: see `read`.
+        unknown: what unknown cells count as.
+        start, goal: positions (d,), m.
+        vehicle_radius, goal_radius: m; None: the file's, or 0.25 and 0.3.
+        stages: N.
+        dt: s.
+
+    Named by the file's stem; the dimension is the map's. Raises InputError where the file is missing or malformed
+    (`scenario.path`), or a field is out of its range (`scenario.<field>`).
+    """
+
+    path: str | Path
+    resolution: float | None = None
+    radius: float | None = None
+    origin: Any = None
+    height: float | None = None
+    topic: str | None = None
+    layer: Any = None
+    unknown: Unknown = "occupied"
+    start: Any = None
+    goal: Any = None
+    vehicle_radius: checks.Length | None = None
+    goal_radius: checks.Size | None = None
+    stages: checks.Stages = 200
+    dt: checks.TimeStep = 0.1
+    name: str = field(init=False)
+    map: DistanceField = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        def put(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        put("name", "map")
+        check_options(self, "scenario")
+        options = {key: getattr(self, key) for key in ("resolution", "radius", "origin", "height", "topic", "layer")}
+        found = read(self.path, field="scenario", **options)
+        put("map", DistanceField.of(found, self.unknown))
+        put("name", Path(self.path).stem)
+        task = read_task(Path(self.path)) | {
+            key: getattr(self, key) for key in ("start", "goal") if getattr(self, key) is not None
+        }
+        for key in ("start", "goal"):
+            put(key, None if key not in task else self._position(task[key], key))
+        for key, default in (("vehicle_radius", VEHICLE_RADIUS), ("goal_radius", GOAL_RADIUS)):
+            if getattr(self, key) is None:
+                put(key, checks.scalar(key, task.get(key, default)))
+
+    @property
+    def dimension(self) -> int:
+        """Dimension d of the map."""
+        return self.map.d
+
+    @property
+    def available(self) -> int | None:
+        """One layout where start and goal are given; None where some are drawn."""
+        return None if self.start is None or self.goal is None else 1
+
+    def draw(self, ids: Sequence[int], seed: int) -> Layouts:
+        """Layouts `ids` under `seed`: each has the map, and its own start and goal where these are drawn.
+
+        Raises:
+            InputError: ids or seed are malformed, a given start isn't free while the goal is drawn, or no place is
+                free for the vehicle.
+        """
+        numbers, seed = checks.indices(ids, "ids"), check_value(seed, Seed, "seed")
+        ends = np.array([self._ends(generator(seed, int(number))) for number in numbers])
+        none = np.empty((len(numbers), 0, self.dimension))
+        return Layouts(
+            centers=none, radii=none[..., 0], start=ends[:, 0], goal=ends[:, 1], vehicle_radius=self.vehicle_radius,
+            goal_radius=self.goal_radius, dt=self.dt, stages=self.stages, map=self.map, name=self.name, ids=numbers,
+        )  # fmt: skip
+
+    def _position(self, value: Any, name: str) -> np.ndarray:
+        place = coordinates(value, f"scenario.{name}")
+        if place.shape != (self.dimension,) or not (np.abs(place) <= checks.LARGEST).all():
+            expected = f"{self.dimension} coordinates within {checks.LARGEST:g} m, as the map is {self.dimension}-D"
+            raise InputError(f"scenario.{name}", expected, shown(place.tolist()))
+        return place
+
+    def _ends(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Start and goal (d,), the given ones as they are."""
+        if self.start is not None and self.goal is not None:
+            return self.start, self.goal
+        given = self.goal if self.start is None else self.start
+        places = self._free(given)
+        apart = APART * math.dist(places.min(0), places.max(0))
+        for _ in range(MAX_DRAWS):
+            first = places[rng.integers(len(places))] if given is None else given
+            second = places[rng.integers(len(places))]
+            if math.dist(first, second) >= apart:
+                break
+        else:
+            second = places[np.linalg.norm(places - first, axis=1).argmax()]
+        return (second, first) if self.start is None and given is not None else (first, second)
+
+    def _free(self, near: np.ndarray | None) -> np.ndarray:
+        """Places (P, d) of the connected free space around `near`; of the largest one where that is None."""
+        labels, count = self._labels
+        if not count:
+            expected = f"a map with a place that is free for a vehicle of radius {self.vehicle_radius:g} m"
+            raise InputError("scenario.vehicle_radius", expected, f"none in {self.path}")
+        sizes = np.bincount(labels.ravel())
+        chosen = int(sizes[1:].argmax()) + 1
+        if near is not None:
+            node = np.rint((near - self.map.origin[0]) / self.map.spacing).astype(int)
+            inside = ((node >= 0) & (node < labels.shape)).all()
+            chosen = int(labels[tuple(node)]) if inside else 0
+            if not chosen:
+                name = "goal" if self.start is None else "start"
+                raise InputError(f"scenario.{name}", "a place on the map that is free for the vehicle", near.tolist())
+        return self.map.origin[0] + self.map.spacing * np.argwhere(labels == chosen)
+
+    @cached_property
+    def _labels(self) -> tuple[np.ndarray, int]:
+        """Numbers of the connected free spaces at the nodes, 0 where not free, and how many there are."""
+        from scipy.ndimage import label
+
+        assert self.vehicle_radius is not None
+        return label(self.map.values[0] > CLEAR * self.vehicle_radius + self.map.spacing)
