@@ -186,6 +186,23 @@ def test_clouds_are_balls(d: int) -> None:
     assert some.any() and np.abs(few.distance(p).numpy() - away)[some].max() < 1e-6
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_starts_are_measured_exactly(d: int) -> None:
+    """A start that touches nothing isn't refused because an interpolated distance is too low."""
+    grid, R = random_grid(d), 0.15
+    field = DistanceField.of(grid, refine=1)
+    p = points_around(grid, 200)
+    due = np.array([distance_from_cells(at, grid.is_occupied, grid.origin, grid.resolution) for at in p])
+    part = bound(field, [R] * len(p), B=len(p))
+    x0 = torch.nn.functional.pad(torch.from_numpy(p), (0, 4 if d == 2 else 7))
+    assert part.start_is_clear(x0).tolist() == (due >= 0.95 * R).tolist()
+    bounds = part.signed_distance(torch.from_numpy(p).unsqueeze(1), torch.zeros(1))[:, 0, 0].numpy()
+    assert ((bounds < -0.05 * R) & (due >= 0.95 * R)).any()
+    cloud = PointCloud(p, 0.0)
+    inside = bound(DistanceField.of(cloud, resolution=0.1), R).start_is_clear(x0[:1])
+    assert inside.tolist() == [False]
+
+
 def brute_clearance(grid: OccupancyGrid, a: Tensor, b: Tensor) -> np.ndarray:
     share = np.linspace(0, 1, 201)[:, None]
     lines = [x + share * (y - x) for x, y in zip(a.numpy(), b.numpy(), strict=True)]

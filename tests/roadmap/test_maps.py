@@ -22,11 +22,13 @@ from torchgco import (
     presets,
 )
 from torchgco.maps import DistanceField, OccupancyGrid
+from torchgco.native import kernels
 from torchgco.obstacles.base import Obstacles
+from torchgco.roadmap.blocks import blocks_of
 from torchgco.roadmap.geometry import Inflated, length
 from torchgco.roadmap.homotopy import classes
-from torchgco.roadmap.lattice import blocks_of, lattice_of
-from torchgco.roadmap.mapped import Ways, _swept_on_the_way, keys, swept
+from torchgco.roadmap.lattice import lattice_of
+from torchgco.roadmap.mapped import Ways, _shortcut, _swept_on_the_way, keys, swept
 from torchgco.roadmap.scene import has_paths, scene_of
 from torchgco.solvers.contracts import Solver
 
@@ -112,12 +114,11 @@ def test_sums_along_ways_are_those_of_their_polylines_and_tell_windings_apart() 
     (field,) = problem.constraints
     ends = np.array([[0.1, 0.1], [3.9, 3.9]])
     lattice = lattice_of([field], [], ends)
-    ways = Ways(lattice, blocks_of(lattice, 4096), ends, lambda p: np.ones(len(p)), R)
-    costs, before = ways.costs([ways.start, ways.goal])
-    sums = _swept_on_the_way(ways, before[0])
-    for v in np.flatnonzero(np.isfinite(costs[0]))[::97]:
-        way = ways.points[ways.traced(before[0], int(v))[::-1]]
-        assert int(sums[v]) == swept(lattice, way)
+    ways = Ways(blocks_of(lattice, 0.05, 4096), ends, lambda p: np.ones(len(p)), R, 0.0)
+    for end in (0, 1):
+        sums, others = _swept_on_the_way(ways, end), _swept_on_the_way(ways, 1 - end)
+        for v in np.flatnonzero(np.isfinite(ways.total))[::97]:
+            assert int((sums - others)[v]) == (1 - 2 * end) * swept(lattice, ways.path(int(v)))
     for some in range(30):  # two polylines between the same ends, by winding angles and by sums
         a, b = (np.concatenate((ends[:1], rng.uniform(0, 4, (3, 2)), ends[1:])) for _ in range(2))
         marks = lattice.position(lattice.marks)
@@ -185,6 +186,34 @@ def test_batches_take_each_problems_own_map_and_give_the_same_paths() -> None:
         alone, arrives, _ = paths_in(problem.take(torch.tensor([b])), 3)
         assert torch.equal(alone[0], paths[b]) and bool(arrives[0]) == bool(found[b])
     assert bool(found.all()) and not torch.equal(paths[0], paths[1])
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_scipy_finds_ways_of_the_same_costs_and_draws_them_taut_alike(d: int) -> None:
+    rng = np.random.default_rng(1)
+    cells = rng.random([24] * d) < 0.03
+    problem = problem_in(cells, [0.1] * d, [2.3] * d, radius=0.15)
+    (field,) = problem.constraints
+    ends = np.array([[0.1] * d, [2.3] * d])
+    lattice = lattice_of([field], [], ends)
+
+    def price(points: np.ndarray) -> np.ndarray:
+        return 1.0 + points[:, 0] ** 2
+
+    found = []
+    for native in (True, False):
+        kernels.use_native(native)
+        ways = Ways(blocks_of(lattice, 0.15, 2**12), ends, price, R, 0.0)
+        path = ways.path(int(ways.total.argmin()))
+        found.append((ways.costs, ways.path(int(found[0][0].sum(0).argmin())) if found else path, path))
+    np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-9)
+    assert np.isfinite(found[0][0]).all(0).any()
+    kernels.use_native(True)
+    taut = _shortcut(lattice, found[0][2])
+    kernels.use_native(False)
+    np.testing.assert_array_equal(_shortcut(lattice, found[0][2]), taut)
+    kernels.use_native(True)
+    assert 2 <= len(taut) < len(found[0][2])
 
 
 def solver_of(problem: Problem) -> Solver:

@@ -13,10 +13,11 @@ from torchgco.base.options import check_value
 from torchgco.base.shapes import Dimensions
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
 from torchgco.maps.distance import FAR, DistanceField
+from torchgco.maps.exact import distance_within
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.lookup import Lattice, lengths, squares, squares_and_slopes
 from torchgco.maps.points import PointCloud
-from torchgco.obstacles.base import ABSENT, Obstacles
+from torchgco.obstacles.base import ABSENT, CONTACT_FACTOR, Obstacles
 from torchgco.obstacles.inputs import dimension, vehicle_radii
 
 Interpolation = Literal["smooth", "linear"]
@@ -178,6 +179,17 @@ class BoundField(Obstacles):
         share = (count / steps.unsqueeze(-1)).clamp(max=1.0).unsqueeze(-1)
         p = a.unsqueeze(1) + share * (b - a).unsqueeze(1)
         return self.take(rows).signed_distance(p, count)[..., 0].amin(-1)
+
+    def start_is_clear(self, x0: Tensor) -> Tensor:
+        """As for all obstacles; where the field's bound says no, each cell, or point, near the start is measured."""
+        clear = super().start_is_clear(x0)
+        for b in (~clear).nonzero().flatten().tolist():
+            least = CONTACT_FACTOR * float(self.vehicle_radius[b])
+            p = x0[b, self.position].double().cpu().numpy()
+            field = self.field
+            near = distance_within(field.source, field.unknown, int(self.which[b]), p, least + field.spacing)
+            clear[b] = near >= least and near > 0
+        return clear
 
     def grown(self, by: Tensor) -> Self:
         return replace(self, vehicle_radius=self.vehicle_radius + by)

@@ -1,15 +1,10 @@
-"""The free space of maps as the search sees it: clearances at the nodes of a lattice, thinned out to blocks of nodes.
-
-NumPy, one problem at a time. Each block is represented by its clearest node, so that a narrow door in a fine map is
-known at a coarse lattice too.
-"""
+"""The free space of maps as the search sees it: clearances at the nodes of a lattice, one problem at a time."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -114,12 +109,6 @@ class Lattice:
             gap = np.minimum(gap, field.signed_distance(p, p.new_zeros(1))[..., 0].numpy().reshape(gap.shape))
         return gap
 
-    def segments(self, a: Array, b: Array) -> Array:
-        """Smallest clearances (E,) along segments from a to b (E, d), at steps of a spacing."""
-        steps = int(np.ceil(np.linalg.norm(b - a, axis=-1).max(initial=0.0) / self.spacing)) + 1
-        share = np.linspace(0.0, 1.0, steps + 1)[:, None, None]
-        return self.at(a + share * (b - a)).min(0)
-
     def see(self, a: Array, b: Array, least: Array) -> NDArray[np.bool_]:
         """Whether all clearances along segments from a to b (E, d) are above `least` (E,).
 
@@ -206,81 +195,3 @@ def _measured(field: BoundField, which: int, R: float, low: Any, high: Any) -> N
     padded = np.pad(distance, list(zip(low, high, strict=True)), mode="edge")
     padded = np.where(beyond > 0, np.sqrt(np.maximum(padded, 0.0) ** 2 + beyond), padded)
     return (padded - limit).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class Blocks:
-    """The clearest node of each block of nodes, and the edges between free neighbours."""
-
-    nodes: NDArray[np.int64]  # (V, d)
-    clearance: Array  # (V,)
-    tails: NDArray[np.int64]  # (E,)
-    heads: NDArray[np.int64]  # (E,)
-    gaps: Array  # (E,): smallest clearances of the edges
-
-
-def blocks_of(lattice: Lattice, most: int) -> Blocks:
-    """Blocks of a lattice, `most` of them at most, that hold a free node."""
-    size = max(1, int(np.ceil((lattice.clearance.size / most) ** (1.0 / lattice.d))))
-    while np.prod([-(-n // size) for n in lattice.clearance.shape]) > most:
-        size += 1
-    nodes = _clearest(lattice.clearance, size)
-    counts = nodes.shape[:-1]
-    flat = nodes.reshape(-1, lattice.d)
-    clear = lattice.clearance[tuple(flat.T)].astype(float)
-    free = clear > 0
-    clear[free] = np.minimum(clear[free], lattice.beside(lattice.position(flat[free])))
-    free = clear > 0
-    number = np.full(len(flat), -1)
-    number[free] = np.arange(free.sum())
-    number = number.reshape(counts)
-    tails, heads = [], []
-    for step in product((-1, 0, 1), repeat=lattice.d):
-        if step <= (0,) * lattice.d:
-            continue
-        here = tuple(slice(max(0, -k), n - max(0, k)) for k, n in zip(step, counts, strict=True))
-        there = tuple(slice(max(0, k), n - max(0, -k)) for k, n in zip(step, counts, strict=True))
-        a, b = number[here].ravel(), number[there].ravel()
-        both = (a >= 0) & (b >= 0)
-        tails.append(a[both])
-        heads.append(b[both])
-    tail, head = np.concatenate(tails), np.concatenate(heads)
-    gaps = _along(lattice, flat[free], clear[free], tail, head, size)
-    open_ = gaps > 0
-    return Blocks(flat[free], clear[free], tail[open_], head[open_], gaps[open_])
-
-
-def _clearest(clearance: NDArray[np.float32], size: int) -> NDArray[np.int64]:
-    """The clearest node of each block, (blocks along each axis, d)."""
-    d = clearance.ndim
-    if size == 1:
-        return np.stack(np.indices(clearance.shape), axis=-1)
-    counts = [-(-n // size) for n in clearance.shape]
-    padded = np.pad(
-        clearance, [(0, c * size - n) for c, n in zip(counts, clearance.shape, strict=True)], constant_values=-np.inf
-    )
-    split = padded.reshape([n for c in counts for n in (c, size)])
-    split = split.transpose([2 * i for i in range(d)] + [2 * i + 1 for i in range(d)]).reshape(*counts, -1)
-    # Of equally clear nodes the one next to the block's middle: far from obstacles blocks are evenly spaced then.
-    middle = sum((x - 0.5 * (size - 1)) ** 2 for x in np.indices([size] * d)).ravel()
-    within = np.stack(np.unravel_index((split - 1e-6 * middle.astype(np.float32)).argmax(-1), [size] * d), axis=-1)
-    return np.stack(np.indices(counts), axis=-1) * size + within
-
-
-def _along(
-    lattice: Lattice,
-    nodes: NDArray[np.int64],
-    clear: Array,
-    tail: NDArray[np.int64],
-    head: NDArray[np.int64],
-    size: int,
-) -> Array:
-    """Smallest clearances of edges between nodes, those that can't be near anything by their ends alone."""
-    gaps = np.minimum(clear[tail], clear[head])
-    if size == 1:
-        return gaps
-    long = lattice.spacing * np.linalg.norm(nodes[tail] - nodes[head], axis=1)
-    unsure = np.flatnonzero(clear[tail] + clear[head] < 2.0 * long)
-    a, b = lattice.position(nodes[tail[unsure]]), lattice.position(nodes[head[unsure]])
-    gaps[unsure] = np.minimum(gaps[unsure], lattice.segments(a, b))
-    return gaps

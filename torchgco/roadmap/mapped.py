@@ -1,8 +1,8 @@
-"""Short paths through the free space of maps: over a lattice from start to goal, drawn taut.
+"""Short paths through the free space of maps: over blocks of a lattice from start to goal, drawn taut.
 
-In the plane one search from either end gives the cheapest path through every node, and their homotopy classes: the
-cheapest node of each class is the way of a path. In space the price of what lies next to the paths so far is raised, as
-around spheres and boxes (roadmap.py). NumPy and SciPy, one problem at a time; nothing is random.
+One search from either end gives the cheapest way through every block. In the plane the cheapest one of each homotopy
+class becomes a path; in space those that are cheapest nearby, on stretches where both searches agree. One problem at a
+time; nothing is random.
 """
 
 from __future__ import annotations
@@ -13,23 +13,30 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from torchgco.base.tree import take
+from torchgco.roadmap.blocks import Blocks, blocks_of, shortcut
 from torchgco.roadmap.geometry import Inflated, Scene
-from torchgco.roadmap.lattice import Array, Blocks, Lattice, blocks_of, lattice_of
+from torchgco.roadmap.lattice import Array, Lattice, lattice_of
 from torchgco.roadmap.search import HOPS
 
-BLOCKS = (2**13, 2**16, 2**20)  # of a first search, and of further ones where there is no path yet
-MARGIN = 0.5  # vehicle's radii within which an edge costs up to double
-LONGEST = 2.0  # times as dear as the cheapest one other paths in the plane may be
+# The most blocks of a search, and the clearance of free ones in spacings of the nodes; of further searches where there
+# is no path yet. Through gaps with less clearance than the nodes are apart no trajectory may fit between its knots.
+SEARCHES = ((2**18, 0.5), (2**18, 0.0), (2**21, 0.0))
+MARGIN = 0.5  # of closeness: within so many units an edge costs up to double
+LEAST = 1e-6  # of the price: no edge may cost nothing
+LONGEST = 2.0  # times as dear as the cheapest one other paths may be
+TRIED = 3  # candidates per path in space that are drawn taut, and compared with those before
+COMPARED = 32  # points of a path that are compared
+SAMPLES = 16  # along each axis, at which the price is evaluated
+WINDOW = np.arange(-2, 3)  # blocks next to start and goal at which ways begin
 ROUNDS = 4  # of drawing taut, at most, and the gain in length, as a share, below which there is no further one
 LITTLE = 1e-3
 WINDOWS = (8, 16, 64, 10**6)  # points ahead that are looked at together
 POINTS = 96  # of a path that is drawn taut
-ENDS = 64  # blocks to which start and goal are joined, the nearest that they see
+ROUNDING = 1e-9  # m
 KEY = 0x5DEECE66D  # seed of the numbers that stand for blocked regions
 
 Price = Callable[[Array], Array]  # per metre at points (V, d)
@@ -49,7 +56,8 @@ def paths_in_maps(scene: Scene, count: int, overlap: float) -> tuple[Tensor, Ten
 
         ends = torch.stack((start[b], goal[b])).double().cpu().numpy()
         lattice = lattice_of(obstacles.maps, obstacles.kinds, ends)
-        for k, path in enumerate(paths(lattice, ends, price, count, float(obstacles.largest), HOPS + 1)):
+        radius = float(obstacles.maps[0].vehicle_radius[0])
+        for k, path in enumerate(paths(lattice, ends, price, count, radius, float(obstacles.largest), HOPS + 1)):
             corners[b, k, : len(path)] = start.new_tensor(path)
             if k == 0:
                 corners[b, 1:], found[b] = corners[b, :1], True  # the first stands in for those that there aren't
@@ -69,103 +77,135 @@ def sweep_alike(paths: Tensor, obstacles: Inflated) -> Tensor:
 
 
 class Ways:
-    """The cheapest ways from a start over the blocks of a lattice, and those from a goal.
+    """The cheapest ways from start and goal over all blocks of a lattice.
 
     Args:
         ends: start and goal, (2, d), m.
         price: per metre.
         unit: m, of closeness to obstacles.
+        least: clearance from which a block is free, m.
     """
 
-    def __init__(self, lattice: Lattice, blocks: Blocks, ends: Array, price: Price, unit: float) -> None:
-        self.lattice, self.ends = lattice, ends
-        V = len(blocks.nodes)
-        self.points = np.concatenate((lattice.position(blocks.nodes), ends))
-        tails, heads, gaps = [blocks.tails], [blocks.heads], [blocks.gaps]
+    def __init__(self, blocks: Blocks, ends: Array, price: Price, unit: float, least: float) -> None:
+        self.blocks, self.ends, self.points = blocks, ends, blocks.points
+        close = 1.0 + np.clip(1.0 - blocks.clearance / (MARGIN * unit), 0.0, 1.0)
+        rate = _smoothed(price, self.points, blocks.counts)
+        usable = (blocks.clearance > least) & np.isfinite(rate)
+        self.weight = np.where(usable, np.maximum(rate, 0.0) * close + LEAST, np.inf)
+        self.costs = np.empty((2, len(self.weight)))
+        self.before = np.empty((2, len(self.weight)), np.int32)
         for i, end in enumerate(ends):
-            near, gap = self._seen(end, self.points[:V])
-            tails.append(np.full(len(near), V + i))
-            heads.append(near)
-            gaps.append(gap)
-        self.tail, self.head, gap = np.concatenate(tails), np.concatenate(heads), np.concatenate(gaps)
-        close = 1.0 + np.clip(1.0 - gap / (MARGIN * unit), 0.0, 1.0)
-        self.lengths = np.linalg.norm(self.points[self.tail] - self.points[self.head], axis=1) * close + 1e-12
-        self.price = price(self.points)
-        self.start, self.goal = V, V + 1
+            seeds = self._seen(end, usable)
+            apart = np.linalg.norm(self.points[seeds] - end, axis=1)
+            self.costs[i], self.before[i] = blocks.costs(self.weight, seeds, apart * self.weight[seeds])
 
-    def _seen(self, end: Array, points: Array) -> tuple[NDArray[np.int64], Array]:
-        """The nearest points that are seen from start or goal, and the clearances on the way."""
-        away = np.linalg.norm(points - end, axis=1)
-        near = np.argsort(away, kind="stable")[:ENDS]
-        gaps = self.lattice.segments(np.broadcast_to(end, points[near].shape), points[near])
+    @property
+    def total(self) -> Array:
+        """The cost of the cheapest way from start to goal through each block, (V,)."""
+        return self.costs.sum(0)
+
+    def _seen(self, end: Array, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Free blocks that are seen from start or goal, or else the nearest one."""
+        blocks, lattice = self.blocks, self.blocks.lattice
+        axes = [np.unique(np.clip(int(i * lattice.spacing / blocks.step) + WINDOW, 0, n - 1))
+                for i, n in zip(lattice.node(end), blocks.counts, strict=False)]  # fmt: skip
+        near = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), blocks.counts[: lattice.d]).ravel()
+        near = near[usable[near]]
         # An end may be a little nearer to the map than the constraint admits: the way leads out of there.
-        seen = gaps > min(0.0, float(self.lattice.at(end[None])[0]) - 1e-9)
-        return near[seen], np.maximum(gaps[seen], 0.0)
+        least = min(0.0, float(lattice.at(end[None])[0])) - ROUNDING
+        a = np.broadcast_to(end, self.points[near].shape)
+        seen = near[lattice.see(a, self.points[near], np.full(len(near), least))]
+        if len(seen) == 0 and len(near) > 0:
+            seen = near[[np.linalg.norm(self.points[near] - end, axis=1).argmin()]]
+        return seen
 
-    def costs(self, sources: list[int], raised: Array | float = 1.0) -> tuple[Array, NDArray[np.int32]]:
-        """Costs of the cheapest ways from some points to all, and the points before, (sources, V)."""
-        price = self.price * raised
-        weight = self.lengths * 0.5 * (price[self.tail] + price[self.head])
-        usable = np.isfinite(weight)
-        pairs, n = (self.tail[usable], self.head[usable]), len(self.points)
-        graph = csr_matrix((weight[usable], pairs), shape=(n, n))
-        return dijkstra(graph, directed=False, indices=sources, return_predecessors=True)
-
-    def traced(self, before: NDArray[np.int32], node: int) -> list[int]:
-        """The points from a node back to where its way begins."""
-        way = [node]
-        while before[way[-1]] >= 0:
-            way.append(int(before[way[-1]]))
-        return way
+    def path(self, block: int) -> Array:
+        """The way from start to goal (P, d) through a block."""
+        ways = [[block], [block]]
+        for way, before in zip(ways, self.before, strict=True):
+            while before[way[-1]] >= 0:
+                way.append(int(before[way[-1]]))
+        return np.concatenate((self.ends[:1], self.points[ways[0][::-1] + ways[1][1:]], self.ends[1:]))
 
 
-def paths(lattice: Lattice, ends: Array, price: Price, count: int, unit: float, corners: int) -> list[Array]:
+def _smoothed(price: Price, points: Array, counts: tuple[int, ...]) -> Array:
+    """Prices (V,) at points, interpolated between a few of them: costs are smooth, and may be dear to evaluate."""
+    low, high, d = points.min(0), points.max(0), points.shape[1]
+    sizes = [min(n + 1, SAMPLES) for n in counts[:d]]
+    axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, sizes, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    values = price(grid.reshape(-1, d)).reshape(sizes)
+    share = (points - low) / np.maximum(high - low, ROUNDING) * (np.array(sizes) - 1)
+    return map_coordinates(values, share.T, order=1, mode="nearest")
+
+
+def paths(
+    lattice: Lattice, ends: Array, price: Price, count: int, radius: float, unit: float, corners: int
+) -> list[Array]:
     """Up to `count` taut paths (P, d), P <= corners, between two points (2, d), the cheapest first."""
     if not lattice.may_join(ends):
         return []
-    for most in BLOCKS:
-        ways = Ways(lattice, blocks_of(lattice, most), ends, price, unit)
-        found = _in_the_plane(ways, count) if lattice.d == 2 else _in_space(ways, count, unit)
-        if found or most >= lattice.clearance.size:
+    for most, share in SEARCHES:
+        ways = Ways(blocks_of(lattice, radius, most), ends, price, unit, share * lattice.spacing)
+        if np.isfinite(ways.total).any():
             break
-    taut = [tightened(lattice, path) for path in found]
-    return [path for path in taut if len(path) <= corners]
+    if not np.isfinite(ways.total).any():
+        return []
+    found = _in_the_plane(ways, count) if lattice.d == 2 else _in_space(ways, count, unit)
+    return [path for path in found if len(path) <= corners]
 
 
 def _in_the_plane(ways: Ways, count: int) -> list[Array]:
-    """The cheapest way of each homotopy class that leads through one node on the cheapest ways from both ends."""
-    costs, before = ways.costs([ways.start, ways.goal])
-    total = costs.sum(0)
+    """The cheapest way of each homotopy class that leads through one block on the cheapest ways from both ends."""
+    total = ways.total
     live = np.flatnonzero(np.isfinite(total))
-    if not np.isfinite(total[ways.goal]):
-        return []
-    swept = [_swept_on_the_way(ways, part) for part in before]
-    kind = (swept[0] - swept[1])[live]
+    sums = [_swept_on_the_way(ways, i) for i in (0, 1)]
+    kind = (sums[0] - sums[1])[live]
     order = np.argsort(total[live], kind="stable")
     _, first = np.unique(kind[order], return_index=True)
     chosen = live[order[np.sort(first)[:count]]]
-    chosen = chosen[total[chosen] <= LONGEST * total[ways.goal]]
-    return [ways.points[ways.traced(before[0], v)[::-1] + ways.traced(before[1], v)[1:]] for v in chosen]
+    chosen = chosen[total[chosen] <= LONGEST * total[chosen[0]]]
+    return [tightened(ways.blocks.lattice, ways.path(int(v))) for v in chosen]
 
 
 def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
-    """The cheapest way, and others for which what lies next to those before costs double."""
-    found, raised = [], np.ones(len(ways.points))
-    for _ in range(count):
-        costs, before = ways.costs([ways.start], raised)
-        if not np.isfinite(costs[0, ways.goal]):
+    """The cheapest way, and others that are cheapest nearby and lead elsewhere.
+
+    Where the cheapest ways from start and from goal agree on a stretch of blocks, the way along it is the cheapest
+    between its neighbours; the longest of these plateaus are ways around obstacles.
+    """
+    total, onward = ways.total, ways.before[1]
+    own = np.arange(len(total))
+    ahead = np.where(onward >= 0, onward, own)
+    agree = (onward >= 0) & (ways.before[0][ahead] == own) & np.isfinite(total)
+    end = np.where(agree, ahead, own)
+    while (end[end] != end).any():
+        end = end[end]
+    first = np.where(agree, ways.costs[0], np.inf)
+    begins = np.full(len(total), np.inf)
+    np.minimum.at(begins, end, first)
+    ends = np.flatnonzero(np.isfinite(begins))
+    best = float(total.min())
+    shares = (ways.costs[0][ends] - begins[ends]) / best
+    ends, shares = ends[total[ends] <= LONGEST * best], shares[total[ends] <= LONGEST * best]
+    order = np.argsort(total[ends] / best - shares, kind="stable")[: TRIED * count]
+    lattice, found = ways.blocks.lattice, [tightened(ways.blocks.lattice, ways.path(int(total.argmin())))]
+    for v in ends[order]:
+        if len(found) == count:
             break
-        path = ways.points[ways.traced(before[0], ways.goal)[::-1]]
-        found.append(path)
-        raised[_nearest(ways.points, path) < unit] *= 2.0
+        path = tightened(lattice, ways.path(int(v)))
+        if all(_apart(path, other) > unit for other in found):
+            found.append(path)
     return found
 
 
-def _nearest(points: Array, path: Array) -> Array:
-    """Distances (V,) of points from the corners of a path, which are dense."""
-    from scipy.spatial import cKDTree
-
-    return cKDTree(path).query(points)[0]
+def _apart(path: Array, other: Array) -> float:
+    """The largest distance of a path's points from another path, m."""
+    a, along = other[:-1], np.diff(other, axis=0)
+    toward = _dense(path, length(path) / COMPARED)[:, None] - a
+    share = (toward * along).sum(-1) / np.maximum((along * along).sum(-1), ROUNDING)
+    gap = np.linalg.norm(toward - np.clip(share, 0.0, 1.0)[..., None] * along, axis=-1)
+    return float(gap.min(1).max())
 
 
 # Homotopy classes -------------------------------------------------------------------------------------------------
@@ -194,14 +234,20 @@ def swept(lattice: Lattice, path: Array) -> int:
     return int((times * keys(len(marks))).sum())
 
 
-def _swept_on_the_way(ways: Ways, before: NDArray[np.int32]) -> NDArray[np.int64]:
-    """The same of the cheapest ways from one end to all points (V,)."""
+def _swept_on_the_way(ways: Ways, end: int) -> NDArray[np.int64]:
+    """The same of the cheapest ways from start (0) or goal (1) to all blocks, (V,)."""
+    before, lattice = ways.before[end], ways.blocks.lattice
     parent = np.where(before >= 0, before, np.arange(len(before)))
-    u = (ways.points - ways.lattice.origin) / ways.lattice.spacing
-    total = _crossings(ways.lattice, u[parent], u)
+    u = (ways.points - lattice.origin) / lattice.spacing
+    total = _crossings(lattice, u[parent], u)
+    # The way begins at the end itself.
+    roots = np.flatnonzero((before < 0) & np.isfinite(ways.costs[end]))
+    begin = np.broadcast_to((ways.ends[end] - lattice.origin) / lattice.spacing, u[roots].shape)
+    first = np.zeros_like(total)
+    first[roots] = _crossings(lattice, begin, u[roots])
     while (parent[parent] != parent).any():  # each round doubles the length of the ways that are summed
         total, parent = total + total[parent], parent[parent]
-    return total
+    return total + first[parent]
 
 
 def _crossings(lattice: Lattice, a: Array, b: Array) -> NDArray[np.int64]:
@@ -257,8 +303,11 @@ def _shortcut(lattice: Lattice, path: Array) -> Array:
 
     The path is bent through the triangles between, which are free: it stays in its homotopy class.
     """
+    least = min(0.0, *lattice.at(path[[0, -1]])) - ROUNDING
+    marked = shortcut(lattice, path, least)
+    if marked is not None:
+        return path[marked]
     kept, i, last = [0], 0, len(path) - 1
-    least = min(0.0, *lattice.at(path[[0, -1]])) - 1e-9
     while i < last:
         far = i
         for window in WINDOWS:
