@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 
 import torch
 from torch import Tensor
@@ -146,11 +146,14 @@ def followed(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor,
     return rollout.closed_loop(problem.dynamics, X, U, G.transpose(0, 1).contiguous(), alpha)
 
 
-def reproducible(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+def reproducible(
+    problem: Problem, X: Tensor, U: Tensor, gains: Callable[[Tensor], Tensor]
+) -> tuple[Tensor, Tensor]:
     """X (B, N+1, n) and U (B, N, m) of native kernels, mended where PyTorch's rollout of U would not give X.
 
     The two kinds of kernels differ in the last bits. Where unstable dynamics amplify this, as a rollout of slightly
-    different controls shows, PyTorch tracks X with the gains K (B, N, m, n), and X and U of that rollout are returned.
+    different controls shows, PyTorch tracks X with the `gains` (b, N, m, n) of these rows (b,), and X and U of that
+    rollout are returned.
     """
     engine = engine_of(problem)
     if engine is None:
@@ -160,9 +163,10 @@ def reproducible(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Ten
     rows = (~((other - X).abs().flatten(1).amax(-1) <= AMPLIFIED * NUDGE * scale)).nonzero().flatten()
     if rows.numel() == 0:
         return X, U
-    gains = torch.cat((K[rows], torch.zeros_like(K[rows][..., :1])), dim=-1).nan_to_num(0.0).transpose(0, 1)
+    K = gains(rows)
+    G = torch.cat((K, torch.zeros_like(K[..., :1])), dim=-1).nan_to_num(0.0).transpose(0, 1)
     X, U, alpha = X.clone(), U.clone(), torch.zeros_like(scale[rows])
-    X[rows], U[rows] = rollout.closed_loop(problem.dynamics.take(rows), X[rows], U[rows], gains.contiguous(), alpha)
+    X[rows], U[rows] = rollout.closed_loop(problem.dynamics.take(rows), X[rows], U[rows], G.contiguous(), alpha)
     return X, U
 
 

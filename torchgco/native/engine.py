@@ -164,20 +164,32 @@ class Engine:
         """A problem without multipliers or a guide, and further fields, in the form that the library reads."""
         fixed, _ = self._fixed(problem)
         packed = fixed.copy()
-        for name, value in values.items():
-            setattr(packed, name, value)
+        packed.fill(values)
         return packed
 
     def terms(self, lagrangian: Lagrangian, best: Multipliers | None = None, **values: Any) -> c.Problem:
         """The same with the terms that the Lagrangian adds to the cost; `best` are those of an outer loop's best."""
-        multipliers, phr = lagrangian.multipliers, lagrangian.phr
+        if best is not None:
+            packed = self._summed(lagrangian, best)
+        elif "packed" in vars(lagrangian):
+            packed = vars(lagrangian)["packed"].copy()
+        else:
+            packed = self._summed(lagrangian)
+            object.__setattr__(lagrangian, "packed", packed)  # several calls of an inner solve read the same terms
+            packed = packed.copy()
+        packed.fill(values)
+        return packed
+
+    def _summed(self, lagrangian: Lagrangian, best: Multipliers | None = None) -> c.Problem:
+        """The problem with multipliers, penalties and guide."""
+        multipliers = lagrangian.multipliers
         rows = [constraint.copy() for constraint in self._fixed(lagrangian.problem)[1]]
         for row, lam in zip(rows, multipliers.lam, strict=True):
             row.lam = lam.contiguous()
         for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
             row.best = lam
-        values |= {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": phr, **guide_of(lagrangian.penalty)}
-        return self.packed(lagrangian.problem, **values)
+        own = {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
+        return self.packed(lagrangian.problem, **own, **guide_of(lagrangian.penalty))
 
     def _fixed(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         """The parts that don't change from call to call: model, cost and constraints; kept with the problem."""

@@ -14,6 +14,7 @@ from torchgco.base.tree import copied, put, take
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import has_arrived, is_preferred
 from torchgco.roadmap.scene import has_paths
+from torchgco.search.candidates import unwatched
 from torchgco.search.proposals import PathProposals, Round
 from torchgco.solution import SearchRecord
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -193,7 +194,8 @@ class Search:
         """A pass of proposals: of a new round, or of the one that has begun."""
         if not proposals.continues:
             rows = self.rows(proposals.when)
-            watch = partial(self._watched, rows)
+            watches = self.call.callback is not None or self.call.deadline is not None
+            watch = partial(self._watched, rows) if watches else unwatched
             problem, places = self.call.problem.take(rows), self.call.rows[rows]
             begun = Round(problem, proposals.at_once, watch, places, self.record) if rows.numel() > 0 else None
             self._round = None if begun is None else (rows, begun)

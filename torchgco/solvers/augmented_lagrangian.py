@@ -88,6 +88,12 @@ class AugmentedLagrangian(Solver):
         end = self.outer_loop(session.call, guidance, recorder=session.recorder)
         return session.finished(end, self.violation_tolerance, self.slots)
 
+    def improved(self, call: Call) -> tuple[Iterate, Tensor]:
+        """The trajectories of a solve without its verdict, in the user's units, and the iterations made (B,)."""
+        session = Session(call, self.inner.rules)
+        end = self.outer_loop(session.call)
+        return session.trajectories(end), end.iterations
+
     def outer_loop(
         self,
         call: Call,
