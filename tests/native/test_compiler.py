@@ -301,3 +301,47 @@ def test_the_cache_folder(monkeypatch) -> None:
 
 def test_keys_distinguish_their_parts() -> None:
     assert store.key_of(("ab", "c")) != store.key_of(("a", "bc")) != store.key_of(("abc",))
+
+
+PROCESSOR = "vendor_id : {}\ncpu family : {}\nflags : fpu avx2{}\n"
+
+
+@pytest.mark.parametrize(
+    ("described", "expected"),
+    [
+        (PROCESSOR.format("GenuineIntel", 6, " avx512f"), 8),
+        (PROCESSOR.format("GenuineIntel", 6, ""), 4),
+        (PROCESSOR.format("AuthenticAMD", 25, " avx512f"), 4),
+        (PROCESSOR.format("AuthenticAMD", 26, " avx512f"), 8),
+        ("Features : fp asimd\n", 4),
+        ("", 4),
+    ],
+)
+def test_lanes_are_those_that_a_processor_computes_at_once(monkeypatch, described: str, expected: int) -> None:
+    monkeypatch.delenv("TORCHGCO_LANES", raising=False)
+    assert compiler.lanes(described) == expected
+    monkeypatch.setenv("TORCHGCO_LANES", str(12 - expected))
+    assert compiler.lanes(described) == 12 - expected
+
+
+WIDTH = """
+import hashlib, torch
+from tests.problems import planar_batch
+from torchgco import presets
+from torchgco.native.codegen.source import LANES
+torch.set_num_threads(1)
+problem = planar_batch(5)
+solution = presets.gco(problem).solve(problem, torch.zeros(5, problem.N, problem.m).double())
+print(LANES, hashlib.sha256(solution.U.numpy().tobytes()).hexdigest(), solution.status.tolist())
+"""
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_results_have_the_same_bits_in_any_number_of_lanes() -> None:
+    said = []
+    for width in ("4", "8"):
+        environment = {**os.environ, "TORCHGCO_LANES": width}
+        done = subprocess.run([sys.executable, "-c", WIDTH], env=environment, capture_output=True, text=True, check=True)
+        said.append(done.stdout.split(" ", 1))
+    assert [width for width, _ in said] == ["4", "8"] and said[0][1] == said[1][1]

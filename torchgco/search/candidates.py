@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import Count, Positive, check_options
-from torchgco.base.tree import put, take
+from torchgco.base.tree import LastTaken, put, take
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.native.dispatch import chord_clearance, measured, value
@@ -65,20 +65,6 @@ def unwatched(done: int, total: int) -> None:
     """The watch of candidates that nobody watches."""
 
 
-class Selected:
-    """Problems selected from others; the last selection is kept, as several steps in turn look at the same candidates."""
-
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
-        self.last: tuple[Tensor, Problem] | None = None
-
-    def take(self, rows: Tensor) -> Problem:
-        """The problems in `rows` (b,)."""
-        if self.last is None or not torch.equal(self.last[0], rows):
-            self.last = rows, self.problem.take(rows)
-        return self.last[1]
-
-
 @dataclass(frozen=True)
 class Candidates:
     """Some candidates for each of B problems, those of one problem next to each other.
@@ -96,7 +82,7 @@ class Candidates:
     count: int  # candidates of each problem
     iterations: Tensor  # (B,) int64: of all solves so far, those of dropped candidates included
     watch: Watch
-    selected: Selected  # the problems of the candidates that a step looked at last
+    selected: LastTaken  # the problems of the candidates that a step looked at last
 
     @classmethod
     def begin(
@@ -108,7 +94,7 @@ class Candidates:
         X = U.new_zeros(U.shape[0] * count, problem.N + 1, problem.n)
         none = torch.zeros(problem.B, dtype=torch.int64, device=U.device)
         number = torch.arange(count, device=U.device).repeat(problem.B)
-        return cls(problem, X, U.flatten(0, 1), R, unit, live.flatten(), number, count, none, watch, Selected(problem))
+        return cls(problem, X, U.flatten(0, 1), R, unit, live.flatten(), number, count, none, watch, LastTaken(problem))
 
     def pick(self, order: Tensor) -> Candidates:
         """The candidates at the places `order` (B, c) among those of their problem."""
