@@ -330,8 +330,8 @@ from tests.problems import planar_batch
 from torchgco import presets
 from torchgco.native.codegen.source import LANES
 torch.set_num_threads(1)
-problem = planar_batch(5)
-solution = presets.gco(problem).solve(problem, torch.zeros(5, problem.N, problem.m).double())
+problem, U0 = planar_batch(5)
+solution = presets.gco(problem).solve(problem, U0)
 print(LANES, hashlib.sha256(solution.U.numpy().tobytes()).hexdigest(), solution.status.tolist())
 """
 

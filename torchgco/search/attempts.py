@@ -39,12 +39,15 @@ class Best:
         self.call, self.solver, self.recorder, self.record = call, solver, recorder, record
         self.end = copied(first)
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
+        self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced
 
     def arrived(self, tolerances: float = 1.0) -> Tensor:
         """Whether each problem's best trajectory is feasible and ends within `tolerances` goal tolerances, (B,)."""
-        best = self.end.best
-        fits = best.violation <= self.solver.violation_tolerance
-        return fits & has_arrived(self.call.problem, best.X, tolerances)
+        if tolerances not in self._arrived:
+            best = self.end.best
+            fits = best.violation <= self.solver.violation_tolerance
+            self._arrived[tolerances] = fits & has_arrived(self.call.problem, best.X, tolerances)
+        return self._arrived[tolerances]
 
     def next_attempt(self) -> None:
         """Count attempts in the trace, also those that no problem of this batch needs."""
@@ -86,6 +89,7 @@ class Best:
         if self.record is not None:
             self.record.passes[-1][2].extend(self.call.rows[rows].tolist())
         chosen = where.nonzero().flatten()
+        self._arrived.clear()
         put(self.end.best, rows[chosen], take(trajectories, chosen))
         self.end.status[rows[chosen]] = new.status[chosen]
         for name in ("iterations", "outer", "guided"):
