@@ -107,9 +107,9 @@ def interior_of(problem: Problem) -> InteriorEngine | None:
     engine = engine_of(problem)
     if engine is None:
         return None
-    if INTERIOR not in problem.form:
-        problem.form[INTERIOR] = InteriorEngine(engine)
-    return problem.form[INTERIOR]
+    if INTERIOR not in vars(engine):
+        vars(engine)[INTERIOR] = InteriorEngine(engine)
+    return vars(engine)[INTERIOR]
 
 
 def cost_unit(problem: Problem) -> Tensor:

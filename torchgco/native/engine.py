@@ -26,6 +26,7 @@ from torchgco.native.structures import STRUCTURES, array
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
 
+PACKED = "packed"  # marks the constraints that were packed last, among what a form keeps
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
@@ -200,16 +201,25 @@ class Engine:
     def _made(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         if problem.B == 0:
             return c.Problem(), [c.Constraint() for _ in problem.constraints]
-        rows = []
-        for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
-            source = self.functions.get(i)
-            numbers = None if source is None else rows_numbers(problem, i, source)
-            rows.append(constraint_of(constraint, shape, numbers, problem))
+        rows = self._constraints(problem)
         packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows)
         if self.model.count > 0:
             packed.parameters = array(self.model.numbers(problem.B, problem.dynamics), knots=True)
         packed.cost_data = quadratic_arrays(problem.cost) if self.cost is None else cost_arrays(problem, self.cost)
         return packed, rows
+
+    def _constraints(self, problem: Problem) -> list[c.Constraint]:
+        """The rows without multipliers; those of the last problem where this one differs in its cost alone."""
+        known, rows = problem.form.get(PACKED, (None, []))
+        if known is problem.constraints:
+            return rows
+        rows = []
+        for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
+            source = self.functions.get(i)
+            numbers = None if source is None else rows_numbers(problem, i, source)
+            rows.append(constraint_of(constraint, shape, numbers, problem))
+        problem.form[PACKED] = problem.constraints, rows
+        return rows
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> None:

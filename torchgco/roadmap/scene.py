@@ -16,6 +16,7 @@ from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Inflated, Scene
 
 LITTLE = 1e-6  # in units of cost: a smaller stage cost says nothing about the goal
+PATHS = "paths"  # marks whether there is a way to seek paths, among what a form keeps
 S = TypeVar("S", bound=Solids)
 FALLEN_BACK = 0.25  # share of the distance from start to goal; candidates that end farther from the goal are dropped
 
@@ -48,8 +49,11 @@ def has_paths(problem: Problem) -> bool:
     """Whether there is a goal, and obstacles among which the roadmap can seek a path to it."""
     if problem.dynamics.position is None:
         return False
-    one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
-    return scene_of(one, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))) is not None
+    if PATHS not in problem.form:
+        one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
+        rest = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))
+        problem.form[PATHS] = scene_of(one, rest) is not None
+    return problem.form[PATHS]
 
 
 def _by_kind(start: Tensor, parts: Sequence[Solids]) -> Inflated | None:
