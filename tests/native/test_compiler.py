@@ -341,7 +341,9 @@ print(LANES, hashlib.sha256(solution.U.numpy().tobytes()).hexdigest(), solution.
 def test_results_have_the_same_bits_in_any_number_of_lanes() -> None:
     said = []
     for width in ("4", "8"):
-        environment = {**os.environ, "TORCHGCO_LANES": width}
-        done = subprocess.run([sys.executable, "-c", WIDTH], env=environment, capture_output=True, text=True, check=True)
+        call = [sys.executable, "-c", WIDTH]
+        done = subprocess.run(
+            call, env={**os.environ, "TORCHGCO_LANES": width}, capture_output=True, text=True, check=True
+        )
         said.append(done.stdout.split(" ", 1))
     assert [width for width, _ in said] == ["4", "8"] and said[0][1] == said[1][1]

@@ -146,9 +146,7 @@ def followed(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor,
     return rollout.closed_loop(problem.dynamics, X, U, G.transpose(0, 1).contiguous(), alpha)
 
 
-def reproducible(
-    problem: Problem, X: Tensor, U: Tensor, gains: Callable[[Tensor], Tensor]
-) -> tuple[Tensor, Tensor]:
+def reproducible(problem: Problem, X: Tensor, U: Tensor, gains: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
     """X (B, N+1, n) and U (B, N, m) of native kernels, mended where PyTorch's rollout of U would not give X.
 
     The two kinds of kernels differ in the last bits. Where unstable dynamics amplify this, as a rollout of slightly

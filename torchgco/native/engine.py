@@ -21,7 +21,7 @@ from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import LANES, Form
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.declarations import load
-from torchgco.native.packing import KINDS, constraint_of, guide_of, quadratic_arrays
+from torchgco.native.packing import KINDS, constraint_of, guide_of, is_bounded, quadratic_arrays
 from torchgco.native.structures import STRUCTURES, array
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
@@ -206,6 +206,7 @@ class Engine:
         if self.model.count > 0:
             packed.parameters = array(self.model.numbers(problem.B, problem.dynamics), knots=True)
         packed.cost_data = quadratic_arrays(problem.cost) if self.cost is None else cost_arrays(problem, self.cost)
+        packed.bounded = int(self.cost is None and is_bounded(problem.cost))
         return packed, rows
 
     def _constraints(self, problem: Problem) -> list[c.Constraint]:

@@ -331,7 +331,8 @@ class OuterLoop:
         """Keep the best and the last iterate of the problems at `places` of the state."""
         whole = places.numel() == s.rows.numel()
         state = s if whole else take(s, places)
-        last = Iterate(state.X, state.U, state.multipliers, state.cost, measured(self.problem.take(places), state.X, state.U))
+        violation = measured(self.problem.take(places), state.X, state.U)
+        last = Iterate(state.X, state.U, state.multipliers, state.cost, violation)
         best, known = state.best, torch.isfinite(state.best.violation)
         if not bool(known.all()):
             best = copied(last)
