@@ -228,6 +228,7 @@ def lanes(cpuinfo: str | None = None) -> int:
                 cpuinfo = "".join(itertools.takewhile(str.strip, file))  # the first of its cores
         except OSError:
             return 4
-    words = dict(tuple(map(str.strip, line.split(":", 1))) for line in cpuinfo.splitlines() if ":" in line)
-    halved = words.get("vendor_id") == "AuthenticAMD" and int(words.get("cpu family", 0)) <= _AMD_HALVES
+    parts = (line.partition(":") for line in cpuinfo.splitlines())
+    words = {name.strip(): value.strip() for name, _, value in parts}
+    halved = words.get("vendor_id") == "AuthenticAMD" and int(words.get("cpu family", "0")) <= _AMD_HALVES
     return 8 if "avx512f" in words.get("flags", "").split() and not halved else 4
