@@ -65,6 +65,7 @@ def solve(
     elif U0 is None:
         whole = for_solvers(problem)
         traced = current(whole)
+        solver.announce(traced)
         problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
         U0 = _guess(problem, traced)
     multipliers = None if warm is None else warm.multipliers

@@ -43,9 +43,9 @@ def compiled(monkeypatch) -> list[str]:
     """The sources that were compiled."""
     seen, plain = [], compiler._compile
 
-    def counting(which, source, flags, room):
+    def counting(which, source, flags, room, begun=None):
         seen.append(source)
-        return plain(which, source, flags, room)
+        return plain(which, source, flags, room, begun)
 
     monkeypatch.setattr(compiler, "_compile", counting)
     return seen
@@ -347,3 +347,47 @@ def test_results_have_the_same_bits_in_any_number_of_lanes() -> None:
         )
         said.append(done.stdout.split(" ", 1))
     assert [width for width, _ in said] == ["4", "8"] and said[0][1] == said[1][1]
+
+
+NOTED = """#!/bin/sh
+case "$*" in *--version*) exec {real} "$@";; esac
+echo begin >> {log}
+{real} "$@"
+status=$?
+echo end >> {log}
+exit $status
+"""
+BOTH = """
+import torch, torchgco
+from tests.problems import planar_batch
+problem, U0 = planar_batch(1, N=10)
+torchgco.solve(problem, U0, solver="interior_point")
+"""
+
+
+@needs_compiler
+def test_both_libraries_are_compiled_at_the_same_time(tmp_path: Path) -> None:
+    """The interior point's has begun before the first one has ended, and is not compiled again."""
+    found = find_compiler()
+    assert found is not None
+    log, script = tmp_path / "log", tmp_path / "cc"
+    script.write_text(NOTED.format(real=" ".join(found.command), log=log))
+    script.chmod(0o755)
+    environment = {**os.environ, "TORCHGCO_CC": str(script), "TORCHGCO_CACHE": str(tmp_path / "cache")}
+    environment["TORCHGCO_CFLAGS"] = "-O1"
+    subprocess.run([sys.executable, "-c", BOTH], env=environment, check=True)
+    assert log.read_text().split() == ["begin", "begin", "end", "end"]
+
+
+@needs_compiler
+def test_a_compiler_that_has_begun_is_waited_for(cache: Path, compiled: list[str]) -> None:
+    compiler.begin(source(7))
+    compiler.begin(source(7))
+    assert len(compiler._begun) == 1 and times(7) == 21.0 and len(compiled) == 1 and not compiler._begun
+    compiler.begin(source(7))  # it is loaded
+    next_process()
+    compiler.begin(source(7))  # it is in the cache
+    assert not compiler._begun and times(7) == 21.0 and len(compiled) == 1
+    compiler.begin("no C")
+    with pytest.raises(NativeError, match="error"):
+        build("no C")

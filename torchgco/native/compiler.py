@@ -71,32 +71,65 @@ def build(source: str, flags: Sequence[str] = ()) -> ctypes.CDLL:
             written or loaded.
     """
     compiler = find_compiler()
-    flags = (*flags, *shlex.split(os.environ.get("TORCHGCO_CFLAGS", "")))
-    known = (source, flags, compiler)
+    known = (source, (*flags, *_more_flags()), compiler)
     # No lock: two threads that compile the same source do no harm, and a lock held across a fork would.
     if known not in _loaded:
         if compiler is None:
             raise NativeError(
                 "no C compiler found: install gcc or clang, or `pip install ziglang`, or name one in TORCHGCO_CC"
             )
-        _loaded[known] = _load(compiler, source, (*compiler.flags, *flags))
+        _loaded[known] = _load(compiler, source, (*compiler.flags, *known[1]))
     return _loaded[known]
 
 
+def begin(source: str) -> None:
+    """Start to compile a source that `build` will ask for, while others are compiled; an error is left to `build`."""
+    compiler = find_compiler()
+    if compiler is None or (source, _more_flags(), compiler) in _loaded:
+        return
+    flags = (*compiler.flags, *_more_flags())
+    key = _key(compiler, source, flags)
+    if key not in _begun and store.find(key, ".so") is None:
+        with suppress(OSError):
+            room = TemporaryDirectory(prefix="torchgco-")
+            _begun[key] = _Begun(os.getpid(), room, _start(compiler, source, flags, Path(room.name)))
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A compiler that runs in a room of its own, started by the process `owner`: forks can't wait for it."""
+
+    owner: int
+    room: TemporaryDirectory[str]
+    process: subprocess.Popen[str]
+
+
 _loaded: dict[tuple[str, tuple[str, ...], Compiler | None], ctypes.CDLL] = {}
+_begun: dict[str, _Begun] = {}
+
+
+def _more_flags() -> tuple[str, ...]:
+    return tuple(shlex.split(os.environ.get("TORCHGCO_CFLAGS", "")))
+
+
+def _key(compiler: Compiler, source: str, flags: tuple[str, ...]) -> str:
+    return store.key_of(("library 1", source, *flags, compiler.identity, _processor()))
 
 
 def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
-    key = store.key_of(("library 1", source, *flags, compiler.identity, _processor()))
+    key = _key(compiler, source, flags)
     kept = store.find(key, ".so")
     if kept is not None:
         try:
             return ctypes.CDLL(str(kept))
         except OSError:  # removed meanwhile, or in a folder mounted without execution rights
             pass
+    begun = _begun.pop(key, None)
+    if begun is not None and begun.owner != os.getpid():
+        begun = None
     try:
-        with TemporaryDirectory(prefix="torchgco-") as room:
-            made = _compile(compiler, source, flags, Path(room))
+        with TemporaryDirectory(prefix="torchgco-") if begun is None else begun.room as room:
+            made = _compile(compiler, source, flags, Path(room), None if begun is None else begun.process)
             kept = store.save(key, ".so", made.read_bytes())
             try:
                 return ctypes.CDLL(str(kept or made))
@@ -106,10 +139,11 @@ def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDL
         raise NativeError(f"a compiled library can't be written or loaded: {error}") from error
 
 
-def _compile(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) -> Path:
+def _compile(
+    compiler: Compiler, source: str, flags: tuple[str, ...], room: Path, begun: subprocess.Popen[str] | None = None
+) -> Path:
     notice("compiling native kernels (once for this form of problem, some seconds) ...")
-    (room / "kernels.c").write_text(source)
-    returncode, errors = _run([*compiler.command, *flags, "-o", "kernels.so", "kernels.c", "-lm"], room)
+    returncode, errors = _finished(_start(compiler, source, flags, room) if begun is None else begun)
     if returncode:
         said = errors.splitlines() or [_ended(returncode)]
         shown = [line for line in said if "error" in line] or said
@@ -117,24 +151,35 @@ def _compile(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path
     return room / "kernels.so"
 
 
-def _run(command: Sequence[str], room: Path) -> tuple[int, str]:
-    """Run a compiler; returns its exit code and what it says on stderr.
-
-    It has a process group of its own, which Ctrl-C and SIGTERM end here: a compiler starts processes of its own, which
-    would go on.
-    """
+def _start(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) -> subprocess.Popen[str]:
+    """A compiler that makes kernels.so in its room. It has a process group of its own, as it starts other processes."""
+    (room / "kernels.c").write_text(source)
     # Run in its folder: no path gets into the library, which then has the same bytes wherever it is made.
-    process = subprocess.Popen(
-        command, cwd=room, env={**os.environ, "LC_ALL": "C"}, process_group=0, stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace",
+    return subprocess.Popen(
+        [*compiler.command, *flags, "-o", "kernels.so", "kernels.c", "-lm"], cwd=room,
+        env={**os.environ, "LC_ALL": "C"}, process_group=0, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE, text=True, errors="replace",
     )  # fmt: skip
+
+
+def _finished(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Wait for a compiler; returns its exit code and what it says on stderr.
+
+    Ctrl-C and SIGTERM end it here, with its group and the compilers that have begun: they would go on.
+    """
     try:
         with _ending_by_sigterm(process):
             _, said = process.communicate()
     except BaseException:
-        _end(process)
+        _end_all(process)
         raise
     return process.returncode, said
+
+
+def _end_all(process: subprocess.Popen[str]) -> None:
+    for one in (process, *(begun.process for begun in _begun.values() if begun.owner == os.getpid())):
+        _end(one)
+    _begun.clear()
 
 
 def _end(process: subprocess.Popen[str]) -> None:
@@ -148,7 +193,7 @@ def _ending_by_sigterm(process: subprocess.Popen[str]) -> Iterator[None]:
     """In this block a SIGTERM that nobody handles, as in a study's workers, ends the compiler first."""
 
     def end(number: int, frame: FrameType | None) -> None:
-        _end(process)
+        _end_all(process)
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 

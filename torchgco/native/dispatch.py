@@ -16,7 +16,7 @@ from torchgco.lagrangian.quality import violation
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
-from torchgco.native.interior import InteriorEngine
+from torchgco.native.interior import InteriorEngine, begin_interior
 from torchgco.native.kernels import native
 from torchgco.native.sampler import Sampler
 from torchgco.obstacles.base import TOUCH, Obstacles
@@ -27,6 +27,7 @@ from torchgco.problem.problem import Problem
 NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
 CURRENT = "current"  # marks the form of problems that a solve works on
 INTERIOR = "interior"  # marks the library of the interior point
+EXPECTED = "expected"  # marks that the interior point will be asked for
 WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
 KEPT = 64  # engines of problems without a user's code, the most recent ones
 AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
@@ -72,15 +73,20 @@ def engine_of(problem: Problem) -> Engine | None:
     return problem.form["engine"]
 
 
+def expect_interior(problem: Problem) -> None:
+    """Have the interior point's library compiled beside the first one, where that isn't made yet."""
+    problem.form[EXPECTED] = True
+
+
 def _engine(problem: Problem) -> Engine:
-    same = signature(problem)
+    same, ahead = signature(problem), begin_interior if EXPECTED in problem.form else None
     if same is None:
-        return Engine(problem)
+        return Engine(problem, ahead)
     key = same, find_compiler()
     if key in _engines:
         _engines[key] = _engines.pop(key)  # the most recent one is the last
     else:
-        _engines[key] = Engine(problem)
+        _engines[key] = Engine(problem, ahead)
         if len(_engines) > KEPT:
             del _engines[next(iter(_engines))]
     return _engines[key]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
@@ -33,12 +34,15 @@ MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie
 class Engine:
     """The library of a form of problems.
 
+    Args:
+        ahead: is called when the form is known, before the library is compiled.
+
     Raises:
         InputError: not float64 on a CPU, too many states and controls, or a part without a counterpart in C.
         NativeError: no compiler, or it refuses the source.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, ahead: Callable[[Engine], None] | None = None) -> None:
         if problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
         if problem.n + problem.m > MAX_VARIABLES:
@@ -53,6 +57,8 @@ class Engine:
         boxes = any(type(constraint) is BoundBoxes for constraint in problem.constraints)
         self.measures = all(type(part) in KINDS or _measured(part) for part in problem.constraints)
         self.form = Form(self.model, problem.dynamics.position, self.cost, dense, tuple(self.functions.items()), boxes)
+        if ahead is not None:
+            ahead(self)
         self.library = load(self.form.source(), STRUCTURES)
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
