@@ -70,7 +70,7 @@ def solve(
     name = solver if isinstance(solver, str) else None
     solver = _solver(solver, problem, check_value(record, bool, "record"))
     if U0 is None:
-        problem, U0 = _start(problem, warm)
+        problem, U0 = _start(problem, warm, solver)
     multipliers = None if warm is None else warm.multipliers
     verbose = check_value(verbose, bool | None, "verbose")
     watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
@@ -93,7 +93,7 @@ def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:
     return made.recording() if record else made
 
 
-def _start(problem: Problem, warm: Solution | None) -> tuple[Problem, Tensor]:
+def _start(problem: Problem, warm: Solution | None, solver: Solver) -> tuple[Problem, Tensor]:
     """Controls (B, N, m) to begin with where none are given, and the problem with the guess of its free starts."""
     if warm is not None:
         if problem.free_start is not None:
@@ -104,6 +104,7 @@ def _start(problem: Problem, warm: Solution | None) -> tuple[Problem, Tensor]:
         return problem, problem.x0.new_zeros(0, problem.N, problem.m)
     whole = for_solvers(problem)
     traced = current(whole)
+    solver.announce(traced)
     problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
     return problem, _guess(problem, traced)
 

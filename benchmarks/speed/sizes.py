@@ -41,6 +41,7 @@ class Sizes:
     mppi_repeats: int = 5
     # share
     share_batch: int = 32
+    share_alone: int = 16  # problems that are solved one by one
     # all sections
     num_stages: int | None = None  # None: as the scenario says
     inner_iterations: int | None = None  # None: as the solver says
@@ -50,4 +51,5 @@ QUICK = Sizes(
     family_batch=4, large_batch=8, layouts=2, slow_layouts=1, ipopt_layouts=1, latency_layouts=2, own_layouts=4,
     paper_layouts=2, models=1, whole_batches=(1, 8), limited_batches=(1, 64), fewest_layouts=2,
     growth_batch=8, stages=(50, 100), obstacles=(10, 30), samples=(1000,), mppi_repeats=3, share_batch=8,
+    share_alone=4,
 )  # fmt: skip

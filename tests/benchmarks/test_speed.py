@@ -36,7 +36,7 @@ TINY = Sizes(
     latency_layouts=1, own_layouts=1, paper_layouts=1, models=1,
     whole_batches=(), limited_batches=(2,), fewest_layouts=2,
     growth_batch=2, stages=(6,), obstacles=(3,), samples=(16,), mppi_repeats=1,
-    share_batch=2, num_stages=8, inner_iterations=2,
+    share_batch=2, share_alone=2, num_stages=8, inner_iterations=2,
 )  # fmt: skip
 
 

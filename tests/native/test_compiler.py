@@ -45,9 +45,9 @@ def compiled(monkeypatch) -> list[str]:
     """The sources that were compiled."""
     seen, plain = [], compiler._compile
 
-    def counting(which, source, flags, room):
+    def counting(which, source, flags, room, begun=None):
         seen.append(source)
-        return plain(which, source, flags, room)
+        return plain(which, source, flags, room, begun)
 
     monkeypatch.setattr(compiler, "_compile", counting)
     return seen
@@ -303,3 +303,93 @@ def test_the_cache_folder(monkeypatch) -> None:
 
 def test_keys_distinguish_their_parts() -> None:
     assert store.key_of(("ab", "c")) != store.key_of(("a", "bc")) != store.key_of(("abc",))
+
+
+PROCESSOR = "vendor_id : {}\ncpu family : {}\nflags : fpu avx2{}\n"
+
+
+@pytest.mark.parametrize(
+    ("described", "expected"),
+    [
+        (PROCESSOR.format("GenuineIntel", 6, " avx512f"), 8),
+        (PROCESSOR.format("GenuineIntel", 6, ""), 4),
+        (PROCESSOR.format("AuthenticAMD", 25, " avx512f"), 4),
+        (PROCESSOR.format("AuthenticAMD", 26, " avx512f"), 8),
+        ("Features : fp asimd\n", 4),
+        ("", 4),
+    ],
+)
+def test_lanes_are_those_that_a_processor_computes_at_once(monkeypatch, described: str, expected: int) -> None:
+    monkeypatch.delenv("TORCHGCO_LANES", raising=False)
+    assert compiler.lanes(described) == expected
+    monkeypatch.setenv("TORCHGCO_LANES", str(12 - expected))
+    assert compiler.lanes(described) == 12 - expected
+
+
+WIDTH = """
+import hashlib, torch
+from tests.problems import planar_batch
+from torchgco import presets
+from torchgco.native.codegen.source import LANES
+torch.set_num_threads(1)
+problem, U0 = planar_batch(5)
+solution = presets.gco(problem).solve(problem, U0)
+print(LANES, hashlib.sha256(solution.U.numpy().tobytes()).hexdigest(), solution.status.tolist())
+"""
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_results_have_the_same_bits_in_any_number_of_lanes() -> None:
+    said = []
+    for width in ("4", "8"):
+        call = [sys.executable, "-c", WIDTH]
+        done = subprocess.run(
+            call, env={**os.environ, "TORCHGCO_LANES": width}, capture_output=True, text=True, check=True
+        )
+        said.append(done.stdout.split(" ", 1))
+    assert [width for width, _ in said] == ["4", "8"] and said[0][1] == said[1][1]
+
+
+NOTED = """#!/bin/sh
+case "$*" in *--version*) exec {real} "$@";; esac
+echo begin >> {log}
+{real} "$@"
+status=$?
+echo end >> {log}
+exit $status
+"""
+BOTH = """
+import torch, torchgco
+from tests.problems import planar_batch
+problem, U0 = planar_batch(1, N=10)
+torchgco.solve(problem, U0, solver="interior_point")
+"""
+
+
+@needs_compiler
+def test_both_libraries_are_compiled_at_the_same_time(tmp_path: Path) -> None:
+    """The interior point's has begun before the first one has ended, and is not compiled again."""
+    found = find_compiler()
+    assert found is not None
+    log, script = tmp_path / "log", tmp_path / "cc"
+    script.write_text(NOTED.format(real=" ".join(found.command), log=log))
+    script.chmod(0o755)
+    environment = {**os.environ, "TORCHGCO_CC": str(script), "TORCHGCO_CACHE": str(tmp_path / "cache")}
+    environment["TORCHGCO_CFLAGS"] = "-O1"
+    subprocess.run([sys.executable, "-c", BOTH], env=environment, check=True)
+    assert log.read_text().split() == ["begin", "begin", "end", "end"]
+
+
+@needs_compiler
+def test_a_compiler_that_has_begun_is_waited_for(cache: Path, compiled: list[str]) -> None:
+    compiler.begin(source(7))
+    compiler.begin(source(7))
+    assert len(compiler._begun) == 1 and times(7) == 21.0 and len(compiled) == 1 and not compiler._begun
+    compiler.begin(source(7))  # it is loaded
+    next_process()
+    compiler.begin(source(7))  # it is in the cache
+    assert not compiler._begun and times(7) == 21.0 and len(compiled) == 1
+    compiler.begin("no C")
+    with pytest.raises(NativeError, match="error"):
+        build("no C")

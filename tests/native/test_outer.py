@@ -12,9 +12,11 @@ from torch import Tensor
 from tests.problems import planar_batch, quadrotor_batch
 from tests.search.test_finish import brachistochrone, bryson_denham, parking
 from torchgco import ILQR, AugmentedLagrangian, Boxes, Problem, Spheres, StateBounds, presets
+from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.quality import violation
 from torchgco.native.dispatch import chord_clearance, measured, open_loop
 from torchgco.native.engine import Engine
+from torchgco.native.packing import is_bounded
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.contracts import Call
@@ -128,3 +130,28 @@ def test_violations_and_clearances_equal_those_of_pytorch(moving: bool) -> None:
         torch.testing.assert_close(chord_clearance(problem, X, share), rows.amin(0), rtol=1e-12, atol=1e-12)
     X[1, 7, 0] = torch.nan
     assert bool(torch.isnan(measured(problem, X, U))[1]) and bool(torch.isfinite(measured(problem, X, U))[0])
+
+
+@pytest.mark.parametrize("name", ["planar", "quadrotor", "walled"])
+@pytest.mark.parametrize("kind", ["standard", "as printed"])
+def test_trials_that_end_early_are_those_that_would_be_refused(
+    monkeypatch: pytest.MonkeyPatch, kind: str, name: str
+) -> None:
+    """Rollouts of the line search that end where L_M is already too high change no bit."""
+    problem, U0 = PROBLEMS[name]()
+    solver = SOLVERS[kind]
+    short = solver.solve(problem, U0)
+    assert is_bounded(problem.cost)
+    monkeypatch.setattr("torchgco.native.engine.is_bounded", lambda cost: False)
+    whole = solver.solve(problem.renewed(), U0)
+    for field in ("X", "U", "K", "cost", "violation", "status", "iterations"):
+        assert torch.equal(getattr(short, field), getattr(whole, field)), field
+
+
+def test_a_cost_is_bounded_where_no_stage_can_be_below_zero() -> None:
+    cost = planar_batch()[0].cost
+    assert isinstance(cost, BoundQuadratic) and is_bounded(cost)
+    below = replace(cost, R=-cost.R)
+    linear = replace(cost, q=torch.ones_like(cost.Q))
+    matrices = replace(cost, Q=cost.Q.diag_embed(), R=cost.R.diag_embed(), Qf=cost.Qf.diag_embed(), diagonal=False)
+    assert not any(map(is_bounded, (below, linear, matrices)))

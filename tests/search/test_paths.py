@@ -118,7 +118,7 @@ def test_the_iterations_of_every_candidate_are_counted(monkeypatch) -> None:
 
         return call
 
-    for place in ("torchgco.search.candidates.descend", "torchgco.search.candidates.AugmentedLagrangian.solve"):
+    for place in ("torchgco.search.candidates.descend", "torchgco.search.candidates.AugmentedLagrangian.outer_loop"):
         monkeypatch.setattr(place, noted(resolve_name(place)))
     options = varied(QUICK, num_paths=3, initial_offsets=((0.7, -0.7),), relax_top=3, relax_iterations=4, top=2)
     problem = cups()

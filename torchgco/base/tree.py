@@ -52,6 +52,20 @@ def take(tree: Any, index: Rows) -> Any:
     return tree
 
 
+class LastTaken:
+    """Rows of a tree, which are kept until others are asked for: several steps in turn look at the same ones."""
+
+    def __init__(self, tree: Any) -> None:
+        self.tree = tree
+        self._last: tuple[Tensor, Any] | None = None
+
+    def take(self, index: Tensor) -> Any:
+        """Rows `index` (int64, (b,)) of the tree."""
+        if self._last is None or not torch.equal(self._last[0], index):
+            self._last = index, self.tree.take(index) if hasattr(self.tree, "take") else take(self.tree, index)
+        return self._last[1]
+
+
 def cast(tree: Any, dtype: torch.dtype) -> Any:
     """Every floating tensor in nested tuples and dataclasses in another precision; all else passes unchanged."""
     if isinstance(tree, Tensor):

@@ -89,6 +89,11 @@ class BoundQuadratic(Cost):
     def bind(self, dims: Dimensions) -> BoundQuadratic:
         return self
 
+    @property
+    def control_curvatures(self) -> Tensor:
+        """The second derivatives by each control alone, (B|1, N|1, m)."""
+        return self.R if self.diagonal else self.R.diagonal(dim1=-2, dim2=-1)
+
     def toward(self, x_ref: Tensor) -> BoundQuadratic:
         """The same cost with other references of the states, (B, N+1, n), unchecked: for receding horizons."""
         return replace(self, x_ref=x_ref[:, :-1].contiguous(), xf_ref=x_ref[:, -1].contiguous())

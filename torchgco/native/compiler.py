@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import itertools
 import os
 import platform
 import shlex
@@ -28,6 +29,7 @@ FLAGS = ("-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trappin
 # No warning where a vector type is wider than the registers: within one library that does no harm.
 _QUIET = ("-Wno-psabi",)
 _ERROR_LINES = 5
+_AMD_HALVES = 25  # family of AMD processors, at most, that compute vectors of 512 bits in two steps
 
 
 class NativeError(RuntimeError):
@@ -80,20 +82,50 @@ def build(source: str, flags: Sequence[str] = ()) -> ctypes.CDLL:
     return _loaded[known]
 
 
+def begin(source: str) -> None:
+    """Start to compile a source that `build` will ask for, while others are compiled; an error is left to `build`."""
+    compiler = find_compiler()
+    if compiler is None or (source, (), compiler) in _loaded:
+        return
+    flags = (*compiler.flags, *compiler.further)
+    key = _key(compiler, source, flags)
+    if key not in _begun and store.find(key, ".so") is None:
+        with suppress(OSError):
+            room = TemporaryDirectory(prefix="torchgco-")
+            _begun[key] = _Begun(os.getpid(), room, _start(compiler, source, flags, Path(room.name)))
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A compiler that runs in a room of its own, started by the process `owner`: forks can't wait for it."""
+
+    owner: int
+    room: TemporaryDirectory[str]
+    process: subprocess.Popen[str]
+
+
 _loaded: dict[tuple[str, tuple[str, ...], Compiler | None], ctypes.CDLL] = {}
+_begun: dict[str, _Begun] = {}
+
+
+def _key(compiler: Compiler, source: str, flags: tuple[str, ...]) -> str:
+    return store.key_of(("library 1", source, *flags, compiler.identity, _processor()))
 
 
 def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
-    key = store.key_of(("library 1", source, *flags, compiler.identity, _processor()))
+    key = _key(compiler, source, flags)
     kept = store.find(key, ".so")
     if kept is not None:
         try:
             return ctypes.CDLL(str(kept))
         except OSError:  # removed meanwhile, or in a folder mounted without execution rights
             pass
+    begun = _begun.pop(key, None)
+    if begun is not None and begun.owner != os.getpid():
+        begun = None
     try:
-        with TemporaryDirectory(prefix="torchgco-") as room:
-            made = _compile(compiler, source, flags, Path(room))
+        with TemporaryDirectory(prefix="torchgco-") if begun is None else begun.room as room:
+            made = _compile(compiler, source, flags, Path(room), None if begun is None else begun.process)
             kept = store.save(key, ".so", made.read_bytes())
             try:
                 return ctypes.CDLL(str(kept or made))
@@ -103,10 +135,11 @@ def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDL
         raise NativeError(f"a compiled library can't be written or loaded: {error}") from error
 
 
-def _compile(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) -> Path:
+def _compile(
+    compiler: Compiler, source: str, flags: tuple[str, ...], room: Path, begun: subprocess.Popen[str] | None = None
+) -> Path:
     notice("compiling native kernels (once for this form of problem, some seconds) ...")
-    (room / "kernels.c").write_text(source)
-    returncode, errors = _run([*compiler.command, *flags, "-o", "kernels.so", "kernels.c", "-lm"], room)
+    returncode, errors = _finished(_start(compiler, source, flags, room) if begun is None else begun)
     if returncode:
         said = errors.splitlines() or [_ended(returncode)]
         shown = [line for line in said if "error" in line] or said
@@ -114,24 +147,35 @@ def _compile(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path
     return room / "kernels.so"
 
 
-def _run(command: Sequence[str], room: Path) -> tuple[int, str]:
-    """Run a compiler; returns its exit code and what it says on stderr.
-
-    It has a process group of its own, which Ctrl-C and SIGTERM end here: a compiler starts processes of its own, which
-    would go on.
-    """
+def _start(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) -> subprocess.Popen[str]:
+    """A compiler that makes kernels.so in its room. It has a process group of its own, as it starts other processes."""
+    (room / "kernels.c").write_text(source)
     # Run in its folder: no path gets into the library, which then has the same bytes wherever it is made.
-    process = subprocess.Popen(
-        command, cwd=room, env={**os.environ, "LC_ALL": "C"}, process_group=0, stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace",
+    return subprocess.Popen(
+        [*compiler.command, *flags, "-o", "kernels.so", "kernels.c", "-lm"], cwd=room,
+        env={**os.environ, "LC_ALL": "C"}, process_group=0, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE, text=True, errors="replace",
     )  # fmt: skip
+
+
+def _finished(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Wait for a compiler; returns its exit code and what it says on stderr.
+
+    Ctrl-C and SIGTERM end it here, with its group and the compilers that have begun: they would go on.
+    """
     try:
         with _ending_by_sigterm(process):
             _, said = process.communicate()
     except BaseException:
-        _end(process)
+        _end_all(process)
         raise
     return process.returncode, said
+
+
+def _end_all(process: subprocess.Popen[str]) -> None:
+    for one in (process, *(begun.process for begun in _begun.values() if begun.owner == os.getpid())):
+        _end(one)
+    _begun.clear()
 
 
 def _end(process: subprocess.Popen[str]) -> None:
@@ -145,7 +189,7 @@ def _ending_by_sigterm(process: subprocess.Popen[str]) -> Iterator[None]:
     """In this block a SIGTERM that nobody handles, as in a study's workers, ends the compiler first."""
 
     def end(number: int, frame: FrameType | None) -> None:
-        _end(process)
+        _end_all(process)
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
@@ -207,3 +251,26 @@ def _processor() -> str:
     wanted = ("model name", "flags", "features", "cpu implementer", "cpu part", "cpu variant")
     words |= {line for line in lines if line.lower().startswith(wanted)}
     return "\n".join(sorted(words))
+
+
+def lanes(cpuinfo: str | None = None) -> int:
+    """Problems in the lanes of a vector of doubles: 8 where vectors of 512 bits are computed at once, else 4.
+
+    Results are the same. Processors without units of 512 bits, and AMD's up to family 25, compute eight in two steps:
+    four take no longer in large batches, and half of the time where fewer problems run. TORCHGCO_LANES overrides.
+
+    Args:
+        cpuinfo: the description of a processor; None: of this one.
+    """
+    if given := os.environ.get("TORCHGCO_LANES"):
+        return 8 if given == "8" else 4
+    if cpuinfo is None:
+        try:
+            with open("/proc/cpuinfo", errors="replace") as file:
+                cpuinfo = "".join(itertools.takewhile(str.strip, file))  # the first of its cores
+        except OSError:
+            return 4
+    parts = (line.partition(":") for line in cpuinfo.splitlines())
+    words = {name.strip(): value.strip() for name, _, value in parts}
+    halved = words.get("vendor_id") == "AuthenticAMD" and int(words.get("cpu family", "0")) <= _AMD_HALVES
+    return 8 if "avx512f" in words.get("flags", "").split() and not halved else 4

@@ -20,6 +20,8 @@ TENSORS = {
     "double": torch.float64, "float": torch.float32, "int32_t": torch.int32, "int64_t": torch.int64,
     "uint64_t": torch.int64, "uint8_t": torch.bool,
 }  # fmt: skip
+PLAIN = (int, float, bool)
+_set = ctypes.Structure.__setattr__
 INCLUDES = "#include <stdint.h>\n"
 
 
@@ -44,9 +46,13 @@ class Structure(ctypes.Structure):
 
     def __init__(self, **values: Any) -> None:
         super().__init__()
-        object.__setattr__(self, "kept", [])
+        _set(self, "kept", [])
+        self.fill(values)
+
+    def fill(self, values: Mapping[str, Any]) -> None:
+        """Set fields by name."""
         for name, value in values.items():
-            setattr(self, name, value)
+            self.__setattr__(name, value)
 
     @classmethod
     def complete(cls, **values: Any) -> Self:
@@ -57,13 +63,15 @@ class Structure(ctypes.Structure):
 
     def copy(self) -> Self:
         other = type(self).from_buffer_copy(self)
-        object.__setattr__(other, "kept", [self])
+        _set(other, "kept", [self])
         return other
 
     def __setattr__(self, name: str, value: Any) -> None:
         kind = self.kinds.get(name)
         if kind is None:
             raise AttributeError(f"{type(self).__name__} has no field {name}")
+        if type(value) in PLAIN:
+            return _set(self, name, value)
         if isinstance(value, list):
             self.kept.append(value)
             of: Any = type(value[0]) if value else None
@@ -71,7 +79,7 @@ class Structure(ctypes.Structure):
         if isinstance(value, (Tensor, ctypes.Structure, ctypes.Array)):
             self.kept.append(value)
             value = _address(value, kind, name) if isinstance(kind, str) else value
-        super().__setattr__(name, value)
+        return _set(self, name, value)
 
 
 def fields(declared: tuple[tuple[Any, str], ...]) -> list[tuple[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from torchgco.lagrangian.quality import violation
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
-from torchgco.native.interior import InteriorEngine
+from torchgco.native.interior import InteriorEngine, begin_interior
 from torchgco.native.kernels import native
 from torchgco.native.sampler import Sampler
 from torchgco.obstacles.base import TOUCH, Obstacles
@@ -27,6 +27,7 @@ from torchgco.problem.problem import Problem
 NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitivity
 CURRENT = "current"  # marks the form of problems that a solve works on
 INTERIOR = "interior"  # marks the library of the interior point
+EXPECTED = "expected"  # marks that the interior point will be asked for
 WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
 KEPT = 64  # engines of problems without a user's code, the most recent ones
 AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
@@ -72,15 +73,20 @@ def engine_of(problem: Problem) -> Engine | None:
     return problem.form["engine"]
 
 
+def expect_interior(problem: Problem) -> None:
+    """Have the interior point's library compiled beside the first one, where that isn't made yet."""
+    problem.form[EXPECTED] = True
+
+
 def _engine(problem: Problem) -> Engine:
-    same = signature(problem)
+    same, ahead = signature(problem), begin_interior if EXPECTED in problem.form else None
     if same is None:
-        return Engine(problem)
+        return Engine(problem, ahead)
     key = same, find_compiler()
     if key in _engines:
         _engines[key] = _engines.pop(key)  # the most recent one is the last
     else:
-        _engines[key] = Engine(problem)
+        _engines[key] = Engine(problem, ahead)
         if len(_engines) > KEPT:
             del _engines[next(iter(_engines))]
     return _engines[key]
@@ -107,9 +113,9 @@ def interior_of(problem: Problem) -> InteriorEngine | None:
     engine = engine_of(problem)
     if engine is None:
         return None
-    if INTERIOR not in problem.form:
-        problem.form[INTERIOR] = InteriorEngine(engine)
-    return problem.form[INTERIOR]
+    if INTERIOR not in vars(engine):
+        vars(engine)[INTERIOR] = InteriorEngine(engine)
+    return vars(engine)[INTERIOR]
 
 
 def cost_unit(problem: Problem) -> Tensor:
@@ -146,11 +152,12 @@ def followed(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor,
     return rollout.closed_loop(problem.dynamics, X, U, G.transpose(0, 1).contiguous(), alpha)
 
 
-def reproducible(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+def reproducible(problem: Problem, X: Tensor, U: Tensor, gains: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
     """X (B, N+1, n) and U (B, N, m) of native kernels, mended where PyTorch's rollout of U would not give X.
 
     The two kinds of kernels differ in the last bits. Where unstable dynamics amplify this, as a rollout of slightly
-    different controls shows, PyTorch tracks X with the gains K (B, N, m, n), and X and U of that rollout are returned.
+    different controls shows, PyTorch tracks X with the `gains` (b, N, m, n) of these rows (b,), and X and U of that
+    rollout are returned.
     """
     engine = engine_of(problem)
     if engine is None:
@@ -160,9 +167,10 @@ def reproducible(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Ten
     rows = (~((other - X).abs().flatten(1).amax(-1) <= AMPLIFIED * NUDGE * scale)).nonzero().flatten()
     if rows.numel() == 0:
         return X, U
-    gains = torch.cat((K[rows], torch.zeros_like(K[rows][..., :1])), dim=-1).nan_to_num(0.0).transpose(0, 1)
+    K = gains(rows)
+    G = torch.cat((K, torch.zeros_like(K[..., :1])), dim=-1).nan_to_num(0.0).transpose(0, 1)
     X, U, alpha = X.clone(), U.clone(), torch.zeros_like(scale[rows])
-    X[rows], U[rows] = rollout.closed_loop(problem.dynamics.take(rows), X[rows], U[rows], gains.contiguous(), alpha)
+    X[rows], U[rows] = rollout.closed_loop(problem.dynamics.take(rows), X[rows], U[rows], G.contiguous(), alpha)
     return X, U
 
 

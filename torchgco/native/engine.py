@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
@@ -22,23 +23,27 @@ from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import LANES, Form
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.declarations import load
-from torchgco.native.packing import KINDS, constraint_of, guide_of, quadratic_arrays
+from torchgco.native.packing import KINDS, constraint_of, guide_of, is_bounded, quadratic_arrays
 from torchgco.native.structures import STRUCTURES, array
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
 
+PACKED = "packed"  # marks the constraints that were packed last, among what a form keeps
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
 class Engine:
     """The library of a form of problems.
 
+    Args:
+        ahead: is called when the form is known, before the library is compiled.
+
     Raises:
         InputError: not float64 on a CPU, too many states and controls, or a part without a counterpart in C.
         NativeError: no compiler, or it refuses the source.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, ahead: Callable[[Engine], None] | None = None) -> None:
         if problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
         if problem.n + problem.m > MAX_VARIABLES:
@@ -54,6 +59,8 @@ class Engine:
         self.measures = all(type(part) in KINDS or _measured(part) for part in problem.constraints)
         at, functions = problem.dynamics.position, tuple(self.functions.items())
         self.form = Form(self.model, at, self.cost, dense, functions, BoundBoxes in kinds, BoundField in kinds)
+        if ahead is not None:
+            ahead(self)
         self.library = load(self.form.source(), STRUCTURES)
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
@@ -166,20 +173,32 @@ class Engine:
         """A problem without multipliers or a guide, and further fields, in the form that the library reads."""
         fixed, _ = self._fixed(problem)
         packed = fixed.copy()
-        for name, value in values.items():
-            setattr(packed, name, value)
+        packed.fill(values)
         return packed
 
     def terms(self, lagrangian: Lagrangian, best: Multipliers | None = None, **values: Any) -> c.Problem:
         """The same with the terms that the Lagrangian adds to the cost; `best` are those of an outer loop's best."""
-        multipliers, phr = lagrangian.multipliers, lagrangian.phr
+        if best is not None:
+            packed = self._summed(lagrangian, best)
+        elif "packed" in vars(lagrangian):
+            packed = vars(lagrangian)["packed"].copy()
+        else:
+            packed = self._summed(lagrangian)
+            object.__setattr__(lagrangian, "packed", packed)  # several calls of an inner solve read the same terms
+            packed = packed.copy()
+        packed.fill(values)
+        return packed
+
+    def _summed(self, lagrangian: Lagrangian, best: Multipliers | None = None) -> c.Problem:
+        """The problem with multipliers, penalties and guide."""
+        multipliers = lagrangian.multipliers
         rows = [constraint.copy() for constraint in self._fixed(lagrangian.problem)[1]]
         for row, lam in zip(rows, multipliers.lam, strict=True):
             row.lam = lam.contiguous()
         for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
             row.best = lam
-        values |= {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": phr, **guide_of(lagrangian.penalty)}
-        return self.packed(lagrangian.problem, **values)
+        own = {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
+        return self.packed(lagrangian.problem, **own, **guide_of(lagrangian.penalty))
 
     def _fixed(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         """The parts that don't change from call to call: model, cost and constraints; kept with the problem."""
@@ -190,16 +209,26 @@ class Engine:
     def _made(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
         if problem.B == 0:
             return c.Problem(), [c.Constraint() for _ in problem.constraints]
+        rows = self._constraints(problem)
+        packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows)
+        if self.model.count > 0:
+            packed.parameters = array(self.model.numbers(problem.B, problem.dynamics), knots=True)
+        packed.cost_data = quadratic_arrays(problem.cost) if self.cost is None else cost_arrays(problem, self.cost)
+        packed.bounded = int(self.cost is None and is_bounded(problem.cost))
+        return packed, rows
+
+    def _constraints(self, problem: Problem) -> list[c.Constraint]:
+        """The rows without multipliers; those of the last problem where this one differs in its cost alone."""
+        known, rows = problem.form.get(PACKED, (None, []))
+        if known is problem.constraints:
+            return rows
         rows = []
         for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
             source = self.functions.get(i)
             numbers = None if source is None else rows_numbers(problem, i, source)
             rows.append(constraint_of(constraint, shape, numbers, problem))
-        packed = c.Problem(N=problem.N, constraints=len(rows), constraint=rows)
-        if self.model.count > 0:
-            packed.parameters = array(self.model.numbers(problem.B, problem.dynamics), knots=True)
-        packed.cost_data = quadratic_arrays(problem.cost) if self.cost is None else cost_arrays(problem, self.cost)
-        return packed, rows
+        problem.form[PACKED] = problem.constraints, rows
+        return rows
 
 
 def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
 from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.source import INTERIOR, LANES
+from torchgco.native.compiler import begin
 from torchgco.native.declarations import load
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import STRUCTURES, Interior
@@ -25,8 +28,7 @@ class InteriorEngine:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        curves = curvature_code(engine.model, engine.functions.items())
-        self.library = load(engine.form.source(INTERIOR, more=curves), STRUCTURES)
+        self.library = load(_source(engine), STRUCTURES)
 
     def solve(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
@@ -60,3 +62,13 @@ class InteriorEngine:
             ),
         )  # fmt: skip
         return out | ends
+
+
+def begin_interior(engine: Engine) -> None:
+    """Start to compile the interior point's library, for a form whose first library is about to be compiled."""
+    with suppress(InputError):
+        begin(_source(engine))
+
+
+def _source(engine: Engine) -> str:
+    return engine.form.source(INTERIOR, more=curvature_code(engine.model, engine.functions.items()))

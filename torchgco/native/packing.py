@@ -32,6 +32,13 @@ def quadratic_arrays(cost: Any) -> list[c.Array]:
     return [array(getattr(cost, field), knots=not name.endswith("_LAST")) for name, field in QUADRATIC.items()]
 
 
+def is_bounded(cost: Any) -> bool:
+    """Whether no stage of a quadratic cost can be below 0, rounding included; unknown of weights that are matrices."""
+    if not cost.diagonal or any(part is not None for part in (cost.q, cost.r, cost.qf, cost.H)):
+        return False
+    return all(bool((weights >= 0).all()) for weights in (cost.Q, cost.R, cost.Qf))
+
+
 def constraint_of(
     constraint: Constraint, shape: tuple[int, int], numbers: Tensor | None, problem: Problem
 ) -> c.Constraint:

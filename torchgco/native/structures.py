@@ -98,7 +98,7 @@ class Problem(Structure):
         (Array, "parameters"),  # of the model: (E, N, count)
         ((Array, COST_ARRAYS), "cost_data"),
         ("const Constraint *", "constraint"),
-        ("int32_t", "guide phr replicas optimality"),
+        ("int32_t", "guide phr replicas optimality bounded"),  # bounded: no stage's cost is below 0
         (Array, "center radius weight"),
         (Options, "options"),
         ("double", "gain"),  # share of L_M by which tgco_lift must lower it

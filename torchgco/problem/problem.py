@@ -174,6 +174,10 @@ class Problem:
     def cost_scale(self) -> CostScale:
         """The unit of each problem's cost, above 0, and its constant; see `scale.cost_scale`."""
         X, U = self.at_rest
+        stages = None if self.horizon is None else self.stages
+        if isinstance(self.cost, BoundQuadratic):
+            curvatures = self.cost.control_curvatures.expand(self.B, self.N, self.m)
+            return cost_scale(self.cost.total(X, U), curvatures, None, stages)
         s = self.n + 1 + self.m
         H = self.x0.new_empty(self.B, self.N + 1, s, s)
         self.cost.expand(X, U, H)
@@ -182,16 +186,14 @@ class Problem:
         return self.scale_of(slopes[..., z], diagonal[..., z])
 
     def scale_of(self, slopes: Tensor, curvatures: Tensor) -> CostScale:
-        """`cost_scale` from derivatives of the cost of staying at the start: gradients and the Hessians' diagonals.
+        """`cost_scale` of a cost that isn't quadratic, from its derivatives where the vehicle stays at the start.
 
-        Both are (B, N+1, n+m).
+        These are gradients and the Hessians' diagonals, (B, N+1, n+m) both.
         """
         X, U = self.at_rest
-        total, changes = self.cost.total(X, U), None
-        if not isinstance(self.cost, BoundQuadratic):
-            goal = None if self.goal is None else self.goal.position
-            changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position)
-            changes = torch.maximum(changes, savings(slopes, curvatures))
+        total, goal = self.cost.total(X, U), None if self.goal is None else self.goal.position
+        changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position)
+        changes = torch.maximum(changes, savings(slopes, curvatures))
         return cost_scale(total, curvatures[:, :-1, self.n :], changes, None if self.horizon is None else self.stages)
 
     @property

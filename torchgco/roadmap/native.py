@@ -6,6 +6,7 @@ import ctypes
 import functools
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -116,17 +117,22 @@ class NativeSearch:
 
     def _run(self, name: str, read: dict[str, Tensor], written: dict[str, Tensor], **numbers: float) -> None:
         """Call a function of the library on all problems."""
-        spheres, boxes, _ = self.obstacles
-        read = {**read, "centers": spheres.centers, "distances": marked(spheres.radii, spheres.absent)}
-        if boxes is not None:
-            numbers["boxes"] = boxes.radii.shape[1]
-            read |= {"box": _numbers(boxes), "largest": boxes.sizes.amax(-1)}
-        read = {field: tensor.contiguous() for field, tensor in read.items()}
-        B, M = spheres.radii.shape
-        numbers |= {"margin": self.margin, "clear": CLEAR, "least": EDGE_COST, "tie": TIE}
-        arguments = Arguments(problems=B, spheres=M, corners=HOPS + 1, **read, **written, **numbers)
+        arguments = self._shared.copy()
+        arguments.fill({**{field: tensor.contiguous() for field, tensor in read.items()}, **written, **numbers})
         if not getattr(self.library, name)(ctypes.byref(arguments)):
             raise MemoryError("native kernels: no memory")
+
+    @cached_property
+    def _shared(self) -> Arguments:
+        """The arguments of all calls: the obstacles, and constants."""
+        spheres, boxes, _ = self.obstacles
+        (B, M), more = spheres.radii.shape, {}
+        if boxes is not None:
+            more = {"boxes": boxes.radii.shape[1], "box": _numbers(boxes), "largest": boxes.sizes.amax(-1).contiguous()}
+        return Arguments(
+            problems=B, spheres=M, corners=HOPS + 1, margin=self.margin, clear=CLEAR, least=EDGE_COST, tie=TIE,
+            centers=spheres.centers.contiguous(), distances=marked(spheres.radii, spheres.absent).contiguous(), **more,
+        )  # fmt: skip
 
 
 def _numbers(boxes: Cuboids) -> Tensor:

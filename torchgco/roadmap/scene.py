@@ -8,6 +8,8 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from torchgco.base.tree import LastTaken
+from torchgco.costs.base import Cost
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.obstacles.box_geometry import Cuboids
@@ -15,6 +17,7 @@ from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import Inflated, Scene
 
 LITTLE = 1e-6  # in units of cost: a smaller stage cost says nothing about the goal
+PATHS = "paths"  # marks whether there is a way to seek paths, among what a form keeps
 S = TypeVar("S", bound=Solids)
 FALLEN_BACK = 0.25  # share of the distance from start to goal; candidates that end farther from the goal are dropped
 
@@ -34,11 +37,13 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     obstacles = _by_kind(problem.x0[:, at], [part for part in known if part.radii.shape[1] > 0], maps)
     if obstacles is None:
         return None
-    first = _resting_cost(problem, rest, problem.x0[:, None, at]).clamp(min=1e-12)
+    parts = problem.cost, problem.x0, rest[:, :1]
+    first = _resting_cost(*parts, at, problem.x0[:, None, at]).clamp(min=1e-12)
+    some = LastTaken((*parts, first))
 
     def traversal_cost(points: Tensor, rows: Tensor) -> Tensor:
-        price = _resting_cost(problem, rest, points, rows)
-        return price.clamp(min=0.0) / first[rows] + 0.1
+        cost, x0, u, unit = some.take(rows)
+        return _resting_cost(cost, x0, u, at, points).clamp(min=0.0) / unit + 0.1
 
     return Scene(problem.x0[:, at], problem.goal.position, obstacles, traversal_cost)
 
@@ -47,8 +52,11 @@ def has_paths(problem: Problem) -> bool:
     """Whether there is a goal, and obstacles among which the roadmap can seek a path to it."""
     if problem.dynamics.position is None:
         return False
-    one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
-    return scene_of(one, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))) is not None
+    if PATHS not in problem.form:
+        one = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))
+        rest = one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))
+        problem.form[PATHS] = scene_of(one, rest) is not None
+    return problem.form[PATHS]
 
 
 def _by_kind(start: Tensor, parts: Sequence[Solids], maps: tuple[BoundField, ...]) -> Inflated | None:
@@ -77,7 +85,7 @@ def scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor
     """
     sizes = scene.obstacles.scales
     R = sizes.sum(-1) / (sizes > 0).sum(-1).clamp(min=1)
-    resting = _resting_cost(problem, rest, scene.start.unsqueeze(1))[:, 0]
+    resting = _resting_cost(problem.cost, problem.x0, rest[:, :1], problem.position, scene.start.unsqueeze(1))[:, 0]
     ends_matter = (resting.abs() < LITTLE) & (scene.start != scene.goal).any(-1)
     return R, torch.where(ends_matter, 1.0, resting) / R.pow(4)
 
@@ -101,9 +109,8 @@ def control_reach(problem: Problem, rest: Tensor, signs: Tensor) -> Tensor:
     return torch.where(torch.isfinite(reach), reach, 1.0)
 
 
-def _resting_cost(problem: Problem, rest: Tensor, points: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
-    """Stage cost (B', V) of resting at points (B', V, d) of some problems."""
-    x = problem.x0[rows].unsqueeze(1).repeat(1, points.shape[1], 1)
-    x[..., problem.position] = points
-    u = rest[rows, :1].expand(-1, points.shape[1], -1)
-    return problem.cost.take(rows).stage(x, u, 0)
+def _resting_cost(cost: Cost, x0: Tensor, u: Tensor, at: slice, points: Tensor) -> Tensor:
+    """Stage cost (B, V) of resting at points (B, V, d) under u (B, 1, m); the position is at `at` in x0 (B, n)."""
+    x = x0.unsqueeze(1).repeat(1, points.shape[1], 1)
+    x[..., at] = points
+    return cost.stage(x, u.expand(-1, points.shape[1], -1), 0)

@@ -16,6 +16,7 @@ from torchgco.lagrangian.quality import has_arrived, is_preferred
 from torchgco.native.dispatch import chord_clearance
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.scene import has_paths
+from torchgco.search.candidates import unwatched
 from torchgco.search.proposals import PathProposals, Round
 from torchgco.solution import SearchRecord, Standing
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -42,12 +43,15 @@ class Best:
         self.worked = torch.ones_like(call.ids, dtype=torch.bool)  # (B,): on which problems the present pass has
         self.spare: dict[int, SolveEnd] = {}  # by problem: the best clear trajectory that a cheaper one has replaced
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
+        self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced
 
     def arrived(self, tolerances: float = 1.0) -> Tensor:
         """Whether each problem's best trajectory is feasible and ends within `tolerances` goal tolerances, (B,)."""
-        best = self.end.best
-        fits = best.violation <= self.solver.violation_tolerance
-        return fits & has_arrived(self.call.problem, best.X, tolerances)
+        if tolerances not in self._arrived:
+            best = self.end.best
+            fits = best.violation <= self.solver.violation_tolerance
+            self._arrived[tolerances] = fits & has_arrived(self.call.problem, best.X, tolerances)
+        return self._arrived[tolerances]
 
     def next_attempt(self) -> None:
         """Count attempts in the trace, also those that no problem of this batch needs."""
@@ -117,6 +121,7 @@ class Best:
             self.record.passes[-1][2].extend(self.call.rows[rows].tolist())
         self.worked[rows] = True
         chosen = where.nonzero().flatten()
+        self._arrived.clear()
         put(self.end.best, rows[chosen], take(trajectories, chosen))
         self.end.status[rows[chosen]] = new.status[chosen]
         for name in ("iterations", "outer", "guided"):
@@ -247,7 +252,8 @@ class Search:
         """A pass of proposals: of a new round, or of the one that has begun."""
         if not proposals.continues:
             rows = self.rows(proposals.when)
-            watch = partial(self._watched, rows)
+            watches = self.call.callback is not None or self.call.deadline is not None
+            watch = partial(self._watched, rows) if watches else unwatched
             problem, places = self.call.problem.take(rows), self.call.rows[rows]
             begun = Round(problem, proposals.at_once, watch, places, self.record) if rows.numel() > 0 else None
             self._round = None if begun is None else (rows, begun)

@@ -10,13 +10,15 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import Count, Positive, check_options
-from torchgco.base.tree import put, take
+from torchgco.base.tree import LastTaken, put, take
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.native.dispatch import chord_clearance, measured, value
+from torchgco.problem.horizons import at_rest_after
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
+from torchgco.solvers.contracts import Call
 from torchgco.solvers.ilqr import ILQR, descend
 from torchgco.solvers.line_search import LineSearch
 
@@ -80,6 +82,7 @@ class Candidates:
     count: int  # candidates of each problem
     iterations: Tensor  # (B,) int64: of all solves so far, those of dropped candidates included
     watch: Watch
+    selected: LastTaken  # the problems of the candidates that a step looked at last
 
     @classmethod
     def begin(
@@ -91,13 +94,13 @@ class Candidates:
         X = U.new_zeros(U.shape[0] * count, problem.N + 1, problem.n)
         none = torch.zeros(problem.B, dtype=torch.int64, device=U.device)
         number = torch.arange(count, device=U.device).repeat(problem.B)
-        return cls(problem, X, U.flatten(0, 1), R, unit, live.flatten(), number, count, none, watch)
+        return cls(problem, X, U.flatten(0, 1), R, unit, live.flatten(), number, count, none, watch, LastTaken(problem))
 
     def pick(self, order: Tensor) -> Candidates:
         """The candidates at the places `order` (B, c) among those of their problem."""
         rows = self.rows(order).flatten()
         X, U, R, unit, live, number = (t[rows] for t in (self.X, self.U, self.R, self.unit, self.live, self.number))
-        return Candidates(self.problem, X, U, R, unit, live, number, order.shape[1], self.iterations, self.watch)
+        return replace(self, X=X, U=U, R=R, unit=unit, live=live, number=number, count=order.shape[1])
 
     def rows(self, order: Tensor) -> Tensor:
         """Rows (B, c) of the candidates at the places `order` (B, c)."""
@@ -105,11 +108,12 @@ class Candidates:
 
     def of(self, rows: Tensor) -> Problem:
         """The problems of the candidates in `rows` (b,)."""
-        return self.problem.take(rows // self.count)
+        return self.selected.take(rows // self.count)
 
     def multipliers(self, rows: Tensor, penalty: float) -> Multipliers:
         """Zero multipliers and a penalty in q0 / R^4 for the candidates in `rows` (b,)."""
-        return replace(Multipliers.zero(self.of(rows), 0.0), mu=penalty * self.unit[rows])
+        lam = (self.U.new_zeros(rows.numel(), *shape) for shape in self.problem.row_shapes)
+        return Multipliers(tuple(lam), penalty * self.unit[rows])
 
     def parts(self) -> Iterator[Tensor]:
         """Rows of the live candidates, `CANDIDATES_AT_ONCE` at a time."""
@@ -160,19 +164,18 @@ class Candidates:
             return Refined(self, multipliers, everyone[:: self.count], torch.full_like(self.unit, torch.inf))
         part, inner = self.of(rows), inner_solver(iterations, 0.1)
         solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=refine.rounds)
-        end = solver.solve(
-            part, self.U[rows], warm=take(multipliers, rows),
-            callback=lambda progress: self.watch(progress.finished, progress.total),
-        )  # fmt: skip
+        watched = None if self.watch is unwatched else lambda now: self.watch(now.finished, now.total)
+        call = Call.checked(part, at_rest_after(part, self.U[rows]), warm=take(multipliers, rows), callback=watched)
+        end, made = solver.improved(call)
         good = (end.violation <= refine.violation) & seen.arrives(part, end.X)
         good &= chord_clearance(part, end.X, refine.cut) >= 0.0
         won = rows[good]
         X, U, cost = self.X.clone(), self.U.clone(), torch.full_like(self.unit, torch.inf)
         X[won], U[won], cost[won] = end.X[good], end.U[good], end.cost[good]
-        made = self.iterations.index_add(0, rows // self.count, end.iterations)
+        total = self.iterations.index_add(0, rows // self.count, made)
         put(multipliers, won, take(end.multipliers, good.nonzero().flatten()))
         best = self.rows(cost.view(-1, self.count).argsort(dim=-1, stable=True)[:, :1])[:, 0]
-        return Refined(replace(self, X=X, U=U, iterations=made), multipliers, best, cost)
+        return Refined(replace(self, X=X, U=U, iterations=total), multipliers, best, cost)
 
     def order(self, first: Tensor, alike: float | None = None) -> Tensor:
         """Places (B, count) of each problem's candidates, the best first.

@@ -62,7 +62,12 @@ class Converge:
     @staticmethod
     def serves(problem: Problem) -> bool:
         """Whether these problems have more to them than AL-iLQR's inner solver, and native kernels."""
-        return bool(problem.constraints or problem.free_start is not None) and interior_of(problem) is not None
+        return Converge.worth(problem) and interior_of(problem) is not None
+
+    @staticmethod
+    def worth(problem: Problem) -> bool:
+        """Whether these problems have more to them than AL-iLQR's inner solver."""
+        return bool(problem.constraints or problem.free_start is not None)
 
     @classmethod
     def begins(cls, problem: Problem) -> bool:

@@ -10,7 +10,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_options
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
-from torchgco.native.dispatch import interior_of
+from torchgco.native.dispatch import expect_interior, interior_of
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Late, Search
 from torchgco.search.chords import ClearChords
@@ -64,6 +64,11 @@ class Restarts(Solver):
         """The passes but the last solves, as the next plan continues this one; and the local solver, unguided."""
         passes = tuple(one for one in self.passes if not isinstance(one, Converge | Finish | Starts))
         return replace(self, passes=passes), replace(self.local, guidance=None, max_outer_iterations=rounds)
+
+    def announce(self, problem: Problem) -> None:
+        """Where a pass is the interior point's."""
+        if any(isinstance(one, Converge) for one in self.passes) and Converge.worth(problem):
+            expect_interior(problem)
 
     def frees_start(self, problem: Problem) -> bool:
         """Where a pass is the interior point's, and there are native kernels."""

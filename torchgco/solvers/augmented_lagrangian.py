@@ -92,6 +92,12 @@ class AugmentedLagrangian(Solver):
         end = self.outer_loop(session.call, guidance, recorder=session.recorder)
         return session.finished(end, self.violation_tolerance, self.slots)
 
+    def improved(self, call: Call) -> tuple[Iterate, Tensor]:
+        """The trajectories of a solve without its verdict, in the user's units, and the iterations made (B,)."""
+        session = Session(call, self.inner.rules)
+        end = self.outer_loop(session.call)
+        return session.trajectories(end), end.iterations
+
     def outer_loop(
         self,
         call: Call,
@@ -130,10 +136,17 @@ class OuterLoop:
         self.solver, self.call, self.guidance, self.penalty, self.recorder = solver, call, guidance, penalty, recorder
         self.guide_first, self.by_arrival = guide_first, by_arrival
         self.rules = solver.inner.rules
-        self.result = SolveEnd.blank(call.problem, call.U0)
+        self._result: SolveEnd | None = None
         self.stopped = 0  # problems that guidance has stopped
         self.limit = 1 if recorder is not None else solver.inner.max_iterations
         self._native: NativeOuter | None = None  # of the running problems
+
+    @property
+    def result(self) -> SolveEnd:
+        """How the problems have ended so far."""
+        if self._result is None:
+            self._result = SolveEnd.blank(self.call.problem, self.call.U0)
+        return self._result
 
     def begin(self, rows: Tensor) -> tuple[State, Tensor]:
         """Rollouts of the initial controls of the problems `rows`, and the statuses of invalid starts."""
@@ -320,15 +333,19 @@ class OuterLoop:
 
     def end(self, s: State, places: Tensor, status: Tensor) -> None:
         """Keep the best and the last iterate of the problems at `places` of the state."""
-        problem, r, rows = self.problem.take(places), self.result, s.rows[places]
-        X, U = s.X[places], s.U[places]
-        last = Iterate(X, U, take(s.multipliers, places), s.cost[places], measured(problem, X, U))
-        best, known = copied(last), torch.isfinite(s.best.violation[places]).nonzero().flatten()
-        put(best, known, take(take(s.best, places), known))
-        put(r.last, rows, last)
-        put(r.best, rows, best)
-        r.status[rows], r.iterations[rows] = status, s.iterations[places]
-        r.outer[rows], r.guided[rows] = s.outer[places], s.guided[places]
+        whole = places.numel() == s.rows.numel()
+        state = s if whole else take(s, places)
+        violation = measured(self.problem.take(places), state.X, state.U)
+        last = Iterate(state.X, state.U, state.multipliers, state.cost, violation)
+        best, known = state.best, torch.isfinite(state.best.violation)
+        if not bool(known.all()):
+            best = copied(last)
+            put(best, known, take(state.best, known))
+        ended = SolveEnd(best, last, status, state.iterations, state.outer, state.guided)
+        if whole and self._result is None and places.numel() == self.call.problem.B:
+            self._result = ended
+        else:
+            put(self.result, state.rows, ended)
         self.stopped += int((status == STOPPED).sum())
 
     def report(self, passes: int, rows: Tensor, left: int, state: State) -> None:

@@ -180,6 +180,7 @@ class Solver(Brief):
                 problem.check_controls(U0)
                 U0 = at_rest_after(problem, U0)
             call = Call.checked(whole, U0, seed, ids, warm, callback, max_seconds)
+            self.announce(call.problem)
             call = call if X0 is None else self._from_states(call, X0, problem)
             if problem.free_start is not None and bool(problem.free_start.any()) and not self.frees_start(call.problem):
                 expected = "InteriorPoint, also within gco, does where there are native kernels (float64 on a CPU)"
@@ -192,6 +193,9 @@ class Solver(Brief):
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
         raise NotImplementedError
+
+    def announce(self, problem: Problem) -> None:
+        """Say which libraries `run` will ask for, so that they are compiled side by side; called before any is."""
 
     def take_states(self, problem: Problem) -> bool:
         """Whether `run` can begin these problems with states that their controls don't lead to."""

@@ -15,7 +15,7 @@ from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
-from torchgco.native.dispatch import cost_unit, followed, interior_of, measured, open_loop
+from torchgco.native.dispatch import cost_unit, expect_interior, followed, interior_of, measured, open_loop
 from torchgco.native.interior import InteriorEngine
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, check_problem
@@ -90,6 +90,10 @@ class InteriorPoint(Solver):
         session = Session(call, RAW)
         end = self._least_violated(session.call, self._no_worse(session.call, self.solved(session.call)))
         return session.finished(end, self.violation_tolerance)
+
+    def announce(self, problem: Problem) -> None:
+        """For every problem."""
+        expect_interior(problem)
 
     def frees_start(self, problem: Problem) -> bool:
         """Where there are native kernels."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -11,10 +13,10 @@ from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.dispatch import reproducible
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.ending import final_status, optimality
+from torchgco.solvers.ending import Optimality, final_status, optimality
 from torchgco.solvers.history import Recorder
 from torchgco.solvers.rules import Rules
-from torchgco.solvers.state import SolveEnd
+from torchgco.solvers.state import Iterate, SolveEnd
 from torchgco.solvers.unbounded import falls_without_end
 
 
@@ -50,24 +52,37 @@ class Session:
             slots: problems whose gains are computed together; None: all.
         """
         problem, best = self.call.problem, end.best
-        X, U = best.X.clone(), best.U.clone()
-        K, d, left = U.new_zeros(*U.shape, problem.n), torch.zeros_like(U), torch.zeros_like(best.cost)
-        for rows in torch.arange(problem.B, device=U.device).split(slots or max(1, problem.B)):
-            part = problem if rows.numel() == problem.B else problem.take(rows)
-            lagrangian = Lagrangian(part, take(best.multipliers, rows), None, self.rules.phr)
-            K[rows], d[rows], left[rows] = optimality(lagrangian, X[rows], U[rows])
-            X[rows], U[rows] = reproducible(lagrangian.problem, X[rows], U[rows], K[rows])
+        everyone = torch.arange(problem.B, device=best.X.device)
+        parts = [self._optimality(best, rows) for rows in everyone.split(slots or max(1, problem.B))]
+        K, d, left = (torch.cat(column) for column in zip(*parts, strict=True))
+        found = self.trajectories(end, lambda rows: K[rows])
         if problem.free_start is not None:  # stationary for this start alone, unless the interior point chose it
             left = torch.where(problem.free_start.any(-1) & (end.status != SOLVED), left.clamp(min=1.0), left)
         limit = Status.TIME_LIMIT if self.given.late else Status.MAX_ITERATIONS
         ended = torch.where(end.status == STOPPED, int(limit), end.status)
         constrained = bool(problem.constraints) or problem.free_start is not None
-        status = final_status(ended, left, best.violation, tolerance, constrained)
+        status = final_status(ended, left, found.violation, tolerance, constrained)
         user = self.given.problem
-        cost = user.cost.total(X, U)
-        status[falls_without_end(user, self.given.U0, X, U, cost, best.violation, tolerance)] = Status.UNBOUNDED
+        falls = falls_without_end(user, self.given.U0, found.X, found.U, found.cost, found.violation, tolerance)
+        status[falls] = Status.UNBOUNDED
         return Solution(
-            X, U, K, d, best.multipliers.scaled(self.unit), cost, best.violation, status,
+            found.X, found.U, K, d, found.multipliers, found.cost, found.violation, status,
             end.iterations, end.outer, end.guided,
             None if self.recorder is None else self.recorder.frame(*self.scales),
         )  # fmt: skip
+
+    def trajectories(self, end: SolveEnd, gains: Callable[[Tensor], Tensor] | None = None) -> Iterate:
+        """The best trajectories in the user's units, as PyTorch's rollouts give them.
+
+        Args:
+            gains: those of some rows (b,), (b, N, m, n), where they are known.
+        """
+        best = end.best
+        known = gains or (lambda rows: self._optimality(best, rows).K)
+        X, U = reproducible(self.call.problem, best.X, best.U, known)
+        cost = self.given.problem.cost.total(X, U)
+        return Iterate(X, U, best.multipliers.scaled(self.unit), cost, best.violation)
+
+    def _optimality(self, best: Iterate, rows: Tensor) -> Optimality:
+        part = Lagrangian(self.call.problem.take(rows), take(best.multipliers, rows), None, self.rules.phr)
+        return optimality(part, best.X[rows], best.U[rows])

@@ -1,6 +1,8 @@
 /* iLQR (Algorithm 2) for problems side by side: the line search, and the loop that keeps the lanes filled.
    A problem's results agree with PyTorch's kernels up to rounding (tests/native). */
 
+#define ROUNDED 1e-6 /* share of a sum that rounding can't reach */
+
 /* Commit the trial of lane from[l] to lane l where `won`. */
 static void commit(Lanes *s, I won, const int *from, V alpha, V cost, V merit) {
     int64_t N = s->of->N;
@@ -19,14 +21,18 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
     int replicas = s->of->replicas;
     int64_t landed[LANES];
     I open = moving, done = moving & ~moving;
+    /* No trial is accepted that doesn't lower L_M, which terms that are left lower by at most `floor`, and rounding. */
+    V size = tgco_fabs(s->merit) + s->floor, most = s->merit + s->floor + SET(ROUNDED) * size;
     *shortest = SET(0.0);
     for (int64_t tried = 0; any(open); tried += replicas) {
-        V alpha, cost, merit;
+        V alpha, enough, cost, merit;
         for (int l = 0; l < LANES; l++) {
             int64_t rung = s->rung[l] + tried + l % replicas;
-            alpha[l] = o->ladder[rung < o->rungs ? rung : o->rungs - 1];
+            int last = rung + 1 >= o->rungs; /* its L_M counts, whatever it is */
+            alpha[l] = o->ladder[last ? o->rungs - 1 : rung];
+            enough[l] = !open[l] ? -__builtin_inf() : last || !s->of->bounded ? __builtin_inf() : most[l];
         }
-        roll(s, alpha, &cost, &merit);
+        roll(s, alpha, enough, &cost, &merit);
         V ratio = (merit - s->merit) / (alpha * linear + SET(0.5) * alpha * alpha * quadratic);
         I good = (ratio >= SET(o->ratio_min)) & (ratio <= SET(o->ratio_max));
         if (o->accept_last) good |= alpha < SET(o->smallest);

@@ -1,7 +1,8 @@
 /* Passes along a trajectory: rollouts with the gains, and the backward pass that computes them. */
 
-/* The forward pass (line 16) from the nominal X, U along G with step lengths alpha; writes Xn, Un, J_var and L_M. */
-static void roll(Lanes *s, V alpha, V *cost, V *merit) {
+/* The forward pass (line 16) from the nominal X, U along G with step lengths alpha; writes Xn, Un, J_var and L_M. It ends
+   early, with what has added up so far, where that is over `enough` in all lanes, or isn't a number. */
+static void roll(Lanes *s, V alpha, V enough, V *cost, V *merit) {
     const Problem *p = s->of;
     V total = SET(0.0), more = SET(0.0), part;
     memcpy(s->Xn, s->X, NX * sizeof(V));
@@ -16,6 +17,7 @@ static void roll(Lanes *s, V alpha, V *cost, V *merit) {
         }
         total += knot_value(s, k, x, u, &part);
         more += part;
+        if (!any(total + more <= enough)) { *cost = total; *merit = total + more; return; }
         model_step(x, u, model_at(s, k), x + NX);
     }
     total += knot_value(s, p->N, s->Xn + p->N * NX, 0, &part);

@@ -27,6 +27,7 @@ typedef struct {
     V *X, *U, *Xn, *Un, *G, *parameters, *cost_data[COST_ARRAYS], *center, *radius;
     Rows *rows;
     V weight, mu, inverse_mu, mu_r, merit, cost, inner, made, alpha, used;
+    V floor; /* the constraints' terms add no less than minus this to L_M: lam^2 / (2 mu) for each row */
     int64_t element[LANES], rung[LANES]; /* at which the next line search begins */
     V *memory;
 } Lanes;
@@ -142,6 +143,7 @@ static void enter(Lanes *s, int lane, int64_t e) {
     enter_iterate(s, lane, e);
     fill(s->center, &p->center, N + 1, lane, e); fill(s->radius, &p->radius, N + 1, lane, e);
     if (p->guide != NO_GUIDE) s->weight[lane] = p->weight.data[e * p->weight.element];
+    double squares = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *c = p->constraint + i;
         const double *lam = c->lam + e * c->knots * c->rows;
@@ -150,11 +152,13 @@ static void enter(Lanes *s, int lane, int64_t e) {
             for (int j = 0; j < c->rows; j++, lam++) {
                 s->rows[i].lam[k * c->rows + j][lane] = *lam;
                 pushed |= *lam != 0;
+                squares += *lam * *lam;
             }
             s->rows[i].pushed[k][lane] = -pushed;
         }
     }
     s->mu[lane] = p->mu[e]; s->inverse_mu[lane] = 1 / p->mu[e];
+    s->floor[lane] = squares > 0 ? 0.5 * squares / p->mu[e] : 0;
     s->mu_r[lane] = p->regularisation ? p->regularisation[e] : 0;
     s->merit[lane] = p->merit[e]; s->cost[lane] = p->cost[e];
     s->inner[lane] = p->inner ? p->inner[e] : 0; s->made[lane] = 0; s->rung[lane] = p->rung ? p->rung[e] : 0;

@@ -137,7 +137,7 @@ static int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, 
             gaps(s, gap);
             backward(s, gap, &linear, &squares, &lowest);
             if (round > 0) { /* the first gains are those that failed */
-                roll(s, SET(1.0), &cost, &merit);
+                roll(s, SET(1.0), SET(__builtin_inf()), &cost, &merit);
                 I low = open & finite(merit) & (merit < s->merit - SET(gain) * tgco_fabs(s->merit));
                 for (int l = 0; l < used; l++) if (low[l]) {
                     int64_t e = s->element[l];

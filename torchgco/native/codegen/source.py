@@ -11,11 +11,12 @@ from torchgco.native.codegen.cost import CostSource
 from torchgco.native.codegen.dynamics import DynamicsSource
 from torchgco.native.codegen.emit import PRELUDE, literal
 from torchgco.native.codegen.knot import KnotSource
+from torchgco.native.compiler import lanes
 from torchgco.native.declarations import defines, head
 from torchgco.native.structures import CONSTANTS, COST_ARRAYS, ENUMERATIONS, STRUCTURES, Quadratic, TracedCost
 
 C = Path(__file__).parents[1] / "c"
-LANES = 8
+LANES = lanes()
 KEPT = 64  # texts, the most recent ones
 WRITTEN_OUT = 400  # nonzeros of a Jacobian, at most, that are written out one by one
 LOOPS = """
