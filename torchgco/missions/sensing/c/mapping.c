@@ -1,0 +1,141 @@
+/* The vehicle's map: log-odds of cells updated along rays, and distances from cells to the nearest of a kind. */
+
+#include <math.h>
+#include <stdint.h>
+
+enum { UNKNOWN = 0, FREE = 1, OCCUPIED = 2 };
+
+typedef struct {
+    const int64_t *shape;
+    const double *corner;
+    double size;
+} Grid;
+
+static inline int64_t place(const Grid *g, const int64_t *c) { return (c[0] * g->shape[1] + c[1]) * g->shape[2] + c[2]; }
+
+/* The cell of a point; 0 where it lies outside of the grid. */
+static int cell_of(const Grid *g, const double *p, int64_t *c) {
+    for (int i = 0; i < 3; i++) {
+        double at = floor((p[i] - g->corner[i]) / g->size);
+        if (!(at >= 0.0 && at < g->shape[i])) return 0;
+        c[i] = (int64_t)at;
+    }
+    return 1;
+}
+
+/* Marks the cells that a ray passes, from its origin inside the grid over a length; each is counted once per scan. Of a
+ * cell that it only cuts the corner of, for less than `chord`, it shows nothing. */
+static int64_t pass(
+    const Grid *g, const double *o, const double *d, double length, double chord, int32_t *stamp, int32_t now, int32_t *touched,
+    int64_t count) {
+    int64_t c[3], step[3];
+    double wait[3], per[3];
+    if (!cell_of(g, o, c)) return count;
+    for (int i = 0; i < 3; i++) {
+        int still = fabs(d[i]) < 1e-12;
+        step[i] = d[i] > 0 ? 1 : -1, per[i] = still ? INFINITY : g->size / fabs(d[i]);
+        wait[i] = still ? INFINITY : (g->corner[i] + (c[i] + (d[i] > 0)) * g->size - o[i]) / d[i];
+    }
+    double t = 0.0;
+    while (t < length) {
+        int64_t at = place(g, c);
+        double next = fmin(wait[0], fmin(wait[1], wait[2]));
+        if ((next < length ? next : length) - t >= chord && stamp[at] < now)
+            stamp[at] = now, touched[count++] = (int32_t)at;
+        int i = wait[0] < wait[1] ? (wait[0] < wait[2] ? 0 : 2) : (wait[1] < wait[2] ? 1 : 2);
+        t = wait[i], wait[i] += per[i], c[i] += step[i];
+        if (c[i] < 0 || c[i] >= g->shape[i]) break;
+    }
+    return count;
+}
+
+/* Adds a scan to the map. Cells with a return get `hit`, other cells that rays passed get `miss`, once per scan.
+ *
+ * odds (cells), state (cells), stamp (cells): the last scan that touched a cell, times two, plus one for a return.
+ * touched (cells) is scratch; changed (cells) gets the cells whose state changed. Returns how many. */
+int64_t tgco_add_scan(
+    const int64_t *shape, const double *corner, double size, float *odds, uint8_t *state, int32_t *stamp, int64_t scan,
+    int64_t rays, const double *origin, const double *directions, const double *distances, double range, double before,
+    double chord, double hit, double miss, double least, double most, double free, double occupied, int32_t *touched,
+    int32_t *changed) {
+    Grid g = {shape, corner, size};
+    int64_t count = 0, found = 0;
+    int32_t now = (int32_t)(2 * scan);
+    for (int64_t k = 0; k < rays; k++) {
+        if (!isfinite(distances[k])) continue;
+        double p[3];
+        int64_t c[3];
+        for (int i = 0; i < 3; i++) p[i] = origin[i] + distances[k] * directions[3 * k + i];
+        if (!cell_of(&g, p, c)) continue;
+        int64_t at = place(&g, c);
+        if (stamp[at] <= now) stamp[at] = now + 1, touched[count++] = (int32_t)at;
+    }
+    for (int64_t k = 0; k < rays; k++) {
+        double length = isfinite(distances[k]) ? distances[k] - before : range;
+        count = pass(&g, origin, directions + 3 * k, length, chord, stamp, now, touched, count);
+    }
+    for (int64_t n = 0; n < count; n++) {
+        int32_t at = touched[n];
+        float sum = odds[at] + (float)(stamp[at] == now + 1 ? hit : miss);
+        odds[at] = sum < least ? (float)least : sum > most ? (float)most : sum;
+        uint8_t is = odds[at] >= occupied ? OCCUPIED : odds[at] <= free ? FREE : UNKNOWN;
+        if (is != state[at]) state[at] = is, changed[found++] = at;
+    }
+    return found;
+}
+
+/* One pass of a distance transform along the last axis of (rows, length) values: out_i = min_j (in_j + gap(i - j)^2)
+ * with gap(n) = max(|n| - 1/2, 0), for |i - j| <= reach. */
+static void along(
+    const float *restrict in, float *restrict out, int64_t outer, int64_t length, int64_t inner, int64_t reach) {
+    for (int64_t n = 0; n < outer * length * inner; n++) out[n] = INFINITY;
+    for (int64_t o = 0; o < outer; o++)
+        for (int64_t i = 0; i < (inner == 1 ? 1 : length); i++)
+            for (int64_t j = -reach; j <= reach; j++) {
+                /* Values side by side: of one row where inner is 1, else those that share a place in their rows. */
+                int64_t first = inner == 1 ? (j < 0 ? -j : 0) : i, last = inner == 1 ? length - (j > 0 ? j : 0) : i + 1;
+                if (first + j < 0 || last + j > length || first >= last) continue;
+                float gap = j == 0 ? 0.0f : (j < 0 ? -j : j) - 0.5f, add = gap * gap;
+                const float *from = in + (o * length + first + j) * inner;
+                float *to = out + (o * length + first) * inner;
+                for (int64_t n = 0; n < (last - first) * inner; n++) {
+                    float sum = from[n] + add;
+                    to[n] = sum < to[n] ? sum : to[n];
+                }
+            }
+}
+
+/* Distances from the centres of the cells in a window [first, last) to the nearest cell (as a cube) of a kind, at most
+ * `reach` cells away, else that length; 0 inside. Kinds are bits: 1 << state. Cells outside of the grid are of the kind
+ * where `outside` says so. work holds 2 floats for each cell of the window grown by `reach`. distance (cells), m. */
+int64_t tgco_distances(
+    const int64_t *shape, double size, const uint8_t *state, int64_t kinds, int64_t outside, int64_t reach,
+    const int64_t *first, const int64_t *last, float *work, float *distance) {
+    int64_t low[3], n[3], r = reach;
+    for (int i = 0; i < 3; i++) low[i] = first[i] - r, n[i] = last[i] + r - low[i];
+    float *a = work, *b = work + n[0] * n[1] * n[2];
+    for (int64_t x = 0; x < n[0]; x++)
+        for (int64_t y = 0; y < n[1]; y++) {
+            float *to = a + (x * n[1] + y) * n[2];
+            int64_t X = low[0] + x, Y = low[1] + y;
+            int in = X >= 0 && X < shape[0] && Y >= 0 && Y < shape[1];
+            for (int64_t z = 0; z < n[2]; z++) {
+                int64_t Z = low[2] + z;
+                int is = outside != 0;
+                if (in && Z >= 0 && Z < shape[2]) is = (kinds >> state[(X * shape[1] + Y) * shape[2] + Z]) & 1;
+                to[z] = is ? 0.0f : INFINITY;
+            }
+        }
+    along(a, b, n[0] * n[1], n[2], 1, r);
+    along(b, a, n[0], n[1], n[2], r);
+    along(a, b, 1, n[0], n[1] * n[2], r);
+    float most = (float)reach;
+    for (int64_t x = r; x < n[0] - r; x++)
+        for (int64_t y = r; y < n[1] - r; y++)
+            for (int64_t z = r; z < n[2] - r; z++) {
+                float root = sqrtf(b[(x * n[1] + y) * n[2] + z]);
+                distance[((low[0] + x) * shape[1] + low[1] + y) * shape[2] + low[2] + z] =
+                    (float)size * (root < most ? root : most);
+            }
+    return 0;
+}
