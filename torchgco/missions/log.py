@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from torchgco.missions.planner import Plan
 from torchgco.missions.tracker import Tracking
+from torchgco.missions.unknown.safety import SeenLog
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,10 @@ class MissionLog:
     iterations: Tensor  # (B, K): of the planner's solve
     planner_seconds: Tensor  # (B, K): of the batch's solve, divided by its missions
     tracker_seconds: Tensor  # (B, K): of the J solves, divided likewise
+    map_seconds: Tensor  # (B, K): of missions with a sensor, parts of planner_seconds: cells of the map,
+    field_seconds: Tensor  # (B, K): distances on the map, and corridors,
+    search_seconds: Tensor  # (B, K): paths on it; NaN without a sensor
+    seen: list[SeenLog] = field(default_factory=list)  # of each mission with a sensor
 
     @classmethod
     def blank(cls, x: Tensor, steps: int, substeps: int, period: float, knots: int) -> MissionLog:
@@ -39,7 +45,7 @@ class MissionLog:
 
         log = cls(
             period, empty(substeps + 1, 17), empty(substeps, 4), empty(), empty(knots, 3),
-            *(empty() for _ in range(7)),
+            *(empty() for _ in range(10)),
         )  # fmt: skip
         log.x[:, 0, 0] = x  # of missions, too, that end at their start
         return log
@@ -53,6 +59,11 @@ class MissionLog:
         self.planner_seconds[rows, step] = seconds
         self.tracker_seconds[rows, step] = 0.0
         self.tracking_violation[rows, step] = 0.0
+
+    def add_parts(self, rows: Tensor, step: int, parts: Mapping[str, Tensor]) -> None:
+        """Seconds of a control period by part, (b,) each."""
+        for name, seconds in parts.items():
+            getattr(self, name)[rows, step] = seconds
 
     def add_sample(
         self, rows: Tensor, step: int, j: int, x: Tensor, tracking: Tracking, seconds: float, flew: Tensor
@@ -78,5 +89,6 @@ class MissionLog:
     def arrays(self, plans: bool = False) -> dict[str, np.ndarray]:
         """What a study keeps of every mission, by name (B, ...); with the planned positions where asked for."""
         names = ("x", "commands", "tracking_violation", "cost", "violation", "shifted", "guided", "iterations")
-        names = (*names, "planner_seconds", "tracker_seconds", *(["plan"] if plans else []))
+        names = (*names, "planner_seconds", "tracker_seconds", "map_seconds", "field_seconds", "search_seconds")
+        names = (*names, *(["plan"] if plans else []))
         return {name: getattr(self, name).numpy() for name in names}

@@ -7,14 +7,14 @@ from scipy.sparse.csgraph import dijkstra
 
 from tests.reference.sensing import chords, cubes, distances, inside
 from torchgco.missions.sensing import Lidar, Scan, SeenMap, World
-from torchgco.missions.sensing.grid import CHORD, FREE, HIT, MISS, OCCUPIED, UNKNOWN
+from torchgco.missions.sensing.grid import CHORD, FREE, HIT, MISS, OCCUPIED, REACH, UNKNOWN
 from torchgco.missions.sensing.search import Search
 
 CORNER, SIZE, SHAPE = np.array([-2.0, -1.5, -1.0]), 0.25, (17, 13, 9)
 SPAN = np.array(SHAPE) * SIZE
 
 
-def empty(reach: int = 6) -> SeenMap:
+def empty(reach: int = REACH) -> SeenMap:
     return SeenMap(CORNER, SHAPE, SIZE, reach)
 
 
@@ -72,7 +72,7 @@ def test_distances_are_those_to_the_nearest_cube() -> None:
     for distance, blocking in ((seen.from_occupied, state == OCCUPIED), (seen.from_blocked, state != FREE)):
         slow = distances(centers, centers[blocking], SIZE)
         edge = np.minimum(centers - CORNER, CORNER + SPAN - centers).min(axis=1)  # what lies outside is blocked, too
-        assert np.allclose(distance.ravel(), np.minimum(np.minimum(slow, edge), 6 * SIZE), atol=1e-6)
+        assert np.allclose(distance.ravel(), np.minimum(np.minimum(slow, edge), REACH * SIZE), atol=1e-6)
 
 
 def test_distances_around_changes_alone_are_those_of_the_whole() -> None:

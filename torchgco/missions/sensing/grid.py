@@ -15,6 +15,7 @@ SEEN_OCCUPIED, NOT_FREE = 1 << OCCUPIED, (1 << OCCUPIED) | (1 << UNKNOWN)  # kin
 # Log-odds: one ray that passes makes an unknown cell free, one return makes it occupied. A return outweighs four rays
 # that pass: they may pass through the free part of a cell that an obstacle fills in part.
 HIT, MISS, LEAST, MOST, FREE_AT, OCCUPIED_AT = 0.85, -0.2, -2.0, 3.5, -0.15, 0.5
+REACH = 4  # as C has it
 CHORD = 0.5  # of a cell's side: what a ray passes for less, it doesn't show
 
 
@@ -26,13 +27,13 @@ class SeenMap:
         corner: (3,), m, where cell (0, 0, 0) begins; outside of the grid nothing can be flown.
         shape: number of cells (3,).
         resolution: side of a cell, m.
-        reach: up to which distances are known, in cells.
+        reach: up to which distances are known, in cells, at most `REACH`.
     """
 
     corner: np.ndarray
     shape: tuple[int, int, int]
     resolution: float
-    reach: int = 6
+    reach: int = REACH
     scans: int = 0
     odds: np.ndarray = field(init=False)  # (X, Y, Z) float32
     state: np.ndarray = field(init=False)  # (X, Y, Z) uint8
@@ -48,7 +49,7 @@ class SeenMap:
         self._stamp = np.full(self.shape, -1, np.int32)
         self._touched, self._changed = (np.empty(self.state.size, np.int32) for _ in range(2))
         self._size = np.array(self.shape, np.int64)
-        self._work = np.empty(0, np.float32)
+        self._work = np.empty(0, np.uint8)
         self.measure(np.zeros(3, np.int64), self._size)
 
     def add(self, scan: Scan, reach: float, before: float = 0.0) -> np.ndarray:
@@ -92,7 +93,7 @@ class SeenMap:
         first, last = (np.ascontiguousarray(part, np.int64) for part in (first, last))
         need = 2 * int(np.prod(last - first + 2 * self.reach))
         if len(self._work) < need:
-            self._work = np.empty(need, np.float32)
+            self._work = np.empty(need, np.uint8)
         for kinds, distance in ((SEEN_OCCUPIED, self.from_occupied), (NOT_FREE, self.from_blocked)):
             call(
                 "tgco_distances", self._size, self.resolution, self.state, kinds, 1, self.reach, first, last,

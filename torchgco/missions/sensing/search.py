@@ -11,6 +11,7 @@ from torchgco.missions.sensing.library import call
 
 ENTRIES = 8  # of the heap, for each cell
 ENTRY_BYTES = 8
+DEAR = 20.0  # by which share a step into an avoided cell costs more
 
 
 @dataclass
@@ -60,3 +61,10 @@ class Search:
         )  # fmt: skip
         self.expanded = int(expanded[0])
         return seen.centers(self._path[: abs(count)][::-1]), count > 0
+
+    def avoid(self, point: np.ndarray, radius: float) -> None:
+        """Make the cells within `radius`, m, of a point (3,) dear: nothing more is seen of them from before."""
+        seen = self.seen
+        axes = [seen.corner[i] + (np.arange(seen.shape[i]) + 0.5) * seen.resolution - point[i] for i in range(3)]
+        near = sum(np.meshgrid(*(axis**2 for axis in axes), indexing="ij")) <= radius**2
+        self.price[near] += DEAR

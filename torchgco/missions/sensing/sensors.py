@@ -30,6 +30,15 @@ class Scan:
     directions: np.ndarray
     distances: np.ndarray
 
+    def seen_from(self, attitude: Any, position: Any, believed: Any) -> Scan:
+        """The scan as a vehicle with this true attitude places it, that believes to be elsewhere, turned otherwise.
+
+        Args:
+            attitude, believed: quaternions (4,); position: (3,), m, where it believes to be.
+        """
+        rays = self.directions @ turned(np.asarray(attitude)) @ turned(np.asarray(believed)).T
+        return Scan(np.array(position, np.float64), rays, self.distances)
+
 
 class Sensor:
     """What a lidar and a depth camera have in common. A subclass gives the rays in the vehicle's frame."""
@@ -88,7 +97,7 @@ class Lidar(Sensor):
     """
 
     range: Meters = 15.0
-    rays: tuple[Count, Count] = (360, 40)
+    rays: tuple[Count, Count] = (300, 32)
     field_of_view: tuple[Angle, Angle] = (360.0, 90.0)
     rate: Hertz = 10.0
     noise: NonNegative = 0.02

@@ -26,25 +26,24 @@ static int cell_of(const Grid *g, const double *p, int64_t *c) {
 /* Marks the cells that a ray passes, from its origin inside the grid over a length; each is counted once per scan. Of a
  * cell that it only cuts the corner of, for less than `chord`, it shows nothing. */
 static int64_t pass(
-    const Grid *g, const double *o, const double *d, double length, double chord, int32_t *stamp, int32_t now, int32_t *touched,
-    int64_t count) {
-    int64_t c[3], step[3];
-    double wait[3], per[3];
+    const Grid *g, const double *o, const double *d, double length, double chord, int32_t *stamp, int32_t now,
+    int32_t *touched, int64_t count) {
+    int64_t c[3], stride[3] = {g->shape[1] * g->shape[2], g->shape[2], 1}, left[3];
+    double wait[3], per[3], t = 0.0;
     if (!cell_of(g, o, c)) return count;
+    int64_t at = place(g, c);
     for (int i = 0; i < 3; i++) {
         int still = fabs(d[i]) < 1e-12;
-        step[i] = d[i] > 0 ? 1 : -1, per[i] = still ? INFINITY : g->size / fabs(d[i]);
+        left[i] = d[i] > 0 ? g->shape[i] - 1 - c[i] : c[i], stride[i] = d[i] > 0 ? stride[i] : -stride[i];
+        per[i] = still ? INFINITY : g->size / fabs(d[i]);
         wait[i] = still ? INFINITY : (g->corner[i] + (c[i] + (d[i] > 0)) * g->size - o[i]) / d[i];
     }
-    double t = 0.0;
     while (t < length) {
-        int64_t at = place(g, c);
-        double next = fmin(wait[0], fmin(wait[1], wait[2]));
-        if ((next < length ? next : length) - t >= chord && stamp[at] < now)
-            stamp[at] = now, touched[count++] = (int32_t)at;
         int i = wait[0] < wait[1] ? (wait[0] < wait[2] ? 0 : 2) : (wait[1] < wait[2] ? 1 : 2);
-        t = wait[i], wait[i] += per[i], c[i] += step[i];
-        if (c[i] < 0 || c[i] >= g->shape[i]) break;
+        double next = wait[i], end = next < length ? next : length;
+        if (end - t >= chord && stamp[at] < now) stamp[at] = now, touched[count++] = (int32_t)at;
+        if (left[i]-- == 0) break;
+        t = next, wait[i] += per[i], at += stride[i];
     }
     return count;
 }
@@ -84,22 +83,27 @@ int64_t tgco_add_scan(
     return found;
 }
 
-/* One pass of a distance transform along the last axis of (rows, length) values: out_i = min_j (in_j + gap(i - j)^2)
- * with gap(n) = max(|n| - 1/2, 0), for |i - j| <= reach. */
+/* Squares of distances in halves of a cell: those from a centre to cubes n cells on along an axis are (2 n - 1)^2. NONE
+ * plus the largest of them still fits into a byte, where vectors are wide. */
+enum { NONE = 200, MOST_REACH = 4 };
+
+/* One pass of a distance transform along the middle axis of (outer, length, inner) values:
+ * out_i = min_j (in_j + (2 |i - j| - 1)^2) for |i - j| <= reach, and in_i itself. */
 static void along(
-    const float *restrict in, float *restrict out, int64_t outer, int64_t length, int64_t inner, int64_t reach) {
-    for (int64_t n = 0; n < outer * length * inner; n++) out[n] = INFINITY;
+    const uint8_t *restrict in, uint8_t *restrict out, int64_t outer, int64_t length, int64_t inner, int64_t reach) {
+    for (int64_t n = 0; n < outer * length * inner; n++) out[n] = in[n];
     for (int64_t o = 0; o < outer; o++)
         for (int64_t i = 0; i < (inner == 1 ? 1 : length); i++)
             for (int64_t j = -reach; j <= reach; j++) {
                 /* Values side by side: of one row where inner is 1, else those that share a place in their rows. */
                 int64_t first = inner == 1 ? (j < 0 ? -j : 0) : i, last = inner == 1 ? length - (j > 0 ? j : 0) : i + 1;
-                if (first + j < 0 || last + j > length || first >= last) continue;
-                float gap = j == 0 ? 0.0f : (j < 0 ? -j : j) - 0.5f, add = gap * gap;
-                const float *from = in + (o * length + first + j) * inner;
-                float *to = out + (o * length + first) * inner;
+                if (j == 0 || first + j < 0 || last + j > length || first >= last) continue;
+                int64_t twice = 2 * (j < 0 ? -j : j) - 1;
+                uint8_t add = (uint8_t)(twice * twice);
+                const uint8_t *from = in + (o * length + first + j) * inner;
+                uint8_t *to = out + (o * length + first) * inner;
                 for (int64_t n = 0; n < (last - first) * inner; n++) {
-                    float sum = from[n] + add;
+                    uint8_t sum = (uint8_t)(from[n] + add);
                     to[n] = sum < to[n] ? sum : to[n];
                 }
             }
@@ -107,35 +111,33 @@ static void along(
 
 /* Distances from the centres of the cells in a window [first, last) to the nearest cell (as a cube) of a kind, at most
  * `reach` cells away, else that length; 0 inside. Kinds are bits: 1 << state. Cells outside of the grid are of the kind
- * where `outside` says so. work holds 2 floats for each cell of the window grown by `reach`. distance (cells), m. */
+ * where `outside` says so. work holds 2 bytes for each cell of the window grown by `reach`. distance (cells), m. */
 int64_t tgco_distances(
     const int64_t *shape, double size, const uint8_t *state, int64_t kinds, int64_t outside, int64_t reach,
-    const int64_t *first, const int64_t *last, float *work, float *distance) {
-    int64_t low[3], n[3], r = reach;
+    const int64_t *first, const int64_t *last, uint8_t *work, float *distance) {
+    int64_t low[3], n[3], r = reach < MOST_REACH ? reach : MOST_REACH;
     for (int i = 0; i < 3; i++) low[i] = first[i] - r, n[i] = last[i] + r - low[i];
-    float *a = work, *b = work + n[0] * n[1] * n[2];
+    uint8_t *a = work, *b = work + n[0] * n[1] * n[2], of[3];
+    for (int is = 0; is < 3; is++) of[is] = (kinds >> is) & 1 ? 0 : NONE;
     for (int64_t x = 0; x < n[0]; x++)
         for (int64_t y = 0; y < n[1]; y++) {
-            float *to = a + (x * n[1] + y) * n[2];
+            uint8_t *to = a + (x * n[1] + y) * n[2], beyond = outside ? 0 : NONE;
             int64_t X = low[0] + x, Y = low[1] + y;
             int in = X >= 0 && X < shape[0] && Y >= 0 && Y < shape[1];
-            for (int64_t z = 0; z < n[2]; z++) {
-                int64_t Z = low[2] + z;
-                int is = outside != 0;
-                if (in && Z >= 0 && Z < shape[2]) is = (kinds >> state[(X * shape[1] + Y) * shape[2] + Z]) & 1;
-                to[z] = is ? 0.0f : INFINITY;
-            }
+            const uint8_t *from = state + (X * shape[1] + Y) * shape[2] + low[2];
+            for (int64_t z = 0; z < n[2]; z++)
+                to[z] = in && low[2] + z >= 0 && low[2] + z < shape[2] ? of[from[z]] : beyond;
         }
     along(a, b, n[0] * n[1], n[2], 1, r);
     along(b, a, n[0], n[1], n[2], r);
     along(a, b, 1, n[0], n[1] * n[2], r);
-    float most = (float)reach;
+    float root[256];
+    for (int i = 0; i < 256; i++) root[i] = (float)(size * fmin(0.5 * sqrt(i), (double)r));
     for (int64_t x = r; x < n[0] - r; x++)
-        for (int64_t y = r; y < n[1] - r; y++)
-            for (int64_t z = r; z < n[2] - r; z++) {
-                float root = sqrtf(b[(x * n[1] + y) * n[2] + z]);
-                distance[((low[0] + x) * shape[1] + low[1] + y) * shape[2] + low[2] + z] =
-                    (float)size * (root < most ? root : most);
-            }
+        for (int64_t y = r; y < n[1] - r; y++) {
+            const uint8_t *from = b + (x * n[1] + y) * n[2] + r;
+            float *to = distance + ((low[0] + x) * shape[1] + low[1] + y) * shape[2] + low[2] + r;
+            for (int64_t z = 0; z < n[2] - 2 * r; z++) to[z] = root[from[z]];
+        }
     return 0;
 }

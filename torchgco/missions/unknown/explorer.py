@@ -1,0 +1,148 @@
+"""How missions are flown in space that the vehicle hasn't seen: options, and the planning problems of a period."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.options import Above, Count, Meters, NonNegative, Seconds, Within, check_options
+from torchgco.constraints import ControlBounds, StateBounds
+from torchgco.constraints.base import Constraint
+from torchgco.costs.quadratic import QuadraticCost
+from torchgco.missions.planner import Planner
+from torchgco.missions.planning_problem import biased, first_step, planning_state
+from torchgco.missions.sensing.grid import SeenMap
+from torchgco.missions.unknown.halfspaces import HalfSpaces, stacked
+from torchgco.missions.unknown.reference import Pace
+from torchgco.problem.problem import Problem
+
+SensorName = Literal["full", "lidar", "depth"]
+Unknown = Literal["free", "occupied", "stoppable"]
+Speed = Annotated[float, Above(0, "m/s")]
+Acceleration = Annotated[float, Above(0, "m/s^2")]
+PLANES = 8  # half-spaces of a knot at most
+CORRIDOR = 3.0  # m around a knot, within which cells make half-spaces
+REST = {3: 0.05, 4: 0.05, 5: 0.05, 7: 0.03, 8: 0.03, 10: 0.05, 11: 0.05, 12: 0.05, 13: 0.3}  # of the last two states
+EARLY = 10  # knots in which a vehicle may leave a margin that it has entered
+# Weights of a plan: positions and velocities along the reference, attitude with yaw, body rates, thrust; controls.
+STATE = [4.0, 4.0, 8.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 8.0, 0.5, 0.5, 0.5, 0.1]
+CONTROL = [0.5, 0.5, 0.5, 0.05]
+HOVER = 9.81  # m/s^2
+
+
+@dataclass(frozen=True)
+class Explorer:
+    """Options of missions that see their world through a sensor alone.
+
+    Args:
+        resolution: side of the map's cells, m.
+        region: 3 pairs [low, high], m, which the vehicle doesn't leave, and the map covers; None: the box of start and
+            goal, grown by `around`.
+        around: m along x and y, and along z.
+        known: radius of the ball around the start that is known to be free, m.
+        speed: largest speed along each axis, m/s.
+        acceleration, deceleration: of the motion along a path that a plan is to follow, m/s^2.
+        stages: of a plan, which is at rest after them.
+        margin: m that plans keep from what isn't known to be free, beyond the vehicle's radius.
+        patience: s without a way on, after which the vehicle turns to another part of the unknown.
+
+    Raises:
+        InputError: a field out of its range.
+    """
+
+    resolution: Meters = 0.25
+    region: tuple[tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
+    around: tuple[NonNegative, NonNegative] = (12.0, 4.0)
+    known: NonNegative = 0.6
+    speed: Speed = 5.0
+    acceleration: Acceleration = 5.0
+    deceleration: Acceleration = 3.5
+    stages: Annotated[int, Within(20, 400)] = 60
+    margin: NonNegative = 0.1
+    patience: Seconds = 1.0
+
+    def __post_init__(self) -> None:
+        check_options(self, "mission.explorer")
+
+    @property
+    def pace(self) -> Pace:
+        """The limits of references; some of the speed is left for what a plan deviates."""
+        return Pace(0.94 * self.speed, self.acceleration, self.deceleration)
+
+    def map_of(self, start: np.ndarray, goal: np.ndarray) -> SeenMap:
+        """An empty map for a mission from start to goal (3,), m."""
+        if self.region is not None:
+            low, high = np.array(self.region, float).T
+        else:
+            more = np.array([self.around[0], self.around[0], self.around[1]])
+            low, high = np.minimum(start, goal) - more, np.maximum(start, goal) + more
+        shape = np.maximum(np.ceil((high - low) / self.resolution - 1e-9).astype(int), 1)
+        return SeenMap(low, tuple(int(n) for n in shape), self.resolution)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class PlanningForm:
+    """The planning problems of one control period, for C seeds of each mission: C B problems, seed by seed.
+
+    Args:
+        explorer: options. whole: the mission's problems, of which model, control bounds and vehicle are used.
+        radius: of the vehicles, (B,), m.
+    """
+
+    explorer: Explorer
+    planner: Planner
+    whole: Problem
+    radius: Tensor
+
+    def problem(
+        self, x: Tensor, bias: Tensor, reference: Tensor, planes: Tensor, room: Tensor, seeds: Tensor, allowed: Tensor
+    ) -> Problem:
+        """The problems from plants x (B, 17).
+
+        Args:
+            bias: (B, 3), m/s^2.
+            reference: states (B, N+1, 14) to follow.
+            planes: (B, N, R, 4), see `SeenMap.corridor`; room (B, N), m; seeds (B, N, 3), m: where they were made.
+            allowed: (B, N), m: distance that each knot keeps from what isn't known to be free.
+        """
+        whole, N = self.whole, self.explorer.stages
+        x0 = planning_state(x, self.planner.airframe)
+        dynamics = whole.dynamics if self.planner.estimation == 0 else biased(whole.dynamics, bias)
+        cost = QuadraticCost(Q=STATE, R=CONTROL, Qf=[2.0 * w for w in STATE], x_ref=reference, u_ref=[0, 0, 0, HOVER])
+        normals, offsets = stacked(planes, allowed.unsqueeze(-1))
+        constraints: list[Constraint] = [
+            HalfSpaces(normals, offsets),
+            self._controls(),
+            self._limits(seeds, room, allowed),
+            self._rest(N),
+        ]
+        if self.planner.first_step:
+            constraints.append(first_step(whole, x, self.planner.airframe))
+        return Problem(dynamics, cost, constraints, x0, N)
+
+    def _controls(self) -> ControlBounds:
+        bounds = self.whole.control_bounds
+        assert bounds is not None
+        lower, upper = bounds.by_knot
+        return ControlBounds(lower[:, 0], upper[:, 0])
+
+    def _limits(self, seeds: Tensor, room: Tensor, allowed: Tensor) -> StateBounds:
+        """Speeds, and positions around the seeds within which the half-spaces hold."""
+        wide = ((room - allowed) / 3**0.5).clamp(min=0.05).unsqueeze(-1)
+        upper = seeds.new_full((*seeds.shape[:2], 14), torch.inf)
+        lower = -upper
+        lower[..., :3], upper[..., :3] = seeds - wide, seeds + wide
+        lower[..., 3:6], upper[..., 3:6] = -self.explorer.speed, self.explorer.speed
+        return StateBounds(lower, upper)
+
+    def _rest(self, N: int) -> StateBounds:
+        upper = torch.full((14,), torch.inf, dtype=torch.float64)
+        lower = -upper
+        for i, size in REST.items():
+            middle = HOVER if i == 13 else 0.0
+            lower[i], upper[i] = middle - size, middle + size
+        return StateBounds(lower, upper, knots=[N - 1, N])
