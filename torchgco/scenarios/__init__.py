@@ -2,6 +2,7 @@
 
 from torchgco.scenarios.base import Scenario
 from torchgco.scenarios.crossing import Crossing
+from torchgco.scenarios.cylinders import Cylinders
 from torchgco.scenarios.files import LayoutFile
 from torchgco.scenarios.layouts import Layouts, concatenate
 from torchgco.scenarios.mazes import Mazes
@@ -13,6 +14,7 @@ from torchgco.scenarios.yard import Yard
 
 __all__ = [
     "Crossing",
+    "Cylinders",
     "Forest",
     "ForestMoving",
     "LayoutFile",

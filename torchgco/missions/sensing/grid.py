@@ -12,9 +12,9 @@ from torchgco.missions.sensing.sensors import Scan
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 SEEN_OCCUPIED, NOT_FREE = 1 << OCCUPIED, (1 << OCCUPIED) | (1 << UNKNOWN)  # kinds of cells
-# Log-odds: one ray that passes makes an unknown cell free, one return makes it occupied. A return outweighs four rays
-# that pass: they may pass through the free part of a cell that an obstacle fills in part.
-HIT, MISS, LEAST, MOST, FREE_AT, OCCUPIED_AT = 0.85, -0.2, -2.0, 3.5, -0.15, 0.5
+# Log-odds. A return makes an unknown cell occupied, and outweighs many rays that pass: these may pass through the free
+# part of a cell that an obstacle fills in part. For the same reason it takes several of them to make a cell free.
+HIT, MISS, LEAST, MOST, FREE_AT, OCCUPIED_AT = 2.0, -0.1, -2.0, 3.5, -0.35, 0.5
 REACH = 4  # as C has it
 CHORD = 0.5  # of a cell's side: what a ray passes for less, it doesn't show
 
@@ -77,7 +77,7 @@ class SeenMap:
         ]
         near = sum(np.meshgrid(*(part**2 for part in away), indexing="ij")) <= radius**2
         new = near & (self.state == UNKNOWN)
-        self.odds[new], self.state[new] = MISS, FREE
+        self.odds[new], self.state[new] = FREE_AT, FREE
         return np.flatnonzero(new).astype(np.int32)
 
     def remeasure(self, changed: np.ndarray) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.lagrangian.lagrangian import Multipliers, shifted
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
 from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.sensing.grid import NOT_FREE, SeenMap
 from torchgco.missions.sensing.search import Search
@@ -28,9 +28,11 @@ from torchgco.missions.unknown.safety import AT_REST, SeenLog
 from torchgco.native.dispatch import followed
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
+from torchgco.solvers.ending import optimality
 
 OUTER = 12  # outer iterations of a plan at most
 LOCAL: dict[str, Any] = {"initial_penalty": 1.0, "penalty_growth": 3.0, "violation_tolerance": 5e-3}
+SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
@@ -74,7 +76,8 @@ class Exploration:
     def _scout(self, b: int) -> Scout:
         start, goal = self.whole.x0[b, :3].numpy(), self.whole.goal.position[b].numpy()  # type: ignore[union-attr]
         seen, radius = self.explorer.map_of(start, goal), float(self.radius[b])
-        search = Search(seen, radius + self.explorer.margin, near=2 * seen.resolution, leave=4 * seen.resolution)
+        size = seen.resolution
+        search = Search(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH)
         log = SeenLog(seen.corner, seen.shape, seen.resolution)
         scout = Scout(World.of(self.whole, b), seen, search, log, goal, radius)
         scout.changed = seen.clear(start, self.explorer.known)
@@ -132,7 +135,7 @@ class Exploration:
         position = x[:3]
         scout.path, _ = scout.search.path(position, scout.goal)
         points = np.concatenate([position[None], scout.path[1:]])
-        if np.linalg.norm(scout.path[-1] - scout.goal) <= 2.5 * scout.seen.resolution:
+        if np.linalg.norm(scout.path[-1] - scout.goal) <= 4.5 * scout.seen.resolution:
             points = np.concatenate([points, scout.goal[None]])
         gaps = scout.seen.gaps(points, keep + 0.05)
         blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 2))
@@ -190,6 +193,7 @@ class Exploration:
         else:
             C = problem.B // before.X.shape[0]
             X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
+            X[:, -1], U[:, -1] = _resting(X[:, -1]), problem.cost.rest_controls(U[:, -1:])[:, 0]
             X, U = followed(problem, X, U, K)
             penalty = before.penalty.repeat(C)
         none = torch.zeros(problem.B, dtype=torch.int64)
@@ -200,37 +204,69 @@ class Exploration:
         )  # fmt: skip
 
     def _chosen(self, problem: Problem, kept: Plan, count: int) -> Plan:
-        """Of the new plans, `count` for each mission, the cheapest that is safe; where none is, the one that is kept."""
+        """Of the new plans, `count` for each mission, the cheapest that is safe, or else the one that is kept.
+
+        Where that isn't safe either, as cells have turned out to be occupied, the one that keeps the most distance.
+        """
         B = len(self.scouts)
         found = self.local.solve(problem, kept.U.repeat(count, 1, 1), seed=self.seed)
-        best = [self._best(found.X[b::B], found.U[b::B], found.cost[b::B], b) for b in range(B)]
+        # Gains of the cost alone: with the penalties of constraints they are as stiff as walls, and a rollout may diverge.
+        K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
+        best = [self._best(found.X[b::B], found.cost[b::B], kept.X[b], b) for b in range(B)]
         rows = torch.tensor([b if best[b] is None else best[b] * B + b for b in range(B)])
         new = torch.tensor([choice is not None for choice in best])
         wide = new.view(-1, 1, 1)
         one = problem.take(rows)
         return Plan(
             torch.where(wide, found.X[rows], kept.X), torch.where(wide, found.U[rows], kept.U),
-            torch.where(wide.unsqueeze(-1), found.K[rows], kept.K), kept.multipliers, kept.penalty,
+            torch.where(wide.unsqueeze(-1), K[rows], kept.K), kept.multipliers, kept.penalty,
             torch.where(new, found.cost[rows], kept.cost), torch.where(new, found.violation[rows], 0.0), ~new,
             found.guided[rows], found.iterations[rows], one.x0, one.x0[:, :3], one.dynamics, 0,
         )  # fmt: skip
 
-    def _best(self, X: Tensor, U: Tensor, cost: Tensor, b: int) -> int | None:
-        """Which of some plans (C, N+1, 14) of mission b is safe and the cheapest; None where none is safe."""
+    def _best(self, X: Tensor, cost: Tensor, kept: Tensor, b: int) -> int | None:
+        """Which of some plans (C, N+1, 14) of mission b is flown; None: the kept one (N+1, 14)."""
         order = [int(c) for c in cost.argsort() if bool(torch.isfinite(cost[c]))]
-        return next((c for c in order if self.is_safe(X[c].numpy(), b)), None)
+        spare = {c: self.spare(X[c].numpy(), b) for c in order}
+        safe = next((c for c in order if spare[c] >= 0), None)
+        if safe is not None:
+            return safe
+        most, own = max(order, key=lambda c: spare[c], default=None), self.spare(kept.numpy(), b)
+        return most if most is not None and spare[most] > own and own < 0 else None
+
+    def spare(self, X: np.ndarray, b: int) -> float:
+        """The least distance, m, that a plan (N+1, 14) keeps from what isn't known to be free, beyond what is asked for.
+
+        Minus infinity for a plan that doesn't come to rest, or is too fast. A vehicle that is too near already is asked
+        to go no nearer, and to get away.
+        """
+        scout, least = self.scouts[b], CONTACT_FACTOR * self.scouts[b].radius + SPARE
+        if not np.isfinite(X).all() or np.abs(X[-1, 3:6]).max() > 0.7 * AT_REST:
+            return -np.inf
+        if np.abs(X[:, 3:6]).max() > max(self.explorer.speed + OVER, np.abs(X[0, 3:6]).max()):
+            return -np.inf
+        p = X[:, :3]
+        share = np.arange(FINE)[:, None] / FINE
+        points = np.concatenate([(p[:-1, None] + share * np.diff(p, axis=0)[:, None]).reshape(-1, 3), p[-1:]])
+        gaps = scout.seen.gaps(points, least + 0.01, NOT_FREE)
+        near = gaps[0] - least
+        asked = np.zeros(len(gaps))
+        if near < 0:
+            asked[: FINE * EARLY] = near - 0.02
+        return float((gaps - least - asked).min())
 
     def is_safe(self, X: np.ndarray, b: int) -> bool:
         """Whether a plan (N+1, 14) comes to rest, no faster than allowed, in space that is known to be free."""
-        scout, least = self.scouts[b], CONTACT_FACTOR * self.scouts[b].radius + SPARE
-        if not np.isfinite(X).all() or np.abs(X[-1, 3:6]).max() > 0.7 * AT_REST:
-            return False
-        if np.abs(X[:, 3:6]).max() > self.explorer.speed + OVER:
-            return False
-        p = X[:, :3]
-        share = np.arange(FINE)[:, None, None] / FINE
-        points = np.concatenate([(p[:-1] + share * np.diff(p, axis=0)).reshape(-1, 3), p[-1:]])
-        return bool(scout.seen.gaps(points, least + 0.01, NOT_FREE).min() >= least)
+        return self.spare(X, b) >= 0
+
+
+def _resting(x: Tensor) -> Tensor:
+    """States (B, 14) at rest and upright in the same positions, with the same yaw."""
+    rest = torch.zeros_like(x)
+    rest[:, :3], rest[:, 13] = x[:, :3], HOVER
+    yaw = torch.hypot(x[:, 6], x[:, 9]).clamp(min=1e-9)
+    rest[:, 6], rest[:, 9] = x[:, 6] / yaw, x[:, 9] / yaw
+    return rest
 
 
 def _repeated(problem: Problem, count: int) -> Problem:

@@ -54,7 +54,7 @@ class Explorer:
         InputError: a field out of its range.
     """
 
-    resolution: Meters = 0.25
+    resolution: Meters = 0.2
     region: tuple[tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
     around: tuple[NonNegative, NonNegative] = (12.0, 4.0)
     known: NonNegative = 0.6
@@ -62,7 +62,7 @@ class Explorer:
     acceleration: Acceleration = 5.0
     deceleration: Acceleration = 3.5
     stages: Annotated[int, Within(20, 400)] = 60
-    margin: NonNegative = 0.1
+    margin: NonNegative = 0.15
     patience: Seconds = 1.0
 
     def __post_init__(self) -> None:

@@ -23,8 +23,12 @@ static int cell_of(const Grid *g, const double *p, int64_t *c) {
     return 1;
 }
 
-/* Marks the cells that a ray passes, from its origin inside the grid over a length; each is counted once per scan. Of a
- * cell that it only cuts the corner of, for less than `chord`, it shows nothing. */
+/* What a cell's stamp holds: the number of the scan that touched it last, whether a ray ended in it, and how many passed,
+ * at most PASSES. */
+enum { PASSES = 7, RETURN = 8, SCAN = 16 };
+
+/* Counts the rays that pass cells: here one, from its origin inside the grid over a length. Of a cell that it only cuts
+ * the corner of, for less than `chord`, it shows nothing. */
 static int64_t pass(
     const Grid *g, const double *o, const double *d, double length, double chord, int32_t *stamp, int32_t now,
     int32_t *touched, int64_t count) {
@@ -41,16 +45,19 @@ static int64_t pass(
     while (t < length) {
         int i = wait[0] < wait[1] ? (wait[0] < wait[2] ? 0 : 2) : (wait[1] < wait[2] ? 1 : 2);
         double next = wait[i], end = next < length ? next : length;
-        if (end - t >= chord && stamp[at] < now) stamp[at] = now, touched[count++] = (int32_t)at;
+        if (end - t >= chord) {
+            if (stamp[at] < now) stamp[at] = now, touched[count++] = (int32_t)at;
+            stamp[at] += (stamp[at] & PASSES) < PASSES;
+        }
         if (left[i]-- == 0) break;
         t = next, wait[i] += per[i], at += stride[i];
     }
     return count;
 }
 
-/* Adds a scan to the map. Cells with a return get `hit`, other cells that rays passed get `miss`, once per scan.
+/* Adds a scan to the map. Cells with a return get `hit`, others `miss` for each ray that passed, up to PASSES of them.
  *
- * odds (cells), state (cells), stamp (cells): the last scan that touched a cell, times two, plus one for a return.
+ * odds (cells), state (cells), stamp (cells): see SCAN.
  * touched (cells) is scratch; changed (cells) gets the cells whose state changed. Returns how many. */
 int64_t tgco_add_scan(
     const int64_t *shape, const double *corner, double size, float *odds, uint8_t *state, int32_t *stamp, int64_t scan,
@@ -59,7 +66,7 @@ int64_t tgco_add_scan(
     int32_t *changed) {
     Grid g = {shape, corner, size};
     int64_t count = 0, found = 0;
-    int32_t now = (int32_t)(2 * scan);
+    int32_t now = (int32_t)(SCAN * scan);
     for (int64_t k = 0; k < rays; k++) {
         if (!isfinite(distances[k])) continue;
         double p[3];
@@ -67,7 +74,7 @@ int64_t tgco_add_scan(
         for (int i = 0; i < 3; i++) p[i] = origin[i] + distances[k] * directions[3 * k + i];
         if (!cell_of(&g, p, c)) continue;
         int64_t at = place(&g, c);
-        if (stamp[at] <= now) stamp[at] = now + 1, touched[count++] = (int32_t)at;
+        if (stamp[at] < now) stamp[at] = now + RETURN, touched[count++] = (int32_t)at;
     }
     for (int64_t k = 0; k < rays; k++) {
         double length = isfinite(distances[k]) ? distances[k] - before : range;
@@ -75,7 +82,7 @@ int64_t tgco_add_scan(
     }
     for (int64_t n = 0; n < count; n++) {
         int32_t at = touched[n];
-        float sum = odds[at] + (float)(stamp[at] == now + 1 ? hit : miss);
+        float sum = odds[at] + (float)((stamp[at] & RETURN) ? hit : (stamp[at] & PASSES) * miss);
         odds[at] = sum < least ? (float)least : sum > most ? (float)most : sum;
         uint8_t is = odds[at] >= occupied ? OCCUPIED : odds[at] <= free ? FREE : UNKNOWN;
         if (is != state[at]) state[at] = is, changed[found++] = at;
