@@ -139,6 +139,7 @@ class _Flight:
         self.substeps = mission.substeps(self.period) or 1
         self.steps = math.ceil(mission.duration / self.period - 1e-9)
         self.contact = Contact.among(problem)
+        self.measured_at, self.clearance = problem.x0[:, :3], torch.full_like(problem.x0[:, 0], -torch.inf)
         self.goal = problem.goal.position
         radius = mission.goal_radius
         self.radius = problem.goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
@@ -212,7 +213,14 @@ class _Flight:
         p = self.x[:, :3]
         finite = torch.isfinite(self.x).all(-1) & ((p - self.start[self.rows]).norm(dim=-1) <= FARTHEST)
         there = (p - self.goal[self.rows]).norm(dim=-1) < self.radius[self.rows]
-        return ~finite | there | (self.contact.distance(p, t) < 0)
+        return ~finite | there | self._touches(p, t)
+
+    def _touches(self, p: Tensor, t: float) -> Tensor:
+        """Whether vehicles at p (B, 3) are in contact: none is that has flown less than its last clearance at rest."""
+        if self.contact.moving or not bool(((p - self.measured_at).norm(dim=-1) < self.clearance).all()):
+            self.measured_at, self.clearance = p, self.contact.distance(p, t)
+            return self.clearance < 0
+        return torch.zeros_like(self.clearance, dtype=torch.bool)
 
     def _leave(self, left: Tensor) -> None:
         """Drop the vehicles where `left` (B,)."""
@@ -222,5 +230,6 @@ class _Flight:
         self.problem, self.planned = self.problem.take(stay), self.planned.take(stay)
         self.plant, self.contact = self.plant.take(stay), self.contact.take(stay)
         self.x, self.rows, self.ids = take((self.x, self.rows, self.ids), stay)
+        self.measured_at, self.clearance = self.measured_at[stay], self.clearance[stay]
         if self.exploration is not None:
             self.exploration.take(stay)

@@ -49,7 +49,7 @@ class SeenMap:
         self._stamp = np.full(self.shape, -1, np.int32)
         self._touched, self._changed = (np.empty(self.state.size, np.int32) for _ in range(2))
         self._size = np.array(self.shape, np.int64)
-        self._work = np.empty(0, np.uint8)
+        self._work, self._scratch = np.empty(0, np.uint8), np.empty(0)
         self.measure(np.zeros(3, np.int64), self._size)
 
     def add(self, scan: Scan, reach: float, before: float = 0.0) -> np.ndarray:
@@ -131,9 +131,12 @@ class SeenMap:
         """
         points = np.ascontiguousarray(points, np.float64)
         planes, room = np.zeros((len(points), most, 4)), np.empty(len(points))
-        scratch = np.empty(3 * (2 * int(np.ceil(reach / self.resolution)) + 3) ** 3)
+        low, high = self.cell(points.min(axis=0) - reach), self.cell(points.max(axis=0) + reach)
+        need = 6 * int(np.prod(high - low + 1))
+        if len(self._scratch) < need:
+            self._scratch = np.empty(need)
         call(
             "tgco_corridor", self._size, self.corner, self.resolution, self.state, kinds, float(reach), len(points),
-            points, most, planes, room, scratch,
+            points, most, low, high, planes, room, self._scratch,
         )  # fmt: skip
         return planes, room

@@ -23,7 +23,8 @@ class Search:
         radius: distance, m, that the centres of a path's cells keep from occupied ones, except around the start.
         band: m beyond the radius in which a step costs more.
         shy: by which share it costs more at the radius.
-        unseen: by which share it costs more into a cell that is unknown: what is known to be free leads farther.
+        unseen: by which share it costs more into a cell that is unknown, within `nearby`, m, of the start: what is known
+            to be free leads farther. Beyond, where nearly all is unknown, estimates would be too low by it, and slow.
         greed: paths cost at most so many times what the cheapest does; more than 1 is quicker.
         stride: cells between two of a path: the search passes every so many along each axis.
         near: m from the goal at which a path has arrived.
@@ -35,6 +36,7 @@ class Search:
     band: float = 0.5
     shy: float = 1.0
     unseen: float = 0.0
+    nearby: float = 8.0
     greed: float = 1.0
     stride: int = 1
     near: float = 0.0
@@ -61,7 +63,8 @@ class Search:
         expanded = np.zeros(1, np.int64)
         count = call(
             "tgco_search", np.array(seen.shape, np.int64), seen.from_occupied, seen.state, self.price,
-            self.radius, self.band, self.shy, self.unseen, self.greed, int(np.ceil(self.leave / seen.resolution)), self.stride, seen.cell(start), seen.cell(goal),
+            self.radius, self.band, self.shy, self.unseen,
+            self.nearby / seen.resolution, self.greed, int(np.ceil(self.leave / seen.resolution)), self.stride, seen.cell(start), seen.cell(goal),
             self.near / seen.resolution, self._round, self._sum, self._from, self._seen, self._room, self._heap,
             self._path, expanded,
         )  # fmt: skip

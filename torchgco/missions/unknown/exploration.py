@@ -33,6 +33,9 @@ from torchgco.solvers.ending import optimality
 OUTER = 12  # outer iterations of a plan at most
 LOCAL: dict[str, Any] = {"initial_penalty": 1.0, "penalty_growth": 3.0, "violation_tolerance": 5e-3}
 SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
+# Where no way is found, a search with less margin, then one over all cells: the share of the margin, and the stride.
+LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
+HELD = 2.0  # s before a search with less margin ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
@@ -52,6 +55,8 @@ class Scout:
     path: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # cells' centres, (K, 3), m
     corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
     waited: int = 0  # control periods without a way on
+    level: int = 0  # of LEVELS
+    since: int = 0  # control periods at this level
     seconds: dict[str, float] = field(default_factory=dict)
     changed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
 
@@ -122,7 +127,11 @@ class Exploration:
         plan = self._chosen(problem, kept, len(seeds))
         for b, scout in enumerate(self.scouts):
             scout.log.safe.append(plan.X[b, :, :3].numpy().copy())
-        seconds = time.perf_counter() - began + sum(s.seconds["map_seconds"] + s.seconds["field_seconds"] for s in self.scouts)
+        seconds = (
+            time.perf_counter()
+            - began
+            + sum(s.seconds["map_seconds"] + s.seconds["field_seconds"] for s in self.scouts)
+        )
         return replace(plan, measured=x, bias=bias, step=step), seconds
 
     def parts(self) -> dict[str, Tensor]:
@@ -131,9 +140,9 @@ class Exploration:
 
     def _seek(self, scout: Scout, x: np.ndarray) -> None:
         """The path of a vehicle x (17,), and the part of it that is known to be free."""
-        began, keep = time.perf_counter(), scout.radius + self.explorer.margin
-        position = x[:3]
-        scout.path, _ = scout.search.path(position, scout.goal)
+        began, position = time.perf_counter(), x[:3]
+        self._search(scout, position)
+        keep = self.keep(scout)
         points = np.concatenate([position[None], scout.path[1:]])
         if np.linalg.norm(scout.path[-1] - scout.goal) <= 4.5 * scout.seen.resolution:
             points = np.concatenate([points, scout.goal[None]])
@@ -143,6 +152,24 @@ class Exploration:
         scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05)[1:] >= keep).all()))
         self._wait(scout, x, points, blocked)
         scout.seconds["search_seconds"] += time.perf_counter() - began
+
+    def keep(self, scout: Scout) -> float:
+        """The distance, m, that plans keep from what isn't known to be free."""
+        least = CONTACT_FACTOR * scout.radius + SPARE + 0.01
+        share = LEVELS[scout.level][0]
+        return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least
+
+    def _search(self, scout: Scout, position: np.ndarray) -> None:
+        """The path to the goal; where none is found, with less margin from now on, for a while."""
+        scout.since += 1
+        if scout.level > 0 and scout.since * self.dt >= HELD:
+            scout.level, scout.since = 0, 0
+        while True:
+            scout.search.radius, scout.search.stride = self.keep(scout), LEVELS[scout.level][1]
+            scout.path, arrives = scout.search.path(position, scout.goal)
+            if arrives or scout.level + 1 == len(LEVELS):
+                return
+            scout.level, scout.since = scout.level + 1, 0
 
     def _wait(self, scout: Scout, x: np.ndarray, points: np.ndarray, blocked: np.ndarray) -> None:
         """Count the periods at rest in front of cells that stay unknown, and in the end look elsewhere."""
@@ -169,14 +196,16 @@ class Exploration:
         planes, room, allowed = [], [], []
         for seed in seeds:
             for b, scout in enumerate(self.scouts):
-                began, keep = time.perf_counter(), scout.radius + self.explorer.margin
+                began, keep = time.perf_counter(), self.keep(scout)
                 own, far = scout.seen.corridor(seed[b].numpy(), CORRIDOR, PLANES)
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep)[0])
                 near = np.full(N, keep)
                 near[:EARLY] = min(keep, max(gap - 0.01, CONTACT_FACTOR * scout.radius))
                 planes.append(own), room.append(far), allowed.append(near)
                 scout.seconds["field_seconds"] += time.perf_counter() - began
-        form = PlanningForm(self.explorer, self.planner, self.whole if C == 1 else _repeated(self.whole, C), self.radius)
+        form = PlanningForm(
+            self.explorer, self.planner, self.whole if C == 1 else _repeated(self.whole, C), self.radius
+        )
         stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, allowed)]
         return form.problem(
             x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), stack[0], stack[1],

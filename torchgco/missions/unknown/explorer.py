@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.shapes import Dimensions
 from torchgco.base.options import Above, Count, Meters, NonNegative, Seconds, Within, check_options
 from torchgco.constraints import ControlBounds, StateBounds
 from torchgco.constraints.base import Constraint
@@ -25,7 +26,7 @@ Unknown = Literal["free", "occupied", "stoppable"]
 Speed = Annotated[float, Above(0, "m/s")]
 Acceleration = Annotated[float, Above(0, "m/s^2")]
 PLANES = 8  # half-spaces of a knot at most
-CORRIDOR = 3.0  # m around a knot, within which cells make half-spaces
+CORRIDOR = 2.5  # m around a knot, within which cells make half-spaces
 REST = {3: 0.05, 4: 0.05, 5: 0.05, 7: 0.03, 8: 0.03, 10: 0.05, 11: 0.05, 12: 0.05, 13: 0.3}  # of the last two states
 EARLY = 10  # knots in which a vehicle may leave a margin that it has entered
 # Weights of a plan: positions and velocities along the reference, attitude with yaw, body rates, thrust; controls.
@@ -121,7 +122,7 @@ class PlanningForm:
             self._rest(N),
         ]
         if self.planner.first_step:
-            constraints.append(first_step(whole, x, self.planner.airframe))
+            constraints.append(self._first_step(x, x0))
         return Problem(dynamics, cost, constraints, x0, N)
 
     def _controls(self) -> ControlBounds:
@@ -138,6 +139,19 @@ class PlanningForm:
         lower[..., :3], upper[..., :3] = seeds - wide, seeds + wide
         lower[..., 3:6], upper[..., 3:6] = -self.explorer.speed, self.explorer.speed
         return StateBounds(lower, upper)
+
+    def _first_step(self, x: Tensor, x0: Tensor) -> StateBounds:
+        """`FirstStepRates` as bounds, which native kernels know."""
+        asked = first_step(self.whole, x, self.planner.airframe).bind(self._dimensions(x0)).target
+        assert asked is not None
+        upper = x0.new_full((x0.shape[0], 1, 14), torch.inf)
+        lower = -upper
+        lower[:, 0, 10:13] = upper[:, 0, 10:13] = asked
+        return StateBounds(lower, upper, knots=[1])
+
+    def _dimensions(self, x0: Tensor) -> Dimensions:
+        model = self.whole.dynamics
+        return Dimensions(len(x0), self.explorer.stages, 14, 4, float(model.dt), model.position, x0, 1)
 
     def _rest(self, N: int) -> StateBounds:
         upper = torch.full((14,), torch.inf, dtype=torch.float64)

@@ -8,7 +8,10 @@ import numpy as np
 
 SWERVE = 1.0  # m: the radius of the turn that cuts a corner
 RESPONSE = 0.25  # s, in which the reference's acceleration answers to its speed's error
-JERKS = 6.0, 2.5  # m/s^3, of the reference along and across the plane: a vehicle tilts faster than it changes its thrust
+JERKS = (
+    6.0,
+    2.5,
+)  # m/s^3, of the reference along and across the plane: a vehicle tilts faster than it changes its thrust
 SMOOTH = 5  # steps before and after, over which the reference is averaged
 SETTLED = 0.3  # s before the horizon's end in which the reference rests
 

@@ -41,14 +41,15 @@ static inline float octile(const int64_t *a, const int64_t *b) {
  *
  * distance (cells): from obstacles, m. A cell is passable from `radius` on; around the start, within `leave` cells, from
  * any distance above 0; so is the one midway to a neighbour. A step costs its length times a price: 1, plus `shy` at
- * `radius`, falling to 0 at radius + band, plus `unseen` where the state is 0, four times as much
- * within the band, as walls go on more often than they have holes, plus the cell's own `price`. Estimates of
+ * `radius`, falling to 0 at radius + band, plus `unseen` where the state is 0, up to
+ * `nearby` cells from the start, four times as much within the band, as walls go on more often than they have holes, plus the cell's own `price`. Estimates of
  * what is left count `greed` times: paths cost at most so much more than the cheapest. Scratch for each cell: sum, from,
  * seen; heap of `room` entries. Returns the number of cells of the path, negative where it ends at the cell nearest to
  * the goal, as none leads there. */
 int64_t tgco_search(
     const int64_t *shape, const float *distance, const uint8_t *state, const float *price, double radius, double band,
-    double shy, double unseen, double greed, int64_t leave, int64_t stride, const int64_t *start, const int64_t *goal,
+    double shy, double unseen, double nearby, double greed,
+    int64_t leave, int64_t stride, const int64_t *start, const int64_t *goal,
     double near, int64_t round, float *sum, int32_t *from, int32_t *seen, int64_t room, uint8_t *heap_bytes,
     int32_t *path, int64_t *expanded) {
     Entry *heap = (Entry *)heap_bytes;
@@ -84,7 +85,7 @@ int64_t tgco_search(
                     float length = (float)s * (axes == 1 ? 1.0f : axes == 2 ? 1.41421356f : 1.73205081f);
                     float close = 1.0f - (d - r) / (float)band, each = 1.0f + price[to];
                     each += (close > 0.0f ? (float)shy * close : 0.0f);
-                    if (state[to] == 0) each += (float)unseen * (close > 0.0f ? 4.0f : 1.0f);
+                    if (state[to] == 0 && octile(n, begin) <= (float)nearby) each += (float)unseen * (close > 0.0f ? 4.0f : 1.0f);
                     float cost = sum[at] + length * each;
                     if (seen[to] == open && sum[to] <= cost) continue;
                     if (count >= room) return 0;
