@@ -13,6 +13,8 @@ from torchgco.missions.planner import Plan
 from torchgco.missions.tracker import Tracking
 from torchgco.missions.unknown.safety import SeenLog
 
+PARTS = ("map_seconds", "field_seconds", "search_seconds")
+
 
 @dataclass(frozen=True)
 class MissionLog:
@@ -89,6 +91,6 @@ class MissionLog:
     def arrays(self, plans: bool = False) -> dict[str, np.ndarray]:
         """What a study keeps of every mission, by name (B, ...); with the planned positions where asked for."""
         names = ("x", "commands", "tracking_violation", "cost", "violation", "shifted", "guided", "iterations")
-        names = (*names, "planner_seconds", "tracker_seconds", "map_seconds", "field_seconds", "search_seconds")
+        names = (*names, "planner_seconds", "tracker_seconds", *(PARTS if self.seen else ()))
         names = (*names, *(["plan"] if plans else []))
         return {name: getattr(self, name).numpy() for name in names}

@@ -53,8 +53,8 @@ class Mission:
             plan starts where the former plan leads within the period, and without `first_step`.
         sensor: what the vehicle knows of the obstacles: "full", all of them from the start, or what a "lidar" or a
             "depth" camera sees on the way.
-        unknown: what plans make of space that hasn't been seen, with a lidar or a depth camera: "free" as if nothing
-            were there, "occupied" stay out of it, "stoppable" enter it where they can still stop before.
+        unknown: what plans make of space that hasn't been seen, with a lidar or a depth camera: "occupied" stay out of
+            it and so can always stop in time, "free" plan as if nothing were there.
         lidar, depth, explorer: options of the sensors, and of flights with them.
 
     Raises:
@@ -97,7 +97,7 @@ class Mission:
         if self.sensor == "full":
             return None
         sensor = self.lidar if self.sensor == "lidar" else self.depth
-        return Exploration(self.explorer, self.planner, sensor, problem, seed, ids)
+        return Exploration(self.explorer, self.planner, sensor, self.unknown, problem, seed, ids)
 
     def fly(
         self, problem: Problem, seed: int = 0, ids: Tensor | None = None, report: Report | None = None

@@ -37,7 +37,7 @@ def test_cells_along_rays_are_those_of_a_slow_version() -> None:
     rng = np.random.default_rng(0)
     seen, centers, odds = empty(), cubes(SHAPE, CORNER, SIZE), np.zeros(np.prod(SHAPE))
     for _ in range(3):
-        scan = scan_of(rng, 30)
+        scan = scan_of(rng, 80)
         hit, doubtful, passed = np.zeros(len(odds), bool), np.zeros(len(odds), bool), np.zeros(len(odds), int)
         for d, distance in zip(scan.directions, scan.distances, strict=True):
             length = distance if np.isfinite(distance) else 2.0

@@ -14,7 +14,7 @@ UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 SEEN_OCCUPIED, NOT_FREE = 1 << OCCUPIED, (1 << OCCUPIED) | (1 << UNKNOWN)  # kinds of cells
 # Log-odds. A return makes an unknown cell occupied, and outweighs many rays that pass: these may pass through the free
 # part of a cell that an obstacle fills in part. For the same reason it takes several of them to make a cell free.
-HIT, MISS, LEAST, MOST, FREE_AT, OCCUPIED_AT = 2.0, -0.1, -2.0, 3.5, -0.35, 0.5
+HIT, MISS, LEAST, MOST, FREE_AT, OCCUPIED_AT = 2.0, -0.1, -2.0, 3.5, -0.55, 0.5
 REACH = 4  # as C has it
 CHORD = 0.5  # of a cell's side: what a ray passes for less, it doesn't show
 

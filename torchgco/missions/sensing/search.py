@@ -23,8 +23,8 @@ class Search:
         radius: distance, m, that the centres of a path's cells keep from occupied ones, except around the start.
         band: m beyond the radius in which a step costs more.
         shy: by which share it costs more at the radius.
-        unseen: by which share it costs more into a cell that is unknown, within `nearby`, m, of the start: what is known
-            to be free leads farther. Beyond, where nearly all is unknown, estimates would be too low by it, and slow.
+        unseen: by which share it costs more into a cell that is unknown: what is known to be free leads farther.
+        nearby: m around the start within which it does: where nearly all is unknown, the search would be slow by it.
         greed: paths cost at most so many times what the cheapest does; more than 1 is quicker.
         stride: cells between two of a path: the search passes every so many along each axis.
         near: m from the goal at which a path has arrived.
@@ -61,11 +61,11 @@ class Search:
         """
         seen, self._round = self.seen, self._round + 1
         expanded = np.zeros(1, np.int64)
+        leave, size = int(np.ceil(self.leave / seen.resolution)), seen.resolution
         count = call(
-            "tgco_search", np.array(seen.shape, np.int64), seen.from_occupied, seen.state, self.price,
-            self.radius, self.band, self.shy, self.unseen,
-            self.nearby / seen.resolution, self.greed, int(np.ceil(self.leave / seen.resolution)), self.stride, seen.cell(start), seen.cell(goal),
-            self.near / seen.resolution, self._round, self._sum, self._from, self._seen, self._room, self._heap,
+            "tgco_search", np.array(seen.shape, np.int64), seen.from_occupied, seen.state, self.price, self.radius,
+            self.band, self.shy, self.unseen, self.nearby / size, self.greed, leave, self.stride, seen.cell(start),
+            seen.cell(goal), self.near / size, self._round, self._sum, self._from, self._seen, self._room, self._heap,
             self._path, expanded,
         )  # fmt: skip
         self.expanded = int(expanded[0])

@@ -1,1 +1,1 @@
-"""Missions in space that the vehicle hasn't seen: paths on its map, corridors, plans that come to rest where it is free."""
+"""Missions in space that the vehicle has not seen: paths on its map, corridors, plans that stop where it is free."""

@@ -17,13 +17,14 @@ import torch
 from torch import Tensor
 
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
+from torchgco.missions.log import PARTS
 from torchgco.missions.planner import Plan, Planner
-from torchgco.missions.sensing.grid import NOT_FREE, SeenMap
+from torchgco.missions.sensing.grid import NOT_FREE, SEEN_OCCUPIED, SeenMap
 from torchgco.missions.sensing.search import Search
 from torchgco.missions.sensing.sensors import Sensor
 from torchgco.missions.sensing.world import World
-from torchgco.missions.unknown.explorer import CORRIDOR, EARLY, HOVER, PLANES, Explorer, PlanningForm
-from torchgco.missions.unknown.reference import between, motion, taut
+from torchgco.missions.unknown.explorer import CORRIDOR, EARLY, HOVER, PLANES, Explorer, PlanningForm, Unknown
+from torchgco.missions.unknown.reference import motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
 from torchgco.native.dispatch import followed
 from torchgco.obstacles.base import CONTACT_FACTOR
@@ -39,7 +40,6 @@ HELD = 2.0  # s before a search with less margin ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
-PARTS = ("map_seconds", "field_seconds", "search_seconds")
 
 
 @dataclass
@@ -65,9 +65,17 @@ class Exploration:
     """The scouts and the planning problems of missions in lockstep."""
 
     def __init__(
-        self, explorer: Explorer, planner: Planner, sensor: Sensor, problem: Problem, seed: int, ids: Tensor
+        self,
+        explorer: Explorer,
+        planner: Planner,
+        sensor: Sensor,
+        unknown: Unknown,
+        problem: Problem,
+        seed: int,
+        ids: Tensor,
     ) -> None:
         self.explorer, self.planner, self.sensor, self.seed = explorer, planner, sensor, seed
+        self.kinds = NOT_FREE if unknown == "occupied" else SEEN_OCCUPIED  # of cells, which plans stay out of
         self.dt = float(problem.dynamics.dt)
         self.every = max(1, round(1.0 / (sensor.rate * self.dt)))  # control periods between two scans
         self.ids = ids.tolist()
@@ -95,12 +103,12 @@ class Exploration:
         self.whole, self.radius = self.whole.take(stay), self.radius[stay]
 
     def sense(self, step: int, x: Tensor, measured: Tensor) -> None:
-        """Scans of the control step `step` from plants x (B, 17), placed in the maps where the vehicles believe to be."""
+        """Scan at a control step from plants x (B, 17), and put that into the maps where the vehicles believe to be."""
         for b, scout in enumerate(self.scouts):
             took = [0.0, 0.0]
             if step % self.every == 0:
                 key = (self.seed, self.ids[b], step)
-                scan = self.sensor.scan(scout.world, x[b, :3], x[b, 6:10], step * self.dt, key)
+                scan = self.sensor.scan(scout.world, x[b, :3].numpy(), x[b, 6:10].numpy(), step * self.dt, key)
                 scan = scan.seen_from(x[b, 6:10].numpy(), measured[b, :3].numpy(), measured[b, 6:10].numpy())
                 began = time.perf_counter()
                 changed = scout.seen.add(scan, self.sensor.range, 3.0 * self.sensor.noise)
@@ -115,6 +123,7 @@ class Exploration:
     def plan(self, step: int, x: Tensor, before: Plan | None) -> tuple[Plan, float]:
         """Plans from measured plants x (B, 17), and the seconds that they took, those of the maps among them."""
         began = time.perf_counter()
+        sensed = sum(sum(scout.seconds.values()) for scout in self.scouts)
         bias = self.planner.estimated(x, before, self.dt)
         for b, scout in enumerate(self.scouts):
             self._seek(scout, x[b].numpy())
@@ -127,12 +136,7 @@ class Exploration:
         plan = self._chosen(problem, kept, len(seeds))
         for b, scout in enumerate(self.scouts):
             scout.log.safe.append(plan.X[b, :, :3].numpy().copy())
-        seconds = (
-            time.perf_counter()
-            - began
-            + sum(s.seconds["map_seconds"] + s.seconds["field_seconds"] for s in self.scouts)
-        )
-        return replace(plan, measured=x, bias=bias, step=step), seconds
+        return replace(plan, measured=x, bias=bias, step=step), time.perf_counter() - began + sensed
 
     def parts(self) -> dict[str, Tensor]:
         """Seconds of the last period by part, (B,)."""
@@ -143,13 +147,13 @@ class Exploration:
         began, position = time.perf_counter(), x[:3]
         self._search(scout, position)
         keep = self.keep(scout)
-        points = np.concatenate([position[None], scout.path[1:]])
+        points = _halved(np.concatenate([position[None], scout.path[1:]]))
         if np.linalg.norm(scout.path[-1] - scout.goal) <= 4.5 * scout.seen.resolution:
             points = np.concatenate([points, scout.goal[None]])
-        gaps = scout.seen.gaps(points, keep + 0.05)
-        blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 2))
+        gaps = scout.seen.gaps(points, keep + 0.05, self.kinds)
+        blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 3))
         free = points[: blocked[0] if len(blocked) else len(points)]
-        scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05)[1:] >= keep).all()))
+        scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
         self._wait(scout, x, points, blocked)
         scout.seconds["search_seconds"] += time.perf_counter() - began
 
@@ -186,7 +190,7 @@ class Exploration:
         found[..., 6], found[..., 13] = 1.0, HOVER
         for b, scout in enumerate(self.scouts):
             state = x[b].numpy()
-            p, v = motion(scout.corners, state[3:6], np.zeros(3), self.explorer.pace, N, self.dt)
+            p, v = motion(scout.corners, state[3:6], self.explorer.pace, N, self.dt)
             found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
         return found
 
@@ -197,15 +201,13 @@ class Exploration:
         for seed in seeds:
             for b, scout in enumerate(self.scouts):
                 began, keep = time.perf_counter(), self.keep(scout)
-                own, far = scout.seen.corridor(seed[b].numpy(), CORRIDOR, PLANES)
-                gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep)[0])
+                own, far = scout.seen.corridor(seed[b].numpy(), CORRIDOR, PLANES, self.kinds)
+                gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
                 near = np.full(N, keep)
                 near[:EARLY] = min(keep, max(gap - 0.01, CONTACT_FACTOR * scout.radius))
                 planes.append(own), room.append(far), allowed.append(near)
                 scout.seconds["field_seconds"] += time.perf_counter() - began
-        form = PlanningForm(
-            self.explorer, self.planner, self.whole if C == 1 else _repeated(self.whole, C), self.radius
-        )
+        form = PlanningForm(self.explorer, self.planner, _repeated(self.whole, C))
         stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, allowed)]
         return form.problem(
             x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), stack[0], stack[1],
@@ -239,7 +241,7 @@ class Exploration:
         """
         B = len(self.scouts)
         found = self.local.solve(problem, kept.U.repeat(count, 1, 1), seed=self.seed)
-        # Gains of the cost alone: with the penalties of constraints they are as stiff as walls, and a rollout may diverge.
+        # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
         K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
         best = [self._best(found.X[b::B], found.cost[b::B], kept.X[b], b) for b in range(B)]
         rows = torch.tensor([b if best[b] is None else best[b] * B + b for b in range(B)])
@@ -264,7 +266,7 @@ class Exploration:
         return most if most is not None and spare[most] > own and own < 0 else None
 
     def spare(self, X: np.ndarray, b: int) -> float:
-        """The least distance, m, that a plan (N+1, 14) keeps from what isn't known to be free, beyond what is asked for.
+        """The least distance, m, of a plan (N+1, 14) from what isn't known to be free, beyond what is asked for.
 
         Minus infinity for a plan that doesn't come to rest, or is too fast. A vehicle that is too near already is asked
         to go no nearer, and to get away.
@@ -277,7 +279,7 @@ class Exploration:
         p = X[:, :3]
         share = np.arange(FINE)[:, None] / FINE
         points = np.concatenate([(p[:-1, None] + share * np.diff(p, axis=0)[:, None]).reshape(-1, 3), p[-1:]])
-        gaps = scout.seen.gaps(points, least + 0.01, NOT_FREE)
+        gaps = scout.seen.gaps(points, least + 0.01, self.kinds)
         near = gaps[0] - least
         asked = np.zeros(len(gaps))
         if near < 0:
@@ -296,6 +298,13 @@ def _resting(x: Tensor) -> Tensor:
     yaw = torch.hypot(x[:, 6], x[:, 9]).clamp(min=1e-9)
     rest[:, 6], rest[:, 9] = x[:, 6] / yaw, x[:, 9] / yaw
     return rest
+
+
+def _halved(points: np.ndarray) -> np.ndarray:
+    """The points (K, 3) of a path, and those midway between them."""
+    found = np.repeat(points, 2, axis=0)[:-1]
+    found[1::2] = 0.5 * (points[:-1] + points[1:])
+    return found
 
 
 def _repeated(problem: Problem, count: int) -> Problem:

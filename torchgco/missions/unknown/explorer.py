@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.options import Above, Meters, NonNegative, Seconds, Within, check_options
 from torchgco.base.shapes import Dimensions
-from torchgco.base.options import Above, Count, Meters, NonNegative, Seconds, Within, check_options
 from torchgco.constraints import ControlBounds, StateBounds
 from torchgco.constraints.base import Constraint
 from torchgco.costs.quadratic import QuadraticCost
@@ -22,7 +22,7 @@ from torchgco.missions.unknown.reference import Pace
 from torchgco.problem.problem import Problem
 
 SensorName = Literal["full", "lidar", "depth"]
-Unknown = Literal["free", "occupied", "stoppable"]
+Unknown = Literal["free", "occupied"]
 Speed = Annotated[float, Above(0, "m/s")]
 Acceleration = Annotated[float, Above(0, "m/s^2")]
 PLANES = 8  # half-spaces of a knot at most
@@ -48,7 +48,8 @@ class Explorer:
         speed: largest speed along each axis, m/s.
         acceleration, deceleration: of the motion along a path that a plan is to follow, m/s^2.
         stages: of a plan, which is at rest after them.
-        margin: m that plans keep from what isn't known to be free, beyond the vehicle's radius.
+        margin: m that plans keep from what isn't known to be free, beyond the vehicle's radius: a cell or more, as cells
+            that an obstacle fills in part may look free from afar. Less is kept where there is no other way.
         patience: s without a way on, after which the vehicle turns to another part of the unknown.
 
     Raises:
@@ -63,7 +64,7 @@ class Explorer:
     acceleration: Acceleration = 5.0
     deceleration: Acceleration = 3.5
     stages: Annotated[int, Within(20, 400)] = 60
-    margin: NonNegative = 0.15
+    margin: NonNegative = 0.2
     patience: Seconds = 1.0
 
     def __post_init__(self) -> None:
@@ -90,14 +91,14 @@ class PlanningForm:
     """The planning problems of one control period, for C seeds of each mission: C B problems, seed by seed.
 
     Args:
-        explorer: options. whole: the mission's problems, of which model, control bounds and vehicle are used.
-        radius: of the vehicles, (B,), m.
+        explorer: options.
+        planner: of which airframe, estimation and first step are used.
+        whole: the problems of the missions, of which model and control bounds are used; each C times.
     """
 
     explorer: Explorer
     planner: Planner
     whole: Problem
-    radius: Tensor
 
     def problem(
         self, x: Tensor, bias: Tensor, reference: Tensor, planes: Tensor, room: Tensor, seeds: Tensor, allowed: Tensor

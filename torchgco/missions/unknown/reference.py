@@ -1,4 +1,4 @@
-"""The motion along a path that a plan is to follow: as fast as its corners allow, and at rest where its free part ends."""
+"""The motion along a path that plans are to follow: as fast as its corners allow, at rest where its free part ends."""
 
 from __future__ import annotations
 
@@ -7,12 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 SWERVE = 1.0  # m: the radius of the turn that cuts a corner
-RESPONSE = 0.25  # s, in which the reference's acceleration answers to its speed's error
-JERKS = (
-    6.0,
-    2.5,
-)  # m/s^3, of the reference along and across the plane: a vehicle tilts faster than it changes its thrust
-SMOOTH = 5  # steps before and after, over which the reference is averaged
+STEEP = 2.5  # m/s^2 at most, straight up and down: thrust changes more slowly than a vehicle tilts
+SMOOTH = 5  # steps before and after, over which positions are averaged: that limits the jerk
 SETTLED = 0.3  # s before the horizon's end in which the reference rests
 
 
@@ -72,42 +68,32 @@ def along(corners: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def motion(
-    corners: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, pace: Pace, count: int, dt: float
+    corners: np.ndarray, velocity: np.ndarray, pace: Pace, count: int, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities (count + 1, 3) along a polyline (K, 3) that begins at the vehicle, every dt, s.
 
-    It starts with the velocity and acceleration (3,) along the polyline, and rests at its end, or at the latest shortly
-    before the last of them.
+    It starts with the vehicle's velocity (3,), and rests at the polyline's end, or shortly before the last of them.
     """
-    at = lengths(corners)
-    end, last = at[-1], count * dt - SETTLED
-    _, first = along(corners, np.zeros(1))
-    s, v, a = 0.0, max(0.0, float(first[0] @ velocity)), float(first[0] @ acceleration)
-    slow, jerk = _corner_speeds(corners, pace), _jerk(first[0])
-    places, speeds = np.zeros(count + 1), np.zeros(count + 1)
-    speeds[0] = v
+    at, last, slow = lengths(corners), count * dt - SETTLED, _corner_speeds(corners, pace)
+    steps = np.diff(corners, axis=0) / np.maximum(np.diff(at), 1e-9)[:, None]
+    places, s = np.zeros(count + 1), 0.0
+    v = max(0.0, float(steps[0] @ velocity)) if len(steps) else 0.0
     for k in range(count):
-        left = max(0.0, end - s)
-        wanted = min(pace.speed, np.sqrt(2.0 * pace.deceleration * left), pace.deceleration * max(0.0, last - k * dt))
+        wanted = min(pace.speed, np.sqrt(2.0 * pace.deceleration * (at[-1] - s)), pace.deceleration * (last - k * dt))
         ahead = at[1:-1] - s
-        before = ahead > 0
-        if before.any():
-            room = slow[before] ** 2 + 2.0 * pace.deceleration * ahead[before]
+        if (ahead > 0).any():
+            room = slow[ahead > 0] ** 2 + 2.0 * pace.deceleration * ahead[ahead > 0]
             wanted = min(wanted, float(np.sqrt(room.min())))
-        pull = np.clip((wanted - v) / RESPONSE, -1.5 * pace.deceleration, pace.acceleration)
-        a += float(np.clip(pull - a, -jerk * dt, jerk * dt))
-        v = max(0.0, v + a * dt)
-        if s + v * dt >= end:
-            v, a = max(0.0, (end - s) / dt), 0.0
-        s = min(end, s + v * dt)
-        places[k + 1], speeds[k + 1] = s, v
-    points, _ = along(corners, places)
-    return _smoothed(points, velocity, dt)
+        pull = _acceleration(steps[np.searchsorted(at[1:-1], s, side="right")], pace) if len(steps) else 0.0
+        v = max(0.0, min(wanted, v + pull * dt), v - 2.0 * pace.deceleration * dt)
+        s = min(at[-1], s + v * dt)
+        places[k + 1] = s
+    return _smoothed(along(corners, places)[0], velocity, dt)
 
 
-def _jerk(direction: np.ndarray) -> float:
-    flat, steep = float(np.hypot(*direction[:2])), abs(float(direction[2]))
-    return 1.0 / max(flat / JERKS[0], steep / JERKS[1], 1e-3)
+def _acceleration(direction: np.ndarray, pace: Pace) -> float:
+    """The largest acceleration along a unit vector, m/s^2."""
+    return 1.0 / max(float(np.hypot(*direction[:2])) / pace.acceleration, abs(float(direction[2])) / STEEP, 1e-3)
 
 
 def _smoothed(points: np.ndarray, velocity: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -66,7 +67,7 @@ def least_gap(log: SeenLog, state: np.ndarray, plan: Sequence[np.ndarray] | np.n
     plan = np.asarray(plan)
     parts = [
         a + np.linspace(0, 1, 1 + int(np.ceil(np.linalg.norm(b - a) / SPACING)), endpoint=False)[:, None] * (b - a)
-        for a, b in zip(plan[:-1], plan[1:], strict=True)
+        for a, b in pairwise(plan)
     ]
     points = np.concatenate([*parts, plan[-1:]])
     slack = 0.5 * np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)
