@@ -46,7 +46,7 @@ class Explorer:
         around: m along x and y, and along z.
         known: radius of the ball around the start that is known to be free, m.
         speed: largest speed along each axis, m/s.
-        acceleration, deceleration: of the motion along a path that a plan is to follow, m/s^2.
+        acceleration, deceleration: of the motion that plans are to follow, m/s^2.
         stages: of a plan, which is at rest after them.
         margin: m that plans keep from what isn't known to be free, beyond the vehicle's radius: a cell or more, as cells
             that an obstacle fills in part may look free from afar. Less is kept where there is no other way.
