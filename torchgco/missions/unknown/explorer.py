@@ -48,8 +48,8 @@ class Explorer:
         speed: largest speed along each axis, m/s.
         acceleration, deceleration: of the motion that plans are to follow, m/s^2.
         stages: of a plan, which is at rest after them.
-        margin: m that plans keep from what isn't known to be free, beyond the vehicle's radius. A cell at least, as those
-            that an obstacle fills in part may look free from afar; less is kept where there is no other way.
+        margin: m that plans keep from what isn't known to be free, beyond the vehicle's radius. A cell at least, as
+            one that an obstacle fills in part may look free from afar; less is kept where there is no other way.
         patience: s without a way on, after which the vehicle turns to another part of the unknown.
 
     Raises:
