@@ -13,6 +13,7 @@ LAYERS = [
     ["base"],
     ["tracing", "dynamics", "costs", "constraints"],
     ["obstacles"],
+    ["maps"],
     ["problem"],
     ["lagrangian", "judging"],
     ["solution", "native"],

@@ -44,6 +44,10 @@ from torchgco.guidance import MPPI as MPPI
 from torchgco.judging.certificate import Certificate as Certificate
 from torchgco.judging.certificate import certify as certify
 from torchgco.judging.judge import judge as judge
+from torchgco.maps import DistanceField as DistanceField
+from torchgco.maps import Field as Field
+from torchgco.maps import OccupancyGrid as OccupancyGrid
+from torchgco.maps import PointCloud as PointCloud
 from torchgco.missions.constraints import FirstStepRates as FirstStepRates
 from torchgco.native import kernels as kernels
 from torchgco.obstacles import Boxes as Boxes
@@ -73,6 +77,8 @@ __all__ = [  # noqa: RUF022
     "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules", "ControlBounds",
     "StateBounds", "RateBounds", "Separation", "FirstStepRates", "FunctionConstraint", "FunctionCost",
+    # maps
+    "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
     "solve", "Solution", "Status", "presets", "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR",
     "InteriorPoint", "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",

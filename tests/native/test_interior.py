@@ -14,6 +14,7 @@ from tests.reference.interior import Array, Point, Program, begin, moved, newton
 from torchgco import (
     Boxes,
     ControlBounds,
+    Field,
     FunctionConstraint,
     FunctionCost,
     FunctionDynamics,
@@ -24,6 +25,7 @@ from torchgco import (
     Spheres,
     StateBounds,
 )
+from torchgco.maps import OccupancyGrid
 from torchgco.native.compiler import find_compiler
 from torchgco.native.dispatch import interior_of
 from torchgco.problem.rates import with_controls_before
@@ -136,7 +138,16 @@ def apart(seed: int) -> Problem:
     )
 
 
-MAKERS = {"curved": curved, "obstacles": obstacles, "rates": rates, "apart": apart}
+def maps(seed: int) -> Problem:
+    """Maps of their own, one of them empty, among which the rows bend from node to node."""
+    plain, rng = obstacles(seed), np.random.default_rng(seed)
+    cells = rng.random((B, 8, 8)) < 0.08
+    cells[1] = False
+    field = Field(OccupancyGrid(cells, plain.x0[:, :2].numpy() + np.array([0.1, -1.6]), 0.4), 0.15)
+    return Problem(plain.dynamics, plain.cost, [field, plain.constraints[1]], plain.x0, plain.N)
+
+
+MAKERS = {"curved": curved, "obstacles": obstacles, "rates": rates, "apart": apart, "maps": maps}
 
 
 def guess(problem: Problem, seed: int) -> tuple[Tensor, Tensor]:

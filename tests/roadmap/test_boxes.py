@@ -94,7 +94,7 @@ def test_paths_are_free_and_the_same_in_c_and_in_pytorch(d: int, spheres: int) -
 
 def test_without_its_boxes_a_scene_is_that_of_spheres_alone() -> None:
     s, _ = scene(2)
-    spheres, boxes = s.obstacles
+    spheres, boxes, _ = s.obstacles
     assert boxes is not None
     for native in (True, False):
         use_native(native)
@@ -108,7 +108,7 @@ def test_without_its_boxes_a_scene_is_that_of_spheres_alone() -> None:
 
 def test_paths_on_either_side_of_a_box_are_of_different_classes() -> None:
     s, _ = scene(2, B=1, boxes=1, spheres=0)
-    spheres, boxes = s.obstacles
+    spheres, boxes, _ = s.obstacles
     assert boxes is not None
     boxes = replace(boxes, centers=torch.zeros_like(boxes.centers), radii=torch.full_like(boxes.radii, 0.05))
     corners = torch.tensor([[0.0, 0.9], [0.1, 0.8], [0.0, -0.9]], dtype=torch.float64)

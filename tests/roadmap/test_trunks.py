@@ -87,7 +87,7 @@ def test_points_around_trunks_lie_where_the_straight_line_passes() -> None:
 
 def test_gaps_do_not_depend_on_the_other_problems() -> None:
     scene, _ = trunks(B=70, K=30, tilt=0.3)  # more than are projected at once
-    none, boxes = scene.obstacles
+    none, boxes, _ = scene.obstacles
     assert boxes is not None
     parts = boxes, none, scene.start, scene.goal
     points, exists = between_boxes(*parts)

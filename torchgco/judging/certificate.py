@@ -24,6 +24,8 @@ from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance
 from torchgco.judging.judge import by_kind, segment_distance
+from torchgco.judging.maps import segment_distances
+from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
@@ -173,11 +175,16 @@ def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
     return (box_segment_distance(boxes, p, close + radii) - radii)[0]
 
 
+def _field_chords(field: BoundField, X: Tensor) -> Tensor:
+    return segment_distances(field, X[None, :, field.position])[0].unsqueeze(-1) - field.vehicle_radius
+
+
 # By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, or lower
 # bounds of them.
 CHORDS: dict[type[Constraint], Callable[[Any, Tensor], Tensor]] = {
     BoundSpheres: _sphere_chords,
     BoundBoxes: _box_chords,
+    BoundField: _field_chords,
 }
 
 

@@ -26,11 +26,11 @@ def box_segment_distance(boxes: BoundBoxes, p: Tensor, within: Tensor) -> Tensor
     along = p.diff(dim=1)
     least = 0.5 * (ends[:, :-1] + ends[:, 1:] - along.norm(dim=-1, keepdim=True))
     i, k, j = (least < within).nonzero(as_tuple=True)
-    least[i, k, j] = _closest(boxes.axes[i, j], boxes.centers[i, j], boxes.half_sizes[i, j], p[i, k], along[i, k])
+    least[i, k, j] = closest(boxes.axes[i, j], boxes.centers[i, j], boxes.half_sizes[i, j], p[i, k], along[i, k])
     return least
 
 
-def _closest(axes: Tensor, center: Tensor, half: Tensor, a: Tensor, along: Tensor) -> Tensor:
+def closest(axes: Tensor, center: Tensor, half: Tensor, a: Tensor, along: Tensor) -> Tensor:
     """Close lower bounds (P,) of the distances from boxes, one each, along the segments from a to a + along (P, d).
 
     The signed distance from a convex body is a convex function along a segment: comparing it at two points shows which

@@ -18,6 +18,8 @@ from torchgco.base.shapes import check_shape, computing_on, tensor
 from torchgco.constraints.base import CONTACT_FACTOR, Constraint
 from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance
+from torchgco.judging.maps import segment_distances
+from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
@@ -264,10 +266,21 @@ def separation_clearance(separation: Separation, X: Tensor) -> tuple[Tensor, Ten
     return at_knots - contact, torch.minimum(between, at_knots) - contact
 
 
+def field_clearance(field: BoundField, X: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest distance (B,) of the occupied cells, or points, less 0.95 r_veh, at the knots and between them, m.
+
+    Where nothing is nearer than `maps.NEAR` a lower bound; infinite where the map is empty.
+    """
+    p, contact = X[..., field.position], CONTACT_FACTOR * field.vehicle_radius
+    at_knots = segment_distances(field, torch.stack((p, p), dim=2).flatten(1, 2))[:, ::2].amin(-1) - contact
+    return at_knots, torch.minimum(segment_distances(field, p).amin(-1) - contact, at_knots)
+
+
 # By kind of obstacles: smallest distances (B,) from X (B, N+1, n) to where bodies touch, at the knots and between them.
 CLEARANCES: dict[type[Constraint], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
     BoundSpheres: sphere_clearance,
     BoundBoxes: box_clearance,
+    BoundField: field_clearance,
     Separation: separation_clearance,
 }
 

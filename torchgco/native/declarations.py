@@ -17,8 +17,8 @@ from torchgco.native.compiler import NativeError, build
 
 NUMBERS = {"int32_t": ctypes.c_int32, "int64_t": ctypes.c_int64, "double": ctypes.c_double}
 TENSORS = {
-    "double": torch.float64, "int32_t": torch.int32, "int64_t": torch.int64, "uint64_t": torch.int64,
-    "uint8_t": torch.bool,
+    "double": torch.float64, "float": torch.float32, "int32_t": torch.int32, "int64_t": torch.int64,
+    "uint64_t": torch.int64, "uint8_t": torch.bool,
 }  # fmt: skip
 INCLUDES = "#include <stdint.h>\n"
 

@@ -15,6 +15,7 @@ from torchgco.base.status import Status
 from torchgco.constraints.base import Constraint
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
+from torchgco.maps.field import BoundField
 from torchgco.native import structures as c
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
@@ -49,9 +50,10 @@ class Engine:
         sources = ((i, trace_rows(problem, i)) for i in traced)
         self.functions = {i: source for i, source in sources if source.size > 0}
         dense = quadratic is not None and not quadratic.diagonal
-        boxes = any(type(constraint) is BoundBoxes for constraint in problem.constraints)
+        kinds = {type(constraint) for constraint in problem.constraints}
         self.measures = all(type(part) in KINDS or _measured(part) for part in problem.constraints)
-        self.form = Form(self.model, problem.dynamics.position, self.cost, dense, tuple(self.functions.items()), boxes)
+        at, functions = problem.dynamics.position, tuple(self.functions.items())
+        self.form = Form(self.model, at, self.cost, dense, functions, BoundBoxes in kinds, BoundField in kinds)
         self.library = load(self.form.source(), STRUCTURES)
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:

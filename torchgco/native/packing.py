@@ -10,15 +10,20 @@ from torch import Tensor
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.penalties import GuideRegion, Penalty
+from torchgco.maps.field import BoundField
 from torchgco.native import structures as c
 from torchgco.native.structures import NOWHERE, QUADRATIC, Guide, Kind, array
-from torchgco.obstacles.base import marked
+from torchgco.obstacles.base import ABSENT, marked
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
 # All other constraints, subclasses of these too, are traced.
-KINDS = {ControlBounds: Kind.BOUNDS, StateBounds: Kind.BOUNDS, BoundSpheres: Kind.SPHERES, BoundBoxes: Kind.BOXES}
+KINDS = {
+    ControlBounds: Kind.BOUNDS, StateBounds: Kind.BOUNDS, BoundSpheres: Kind.SPHERES, BoundBoxes: Kind.BOXES,
+    BoundField: Kind.FIELD,
+}  # fmt: skip
+REACH_SLACK = 1.0 + 1e-4  # as below
 BOUND_SLACK = 1.0 + 1e-4  # so that rounding, in single precision too, can't make a row active beyond its box's bounds
 
 
@@ -48,7 +53,9 @@ def constraint_of(
         own = _spheres(constraint)
     elif isinstance(constraint, BoundBoxes):
         own = {"bound": array(_box_numbers(constraint), knots=False)}
-    if isinstance(constraint, BoundSpheres | BoundBoxes) and constraint.stops is not None:
+    elif isinstance(constraint, BoundField):
+        own = _field(constraint)
+    if isinstance(constraint, BoundSpheres | BoundBoxes | BoundField) and constraint.stops is not None:
         own["stops"] = array(constraint.stops.unsqueeze(-1), knots=False)
     equality, geometric = constraint.sense == "equality", constraint.geometric
     return c.Constraint(kind=kind, equality=equality, geometric=geometric, knots=knots, rows=rows, place=place, **own)
@@ -90,3 +97,18 @@ def _box_numbers(boxes: BoundBoxes) -> Tensor:
     bounds = torch.stack((boxes.centers, reach), dim=-1).transpose(1, 2)
     numbers = torch.cat((boxes.centers, boxes.axes.flatten(2), boxes.half_sizes, marked(radius, absent)), dim=-1)
     return torch.cat((bounds.flatten(1), 2.0 * boxes.depths, numbers.flatten(1)), dim=1)
+
+
+def _field(field: BoundField) -> dict[str, Any]:
+    """The numbers (B, ...) that field.c reads, and the map itself, which isn't copied."""
+    h, d, R, like = field.field.spacing, field.origins.shape[-1], field.vehicle_radius, field.origins
+    factors = torch.where(field.absent[:, 0], ABSENT, field.factors)
+    reach = REACH_SLACK * (R + 1.5 * h * d**0.5)  # nodes read for a point lie within h sqrt(d) of the nearest one
+    columns = [like.new_full((len(R),), 1.0 / h), like.new_full((len(R),), h * h), R.square(), factors, field.cores]
+    numbers = torch.cat((field.origins, torch.stack([*columns, field.limits, reach], dim=-1)), dim=-1)
+    nodes = field.field.nodes(like.device)
+    x, y, z = (*nodes.shape[1:], 1)[:3]
+    return {
+        "bound": array(numbers, knots=False), "map": nodes, "map_of": field.which.contiguous(),
+        "map_x": x, "map_y": y, "map_z": z, "smooth": field.smooth,
+    }  # fmt: skip

@@ -24,7 +24,7 @@ CONSTANTS = {
 
 
 # How a constraint's rows are computed, FUNCTION: by traced code; the penalty of guidance, if any.
-Kind = IntEnum("Kind", "BOUNDS SPHERES FUNCTION BOXES", start=0)
+Kind = IntEnum("Kind", "BOUNDS SPHERES FUNCTION BOXES FIELD", start=0)
 Guide = IntEnum("Guide", "NO_GUIDE REGION PATH", start=0)
 # How an inner solve is marked that ended, for a reason that `converged` and `refused` say. Others have a `Status`:
 # RUNNING, or the one with which they failed.
@@ -54,12 +54,17 @@ class Constraint(Structure):
         ("double *", "lam best"),  # (E, knots, rows): multipliers, and those of the best iterate of an outer loop
         ("const int32_t *", "variable"),  # BOUNDS: (rows) index into [x, u]
         ("const double *", "sign"),  # BOUNDS: (rows) +1 for an upper bound, -1 for a lower one
-        # BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ...); BOXES: see boxes.c.
+        # BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ...); BOXES, FIELD: see
+        # boxes.c, field.c.
         (Array, "bound"),
         (Array, "squares"),  # SPHERES: squared inflated radii (E, 1, rows), ABSENT where there is none
         (Array, "velocities"),  # SPHERES: as centres, or NULL
-        (Array, "stops"),  # SPHERES, BOXES: the last knot at which they count (E, 1, 1), or NULL
+        (Array, "stops"),  # SPHERES, BOXES, FIELD: the last knot at which they count (E, 1, 1), or NULL
         ("double", "dt"),
+        ("const float *", "map"),  # FIELD: distances at the nodes of all maps (G, map_x, map_y, map_z)
+        ("const int64_t *", "map_of"),  # FIELD: (E)
+        ("int64_t", "map_x map_y map_z"),
+        ("int32_t", "smooth"),  # FIELD: three nodes per axis, or two
     )
     _fields_ = fields(declared)
 

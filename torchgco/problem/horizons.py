@@ -22,6 +22,7 @@ from torchgco.constraints.bounds import ControlBounds, RateBounds, StateBounds
 from torchgco.costs.base import Cost, WrappedCost, add_blocks
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
+from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
@@ -235,8 +236,8 @@ def _obstacles(obstacles: Obstacles, problem: Problem, i: int) -> Obstacles:
         return obstacles
     if problem.N in late and not all(obstacles.holds_at(int(h)) for h in horizon.unique()):
         raise InputError("horizon", f"last knots at which constraints[{i}] holds", horizon.unique().tolist())
-    if not isinstance(obstacles, BoundSpheres | BoundBoxes):
-        raise InputError("horizon", "obstacles that are Spheres, Boxes or Capsules", type(obstacles).__name__)
+    if not isinstance(obstacles, BoundSpheres | BoundBoxes | BoundField):
+        raise InputError("horizon", "obstacles that are Spheres, Boxes, Capsules or a Field", type(obstacles).__name__)
     return obstacles.stopping_at(horizon)
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.tree import take
+from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import TINY, Solids
 from torchgco.obstacles.box_geometry import Cuboids
 
@@ -22,16 +23,23 @@ class Inflated(NamedTuple):
 
     spheres: Solids
     boxes: Cuboids | None = None
+    maps: tuple[BoundField, ...] = ()
 
     @property
     def kinds(self) -> tuple[Solids, ...]:
-        """The kinds of which there are any."""
+        """The kinds of spheres and boxes of which there are any."""
         return (self.spheres,) if self.boxes is None else (self.spheres, self.boxes)
 
     @property
     def sizes(self) -> Tensor:
         """The depth of each obstacle's deepest point beneath its surface, boxes last, (B, M'), m; 0 where absent."""
         return torch.cat([part.sizes for part in self.kinds], dim=1)
+
+    @property
+    def scales(self) -> Tensor:
+        """The same, of maps too: a map counts as its cells."""
+        maps = [torch.where(part.absent, 0.0, part.sizes) for part in self.maps]
+        return torch.cat((self.sizes, *maps), dim=1)
 
     @property
     def middles(self) -> Tensor:
@@ -41,12 +49,13 @@ class Inflated(NamedTuple):
     @property
     def largest(self) -> Tensor:
         """The largest size, (B, 1), m."""
-        return self.sizes.amax(-1, keepdim=True)
+        return self.scales.amax(-1, keepdim=True)
 
     def reduced(self, share: float) -> Self:
         """The same obstacles with radii reduced by this share."""
-        parts = (part if part is None else replace(part, radii=(1.0 - share) * part.radii) for part in self)
-        return self._make(parts)
+        spheres = replace(self.spheres, radii=(1.0 - share) * self.spheres.radii)
+        boxes = None if self.boxes is None else replace(self.boxes, radii=(1.0 - share) * self.boxes.radii)
+        return Inflated(spheres, boxes, tuple(part.grown(-share * part.vehicle_radius) for part in self.maps))
 
     def region(self, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """The lower and upper corner (B, d) around start, goal, and the obstacles, each `AROUND` times as large."""
@@ -60,12 +69,13 @@ class Inflated(NamedTuple):
     def depth(self, points: Tensor) -> Tensor:
         """How deep points (B, V, d) lie beneath the surface of an obstacle, (B, V), m; negative outside of all."""
         B, V = points.shape[:2]
-        at_once = max(1, DISTANCES_AT_ONCE // max(1, V * self.sizes.shape[1]))
+        at_once = max(1, DISTANCES_AT_ONCE // max(1, V * self.scales.shape[1]))
         parts = torch.arange(B, device=points.device).split(at_once)
         return torch.cat([take(self, rows)._depth(points[rows]) for rows in parts])
 
     def _depth(self, points: Tensor) -> Tensor:
         away = [part.signed_distance(points).masked_fill(part.absent.unsqueeze(1), torch.inf) for part in self.kinds]
+        away += [part.signed_distance(points, points.new_zeros(1)) for part in self.maps]
         return -torch.cat(away, dim=-1).amin(-1)
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchgco.roadmap.geometry import Inflated, length, points_along
+from torchgco.roadmap.mapped import sweep_alike
 
 COMPARED_POINTS = 65  # at which two paths in space are compared
 
@@ -36,7 +37,8 @@ def _wind_alike(paths: Tensor, obstacles: Inflated) -> Tensor:
     cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     swept = torch.atan2(cross, (a * b).sum(-1)).sum(-1)
     turned = (swept.unsqueeze(2) - swept.unsqueeze(1)).abs() > math.pi
-    return ~(turned & (obstacles.sizes > 0)[:, None, None]).any(-1)
+    alike = ~(turned & (obstacles.sizes > 0)[:, None, None]).any(-1)
+    return alike & sweep_alike(paths, obstacles) if obstacles.maps else alike
 
 
 def _are_close(paths: Tensor, obstacles: Inflated) -> Tensor:

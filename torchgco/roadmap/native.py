@@ -69,7 +69,7 @@ class NativeSearch:
     margin: float
 
     def graph(self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int) -> Graph:
-        (B, d), (spheres, boxes) = start.shape, self.obstacles
+        (B, d), (spheres, boxes, _) = start.shape, self.obstacles
         M = spheres.radii.shape[1]
         rays, shell = directions(start, goal), start.new_tensor(SHELLS[d])
         count, more = M * (RAYS * len(shell) + min(MIDWAY, M)), {}
@@ -116,7 +116,7 @@ class NativeSearch:
 
     def _run(self, name: str, read: dict[str, Tensor], written: dict[str, Tensor], **numbers: float) -> None:
         """Call a function of the library on all problems."""
-        spheres, boxes = self.obstacles
+        spheres, boxes, _ = self.obstacles
         read = {**read, "centers": spheres.centers, "distances": marked(spheres.radii, spheres.absent)}
         if boxes is not None:
             numbers["boxes"] = boxes.radii.shape[1]

@@ -19,6 +19,7 @@ from torchgco.base.options import AtLeast, Below, check_options
 from torchgco.base.tree import take
 from torchgco.roadmap import native as roadmap
 from torchgco.roadmap.geometry import Scene, length
+from torchgco.roadmap.mapped import paths_in_maps
 from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.search import TorchSearch
 
@@ -62,6 +63,8 @@ class Roadmap:
             Corners (B, count, HOPS+1, d), m, the goal repeated at their ends, or the straight line where there is no
             path; and whether there is a path (B,).
         """
+        if scene.obstacles.maps:
+            return paths_in_maps(scene, count, self.max_overlap)
         library = roadmap.library_for(scene.start, scene.obstacles.boxes is not None)
         most = PROBLEMS_AT_ONCE if library is None else roadmap.PROBLEMS_AT_ONCE
         everyone = torch.arange(scene.start.shape[0], device=scene.start.device)

@@ -8,6 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.problem.problem import Problem
@@ -24,11 +25,13 @@ def scene_of(problem: Problem, rest: Tensor) -> Scene | None:
     Obstacles that don't hold at the last knot are left out: only those that stay bar a path. None without a goal or
     obstacles, with obstacles that the roadmap can't take, or if space is neither 2-D nor 3-D.
     """
-    parts = [c.inflated() if isinstance(c, Obstacles) else None for c in problem.geometric if c.holds_at(problem.N)]
+    lasting = [c for c in problem.geometric if c.holds_at(problem.N)]
+    maps = tuple(c for c in lasting if isinstance(c, BoundField))
+    parts = [c.inflated() if isinstance(c, Obstacles) else None for c in lasting if not isinstance(c, BoundField)]
     known, at = [part for part in parts if part is not None], problem.position
     if len(known) < len(parts) or problem.goal is None or at.stop - at.start not in (2, 3):
         return None
-    obstacles = _by_kind(problem.x0[:, at], [part for part in known if part.radii.shape[1] > 0])
+    obstacles = _by_kind(problem.x0[:, at], [part for part in known if part.radii.shape[1] > 0], maps)
     if obstacles is None:
         return None
     first = _resting_cost(problem, rest, problem.x0[:, None, at]).clamp(min=1e-12)
@@ -48,16 +51,16 @@ def has_paths(problem: Problem) -> bool:
     return scene_of(one, one.cost.rest_controls(one.x0.new_zeros(1, one.N, one.m))) is not None
 
 
-def _by_kind(start: Tensor, parts: Sequence[Solids]) -> Inflated | None:
+def _by_kind(start: Tensor, parts: Sequence[Solids], maps: tuple[BoundField, ...]) -> Inflated | None:
     """The spheres and the boxes among obstacles of problems with starts (B, d); None where there are none at all."""
     boxes = _joined([part for part in parts if isinstance(part, Cuboids)])
     spheres = _joined([part for part in parts if not isinstance(part, Cuboids)])
     if spheres is None:
-        if boxes is None:
+        if boxes is None and not maps:
             return None
         zero = torch.zeros_like(start[:, :1])
         spheres = Solids(start.unsqueeze(1), zero, torch.ones_like(zero, dtype=torch.bool))  # one that is absent
-    return Inflated(spheres, boxes)
+    return Inflated(spheres, boxes, maps)
 
 
 def _joined(parts: Sequence[S]) -> S | None:
@@ -72,7 +75,7 @@ def scales(problem: Problem, scene: Scene, rest: Tensor) -> tuple[Tensor, Tensor
     R is the mean size of the obstacles, m. q0 is the stage cost of resting at the start, or, where only the
     terminal cost depends on the goal, the mean cost per stage of staying there.
     """
-    sizes = scene.obstacles.sizes
+    sizes = scene.obstacles.scales
     R = sizes.sum(-1) / (sizes > 0).sum(-1).clamp(min=1)
     resting = _resting_cost(problem, rest, scene.start.unsqueeze(1))[:, 0]
     ends_matter = (resting.abs() < LITTLE) & (scene.start != scene.goal).any(-1)

@@ -139,7 +139,7 @@ class TorchSearch:
 
     def _beside(self, start: Tensor, goal: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
         """Free points around the obstacles and between them (B, nodes, d), and which places are taken (B, nodes)."""
-        spheres, boxes = self.obstacles
+        spheres, boxes, _ = self.obstacles
         parts = [around_spheres(spheres, start, goal), between_spheres(spheres)]
         if boxes is not None:
             parts.append(of_boxes(boxes, spheres, start, goal))

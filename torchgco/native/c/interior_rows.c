@@ -47,6 +47,10 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, con
     } else if (con->kind == BOXES) {
         for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, k, x, 0);
 #endif
+#if WITH_FIELDS
+    } else if (con->kind == FIELD) {
+        c[0] = field_row(con, rows, k, x, 0, 0);
+#endif
     } else tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
 }
 
@@ -127,6 +131,16 @@ static inline void add_boxes(Barrier *t, int64_t i, int64_t k, const V *x) {
 }
 #endif
 
+#if WITH_FIELDS
+static inline void add_field(Barrier *t, int64_t i, int64_t k, const V *x) {
+    int64_t q = row_of(t, i, k);
+    V slopes[DIM], curvature[DIM * DIM], lam = t->objective * t->z[q];
+    field_row(t->lanes.of->constraint + i, t->lanes.rows + i, k, x, slopes, curvature);
+    for (int a = 0; a < DIM; a++) for (int b = a; b < DIM; b++) curvature[a * DIM + b] *= lam;
+    add_row(t, k, q, slopes, curvature);
+}
+#endif
+
 static inline void add_bounds(Barrier *t, int64_t i, int64_t k) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
@@ -148,6 +162,9 @@ static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const 
 #endif
 #if WITH_BOXES
     if (con->kind == BOXES) { add_boxes(t, i, k, x); return; }
+#endif
+#if WITH_FIELDS
+    if (con->kind == FIELD) { add_field(t, i, k, x); return; }
 #endif
     V by[PARTS * MAX_ROWS], cc[MAX_ROWS], lam[MAX_ROWS], own[PARTS];
     int64_t q = row_of(t, i, k);
@@ -184,6 +201,13 @@ static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, con
             out[j] = SET(0.0);
             for (int a = 0; a < DIM; a++) out[j] += slopes[a] * z[POSITION + a];
         }
+#endif
+#if WITH_FIELDS
+    } else if (con->kind == FIELD) {
+        V slopes[DIM];
+        field_row(con, rows, k, x, slopes, 0);
+        out[0] = SET(0.0);
+        for (int a = 0; a < DIM; a++) out[0] += slopes[a] * z[POSITION + a];
 #endif
     } else tgco_along_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), z, out);
 }

@@ -86,6 +86,10 @@ static inline V rows_value(const Lanes *s, int64_t i, int64_t k, const V *x, con
     } else if (con->kind == BOXES) {
         total = boxes_value(s, con, rows, k, x, total);
 #endif
+#if WITH_FIELDS
+    } else if (con->kind == FIELD) {
+        total = field_value(s, con, rows, k, x, total);
+#endif
     } else {
         V c[MAX_ROWS];
         tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
@@ -112,6 +116,10 @@ static inline void rows_expand(const Lanes *s, int64_t i, int64_t k, const V *x,
 #if WITH_BOXES
     } else if (con->kind == BOXES) {
         boxes_expand(s, con, rows, k, x, g, H);
+#endif
+#if WITH_FIELDS
+    } else if (con->kind == FIELD) {
+        field_expand(s, con, rows, k, x, g, H);
 #endif
     } else {
         V c[MAX_ROWS], slope[MAX_ROWS], rho[MAX_ROWS];

@@ -48,6 +48,13 @@ static V hits(const Samples *q, int64_t k, const V *x) {
             continue;
         }
 #endif
+#if WITH_FIELDS
+        if (con->kind == FIELD) {
+            const Rows *rows = q->s.rows + i;
+            if (!is_far_from_map(con, rows, x)) count += tgco_truth(field_row(con, rows, k, x, 0, 0) >= SET(0.0));
+            continue;
+        }
+#endif
         V c[MAX_ROWS], u[NU];
         memset(u, 0, sizeof u); /* a geometric constraint reads x alone */
         tgco_rows((int)i, x, u, at(q->s.rows[i].bound, &con->bound, con->place[k]), c);

@@ -53,6 +53,13 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
             note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, &pushed, sweep);
         }
 #endif
+#if WITH_FIELDS
+    } else if (con->kind == FIELD) {
+        if (any(rows->pushed[place]) || !is_far_from_map(con, rows, x)) {
+            V c = field_row(con, rows, k, x, 0, 0);
+            note(s, con, c, tgco_choose(c <= zero, zero, depth_of(rows, c)), lam, &pushed, sweep);
+        }
+#endif
     } else {
         V c[MAX_ROWS];
         tgco_rows((int)i, x, u, at(rows->bound, &con->bound, place), c);

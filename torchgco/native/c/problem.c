@@ -1,7 +1,7 @@
 /* Problems side by side, one per lane of the vectors V; no operation mixes lanes.
 
    The generated part before this file declares the structures and enumerations of native/structures.py. It defines NX,
-   NU, NP, NJ, DIM, POSITION, QUADRATIC_FULL, WITH_BOXES, COST_ARRAYS, MAX_ROWS, and
+   NU, NP, NJ, DIM, POSITION, QUADRATIC_FULL, WITH_BOXES, WITH_FIELDS, COST_ARRAYS, MAX_ROWS, and
 
        tgco_step, tgco_jacobian                         the model
        tgco_gather(P, f, T), tgco_product(f, T, Q)      T = P F and Q = F' T (upper triangle) for its sparse F = [fx fu]
@@ -18,6 +18,7 @@
 typedef struct {
     V *lam, *bound, *squares, *velocities, *stops;
     I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
+    const float *map[LANES]; /* of a FIELD: each lane's map */
 } Rows;
 
 /* The working data of a group of lanes. */
@@ -80,6 +81,7 @@ static int64_t lay_out(Lanes *s, V *memory) {
         rows.squares = cut(&m, length(&c->squares, 1)); rows.velocities = cut(&m, length(&c->velocities, 1));
         rows.stops = cut(&m, length(&c->stops, 1));
         rows.pushed = (I *)cut(&m, c->knots);
+        for (int l = 0; l < LANES; l++) rows.map[l] = c->map;
         if (memory) s->rows[i] = rows;
     }
     return m - memory;
@@ -120,6 +122,7 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
         fill(s->rows[i].squares, &c->squares, 1, lane, e);
         fill(s->rows[i].velocities, &c->velocities, 1, lane, e);
         fill(s->rows[i].stops, &c->stops, 1, lane, e);
+        if (c->map) s->rows[i].map[lane] = c->map + c->map_of[e] * c->map_x * c->map_y * c->map_z;
     }
 }
 

@@ -41,8 +41,9 @@ static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict
     for (int e = 0; e < COUNT; e++) g[F_column[e]] += entry(e, f) * p[F_row[e]];
 }
 """
-COST, BOXES = "quadratic.c", ("box.h", "boxes.c")  # or traced.c; left out where there are no boxes
-TERMS = ("problem.c", COST, "penalty.c", *BOXES, "knot.c")
+COST = "quadratic.c"  # or traced.c
+BOXES, FIELDS = ("box.h", "boxes.c"), ("field.c",)  # left out where there are no boxes, or no maps
+TERMS = ("problem.c", COST, "penalty.c", *BOXES, *FIELDS, "knot.c")
 SOLVER = (*TERMS, "cholesky.h", "passes.c", "ilqr.c", "trajectories.c", "outer.c")
 SAMPLER = (*TERMS, "normal.c", "mppi.c")
 INTERIOR = (*TERMS, "cholesky.h", *(f"interior{part}.c" for part in ("_rows", "_step", "_memory", "_search", "")))
@@ -61,6 +62,7 @@ class Form:
     dense: bool  # the quadratic cost's weights are matrices
     functions: tuple[tuple[int, KnotSource], ...]  # the constraints that are traced, by their place
     boxes: bool = False  # whether there are boxes among the obstacles
+    fields: bool = False  # the same of maps
 
     def source(self, parts: tuple[str, ...] = SOLVER, real: str = "double", lanes: int = LANES, more: str = "") -> str:
         """The C file of one of the solvers or the sampler, for numbers of type `real`; `more` is generated code."""
@@ -76,14 +78,15 @@ class Form:
         at = self.position
         cost = None if self.cost is None else (self.cost.stage.key, self.cost.last.key)
         functions = tuple((i, rows.key) for i, rows in self.functions)
-        return self.dynamics.key, at and (at.start, at.stop), cost, self.dense, functions, self.boxes
+        return self.dynamics.key, at and (at.start, at.stop), cost, self.dense, functions, self.boxes, self.fields
 
     def _written(self, parts: tuple[str, ...], real: str, lanes: int, more: str) -> str:
         model, at = self.dynamics, self.position
         sizes = {
             "REAL": real, "LANES": lanes, "NX": model.n, "NU": model.m, "NP": model.count, "NJ": model.computed,
             "DIM": 0 if at is None else at.stop - at.start, "POSITION": 0 if at is None else at.start,
-            "QUADRATIC_FULL": int(self.dense), "WITH_BOXES": int(self.boxes), "COST_ARRAYS": COST_ARRAYS,
+            "QUADRATIC_FULL": int(self.dense), "WITH_BOXES": int(self.boxes), "WITH_FIELDS": int(self.fields),
+            "COST_ARRAYS": COST_ARRAYS,
             "MAX_ROWS": max([1, *(rows.size for _, rows in self.functions)]),
         }  # fmt: skip
         cost = Quadratic if self.cost is None else TracedCost
@@ -91,8 +94,9 @@ class Form:
         generated = [model.code, _products(model), "" if self.cost is None else self.cost.code]
         generated += [*dict.fromkeys(rows.code for _, rows in self.functions), _switches(self.functions)]
         generated += [more] if more else []
-        # Without boxes their code is left out, so that it can't change how the rest is compiled.
-        names = [name for name in parts if self.boxes or name not in BOXES]
+        # Without boxes or maps their code is left out, so that it can't change how the rest is compiled.
+        absent = (*(() if self.boxes else BOXES), *(() if self.fields else FIELDS))
+        names = [name for name in parts if name not in absent]
         names = ["traced.c" if name == COST and self.cost is not None else name for name in names]
         return "\n".join((defines(sizes), shared, PRELUDE, *generated, *((C / name).read_text() for name in names)))
 

@@ -1,0 +1,89 @@
+"""Grids and clouds are checked where they are made."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torchgco import InputError
+from torchgco.maps import OccupancyGrid, PointCloud
+
+
+def test_a_grid_says_where_its_cells_lie() -> None:
+    occupied = np.zeros((4, 3), bool)
+    occupied[2, 1] = True
+    grid = OccupancyGrid(occupied, [-1.0, 2.0], 0.5)
+    assert (grid.d, grid.batch, grid.shape) == (2, None, (4, 3))
+    assert grid.upper.tolist() == [1.0, 3.5]
+    assert grid.cell([[-0.9, 2.1], [0.2, 2.7], [-1.1, 3.6]]).tolist() == [[0, 0], [2, 1], [-1, 3]]
+    assert grid.is_occupied[2, 1] and grid.is_occupied.sum() == 1 and not grid.is_unknown.any()
+
+
+def test_numbers_are_probabilities_and_a_third_value_is_unknown() -> None:
+    grid = OccupancyGrid([[0.1, 0.5], [np.nan, 1.0]], [0, 0], 1)
+    assert grid.is_occupied.tolist() == [[False, True], [False, True]]
+    assert grid.is_unknown.tolist() == [[False, False], [True, False]]
+    whole = OccupancyGrid(np.array([[0, 1], [-1, 1]], np.int8), [0, 0], 1)
+    assert whole.is_occupied.tolist() == grid.is_occupied.tolist()
+    assert whole.is_unknown.tolist() == grid.is_unknown.tolist()
+    assert OccupancyGrid(np.zeros((2, 2), bool), [0, 0], 1).is_unknown.shape == (2, 2)
+
+
+def test_a_grid_per_problem_may_have_its_own_origin() -> None:
+    grid = OccupancyGrid(torch.zeros(2, 4, 5, 6, dtype=torch.bool), np.array([[0.0, 0, 0], [1, 0, 0]]), 0.5)
+    assert (grid.d, grid.batch, grid.shape) == (3, 2, (4, 5, 6))
+    assert grid.cell(np.array([[1.2, 0, 0], [1.2, 0, 0]])).tolist() == [[2, 0, 0], [0, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "field"),
+    [
+        ((np.zeros((2, 2), bool), [0, 0], 0.0), "grid.resolution"),
+        ((np.zeros((2, 2), bool), [0, 0], np.nan), "grid.resolution"),
+        ((np.zeros((2, 2), bool), [0, 0], "small"), "grid.resolution"),
+        ((np.zeros((2, 2), bool), [0, 0], [1, 1]), "grid.resolution"),
+        ((np.zeros((2, 2), bool), [0, np.inf], 1), "grid.origin"),
+        ((np.zeros((2, 2), bool), [0], 1), "grid.origin"),
+        ((np.zeros((2, 2), bool), "here", 1), "grid.origin"),
+        ((np.zeros((2, 2), bool), [0, 0, 0], 1), "grid.occupied"),
+        ((np.zeros((2, 2, 2, 2, 2), bool), [0, 0, 0], 1), "grid.occupied"),
+        ((np.zeros((0, 2), bool), [0, 0], 1), "grid.occupied"),
+        ((np.full((2, 2), 1.5), [0, 0], 1), "grid.occupied"),
+        ((np.full((2, 2), 100, np.int8), [0, 0], 1), "grid.occupied"),
+        ((np.full((2, 2), "x"), [0, 0], 1), "grid.occupied"),
+        (([[0, 1], [0]], [0, 0], 1), "grid.occupied"),
+        ((np.zeros((2, 2), bool), [[0, 0], [0, 0]], 1), "grid.origin"),
+        ((np.zeros((3, 2, 2), bool), [[0, 0], [0, 0]], 1), "grid.origin"),
+    ],
+)
+def test_a_wrong_grid_is_refused(arguments: Any, field: str) -> None:
+    with pytest.raises(InputError) as error:
+        OccupancyGrid(*arguments)
+    assert error.value.field == field
+
+
+def test_points_that_are_no_returns_are_none() -> None:
+    cloud = PointCloud([[0.0, 0, 0], [np.inf, 1, 2], [1, np.nan, 0], [1, 1, 1]], 0.1)
+    assert (cloud.d, cloud.batch) == (3, None)
+    assert cloud.clouds()[0].tolist() == [[0, 0, 0], [1, 1, 1]]
+    many = PointCloud(np.zeros((2, 5, 2)), 0)
+    assert many.batch == 2 and [len(points) for points in many.clouds()] == [5, 5]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "field"),
+    [
+        (([[0.0, 0, 0, 0]], 0.1), "cloud.points"),
+        (([0.0, 0.0], 0.1), "cloud.points"),
+        (([["a", "b"]], 0.1), "cloud.points"),
+        (([], 0.1), "cloud.points"),
+        (([[0.0, 0.0]], -0.1), "cloud.radius"),
+        (([[0.0, 0.0]], np.inf), "cloud.radius"),
+        (([[0.0, 0.0]], None), "cloud.radius"),
+    ],
+)
+def test_a_wrong_cloud_is_refused(arguments: Any, field: str) -> None:
+    with pytest.raises(InputError) as error:
+        PointCloud(*arguments)
+    assert error.value.field == field

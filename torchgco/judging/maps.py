@@ -1,0 +1,139 @@
+"""Distances from what a map holds, as judge and certificate measure them: from occupied cells as boxes, from points.
+
+Nothing is shared with the solvers' distance fields: cells and points near a segment are found in a tree, and each is
+measured by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.judging.distances import closest
+from torchgco.maps.distance import DistanceField
+from torchgco.maps.field import BoundField
+from torchgco.maps.grid import OccupancyGrid
+
+NEAR = 2.0  # m: distances up to here are exact, farther ones lower bounds
+LEAST = 1e-12  # m, of a bound's rounding
+AT_ONCE = 2**17  # pairs measured together
+
+
+@dataclass(frozen=True)
+class Solid:
+    """The occupied cells next to free ones, or the points, of one map."""
+
+    centers: np.ndarray  # (P, d), m
+    half: float  # half a cell's side; 0 for points
+    radius: float  # of points; 0 for cells
+    tree: Any  # scipy's, of the centres; None where there is none
+    cells: np.ndarray | None = None  # whether cells are occupied; the first one's lowest corner
+    origin: np.ndarray | None = None
+
+    @property
+    def reach(self) -> float:
+        """The largest distance of a solid's surface from its centre, m."""
+        return self.half * self.centers.shape[1] ** 0.5 + self.radius
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (Q, d) lie in occupied cells, those inside of others among them."""
+        if self.cells is None or self.origin is None:
+            return np.zeros(len(points), bool)
+        with np.errstate(invalid="ignore"):
+            place = np.floor((points - self.origin) / (2 * self.half))
+        within = ((place >= 0) & (place < self.cells.shape)).all(-1)
+        index = np.where(within[:, None], place, 0).astype(int)
+        return within & np.asarray(self.cells)[tuple(index.T)]
+
+
+def segment_distances(field: BoundField, p: Tensor) -> Tensor:
+    """Distances (B, K-1) of the map from the straight segments between points p (B, K, d), m.
+
+    Below `NEAR` close lower bounds, within 1e-9 m, of the signed distances from the nearest cell or point: negative
+    where a segment enters one. Farther away they may be loose. Infinite where nothing is occupied, NaN at points that
+    are NaN.
+    """
+    solids = solids_of(field.field)
+    rows = []
+    for which, path in zip(field.which.tolist(), p.detach().cpu().double(), strict=True):
+        rows.append(_distances(solids[which], path))
+    return torch.stack(rows).to(p)
+
+
+def _distances(solid: Solid, p: Tensor) -> Tensor:
+    """The same for one problem, (K-1,), with p (K, d)."""
+    a, along = p[:-1], p.diff(dim=0)
+    finite = torch.isfinite(a).all(-1) & torch.isfinite(along).all(-1)
+    found = torch.where(finite, torch.inf, torch.nan).double()
+    rows = finite.nonzero().flatten().numpy()
+    if solid.tree is None or len(rows) == 0:
+        return found
+    middle, half = (a + 0.5 * along)[rows].numpy(), 0.5 * along[rows].norm(dim=-1).numpy()
+    nearest, _ = solid.tree.query(middle)
+    # The distance changes no faster than the point moves, and a solid reaches no farther than `reach`.
+    bound = nearest - half - solid.reach - LEAST
+    close = bound < NEAR
+    distance = bound.copy()
+    distance[close] = np.inf
+    distance[close] = _measured(solid, a[rows[close]], along[rows[close]], middle[close], (nearest + half)[close])
+    inside = solid.holds(a[rows].numpy()) | solid.holds((a + along)[rows].numpy())
+    found[rows] = torch.from_numpy(np.where(inside, np.minimum(distance, -solid.half), distance))
+    return found
+
+
+def _measured(solid: Solid, a: Tensor, along: Tensor, middle: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Distances (E,) of the solids from segments from a to a + along (E, d), with one at `least` (E,) at most."""
+    lists = solid.tree.query_ball_point(middle, least + solid.reach + LEAST) if len(middle) else []
+    near = np.concatenate([np.asarray(some, int) for some in lists]) if len(lists) else np.zeros(0, int)
+    segment = np.repeat(np.arange(len(lists)), [len(some) for some in lists])
+    distance = np.full(len(middle), np.inf)
+    for first in range(0, len(near), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        which, center = segment[part], torch.from_numpy(solid.centers[near[part]])
+        axes = torch.eye(center.shape[1], dtype=center.dtype).expand(len(center), -1, -1)
+        away = closest(axes, center, torch.full_like(center, solid.half), a[which], along[which])
+        np.minimum.at(distance, which, away.numpy() - solid.radius)
+    return distance
+
+
+def solids_of(field: DistanceField) -> list[Solid]:
+    """What each of a field's maps holds; kept as long as the map."""
+    key = field.source
+    kept = _kept.setdefault(key, {})
+    if field.unknown not in kept:
+        kept[field.unknown] = _solids(field)
+    return kept[field.unknown]
+
+
+_kept: WeakKeyDictionary[object, dict[str, list[Solid]]] = WeakKeyDictionary()
+
+
+def _solids(field: DistanceField) -> list[Solid]:
+    source = field.source
+    if not isinstance(source, OccupancyGrid):
+        return [Solid(points, 0.0, source.radius, _tree(points)) for points in source.clouds()]
+    cells = source.is_occupied
+    if field.unknown == "occupied":
+        cells = cells | source.is_unknown
+    each = cells if source.batch is not None else cells[None]
+    origins = np.broadcast_to(source.origin, (len(each), source.d))
+    solids = []
+    for one, origin in zip(each, origins, strict=True):
+        inner = padded = np.pad(one, 1)
+        for axis in range(one.ndim):
+            inner = inner & np.roll(padded, 1, axis) & np.roll(padded, -1, axis)
+        surface = np.argwhere(one & ~inner[tuple([slice(1, -1)] * one.ndim)])
+        centers = origin + source.resolution * (surface + 0.5)
+        solids.append(Solid(centers, 0.5 * source.resolution, 0.0, _tree(centers), one, origin))
+    return solids
+
+
+def _tree(points: np.ndarray) -> Any:
+    from scipy.spatial import cKDTree
+
+    return cKDTree(points) if len(points) else None

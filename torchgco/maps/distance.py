@@ -1,0 +1,202 @@
+"""Distance fields: at the nodes of a lattice, how far the nearest occupied cell or point is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError, shown
+from torchgco.base.options import check_value
+from torchgco.maps.grid import OccupancyGrid
+from torchgco.maps.lookup import Lattice, distances
+from torchgco.maps.points import PointCloud
+
+FINE = 2**23  # nodes, at most, of fields with two nodes per cell and axis where `refine` doesn't say
+NODES = 2**30  # of one field
+FAR = 1e6  # m: the distance where nothing is occupied
+MARGIN = 2  # nodes around the points of a cloud
+
+Unknown = Literal["occupied", "free"]
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceField:
+    """Euclidean signed distances from what a map holds, at the nodes of a lattice; made by `DistanceField.of`.
+
+    The nodes lie at the corners of the cells, and `refine - 1` between them along each axis. There the distances are
+    exact: from the nearest point of an occupied cell, a closed box; inside of occupied cells minus the distance to the
+    nearest free one. Outside of the grid nothing is occupied.
+
+    Attributes:
+        values: distances (G, nodes along x, y[, z]), m, as an array of float32; G is 1 where all problems share a map.
+        origin: the first node, (G, d), m.
+        spacing: of the nodes, m.
+        source: the map.
+        unknown: what unknown cells count as.
+        thickness: half the size of the smallest obstacle, m: half a cell, or a point's radius.
+    """
+
+    values: np.ndarray
+    origin: np.ndarray
+    spacing: float
+    source: OccupancyGrid | PointCloud
+    unknown: Unknown = "occupied"
+    _nodes: dict[torch.device, Tensor] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(
+        cls,
+        source: OccupancyGrid | PointCloud,
+        unknown: Unknown = "occupied",
+        refine: int | None = None,
+        resolution: float | None = None,
+    ) -> DistanceField:
+        """The distances from a map.
+
+        Args:
+            source: a grid, or a cloud.
+            unknown: what the unknown cells of a grid count as.
+            refine: steps of the lattice per cell of a grid, along each axis. None: 2 where that gives at most
+                `FINE` nodes, 1 otherwise. With 1, walls of a single cell have no inside: a trajectory that crosses one
+                isn't pushed out of it.
+            resolution: spacing of the lattice over a cloud, m. None: its radius.
+
+        Raises:
+            InputError: another kind of map, an option out of range or that the kind of map doesn't take, too many
+                nodes.
+        """
+        check_value(unknown, Unknown, "field.unknown")
+        if isinstance(source, OccupancyGrid):
+            if resolution is not None:
+                raise InputError("field.resolution", "none for a grid, which has its own", resolution)
+            return _of_grid(source, unknown, refine)
+        if not isinstance(source, PointCloud):
+            raise InputError("field.source", "an OccupancyGrid or a PointCloud", shown(source))
+        if refine is not None:
+            raise InputError("field.refine", "none for a cloud, which has no cells", refine)
+        return _of_cloud(source, unknown, resolution)
+
+    @property
+    def d(self) -> int:
+        """Dimension of space, 2 or 3."""
+        return self.origin.shape[-1]
+
+    @property
+    def batch(self) -> int | None:
+        """How many problems have a map of their own; None for one map that all share."""
+        return self.source.batch
+
+    @property
+    def thickness(self) -> float:
+        if isinstance(self.source, OccupancyGrid):
+            return 0.5 * self.source.resolution
+        return self.source.radius
+
+    @property
+    def upper(self) -> np.ndarray:
+        """The last node, (G, d), m."""
+        return self.origin + self.spacing * (np.array(self.values.shape[1:]) - 1)
+
+    def nodes(self, device: torch.device) -> Tensor:
+        """`values` as a tensor; on a CPU it shares their memory."""
+        if device not in self._nodes:
+            self._nodes[device] = torch.from_numpy(self.values).to(device)
+        return self._nodes[device]
+
+    def distance(self, points: Any, smooth: bool = True) -> Tensor:
+        """Distances (...) at points (..., d), m: lower bounds of the true ones; see `Field`.
+
+        Of the map that all problems share; points (G, ..., d) of maps per problem.
+
+        Raises:
+            InputError: points of another space, or another number of maps.
+        """
+        p = torch.as_tensor(points, dtype=torch.float64)
+        G = len(self.values)
+        if p.dim() < 1 or p.shape[-1] != self.d or (G > 1 and p.shape[0] != G):
+            expected = f"({'' if G == 1 else f'{G}, '}..., {self.d})"
+            raise InputError("points", expected, tuple(p.shape))
+        flat = p.reshape(G, -1, self.d)
+        origins = torch.from_numpy(self.origin)
+        lattice = Lattice(self.nodes(p.device), torch.arange(G), origins, self.spacing, smooth)
+        return distances(lattice, flat, torch.full((G,), 0.5 * self.spacing, dtype=p.dtype)).reshape(p.shape[:-1])
+
+
+def _of_grid(grid: OccupancyGrid, unknown: Unknown, refine: int | None) -> DistanceField:
+    if refine is None:
+        fine = np.prod([2.0 * size + 1 for size in grid.shape])
+        refine = 2 if fine <= FINE else 1
+    else:
+        check_value(refine, int, "field.refine")
+    if not 1 <= refine <= 8:
+        raise InputError("field.refine", "1 to 8 steps per cell", refine)
+    _check_count([refine * size + 1 for size in grid.shape])
+    spacing = grid.resolution / refine
+    cells = grid.is_occupied
+    if unknown == "occupied":
+        cells = cells | grid.is_unknown
+    each = cells if grid.batch is not None else cells[None]
+    values = np.stack([_signed_distances(one, refine, spacing) for one in each])
+    origin = np.broadcast_to(grid.origin, (len(values), grid.d)).copy()
+    return DistanceField(values, origin, spacing, grid, unknown)
+
+
+def _signed_distances(cells: np.ndarray, refine: int, spacing: float) -> np.ndarray:
+    """Distances at the nodes from closed occupied cells, inside minus those from closed free ones, m.
+
+    The nearest point of a box to a node is a node, as all corners of cells are nodes: a transform of nodes is exact.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    if not cells.any():
+        return np.full([refine * size + 1 for size in cells.shape], FAR, np.float32)
+    for axis in range(cells.ndim):
+        cells = cells.repeat(refine, axis)
+    occupied, free = _touched(cells, False), _touched(~cells, True)
+    values = distance_transform_edt(~occupied, sampling=spacing).astype(np.float32)
+    if not free.all():
+        values -= distance_transform_edt(~free, sampling=spacing).astype(np.float32)
+    return values
+
+
+def _touched(cells: np.ndarray, outside: bool) -> np.ndarray:
+    """Which nodes, corners of cells, belong to a marked cell; `outside`: those outside of the grid are marked."""
+    nodes = np.zeros([size + 1 for size in cells.shape], bool)
+    for corner in np.ndindex(*([2] * cells.ndim)):
+        nodes[tuple(slice(at, at + size) for at, size in zip(corner, cells.shape, strict=True))] |= cells
+    for axis in range(cells.ndim) if outside else ():
+        edges = np.moveaxis(nodes, axis, 0)
+        edges[0] = edges[-1] = True
+    return nodes
+
+
+def _of_cloud(cloud: PointCloud, unknown: Unknown, resolution: float | None) -> DistanceField:
+    from scipy.spatial import cKDTree
+
+    spacing = cloud.radius if resolution is None else float(check_value(resolution, float, "field.resolution"))
+    if not 0.0 < spacing < np.inf:
+        raise InputError("field.resolution", "a length above 0 m, as the cloud's radius is 0", spacing)
+    clouds, d = cloud.clouds(), cloud.d
+    ends = [(c.min(0), c.max(0)) if len(c) else (np.zeros(d), np.zeros(d)) for c in clouds]
+    room = cloud.radius + MARGIN * spacing
+    origin = np.array([low - room for low, _ in ends])
+    with np.errstate(over="ignore"):
+        counts = np.max([np.ceil((high - low + 2 * room) / spacing) for low, high in ends], axis=0) + 1
+    _check_count(counts.tolist())
+    shape = counts.astype(int)
+    values = np.full((len(clouds), *shape), FAR, np.float32)
+    offsets = spacing * np.stack(np.meshgrid(*(np.arange(size) for size in shape), indexing="ij"), axis=-1)
+    for i, points in enumerate(clouds):
+        if len(points):
+            values[i] = cKDTree(points).query((offsets + origin[i]).reshape(-1, d))[0].reshape(shape) - cloud.radius
+    return DistanceField(values, origin, spacing, cloud, unknown)
+
+
+def _check_count(counts: list[float]) -> None:
+    if np.prod(np.asarray(counts, float)) > NODES:
+        wanted = f"at most {NODES:,} nodes: cells that are larger, or `refine`"
+        raise InputError("field", wanted, " x ".join(f"{count:.0f}" for count in counts))

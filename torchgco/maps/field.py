@@ -1,0 +1,193 @@
+"""Maps as obstacles: a constraint that keeps the vehicle's position away from what a distance field is of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError, shown
+from torchgco.base.options import check_value
+from torchgco.base.shapes import Dimensions
+from torchgco.constraints.base import Constraint, Sense, resolve_knots
+from torchgco.maps.distance import FAR, DistanceField
+from torchgco.maps.grid import OccupancyGrid
+from torchgco.maps.lookup import Lattice, lengths, squares, squares_and_slopes
+from torchgco.maps.points import PointCloud
+from torchgco.obstacles.base import ABSENT, Obstacles
+from torchgco.obstacles.inputs import dimension, vehicle_radii
+
+Interpolation = Literal["smooth", "linear"]
+STEPS = 0.5  # spacings of the lattice between points at which a segment's distance is looked up
+AT_ONCE = 2**16  # points looked up together
+
+
+@dataclass(frozen=True)
+class Field(Constraint):
+    """a (R^2 - G(p_k)) <= 0: the vehicle stays R = r_veh away from everything that a map holds.
+
+    G is a lower bound of the squared distance from the map, interpolated between the nodes of the field
+    (`maps/lookup.py`): a position that meets the constraint is at least R from every occupied cell. In front of a flat
+    wall it keeps up to h^2 (d - 1) / (8 R) more, with h the field's spacing, and around single points nothing. The
+    factor a = (R + half a cell) / R gives c the slope of a box of one cell. One row per knot, whatever the map: its
+    time doesn't grow with the map.
+
+    Args:
+        field: a `DistanceField`; or a grid or cloud, whose field is made with the defaults.
+        vehicle_radius: number or (B,), m.
+        interpolation: "smooth", quadratic B-splines, or "linear", with kinks between the cells.
+        knots: default 1..N.
+
+    Raises:
+        InputError: no field, another option; on `Problem(...)`: a map of another space than the position's, another
+            number of maps than problems, a negative radius.
+    """
+
+    field: Any
+    vehicle_radius: Any = 0.0
+    interpolation: Interpolation = "smooth"
+    knots: Any = None
+
+    sense: ClassVar[Sense] = "inequality"
+    geometric: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if isinstance(self.field, OccupancyGrid | PointCloud):
+            object.__setattr__(self, "field", DistanceField.of(self.field))
+        if not isinstance(self.field, DistanceField):
+            raise InputError("field.field", "a DistanceField, an OccupancyGrid or a PointCloud", shown(self.field))
+        check_value(self.interpolation, Interpolation, "field.interpolation")
+
+    def bind(self, dims: Dimensions) -> Constraint:
+        d, field, like = dimension(dims, "field.field"), self.field, dims.like
+        if field.d != d:
+            raise InputError("field.field", f"a {d}-D map, as the vehicle's position is {d}-D", f"{field.d}-D")
+        if field.batch not in (None, dims.B):
+            raise InputError("field.field", f"one map for all, or {dims.B} maps", field.batch)
+        vehicle = vehicle_radii(self.vehicle_radius, "field.vehicle_radius", dims)
+        knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
+        knots = resolve_knots(knots, dims.N, "field.knots", like.device)
+        which = torch.zeros(dims.B, dtype=torch.int64, device=like.device)
+        if field.batch is not None:
+            which = torch.arange(dims.B, device=like.device)
+        origins = torch.as_tensor(field.origin, dtype=like.dtype, device=like.device)[which]
+        empty = torch.as_tensor(field.values.reshape(len(field.values), -1).min(-1) >= FAR, device=like.device)
+        absent = empty[which].unsqueeze(-1)
+        assert dims.position is not None
+        smooth = self.interpolation == "smooth"
+        return BoundField(field, which, origins, vehicle, absent, smooth, knots, dims.position, dims.dt or 0.0)
+
+
+@dataclass(frozen=True)
+class BoundField(Obstacles):
+    """A field shaped for its problem: one obstacle, the map."""
+
+    field: DistanceField  # of all maps; a batch's subsets share it
+    which: Tensor  # (B,) int64: the problem's map
+    origins: Tensor  # (B, d)
+    vehicle_radius: Tensor  # (B,)
+    absent: Tensor  # (B, 1) bool: nothing is occupied
+    smooth: bool
+    knots: Any
+    position: slice
+    dt: float
+    stops: Tensor | None = None  # (B,)
+
+    batched: ClassVar[tuple[str, ...]] = ("which", "origins", "vehicle_radius", "absent", "stops")
+
+    def bind(self, dims: Dimensions) -> Self:
+        return self
+
+    @property
+    def lattice(self) -> Lattice:
+        """The field as it is looked up."""
+        nodes = self.field.nodes(self.which.device)
+        return Lattice(nodes, self.which, self.origins, self.field.spacing, self.smooth)
+
+    @property
+    def cores(self) -> Tensor:
+        """The distance (B,), m, below which G is linear in it: R less a spacing, so that the surface is beyond it."""
+        R, h = self.vehicle_radius, self.field.spacing
+        return torch.maximum(R - h, 0.5 * R).clamp(min=0.5 * h)
+
+    @property
+    def factors(self) -> Tensor:
+        """a (B,): it gives c the slope 2 (R + half a cell) by the distance, at the surface."""
+        return (self.vehicle_radius + self.field.thickness) / torch.maximum(self.vehicle_radius, self.cores)
+
+    @property
+    def limits(self) -> Tensor:
+        """The distance (B,), m, that counts as 0: R, or more where R is below the core."""
+        return lengths(self.vehicle_radius.square(), self.cores)
+
+    @property
+    def margins(self) -> Tensor:
+        return self.vehicle_radius.unsqueeze(-1)
+
+    @property
+    def sizes(self) -> Tensor:
+        return (self.vehicle_radius + self.field.thickness).unsqueeze(-1)
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.counted(self._rows(X[:, self.knots, self.position]), ABSENT, X.shape[1])
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        rows = self._rows(x[..., self.position])
+        return rows if self.stops is None else rows.masked_fill((k > self.stops)[:, None, None], ABSENT)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        n, at = X.shape[-1], self.position
+        g, h = self.counted(g, 0.0, X.shape[1]), self.counted(h, 0.0, X.shape[1])
+        _, slopes = squares_and_slopes(self.lattice, X[:, self.knots, at], self.cores)
+        slopes = torch.where(self.absent.unsqueeze(-1), 0.0, -self.factors[:, None, None] * slopes)
+        gradient = g * slopes
+        H[:, self.knots, at, n] += gradient
+        H[:, self.knots, n, at] += gradient
+        H[:, self.knots, at, at] += h.unsqueeze(-1) * slopes.unsqueeze(-1) * slopes.unsqueeze(-2)
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """Depth beneath the full surface, (B, K, 1), m."""
+        depth = (-self.signed_distance(X[:, self.knots, self.position], self.times(X))).clamp(min=0.0)
+        return self.counted(depth, 0.0, X.shape[1])
+
+    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
+        distance = lengths(squares(self.lattice, p, self.cores), self.cores.unsqueeze(-1))
+        return torch.where(self.absent, torch.inf, distance - self.limits.unsqueeze(-1)).unsqueeze(-1)
+
+    def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
+        at_ends = [self.signed_distance(p, p.new_zeros(p.shape[1]))[..., 0] for p in (a, b)]
+        along = (b - a).square().sum(-1).sqrt()
+        gap = torch.minimum(*at_ends)
+        # The distance changes no faster than the point moves: of most segments this shows that others are nearer.
+        bound = 0.5 * (at_ends[0] + at_ends[1] - along)
+        near = ~self.absent & (bound < gap.amin(-1, keepdim=True) + self.field.spacing) if gap.numel() > 0 else gap > 0
+        steps = (along / (STEPS * self.field.spacing)).ceil()
+        i, e = (near & (steps > 1)).nonzero(as_tuple=True)
+        most = max(1, AT_ONCE // (int(steps[i, e].amax()) + 1)) if len(i) > 0 else 1
+        for first in range(0, len(i), most):
+            rows, segments = i[first : first + most], e[first : first + most]
+            ends = a[rows, segments], b[rows, segments]
+            gap[rows, segments] = self._between(rows, *ends, steps[rows, segments])
+        return torch.where(near | self.absent, gap, bound).unsqueeze(-1)
+
+    def _between(self, rows: Tensor, a: Tensor, b: Tensor, steps: Tensor) -> Tensor:
+        """Smallest distances (E,) at points in equal steps along segments from a to b (E, d) of problems `rows`."""
+        count = torch.arange(int(steps.amax()) + 1, dtype=a.dtype, device=a.device)
+        share = (count / steps.unsqueeze(-1)).clamp(max=1.0).unsqueeze(-1)
+        p = a.unsqueeze(1) + share * (b - a).unsqueeze(1)
+        return self.take(rows).signed_distance(p, count)[..., 0].amin(-1)
+
+    def grown(self, by: Tensor) -> Self:
+        return replace(self, vehicle_radius=self.vehicle_radius + by)
+
+    def stopping_at(self, knots: Tensor) -> Self:
+        return replace(self, stops=knots.to(self.origins.dtype))
+
+    def _rows(self, p: Tensor) -> Tensor:
+        """c (B, K, 1) at points (B, K, d); an empty map is c = -1 everywhere."""
+        c = self.factors.unsqueeze(-1) * (
+            self.vehicle_radius.square().unsqueeze(-1) - squares(self.lattice, p, self.cores)
+        )
+        return torch.where(self.absent, ABSENT, c).unsqueeze(-1)

@@ -1,0 +1,161 @@
+"""Occupancy grids: which cells of the plane or of space are occupied, free or unknown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from torchgco.base.errors import InputError, shown
+
+OCCUPIED_FROM = 0.5  # the probability from which a cell counts as occupied
+CELLS = 2**30  # of one grid: more is a mistake in the resolution
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyGrid:
+    """Cells of equal size along the axes, each of them occupied, free or unknown.
+
+    Cell (i, j[, k]) fills the box from `origin + resolution (i, j[, k])` to `origin + resolution (i + 1, ...)`: the
+    origin is the lowest corner of the first cell, not its centre. The first axis of `occupied` is x, the second y, the
+    third z. An image has its rows along -y and comes transposed and flipped.
+
+    Args:
+        occupied: (X, Y[, Z]), or (B, X, Y[, Z]) one grid per problem. Bool: occupied or free. Numbers in [0, 1]: the
+            probability that the cell is occupied, which it counts as from 0.5; NaN where unknown. Whole numbers: 0
+            free, 1 occupied, -1 unknown. The array isn't copied: don't change it.
+        origin: (d,), or (B, d) one per problem, m.
+        resolution: side of a cell, m.
+
+    Attributes:
+        occupied: an array of bool, or of floating numbers in [0, 1] and NaN.
+        origin: an array (d,) or (B, d) of float64.
+
+    Raises:
+        InputError: another number of axes than the origin says, none or too many cells, values outside of the range,
+            origin or resolution that aren't finite, a resolution that isn't above 0.
+    """
+
+    occupied: Any
+    origin: Any
+    resolution: Any
+
+    def __post_init__(self) -> None:
+        resolution = number(self.resolution, "grid.resolution")
+        if not 0.0 < resolution < np.inf:
+            raise InputError("grid.resolution", "a finite length above 0 m", resolution)
+        origin = coordinates(self.origin, "grid.origin")
+        if origin.ndim not in (1, 2) or origin.shape[-1] not in (2, 3) or not np.isfinite(origin).all():
+            raise InputError("grid.origin", "2 or 3 finite coordinates, m", shown(self.origin))
+        cells = _cells(self.occupied)
+        d = origin.shape[-1]
+        axes = "(X, Y)" if d == 2 else "(X, Y, Z)"
+        if cells.ndim not in (d, d + 1):
+            raise InputError("grid.occupied", f"shape {axes}, or (B, ...), as the origin is {d}-D", cells.shape)
+        if min(cells.shape[-d:]) < 1 or np.prod(cells.shape[-d:], dtype=float) > CELLS:
+            raise InputError("grid.occupied", f"1 to {CELLS:,} cells", cells.shape)
+        if origin.ndim == 2 and (cells.ndim == d or len(origin) != len(cells)):
+            expected = "(d,), or (B, d) where there is one grid per problem"
+            raise InputError("grid.origin", expected, f"shape {origin.shape} for cells {cells.shape}")
+        for name, value in (("occupied", cells), ("origin", origin), ("resolution", resolution)):
+            object.__setattr__(self, name, value)
+
+    @property
+    def d(self) -> int:
+        """Dimension of space, 2 or 3."""
+        return self.origin.shape[-1]
+
+    @property
+    def batch(self) -> int | None:
+        """How many problems have a grid of their own; None for one grid that all share."""
+        return None if self.occupied.ndim == self.d else len(self.occupied)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Cells along each axis, (X, Y[, Z])."""
+        return self.occupied.shape[-self.d :]
+
+    @property
+    def upper(self) -> np.ndarray:
+        """The highest corner of the last cell, (d,) or (B, d), m."""
+        return self.origin + self.resolution * np.array(self.shape)
+
+    @cached_property
+    def is_occupied(self) -> np.ndarray:
+        """Whether cells are occupied, of the shape of `occupied`; unknown ones aren't."""
+        if self.occupied.dtype == np.bool_:
+            return self.occupied
+        with np.errstate(invalid="ignore"):
+            return self.occupied >= OCCUPIED_FROM
+
+    @cached_property
+    def is_unknown(self) -> np.ndarray:
+        """Whether cells are unknown, of the shape of `occupied`."""
+        return np.zeros(1, bool) & self.occupied if self.occupied.dtype == np.bool_ else np.isnan(self.occupied)
+
+    def cell(self, points: Any) -> np.ndarray:
+        """Indices (..., d) of the cells that hold points (..., d), m; outside of the grid they aren't in its shape.
+
+        For one grid that all problems share, or points (B, ..., d) of grids with an origin each.
+        """
+        points = np.asarray(points, float)
+        origin = self.origin
+        if origin.ndim == 2:
+            origin = origin.reshape(len(origin), *([1] * (points.ndim - 2)), self.d)
+        return np.floor((points - origin) / self.resolution).astype(np.int64)
+
+    def __repr__(self) -> str:
+        batch = "" if self.batch is None else f"{self.batch} of "
+        cells = " x ".join(map(str, self.shape))
+        return f"OccupancyGrid({batch}{cells} cells of {self.resolution:g} m)"
+
+
+def number(value: Any, field: str) -> float:
+    """A number, also as an array or tensor of one; InputError for all else."""
+    held = coordinates(value, field)
+    if held.size != 1:
+        raise InputError(field, "a number", shown(value))
+    return float(held.reshape(()))
+
+
+def coordinates(value: Any, field: str) -> np.ndarray:
+    """Numbers as a new array of float64; InputError for all else."""
+    if isinstance(value, Tensor):
+        value = value.detach().cpu().numpy()
+    try:
+        held = np.asarray(value)
+    except (TypeError, ValueError):  # lists of different length
+        raise InputError(field, "numbers", shown(value)) from None
+    if held.dtype.kind not in "iuf":
+        raise InputError(field, "numbers", shown(value))
+    return np.array(held, float)
+
+
+def _cells(value: Any) -> np.ndarray:
+    """The cells as bool, or as probabilities with NaN where unknown.
+
+    Raises:
+        InputError: neither bools nor numbers, or numbers out of range.
+    """
+    if isinstance(value, Tensor):
+        value = value.detach().cpu().numpy()
+    try:
+        cells = np.asarray(value)
+    except (TypeError, ValueError):
+        raise InputError("grid.occupied", "an array of bools or numbers", shown(value)) from None
+    if cells.dtype == np.bool_:
+        return cells
+    if cells.dtype.kind not in "iuf":
+        raise InputError("grid.occupied", "an array of bools or numbers", f"an array of {cells.dtype}")
+    whole = cells.dtype.kind in "iu"
+    with np.errstate(invalid="ignore"):
+        wrong = (cells < -1) | (cells > 1) if whole else (cells < 0) | (cells > 1)
+    if wrong.any():
+        expected = "0 free, 1 occupied, -1 unknown" if whole else "probabilities in [0, 1], NaN where unknown"
+        raise InputError("grid.occupied", expected, cells[wrong][0])
+    if not whole:
+        return cells
+    return np.where(cells < 0, np.float32("nan"), cells.astype(np.float32))

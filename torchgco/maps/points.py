@@ -1,0 +1,66 @@
+"""Clouds of points, such as a lidar measures: each is a ball of one radius."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from torchgco.base.errors import InputError, shown
+from torchgco.maps.grid import coordinates, number
+
+POINTS = 2**28  # of one cloud
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points in the plane or in space, each of them a ball.
+
+    Args:
+        points: (P, d), or (B, P, d) one cloud per problem, m. Rows with NaN or infinity are no points: sensors mark
+            missing returns so.
+        radius: of the ball around each, m, at least 0. About half the distance between neighbours closes the
+            surfaces that were measured.
+
+    Attributes:
+        points: an array of float64; rows that are no points are NaN throughout.
+
+    Raises:
+        InputError: points of another shape, a radius that isn't finite or is negative.
+    """
+
+    points: Any
+    radius: Any
+
+    def __post_init__(self) -> None:
+        points = coordinates(self.points, "cloud.points")
+        if points.ndim not in (2, 3) or points.shape[-1] not in (2, 3):
+            got = points.shape if points.size else shown(self.points)
+            raise InputError("cloud.points", "shape (P, 2), (P, 3) or (B, P, d)", got)
+        if points.shape[-2] > POINTS:
+            raise InputError("cloud.points", f"at most {POINTS:,} points", points.shape)
+        radius = number(self.radius, "cloud.radius")
+        if not 0.0 <= radius < np.inf:
+            raise InputError("cloud.radius", "a finite length of at least 0 m", radius)
+        points[~np.isfinite(points).all(-1)] = np.nan
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "radius", radius)
+
+    @property
+    def d(self) -> int:
+        """Dimension of space, 2 or 3."""
+        return self.points.shape[-1]
+
+    @property
+    def batch(self) -> int | None:
+        """How many problems have a cloud of their own; None for one cloud that all share."""
+        return None if self.points.ndim == 2 else len(self.points)
+
+    def clouds(self) -> list[np.ndarray]:
+        """The points (P', d) of each problem's cloud, or of the one that all share, without rows of NaN."""
+        return [cloud[np.isfinite(cloud[:, 0])] for cloud in self.points.reshape(-1, *self.points.shape[-2:])]
+
+    def __repr__(self) -> str:
+        batch = "" if self.batch is None else f"{self.batch} of "
+        return f"PointCloud({batch}{self.points.shape[-2]} points in {self.d}-D, radius {self.radius:g} m)"
