@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,10 +46,8 @@ class MissionLog:
         def empty(*shape: int) -> Tensor:
             return x.new_full((B, steps, *shape), torch.nan)
 
-        log = cls(
-            period, empty(substeps + 1, 17), empty(substeps, 4), empty(), empty(knots, 3),
-            *(empty() for _ in range(10)),
-        )  # fmt: skip
+        one: list[Any] = [empty() for _ in range(10)]
+        log = cls(period, empty(substeps + 1, 17), empty(substeps, 4), empty(), empty(knots, 3), *one)
         log.x[:, 0, 0] = x  # of missions, too, that end at their start
         return log
 

@@ -11,6 +11,7 @@ from tests.reference.sensing import in_cells, inside, march
 from torchgco import Boxes, Capsules, ControlBounds, Problem, QuadraticCost, QuadrotorPlanning, Spheres
 from torchgco.base.errors import InputError
 from torchgco.constraints import FunctionConstraint
+from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
 from torchgco.missions.sensing import World
 from torchgco.obstacles.base import Obstacles
 
@@ -116,6 +117,32 @@ def test_obstacles_without_rays_are_refused() -> None:
     foggy: Any = SimpleNamespace(constraints=[Fog()], take=lambda rows: foggy)
     with pytest.raises(InputError, match="spheres, boxes, capsules or a map"):
         World.of(foggy, 0)
+
+
+def test_occupied_cells_of_a_map_are_seen() -> None:
+    occupied = np.zeros((10, 8, 6), bool)
+    occupied[7, 4, 3] = True
+    world = World.of(problem([Field(OccupancyGrid(occupied, [-1.0, -1.0, -1.0], 0.25), 0.2)]), 1)
+    ray = np.array([[1.0, 0, 0]])
+    assert np.allclose(world.cast([-3.0, 0.1, -0.1], ray, 9.0), [3.75])  # the cell begins at 0.75
+    assert np.isinf(world.cast([-3.0, -0.1, -0.1], ray, 9.0)).all()
+
+
+def test_unknown_cells_of_a_map_are_what_the_field_says() -> None:
+    cells = np.zeros((4, 4, 4))
+    cells[2] = np.nan
+    cases: list[tuple[Any, float]] = [("occupied", 0.5), ("free", np.inf)]
+    for unknown, seen in cases:
+        field = DistanceField.of(OccupancyGrid(cells, [0.0, 0.0, 0.0], 0.25), unknown=unknown)
+        world = World.of(problem([Field(field, 0.0)]), 0)
+        assert np.allclose(world.cast([0.0, 0.4, 0.4], np.array([[1.0, 0, 0]]), 9.0), [seen])
+
+
+def test_a_cloud_or_a_second_map_is_refused() -> None:
+    cloud, grid = PointCloud([[3.0, 0, 0]], 0.2), OccupancyGrid(np.ones((1, 1, 1), bool), [5.0, 5.0, 5.0], 0.5)
+    for maps, expected in (([Field(cloud, 0.1)], "an occupancy grid"), ([Field(grid, 0.1)] * 2, "one map at most")):
+        with pytest.raises(InputError, match=expected):
+            World.of(problem(maps), 0)
 
 
 def test_constraints_that_are_no_obstacles_are_not_seen() -> None:

@@ -1,5 +1,7 @@
 """Half-spaces at each knot: rows and derivatives against autodiff, and native kernels."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -31,7 +33,7 @@ def drawn() -> tuple[Problem, torch.Tensor, torch.Tensor]:
 
 def test_rows_are_depths_beneath_the_planes() -> None:
     problem, X, U = drawn()
-    spaces = problem.constraints[0]
+    spaces: Any = problem.constraints[0]
     for b in range(B):
         for k in range(N):
             for r in range(R):
@@ -41,7 +43,7 @@ def test_rows_are_depths_beneath_the_planes() -> None:
 
 def test_derivatives_are_those_of_autodiff() -> None:
     problem, X, U = drawn()
-    spaces = problem.constraints[0]
+    spaces: Any = problem.constraints[0]
     c = spaces.value(X, U)
     g, h = torch.randn_like(c), torch.rand_like(c)
     H = torch.zeros(B, N + 1, 19, 19, dtype=torch.float64)
@@ -95,6 +97,6 @@ def test_stacked_planes_are_moved_into_the_free_side() -> None:
 
 def test_wrong_shapes_are_named() -> None:
     problem, _, _ = drawn()
-    spaces = problem.constraints[0]
+    spaces: Any = problem.constraints[0]
     with pytest.raises(InputError, match=r"half_spaces\.offsets"):
         Problem(problem.dynamics, problem.cost, [HalfSpaces(spaces.normals, spaces.offsets[:, :-1])], problem.x0, N)

@@ -1,5 +1,7 @@
 """Motions along paths: their ends, their limits, and shortcuts between corners."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,6 @@ def test_shortcuts_avoid_what_is_not_free() -> None:
 
     corners = taut(path, is_free)
     assert np.array_equal(corners[[0, -1]], path[[0, -1]]) and len(corners) < len(path)
-    assert all(is_free(between(a, b)) for a, b in zip(corners[:-1], corners[1:], strict=True))
+    assert all(is_free(between(a, b)) for a, b in pairwise(corners))
     assert np.array_equal(taut(path, lambda p: True), path[[0, -1]])
     assert np.array_equal(taut(path[:1], is_free), path[:1])

@@ -12,6 +12,8 @@ from typing import Self
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.maps.field import BoundField
+from torchgco.maps.grid import OccupancyGrid
 from torchgco.missions.sensing.library import call
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
@@ -50,9 +52,16 @@ class World:
             InputError: obstacles of a kind that has no rays.
         """
         one = problem.take(slice(b, b + 1))
-        parts = [_bodies(part) for part in one.constraints if isinstance(part, Obstacles)]
+        maps = [part for part in one.constraints if isinstance(part, BoundField)]
+        if len(maps) > 1:
+            raise InputError("constraints", "one map at most, for a sensor", len(maps))
+        parts = [_bodies(part) for part in one.constraints if isinstance(part, Obstacles) and part not in maps]
         boxes, velocities = zip(*parts, strict=True) if parts else ((np.zeros((0, 16)),), (np.zeros((0, 3)),))
-        return cls(np.concatenate(boxes), np.concatenate(velocities))
+        world = cls(np.concatenate(boxes), np.concatenate(velocities))
+        if not maps:
+            return world
+        occupied, corner, resolution = _cells(maps[0])
+        return replace(world, occupied=occupied, corner=corner, resolution=resolution)
 
     @property
     def moving(self) -> bool:
@@ -80,6 +89,22 @@ class World:
             np.ascontiguousarray(self.occupied), np.array(self.corner, np.float64), float(self.resolution), distance,
         )  # fmt: skip
         return distance
+
+
+def _cells(part: BoundField) -> tuple[np.ndarray, tuple[float, float, float], float]:
+    """The occupied cells of one problem's map, where they begin, m, and their side, m.
+
+    Raises:
+        InputError: a cloud of points, which has no cells, or a map of the plane.
+    """
+    source, which = part.field.source, int(part.which[0])
+    if not isinstance(source, OccupancyGrid) or source.d != 3:
+        kind = f"{type(source).__name__} in {source.d}-D"
+        raise InputError("scenario", "an occupancy grid in space, for a sensor", kind)
+    held = source.is_occupied | (source.is_unknown & (part.field.unknown == "occupied"))
+    occupied, origin = (held, source.origin) if source.batch is None else (held[which], source.origin)
+    x, y, z = (origin if origin.ndim == 1 else origin[which]).tolist()
+    return np.ascontiguousarray(occupied, np.uint8), (x, y, z), source.resolution
 
 
 def _bodies(part: Obstacles) -> tuple[np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
 from torchgco.missions.log import PARTS
 from torchgco.missions.planner import Plan, Planner
@@ -29,6 +30,7 @@ from torchgco.missions.unknown.safety import AT_REST, SeenLog
 from torchgco.native.dispatch import followed
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.ending import optimality
 
 OUTER = 12  # outer iterations of a plan at most
@@ -79,7 +81,10 @@ class Exploration:
         self.dt = float(problem.dynamics.dt)
         self.every = max(1, round(1.0 / (sensor.rate * self.dt)))  # control periods between two scans
         self.ids = ids.tolist()
-        self.local = replace(planner.solver.in_closed_loop(OUTER)[1], **LOCAL)
+        local = planner.solver.in_closed_loop(OUTER)[1]
+        if not isinstance(local, AugmentedLagrangian):
+            raise InputError("solver", "gco, al_ilqr or another around AL-iLQR, for a sensor", type(local).__name__)
+        self.local = replace(local, guidance=None, max_outer_iterations=OUTER, **LOCAL)
         assert problem.goal is not None
         radius = torch.stack([part.vehicle_radius for part in problem.obstacles]).amax(0) if problem.obstacles else None
         self.radius = torch.full_like(problem.x0[:, 0], 0.3) if radius is None else radius
@@ -205,7 +210,8 @@ class Exploration:
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
                 near = np.full(N, keep)
                 near[:EARLY] = min(keep, max(gap - 0.01, CONTACT_FACTOR * scout.radius))
-                planes.append(own), room.append(far), allowed.append(near)
+                for parts, part in ((planes, own), (room, far), (allowed, near)):
+                    parts.append(part)
                 scout.seconds["field_seconds"] += time.perf_counter() - began
         form = PlanningForm(self.explorer, self.planner, _repeated(self.whole, C))
         stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, allowed)]
@@ -244,7 +250,7 @@ class Exploration:
         # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
         K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
         best = [self._best(found.X[b::B], found.cost[b::B], kept.X[b], b) for b in range(B)]
-        rows = torch.tensor([b if best[b] is None else best[b] * B + b for b in range(B)])
+        rows = torch.tensor([b + B * (choice or 0) for b, choice in enumerate(best)])
         new = torch.tensor([choice is not None for choice in best])
         wide = new.view(-1, 1, 1)
         one = problem.take(rows)

@@ -55,8 +55,8 @@ class HalfSpaces(Constraint):
         H[:, self.knots, at, at] += (h.unsqueeze(-1) * n).mT @ n
 
 
-def stacked(planes: Tensor, radius: float, keep: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Normals and offsets of planes (B, N, R, 4), moved by `radius` into the free side, for `HalfSpaces`."""
+def stacked(planes: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """Normals and offsets of planes (B, N, R, 4), moved by `radius` (B, N, 1), m, into the free side."""
     normals, offsets = planes[..., :3].contiguous(), planes[..., 3]
     there = (normals != 0).any(-1)
-    return normals, torch.where(there, offsets + radius - keep, -1.0)
+    return normals, torch.where(there, offsets + radius, -1.0)
