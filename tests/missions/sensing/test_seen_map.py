@@ -38,24 +38,35 @@ def test_cells_along_rays_are_those_of_a_slow_version() -> None:
     seen, centers, odds = empty(), cubes(SHAPE, CORNER, SIZE), np.zeros(np.prod(SHAPE))
     for _ in range(3):
         scan = scan_of(rng, 80)
-        hit, doubtful, passed = np.zeros(len(odds), bool), np.zeros(len(odds), bool), np.zeros(len(odds), int)
+        ended, doubtful, passed = np.zeros(len(odds), int), np.zeros(len(odds), bool), np.zeros(len(odds), int)
         for d, distance in zip(scan.directions, scan.distances, strict=True):
             length = distance if np.isfinite(distance) else 2.0
             chord = chords(scan.origin, d, length, centers, SIZE)
-            passed += chord >= CHORD * SIZE
+            within = np.isfinite(distance) & (np.abs(scan.origin + distance * d - centers) < 0.5 * SIZE).all(axis=1)
+            passed += (chord >= CHORD * SIZE) & ~within
+            ended += within
             doubtful |= np.abs(chord - CHORD * SIZE) < 1e-9
-            if np.isfinite(distance):
-                hit |= (np.abs(scan.origin + distance * d - centers) < 0.5 * SIZE).all(axis=1)
+        hit = (ended > 0) & (passed <= 8 * ended)
         odds += np.where(hit, HIT, MISS * np.minimum(passed, 7))
         changed = seen.add(scan, 2.0)
         assert not doubtful.any()
         assert np.allclose(seen.odds.ravel(), np.clip(odds, -2.0, 3.5), atol=1e-6)
-        assert set(changed) <= set(np.flatnonzero(hit | (passed > 0)))
+        assert set(changed) <= set(np.flatnonzero(ended + passed > 0))
     state = seen.state.ravel()
     clear = np.abs(odds - FREE_AT) > 1e-6  # of rounding
     assert np.array_equal(state == FREE, odds < FREE_AT) or not clear.all()
     assert np.array_equal((state == FREE)[clear], (odds < FREE_AT)[clear]) and (state == FREE).sum() > 10
     assert (state[odds == HIT] == OCCUPIED).all() and (state == OCCUPIED).sum() > 10
+
+
+def test_a_few_returns_among_many_passes_are_noise() -> None:
+    at = CORNER + SIZE * np.array([8.5, 6.5, 4.5])
+    origin, ray = at - np.array([1.0, 0, 0]), np.array([1.0, 0, 0])
+    for passes, state in ((8, OCCUPIED), (9, FREE)):
+        seen = empty()
+        distances = np.array([1.0] + [np.inf] * passes)
+        seen.add(Scan(origin, np.tile(ray, (passes + 1, 1)), distances), 2.0)
+        assert seen.state[8, 6, 4] == state
 
 
 def test_changes_are_those_of_the_state() -> None:

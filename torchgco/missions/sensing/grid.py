@@ -12,8 +12,8 @@ from torchgco.missions.sensing.sensors import Scan
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 SEEN_OCCUPIED, NOT_FREE = 1 << OCCUPIED, (1 << OCCUPIED) | (1 << UNKNOWN)  # kinds of cells
-# Log-odds. A return makes an unknown cell occupied, and outweighs many rays that pass: these may pass through the free
-# part of a cell that an obstacle fills in part. For the same reason it takes several of them to make a cell free.
+# Log-odds. Returns make an unknown cell occupied, and outweigh many rays that pass: they may pass through the free part
+# of a cell that an obstacle fills in part. For the same reason it takes several of them to make a cell free.
 HIT, MISS, LEAST, MOST, FREE_AT, OCCUPIED_AT = 2.0, -0.1, -2.0, 3.5, -0.55, 0.5
 REACH = 4  # as C has it
 CHORD = 0.5  # of a cell's side: what a ray passes for less, it doesn't show
@@ -46,7 +46,7 @@ class SeenMap:
         self.state = np.zeros(self.shape, np.uint8)
         self.from_occupied = np.empty(self.shape, np.float32)
         self.from_blocked = np.empty(self.shape, np.float32)
-        self._stamp = np.full(self.shape, -1, np.int32)
+        self._stamp = np.full(self.shape, -1, np.int64)
         self._touched, self._changed = (np.empty(self.state.size, np.int32) for _ in range(2))
         self._size = np.array(self.shape, np.int64)
         self._work, self._scratch = np.empty(0, np.uint8), np.empty(0)

@@ -23,14 +23,20 @@ static int cell_of(const Grid *g, const double *p, int64_t *c) {
     return 1;
 }
 
-/* What a cell's stamp holds: the number of the scan that touched it last, whether a ray ended in it, and how many passed,
- * at most PASSES. */
-enum { PASSES = 7, RETURN = 8, SCAN = 16 };
+/* What a cell's stamp holds: the number of the scan that touched it last, how many rays ended in it, and how many passed,
+ * at most MOST_RAYS each. */
+enum { MOST_RAYS = 4095, PASS = 1, RETURN = 4096, SCAN = 4096 * 4096 };
+/* Passes of a scan that count; and passes per return up to which the cell is occupied. Fewer returns are noise of a
+ * surface beside it. */
+enum { PASSES = 7, PER_RETURN = 8 };
+
+static inline int64_t returns(int64_t stamp) { return stamp / RETURN % RETURN; }
+static inline int64_t passes(int64_t stamp) { return stamp % RETURN; }
 
 /* Counts the rays that pass cells: here one, from its origin inside the grid over a length. Of a cell that it only cuts
- * the corner of, for less than `chord`, it shows nothing. */
+ * the corner of, for less than `chord`, it shows nothing; nor of the cell `last`, in which it ends. */
 static int64_t pass(
-    const Grid *g, const double *o, const double *d, double length, double chord, int32_t *stamp, int32_t now,
+    const Grid *g, const double *o, const double *d, double length, double chord, int64_t last, int64_t *stamp, int64_t now,
     int32_t *touched, int64_t count) {
     int64_t c[3], stride[3] = {g->shape[1] * g->shape[2], g->shape[2], 1}, left[3];
     double wait[3], per[3], t = 0.0;
@@ -45,9 +51,9 @@ static int64_t pass(
     while (t < length) {
         int i = wait[0] < wait[1] ? (wait[0] < wait[2] ? 0 : 2) : (wait[1] < wait[2] ? 1 : 2);
         double next = wait[i], end = next < length ? next : length;
-        if (end - t >= chord) {
+        if (end - t >= chord && at != last) {
             if (stamp[at] < now) stamp[at] = now, touched[count++] = (int32_t)at;
-            stamp[at] += (stamp[at] & PASSES) < PASSES;
+            if (passes(stamp[at]) < MOST_RAYS) stamp[at] += PASS;
         }
         if (left[i]-- == 0) break;
         t = next, wait[i] += per[i], at += stride[i];
@@ -55,18 +61,18 @@ static int64_t pass(
     return count;
 }
 
-/* Adds a scan to the map. Cells with a return get `hit`, others `miss` for each ray that passed, up to PASSES of them.
+/* Adds a scan to the map. Cells with returns get `hit`, others `miss` for each ray that passed, up to PASSES of them.
  *
  * odds (cells), state (cells), stamp (cells): see SCAN.
  * touched (cells) is scratch; changed (cells) gets the cells whose state changed. Returns how many. */
 int64_t tgco_add_scan(
-    const int64_t *shape, const double *corner, double size, float *odds, uint8_t *state, int32_t *stamp, int64_t scan,
+    const int64_t *shape, const double *corner, double size, float *odds, uint8_t *state, int64_t *stamp, int64_t scan,
     int64_t rays, const double *origin, const double *directions, const double *distances, double range, double before,
     double chord, double hit, double miss, double least, double most, double free, double occupied, int32_t *touched,
     int32_t *changed) {
     Grid g = {shape, corner, size};
     int64_t count = 0, found = 0;
-    int32_t now = (int32_t)(SCAN * scan);
+    int64_t now = SCAN * scan;
     for (int64_t k = 0; k < rays; k++) {
         if (!isfinite(distances[k])) continue;
         double p[3];
@@ -74,15 +80,24 @@ int64_t tgco_add_scan(
         for (int i = 0; i < 3; i++) p[i] = origin[i] + distances[k] * directions[3 * k + i];
         if (!cell_of(&g, p, c)) continue;
         int64_t at = place(&g, c);
-        if (stamp[at] < now) stamp[at] = now + RETURN, touched[count++] = (int32_t)at;
+        if (stamp[at] < now) stamp[at] = now, touched[count++] = (int32_t)at;
+        if (returns(stamp[at]) < MOST_RAYS) stamp[at] += RETURN;
     }
     for (int64_t k = 0; k < rays; k++) {
-        double length = isfinite(distances[k]) ? distances[k] - before : range;
-        count = pass(&g, origin, directions + 3 * k, length, chord, stamp, now, touched, count);
+        double length = range, p[3];
+        int64_t last = -1, c[3];
+        if (isfinite(distances[k])) {
+            length = distances[k] - before;
+            for (int i = 0; i < 3; i++) p[i] = origin[i] + distances[k] * directions[3 * k + i];
+            if (cell_of(&g, p, c)) last = place(&g, c);
+        }
+        count = pass(&g, origin, directions + 3 * k, length, chord, last, stamp, now, touched, count);
     }
     for (int64_t n = 0; n < count; n++) {
         int32_t at = touched[n];
-        float sum = odds[at] + (float)((stamp[at] & RETURN) ? hit : (stamp[at] & PASSES) * miss);
+        int64_t ended = returns(stamp[at]), passed = passes(stamp[at]);
+        int is_hit = ended > 0 && passed <= PER_RETURN * ended;
+        float sum = odds[at] + (float)(is_hit ? hit : (passed < PASSES ? passed : PASSES) * miss);
         odds[at] = sum < least ? (float)least : sum > most ? (float)most : sum;
         uint8_t is = odds[at] >= occupied ? OCCUPIED : odds[at] <= free ? FREE : UNKNOWN;
         if (is != state[at]) state[at] = is, changed[found++] = at;
