@@ -14,7 +14,8 @@ UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 SEEN_OCCUPIED, NOT_FREE = 1 << OCCUPIED, (1 << OCCUPIED) | (1 << UNKNOWN)  # kinds of cells
 # Log-odds. Returns make an unknown cell occupied, and outweigh many rays that pass: they may pass through the free part
 # of a cell that an obstacle fills in part. For the same reason it takes several of them to make a cell free.
-HIT, MISS, LEAST, MOST, FREE_AT, OCCUPIED_AT = 2.0, -0.1, -2.0, 3.5, -0.55, 0.5
+# Beside an occupied cell it takes more, as the surface may go on into this one.
+HIT, MISS, LEAST, MOST, FREE_AT, FREE_BESIDE, OCCUPIED_AT = 2.0, -0.1, -2.0, 3.5, -0.55, -1.45, 0.5
 REACH = 4  # as C has it
 CHORD = 0.5  # of a cell's side: what a ray passes for less, it doesn't show
 
@@ -65,7 +66,7 @@ class SeenMap:
             len(scan.distances), np.ascontiguousarray(scan.origin, np.float64),
             np.ascontiguousarray(scan.directions, np.float64), np.ascontiguousarray(scan.distances, np.float64),
             float(reach), float(before), CHORD * self.resolution,
-            HIT, MISS, LEAST, MOST, FREE_AT, OCCUPIED_AT, self._touched, self._changed,
+            HIT, MISS, LEAST, MOST, FREE_AT, FREE_BESIDE, OCCUPIED_AT, self._touched, self._changed,
         )  # fmt: skip
         return self._changed[:found].copy()
 
@@ -77,7 +78,7 @@ class SeenMap:
         ]
         near = sum(np.meshgrid(*(part**2 for part in away), indexing="ij")) <= radius**2
         new = near & (self.state == UNKNOWN)
-        self.odds[new], self.state[new] = FREE_AT, FREE
+        self.odds[new], self.state[new] = FREE_BESIDE, FREE
         return np.flatnonzero(new).astype(np.int32)
 
     def remeasure(self, changed: np.ndarray) -> None:

@@ -1,6 +1,7 @@
 /* The vehicle's map: log-odds of cells updated along rays, and distances from cells to the nearest of a kind. */
 
 #include <math.h>
+#include <stddef.h>
 #include <stdint.h>
 
 enum { UNKNOWN = 0, FREE = 1, OCCUPIED = 2 };
@@ -61,14 +62,33 @@ static int64_t pass(
     return count;
 }
 
+/* Whether one of the 26 cells around a cell is occupied. With a list: adds those to it that the scan `now` hasn't touched,
+ * and returns its length. */
+static int64_t beside(
+    const Grid *g, const float *odds, double occupied, int64_t at, int64_t *stamp, int64_t now, int32_t *touched,
+    int64_t count) {
+    int64_t Y = g->shape[1], Z = g->shape[2], c[3] = {at / (Y * Z), at / Z % Y, at % Z};
+    for (int64_t x = c[0] - 1; x <= c[0] + 1; x++)
+        for (int64_t y = c[1] - 1; y <= c[1] + 1; y++)
+            for (int64_t z = c[2] - 1; z <= c[2] + 1; z++) {
+                if (x < 0 || y < 0 || z < 0 || x >= g->shape[0] || y >= Y || z >= Z) continue;
+                int64_t other = (x * Y + y) * Z + z;
+                if (touched == NULL && other != at && odds[other] >= occupied) return 1;
+                if (touched != NULL && stamp[other] < now) stamp[other] = now, touched[count++] = (int32_t)other;
+            }
+    return count;
+}
+
 /* Adds a scan to the map. Cells with returns get `hit`, others `miss` for each ray that passed, up to PASSES of them.
+ * A cell is occupied from the odds `occupied` on, free up to `free`, beside an occupied one up to `free_beside`.
  *
  * odds (cells), state (cells), stamp (cells): see SCAN.
  * touched (cells) is scratch; changed (cells) gets the cells whose state changed. Returns how many. */
 int64_t tgco_add_scan(
     const int64_t *shape, const double *corner, double size, float *odds, uint8_t *state, int64_t *stamp, int64_t scan,
     int64_t rays, const double *origin, const double *directions, const double *distances, double range, double before,
-    double chord, double hit, double miss, double least, double most, double free, double occupied, int32_t *touched,
+    double chord, double hit, double miss, double least, double most, double free, double free_beside, double occupied,
+    int32_t *touched,
     int32_t *changed) {
     Grid g = {shape, corner, size};
     int64_t count = 0, found = 0;
@@ -99,8 +119,17 @@ int64_t tgco_add_scan(
         int is_hit = ended > 0 && passed <= PER_RETURN * ended;
         float sum = odds[at] + (float)(is_hit ? hit : (passed < PASSES ? passed : PASSES) * miss);
         odds[at] = sum < least ? (float)least : sum > most ? (float)most : sum;
-        uint8_t is = odds[at] >= occupied ? OCCUPIED : odds[at] <= free ? FREE : UNKNOWN;
-        if (is != state[at]) state[at] = is, changed[found++] = at;
+    }
+    for (int64_t n = 0; n < count; n++) {
+        int32_t at = touched[n];
+        uint8_t is = UNKNOWN;
+        if (odds[at] >= occupied)
+            is = OCCUPIED;
+        else if (odds[at] <= free)
+            is = odds[at] <= free_beside || !beside(&g, odds, occupied, at, stamp, 0, NULL, 0) ? FREE : UNKNOWN;
+        if (is == state[at]) continue;
+        state[at] = is, changed[found++] = at;
+        if (is == OCCUPIED) count = beside(&g, odds, occupied, at, stamp, now, touched, count);
     }
     return found;
 }
