@@ -5,6 +5,7 @@
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
 # make general   48 families of constrained problems, compared with IPOPT and FATROP (ARGS="--solvers gco al_ilqr" for others)
 # make worlds   woods, mazes, crossing spheres and the outside benchmarks, with pages in benchmarks/results (half an hour)
+# make unknown   missions in worlds that a lidar sees on the way (an hour; ARGS="--count 32" for more)
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
@@ -38,7 +39,7 @@ FIND := import sys; from torchgco.native.compiler import find_compiler; sys.exit
 SPEED := $(BIN)/python -m benchmarks.speed
 
 .PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle general worlds benchmark benchmark-gpu ladder \
-    docs figures paper
+    docs figures paper unknown
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -78,6 +79,9 @@ worlds: $(PEERS)
 	$(BIN)/python -m benchmarks.outside.maze --write --fatrop 8
 	$(BIN)/python -m benchmarks.outside.navigation --write
 	$(BIN)/python -m benchmarks.outside.jaxipm --write
+
+unknown: $(RUNTIME)
+	$(BIN)/python -m benchmarks.families.unknown --write $(ARGS)
 
 benchmark: $(PEERS)
 	$(MAKE) $(ACADOS)/.ready || echo "acados can't be installed here: the tables will say so."

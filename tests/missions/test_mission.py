@@ -51,7 +51,7 @@ def ends(log: MissionLog, problem: Problem, radius: Tensor) -> list[Ending]:
 def assert_same_flights(part: MissionLog, whole: MissionLog, rows: Sequence[int]) -> None:
     """Assert that missions of `part` have the bits of missions `rows` of `whole`, all but the times they took."""
     for f in fields(MissionLog):
-        if f.name not in ("period", *TIMES):
+        if f.name not in ("period", "seen", *TIMES):
             mine, theirs = getattr(part, f.name), getattr(whole, f.name)[list(rows)]
             assert torch.equal(mine.isnan(), theirs.isnan()), f.name
             assert torch.equal(mine.nan_to_num(9e9), theirs.nan_to_num(9e9)), f.name

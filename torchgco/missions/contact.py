@@ -40,6 +40,11 @@ class Contact(PerElement):
             by_kind(CLEARANCES, part)
         return cls(found)
 
+    @property
+    def moving(self) -> bool:
+        """Whether any obstacle moves."""
+        return any(part.moving for part in self.obstacles)
+
     def distance(self, p: Tensor, t: float) -> Tensor:
         """Smallest distances (B,), m, of positions p (B, 3), m, at time t, s: negative in contact.
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +12,9 @@ from torch import Tensor
 
 from torchgco.missions.planner import Plan
 from torchgco.missions.tracker import Tracking
+from torchgco.missions.unknown.safety import SeenLog
+
+PARTS = ("map_seconds", "field_seconds", "search_seconds")
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,10 @@ class MissionLog:
     iterations: Tensor  # (B, K): of the planner's solve
     planner_seconds: Tensor  # (B, K): of the batch's solve, divided by its missions
     tracker_seconds: Tensor  # (B, K): of the J solves, divided likewise
+    map_seconds: Tensor  # (B, K): of missions with a sensor, parts of planner_seconds: cells of the map,
+    field_seconds: Tensor  # (B, K): distances on the map, and corridors,
+    search_seconds: Tensor  # (B, K): paths on it; NaN without a sensor
+    seen: list[SeenLog] = field(default_factory=list)  # of each mission with a sensor
 
     @classmethod
     def blank(cls, x: Tensor, steps: int, substeps: int, period: float, knots: int) -> MissionLog:
@@ -37,10 +46,8 @@ class MissionLog:
         def empty(*shape: int) -> Tensor:
             return x.new_full((B, steps, *shape), torch.nan)
 
-        log = cls(
-            period, empty(substeps + 1, 17), empty(substeps, 4), empty(), empty(knots, 3),
-            *(empty() for _ in range(7)),
-        )  # fmt: skip
+        one: list[Any] = [empty() for _ in range(10)]
+        log = cls(period, empty(substeps + 1, 17), empty(substeps, 4), empty(), empty(knots, 3), *one)
         log.x[:, 0, 0] = x  # of missions, too, that end at their start
         return log
 
@@ -53,6 +60,11 @@ class MissionLog:
         self.planner_seconds[rows, step] = seconds
         self.tracker_seconds[rows, step] = 0.0
         self.tracking_violation[rows, step] = 0.0
+
+    def add_parts(self, rows: Tensor, step: int, parts: Mapping[str, Tensor]) -> None:
+        """Seconds of a control period by part, (b,) each."""
+        for name, seconds in parts.items():
+            getattr(self, name)[rows, step] = seconds
 
     def add_sample(
         self, rows: Tensor, step: int, j: int, x: Tensor, tracking: Tracking, seconds: float, flew: Tensor
@@ -78,5 +90,6 @@ class MissionLog:
     def arrays(self, plans: bool = False) -> dict[str, np.ndarray]:
         """What a study keeps of every mission, by name (B, ...); with the planned positions where asked for."""
         names = ("x", "commands", "tracking_violation", "cost", "violation", "shifted", "guided", "iterations")
-        names = (*names, "planner_seconds", "tracker_seconds", *(["plan"] if plans else []))
+        names = (*names, "planner_seconds", "tracker_seconds", *(PARTS if self.seen else ()))
+        names = (*names, *(["plan"] if plans else []))
         return {name: getattr(self, name).numpy() for name in names}

@@ -26,7 +26,10 @@ from torchgco.missions.outcome import FARTHEST
 from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import check_model
 from torchgco.missions.plant import Plant, RotorPlant, hovering
+from torchgco.missions.sensing.sensors import Depth, Lidar
 from torchgco.missions.tracker import Reference, Tracker, Tracking
+from torchgco.missions.unknown.exploration import Exploration
+from torchgco.missions.unknown.explorer import Explorer, SensorName, Unknown
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solvers.contracts import check_ids
 
@@ -48,6 +51,11 @@ class Mission:
         goal_radius: m, within which the goal counts as reached; None: the problems' own.
         latency: control periods between a measurement and the first use of the plan made from it, 0 or 1. With 1, a
             plan starts where the former plan leads within the period, and without `first_step`.
+        sensor: what the vehicle knows of the obstacles: "full", all of them from the start, or what a "lidar" or a
+            "depth" camera sees on the way.
+        unknown: what plans make of space that hasn't been seen, with a lidar or a depth camera: "occupied" stay out of
+            it and so can always stop in time, "free" plan as if nothing were there.
+        lidar, depth, explorer: options of the sensors, and of flights with them.
 
     Raises:
         InputError: a field out of its range, or periods that don't fit each other.
@@ -60,9 +68,16 @@ class Mission:
     duration: Annotated[float, Above(0, "s"), AtMost(LONGEST, "s")] = 15.0
     goal_radius: Meters | None = 0.5
     latency: Annotated[int, Within(0, 1, "control periods")] = 0
+    sensor: SensorName = "full"
+    unknown: Unknown = "occupied"
+    lidar: Lidar = field(default_factory=Lidar)
+    depth: Depth = field(default_factory=Depth)
+    explorer: Explorer = field(default_factory=Explorer)
 
     def __post_init__(self) -> None:
         check_options(self, "mission")
+        if self.sensor != "full" and self.latency:
+            raise InputError("mission.latency", "0 with a sensor", self.latency)
         if self.plant.dt != self.tracker.dt:
             raise InputError("tracker.dt", f"the plant's {self.plant.dt} s", self.tracker.dt)
 
@@ -76,6 +91,13 @@ class Mission:
         """Time steps of the plant in a control period, s; None where they don't fit."""
         count = round(period / self.plant.dt)
         return count if count >= 1 and math.isclose(count * self.plant.dt, period, rel_tol=1e-9) else None
+
+    def exploration(self, problem: Problem, seed: int, ids: Tensor) -> Exploration | None:
+        """The planner of missions with a sensor; None where all obstacles are known."""
+        if self.sensor == "full":
+            return None
+        sensor = self.lidar if self.sensor == "lidar" else self.depth
+        return Exploration(self.explorer, self.planner, sensor, self.unknown, problem, seed, ids)
 
     def fly(
         self, problem: Problem, seed: int = 0, ids: Tensor | None = None, report: Report | None = None
@@ -117,6 +139,7 @@ class _Flight:
         self.substeps = mission.substeps(self.period) or 1
         self.steps = math.ceil(mission.duration / self.period - 1e-9)
         self.contact = Contact.among(problem)
+        self.measured_at, self.clearance = problem.x0[:, :3], torch.full_like(problem.x0[:, 0], -torch.inf)
         self.goal = problem.goal.position
         radius = mission.goal_radius
         self.radius = problem.goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
@@ -124,8 +147,12 @@ class _Flight:
         self.start = x[:, :3]
         self.problem, self.planned = problem, self.planner.problem(problem, x)
         self.force, self.noise = mission.disturbance.draw(seed, ids.tolist(), self.steps, self.period)
-        self.log = MissionLog.blank(x, self.steps, self.substeps, self.period, problem.N + 1)
         self.plant, self.x, self.rows, self.ids = mission.plant, x, torch.arange(problem.B), ids
+        self.exploration = mission.exploration(problem, seed, ids)
+        knots = (problem.N if self.exploration is None else mission.explorer.stages) + 1
+        self.log = MissionLog.blank(x, self.steps, self.substeps, self.period, knots)
+        if self.exploration is not None:
+            self.log.seen.extend(scout.log for scout in self.exploration.scouts)
 
     def run(self, report: Report) -> MissionLog:
         """Fly until all missions have ended."""
@@ -136,6 +163,8 @@ class _Flight:
             if self.rows.numel() == 0:
                 break
             seen, seconds = measured(self.x, self.noise[self.rows, step]), 0.0
+            if self.exploration is not None:
+                self.exploration.sense(step, self.x, seen)
             if plan is None or self.mission.latency == 0:
                 plan, seconds = self._planned(step, seen, seen, plan)
             flown = plan
@@ -143,6 +172,8 @@ class _Flight:
                 plan, more = self._planned(step + 1, self.planner.predicted(seen, flown), seen, flown)
                 seconds += more
             self.log.add_plan(self.rows, step, self.x, flown, seconds / self.rows.numel())
+            if self.exploration is not None:
+                self.log.add_parts(self.rows, step, self.exploration.parts())
             tracking, left = self._fly_period(step, flown, tracking)
             if bool(left.any()):
                 stay = (~left).nonzero().flatten()
@@ -153,6 +184,8 @@ class _Flight:
 
     def _planned(self, step: int, x: Tensor, seen: Tensor, before: Plan | None) -> tuple[Plan, float]:
         """Plans from states x (B, 17) at a control step, when `seen` is measured; and the seconds they took."""
+        if self.exploration is not None:
+            return self.exploration.plan(step, x, before)
         seed = self.seed + SEED_STEP * step
         plan, self.planned, seconds = self.planner.plan(
             self.problem, self.planned, x, step, before, seed, self.ids, seen
@@ -180,7 +213,14 @@ class _Flight:
         p = self.x[:, :3]
         finite = torch.isfinite(self.x).all(-1) & ((p - self.start[self.rows]).norm(dim=-1) <= FARTHEST)
         there = (p - self.goal[self.rows]).norm(dim=-1) < self.radius[self.rows]
-        return ~finite | there | (self.contact.distance(p, t) < 0)
+        return ~finite | there | self._touches(p, t)
+
+    def _touches(self, p: Tensor, t: float) -> Tensor:
+        """Whether vehicles at p (B, 3) are in contact: none is that has flown less than its last clearance at rest."""
+        if self.contact.moving or not bool(((p - self.measured_at).norm(dim=-1) < self.clearance).all()):
+            self.measured_at, self.clearance = p, self.contact.distance(p, t)
+            return self.clearance < 0
+        return torch.zeros_like(self.clearance, dtype=torch.bool)
 
     def _leave(self, left: Tensor) -> None:
         """Drop the vehicles where `left` (B,)."""
@@ -190,3 +230,6 @@ class _Flight:
         self.problem, self.planned = self.problem.take(stay), self.planned.take(stay)
         self.plant, self.contact = self.plant.take(stay), self.contact.take(stay)
         self.x, self.rows, self.ids = take((self.x, self.rows, self.ids), stay)
+        self.measured_at, self.clearance = self.measured_at[stay], self.clearance[stay]
+        if self.exploration is not None:
+            self.exploration.take(stay)

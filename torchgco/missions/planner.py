@@ -152,7 +152,7 @@ class Planner:
         began = time.perf_counter()
         t, x0 = step * float(whole.dynamics.dt), planning_state(x, self.airframe)
         U0 = now.cost.rest_controls(x0.new_zeros(now.B, now.N, now.m)) if before is None else shifted(before.U)
-        bias = self._estimated(measured, before, float(whole.dynamics.dt))
+        bias = self.estimated(measured, before, float(whole.dynamics.dt))
         dynamics = whole.dynamics if self.estimation == 0 else biased(whole.dynamics, bias)
         margin = self._margin(x, before)
         depth = margin.unavoidable_depth(whole.started_at(x0, whole.constraints), t, U0)
@@ -191,7 +191,7 @@ class Planner:
                 parts.append(later)
         return [*parts, *([first_step(whole, x, self.airframe)] if self.first_step else [])]
 
-    def _estimated(self, x: Tensor, before: Plan | None, dt: float) -> Tensor:
+    def estimated(self, x: Tensor, before: Plan | None, dt: float) -> Tensor:
         """The acceleration (B, 3) that the planning model lacks: a low-pass of what the last period has shown."""
         if before is None or self.estimation == 0:
             return torch.zeros_like(x[:, :3])

@@ -11,28 +11,32 @@ import torch
 
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.contact import Contact
+from torchgco.missions.log import PARTS
 from torchgco.missions.outcome import Ending, judge_flight
 
 Arrays = Mapping[str, np.ndarray]
 SCALARS = (
     "cost", "violation", "shifted", "guided", "iterations", "planner_seconds", "tracker_seconds", "tracking_violation",
 )  # fmt: skip
+SENSED = (*PARTS, "safe")  # further ones, of missions with a sensor: safe is 1 where the period held a safe plan
 STATES, ROTORS = 17, 4
 
 
 def packed(arrays: Arrays) -> np.ndarray:
     """The arrays of B missions as one (B, K, W), a row per control step; planned positions come last, if they do."""
     B, K = arrays["cost"].shape
-    names = ("x", "commands", *SCALARS, *(["plan"] if "plan" in arrays else []))
+    more = SENSED if "safe" in arrays else ()
+    names = ("x", "commands", *SCALARS, *more, *(["plan"] if "plan" in arrays else []))
     return np.concatenate([arrays[name].reshape(B, K, -1) for name in names], axis=-1)
 
 
-def unpacked(rows: np.ndarray, substeps: int) -> dict[str, np.ndarray]:
-    """The arrays that `packed` made of logs with so many time steps per control step."""
+def unpacked(rows: np.ndarray, substeps: int, sensed: bool = False) -> dict[str, np.ndarray]:
+    """The arrays that `packed` made of logs with so many time steps per control step, with a sensor or without."""
     B, K, J = *rows.shape[:2], substeps
-    widths = [(J + 1) * STATES, J * ROTORS, *[1] * len(SCALARS)]
+    names = (*SCALARS, *(SENSED if sensed else ()))
+    widths = [(J + 1) * STATES, J * ROTORS, *[1] * len(names)]
     x, commands, *scalars, plan = np.split(rows, np.cumsum(widths), axis=-1)
-    arrays = {name: part[..., 0] for name, part in zip(SCALARS, scalars, strict=True)}
+    arrays = {name: part[..., 0] for name, part in zip(names, scalars, strict=True)}
     arrays |= {"x": x.reshape(B, K, J + 1, STATES), "commands": commands.reshape(B, K, J, ROTORS)}
     return arrays | ({"plan": plan.reshape(B, K, -1, 3)} if plan.shape[-1] else {})
 
@@ -66,6 +70,7 @@ def mission_frame(arrays: Arrays, ids: Sequence[int], period: float, clearances:
         columns |= {"clearance": clearances[b][:K]}
         columns |= {name: arrays[name][b, :K] for name in ("planner_seconds", "tracker_seconds", "tracking_violation")}
         columns |= {"guided": arrays["guided"][b, :K].astype(int)}
+        columns |= {name: arrays[name][b, :K] for name in SENSED if name in arrays}
         columns |= {"source": np.where(arrays["shifted"][b, :K] == 1, "shifted", "solved")}
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
@@ -116,7 +121,7 @@ def mission_row(arrays: Arrays, b: int, period: float, end: Ending, airframe: Ai
     """The columns of mission b that its log decides, but for its clearance at the starts of control steps."""
     t, x = samples(arrays, b, period)
     until = t <= end.flight_time + 1e-9
-    steps = {name: arrays[name][b, : _steps(arrays, b)] for name in SCALARS}
+    steps = {name: arrays[name][b, : _steps(arrays, b)] for name in (*SCALARS, *SENSED) if name in arrays}
     return {
         "outcome": end.outcome.name,
         "flight_time": end.flight_time,
@@ -132,7 +137,8 @@ def step_columns(steps: Arrays, period: float) -> dict[str, float]:
     """The columns of a mission that are counts, sums and quantiles over its control steps.
 
     Args:
-        steps: violation, guided, shifted, planner_seconds, tracker_seconds and tracking_violation, (K,) each.
+        steps: violation, guided, shifted, planner_seconds, tracker_seconds and tracking_violation, (K,) each; with a
+            sensor safe, too.
         period: of a control step, s.
     """
     planner, tracker = steps["planner_seconds"], steps["tracker_seconds"]
@@ -148,6 +154,7 @@ def step_columns(steps: Arrays, period: float) -> dict[str, float]:
         "planner_seconds_p99": float(np.quantile(planner, 0.99)) if flew else math.nan,
         "tracker_seconds_median": float(np.median(tracker)) if flew else math.nan,
         "tracking_violation": float(steps["tracking_violation"].max(initial=0.0)),
+        **({"safe_share": float(np.mean(steps["safe"])) if flew else math.nan} if "safe" in steps else {}),
     }
 
 

@@ -2,6 +2,7 @@
 
 from torchgco.scenarios.base import Scenario
 from torchgco.scenarios.crossing import Crossing
+from torchgco.scenarios.cylinders import Cylinders
 from torchgco.scenarios.files import LayoutFile
 from torchgco.scenarios.layouts import Layouts, concatenate
 from torchgco.scenarios.maps import MapFile
@@ -14,6 +15,7 @@ from torchgco.scenarios.yard import Yard
 
 __all__ = [
     "Crossing",
+    "Cylinders",
     "Forest",
     "ForestMoving",
     "LayoutFile",

@@ -26,6 +26,7 @@ from torchgco.missions import Disturbance, Mission, Planner, RotorPlant, Tracker
 from torchgco.presets import PRESETS
 from torchgco.scenarios import (
     Crossing,
+    Cylinders,
     Forest,
     ForestMoving,
     LayoutFile,
@@ -40,7 +41,7 @@ from torchgco.scenarios import (
 from torchgco.scenarios.vehicle import BUILT_IN
 
 FAMILIES: tuple[type[Any], ...] = (
-    Forest, ForestMoving, Walls, Woods, Mazes, Crossing, PlanarTrap, PlanarRandom, Yard,
+    Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, PlanarTrap, PlanarRandom, Yard,
 )  # fmt: skip
 BY_DIMENSION = "torchgco.by_dimension"
 ALIKE = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each

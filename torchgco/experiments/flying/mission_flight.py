@@ -15,6 +15,7 @@ from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.progress import Bar
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
+from torchgco.missions.safe import safe_arrays
 from torchgco.missions.tables import clearances, ending, mission_row, packed
 from torchgco.scenarios import Layouts
 
@@ -47,6 +48,7 @@ class MissionFlight:
         log = mission.fly(problem, seed=setup.seed, ids=ids, report=progress)
         self.bar.update(layouts.count - self.shown)
         arrays, contact = log.arrays(self.plans), Contact.among(problem)
+        arrays |= safe_arrays(log, problem)
         nearest = np.fmin.reduce(clearances(arrays, log.period, contact), axis=1, initial=np.inf)
         goal, radius = problem.goal.position.numpy(), problem.goal.radius.numpy()  # type: ignore[union-attr]
         rows = []

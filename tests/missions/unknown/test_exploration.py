@@ -1,0 +1,144 @@
+"""Short missions with a sensor: goals, safe plans, the log, and the same bits alone and in a batch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.missions.missions import REST
+from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, presets
+from torchgco.base.errors import InputError
+from torchgco.missions import Mission, Planner
+from torchgco.missions.contact import Contact
+from torchgco.missions.log import MissionLog
+from torchgco.missions.outcome import Outcome
+from torchgco.missions.safe import safe_arrays
+from torchgco.missions.sensing import Depth, Lidar
+from torchgco.missions.tables import SENSED, ending, mission_frame, mission_row, packed, unpacked
+from torchgco.missions.unknown.explorer import Explorer
+
+GOALS = torch.tensor([[4.0, 0.0, 0.0], [3.0, 0.5, 0.2]]).double()
+EXPLORER = Explorer(around=(2.5, 1.5), stages=40)
+LIDAR = Lidar(rays=(150, 30), range=8.0)
+
+
+def walled(side: float = 0.0) -> Problem:
+    """Two missions behind a wall with its middle at `side`, m: the way is around it."""
+    cost = QuadraticCost(
+        Q=[1.0] * 14, R=[1.0] * 4, Qf=[1.0] * 14, x_ref=[4.0, 0.0, 0.0, *REST[3:]], u_ref=[0, 0, 0, 9.81]
+    )
+    wall = Boxes([[2.0, side, 0.0]], [[0.2, 0.8, 2.5]], 0.2)
+    bounds = ControlBounds([-5, -5, -5, 0.26], [5, 5, 5, 14.9])
+    x0 = torch.tensor([REST, REST]).double()
+    return Problem(QuadrotorPlanning(dt=0.05), cost, [wall, bounds], x0, 20, Goal(GOALS, 0.4))
+
+
+def mission(**options: Any) -> Mission:
+    parts: dict[str, Any] = {"sensor": "lidar", "lidar": LIDAR, "explorer": EXPLORER, "duration": 6.0} | options
+    return Mission(Planner(presets.gco(3)), **parts)
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[Problem, MissionLog]:
+    problem = walled()
+    return problem, mission().fly(problem, seed=1)
+
+
+def test_goals_behind_a_wall_that_was_not_known_are_reached(flown: tuple[Problem, MissionLog]) -> None:
+    problem, log = flown
+    for b in range(2):
+        end = ending(log.arrays(), b, log.period, Contact.among(problem), GOALS[b].numpy(), 0.5)
+        assert end.outcome is Outcome.REACHED and end.clearance > 0.02
+
+
+def test_every_period_holds_a_safe_plan(flown: tuple[Problem, MissionLog]) -> None:
+    problem, log = flown
+    safe = safe_arrays(log, problem)["safe"]
+    for b, K in enumerate(log.steps()):
+        assert (safe[b, :K] == 1).all() and np.isnan(safe[b, K:]).all() and K > 20
+
+
+def test_a_period_without_a_safe_plan_is_found_out(flown: tuple[Problem, MissionLog]) -> None:
+    problem, log = flown
+    seen = log.seen[0]
+    wrong = replace(seen, safe=[plan + np.array([1.5, 0.0, 0.0]) for plan in seen.safe])
+    safe = safe_arrays(replace(log, seen=[wrong, log.seen[1]]), problem)["safe"]
+    assert safe[0, 0] == 0 and np.nanmean(safe[1]) == 1
+
+
+def test_the_log_is_kept_whole_and_becomes_tables(flown: tuple[Problem, MissionLog]) -> None:
+    problem, log = flown
+    arrays = log.arrays(plans=True) | safe_arrays(log, problem)
+    back = unpacked(packed(arrays), log.commands.shape[2], sensed=True)
+    assert set(back) == set(arrays)
+    assert all(np.array_equal(back[name], arrays[name], equal_nan=True) for name in arrays)
+    frame = mission_frame(arrays, [7, 8], log.period, arrays["cost"])
+    assert set(SENSED) <= set(frame.columns) and (frame["safe"] == 1).all()
+    parts = frame[["map_seconds", "field_seconds", "search_seconds"]].sum(axis=1)
+    assert (parts <= 2.0 * frame["planner_seconds"]).all() and (frame["search_seconds"] > 0).all()
+    end = ending(arrays, 0, log.period, Contact.among(problem), GOALS[0].numpy(), 0.5)
+    row = mission_row(arrays, 0, log.period, end, mission().planner.airframe)
+    assert row["safe_share"] == 1.0
+
+
+def test_plans_keep_the_speed_and_end_at_rest(flown: tuple[Problem, MissionLog]) -> None:
+    _, log = flown
+    for b, K in enumerate(log.steps()):
+        assert float(log.x[b, :K, 0, 3:6].abs().max()) <= EXPLORER.speed
+        ends = log.plan[b, :K, -1] - log.plan[b, :K, -2]
+        assert float(ends.norm(dim=-1).max()) <= 0.1 * log.period
+
+
+def test_a_mission_is_the_same_alone(flown: tuple[Problem, MissionLog]) -> None:
+    problem, log = flown
+    second = torch.tensor([1])
+    alone = replace(mission(), duration=1.0).fly(problem.take(second), seed=1, ids=second)
+    assert torch.equal(alone.x[0, :20], log.x[1, :20])
+
+
+def test_a_mission_without_a_sensor_has_no_such_columns() -> None:
+    log = MissionLog.blank(torch.zeros(1, 17).double(), 2, 5, 0.05, 3)
+    assert "map_seconds" not in log.arrays() and safe_arrays(log, walled().take(slice(0, 1))) == {}
+
+
+@pytest.mark.slow
+def test_a_dead_end_is_left() -> None:
+    """A pocket whose mouth is at the start: from within, the way on is back and around."""
+    pocket = Boxes(
+        [[2.4, 0.0, 0.0], [1.4, 1.1, 0.0], [1.4, -1.1, 0.0]], [[0.2, 1.3, 2.5], [0.8, 0.2, 2.5], [0.8, 0.2, 2.5]], 0.2
+    )
+    problem = walled().take(slice(0, 1))
+    problem = replace(problem, constraints=[pocket, problem.constraints[1]], goal=Goal(GOALS[:1], 0.4))
+    near = replace(LIDAR, range=2.0)  # it sees the end of the pocket from within alone
+    log = mission(lidar=near, duration=12.0).fly(problem)
+    end = ending(log.arrays(), 0, log.period, Contact.among(problem), GOALS[0].numpy(), 0.5)
+    assert end.outcome is Outcome.REACHED
+    safe = safe_arrays(log, problem)["safe"]
+    assert np.nanmean(safe) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"sensor": "sonar"}, "mission.sensor"),
+        ({"unknown": "maybe"}, "mission.unknown"),
+        ({"latency": 1}, "mission.latency"),
+    ],
+)
+def test_options_that_do_not_fit_are_named(options: dict[str, Any], field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        mission(**options)
+
+
+def test_an_explorer_names_what_is_wrong() -> None:
+    with pytest.raises(InputError, match=r"mission\.explorer\.stages"):
+        Explorer(stages=2)
+
+
+def test_a_depth_camera_flies_too() -> None:
+    log = mission(sensor="depth", depth=Depth(rays=(60, 45)), duration=0.5).fly(walled())
+    assert bool(torch.isfinite(log.x[:, 0]).all()) and len(log.seen) == 2

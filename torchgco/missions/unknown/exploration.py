@@ -1,0 +1,317 @@
+"""The planner of missions that see their world through a sensor: map, path, corridor, plan, and the safe plan it keeps.
+
+In every control period the map takes what the sensor has seen, a search over its cells finds the cheapest path to the
+goal through all that isn't known to be occupied, and plans follow the part of this path that is known to be free. Every
+plan comes to rest within it. Where no new plan does, the former one is flown on.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
+from torchgco.missions.log import PARTS
+from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.sensing.grid import NOT_FREE, SEEN_OCCUPIED, SeenMap
+from torchgco.missions.sensing.search import Search
+from torchgco.missions.sensing.sensors import Sensor
+from torchgco.missions.sensing.world import World
+from torchgco.missions.unknown.explorer import CORRIDOR, EARLY, HOVER, PLANES, Explorer, PlanningForm, Unknown
+from torchgco.missions.unknown.reference import motion, taut
+from torchgco.missions.unknown.safety import AT_REST, SeenLog
+from torchgco.native.dispatch import followed
+from torchgco.obstacles.base import CONTACT_FACTOR
+from torchgco.problem.problem import Problem
+from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
+from torchgco.solvers.ending import optimality
+
+OUTER = 12  # outer iterations of a plan at most
+LOCAL: dict[str, Any] = {"initial_penalty": 1.0, "penalty_growth": 3.0, "violation_tolerance": 5e-3}
+SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
+# Where no way is found, a search with less margin, then one over all cells: the share of the margin, and the stride.
+LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
+HELD = 2.0  # s before a search with less margin ends
+SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
+FINE = 4  # points tested per step of a plan
+OVER = 0.2  # m/s by which a plan may exceed the speed
+
+
+@dataclass
+class Scout:
+    """What one vehicle knows, and seeks."""
+
+    world: World
+    seen: SeenMap
+    search: Search
+    log: SeenLog
+    goal: np.ndarray
+    radius: float  # m, of the vehicle
+    path: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # cells' centres, (K, 3), m
+    corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
+    waited: int = 0  # control periods without a way on
+    level: int = 0  # of LEVELS
+    since: int = 0  # control periods at this level
+    seconds: dict[str, float] = field(default_factory=dict)
+    changed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+
+
+class Exploration:
+    """The scouts and the planning problems of missions in lockstep."""
+
+    def __init__(
+        self,
+        explorer: Explorer,
+        planner: Planner,
+        sensor: Sensor,
+        unknown: Unknown,
+        problem: Problem,
+        seed: int,
+        ids: Tensor,
+    ) -> None:
+        self.explorer, self.planner, self.sensor, self.seed = explorer, planner, sensor, seed
+        self.kinds = NOT_FREE if unknown == "occupied" else SEEN_OCCUPIED  # of cells, which plans stay out of
+        self.dt = float(problem.dynamics.dt)
+        self.every = max(1, round(1.0 / (sensor.rate * self.dt)))  # control periods between two scans
+        self.ids = ids.tolist()
+        local = planner.solver.in_closed_loop(OUTER)[1]
+        if not isinstance(local, AugmentedLagrangian):
+            raise InputError("solver", "gco, al_ilqr or another around AL-iLQR, for a sensor", type(local).__name__)
+        self.local = replace(local, guidance=None, max_outer_iterations=OUTER, **LOCAL)
+        assert problem.goal is not None
+        radius = torch.stack([part.vehicle_radius for part in problem.obstacles]).amax(0) if problem.obstacles else None
+        self.radius = torch.full_like(problem.x0[:, 0], 0.3) if radius is None else radius
+        self.whole = problem
+        self.scouts = [self._scout(b) for b in range(problem.B)]
+
+    def _scout(self, b: int) -> Scout:
+        start, goal = self.whole.x0[b, :3].numpy(), self.whole.goal.position[b].numpy()  # type: ignore[union-attr]
+        seen, radius = self.explorer.map_of(start, goal), float(self.radius[b])
+        size = seen.resolution
+        search = Search(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH)
+        log = SeenLog(seen.corner, seen.shape, seen.resolution)
+        scout = Scout(World.of(self.whole, b), seen, search, log, goal, radius)
+        scout.changed = seen.clear(start, self.explorer.known)
+        return scout
+
+    def take(self, stay: Tensor) -> None:
+        """Keep the missions in `stay`."""
+        self.scouts = [self.scouts[b] for b in stay.tolist()]
+        self.ids = [self.ids[b] for b in stay.tolist()]
+        self.whole, self.radius = self.whole.take(stay), self.radius[stay]
+
+    def sense(self, step: int, x: Tensor, measured: Tensor) -> None:
+        """Scan at a control step from plants x (B, 17), and put that into the maps where the vehicles believe to be."""
+        for b, scout in enumerate(self.scouts):
+            took = [0.0, 0.0]
+            if step % self.every == 0:
+                key = (self.seed, self.ids[b], step)
+                scan = self.sensor.scan(scout.world, x[b, :3].numpy(), x[b, 6:10].numpy(), step * self.dt, key)
+                scan = scan.seen_from(x[b, 6:10].numpy(), measured[b, :3].numpy(), measured[b, 6:10].numpy())
+                began = time.perf_counter()
+                changed = scout.seen.add(scan, self.sensor.range, 3.0 * self.sensor.noise)
+                scout.changed = np.concatenate([scout.changed, changed])
+                mapped = time.perf_counter()
+                scout.seen.remeasure(scout.changed)
+                took = [mapped - began, time.perf_counter() - mapped]
+            scout.log.changes.append((scout.changed, scout.seen.state.reshape(-1)[scout.changed]))
+            scout.changed = scout.changed[:0]
+            scout.seconds = dict(zip(PARTS, (*took, 0.0), strict=True))
+
+    def plan(self, step: int, x: Tensor, before: Plan | None) -> tuple[Plan, float]:
+        """Plans from measured plants x (B, 17), and the seconds that they took, those of the maps among them."""
+        began = time.perf_counter()
+        sensed = sum(sum(scout.seconds.values()) for scout in self.scouts)
+        bias = self.planner.estimated(x, before, self.dt)
+        for b, scout in enumerate(self.scouts):
+            self._seek(scout, x[b].numpy())
+        reference = self._reference(x)
+        rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
+        former = rest if before is None else shifted(before.X[:, 1:, :3])
+        seeds = [former, reference[:, 1:, :3]]
+        problem = self._problem(x, bias, reference, seeds)
+        kept = self._kept(problem, before).take(slice(0, len(self.scouts)))
+        plan = self._chosen(problem, kept, len(seeds))
+        for b, scout in enumerate(self.scouts):
+            scout.log.safe.append(plan.X[b, :, :3].numpy().copy())
+        return replace(plan, measured=x, bias=bias, step=step), time.perf_counter() - began + sensed
+
+    def parts(self) -> dict[str, Tensor]:
+        """Seconds of the last period by part, (B,)."""
+        return {name: torch.tensor([s.seconds[name] for s in self.scouts], dtype=torch.float64) for name in PARTS}
+
+    def _seek(self, scout: Scout, x: np.ndarray) -> None:
+        """The path of a vehicle x (17,), and the part of it that is known to be free."""
+        began, position = time.perf_counter(), x[:3]
+        self._search(scout, position)
+        keep = self.keep(scout)
+        points = _halved(np.concatenate([position[None], scout.path[1:]]))
+        if np.linalg.norm(scout.path[-1] - scout.goal) <= 4.5 * scout.seen.resolution:
+            points = np.concatenate([points, scout.goal[None]])
+        gaps = scout.seen.gaps(points, keep + 0.05, self.kinds)
+        blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 3))
+        free = points[: blocked[0] if len(blocked) else len(points)]
+        scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
+        self._wait(scout, x, points, blocked)
+        scout.seconds["search_seconds"] += time.perf_counter() - began
+
+    def keep(self, scout: Scout) -> float:
+        """The distance, m, that plans keep from what isn't known to be free."""
+        least = CONTACT_FACTOR * scout.radius + SPARE + 0.01
+        share = LEVELS[scout.level][0]
+        return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least
+
+    def _search(self, scout: Scout, position: np.ndarray) -> None:
+        """The path to the goal; where none is found, with less margin from now on, for a while."""
+        scout.since += 1
+        if scout.level > 0 and scout.since * self.dt >= HELD:
+            scout.level, scout.since = 0, 0
+        while True:
+            scout.search.radius, scout.search.stride = self.keep(scout), LEVELS[scout.level][1]
+            scout.path, arrives = scout.search.path(position, scout.goal)
+            if arrives or scout.level + 1 == len(LEVELS):
+                return
+            scout.level, scout.since = scout.level + 1, 0
+
+    def _wait(self, scout: Scout, x: np.ndarray, points: np.ndarray, blocked: np.ndarray) -> None:
+        """Count the periods at rest in front of cells that stay unknown, and in the end look elsewhere."""
+        length = np.linalg.norm(np.diff(scout.corners, axis=0), axis=1).sum()
+        still = len(blocked) > 0 and length < 0.3 and np.linalg.norm(x[3:6]) < 0.2
+        scout.waited = scout.waited + 1 if still else 0
+        if scout.waited * self.dt >= self.explorer.patience:
+            scout.search.avoid(points[blocked[0]], 1.0)
+            scout.waited = 0
+
+    def _reference(self, x: Tensor) -> Tensor:
+        """States (B, N+1, 14) that the plans are to follow."""
+        N, found = self.explorer.stages, x.new_zeros(x.shape[0], self.explorer.stages + 1, 14)
+        found[..., 6], found[..., 13] = 1.0, HOVER
+        for b, scout in enumerate(self.scouts):
+            state = x[b].numpy()
+            p, v = motion(scout.corners, state[3:6], self.explorer.pace, N, self.dt)
+            found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
+        return found
+
+    def _problem(self, x: Tensor, bias: Tensor, reference: Tensor, seeds: Sequence[Tensor]) -> Problem:
+        """The planning problems, seed by seed."""
+        C, N = len(seeds), self.explorer.stages
+        planes, room, allowed = [], [], []
+        for seed in seeds:
+            for b, scout in enumerate(self.scouts):
+                began, keep = time.perf_counter(), self.keep(scout)
+                own, far = scout.seen.corridor(seed[b].numpy(), CORRIDOR, PLANES, self.kinds)
+                gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
+                near = np.full(N, keep)
+                near[:EARLY] = min(keep, max(gap - 0.01, CONTACT_FACTOR * scout.radius))
+                for parts, part in ((planes, own), (room, far), (allowed, near)):
+                    parts.append(part)
+                scout.seconds["field_seconds"] += time.perf_counter() - began
+        form = PlanningForm(self.explorer, self.planner, _repeated(self.whole, C))
+        stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, allowed)]
+        return form.problem(
+            x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), stack[0], stack[1],
+            torch.cat(list(seeds)).contiguous(), stack[2],
+        )  # fmt: skip
+
+    def _kept(self, problem: Problem, before: Plan | None) -> Plan:
+        """The former plans one stage later, brought back to by feedback; of a first plan, rest."""
+        if before is None:
+            x0, B, N = problem.x0, problem.B, problem.N
+            U = problem.cost.rest_controls(x0.new_zeros(B, N, 4))
+            X, K = x0.unsqueeze(1).repeat(1, N + 1, 1), x0.new_zeros(B, N, 4, 14)
+            penalty = torch.full_like(x0[:, 0], 1.0)
+        else:
+            C = problem.B // before.X.shape[0]
+            X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
+            X[:, -1], U[:, -1] = _resting(X[:, -1]), problem.cost.rest_controls(U[:, -1:])[:, 0]
+            X, U = followed(problem, X, U, K)
+            penalty = before.penalty.repeat(C)
+        none = torch.zeros(problem.B, dtype=torch.int64)
+        return Plan(
+            X, U.nan_to_num(), K, Multipliers.zero(problem, 1.0), penalty, problem.cost.total(X, U),
+            problem.x0.new_zeros(problem.B), torch.ones(problem.B, dtype=torch.bool), none, none.clone(),
+            problem.x0, problem.x0[:, :3], problem.dynamics, 0,
+        )  # fmt: skip
+
+    def _chosen(self, problem: Problem, kept: Plan, count: int) -> Plan:
+        """Of the new plans, `count` for each mission, the cheapest that is safe, or else the one that is kept.
+
+        Where that isn't safe either, as cells have turned out to be occupied, the one that keeps the most distance.
+        """
+        B = len(self.scouts)
+        found = self.local.solve(problem, kept.U.repeat(count, 1, 1), seed=self.seed)
+        # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
+        K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
+        best = [self._best(found.X[b::B], found.cost[b::B], kept.X[b], b) for b in range(B)]
+        rows = torch.tensor([b + B * (choice or 0) for b, choice in enumerate(best)])
+        new = torch.tensor([choice is not None for choice in best])
+        wide = new.view(-1, 1, 1)
+        one = problem.take(rows)
+        return Plan(
+            torch.where(wide, found.X[rows], kept.X), torch.where(wide, found.U[rows], kept.U),
+            torch.where(wide.unsqueeze(-1), K[rows], kept.K), kept.multipliers, kept.penalty,
+            torch.where(new, found.cost[rows], kept.cost), torch.where(new, found.violation[rows], 0.0), ~new,
+            found.guided[rows], found.iterations[rows], one.x0, one.x0[:, :3], one.dynamics, 0,
+        )  # fmt: skip
+
+    def _best(self, X: Tensor, cost: Tensor, kept: Tensor, b: int) -> int | None:
+        """Which of some plans (C, N+1, 14) of mission b is flown; None: the kept one (N+1, 14)."""
+        order = [int(c) for c in cost.argsort() if bool(torch.isfinite(cost[c]))]
+        spare = {c: self.spare(X[c].numpy(), b) for c in order}
+        safe = next((c for c in order if spare[c] >= 0), None)
+        if safe is not None:
+            return safe
+        most, own = max(order, key=lambda c: spare[c], default=None), self.spare(kept.numpy(), b)
+        return most if most is not None and spare[most] > own and own < 0 else None
+
+    def spare(self, X: np.ndarray, b: int) -> float:
+        """The least distance, m, of a plan (N+1, 14) from what isn't known to be free, beyond what is asked for.
+
+        Minus infinity for a plan that doesn't come to rest, or is too fast. A vehicle that is too near already is asked
+        to go no nearer, and to get away.
+        """
+        scout, least = self.scouts[b], CONTACT_FACTOR * self.scouts[b].radius + SPARE
+        if not np.isfinite(X).all() or np.abs(X[-1, 3:6]).max() > 0.7 * AT_REST:
+            return -np.inf
+        if np.abs(X[:, 3:6]).max() > max(self.explorer.speed + OVER, np.abs(X[0, 3:6]).max()):
+            return -np.inf
+        p = X[:, :3]
+        share = np.arange(FINE)[:, None] / FINE
+        points = np.concatenate([(p[:-1, None] + share * np.diff(p, axis=0)[:, None]).reshape(-1, 3), p[-1:]])
+        gaps = scout.seen.gaps(points, least + 0.01, self.kinds)
+        near = gaps[0] - least
+        asked = np.zeros(len(gaps))
+        if near < 0:
+            asked[: FINE * EARLY] = near - 0.02
+        return float((gaps - least - asked).min())
+
+    def is_safe(self, X: np.ndarray, b: int) -> bool:
+        """Whether a plan (N+1, 14) comes to rest, no faster than allowed, in space that is known to be free."""
+        return self.spare(X, b) >= 0
+
+
+def _resting(x: Tensor) -> Tensor:
+    """States (B, 14) at rest and upright in the same positions, with the same yaw."""
+    rest = torch.zeros_like(x)
+    rest[:, :3], rest[:, 13] = x[:, :3], HOVER
+    yaw = torch.hypot(x[:, 6], x[:, 9]).clamp(min=1e-9)
+    rest[:, 6], rest[:, 9] = x[:, 6] / yaw, x[:, 9] / yaw
+    return rest
+
+
+def _halved(points: np.ndarray) -> np.ndarray:
+    """The points (K, 3) of a path, and those midway between them."""
+    found = np.repeat(points, 2, axis=0)[:-1]
+    found[1::2] = 0.5 * (points[:-1] + points[1:])
+    return found
+
+
+def _repeated(problem: Problem, count: int) -> Problem:
+    return problem.take(torch.arange(problem.B).repeat(count))
