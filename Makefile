@@ -6,6 +6,7 @@
 # make general   48 families of constrained problems, compared with IPOPT and FATROP (ARGS="--solvers gco al_ilqr" for others)
 # make worlds   woods, mazes, crossing spheres and the outside benchmarks, with pages in benchmarks/results (half an hour)
 # make unknown   missions in worlds that a lidar sees on the way (an hour; ARGS="--count 32" for more)
+# make maps   drawn worlds as occupancy grids against the same worlds as shapes (ARGS="--count 8" for fewer)
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
@@ -38,7 +39,7 @@ FIND := import sys; from torchgco.native.compiler import find_compiler; sys.exit
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle general worlds benchmark benchmark-gpu ladder \
+.PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle general worlds maps benchmark benchmark-gpu ladder \
     docs figures paper unknown
 
 study: $(RUNTIME)
@@ -72,6 +73,9 @@ oracle: $(RUNTIME)
 general: $(PEERS)
 	$(BIN)/python -m benchmarks.families.general_peers
 	$(BIN)/python -m benchmarks.families.general --write --restart 3 $(ARGS)
+
+maps: $(RUNTIME)
+	$(BIN)/python -m benchmarks.families.maps --write $(ARGS)
 
 worlds: $(PEERS)
 	$(BIN)/python -m benchmarks.families.worlds --write $(ARGS)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchgco import (
     Boxes,
+    Constraint,
     Field,
     Goal,
     Planar,
@@ -22,6 +23,7 @@ from torchgco import (
     presets,
 )
 from torchgco.maps import DistanceField, OccupancyGrid
+from torchgco.maps.field import BoundField
 from torchgco.native import kernels
 from torchgco.obstacles.base import Obstacles
 from torchgco.roadmap.blocks import blocks_of
@@ -35,7 +37,9 @@ from torchgco.solvers.contracts import Solver
 R = 0.2
 
 
-def problem_in(cells: np.ndarray, start: list[float], goal: list[float], *others: object, radius: float = R) -> Problem:
+def problem_in(
+    cells: np.ndarray, start: list[float], goal: list[float], *others: Constraint, radius: float = R
+) -> Problem:
     d = cells.ndim
     model = Planar(dt=0.05) if d == 2 else QuadrotorPlanning(dt=0.05)
     rest = [0.0] * (model.n - d)
@@ -111,7 +115,8 @@ def test_sums_along_ways_are_those_of_their_polylines_and_tell_windings_apart() 
     rng = np.random.default_rng(0)
     cells = rng.random((40, 40)) < 0.03
     problem = problem_in(cells, [0.1, 0.1], [3.9, 3.9], radius=0.05)
-    (field,) = problem.constraints
+    field = problem.constraints[0]
+    assert isinstance(field, BoundField)
     ends = np.array([[0.1, 0.1], [3.9, 3.9]])
     lattice = lattice_of([field], [], ends)
     ways = Ways(blocks_of(lattice, 0.05, 4096), ends, lambda p: np.ones(len(p)), R, 0.0)
@@ -193,7 +198,8 @@ def test_scipy_finds_ways_of_the_same_costs_and_draws_them_taut_alike(d: int) ->
     rng = np.random.default_rng(1)
     cells = rng.random([24] * d) < 0.03
     problem = problem_in(cells, [0.1] * d, [2.3] * d, radius=0.15)
-    (field,) = problem.constraints
+    field = problem.constraints[0]
+    assert isinstance(field, BoundField)
     ends = np.array([[0.1] * d, [2.3] * d])
     lattice = lattice_of([field], [], ends)
 

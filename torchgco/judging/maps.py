@@ -46,9 +46,10 @@ class Solid:
             return np.zeros(len(points), bool)
         with np.errstate(invalid="ignore"):
             place = np.floor((points - self.origin) / (2 * self.half))
-        within = np.all((place >= 0) & (place < self.cells.shape), axis=-1)
+        within: np.ndarray = np.all((place >= 0) & (place < self.cells.shape), axis=-1)
         index = np.where(within[:, None], place, 0).astype(int)
-        return within & np.asarray(self.cells)[tuple(index.T)]
+        held: np.ndarray = self.cells[tuple(index.T)]
+        return np.logical_and(within, held)
 
 
 def segment_distances(field: BoundField, p: Tensor) -> Tensor:

@@ -151,16 +151,16 @@ def _clearest(clearance: NDArray[np.float32], size: int) -> NDArray[np.int64]:
     """The clearest node of each block, (blocks along each axis, d)."""
     d = clearance.ndim
     if size == 1:
-        return np.stack(np.indices(clearance.shape), axis=-1)
+        return np.stack(list(np.indices(clearance.shape)), axis=-1)
     counts = [-(-n // size) for n in clearance.shape]
     beyond = [(0, c * size - n) for c, n in zip(counts, clearance.shape, strict=True)]
     padded = np.pad(clearance, beyond, constant_values=-np.inf)
     split = padded.reshape([n for c in counts for n in (c, size)])
     split = split.transpose([2 * i for i in range(d)] + [2 * i + 1 for i in range(d)]).reshape(*counts, -1)
     # Of equally clear nodes the one next to the block's middle: far from obstacles blocks are evenly spaced then.
-    middle = sum((x - 0.5 * (size - 1)) ** 2 for x in np.indices([size] * d)).ravel()
+    middle = ((np.indices([size] * d) - 0.5 * (size - 1)) ** 2).sum(0).ravel()
     within = np.stack(np.unravel_index((split - 1e-6 * middle.astype(np.float32)).argmax(-1), [size] * d), axis=-1)
-    return np.stack(np.indices(counts), axis=-1) * size + within
+    return np.stack(list(np.indices(counts)), axis=-1) * size + within
 
 
 def shortcut(lattice: Lattice, path: Array, least: float) -> NDArray[np.bool_] | None:

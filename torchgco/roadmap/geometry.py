@@ -55,7 +55,9 @@ class Inflated(NamedTuple):
         """The same obstacles with radii reduced by this share."""
         spheres = replace(self.spheres, radii=(1.0 - share) * self.spheres.radii)
         boxes = None if self.boxes is None else replace(self.boxes, radii=(1.0 - share) * self.boxes.radii)
-        return Inflated(spheres, boxes, tuple(part.grown(-share * part.vehicle_radius) for part in self.maps))
+        return self._replace(
+            spheres=spheres, boxes=boxes, maps=tuple(part.grown(-share * part.vehicle_radius) for part in self.maps)
+        )
 
     def region(self, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """The lower and upper corner (B, d) around start, goal, and the obstacles, each `AROUND` times as large."""

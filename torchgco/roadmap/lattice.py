@@ -145,7 +145,7 @@ def lattice_of(fields: Sequence[BoundField], solids: Sequence[Solids], ends: Arr
         here, reach = ~part.absent[0], part.extent[0] + part.radii[0].unsqueeze(-1)
         points += [(part.centers[0] + side * BESIDE * reach)[here].numpy() for side in (-1.0, 1.0)]
     clearance, pad = _clearance(first, np.concatenate(points))
-    origin = first.origins[0].numpy() - first.field.spacing * pad
+    origin = np.asarray(first.origins[0].numpy() - first.field.spacing * pad, np.float64)
     return Lattice(clearance, origin, first.field.spacing, tuple(others), present)
 
 
