@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks.lib.families import FAMILIES
-from benchmarks.lib.timers import Timers
+from benchmarks.lib.timers import Name, Timers
 from benchmarks.speed.bench import Bench
 
 SECTION = "share"
@@ -39,9 +39,10 @@ def _native(before: tuple[str, str], args: tuple[Any, ...]) -> tuple[str, str]:
     return before[0], next((arg for arg in args if isinstance(arg, str)), None) or args[0].__name__
 
 
-PLACES = {
+PLACES: dict[str, Name] = {
     place: lambda _, __, phase=phase: (phase, PYTHON) for phase, places in PHASES.items() for place in places
-} | dict.fromkeys(CALLS, _native)
+}
+PLACES |= dict.fromkeys(CALLS, _native)
 
 
 def run(bench: Bench) -> None:

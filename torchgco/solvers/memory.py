@@ -20,8 +20,8 @@ BYTES_PER_NUMBER = 8  # bytes of float64
 def least_bytes(N: int, n: int, m: int, rows: int) -> int:
     """Bytes that a problem of this size takes at least in a solve; `rows` of its constraints at all knots together."""
     gains = N * 2 * m * (n + 1)
-    trajectories = N * (n + m) * 16  # iterate, best, last, result, and those tried by a line search
-    return BYTES_PER_NUMBER * (gains + trajectories + 12 * rows)
+    trajectories = N * (n + m) * 10  # iterate, best, last, result, and those tried by a line search
+    return BYTES_PER_NUMBER * (gains + trajectories + 6 * rows)
 
 
 def element_bytes(problem: Problem) -> int:
