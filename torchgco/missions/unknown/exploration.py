@@ -276,8 +276,8 @@ class Exploration:
     def spare(self, X: np.ndarray, b: int, rest: float = 0.7 * AT_REST) -> float:
         """The least distance, m, of a plan (N+1, 14) from what isn't known to be free, beyond what is asked for.
 
-        Minus infinity for a plan that isn't at rest in the end, up to `rest`, m/s, or is too fast. A vehicle that is too
-        near already is asked to go no nearer, and to get away.
+        Minus infinity for a plan that isn't at rest in the end, up to `rest`, m/s, or is too fast. A vehicle that is
+        too near already is asked to go no nearer, and to get away.
         """
         scout, least = self.scouts[b], CONTACT_FACTOR * self.scouts[b].radius + SPARE
         if not np.isfinite(X).all() or np.abs(X[-1, 3:6]).max() > rest:
