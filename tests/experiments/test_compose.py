@@ -20,10 +20,10 @@ from torchgco.missions import Mission, Planner
 DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
 EXPERIMENTS = options_of("experiment")
-MISSIONS = ("mission", "mission_study")
+MISSIONS = ("mission", "mission_study", "mission_unknown")
 OF_MODEL = {
     "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": ("yard",),
-    "quadrotor": ("crossing", "forest", "forest_mission", "forest_moving", "mazes", "walls", "woods"),
+    "quadrotor": ("crossing", "cylinders", "forest", "forest_mission", "forest_moving", "mazes", "walls", "woods"),
 }  # fmt: skip
 MODEL = {scenario: model for model, scenarios in OF_MODEL.items() for scenario in scenarios}
 FILES = {"forest30": "quadrotor", "planar_trap": "planar"}
@@ -70,7 +70,7 @@ def test_every_experiment_composes_with_every_scenario_model_and_solver(experime
         given = [f"experiment={experiment}", *words, f"solver={solver}"]
         given += [f"model={model}"] if next(named) and f"model={model}" not in words else []
         if experiment in MISSIONS and model != "quadrotor":
-            assert "scenario: expected one in space for a mission: crossing, forest" in refused(*given)
+            assert "scenario: expected one in space for a mission: crossing, cylinders, forest" in refused(*given)
         else:
             setup = checked(*given)
             assert setup.vehicle.name == model and (setup.mission is not None) == (experiment in MISSIONS)

@@ -105,6 +105,7 @@ class Lidar(Sensor):
 
     def __post_init__(self) -> None:
         check_options(self, "lidar")
+        _keep_tuples(self)
         if self.field_of_view[1] > 180:
             raise InputError("lidar.field_of_view", "at most 180 degrees in elevation", self.field_of_view[1])
 
@@ -154,6 +155,7 @@ class Depth(Sensor):
 
     def __post_init__(self) -> None:
         check_options(self, "depth")
+        _keep_tuples(self)
 
     def pattern(self, shift: np.ndarray) -> np.ndarray:
         """See `Sensor`."""
@@ -168,6 +170,12 @@ class Depth(Sensor):
     def spread(self, distances: np.ndarray) -> np.ndarray:
         """See `Sensor`."""
         return self.noise * distances**2
+
+
+def _keep_tuples(sensor: Lidar | Depth) -> None:
+    """Lists, as configurations give them, as tuples, so that equal sensors are equal."""
+    for name in ("rays", "field_of_view"):
+        object.__setattr__(sensor, name, tuple(getattr(sensor, name)))
 
 
 def turned(q: np.ndarray) -> np.ndarray:

@@ -40,6 +40,7 @@ SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
 LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
 HELD = 2.0  # s before a search with less margin ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
+BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
 
@@ -268,17 +269,18 @@ class Exploration:
         safe = next((c for c in order if spare[c] >= 0), None)
         if safe is not None:
             return safe
-        most, own = max(order, key=lambda c: spare[c], default=None), self.spare(kept.numpy(), b)
-        return most if most is not None and spare[most] > own and own < 0 else None
+        # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.
+        most, own = max(order, key=lambda c: spare[c], default=None), self.spare(kept.numpy(), b, 3.0 * AT_REST)
+        return most if most is not None and own < 0 and spare[most] > own + BETTER else None
 
-    def spare(self, X: np.ndarray, b: int) -> float:
+    def spare(self, X: np.ndarray, b: int, rest: float = 0.7 * AT_REST) -> float:
         """The least distance, m, of a plan (N+1, 14) from what isn't known to be free, beyond what is asked for.
 
-        Minus infinity for a plan that doesn't come to rest, or is too fast. A vehicle that is too near already is asked
-        to go no nearer, and to get away.
+        Minus infinity for a plan that isn't at rest in the end, up to `rest`, m/s, or is too fast. A vehicle that is
+        too near already is asked to go no nearer, and to get away.
         """
         scout, least = self.scouts[b], CONTACT_FACTOR * self.scouts[b].radius + SPARE
-        if not np.isfinite(X).all() or np.abs(X[-1, 3:6]).max() > 0.7 * AT_REST:
+        if not np.isfinite(X).all() or np.abs(X[-1, 3:6]).max() > rest:
             return -np.inf
         if np.abs(X[:, 3:6]).max() > max(self.explorer.speed + OVER, np.abs(X[0, 3:6]).max()):
             return -np.inf

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
 from torchgco.base.options import Above, Meters, NonNegative, Seconds, Within, check_options
 from torchgco.base.shapes import Dimensions
 from torchgco.constraints import ControlBounds, StateBounds
@@ -69,6 +70,11 @@ class Explorer:
 
     def __post_init__(self) -> None:
         check_options(self, "mission.explorer")
+        object.__setattr__(self, "around", tuple(self.around))
+        if self.region is not None:
+            object.__setattr__(self, "region", tuple(map(tuple, self.region)))
+            if any(low >= high for low, high in self.region):
+                raise InputError("mission.explorer.region", "pairs [low, high], low below high", self.region)
 
     @property
     def pace(self) -> Pace:

@@ -76,7 +76,17 @@ int64_t tgco_corridor(
                     for (int i = 0; i < 3; i++) n[i] = v[i];
                 }
             }
-            if (m == most || nearest < 1e-9) {
+            if (nearest < 1e-9) { /* no plane parts a point from the cubes that it lies in: the others count */
+                int64_t out = 0;
+                for (int64_t j = 0; j < count; j++) {
+                    double *c = own + 3 * j, *to = own + 3 * out;
+                    if (from_cube(q, c, half, v) < 1e-9) continue;
+                    to[0] = c[0], to[1] = c[1], to[2] = c[2], out++;
+                }
+                count = out, m--;
+                continue;
+            }
+            if (m == most) {
                 room[k] = nearest;
                 break;
             }
