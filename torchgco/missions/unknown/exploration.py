@@ -41,6 +41,7 @@ LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
 HELD = 2.0  # s before a search with less margin ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
+WAITS = 5  # knots before the first that is blocked
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
 
@@ -135,7 +136,7 @@ class Exploration:
             self._seek(scout, x[b].numpy())
         reference = self._reference(x)
         rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
-        former = rest if before is None else shifted(before.X[:, 1:, :3])
+        former = rest if before is None else self._clear_part(shifted(before.X[:, 1:, :3]))
         seeds = [former, reference[:, 1:, :3]]
         problem = self._problem(x, bias, reference, seeds)
         kept = self._kept(problem, before).take(slice(0, len(self.scouts)))
@@ -220,6 +221,17 @@ class Exploration:
             x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), stack[0], stack[1],
             torch.cat(list(seeds)).contiguous(), stack[2],
         )  # fmt: skip
+
+    def _clear_part(self, former: Tensor) -> Tensor:
+        """Positions (B, N, 3) of former plans; where one has become blocked, it waits some knots before that."""
+        former = former.clone()
+        for b, scout in enumerate(self.scouts):
+            least = CONTACT_FACTOR * scout.radius + SPARE
+            blocked = np.flatnonzero(scout.seen.gaps(former[b].numpy(), least + 0.01, self.kinds) < least)
+            if len(blocked):
+                at = max(0, int(blocked[0]) - WAITS)
+                former[b, at:] = former[b, at].clone()
+        return former
 
     def _kept(self, problem: Problem, before: Plan | None) -> Plan:
         """The former plans one stage later, brought back to by feedback; of a first plan, rest."""
