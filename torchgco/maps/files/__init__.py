@@ -1,4 +1,4 @@
-"""Maps from files: docs/map-files.md lists the formats.
+"""Maps from files: docs/maps.md lists the formats.
 
 Files of others are data only: no pickles, no code, no memory taken before sizes are checked. A wrong, cut or hostile
 file is one InputError with its name.
