@@ -33,7 +33,7 @@ def studies_here(monkeypatch) -> None:
         assert app.main() == 0
 
     monkeypatch.setattr(quality, "subprocess", SimpleNamespace(run=started, DEVNULL=subprocess.DEVNULL))
-    monkeypatch.setattr(study, "write_report", lambda folder, trajectories, figures: "")
+    monkeypatch.setattr(study, "write_report", lambda *arguments: "")
 
 
 @pytest.mark.parametrize("search", oracle.SEARCH)

@@ -65,8 +65,8 @@ def both(monkeypatch: pytest.MonkeyPatch, solve: Callable[[], SolveEnd]) -> tupl
     native = solve()
     real = Engine.__init__
 
-    def without(self: Engine, problem: Problem) -> None:
-        real(self, problem)
+    def without(self: Engine, *arguments: object) -> None:
+        real(self, *arguments)
         self.measures = False
 
     monkeypatch.setattr(Engine, "__init__", without)

@@ -70,8 +70,8 @@ def test_the_built_in_models_are_those_of_the_configurations() -> None:
         ("model=unicycle scenario=planar_trap", "model=planar, as planar_trap is 2-D with 6 states, got model=un"),
         (
             "model=quadrotor scenario=yard",
-            "expected model=unicycle, as yard is 2-D with 4 states, or scenario=crossing or forest or forest_moving or "
-            "mazes or walls or woods, got model=quadrotor",
+            "expected model=unicycle, as yard is 2-D with 4 states, or scenario=crossing or cylinders or forest or "
+            "forest_moving or mazes or walls or woods, got model=quadrotor",
         ),
         ("model=unicycle scenario=forest", "expected model=quadrotor, as forest is 3-D with 14 states"),
     ],
