@@ -272,8 +272,8 @@ class Exploration:
         found = self.local.solve(problem, kept.U.repeat(count, 1, 1), seed=self.seed)
         # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
         K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
-        cost = found.cost.masked_fill(unflyable(problem, found.X, found.U) > FLYABLE, torch.inf)
-        best = [self._best(found.X[b::B], cost[b::B], kept.X[b], b) for b in range(B)]
+        flyable = unflyable(problem, found.X, found.U) <= FLYABLE
+        best = [self._best(found.X[b::B], found.cost[b::B], flyable[b::B], kept.X[b], b) for b in range(B)]
         rows = torch.tensor([b + B * (choice or 0) for b, choice in enumerate(best)])
         new = torch.tensor([choice is not None for choice in best])
         wide = new.view(-1, 1, 1)
@@ -285,14 +285,14 @@ class Exploration:
             found.guided[rows], found.iterations[rows], one.x0, one.x0[:, :3], one.dynamics, 0,
         )  # fmt: skip
 
-    def _best(self, X: Tensor, cost: Tensor, kept: Tensor, b: int) -> int | None:
+    def _best(self, X: Tensor, cost: Tensor, flyable: Tensor, kept: Tensor, b: int) -> int | None:
         """Which of some plans (C, N+1, 14) of mission b is flown; None: the kept one (N+1, 14).
 
-        Costs (C,) are infinite of plans that the vehicle couldn't fly.
+        flyable (C,): whether it could be flown as it is. Where no plan is safe, nearly may do.
         """
         order = [int(c) for c in cost.argsort() if bool(torch.isfinite(cost[c]))]
         spare = {c: self.spare(X[c].numpy(), b) for c in order}
-        safe = next((c for c in order if spare[c] >= 0), None)
+        safe = next((c for c in order if spare[c] >= 0 and bool(flyable[c])), None)
         if safe is not None:
             return safe
         # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.
