@@ -123,6 +123,13 @@ def test_gaps_are_exact_up_to_their_reach() -> None:
     assert np.array_equal(seen.gaps(CORNER - np.eye(3), 0.7), np.zeros(3))
 
 
+def test_the_box_of_a_map_is_between_its_faces() -> None:
+    low, high = empty().box(0.5)
+    assert np.allclose(low, CORNER + 0.5) and np.allclose(high, CORNER + SPAN - 0.5)
+    low, high = empty().box(9.0)
+    assert np.allclose(low, CORNER + 0.5 * SPAN) and np.allclose(high, low)
+
+
 def test_a_corridor_holds_no_blocked_cell() -> None:
     rng = np.random.default_rng(5)
     seen, centers, reach = drawn(rng, 0.98), cubes(SHAPE, CORNER, SIZE), 1.2

@@ -40,9 +40,16 @@ def test_a_plan_near_a_cell_that_is_not_free_is_not(state: int) -> None:
         assert safe_periods(log_of(states, PLAN), radius, 0.05).tolist() == [safe]
 
 
-def test_a_plan_that_leaves_the_grid_is_not() -> None:
-    over = stopping(np.array([0.0, 0, 0]), np.array([4.2, 0, 0]))
-    assert safe_periods(log_of(FREE_ALL, over), 0.1, 0.05).tolist() == [False]
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_plan_that_leaves_the_grid_is_not(axis: int, side: int) -> None:
+    """Through any face, however far, and where it comes back, although all cells are free."""
+    start, face = np.array([0.1, 0.2, 0.0]), (CORNER, CORNER + SIZE * np.array(SHAPE))[side][axis]
+    for beyond in (-0.3, -0.05, 0.05, 3.0):
+        end = start.copy()
+        end[axis] = face + (beyond if side else -beyond)
+        for plan in (stopping(start, end), np.concatenate([stopping(start, end), stopping(end, start)])):
+            assert safe_periods(log_of(FREE_ALL, plan), 0.1, 0.05).tolist() == [beyond < -0.1]
 
 
 def test_cells_are_those_of_the_period() -> None:

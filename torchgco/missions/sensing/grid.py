@@ -106,6 +106,12 @@ class SeenMap:
         at = np.floor((np.asarray(point) - self.corner) / self.resolution).astype(np.int64)
         return np.clip(at, 0, self._size - 1)
 
+    def box(self, inset: float) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest point (3,), m, of what is left of the grid `inset`, m, within its faces."""
+        high = self.corner + self._size * self.resolution
+        by = np.minimum(inset, 0.5 * (high - self.corner))
+        return self.corner + by, high - by
+
     def centers(self, cells: np.ndarray) -> np.ndarray:
         """The centres (K, 3), m, of cells given by flat indices (K,)."""
         return self.corner + (np.stack(np.unravel_index(cells, self.shape), axis=-1) + 0.5) * self.resolution
@@ -125,6 +131,8 @@ class SeenMap:
 
     def corridor(self, points: np.ndarray, reach: float, most: int, kinds: int = NOT_FREE) -> tuple[np.ndarray, ...]:
         """Half-spaces n x >= b around points (K, 3) that cut off all cells of these kinds within `reach`, m.
+
+        The faces of the grid cut off nothing: see `box`.
 
         Returns:
             (K, most, 4): n and b, zeros where fewer planes are needed; and (K,), m: how far each point may move before

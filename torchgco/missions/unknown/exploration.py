@@ -24,7 +24,18 @@ from torchgco.missions.sensing.grid import NOT_FREE, SEEN_OCCUPIED, SeenMap
 from torchgco.missions.sensing.search import Search
 from torchgco.missions.sensing.sensors import Sensor
 from torchgco.missions.sensing.world import World
-from torchgco.missions.unknown.explorer import CORRIDOR, EARLY, HOVER, PLANES, Explorer, PlanningForm, Unknown
+from torchgco.missions.unknown.explorer import (
+    CORRIDOR,
+    EARLY,
+    FLYABLE,
+    HOVER,
+    PLANES,
+    Explorer,
+    PlanningForm,
+    Unknown,
+    unflyable,
+    within_bounds,
+)
 from torchgco.missions.unknown.reference import motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
 from torchgco.native.dispatch import followed
@@ -204,23 +215,22 @@ class Exploration:
     def _problem(self, x: Tensor, bias: Tensor, reference: Tensor, seeds: Sequence[Tensor]) -> Problem:
         """The planning problems, seed by seed."""
         C, N = len(seeds), self.explorer.stages
-        planes, room, allowed = [], [], []
+        planes, room, allowed, inside, regions = [], [], [], [], []
         for seed in seeds:
             for b, scout in enumerate(self.scouts):
                 began, keep = time.perf_counter(), self.keep(scout)
-                own, far = scout.seen.corridor(seed[b].numpy(), CORRIDOR, PLANES, self.kinds)
+                knots = np.clip(seed[b].numpy(), *scout.seen.box(keep))
+                own, far = scout.seen.corridor(knots, CORRIDOR, PLANES, self.kinds)
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
                 near = np.full(N, keep)
                 near[:EARLY] = min(keep, max(gap - 0.01, CONTACT_FACTOR * scout.radius))
-                for parts, part in ((planes, own), (room, far), (allowed, near)):
+                new = ((planes, own), (room, far), (inside, knots), (allowed, near), (regions, scout.seen.box(0.0)))
+                for parts, part in new:
                     parts.append(part)
                 scout.seconds["field_seconds"] += time.perf_counter() - began
         form = PlanningForm(self.explorer, self.planner, _repeated(self.whole, C))
-        stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, allowed)]
-        return form.problem(
-            x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), stack[0], stack[1],
-            torch.cat(list(seeds)).contiguous(), stack[2],
-        )  # fmt: skip
+        stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, inside, allowed, regions)]
+        return form.problem(x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), *stack)
 
     def _clear_part(self, former: Tensor) -> Tensor:
         """Positions (B, N, 3) of former plans; where one has become blocked, it waits some knots before that."""
@@ -244,7 +254,7 @@ class Exploration:
             C = problem.B // before.X.shape[0]
             X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
             X[:, -1], U[:, -1] = _resting(X[:, -1]), problem.cost.rest_controls(U[:, -1:])[:, 0]
-            X, U = followed(problem, X, U, K)
+            X, U = within_bounds(problem, *followed(problem, X, U, K), X, U, K)
             penalty = before.penalty.repeat(C)
         none = torch.zeros(problem.B, dtype=torch.int64)
         return Plan(
@@ -262,7 +272,8 @@ class Exploration:
         found = self.local.solve(problem, kept.U.repeat(count, 1, 1), seed=self.seed)
         # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
         K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
-        best = [self._best(found.X[b::B], found.cost[b::B], kept.X[b], b) for b in range(B)]
+        flyable = unflyable(problem, found.X, found.U) <= FLYABLE
+        best = [self._best(found.X[b::B], found.cost[b::B], flyable[b::B], kept.X[b], b) for b in range(B)]
         rows = torch.tensor([b + B * (choice or 0) for b, choice in enumerate(best)])
         new = torch.tensor([choice is not None for choice in best])
         wide = new.view(-1, 1, 1)
@@ -274,11 +285,14 @@ class Exploration:
             found.guided[rows], found.iterations[rows], one.x0, one.x0[:, :3], one.dynamics, 0,
         )  # fmt: skip
 
-    def _best(self, X: Tensor, cost: Tensor, kept: Tensor, b: int) -> int | None:
-        """Which of some plans (C, N+1, 14) of mission b is flown; None: the kept one (N+1, 14)."""
+    def _best(self, X: Tensor, cost: Tensor, flyable: Tensor, kept: Tensor, b: int) -> int | None:
+        """Which of some plans (C, N+1, 14) of mission b is flown; None: the kept one (N+1, 14).
+
+        flyable (C,): whether it could be flown as it is. Where no plan is safe, nearly may do.
+        """
         order = [int(c) for c in cost.argsort() if bool(torch.isfinite(cost[c]))]
         spare = {c: self.spare(X[c].numpy(), b) for c in order}
-        safe = next((c for c in order if spare[c] >= 0), None)
+        safe = next((c for c in order if spare[c] >= 0 and bool(flyable[c])), None)
         if safe is not None:
             return safe
         # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.

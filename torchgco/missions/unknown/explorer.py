@@ -29,6 +29,8 @@ Acceleration = Annotated[float, Above(0, "m/s^2")]
 PLANES = 8  # half-spaces of a knot at most
 CORRIDOR = 2.5  # m around a knot, within which cells make half-spaces
 REST = {3: 0.05, 4: 0.05, 5: 0.05, 7: 0.03, 8: 0.03, 10: 0.05, 11: 0.05, 12: 0.05, 13: 0.3}  # of the last two states
+FLYABLE = 0.02  # at most, by which a plan exceeds controls, misses its first step or doesn't rest, in their units
+PLACES = (0, 2)  # of a form's constraints: those of positions
 EARLY = 10  # knots in which a vehicle may leave a margin that it has entered
 # Weights of a plan: positions and velocities along the reference, attitude with yaw, body rates, thrust; controls.
 STATE = [4.0, 4.0, 8.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 8.0, 0.5, 0.5, 0.5, 0.1]
@@ -107,7 +109,15 @@ class PlanningForm:
     whole: Problem
 
     def problem(
-        self, x: Tensor, bias: Tensor, reference: Tensor, planes: Tensor, room: Tensor, seeds: Tensor, allowed: Tensor
+        self,
+        x: Tensor,
+        bias: Tensor,
+        reference: Tensor,
+        planes: Tensor,
+        room: Tensor,
+        seeds: Tensor,
+        allowed: Tensor,
+        region: Tensor,
     ) -> Problem:
         """The problems from plants x (B, 17).
 
@@ -116,6 +126,7 @@ class PlanningForm:
             reference: states (B, N+1, 14) to follow.
             planes: (B, N, R, 4), see `SeenMap.corridor`; room (B, N), m; seeds (B, N, 3), m: where they were made.
             allowed: (B, N), m: distance that each knot keeps from what isn't known to be free.
+            region: (B, 2, 3), m: the lowest and the highest point of the map, which half-spaces don't know.
         """
         whole, N = self.whole, self.explorer.stages
         x0 = planning_state(x, self.planner.airframe)
@@ -125,7 +136,7 @@ class PlanningForm:
         constraints: list[Constraint] = [
             HalfSpaces(normals, offsets),
             self._controls(),
-            self._limits(seeds, room, allowed),
+            self._limits(seeds, room, allowed, region),
             self._rest(N),
         ]
         if self.planner.first_step:
@@ -138,12 +149,15 @@ class PlanningForm:
         lower, upper = bounds.by_knot
         return ControlBounds(lower[:, 0], upper[:, 0])
 
-    def _limits(self, seeds: Tensor, room: Tensor, allowed: Tensor) -> StateBounds:
-        """Speeds, and positions around the seeds within which the half-spaces hold."""
+    def _limits(self, seeds: Tensor, room: Tensor, allowed: Tensor, region: Tensor) -> StateBounds:
+        """Speeds, and positions within the map, around the seeds as far as the half-spaces hold."""
         wide = ((room - allowed) / 3**0.5).clamp(min=0.05).unsqueeze(-1)
         upper = seeds.new_full((*seeds.shape[:2], 14), torch.inf)
         lower = -upper
-        lower[..., :3], upper[..., :3] = seeds - wide, seeds + wide
+        low, high = region[:, :1], region[:, 1:]
+        inset = torch.minimum(allowed.unsqueeze(-1), 0.5 * (high - low))
+        lower[..., :3] = torch.maximum(seeds - wide, low + inset)
+        upper[..., :3] = torch.minimum(seeds + wide, high - inset)
         lower[..., 3:6], upper[..., 3:6] = -self.explorer.speed, self.explorer.speed
         return StateBounds(lower, upper)
 
@@ -167,3 +181,37 @@ class PlanningForm:
             middle = HOVER if i == 13 else 0.0
             lower[i], upper[i] = middle - size, middle + size
         return StateBounds(lower, upper, knots=[N - 1, N])
+
+
+def unflyable(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """By how much plans (B, N+1, 14), (B, N, 4) break what the vehicle can do, (B,), in units of each constraint.
+
+    Of a `PlanningForm`: bounds of the controls, rest at the end, and the first step; where it leads doesn't count.
+    """
+    parts = [part.value(X, U) for i, part in enumerate(problem.constraints) if i not in PLACES]
+    return torch.stack([part.flatten(1).amax(-1) for part in parts]).amax(0).nan_to_num(nan=torch.inf)
+
+
+def within_bounds(
+    problem: Problem, X: Tensor, U: Tensor, former: Tensor, controls: Tensor, K: Tensor
+) -> tuple[Tensor, Tensor]:
+    """X (B, N+1, n) and U (B, N, m) of feedback K around a former plan, with controls cut off at their bounds.
+
+    The vehicle wouldn't follow a plan that asks for more. `X`, `U`: the same without bounds, kept where those hold.
+    """
+    bounds = problem.control_bounds
+    assert bounds is not None
+    lower, upper = (bound.expand(*U.shape) for bound in bounds.by_knot)
+    over = torch.maximum(lower - U, U - upper).flatten(1).amax(-1)
+    rows = (~(over <= FLYABLE)).nonzero().flatten()
+    if rows.numel() == 0:
+        return X, U
+    X, U, K = X.clone(), U.clone(), K.nan_to_num(0.0, 0.0, 0.0)
+    model, x = problem.dynamics.take(rows), problem.x0[rows]
+    X[rows, 0] = x
+    for k in range(U.shape[1]):
+        away = (K[rows, k] * (x - former[rows, k]).unsqueeze(1)).sum(-1)
+        u = torch.clamp(controls[rows, k] + away, lower[rows, k], upper[rows, k])
+        x = model.at(k).step(x, u)
+        U[rows, k], X[rows, k + 1] = u, x
+    return X, U

@@ -1,0 +1,108 @@
+"""Plans near the faces of the map: they stay within, and ask for what the vehicle can do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.missions.missions import REST
+from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, presets
+from torchgco.missions import Planner
+from torchgco.missions.plant import hovering
+from torchgco.missions.sensing import Lidar
+from torchgco.missions.sensing.grid import FREE
+from torchgco.missions.unknown.exploration import Exploration
+from torchgco.missions.unknown.explorer import FLYABLE, PLACES, Explorer, unflyable, within_bounds
+from torchgco.native.dispatch import followed
+
+LOW, HIGH = -0.5, 3.0  # m: floor and ceiling of the map
+LEAST, MOST = [-5.0, -5.0, -5.0, 0.26], [5.0, 5.0, 5.0, 14.9]  # controls
+
+
+def exploring(height: float) -> tuple[Exploration, Tensor]:
+    """A vehicle (1, 17) at a height, m, with 0.85 of the thrust that would carry it; a goal far ahead in free space."""
+    start, goal = torch.tensor([REST]).double(), torch.tensor([[12.0, 0.0, height]]).double()
+    start[:, 2] = height
+    cost = QuadraticCost(Q=[1.0] * 14, R=[1.0] * 4, Qf=[1.0] * 14, x_ref=REST, u_ref=[0, 0, 0, 9.81])
+    far = Boxes([[30.0, 0.0, 0.0]], [[0.2, 0.2, 0.2]], 0.1)
+    problem = Problem(QuadrotorPlanning(dt=0.05), cost, [far, ControlBounds(LEAST, MOST)], start, 20, Goal(goal, 0.4))
+    explorer = Explorer(region=((-2.0, 14.0), (-2.0, 2.0), (LOW, HIGH)), known=20.0)
+    planner = Planner(presets.gco(3))
+    exploration = Exploration(explorer, planner, Lidar(), "occupied", problem, 0, torch.tensor([0]))
+    exploration.sense(0, hovering(planner.airframe, start[:, :3]), hovering(planner.airframe, start[:, :3]))
+    x = hovering(planner.airframe, start[:, :3])
+    x[:, 13:] *= 0.85
+    return exploration, x
+
+
+def test_the_cheapest_plan_near_the_floor_of_the_map_stays_within() -> None:
+    """It would dip on the way: thrust changes slowly, and the reference runs ahead."""
+    exploration, x = exploring(LOW + 0.6)
+    lowest, best = [], exploration._best
+
+    def choose(X: Tensor, *others: Any) -> int | None:
+        lowest.append(float(X[..., 2].min()))
+        return best(X, *others)
+
+    exploration._best = choose  # type: ignore[method-assign]
+    before = None
+    for step in range(3):
+        before, _ = exploration.plan(step, x, before)
+        assert not before.shifted[0] and exploration.is_safe(before.X[0].numpy(), 0)
+    assert len(lowest) == 3 and min(lowest) > LOW
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("side", [0, 1])
+def test_what_leaves_the_map_breaks_the_planning_problem(axis: int, side: int) -> None:
+    """Also where the former plan, around which half-spaces are made, was there, and for each face."""
+    exploration, x = exploring(1.0)
+    seen = exploration.scouts[0].seen
+    seen.state[:] = FREE
+    bias, reference = x.new_zeros(1, 3), exploration._reference(x)
+    seed = x[:, None, :3].repeat(1, exploration.explorer.stages, 1)
+    seed[..., axis] = float(seen.box(0.0)[side][axis]) + (0.1 if side else -0.1)
+    problem = exploration._problem(x, bias, reference, [seed])
+    X = reference.clone()
+    U = problem.cost.rest_controls(x.new_zeros(1, exploration.explorer.stages, 4))
+    X[:, 1:, :3], X[..., 3:6] = seed, 0.0
+    assert max(float(problem.constraints[i].value(X, U).max()) for i in PLACES) >= 0.1
+    assert not exploration.is_safe(X[0].numpy(), 0)
+
+
+def test_a_plan_that_cannot_be_flown_is_not() -> None:
+    exploration, x = exploring(1.0)
+    plan, _ = exploration.plan(0, x, None)
+    cost, X = torch.zeros(2).double(), plan.X.repeat(2, 1, 1)
+    kept = plan.X[0]
+    assert exploration._best(X, cost, torch.tensor([False, True]), kept, 0) == 1
+    assert exploration._best(X, cost, torch.tensor([False, False]), kept, 0) is None
+    reference = exploration._reference(x)
+    problem = exploration._problem(x, x.new_zeros(1, 3), reference, [reference[:, 1:, :3]])
+    assert float(unflyable(problem, plan.X, plan.U)[0]) <= FLYABLE
+    for wrong in (plan.U + 9.0, plan.U - 20.0):
+        assert float(unflyable(problem, plan.X, wrong)[0]) > 1.0
+    falling = plan.X.clone()
+    falling[:, -1, 13] -= 2.0  # its velocity is still that of rest, its thrust isn't
+    assert float(unflyable(problem, falling, plan.U)[0]) > 1.0
+
+
+def test_a_former_plan_asks_for_no_more_than_the_bounds() -> None:
+    exploration, x = exploring(1.0)
+    plan, _ = exploration.plan(0, x, None)
+    x[:, 2] -= 0.5
+    reference = exploration._reference(x)
+    problem = exploration._problem(x, x.new_zeros(1, 3), reference, [reference[:, 1:, :3]])
+    X, U = followed(problem, plan.X, plan.U, plan.K)
+    assert float(unflyable(problem, X, U)[0]) > 1.0
+    X, U = within_bounds(problem, X, U, plan.X, plan.U, plan.K)
+    for i, (low, high) in enumerate(zip(LEAST, MOST, strict=True)):
+        assert low <= float(U[..., i].min()) and float(U[..., i].max()) <= high
+    state = X[:, 0]
+    assert torch.equal(state, problem.x0)
+    for k in range(U.shape[1]):
+        state = problem.dynamics.at(k).step(state, U[:, k])
+        assert torch.allclose(state, X[:, k + 1])
