@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import torch
@@ -13,12 +13,15 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import AtLeast, Below, Count, Positive, check_options
 from torchgco.base.shapes import check_shape, tensor
 from torchgco.base.tree import take
+from torchgco.constraints.bounds import ControlBounds
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
+from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.roadmap.geometry import Inflated, length, points_along
 from torchgco.search.candidates import Candidates, inner_solver
+from torchgco.search.nearby import without_obstacles
 from torchgco.solvers.ilqr import descend
 
 OFFSET_LASTS = 0.1  # share of the horizon that an initial offset lasts
@@ -34,6 +37,7 @@ class Free(NamedTuple):
 
     cost: Tensor  # (B,)
     share: Tensor  # (B,): of the horizon, until a tenth of the distance to the goal is left; infinite where never
+    slower: Tensor  # (B,): times as long as that takes within the limits on states, at least 1
     iterations: Tensor  # (B,) int64
 
 
@@ -126,9 +130,12 @@ class Follow:
         paces, K = len(self.paces), paths.corners.shape[1]
         path = paths.corners.flatten(0, 1).repeat_interleave(paces, dim=0)
         arrive = path.new_tensor(self.paces).repeat(path.shape[0] // paces)
+        if free is not None:
+            slower = free.slower.repeat_interleave(K * paces)
+            arrive = torch.minimum(self.depart + (arrive - self.depart) * slower, arrive.clamp(min=1.0))
         if self.pace is not None:
             assert free is not None
-            shares = (free.share.unsqueeze(-1) * paths.stretch()).nan_to_num(torch.inf)
+            shares = ((free.share * free.slower).unsqueeze(-1) * paths.stretch()).nan_to_num(torch.inf)
             latest = self.pace * shares.flatten().repeat_interleave(paces)
             arrive = torch.minimum(arrive, latest.clamp(min=self.depart + SHORTEST))
         center = self._centers(path, arrive, candidates.problem, paths)
@@ -156,14 +163,32 @@ class Follow:
         return center
 
 
-def unconstrained(problem: Problem, rest: Tensor, iterations: int) -> Free:
-    """The trajectories without constraints, from the controls `rest` (B, N, m)."""
+def unconstrained(problem: Problem, rest: Tensor, iterations: int, unit: Tensor) -> Free:
+    """The trajectories without constraints, from the controls `rest` (B, N, m); unit (B,): q0 / R^4."""
     end, _ = descend(inner_solver(iterations), plain(problem), rest)
+    share, slower, made = _share(problem, end.X), torch.ones_like(end.cost), end.iterations
+    bare = without_obstacles(problem) if limits_states(problem) else None
+    if bare is not None:
+        limits = Lagrangian(bare, replace(Multipliers.zero(bare, 0.0), mu=TRACK_PENALTY * unit), None, True)
+        limited, _ = descend(inner_solver(iterations), limits, end.U)
+        slower = (_share(problem, limited.X) / share).nan_to_num(1.0).clamp(min=1.0)
+        made = made + limited.iterations
+    return Free(end.cost, share, slower, made)
+
+
+def limits_states(problem: Problem) -> bool:
+    """Whether rows besides obstacles and control bounds may limit how fast a vehicle is."""
+    others = (part for part in problem.constraints if not isinstance(part, Obstacles | ControlBounds))
+    return any(part.sense == "inequality" for part in others)
+
+
+def _share(problem: Problem, X: Tensor) -> Tensor:
+    """Share (B,) of the horizon until a tenth of the distance to the goal is left; infinite where never."""
     assert problem.goal is not None
-    left = problem.goal.distance(end.X[..., problem.position])
+    left = problem.goal.distance(X[..., problem.position])
     near = left <= LAST_PART * left[:, :1]
     share = near.to(torch.int8).argmax(-1).to(left) / problem.stages
-    return Free(end.cost, torch.where(near.any(-1), share, torch.inf), end.iterations)
+    return torch.where(near.any(-1), share, torch.inf)
 
 
 def plain(problem: Problem) -> Lagrangian:

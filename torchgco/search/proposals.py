@@ -29,7 +29,7 @@ from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.homotopy import classes
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
-from torchgco.search.following import Follow, Free, Paths, plain, unconstrained
+from torchgco.search.following import Follow, Free, Paths, limits_states, plain, unconstrained
 from torchgco.search.record import comparison
 from torchgco.solution import SearchRecord
 
@@ -151,7 +151,8 @@ class PathProposals:
             whole.paths = paths
         note = None if whole.record is None else partial(whole.note, rows, paths, self.refine)
         for follow in self.follow:
-            free = None if follow.pace is None else take(whole.free(follow.iterations), rows)
+            paced = follow.pace is not None or limits_states(problem)
+            free = take(whole.free(follow.iterations), rows) if paced else None
             new, old = self._along(problem, rest, paths, follow, free, watch, note), take(whole.proposal, rows)
             better = (~old.found | (new.found & (new.cost < old.cost))).nonzero().flatten()
             put(whole.proposal, rows[better], take(new, better))
@@ -236,7 +237,9 @@ class Part:
     def free(self, iterations: int) -> Free:
         """The trajectories without constraints, solved at the first call; their iterations count as the proposals'."""
         if self._free is None:
-            self._free = unconstrained(self.problem, self.rest, iterations)
+            assert self.scene is not None
+            _, unit = seen.scales(self.problem, self.scene, self.rest)
+            self._free = unconstrained(self.problem, self.rest, iterations, unit.nan_to_num(1.0, 1.0, 1.0))
             self.proposal.iterations.add_(self._free.iterations)
         return self._free
 
