@@ -20,7 +20,7 @@ from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.points import MIDWAY, RAYS, SHELLS, directions, of_boxes
-from torchgco.roadmap.search import CLEAR, EDGE_COST, HOPS, SMALL, TIE, Graph
+from torchgco.roadmap.search import CLEAR, EDGE_COST, HOPS, SMALL, TIE, Beside, Graph
 
 PROBLEMS_AT_ONCE = 64  # problems searched together
 BLOCK, SIDE = 32, 8  # edges measured side by side; of those near a box, so many at once
@@ -76,14 +76,16 @@ class NativeSearch:
     obstacles: Inflated
     margin: float
 
-    def graph(self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int) -> Graph:
+    def graph(
+        self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int, beside: Beside = None
+    ) -> Graph:
         (B, d), (spheres, boxes, _) = start.shape, self.obstacles
         M = spheres.radii.shape[1]
         rays, shell = directions(start, goal), start.new_tensor(SHELLS[d])
         count, more = M * (RAYS * len(shell) + min(MIDWAY, M)), {}
         reach = torch.stack(self.obstacles.region(start, goal), dim=1)
         if boxes is not None:
-            more["beside"], more["exists"] = of_boxes(boxes, spheres, start, goal)
+            more["beside"], more["exists"] = beside or of_boxes(boxes, spheres, start, goal)
             count += more["beside"].shape[1]
         V, K = 2 + len(cube) + min(nodes, count), neighbours + hubs + 1
         made = Graph(start.new_empty(B, V, d), torch.empty(B, V, K, dtype=torch.int32), start.new_empty(B, V, K))
