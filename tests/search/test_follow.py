@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 
 from tests.reference import boxes as brute_force
@@ -12,6 +11,7 @@ from tests.search.rows import proposed, restarts, varied
 from tests.search.scenes import NONE, inflated
 from tests.search.test_paths import alone
 from torchgco import AugmentedLagrangian, PathProposals, Problem, compose, judge
+from torchgco.base.tree import take
 from torchgco.lagrangian.rollout import open_loop
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.candidates import Candidates
@@ -154,24 +154,38 @@ def test_corners_are_averaged_less_where_the_average_would_cut_an_obstacle() -> 
     centers = followed(corner, *options, spheres, torch.full((2,), 0.3, dtype=torch.float64))
     plain = travel(corner, *options)
     assert torch.equal(centers[1], plain[1])
-    deepest = [float(spheres.depth(points).amax(-1)[0]) for points in (plain, centers)]
-    assert deepest[1] <= CUT * 0.3 < deepest[0]
+    limit = torch.full((2,), CUT * 0.3, dtype=torch.float64)
+    assert [bool(spheres.deeper(points, limit)[0].any()) for points in (plain, centers)] == [True, False]
 
 
-def test_the_depth_of_points_against_brute_force() -> None:
+def test_every_path_is_averaged_as_it_is_alone() -> None:
+    corner = torch.tensor([[[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]], [[-1.0, 0.0], [0.0, 0.2], [1.0, 0.0]]]).double()
+    path, R = corner[[0, 1, 1, 0, 0, 1]], torch.tensor([0.3, 0.3, 0.2]).double()
+    spheres = inflated([[[0.0, 0.6]], [[0.0, -0.6]], [[0.1, 0.5]]], [[0.3], [0.3], [0.2]])
+    options = 0.0, END.expand(6), 0.5, 100
+    whole = followed(path, *options, spheres, R)
+    assert not torch.equal(whole, travel(path, *options))
+    for i in range(6):
+        b = torch.tensor([i // 2])
+        assert torch.equal(whole[i : i + 1], followed(path[i : i + 1], 0.0, END, 0.5, 100, take(spheres, b), R[b]))
+
+
+def test_how_deep_points_lie_against_brute_force() -> None:
     setup = compose(["scenario=mazes", "scenario.walls=1", "study.layouts=2"])
     layouts = setup.layouts()
     task = setup.task(layouts)
     scene = scene_of(task.problem, task.U0)
     assert scene is not None and layouts.box_centers is not None and layouts.box_half_sizes is not None
     assert layouts.box_rotations is not None
-    points = np.random.default_rng(3).uniform((3.0, -4.0, -3.0), (16.0, 6.0, 3.0), (2, 40, 3))
-    found = scene.obstacles.depth(torch.as_tensor(points))
+    points = np.random.default_rng(3).uniform((3.0, -4.0, -3.0), (16.0, 6.0, 3.0), (2, 150, 3))
+    limits = (0.0, 0.1, 0.3)
+    found = [scene.obstacles.deeper(torch.as_tensor(points), torch.full((2,), at).double()) for at in limits]
+    assert all(0 < int(deep.sum()) < 300 for deep in found)
     for b in range(2):
         boxes = list(zip(layouts.box_centers[b], layouts.box_half_sizes[b], layouts.box_rotations[b], strict=True))
-        for i in range(40):
+        for i in range(150):
             nearest = min(brute_force.distance(points[b, i], *box, 0.36) for box in boxes)
-            assert float(found[b, i]) == pytest.approx(-nearest, abs=1e-9)
+            assert [bool(deep[b, i]) for deep in found] == [-nearest > at for at in limits]
 
 
 def test_a_path_through_doors_is_followed_closer_where_no_candidate_arrives() -> None:

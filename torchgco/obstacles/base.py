@@ -55,6 +55,11 @@ class Solids:
         """Distances (B, V, M) of points (B, V, d) from the grown surfaces, m; negative inside."""
         return self.squares(points).sqrt_() - self.radii.unsqueeze(1)
 
+    def deeper(self, points: Tensor, than: Tensor) -> Tensor:
+        """Whether points (B, V, d) lie deeper than lengths (B,) >= 0, m, beneath the surface of one present, (B, V)."""
+        deep = self.signed_distance(points) < -than.view(-1, 1, 1)
+        return (deep & ~self.absent.unsqueeze(1)).any(-1)
+
 
 class Obstacles(Constraint):
     """Obstacles that the vehicle's position keeps clear of, M per problem, once bound.

@@ -20,13 +20,20 @@ from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.points import MIDWAY, RAYS, SHELLS, directions, of_boxes
-from torchgco.roadmap.search import CLEAR, EDGE_COST, HOPS, SMALL, TIE, Graph
+from torchgco.roadmap.search import CLEAR, EDGE_COST, HOPS, SMALL, TIE, Beside, Graph
 
 PROBLEMS_AT_ONCE = 64  # problems searched together
+BLOCK, SIDE = 32, 8  # edges measured side by side; of those near a box, so many at once
 
 SEARCH, BOXES = (Path(__file__).parent / "c" / name for name in ("search.c", "boxes.h"))
 BOX = Path(__file__).parents[1] / "native" / "c" / "box.h"
-SCALARS = "#define V double\n#define tgco_choose(where, a, b) ((where) ? (a) : (b))"  # box.h for one number at a time
+# What box.h needs, for SIDE edges in a vector.
+VECTORS = """
+typedef double V __attribute__((vector_size(SIDE * sizeof(double))));
+typedef __typeof__((V){0} == (V){0}) I;
+#define SET(c) ((double)(c) - (V){0})
+static inline V tgco_choose(I where, V a, V b) { return (V)((where & (I)a) | (~where & (I)b)); }
+"""
 # Fused products and sums would be rounded once where PyTorch rounds twice.
 FLAGS = ("-ffp-contract=off",)
 
@@ -69,14 +76,16 @@ class NativeSearch:
     obstacles: Inflated
     margin: float
 
-    def graph(self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int) -> Graph:
+    def graph(
+        self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int, beside: Beside = None
+    ) -> Graph:
         (B, d), (spheres, boxes, _) = start.shape, self.obstacles
         M = spheres.radii.shape[1]
         rays, shell = directions(start, goal), start.new_tensor(SHELLS[d])
         count, more = M * (RAYS * len(shell) + min(MIDWAY, M)), {}
         reach = torch.stack(self.obstacles.region(start, goal), dim=1)
         if boxes is not None:
-            more["beside"], more["exists"] = of_boxes(boxes, spheres, start, goal)
+            more["beside"], more["exists"] = beside or of_boxes(boxes, spheres, start, goal)
             count += more["beside"].shape[1]
         V, K = 2 + len(cube) + min(nodes, count), neighbours + hubs + 1
         made = Graph(start.new_empty(B, V, d), torch.empty(B, V, K, dtype=torch.int32), start.new_empty(B, V, K))
@@ -155,11 +164,10 @@ def library_for(like: Tensor, boxes: bool = False) -> ctypes.CDLL | None:
 @functools.cache
 def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.CDLL | None:
     # Without boxes their code is left out, so that it can't change how the spheres' code is compiled.
-    constants = {"DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": SMALL}
-    parts = [BOX, BOXES, SEARCH] if boxes else [SEARCH]
-    texts = (SCALARS, *(part.read_text() for part in parts))
+    constants = {"DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": SMALL, "BLOCK": BLOCK, "SIDE": SIDE}
+    own = [VECTORS, BOX.read_text(), BOXES.read_text()] if boxes else []
     try:
-        return load("\n".join((head([Arguments], [], constants), *texts)), [Arguments], FLAGS)
+        return load("\n".join((head([Arguments], [], constants), *own, SEARCH.read_text())), [Arguments], FLAGS)
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)

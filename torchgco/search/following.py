@@ -226,14 +226,18 @@ def followed(
         R: mean inflated radius (B,), m.
     """
     center, B = travel(path, depart, arrive, smoothing, N), R.shape[0]
-    while B > 0 and smoothing * N >= 2.0:
-        points = center[:, :: max(1, N // DEPTH_POINTS)]
-        deepest = obstacles.depth(points.reshape(B, -1, points.shape[-1])).view(B, -1, points.shape[1]).amax(-1)
-        deep = deepest > CUT * R.unsqueeze(-1)
-        if not bool(deep.any()):
+    each, some = path.shape[0] // max(1, B), torch.arange(B, device=path.device)  # the problems with deep paths
+    while some.numel() > 0 and smoothing * N >= 2.0:
+        points = center.view(B, each, N + 1, -1)[some, :, :: max(1, N // DEPTH_POINTS)]
+        deep = obstacles.deeper(points.flatten(1, 2), CUT * R).view(*points.shape[:3]).any(-1)
+        rows = (some.unsqueeze(-1) * each + torch.arange(each, device=path.device))[deep]
+        if rows.numel() == 0:
             break
         smoothing *= 0.5
-        center = torch.where(deep.view(-1, 1, 1), travel(path, depart, arrive, smoothing, N), center)
+        center[rows] = travel(path[rows], depart, arrive[rows], smoothing, N)
+        again = deep.any(-1)
+        if not bool(again.all()):
+            some, obstacles, R = some[again], take(obstacles, again.nonzero().flatten()), R[again]
     return center
 
 
