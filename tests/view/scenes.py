@@ -73,7 +73,7 @@ def sensed() -> Sensed:
         cells = [(k // 4, y, z) for y in (3, 4) for z in range(4)] if k % 4 == 0 and k < 40 else []
         states = [FREE] * len(cells)
         if k in (10, 30):
-            cells, states = [*cells, (5, 6, 2)], [*states, OCCUPIED if k == 10 else FREE]
+            cells, states = [*cells, (5, 6, 1)], [*states, OCCUPIED if k == 10 else FREE]
         flat = np.array([np.ravel_multi_index(cell, shape) for cell in cells], dtype=np.int32)
         changes.append((flat, np.array(states, dtype=np.uint8)))
     path = trajectories(1)[SOLVERS[0]][0].numpy()

@@ -7,6 +7,7 @@ measured states: a log need not hold what it can be found again from. Plans are 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +36,9 @@ class Replay:
     sought: list[np.ndarray]
 
 
-def replayed(mission: Mission, problem: Problem, x: Tensor, seed: int, number: int) -> Replay:
+def replayed(
+    mission: Mission, problem: Problem, x: Tensor, seed: int, number: int, report: Callable[[], object] = lambda: None
+) -> Replay:
     """What the vehicle of a mission saw and sought.
 
     Args:
@@ -43,6 +46,7 @@ def replayed(mission: Mission, problem: Problem, x: Tensor, seed: int, number: i
         problem: a batch of one: the planning problem it was flown from.
         x: (K, 17): true states at the starts of its control periods.
         seed, number: the key of its random draws.
+        report: called after each control period.
 
     Raises:
         InputError: a mission without a sensor, more than one problem, or states of another shape.
@@ -63,4 +67,5 @@ def replayed(mission: Mission, problem: Problem, x: Tensor, seed: int, number: i
         path = np.concatenate([found[0, None, :3].numpy(), scout.path[1:]])
         near = np.linalg.norm(path[-1] - scout.goal) <= ARRIVES * scout.seen.resolution
         sought.append(np.concatenate([path, scout.goal[None]]) if near else path)
+        report()
     return Replay(scout.log, sought)

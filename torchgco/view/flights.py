@@ -72,7 +72,7 @@ class Flight:
         if self.plan is not None:
             held["plan"] = packing.put(np.nan_to_num(self.plan), steps=True)
         if self.sensed is not None:
-            held["sensed"] = self.sensed.until(len(self.path)).packed(packing)
+            held["sensed"] = self.sensed.until(len(self.path)).packed(packing, self.path[:, 2])
         return held
 
 

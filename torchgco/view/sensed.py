@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from torchgco.missions.sensing.grid import OCCUPIED
 from torchgco.missions.unknown.safety import SeenLog
 from torchgco.view.packing import Packing
 
@@ -34,10 +35,17 @@ class Sensed:
         seen = SeenLog(log.corner, log.shape, log.resolution, log.changes[:periods], log.safe[:periods])
         return Sensed(seen, self.sought[:periods], self.safe[:periods])
 
-    def packed(self, packing: Packing) -> dict[str, Any]:
-        """As the page reads it: a change is the number of its cell plus its new state times the number of all cells."""
-        log, cells = self.seen, int(np.prod(self.seen.shape))
-        changes = [np.sort(at.astype(np.int64) + cells * states.astype(np.int64)) for at, states in log.changes]
+    def packed(self, packing: Packing, heights: np.ndarray) -> dict[str, Any]:
+        """As the page reads it: a change is the number of its cell plus its new state times the number of all cells.
+
+        Args:
+            heights: (K,), m, of the vehicle; free cells are shown, and kept, where it flies alone.
+        """
+        log, cells, kept = self.seen, int(np.prod(self.seen.shape)), self._kept(heights)
+        changes = [
+            np.sort(at[kept[at]].astype(np.int64) + cells * states[kept[at]].astype(np.int64))
+            for at, states in log.changes
+        ]
         paths = [corners(path) for path in self.sought]
         none = np.zeros(0, np.int64)
         return {
@@ -48,6 +56,17 @@ class Sensed:
             "corners": packing.put_whole(np.array([len(path) for path in paths])),
             "safe": [int(one) for one in self.safe],
         }  # fmt: skip
+
+    def _kept(self, heights: np.ndarray) -> np.ndarray:
+        """Which cells, by flat index, are occupied at any time, or at a height where the vehicle flies."""
+        log = self.seen
+        kept = np.zeros(log.shape, dtype=bool)
+        levels = np.floor((heights - log.corner[2]) / log.resolution).clip(0, log.shape[2] - 1).astype(int)
+        kept[:, :, levels.min() : levels.max() + 1] = True
+        flat = kept.reshape(-1)
+        for at, states in log.changes:
+            flat[at[states == OCCUPIED]] = True
+        return flat
 
 
 def corners(path: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from tqdm import tqdm
 
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_report import PLANS
@@ -24,6 +25,7 @@ from torchgco.view.sensed import Sensed
 from torchgco.view.vehicles import Look
 
 QUADROTOR = Look("quadrotor", quaternion=slice(6, 10))  # the plant
+SLOW = 100  # control periods from which on a bar shows how far a map is
 DRAWN = 13  # of its states: those that place it and turn it come before the rotors'
 
 
@@ -84,7 +86,8 @@ class _Log:
             return replace(flight, plan=None if plan is None else plan[: len(flight.path)])
         x = torch.tensor(steps[[f"x{i}" for i in range(STATES)]].to_numpy(dtype=float))
         try:
-            replay = replayed(loop, problem, x, study.seed, number)
+            with tqdm(total=len(x), desc="map", unit="period", leave=False, disable=len(x) < SLOW) as bar:
+                replay = replayed(loop, problem, x, study.seed, number, bar.update)
         except NativeError as error:
             notes += [] if notes else [f"no map: {str(error).splitlines()[0]}"]
             return replace(flight, plan=plan[: len(flight.path)])

@@ -107,16 +107,12 @@ class SeenMap {
     Object.assign(this, { corner, shape, resolution, changes: changes.data });
     this.starts = sums(counts.data);
     this.state = new Uint8Array(shape[0] * shape[1] * shape[2]);
-    this.boxes = new Boxes(resolution, Math.max(64, this.mostOccupied()));
+    this.occupied = new Set();
+    this.boxes = new Boxes(corner, shape, resolution);
     this.sheet = this.sheetOf(shape[0], shape[1]);
     this.group = new THREE.Group();
     this.group.add(this.boxes.mesh, this.sheet);
     this.reset();
-  }
-
-  /** No more cells than ever become occupied. */
-  mostOccupied() {
-    return this.changes.filter((change) => Math.floor(change / this.state.length) === OCCUPIED_STATE).length;
   }
 
   sheetOf(width, height) {
@@ -132,7 +128,7 @@ class SeenMap {
   reset() {
     this.step = -1;
     this.state.fill(0);
-    this.boxes.clear();
+    this.occupied.clear();
   }
 
   /** Bring the map to period k. */
@@ -142,21 +138,13 @@ class SeenMap {
     for (let i = this.starts[this.step + 1]; i < this.starts[k + 1]; i++) {
       const cell = this.changes[i] % cells;
       const state = Math.floor(this.changes[i] / cells);
-      if (state === OCCUPIED_STATE) this.boxes.add(cell, this.centerOf(cell));
-      else if (this.state[cell] === OCCUPIED_STATE) this.boxes.remove(cell);
+      if (state === OCCUPIED_STATE) this.occupied.add(cell);
+      else this.occupied.delete(cell);
       this.state[cell] = state;
     }
     this.step = k;
-    this.boxes.update();
+    this.boxes.fill(this.occupied);
     this.paint();
-  }
-
-  centerOf(cell) {
-    const [, width, height] = this.shape;
-    const z = cell % height;
-    const y = Math.floor(cell / height) % width;
-    const x = Math.floor(cell / (height * width));
-    return [x, y, z].map((at, i) => this.corner[i] + (at + 0.5) * this.resolution);
   }
 
   /** Move the sheet to the cells in which a height, m, lies. */
@@ -182,61 +170,96 @@ class SeenMap {
   }
 }
 
-/** Equal cubes that come and go, in one draw call. */
+/** Boxes that fill some cells, in one draw call; each costs as much as a cell would. */
 class Boxes {
-  constructor(size, most) {
-    this.places = new Float32Array(3 * most);
-    this.cells = new Uint32Array(most);
-    this.slots = new Map(); // of each cell
-    const box = new THREE.BoxGeometry(size, size, size);
-    const geometry = new THREE.InstancedBufferGeometry();
-    geometry.setIndex(box.index);
-    for (const name of ["position", "normal"]) geometry.setAttribute(name, box.attributes[name]);
-    this.attribute = new THREE.InstancedBufferAttribute(this.places, 3).setUsage(THREE.DynamicDrawUsage);
-    geometry.setAttribute("middle", this.attribute);
-    this.mesh = new THREE.Mesh(geometry, new THREE.ShaderMaterial(shader()));
+  constructor(corner, shape, resolution) {
+    Object.assign(this, { corner, shape, resolution });
+    this.geometry = new THREE.InstancedBufferGeometry();
+    this.geometry.setIndex([0, 1, 2, 0, 2, 3, 4, 5, 6, 4, 6, 7, 8, 9, 10, 8, 10, 11]);
+    for (const [name, values] of Object.entries(threeSides())) {
+      this.geometry.setAttribute(name, new THREE.Float32BufferAttribute(values, 3));
+    }
+    this.mesh = new THREE.Mesh(this.geometry, new THREE.ShaderMaterial(shader()));
     this.mesh.frustumCulled = false;
+    this.grow(64);
   }
 
-  clear() {
-    this.slots.clear();
-    this.update();
+  grow(count) {
+    this.most = 2 * count;
+    this.geometry.dispose(); // its buffers have another size from now on
+    for (const name of ["middle", "sides"]) {
+      const attribute = new THREE.InstancedBufferAttribute(new Float32Array(3 * this.most), 3);
+      this.geometry.setAttribute(name, attribute.setUsage(THREE.DynamicDrawUsage));
+    }
   }
 
-  add(cell, place) {
-    if (this.slots.has(cell)) return;
-    const slot = this.slots.size;
-    this.slots.set(cell, slot);
-    this.cells[slot] = cell;
-    this.places.set(place, 3 * slot);
+  /** Fill cells, given by their numbers in a set. */
+  fill(cells) {
+    this.boxes = merged(Uint32Array.from(cells).sort(), this.shape);
+    if (this.boxes.length > this.most) this.grow(this.boxes.length);
+    const { middle, sides } = this.geometry.attributes;
+    const half = 0.5 * this.resolution;
+    this.boxes.forEach(([low, high], i) => {
+      middle.setXYZ(i, ...low.map((first, axis) => this.corner[axis] + half * (first + high[axis])));
+      sides.setXYZ(i, ...low.map((first, axis) => half * (high[axis] - first)));
+    });
+    middle.needsUpdate = sides.needsUpdate = true;
+    this.geometry.instanceCount = this.boxes.length;
+    this.mesh.visible = this.boxes.length > 0;
   }
+}
 
-  /** The last one takes the place of the one that goes. */
-  remove(cell) {
-    const slot = this.slots.get(cell);
-    const last = this.slots.size - 1;
-    this.slots.delete(cell);
-    if (slot === last) return;
-    this.cells[slot] = this.cells[last];
-    this.slots.set(this.cells[slot], slot);
-    this.places.copyWithin(3 * slot, 3 * last, 3 * last + 3);
+/** Few boxes [first cell, the one after the last] that fill cells, given by their numbers in order: runs along z become
+ * bars, bars of equal ends side by side plates, and so on. */
+function merged(cells, [, width, height]) {
+  const boxes = [];
+  for (let i = 0; i < cells.length; i++) {
+    const z = cells[i] % height;
+    const column = (cells[i] - z) / height;
+    const last = boxes[boxes.length - 1];
+    if (last && z > 0 && cells[i] === cells[i - 1] + 1) last[1][2] += 1;
+    else boxes.push([[Math.floor(column / width), column % width, z], [Math.floor(column / width) + 1, (column % width) + 1, z + 1]]);
   }
+  return [1, 0].reduce(joined, boxes);
+}
 
-  update() {
-    this.mesh.geometry.instanceCount = this.slots.size;
-    this.mesh.visible = this.slots.size > 0;
-    this.attribute.needsUpdate = true;
+/** Boxes in order, those joined that touch along an axis and end alike along the others. */
+function joined(boxes, axis) {
+  const open = new Map();
+  return boxes.filter(([low, high]) => {
+    const key = [0, 1, 2].filter((other) => other !== axis).map((other) => `${low[other]} ${high[other]}`).join(" ");
+    const before = open.get(key);
+    const joins = before !== undefined && before[1][axis] === low[axis];
+    if (joins) before[1][axis] = high[axis];
+    else open.set(key, [low, high]);
+    return !joins;
+  });
+}
+
+/** Of a box no more than three sides face the camera: those at the higher ends, which the shader mirrors where need be. */
+function threeSides() {
+  const found = { position: [], normal: [] };
+  for (const axis of [0, 1, 2]) {
+    for (const [a, b] of [[-1, -1], [1, -1], [1, 1], [-1, 1]]) {
+      const corner = [a, b];
+      found.position.push(...[0, 1, 2].map((other) => (other === axis ? 1 : corner.shift())));
+      found.normal.push(...[0, 1, 2].map((other) => (other === axis ? 1 : 0)));
+    }
   }
+  return found;
 }
 
 function shader() {
   return {
+    side: THREE.DoubleSide,
     uniforms: { colour: { value: new THREE.Color(OCCUPIED) }, sun: { value: SUN } },
-    vertexShader: `attribute vec3 middle; uniform vec3 colour; uniform vec3 sun; varying vec3 shade;
+    vertexShader: `attribute vec3 middle; attribute vec3 sides; uniform vec3 colour; uniform vec3 sun; varying vec3 shade;
       void main() {
-        vec3 light = mix(vec3(0.42, 0.40, 0.38), vec3(0.66, 0.67, 0.69), 0.5 + 0.5 * normal.z) + 0.5 * max(0.0, dot(normal, sun));
+        vec3 facing = vec3(greaterThan(cameraPosition, middle)) * 2.0 - 1.0;
+        vec3 n = facing * normal;
+        vec3 light = mix(vec3(0.42, 0.40, 0.38), vec3(0.66, 0.67, 0.69), 0.5 + 0.5 * n.z) + 0.5 * max(0.0, dot(n, sun));
         shade = pow(colour * light, vec3(1.0 / 2.2));
-        gl_Position = projectionMatrix * viewMatrix * vec4(middle + position, 1.0);
+        gl_Position = projectionMatrix * viewMatrix * vec4(middle + sides * facing * position, 1.0);
       }`,
     fragmentShader: "varying vec3 shade; void main() { gl_FragColor = vec4(shade, 1.0); }",
   };
