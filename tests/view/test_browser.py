@@ -203,6 +203,13 @@ def test_the_search_is_shown_on_demand(tab: Tab) -> None:
     assert (np.abs(pixels(tab) - before).max(axis=-1) > 25).sum() < 20
 
 
+def test_a_trajectory_along_another_has_gaps(tab: Tab) -> None:
+    script = """torchgcoView.flights.all.map(({ line }) => Array.from(line.geometry.index.array))"""
+    first, second = (np.reshape(corners, (N, -1)) for corners in tab.evaluate(script))
+    first, second = (int((pieces == 0).all(axis=1).sum()) for pieces in (first, second))
+    assert first == 0 and 0 < second < 0.2 * N  # they share their start and their end alone
+
+
 def test_views_of_obstacles(tab: Tab) -> None:
     pictures = [pixels(tab)]
     for name in ("#grown", "#through", "#follow"):

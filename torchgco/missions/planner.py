@@ -150,19 +150,31 @@ class Planner:
         """
         measured = x if measured is None else measured
         began = time.perf_counter()
+        now, margin, bias, U0 = self._posed(whole, now, x, step, before, measured)
+        solve = _Solve(self, now, seed, ids, began, self.tolerance + margin.between(whole))
+        if before is not None and self.feedback:
+            U0 = _brought_back(now, before)
+        plan = solve.first(U0) if before is None else solve.next(U0, before)
+        return replace(plan, measured=measured, bias=bias, step=step), now, time.perf_counter() - began
+
+    def first(self, whole: Problem, x: Tensor, seed: int, ids: Tensor) -> tuple[Problem, Solution]:
+        """The problems of the first plans from plants x (B, 17), and the solver's solutions, as `plan` makes them."""
+        now, _, _, U0 = self._posed(whole, self.problem(whole, x), x, 0, None, x)
+        solver, _ = self.solver.in_closed_loop(CONTINUED)
+        return now, solver.solve(now, U0, seed=seed, ids=ids, max_seconds=self.max_seconds)
+
+    def _posed(
+        self, whole: Problem, now: Problem, x: Tensor, step: int, before: Plan | None, measured: Tensor
+    ) -> tuple[Problem, Margin, Tensor, Tensor]:
+        """The problems of a control step, their margin, the estimated acceleration (B, 3), controls to begin with."""
         t, x0 = step * float(whole.dynamics.dt), planning_state(x, self.airframe)
         U0 = now.cost.rest_controls(x0.new_zeros(now.B, now.N, now.m)) if before is None else shifted(before.U)
         bias = self.estimated(measured, before, float(whole.dynamics.dt))
         dynamics = whole.dynamics if self.estimation == 0 else biased(whole.dynamics, bias)
         margin = self._margin(x, before)
         depth = margin.unavoidable_depth(whole.started_at(x0, whole.constraints), t, U0)
-        now = now.started_at(x0, self._constraints(whole, t, x, margin, depth), dynamics=dynamics)
-        allowed = self.tolerance + margin.between(whole)
-        solve = _Solve(self, now, seed, ids, began, allowed)
-        if before is not None and self.feedback:
-            U0 = _brought_back(now, before)
-        plan = solve.first(U0) if before is None else solve.next(U0, before)
-        return replace(plan, measured=measured, bias=bias, step=step), now, time.perf_counter() - began
+        constraints = self._constraints(whole, t, x, margin, depth)
+        return now.started_at(x0, constraints, dynamics=dynamics), margin, bias, U0
 
     def predicted(self, x: Tensor, plan: Plan) -> Tensor:
         """The plants (B, 17) one period later, from x (B, 17) at the plan's first knot: as the plan's model leads."""

@@ -52,6 +52,7 @@ LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
 HELD = 2.0  # s before a search with less margin ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
+ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joined to it
 WAITS = 5  # knots before the first that is blocked
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
@@ -143,8 +144,7 @@ class Exploration:
         began = time.perf_counter()
         sensed = sum(sum(scout.seconds.values()) for scout in self.scouts)
         bias = self.planner.estimated(x, before, self.dt)
-        for b, scout in enumerate(self.scouts):
-            self._seek(scout, x[b].numpy())
+        self.seek(x)
         reference = self._reference(x)
         rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
         former = rest if before is None else self._clear_part(shifted(before.X[:, 1:, :3]))
@@ -160,13 +160,17 @@ class Exploration:
         """Seconds of the last period by part, (B,)."""
         return {name: torch.tensor([s.seconds[name] for s in self.scouts], dtype=torch.float64) for name in PARTS}
 
+    def seek(self, x: Tensor) -> None:
+        """Find paths of vehicles measured at x (B, 17) to their goals, and the parts that are known to be free."""
+        for b, scout in enumerate(self.scouts):
+            self._seek(scout, x[b].numpy())
+
     def _seek(self, scout: Scout, x: np.ndarray) -> None:
-        """The path of a vehicle x (17,), and the part of it that is known to be free."""
         began, position = time.perf_counter(), x[:3]
         self._search(scout, position)
         keep = self.keep(scout)
         points = _halved(np.concatenate([position[None], scout.path[1:]]))
-        if np.linalg.norm(scout.path[-1] - scout.goal) <= 4.5 * scout.seen.resolution:
+        if np.linalg.norm(scout.path[-1] - scout.goal) <= ARRIVES * scout.seen.resolution:
             points = np.concatenate([points, scout.goal[None]])
         gaps = scout.seen.gaps(points, keep + 0.05, self.kinds)
         blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 3))
