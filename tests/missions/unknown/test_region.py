@@ -98,7 +98,7 @@ def test_a_former_plan_asks_for_no_more_than_the_bounds() -> None:
     problem = exploration._problem(x, x.new_zeros(1, 3), reference, [reference[:, 1:, :3]])
     X, U = followed(problem, plan.X, plan.U, plan.K)
     assert float(unflyable(problem, X, U)[0]) > 1.0
-    X, U = within_bounds(problem, X, U, plan.X, plan.U, plan.K)
+    X, U = within_bounds(problem, plan.X, plan.U, plan.K)
     for i, (low, high) in enumerate(zip(LEAST, MOST, strict=True)):
         assert low <= float(U[..., i].min()) and float(U[..., i].max()) <= high
     state = X[:, 0]

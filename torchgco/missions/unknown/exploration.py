@@ -38,7 +38,6 @@ from torchgco.missions.unknown.explorer import (
 )
 from torchgco.missions.unknown.reference import motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
-from torchgco.native.dispatch import followed
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -49,6 +48,7 @@ LOCAL: dict[str, Any] = {"initial_penalty": 1.0, "penalty_growth": 3.0, "violati
 SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
 # Where no way is found, a search with less margin, then one over all cells: the share of the margin, and the stride.
 LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
+SEARCHED = 2  # control periods after which a new search is due
 HELD = 2.0  # s before a search with less margin ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
@@ -75,6 +75,8 @@ class Scout:
     since: int = 0  # control periods at this level
     seconds: dict[str, float] = field(default_factory=dict)
     changed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    scanned: bool = False  # in this control period
+    age: int = 0  # control periods since the last search; 0: there was none
 
 
 class Exploration:
@@ -124,8 +126,8 @@ class Exploration:
     def sense(self, step: int, x: Tensor, measured: Tensor) -> None:
         """Scan at a control step from plants x (B, 17), and put that into the maps where the vehicles believe to be."""
         for b, scout in enumerate(self.scouts):
-            took = [0.0, 0.0]
-            if step % self.every == 0:
+            took, scout.scanned = [0.0, 0.0], step % self.every == 0
+            if scout.scanned:
                 key = (self.seed, self.ids[b], step)
                 scan = self.sensor.scan(scout.world, x[b, :3].numpy(), x[b, 6:10].numpy(), step * self.dt, key)
                 scan = scan.seen_from(x[b, 6:10].numpy(), measured[b, :3].numpy(), measured[b, 6:10].numpy())
@@ -186,8 +188,17 @@ class Exploration:
         return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least
 
     def _search(self, scout: Scout, position: np.ndarray) -> None:
-        """The path to the goal; where none is found, with less margin from now on, for a while."""
+        """The path to the goal; where none is found, with less margin from now on, for a while.
+
+        Scan and search take turns where there are periods without a scan: both in one would be the longest.
+        """
         scout.since += 1
+        if scout.scanned and 0 < scout.age < SEARCHED and self.every > 1:
+            scout.age += 1
+            nearest = np.linalg.norm(scout.path - position, axis=1).argmin()
+            scout.path = scout.path[min(nearest, len(scout.path) - 2) :]
+            return
+        scout.age = 1
         if scout.level > 0 and scout.since * self.dt >= HELD:
             scout.level, scout.since = 0, 0
         while True:
@@ -258,7 +269,7 @@ class Exploration:
             C = problem.B // before.X.shape[0]
             X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
             X[:, -1], U[:, -1] = _resting(X[:, -1]), problem.cost.rest_controls(U[:, -1:])[:, 0]
-            X, U = within_bounds(problem, *followed(problem, X, U, K), X, U, K)
+            X, U = within_bounds(problem, X, U, K)
             penalty = before.penalty.repeat(C)
         none = torch.zeros(problem.B, dtype=torch.int64)
         return Plan(
