@@ -10,12 +10,22 @@ from tests.search.cup import GOAL, QUICK, controls, cost, cup
 from tests.search.rows import proposed, restarts, varied
 from tests.search.scenes import NONE, inflated
 from tests.search.test_paths import alone
-from torchgco import AugmentedLagrangian, PathProposals, Problem, compose, judge
+from torchgco import (
+    AugmentedLagrangian,
+    PathProposals,
+    Problem,
+    StateBounds,
+    compose,
+    judge,
+)
 from torchgco.base.tree import take
 from torchgco.lagrangian.rollout import open_loop
+from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.candidates import Candidates
-from torchgco.search.following import CUT, Paths, followed, travel
+from torchgco.search.following import CUT, Free, Paths, followed, travel, unconstrained
+from torchgco.search.nearby import without_obstacles
 from torchgco.search.proposals import propose
 from torchgco.solvers.ilqr import ILQR
 
@@ -78,6 +88,59 @@ def test_every_candidate_tracks_its_own_path_at_its_own_pace() -> None:
                 center = travel(path[None], follow.depart, arrive, follow.smoothing, 120)[0]
                 apart.append(float((X[:, :2] - center).norm(dim=-1).mean()))
         assert apart.index(min(apart)) == i // 4 * 2 + i % 2
+
+
+def limited(speed: float, N: int = 120) -> Problem:
+    """Cups for vehicles with limits of +-speed, m/s, on both parts of the velocity."""
+    problem = cup(B=2, N=N)
+    bound = [np.inf, np.inf, np.inf, speed, speed, np.inf]
+    return replace(problem, constraints=[*problem.constraints, StateBounds([-b for b in bound], bound)])
+
+
+def free(problem: Problem) -> Free:
+    """The trajectories without obstacles, in the unit of `make_candidates`."""
+    return unconstrained(problem, controls(problem), 40, torch.full((2,), 1e4, dtype=torch.float64))
+
+
+def among(corners: torch.Tensor) -> Paths:
+    """The paths (B, 1, P, 2) of `known`, for B problems."""
+    one, B = known(cup(B=1), corners[:1]), corners.shape[0]
+    none = inflated([[[0.0, 0.0]]] * B, [[NONE]] * B)
+    R, unit, live = one.R.repeat(B), one.unit.repeat(B), one.live.repeat(B, 1)
+    return replace(one, corners=corners, classes=one.classes.repeat(B, 1), obstacles=none, R=R, unit=unit, live=live)
+
+
+def test_limits_on_speed_make_free_trajectories_slower() -> None:
+    """A tenth of the way is left after at least 0.9 of its longer side over the speed."""
+    fast, slow, plain = free(limited(50.0)), free(limited(0.5)), free(cup(N=120))
+    assert torch.equal(fast.slower, torch.ones(2, dtype=torch.float64)) and torch.equal(fast.slower, plain.slower)
+    for one in (fast, slow):
+        torch.testing.assert_close(one.share, plain.share)
+        torch.testing.assert_close(one.cost, plain.cost)
+    least = (2.0 * 0.9 / 0.5) / (120 * 0.05)
+    assert bool((slow.share * slow.slower >= 0.95 * least).all()) and bool(
+        (slow.slower < 2.0 * least / slow.share).all()
+    )
+
+
+def test_paths_are_followed_as_slowly_as_limits_ask_for() -> None:
+    """From departure on, by as much as without obstacles, but never beyond the end of the horizon."""
+    problem = limited(0.5)
+    follow = replace(QUICK.follow[0], depart=0.1, arrive=(0.3, 0.9), stiffness=(1.0,), iterations=1)
+    paths = among(torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64).repeat(2, 1, 1, 1))
+    U = controls(problem)[:, None].repeat(1, 2, 1, 1)
+    at_rest = Candidates.begin(problem, U, paths.R, paths.unit, torch.ones(2, 2, dtype=torch.bool))
+    timed = follow.track(at_rest, paths, free(problem)._replace(slower=torch.tensor([1.5, 9.0], dtype=torch.float64)))
+    for b, slower in enumerate((1.5, 9.0)):
+        for k, arrive in enumerate(follow.paces):
+            later = torch.tensor([min(0.1 + (arrive - 0.1) * slower, 1.0)], dtype=torch.float64)
+            alone = replace(follow, arrive=float(later))
+            torch.testing.assert_close(timed.X[2 * b + k], alone.track(at_rest, paths, None).X[2 * b + k])
+
+
+def test_kinds_of_obstacles_that_must_stay_set_no_pace(monkeypatch) -> None:
+    monkeypatch.setattr(BoundSpheres, "chosen", Obstacles.chosen)
+    assert without_obstacles(limited(0.5)) is None and bool((free(limited(0.5)).slower == 1.0).all())
 
 
 def test_candidates_that_are_not_among_the_first_are_not_relaxed(monkeypatch) -> None:
