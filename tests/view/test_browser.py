@@ -221,6 +221,21 @@ def test_views_of_obstacles(tab: Tab) -> None:
     assert all((np.abs(a - b).max(axis=-1) > 8).sum() > 300 for a, b in pairwise(pictures))
 
 
+def test_nothing_is_shown_above_the_cut(tab: Tab) -> None:
+    tab.click("#view-side")
+    whole = stony(pixels(tab))
+    space = tab.evaluate("({ low: torchgcoView.space.low.z, top: torchgcoView.space.top })")
+    share = (0.05 - space["low"]) / (space["top"] - space["low"])  # through the middle of the sharp box
+    tab.evaluate(f"document.getElementById('cut').value = {share}")
+    tab.evaluate("document.getElementById('cut').dispatchEvent(new Event('input', { bubbles: true }))")
+    cut = stony(pixels(tab))
+    x, y = map(round, place(tab, [5.5, -3.0, 0.8]))  # the rounded box is wholly above 0.05 m
+    assert whole[y, x] and not cut[y - 3 : y + 4, x - 3 : x + 4].any()
+    x, y = map(round, place(tab, [4.5, -2.0, 0.4]))  # of the sharp one half is left
+    below = round(place(tab, [4.5, -2.3, -0.4])[1])
+    assert whole[y, x] and not cut[y, x] and cut[below, x]
+
+
 def test_light_and_dark(tab: Tab) -> None:
     light = pixels(tab)
     tab.dark(True)
