@@ -173,6 +173,25 @@ def test_keys_play_step_and_choose(tab: Tab) -> None:
     assert tab.evaluate("torchgcoView.playing") is False
 
 
+def test_a_screen_reader_has_a_name_for_every_control(tab: Tab) -> None:
+    nodes = [one for one in tab.call("Accessibility.getFullAXTree")["nodes"] if not one.get("ignored")]
+    controls = [one for one in nodes if one["role"]["value"] in ("button", "checkbox", "slider", "combobox", "image")]
+    assert len(controls) > 15 and all(len(one["name"]["value"].strip()) > 1 for one in controls)
+    told = " ".join(one["name"]["value"] for one in nodes if "name" in one)
+    assert f"layout 0 {WORDS}, in perspective. gco: reached; al_ilqr: failed" in told
+
+
+def test_every_control_is_reached_by_the_tab_key(tab: Tab) -> None:
+    tab.evaluate(f"{PICTURE}.focus()")
+    reached = []
+    for _ in range(40):
+        for kind in ("rawKeyDown", "keyUp"):
+            tab.call("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab", windowsVirtualKeyCode=9)
+        reached.append(tab.evaluate("document.activeElement.id"))
+    shown = "[...document.querySelectorAll('button[id], select, input[id]')].filter((one) => one.offsetParent)"
+    assert set(tab.evaluate(f"{shown}.map((one) => one.id)")) <= set(reached)
+
+
 def test_dragging_turns_the_picture(tab: Tab) -> None:
     before = pixels(tab)
     tab.mouse("mousePressed", 300, 300, button="left", buttons=1, clickCount=1)
