@@ -70,6 +70,7 @@ def check(tab: Tab, page: Path, fragment: str = "") -> np.ndarray:
     tab.errors.clear()
     tab.requests.clear()
     tab.open(page, fragment)
+    tab.evaluate("torchgcoView.toggle('through', false)")
     picture = pixels(tab)
     assert tab.errors == [] and tab.evaluate("document.getElementById('notes').children.length") == 0
     assert [url for url in tab.requests if not url.startswith(("file:", "blob:null/", "about:"))] == []
