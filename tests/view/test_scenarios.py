@@ -82,9 +82,12 @@ def check(tab: Tab, page: Path, fragment: str = "") -> np.ndarray:
     return picture
 
 
-@pytest.mark.parametrize(
-    "scenario", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in options_of("scenario")]
-)
+SCENARIOS = [
+    pytest.param(name, marks=[] if name in FAST else [pytest.mark.slow]) for name in options_of("scenario")
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
 def test_every_scenario_has_its_page(scenario: str, flown: Callable[..., Path], opened: Tab) -> None:
     count = "study.layouts=null" if scenario == "map" else "study.layouts=2"
     page = flown(*QUICK, f"scenario={scenario}", *MADE.get(scenario, []), count)
