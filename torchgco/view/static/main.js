@@ -111,6 +111,8 @@ class Page {
     layout.obstacles = await Promise.all(layout.obstacles.map((one) => ("shared" in one ? part(`map-${one.shared}`) : one)));
     if (number !== this.number) return;
     this.layout = layout;
+    // Maps may have a ceiling: it is cut off at first.
+    if (!this.placed && this.head.dimension === 3 && layout.obstacles.some((one) => one.cells)) by("cut").value = 0.99;
     showLayout(layout, number, this.head, this.visible, this.actions());
     this.rebuild();
     if (!this.placed) this.view("perspective");
@@ -177,6 +179,9 @@ class Page {
   cut(share) {
     const { low, high, top } = this.space;
     high.z = low.z + share * (top - low.z);
+    const ceiling = share < 1 ? high.z : null;
+    this.obstacles.setCeiling(ceiling);
+    this.flights.all.forEach(({ parts }) => parts?.setCeiling(ceiling));
     this.redraw();
   }
 

@@ -1,7 +1,7 @@
 // What a mission planned, saw and sought in a control period.
 import * as THREE from "./three.module.min.js";
 import { point } from "./data.js";
-import { SUN } from "./shapes.js";
+import { NONE, SUN } from "./shapes.js";
 import { tube } from "./tubes.js";
 
 export const PARTS = ["plan", "safe", "sought", "sensed"];
@@ -24,6 +24,11 @@ export class MissionParts {
       Object.assign(this.layers, { safe: this.safe.group, sought: this.sought.line, sensed: this.seen.group });
     }
     this.group.add(...Object.values(this.layers));
+  }
+
+  /** Show no cells above a height, m. */
+  setCeiling(z) {
+    if (this.seen) this.seen.boxes.ceiling.value = z ?? NONE;
   }
 
   /** Show period k, with the vehicle at a place. */
@@ -179,7 +184,8 @@ class Boxes {
     for (const [name, values] of Object.entries(threeSides())) {
       this.geometry.setAttribute(name, new THREE.Float32BufferAttribute(values, 3));
     }
-    this.mesh = new THREE.Mesh(this.geometry, new THREE.ShaderMaterial(shader()));
+    this.ceiling = { value: NONE };
+    this.mesh = new THREE.Mesh(this.geometry, new THREE.ShaderMaterial(shader(this.ceiling)));
     this.mesh.frustumCulled = false;
     this.grow(64);
   }
@@ -249,17 +255,19 @@ function threeSides() {
   return found;
 }
 
-function shader() {
+function shader(ceiling) {
   return {
     side: THREE.DoubleSide,
-    uniforms: { colour: { value: new THREE.Color(OCCUPIED) }, sun: { value: SUN } },
-    vertexShader: `attribute vec3 middle; attribute vec3 sides; uniform vec3 colour; uniform vec3 sun; varying vec3 shade;
+    uniforms: { colour: { value: new THREE.Color(OCCUPIED) }, sun: { value: SUN }, ceiling },
+    vertexShader: `attribute vec3 middle; attribute vec3 sides; uniform float ceiling; uniform vec3 colour; uniform vec3 sun; varying vec3 shade;
       void main() {
         vec3 facing = vec3(greaterThan(cameraPosition, middle)) * 2.0 - 1.0;
         vec3 n = facing * normal;
         vec3 light = mix(vec3(0.42, 0.40, 0.38), vec3(0.66, 0.67, 0.69), 0.5 + 0.5 * n.z) + 0.5 * max(0.0, dot(n, sun));
         shade = pow(colour * light, vec3(1.0 / 2.2));
-        gl_Position = projectionMatrix * viewMatrix * vec4(middle + sides * facing * position, 1.0);
+        vec3 p = middle + sides * facing * position;
+        p = middle.z - sides.z > ceiling ? middle : vec3(p.xy, min(p.z, ceiling));
+        gl_Position = projectionMatrix * viewMatrix * vec4(p, 1.0);
       }`,
     fragmentShader: "varying vec3 shade; void main() { gl_FragColor = vec4(shade, 1.0); }",
   };
