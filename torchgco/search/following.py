@@ -69,8 +69,8 @@ class Follow:
             a vehicle that turns slowly find reversing and three-point turns. `Restarts` leaves them out where they
             don't fit the number of controls.
         depart, arrive: shares of the horizon at which the vehicle leaves the start and reaches the goal. Several
-            values of `arrive`: every path is tracked at each pace. Where rows limit states, all this takes as much longer
-            as they make the way without obstacles.
+            values of `arrive`: every path is tracked at each pace. Where rows limit states, all this takes as
+            much longer as they make the way without obstacles.
         pace: times the time that the vehicle takes without constraints, per length of the path: no path is followed
             more slowly than this, whatever `arrive` says. None: no such limit.
         smoothing: share of the horizon over which the corners of a path are averaged, at most (see `followed`).
