@@ -171,7 +171,7 @@ def array(value: Tensor | None, knots: bool) -> Array:
     if value is None or value.numel() == 0:
         return Array()
     value = value.double().contiguous()
-    size = value[0, 0].numel() if knots else value[0].numel()
-    many = value.shape[1] if knots else 1
-    element, knot = 0 if value.shape[0] == 1 else many * size, size if many > 1 else 0
+    elements, many = value.shape[0], value.shape[1] if knots else 1
+    size = value.numel() // (elements * many)
+    element, knot = 0 if elements == 1 else many * size, size if many > 1 else 0
     return Array(data=value, element=element, knot=knot, size=size)
