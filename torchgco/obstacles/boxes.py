@@ -169,8 +169,8 @@ class BoundBoxes(Obstacles):
         i, first = torch.arange(len(apart), device=a.device), apart.flatten(1).argmin(-1)
         e, j = first // apart.shape[2], first % apart.shape[2]
         most = boxes.segment_distance((i, e, j), a, b) + self.inflated_radii.amax(-1)
-        pairs = ((apart <= most.view(-1, 1, 1)) & here).nonzero(as_tuple=True)
-        apart[pairs] = boxes.segment_distance(pairs, a, b)
+        i, e, j = ((apart <= most.view(-1, 1, 1)) & here).nonzero(as_tuple=True)
+        apart[i, e, j] = boxes.segment_distance((i, e, j), a, b)
         return apart
 
     def grown(self, by: Tensor) -> Self:
