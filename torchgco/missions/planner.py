@@ -40,7 +40,7 @@ class Plan:
     U: Tensor  # (B, N, 4)
     K: Tensor  # (B, N, 4, 14): feedback gains
     multipliers: Multipliers
-    penalty: Tensor  # (B,): least mu of the searches that succeeded, which plans that continue this one start from
+    penalty: Tensor  # (B,): mu from which plans that continue this one start
     cost: Tensor
     violation: Tensor
     shifted: Tensor  # bool: the former plan one stage later, as the new one was infeasible
@@ -224,24 +224,24 @@ class _Solve:
 
     def first(self, U0: Tensor) -> Plan:
         """The solver's plans, from controls U0 (B, N, 4)."""
-        return self._plan(self._solved(self.solver, self.problem, U0, None, self.ids))
+        return self._plan(self._solved(self.solver, self.problem, U0, None, self.ids), self.allowed)
 
     def next(self, U0: Tensor, before: Plan) -> Plan:
         """Plans that continue former ones, which are flown one stage later by U0 (B, N, 4)."""
         multipliers = before.continued(self.problem)
         warm = multipliers if self.planner.multipliers == "shifted" else None
-        plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids))
+        plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids), self.allowed)
         plan.penalty.copy_(before.penalty)
         self._keep_former(plan, before, U0, multipliers)
         rows = (~(plan.violation <= self.allowed)).nonzero().flatten()
         left = self._time_left()
         if self.local is not self.solver and rows.numel() > 0 and (left is None or left > MIN_SECONDS):
-            found = self._plan(self._solved(self.solver, self.problem.take(rows), U0[rows], None, self.ids[rows]))
+            again = self._solved(self.solver, self.problem.take(rows), U0[rows], None, self.ids[rows])
+            found = self._plan(again, self.allowed[rows])
             self._replace(plan, rows, found)
             for name in ("guided", "iterations"):
                 getattr(plan, name)[rows] += getattr(found, name)
-        lower = (plan.penalty < before.penalty) & (plan.violation <= self.allowed)
-        return replace(plan, penalty=torch.where(lower, plan.penalty, before.penalty))
+        return replace(plan, penalty=torch.where(plan.violation <= self.allowed, plan.penalty, before.penalty))
 
     def _solved(self, solver: Solver, problem: Problem, U0: Tensor, warm: Multipliers | None, ids: Tensor) -> Solution:
         return solver.solve(problem, U0, seed=self.seed, ids=ids, warm=warm, max_seconds=self._time_left())
@@ -273,10 +273,23 @@ class _Solve:
         for name in TRAJECTORY:
             put(getattr(plan, name), rows[chosen], take(getattr(other, name), chosen))
 
-    def _plan(self, solution: Solution) -> Plan:
+    def _plan(self, solution: Solution, allowed: Tensor) -> Plan:
         none = torch.zeros_like(solution.cost, dtype=torch.bool)
         return Plan(
-            solution.X, solution.U, solution.K, solution.multipliers, solution.multipliers.mu.clone(), solution.cost,
-            solution.violation, none, solution.guided, solution.iterations, solution.X[:, 0], solution.X[:, 0, :3],
-            self.problem.dynamics, 0,
+            solution.X, solution.U, solution.K, solution.multipliers, _penalty(solution.multipliers, allowed),
+            solution.cost, solution.violation, none, solution.guided, solution.iterations, solution.X[:, 0],
+            solution.X[:, 0, :3], self.problem.dynamics, 0,
         )  # fmt: skip
+
+
+def _penalty(multipliers: Multipliers, allowed: Tensor) -> Tensor:
+    """mu (B,) with which multipliers that are wrong by as much as they are large leave the allowed violation (B,).
+
+    The mu of a solve's end is none to continue from: AL-iLQR raises it to where solves are stiff, and the interior
+    point has none.
+    """
+    largest = torch.zeros_like(multipliers.mu)
+    for lam in multipliers.lam:
+        if lam.numel() > 0:
+            largest = torch.maximum(largest, lam.abs().flatten(1).amax(-1))
+    return torch.where((largest > 0) & torch.isfinite(allowed), largest / allowed, multipliers.mu)
