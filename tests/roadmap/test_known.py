@@ -62,3 +62,15 @@ def test_without_boxes_there_are_no_points_around_them() -> None:
     s = random_scene(3)
     assert Known().beside(0, SOME, s.obstacles, s) is None
     assert torch.equal(Roadmap().paths(s, 2, SOME)[0], Roadmap().paths(s.take(SOME), 2)[0])
+
+
+def test_two_threads_find_the_paths_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchgco.roadmap.native.GROUP", 2)
+    s, threads = trunks(B=5, K=14)[0], torch.get_num_threads()
+    alone = Roadmap().paths(s, 3)
+    torch.set_num_threads(2)
+    try:
+        together = Roadmap().paths(s, 3)
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(alone, together, strict=True))

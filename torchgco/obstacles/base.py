@@ -57,8 +57,10 @@ class Solids:
 
     def deeper(self, points: Tensor, than: Tensor) -> Tensor:
         """Whether points (B, V, d) lie deeper than lengths (B,) >= 0, m, beneath the surface of one present, (B, V)."""
-        deep = self.signed_distance(points) < -than.view(-1, 1, 1)
-        return (deep & ~self.absent.unsqueeze(1)).any(-1)
+        limit = self.radii - than.unsqueeze(-1)
+        limit = torch.where(self.absent | (limit <= 0), 0.0, limit.square()).unsqueeze(1)
+        axes = ((points[..., i, None] - self.centers[:, None, :, i]).square_() for i in range(points.shape[-1]))
+        return (reduce(torch.add, axes) < limit).any(-1)
 
 
 class Obstacles(Constraint):

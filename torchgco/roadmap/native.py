@@ -15,6 +15,7 @@ from torch import Tensor
 from torchgco.native.compiler import Compiler, NativeError, find_compiler
 from torchgco.native.declarations import Structure, fields, head, load
 from torchgco.native.dispatch import EagerWarning
+from torchgco.native.engine import run
 from torchgco.native.kernels import native
 from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
@@ -23,6 +24,7 @@ from torchgco.roadmap.points import MIDWAY, RAYS, SHELLS, directions, of_boxes
 from torchgco.roadmap.search import CLEAR, EDGE_COST, HOPS, SMALL, TIE, Beside, Graph
 
 PROBLEMS_AT_ONCE = 64  # problems searched together
+GROUP = 4  # of them, at least so many by each thread
 BLOCK, SIDE = 32, 8  # edges measured side by side; of those near a box, so many at once
 
 SEARCH, BOXES = (Path(__file__).parent / "c" / name for name in ("search.c", "boxes.h"))
@@ -44,7 +46,7 @@ class Arguments(Structure):
     """
 
     declared = (
-        ("int64_t", "problems spheres spread candidates points edges neighbours hubs corners directions shells midway"),
+        ("int64_t", "spheres spread candidates points edges neighbours hubs corners directions shells midway"),
         ("double", "margin least clear factor tie"),
         ("const double *", "centers distances"),  # (B, M, DIM), (B, M): radii, negative where absent
         ("const double *", "start goal"),  # (B, DIM)
@@ -125,21 +127,20 @@ class NativeSearch:
         return price.to(o).expand(o.shape[0], points)
 
     def _run(self, name: str, read: dict[str, Tensor], written: dict[str, Tensor], **numbers: float) -> None:
-        """Call a function of the library on all problems."""
+        """Call a function of the library on all problems, by as many threads as PyTorch uses."""
         arguments = self._shared.copy()
         arguments.fill({**{field: tensor.contiguous() for field, tensor in read.items()}, **written, **numbers})
-        if not getattr(self.library, name)(ctypes.byref(arguments)):
-            raise MemoryError("native kernels: no memory")
+        run(getattr(self.library, name), self.obstacles.spheres.radii.shape[0], GROUP, arguments)
 
     @cached_property
     def _shared(self) -> Arguments:
         """The arguments of all calls: the obstacles, and constants."""
         spheres, boxes, _ = self.obstacles
-        (B, M), more = spheres.radii.shape, {}
+        M, more = spheres.radii.shape[1], {}
         if boxes is not None:
             more = {"boxes": boxes.radii.shape[1], "box": _numbers(boxes), "largest": boxes.sizes.amax(-1).contiguous()}
         return Arguments(
-            problems=B, spheres=M, corners=HOPS + 1, margin=self.margin, clear=CLEAR, least=EDGE_COST, tie=TIE,
+            spheres=M, corners=HOPS + 1, margin=self.margin, clear=CLEAR, least=EDGE_COST, tie=TIE,
             centers=spheres.centers.contiguous(), distances=marked(spheres.radii, spheres.absent).contiguous(), **more,
         )  # fmt: skip
 

@@ -194,7 +194,7 @@ def _share(problem: Problem, X: Tensor) -> Tensor:
 
 def plain(problem: Problem) -> Lagrangian:
     """The cost alone: the constraints with multipliers and penalties of zero."""
-    return Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True)
+    return Lagrangian(problem, Multipliers.none(problem, torch.zeros_like(problem.x0[:, 0])), None, True)
 
 
 def travel(path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int) -> Tensor:

@@ -373,9 +373,9 @@ static void lay(const double *path, int64_t corners, double *string) {
         }
 }
 
-/* Called from Python; 0 where there is no memory ------------------------------------------------------------------- */
+/* Called from Python for the problems begin, ..., end - 1; 0 where there is no memory ------------------------------ */
 
-int32_t tgco_graph(const Arguments *s) {
+int32_t tgco_graph(const Arguments *s, int64_t begin, int64_t end) {
     int64_t n = s->points, k = s->edges, list = n + k + s->midway;
     int64_t size = sphere_room(s) + (DIM + 1) * n + DIM * s->candidates + list;
     double *memory = malloc(size * sizeof(double) + list * sizeof(int32_t) + n);
@@ -383,7 +383,7 @@ int32_t tgco_graph(const Arguments *s) {
     double *at = memory + sphere_room(s), *others = at + (DIM + 1) * n, *values = others + DIM * s->candidates;
     int32_t *indices = (int32_t *)(memory + size);
     uint8_t *usable = (uint8_t *)(indices + list);
-    for (int64_t b = 0; b < s->problems; b++) {
+    for (int64_t b = begin; b < end; b++) {
         Spheres o = spheres_of(s, b, memory);
         int64_t count = propose(s, b, values, indices, others);
         choose(s, b, &o, others, count, values, indices, usable);
@@ -396,12 +396,12 @@ int32_t tgco_graph(const Arguments *s) {
     return 1;
 }
 
-int32_t tgco_cheapest(const Arguments *s) {
+int32_t tgco_cheapest(const Arguments *s, int64_t begin, int64_t end) {
     int64_t n = s->points, k = s->edges, size = s->corners * DIM;
     void *memory = malloc(room_size(n, k));
     if (!memory) return 0;
     Room room = room_at(memory, n, k);
-    for (int64_t b = 0; b < s->problems; b++) {
+    for (int64_t b = begin; b < end; b++) {
         const double *p = s->nodes + b * n * DIM;
         double *path = s->path + b * size;
         s->arrives[b] = cheapest(
@@ -415,7 +415,7 @@ int32_t tgco_cheapest(const Arguments *s) {
     return 1;
 }
 
-int32_t tgco_taut(const Arguments *s) {
+int32_t tgco_taut(const Arguments *s, int64_t begin, int64_t end) {
     int64_t most = 2 * s->corners - 1, size = s->corners * DIM;
     size_t lengths_size = most * most * sizeof(double), ends_size = most * most * sizeof(int32_t);
     size_t room = room_size(most, most), spheres = sphere_room(s) * sizeof(double);
@@ -424,7 +424,7 @@ int32_t tgco_taut(const Arguments *s) {
     double *lengths = (double *)memory, *taut = lengths + most * most, *at = taut + size;
     void *rest = at + sphere_room(s);
     int32_t *ends = (int32_t *)((char *)rest + room);
-    for (int64_t b = 0; b < s->problems; b++) {
+    for (int64_t b = begin; b < end; b++) {
         double *path = s->path + b * size;
         int64_t n = 2 * edges_of(path, s->corners) + 1;
         if (n == 1) continue;
@@ -440,11 +440,11 @@ int32_t tgco_taut(const Arguments *s) {
     return 1;
 }
 
-int32_t tgco_raise(const Arguments *s) {
+int32_t tgco_raise(const Arguments *s, int64_t begin, int64_t end) {
     int64_t n = s->points, M = s->spheres;
     double *at = malloc((DIM + 1) * n * sizeof(double)), *nearest = at + DIM * n;
     if (!at) return 0;
-    for (int64_t b = 0; b < s->problems; b++) {
+    for (int64_t b = begin; b < end; b++) {
         const double *path = s->path + b * s->corners * DIM, *R = s->distances + b * M;
         double reach = 0.0;
         for (int64_t m = 0; m < M; m++) reach = R[m] > reach ? R[m] : reach;
