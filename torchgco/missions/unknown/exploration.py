@@ -52,6 +52,8 @@ SEARCHED = 2  # control periods after which a new search is due
 HELD = 2.0  # s before a search with less margin ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
+STILL = 0.3  # m within which a vehicle has stayed in its place
+AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
 WAITS = 5  # knots before the first that is blocked
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
@@ -69,7 +71,8 @@ class Scout:
     radius: float  # m, of the vehicle
     path: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # cells' centres, (K, 3), m
     corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
-    waited: int = 0  # control periods without a way on
+    waited: int = 0  # control periods near `place`
+    place: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))  # m
     level: int = 0  # of LEVELS
     since: int = 0  # control periods at this level
     seconds: dict[str, float] = field(default_factory=dict)
@@ -174,7 +177,7 @@ class Exploration:
         blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 3))
         free = points[: blocked[0] if len(blocked) else len(points)]
         scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
-        self._wait(scout, x, points, blocked)
+        self._wait(scout, position, points, gaps)
         scout.seconds["search_seconds"] += time.perf_counter() - began
 
     def keep(self, scout: Scout) -> float:
@@ -204,13 +207,18 @@ class Exploration:
                 return
             scout.level, scout.since = scout.level + 1, 0
 
-    def _wait(self, scout: Scout, x: np.ndarray, points: np.ndarray, blocked: np.ndarray) -> None:
-        """Count the periods at rest in front of cells that stay unknown, and in the end look elsewhere."""
-        length = np.linalg.norm(np.diff(scout.corners, axis=0), axis=1).sum()
-        still = len(blocked) > 0 and length < 0.3 and np.linalg.norm(x[3:6]) < 0.2
-        scout.waited = scout.waited + 1 if still else 0
+    def _wait(self, scout: Scout, position: np.ndarray, points: np.ndarray, gaps: np.ndarray) -> None:
+        """Count the periods in one place, and in the end look elsewhere.
+
+        The way on may be cells that stay unknown, as no ray gets to them, or one that no plan can take.
+        """
+        if np.linalg.norm(position - scout.place) > STILL:
+            scout.place, scout.waited = position.copy(), 0
+        scout.waited += 1
         if scout.waited * self.dt >= self.explorer.patience:
-            scout.search.avoid(points[blocked[0]], 1.0)
+            blocked = np.flatnonzero(gaps < self.keep(scout))
+            first = blocked[blocked > 0][:1]
+            scout.search.avoid(points[first[0] if len(first) else min(AHEAD, len(points) - 1)], 1.0)
             scout.waited = 0
 
     def _reference(self, x: Tensor) -> Tensor:
