@@ -36,6 +36,7 @@ from torchgco.missions.unknown.explorer import (
     unflyable,
     within_bounds,
 )
+from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
 from torchgco.missions.unknown.reference import motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
 from torchgco.obstacles.base import CONTACT_FACTOR
@@ -54,7 +55,9 @@ SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at poi
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
 STILL = 0.3  # m within which a vehicle has stayed in its place
 AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
+SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
 WAITS = 5  # knots before the first that is blocked
+MOST_MOVING = 4  # moving bodies that a knot keeps away from
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
 
@@ -69,6 +72,8 @@ class Scout:
     log: SeenLog
     goal: np.ndarray
     radius: float  # m, of the vehicle
+    movers: Movers
+    moving: Moving = field(default_factory=nothing)  # at this control step
     path: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # cells' centres, (K, 3), m
     corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
     waited: int = 0  # control periods near `place`
@@ -115,9 +120,16 @@ class Exploration:
         size = seen.resolution
         search = Search(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH)
         log = SeenLog(seen.corner, seen.shape, seen.resolution)
-        scout = Scout(World.of(self.whole, b), seen, search, log, goal, radius)
+        world = World.of(self.whole, b)
+        scout = Scout(world, seen, search, log, goal, radius, self._movers(world))
         scout.changed = seen.clear(start, self.explorer.known)
         return scout
+
+    def _movers(self, world: World) -> Movers:
+        """What a vehicle of this world learns of moving bodies."""
+        if self.explorer.movers == "known":
+            return Known(world)
+        return Unaware() if self.explorer.movers == "none" else Tracks(self.sensor.pitch)
 
     def take(self, stay: Tensor) -> None:
         """Keep the missions in `stay`."""
@@ -134,7 +146,10 @@ class Exploration:
                 scan = self.sensor.scan(scout.world, x[b, :3].numpy(), x[b, 6:10].numpy(), step * self.dt, key)
                 scan = scan.seen_from(x[b, 6:10].numpy(), measured[b, :3].numpy(), measured[b, 6:10].numpy())
                 began = time.perf_counter()
+                keep = scout.movers.observe(scan, scout.seen, step * self.dt)
+                scan = scan if keep.all() else scan.take(keep)
                 changed = scout.seen.add(scan, self.sensor.range, 3.0 * self.sensor.noise)
+                scout.movers.note(scout.seen, changed)
                 scout.changed = np.concatenate([scout.changed, changed])
                 mapped = time.perf_counter()
                 scout.seen.remeasure(scout.changed)
@@ -149,11 +164,12 @@ class Exploration:
         sensed = sum(sum(scout.seconds.values()) for scout in self.scouts)
         bias = self.planner.estimated(x, before, self.dt)
         for b, scout in enumerate(self.scouts):
+            scout.moving = scout.movers.now(step * self.dt)
             self._seek(scout, x[b].numpy())
         reference = self._reference(x)
         rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
         former = rest if before is None else self._clear_part(shifted(before.X[:, 1:, :3]))
-        seeds = [former, reference[:, 1:, :3]]
+        seeds = [former, reference[:, 1:, :3], *([] if self.explorer.movers == "none" else [rest])]
         problem = self._problem(x, bias, reference, seeds)
         kept = self._kept(problem, before).take(slice(0, len(self.scouts)))
         plan = self._chosen(problem, kept, len(seeds))
@@ -240,16 +256,31 @@ class Exploration:
                 began, keep = time.perf_counter(), self.keep(scout)
                 knots = np.clip(seed[b].numpy(), *scout.seen.box(keep))
                 own, far = scout.seen.corridor(knots, CORRIDOR, PLANES, self.kinds)
+                if self.explorer.movers != "none":
+                    times = self.dt * np.arange(1, N + 1)
+                    own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING)], axis=1)
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
                 near = np.full(N, keep)
                 near[:EARLY] = min(keep, max(gap - 0.01, CONTACT_FACTOR * scout.radius))
-                new = ((planes, own), (room, far), (inside, knots), (allowed, near), (regions, scout.seen.box(0.0)))
+                new = (
+                    (planes, own),
+                    (room, far),
+                    (inside, knots),
+                    (allowed, near),
+                    (regions, self._region(scout, x[b].numpy())),
+                )
                 for parts, part in new:
                     parts.append(part)
                 scout.seconds["field_seconds"] += time.perf_counter() - began
         form = PlanningForm(self.explorer, self.planner, _repeated(self.whole, C))
         stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, inside, allowed, regions)]
         return form.problem(x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), *stack)
+
+    def _region(self, scout: Scout, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest point (3,), m, for plans: the map's, and around a vehicle that has left it."""
+        low, high = scout.seen.box(0.0)
+        out = (x[:3] < low) | (x[:3] > high)
+        return np.where(out, np.minimum(low, x[:3] - 1.0), low), np.where(out, np.maximum(high, x[:3] + 1.0), high)
 
     def _clear_part(self, former: Tensor) -> Tensor:
         """Positions (B, N, 3) of former plans; where one has become blocked, it waits some knots before that."""
@@ -316,7 +347,13 @@ class Exploration:
             return safe
         # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.
         most, own = max(order, key=lambda c: spare[c], default=None), self.spare(kept.numpy(), b, 3.0 * AT_REST)
-        return most if most is not None and own < 0 and spare[most] > own + BETTER else None
+        if most is not None and own < 0 and spare[most] > own + BETTER:
+            return most
+        if order and own == -np.inf:  # none stops as it should: better a plan that nearly does than one that doesn't
+            ends = X[:, -1, 3:6].norm(dim=-1)
+            slowest = min(order, key=lambda c: float(ends[c]))
+            return slowest if float(ends[slowest]) + SLOWER < float(kept[-1, 3:6].norm()) else None
+        return None
 
     def spare(self, X: np.ndarray, b: int, rest: float = 0.7 * AT_REST) -> float:
         """The least distance, m, of a plan (N+1, 14) from what isn't known to be free, beyond what is asked for.
@@ -333,6 +370,9 @@ class Exploration:
         share = np.arange(FINE)[:, None] / FINE
         points = np.concatenate([(p[:-1, None] + share * np.diff(p, axis=0)[:, None]).reshape(-1, 3), p[-1:]])
         gaps = scout.seen.gaps(points, least + 0.01, self.kinds)
+        gaps = np.minimum(gaps, scout.moving.gaps(points, self.dt / FINE * np.arange(len(points))))
+        low, high = scout.seen.box(0.0)
+        gaps = gaps - np.linalg.norm(points - points.clip(low, high), axis=1)  # how far outside of the map
         near = gaps[0] - least
         asked = np.zeros(len(gaps))
         if near < 0:
