@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.missions.missions import REST
-from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, presets
+from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, Spheres, presets
 from torchgco.base.errors import InputError
 from torchgco.missions import Mission, Planner
 from torchgco.missions.contact import Contact
@@ -161,3 +161,13 @@ def test_scans_and_searches_take_turns(rate: float) -> None:
         scanned.append(exploration.scouts[0].scanned)
     assert scanned == [True, rate == 20] * 3
     assert searched == ([True] * 6 if rate == 20 else [True, True, False, True, False, True])
+
+
+def test_known_moving_bodies_are_made_way_for() -> None:
+    """A sphere comes along the straight way towards the vehicle."""
+    problem = walled(9.0)
+    sphere = Spheres([[8.0, 0.0, 0.0]], [0.6], 0.2, velocities=[[-1.5, 0.0, 0.0]])
+    problem = replace(problem, constraints=[sphere, problem.constraints[1]]).take(slice(0, 1))
+    log = mission(explorer=replace(EXPLORER, movers="known")).fly(problem, seed=1)
+    end = ending(log.arrays(), 0, log.period, Contact.among(problem), GOALS[0].numpy(), 0.5)
+    assert end.outcome is not Outcome.COLLISION and end.clearance > 0.1 and end.goal_distance < 2.0

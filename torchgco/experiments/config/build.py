@@ -27,7 +27,10 @@ from torchgco.scenarios.vehicle import BUILT_IN, fitting
 from torchgco.solvers.memory import free_memory, least_bytes
 
 DEFAULT_LAYOUTS = 64
-FLOWN = "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, walls, woods, or a layout file"
+FLOWN = (
+    "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, rooms, walls, woods, "
+    "or a layout file"
+)
 MAX_PROCESSES = 1024  # threads, too: PyTorch ends with an error of the system long before the system's own limit
 register()
 

@@ -34,6 +34,7 @@ from torchgco.scenarios import (
     Mazes,
     PlanarRandom,
     PlanarTrap,
+    Rooms,
     Walls,
     Woods,
     Yard,
@@ -41,7 +42,7 @@ from torchgco.scenarios import (
 from torchgco.scenarios.vehicle import BUILT_IN
 
 FAMILIES: tuple[type[Any], ...] = (
-    Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, PlanarTrap, PlanarRandom, Yard,
+    Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, PlanarTrap, PlanarRandom, Yard,
 )  # fmt: skip
 BY_DIMENSION = "torchgco.by_dimension"
 ALIKE = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each

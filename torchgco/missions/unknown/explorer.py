@@ -54,6 +54,8 @@ class Explorer:
         stages: of a plan, which is at rest after them.
         margin: m that plans keep from what isn't known to be free, beyond the vehicle's radius. A cell at least, as
             one that an obstacle fills in part may look free from afar; less is kept where there is no other way.
+        movers: moving bodies are "known" with their places and velocities, "tracked" in the sensor's returns, or "none"
+            are: all count as at rest.
         patience: s without a way on, after which the vehicle turns to another part of the unknown.
 
     Raises:
@@ -70,6 +72,7 @@ class Explorer:
     stages: Annotated[int, Within(20, 400)] = 60
     margin: NonNegative = 0.2
     patience: Seconds = 1.0
+    movers: Literal["none", "known", "tracked"] = "none"
 
     def __post_init__(self) -> None:
         check_options(self, "mission.explorer")
