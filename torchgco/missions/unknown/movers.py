@@ -196,9 +196,9 @@ class Tracks:
 
     def note(self, seen: SeenMap, changed: np.ndarray) -> None:
         """See `Movers`."""
-        if self._was_free is None:
-            self._was_free = (seen.state == FREE).ravel()
-        self._was_free[changed[seen.state.ravel()[changed] == FREE]] = True
+        was_free = (seen.state == FREE).ravel() if self._was_free is None else self._was_free
+        was_free[changed[seen.state.ravel()[changed] == FREE]] = True
+        self._was_free = was_free
 
     def now(self, t: float) -> Moving:
         """See `Movers`."""
@@ -212,12 +212,12 @@ class Tracks:
     def _fresh(self, seen: SeenMap, points: np.ndarray) -> np.ndarray:
         """Which points (R, 3) lie in free cells, not beside occupied ones that never were free, (R,) bool."""
         cells = np.floor((points - seen.corner) / seen.resolution).astype(np.int64)
-        found = ((cells >= 1) & (cells < np.array(seen.shape) - 1)).all(axis=1)
+        found = np.atleast_1d(((cells >= 1) & (cells < np.array(seen.shape) - 1)).all(axis=1))
         if self._was_free is None:
             return np.zeros(len(points), bool)
-        flat = np.ravel_multi_index(tuple(cells[found].T), seen.shape)
+        flat = np.atleast_1d(np.ravel_multi_index(tuple(cells[found].T), seen.shape))
         was, state = self._was_free, seen.state.ravel()
-        good = was[flat] & (state[flat] == FREE)
+        good = np.atleast_1d(was[flat] & (state[flat] == FREE))
         at = flat[good]
         steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
         around = at[:, None] + steps @ np.array([seen.shape[1] * seen.shape[2], seen.shape[2], 1])
