@@ -10,7 +10,9 @@ import pytest
 
 from tests.experiments.commands import HOLD
 from tests.view.test_packing import part
-from torchgco.experiments.reports import view
+from torchgco import InputError
+from torchgco.experiments.reports import mission_view, view
+from torchgco.native.compiler import NativeError
 
 WORDS = [*HOLD, "study.figures=false", "study.view=true", "study.figure=one"]
 MISSION = [
@@ -54,7 +56,7 @@ def test_missions_show_track_and_plan(run, tmp_path) -> None:
         np.testing.assert_allclose(flight["plan"], held["plan"][0, 1, :count], atol=2e-3)
 
 
-def test_missions_with_a_sensor_show_what_was_seen(run, tmp_path, capsys) -> None:
+def test_missions_with_a_sensor_show_what_was_seen(run, tmp_path, capsys, monkeypatch) -> None:
     words = ["experiment=mission_unknown", "mission.duration=0.3", "scenario.num_obstacles=5", "study.figures=false"]
     small = ["mission.lidar.rays=[60,10]", "mission.explorer.around=[4,2]", "study.view=true", "hydra.run.dir=unknown"]
     code, _, err = run(*words, *small)
@@ -75,6 +77,18 @@ def test_missions_with_a_sensor_show_what_was_seen(run, tmp_path, capsys) -> Non
     assert ["periods with a safe plan", f"{100 * np.mean(held['safe']):.4g} %"] in flight["rows"]
     assert view.main([str(tmp_path / "unknown"), "--search", "0"]) == 2
     assert "--search: expected missions that know all obstacles" in capsys.readouterr().err
+
+    # Where the map can't be found again, the page says so, and shows the rest.
+    def refused(*words: object) -> None:
+        raise NativeError("no C compiler found")
+
+    for target, words in (("replayed", "no map: no C compiler found"), ("Study.mission", "no map: ")):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"{mission_view.__name__}.{target}", refused if target == "replayed" else old)
+            assert view.main([str(tmp_path / "unknown"), "--output", str(tmp_path / "less.html")]) == 0
+        (note,) = part((tmp_path / "less.html").read_text(), "head")["notes"]
+        (flight,) = part((tmp_path / "less.html").read_text(), "part-0")["flights"]
+        assert words in note and "sensed" not in flight and len(flight["plan"]) == len(flight["path"])
 
 
 def test_the_search_for_the_first_plan_of_a_mission_is_shown(run, tmp_path) -> None:
@@ -107,6 +121,10 @@ def test_the_search_is_shown_where_it_is_asked_for(run, tmp_path, capsys) -> Non
     capsys.readouterr()
     assert view.main([str(tmp_path / "sought"), "--search", "7"]) == 2
     assert "--search: expected numbers of layouts of the study, got 7" in capsys.readouterr().err
+
+
+def old(*words: object) -> None:
+    raise InputError("mission.lidar", "another option", "beams")
 
 
 @pytest.mark.parametrize(

@@ -47,14 +47,14 @@ def opened() -> Iterator[Tab]:
 def flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
     """Runs a study in a folder with a layout file and a map; returns its page."""
     rng = np.random.default_rng(0)
-    ends = {"start": np.array([-1.0, 0.0]), "goal": np.array([1.0, 0.5])}
     centers, radii = rng.uniform(-0.8, 0.8, (2, 5, 2)), rng.uniform(0.02, 0.1, (2, 5))
-    Layouts(centers, radii, **ends).save(tmp_path / "layouts.npz")
+    layouts = Layouts(centers, radii, start=np.array([-1.0, 0.0]), goal=np.array([1.0, 0.5]))
+    layouts.save(tmp_path / "layouts.npz")
     cells = np.zeros((30, 20, 12), bool)
     cells[14:16], cells[14:16, 5:12, 3:10] = True, False  # a wall with a window, under a roof
     cells[:, :, -1] = True
-    ends = {"start": [0.5, 2.0, 1.2], "goal": [5.5, 2.0, 1.2]}
-    np.savez(tmp_path / "map.npz", occupied=cells, origin=[0.0, 0, 0], resolution=0.2, **ends)
+    ends = np.array([[0.5, 2.0, 1.2], [5.5, 2.0, 1.2]])
+    np.savez(tmp_path / "map.npz", occupied=cells, origin=np.zeros(3), resolution=0.2, start=ends[0], goal=ends[1])
 
     def run(*words: str) -> Path:
         monkeypatch.chdir(tmp_path)

@@ -11,6 +11,7 @@ import pandas as pd
 import torch
 from tqdm import tqdm
 
+from torchgco.base.errors import InputError
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_report import PLANS
 from torchgco.experiments.results.records import MISSION
@@ -55,13 +56,14 @@ class _Log:
         steps: rows of mission.parquet by solver and mission.
         rows: of the table, likewise.
         plans: positions (K, N+1, 3), m, likewise, of few missions.
-        loops: by solver, where few missions were flown.
+        loops: by solver, where few missions were flown with a sensor.
     """
 
     steps: Mapping[tuple[str, int], pd.DataFrame]
     rows: Mapping[tuple[str, int], Mapping[str, Any]]
     plans: Mapping[tuple[str, int], np.ndarray]
     loops: Mapping[str, Mission]
+    missing: str = ""  # why there are no loops
 
     @classmethod
     def read(cls, study: Study) -> _Log:
@@ -72,7 +74,12 @@ class _Log:
         with np.load(study.folder / PLANS, allow_pickle=False) as held:
             names, numbers, plans = held["solver"].tolist(), held["layout"].tolist(), held["plan"]
         kept = {(name, i): plans[s, b] for s, name in enumerate(names) for b, i in enumerate(numbers)}
-        return cls(steps, study.rows, kept, {name: study.mission(name) for name in names})  # type: ignore[arg-type]
+        if study.manifest.configuration["mission"].get("sensor", "full") == "full":
+            return cls(steps, study.rows, kept, {})  # type: ignore[arg-type]
+        try:
+            return cls(steps, study.rows, kept, {name: study.mission(name) for name in names})  # type: ignore[arg-type]
+        except InputError as error:  # an option that another version knew
+            return cls(steps, study.rows, kept, {}, f"no map: {error}")  # type: ignore[arg-type]
 
     def flight(self, study: Study, problem: Problem, solver: str, number: int, notes: list[str]) -> Flight | None:
         """The flight of a mission, the problem of which is given; None where it ended at its start."""
@@ -82,7 +89,8 @@ class _Log:
             return None
         flight = _flight(problem, solver, steps, self.rows[key])
         plan = None if plan is None else plan[: len(steps)]
-        if plan is None or loop is None or loop.sensor == "full":
+        notes += [self.missing] if self.missing and self.missing not in notes else []
+        if plan is None or loop is None:
             return replace(flight, plan=None if plan is None else plan[: len(flight.path)])
         x = torch.tensor(steps[[f"x{i}" for i in range(STATES)]].to_numpy(dtype=float))
         try:

@@ -64,7 +64,7 @@ def _named(part: SearchPart, solver: str) -> SearchPart:
     return SearchPart(
         [f"{solver}: {text}" for text in part.passes],
         [(f"{solver}: {text}", lines) for text, lines in part.rounds],
-        [(f"{solver}: {text}", balls, sample) for text, balls, sample in part.guides],
+        [(f"{text}, {solver}", balls, sample) for text, balls, sample in part.guides],
     )
 
 
