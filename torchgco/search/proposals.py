@@ -246,8 +246,7 @@ class Part:
     def free(self, iterations: int) -> Free:
         """The trajectories without constraints, solved at the first call; their iterations count as the proposals'."""
         if self._free is None:
-            assert self.scene is not None
-            _, unit = seen.scales(self.problem, self.scene, self.rest)
+            _, unit = self.scales
             self._free = unconstrained(self.problem, self.rest, iterations, unit.nan_to_num(1.0, 1.0, 1.0))
             self.proposal.iterations.add_(self._free.iterations)
         return self._free

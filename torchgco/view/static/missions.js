@@ -259,7 +259,8 @@ function shader(ceiling) {
   return {
     side: THREE.DoubleSide,
     uniforms: { colour: { value: new THREE.Color(OCCUPIED) }, sun: { value: SUN }, ceiling },
-    vertexShader: `attribute vec3 middle; attribute vec3 sides; uniform float ceiling; uniform vec3 colour; uniform vec3 sun; varying vec3 shade;
+    vertexShader: `attribute vec3 middle; attribute vec3 sides; uniform float ceiling; uniform vec3 colour;
+      uniform vec3 sun; varying vec3 shade;
       void main() {
         vec3 facing = vec3(greaterThan(cameraPosition, middle)) * 2.0 - 1.0;
         vec3 n = facing * normal;
