@@ -92,6 +92,9 @@ def test_every_scenario_has_its_page(scenario: str, flown: Callable[..., Path], 
     count = "study.layouts=null" if scenario == "map" else "study.layouts=2"
     page = flown(*QUICK, f"scenario={scenario}", *MADE.get(scenario, []), count)
     first = check(opened, page)
+    if scenario == "rooms":  # outer walls hide what differs
+        opened.evaluate("torchgcoView.toggle('through', true)")
+        first = pixels(opened)
     if scenario != "map":
         opened.click("#next")
         opened.wait("document.getElementById('picture').dataset.layout === '1'")
