@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import torch
@@ -170,7 +170,7 @@ def unconstrained(problem: Problem, rest: Tensor, iterations: int, unit: Tensor)
     share, slower, made = _share(problem, end.X), torch.ones_like(end.cost), end.iterations
     bare = without_obstacles(problem) if limits_states(problem) else None
     if bare is not None:
-        limits = Lagrangian(bare, replace(Multipliers.zero(bare, 0.0), mu=TRACK_PENALTY * unit), None, True)
+        limits = Lagrangian(bare, Multipliers.none(bare, TRACK_PENALTY * unit), None, True)
         limited, _ = descend(inner_solver(iterations), limits, end.U)
         slower = (_share(problem, limited.X) / share).nan_to_num(1.0).clamp(min=1.0)
         made = made + limited.iterations
