@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.view.browser import Tab, browser, found
+from tests.view.browser import Tab, one_tab
 from tests.view.scenes import DT, SOLVERS, N, document, sensed, trajectories
 from tests.view.test_browser import alike, pixels, place
 from tests.view.test_packing import part
@@ -29,12 +29,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def opened() -> Iterator[Tab]:
-    program = found()
-    if program is None:
-        pytest.skip("there is no Chromium")
-    with browser(program) as new:
-        tab = new()
-        tab.size(900, 600)
+    with one_tab(900, 600) as tab:
         yield tab
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.view.browser import Tab, browser, found
+from tests.view.browser import Tab, one_tab
 from tests.view.test_browser import pixels, stony
 from torchgco.experiments import app
 from torchgco.experiments.config.groups import options_of
@@ -34,12 +34,7 @@ MISSIONS = {
 
 @pytest.fixture(scope="module")
 def opened() -> Iterator[Tab]:
-    program = found()
-    if program is None:
-        pytest.skip("there is no Chromium")
-    with browser(program) as new:
-        tab = new()
-        tab.size(*SIZE)
+    with one_tab(*SIZE) as tab:
         yield tab
 
 
