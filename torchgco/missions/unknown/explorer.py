@@ -195,8 +195,8 @@ class PlanningForm:
 def steady_yaw(airframe: Airframe, model: Dynamics, like: Tensor) -> float:
     """The commanded yaw rate, rad/s, that one period's change of thrusts gives, with as much left for tilting.
 
-    A rotor's thrust falls at once, but rises slowly: a vehicle that is asked to yaw more loses thrust, and sinks. Yawing
-    takes five times the thrust that tilting does.
+    A rotor's thrust falls at once, but rises slowly: a vehicle asked to yaw more loses thrust, and sinks. Yawing takes
+    five times the thrust that tilting does.
     """
     hover = like.new_tensor(airframe.mass * HOVER / 4.0)
     rise = float(model.dt) * airframe.thrust_rate(hover, like.new_tensor(airframe.rotor_speeds[1]))
