@@ -17,14 +17,16 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from torchgco.base.tree import take
-from torchgco.roadmap.blocks import Blocks, blocks_of, shortcut
+from torchgco.roadmap import blocks as searched
+from torchgco.roadmap.blocks import Blocks, blocks_of
 from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.lattice import Array, Lattice, lattice_of
 from torchgco.roadmap.search import HOPS
 
-# The most blocks of a search, and the clearance of free ones in spacings of the nodes; of further searches where there
-# is no path yet. Through gaps with less clearance than the nodes are apart no trajectory may fit between its knots.
-SEARCHES = ((2**18, 0.5), (2**18, 0.0), (2**21, 0.0))
+# The most cells of a search, the clearance of free ones in spacings of the nodes, and whether free ones are merged; of
+# further searches where there is no path yet. Through gaps with less clearance than the nodes are apart no trajectory
+# may fit between its knots.
+SEARCHES = ((2**18, 0.5, True), (2**18, 0.5, False), (2**18, 0.0, False), (2**21, 0.0, False))
 MARGIN = 0.5  # of closeness: within so many units an edge costs up to double
 LEAST = 1e-6  # of the price: no edge may cost nothing
 LONGEST = 2.0  # times as dear as the cheapest one other paths may be
@@ -83,10 +85,9 @@ class Ways:
         ends: start and goal, (2, d), m.
         price: per metre.
         unit: m, of closeness to obstacles.
-        least: clearance from which a block is free, m.
     """
 
-    def __init__(self, blocks: Blocks, ends: Array, price: Price, unit: float, least: float) -> None:
+    def __init__(self, blocks: Blocks, ends: Array, price: Price, unit: float, least: float = 0.0) -> None:
         self.blocks, self.ends, self.points = blocks, ends, blocks.points
         close = 1.0 + np.clip(1.0 - blocks.clearance / (MARGIN * unit), 0.0, 1.0)
         rate = _smoothed(price, self.points, blocks.counts)
@@ -109,7 +110,9 @@ class Ways:
         blocks, lattice = self.blocks, self.blocks.lattice
         axes = [np.unique(np.clip(int(i * lattice.spacing / blocks.step) + WINDOW, 0, n - 1))
                 for i, n in zip(lattice.node(end), blocks.counts, strict=False)]  # fmt: skip
-        near = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), blocks.counts[: lattice.d]).ravel()
+        cells = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), blocks.counts[: lattice.d]).ravel()
+        near = np.unique(blocks.block[cells])
+        near = near[near >= 0]
         near = near[usable[near]]
         # An end may be a little nearer to the map than the constraint admits: the way leads out of there.
         least = min(0.0, float(lattice.at(end[None])[0])) - ROUNDING
@@ -143,16 +146,26 @@ def paths(
     lattice: Lattice, ends: Array, price: Price, count: int, radius: float, unit: float, corners: int
 ) -> list[Array]:
     """Up to `count` taut paths (P, d), P <= corners, between two points (2, d), the cheapest first."""
-    if not lattice.may_join(ends):
-        return []
-    for most, share in SEARCHES:
-        ways = Ways(blocks_of(lattice, radius, most), ends, price, unit, share * lattice.spacing)
-        if np.isfinite(ways.total).any():
-            break
-    if not np.isfinite(ways.total).any():
+    ways = _ways(lattice, ends, price, radius, unit)
+    if ways is None:
         return []
     found = _in_the_plane(ways, count) if lattice.d == 2 else _in_space(ways, count, unit)
     return [path for path in found if len(path) <= corners]
+
+
+def _ways(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> Ways | None:
+    """The ways of the first search that finds any; None where none does."""
+    for number, (most, share, merged) in enumerate(SEARCHES):
+        if number == 1 and not lattice.may_join(ends):
+            return None
+        least = share * lattice.spacing
+        blocks = blocks_of(lattice, radius, most, least, merged)
+        if len(blocks.nodes) == 0:
+            continue
+        ways = Ways(blocks, ends, price, unit, least)
+        if np.isfinite(ways.total).any():
+            return ways
+    return None
 
 
 def _in_the_plane(ways: Ways, count: int) -> list[Array]:
@@ -252,7 +265,7 @@ def _swept_on_the_way(ways: Ways, end: int) -> NDArray[np.int64]:
 
 def _crossings(lattice: Lattice, a: Array, b: Array) -> NDArray[np.int64]:
     """Sums of the numbers of regions whose rays short segments from a to b (E, 2) cross, in steps of the lattice."""
-    marks, columns = lattice.marks, lattice.clearance.shape
+    marks, columns = lattice.marks, lattice.shape
     below = np.zeros((columns[0], columns[1] + 1), np.int64)
     np.add.at(below, (marks[:, 0], marks[:, 1] + 1), keys(len(marks)))
     below = below.cumsum(axis=1)  # [column, row]: of the marks below a row
@@ -274,6 +287,10 @@ def _crossings(lattice: Lattice, a: Array, b: Array) -> NDArray[np.int64]:
 
 def tightened(lattice: Lattice, path: Array) -> Array:
     """A path drawn taut within its homotopy class: corners that aren't needed are left out, from either end in turn."""
+    least = min(0.0, *lattice.at(path[[0, -1]])) - ROUNDING
+    taut = searched.tightened(lattice, path, least, POINTS, ROUNDS, LITTLE)
+    if taut is not None:
+        return taut
     path = _shortcut(lattice, path)
     step = max(2.0 * lattice.spacing, length(path) / POINTS)
     for _ in range(ROUNDS):
@@ -304,7 +321,7 @@ def _shortcut(lattice: Lattice, path: Array) -> Array:
     The path is bent through the triangles between, which are free: it stays in its homotopy class.
     """
     least = min(0.0, *lattice.at(path[[0, -1]])) - ROUNDING
-    marked = shortcut(lattice, path, least)
+    marked = searched.shortcut(lattice, path, least)
     if marked is not None:
         return path[marked]
     kept, i, last = [0], 0, len(path) - 1

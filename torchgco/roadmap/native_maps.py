@@ -1,0 +1,116 @@
+"""The search among a map's cells in C (c/lattice.c): what it reads and writes, and its library."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchgco.native.compiler import Compiler, NativeError, find_compiler
+from torchgco.native.declarations import Structure, fields, head, load
+from torchgco.native.dispatch import EagerWarning
+from torchgco.native.kernels import native
+from torchgco.roadmap.clearances import SURE, Clearances
+
+PARTS = 4  # of the way between two blocks, for each of the larger one's layers, between which it is looked at
+SOURCE = Path(__file__).parent / "c" / "lattice.c"
+
+
+class Map(Structure):
+    declared = (
+        ("const float *", "values"),  # distances at the map's nodes
+        ("const int64_t *", "shape low size"),  # (3): the map's nodes, those before its first one, all
+        ("double", "spacing core limit"),
+        ("int64_t", "smooth"),
+    )
+    _fields_ = fields(declared)
+
+
+class Graph(Structure):
+    declared = (
+        ("const Map *", "map"),
+        ("const int64_t *", "cells"),  # (3): of blocks, along each axis
+        ("int64_t", "side merged"),  # nodes along the side of a cell; whether cells become one block where all are free
+        ("double", "least"),  # clearance from which a block is free, m
+        ("const float *", "tie"),  # (side ** DIM): what nodes are less clear than others of the same clearance, m
+        ("int32_t *", "block"),  # (cells): the block of each, -1 where there is none
+        ("int32_t *", "first node"),  # (blocks, 3): its first cell, its clearest node
+        ("uint8_t *", "layers"),  # (blocks): cells along its side
+        ("float *", "clearance"),  # (blocks)
+        ("int64_t", "blocks"),
+    )
+    _fields_ = fields(declared)
+
+
+class Sweep(Structure):
+    declared = (
+        ("const Graph *", "graph"),
+        ("const double *", "weight"),  # (blocks): price per metre, infinite where blocked
+        ("const int64_t *", "seed"),  # (seeds): blocks at which ways begin
+        ("const double *", "seed_cost"),
+        ("int64_t", "seeds"),
+        ("double", "deepest"),  # the clearance that joins two blocks, m
+        ("double *", "cost"),  # (blocks)
+        ("int32_t *", "before"),  # (blocks)
+    )
+    _fields_ = fields(declared)
+
+
+class String(Structure):
+    declared = (
+        ("const Map *", "map"),
+        ("const double *", "origin path"),  # (DIM), (points, DIM)
+        ("int64_t", "points"),
+        ("double", "least"),  # the clearance of segments at either end, m
+        ("uint8_t *", "corner"),  # (points): which of them are kept
+        ("int64_t", "parts rounds"),  # steps of a path that is drawn taut, and how often that is done
+        ("double", "little"),  # gain in length, as a share, below which there is no further round
+        ("double *", "taut"),  # (room, DIM)
+        ("int64_t", "room"),
+    )
+    _fields_ = fields(declared)
+
+
+def library_for(d: int) -> ctypes.CDLL | None:
+    """The library for space of this dimension; None without a compiler, or where the process uses PyTorch's kernels."""
+    compiler = find_compiler()
+    return None if compiler is None or not native() else _library(d, compiler)
+
+
+@functools.cache
+def _library(d: int, compiler: Compiler) -> ctypes.CDLL | None:
+    structures = [Map, Graph, Sweep, String]
+    try:
+        return load(f"{head(structures, [], {'DIM': d, 'PARTS': PARTS, 'SURE': SURE})}\n{SOURCE.read_text()}", structures)
+    except NativeError as error:
+        warnings.warn(f"paths in maps are sought by SciPy: {str(error).splitlines()[0]}", EagerWarning, stacklevel=3)
+        return None
+
+
+def map_of(clearances: Clearances) -> Map:
+    """What C reads of a map."""
+    if "native" not in clearances.kept:
+        shape, low, size = np.ones(3, np.int64), np.zeros(3, np.int64), np.ones(3, np.int64)
+        for whole, part in ((shape, clearances.values.shape), (low, clearances.low), (size, clearances.size)):
+            whole[: clearances.d] = part
+        clearances.kept["native"] = Map.complete(
+            values=torch.from_numpy(clearances.values), shape=torch.from_numpy(shape), low=torch.from_numpy(low),
+            size=torch.from_numpy(size), spacing=clearances.spacing, core=clearances.core, limit=clearances.limit,
+            smooth=int(clearances.smooth),
+        )  # fmt: skip
+    return clearances.kept["native"]
+
+
+def measured(clearances: Clearances) -> NDArray[np.float32] | None:
+    """Clearances at all nodes; None where C can't serve."""
+    library = library_for(clearances.d)
+    if library is None:
+        return None
+    values = torch.empty(tuple(clearances.size), dtype=torch.float32)
+    library.tgco_measure(ctypes.byref(map_of(clearances)), ctypes.c_void_p(values.data_ptr()))
+    return values.numpy()
