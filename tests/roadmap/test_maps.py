@@ -223,9 +223,9 @@ def test_numpy_finds_the_same_blocks_ways_and_taut_paths(d: int, merged: bool) -
         np.testing.assert_allclose(a[blocks.block[held]], b[other.block[held]], rtol=1e-6)
     assert np.isfinite(ways.costs[0][blocks.block[held]]).any()
     path = ways.path(int(ways.total.argmin()))
-    taut = tightened(ways.blocks.lattice, path)
+    taut = tightened(ways.blocks.lattice, path, ways.least)
     kernels.use_native(False)
-    np.testing.assert_allclose(tightened(other_ways.blocks.lattice, path), taut, atol=1e-12)
+    np.testing.assert_allclose(tightened(other_ways.blocks.lattice, path, ways.least), taut, atol=1e-12)
     kernels.use_native(True)
     assert 2 <= len(taut) < len(path)
 

@@ -222,17 +222,6 @@ def _tensor(values: Any) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values))
 
 
-def shortcut(lattice: Lattice, path: Array, least: float) -> NDArray[np.bool_] | None:
-    """Which points of a path (P, d) are kept as corners; None where C can't serve. See `mapped.tightened`."""
-    library = library_for(lattice.d) if lattice.alone else None
-    if library is None:
-        return None
-    kept = torch.empty(len(path), dtype=torch.bool)
-    string = _string(lattice, path, least, corner=kept)
-    library.tgco_shortcut(ctypes.byref(string))
-    return kept.numpy()
-
-
 def tightened(lattice: Lattice, path: Array, least: float, parts: int, rounds: int, little: float) -> Array | None:
     """A path (P, d) drawn taut; None where C can't serve. See `mapped.tightened`."""
     library = library_for(lattice.d) if lattice.alone else None
@@ -240,14 +229,11 @@ def tightened(lattice: Lattice, path: Array, least: float, parts: int, rounds: i
         return None
     room = parts + len(path) + 2
     taut = torch.empty(room, lattice.d, dtype=torch.float64)
-    string = _string(lattice, path, least, parts=parts, rounds=rounds, little=little, taut=taut, room=room)
-    library.tgco_tighten.restype = ctypes.c_int64
+    string = String(
+        map=map_of(lattice.map), origin=_tensor(lattice.origin), path=_tensor(path), points=len(path), least=least,
+        parts=parts, rounds=rounds, little=little, taut=taut, room=room,
+    )  # fmt: skip
     count = library.tgco_tighten(ctypes.byref(string))
     if count == 0:
         raise MemoryError("native kernels: no memory")
     return taut[:count].numpy()
-
-
-def _string(lattice: Lattice, path: Array, least: float, **more: Any) -> String:
-    path, origin = _tensor(path), _tensor(lattice.origin)
-    return String(map=map_of(lattice.map), origin=origin, path=path, points=len(path), least=least, **more)

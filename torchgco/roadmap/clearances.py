@@ -16,7 +16,7 @@ from scipy.ndimage import label
 Nodes = NDArray[np.int64]
 Numbers = NDArray[np.float64]
 
-SURE = 4.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
+SURE = 2.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
 WEIGHTS = (0.125, 0.75, 0.125)  # of a quadratic B-spline at a node, along each axis
 
 

@@ -89,6 +89,7 @@ class Ways:
 
     def __init__(self, blocks: Blocks, ends: Array, price: Price, unit: float, least: float = 0.0) -> None:
         self.blocks, self.ends, self.points = blocks, ends, blocks.points
+        self.least = least_at(blocks.lattice, ends)
         close = 1.0 + np.clip(1.0 - blocks.clearance / (MARGIN * unit), 0.0, 1.0)
         rate = _smoothed(price, self.points, blocks.counts)
         usable = (blocks.clearance > least) & np.isfinite(rate)
@@ -114,13 +115,15 @@ class Ways:
         near = np.unique(blocks.block[cells])
         near = near[near >= 0]
         near = near[usable[near]]
-        # An end may be a little nearer to the map than the constraint admits: the way leads out of there.
-        least = min(0.0, float(lattice.at(end[None])[0])) - ROUNDING
         a = np.broadcast_to(end, self.points[near].shape)
-        seen = near[lattice.see(a, self.points[near], np.full(len(near), least))]
+        seen = near[lattice.see(a, self.points[near], np.full(len(near), self.least))]
         if len(seen) == 0 and len(near) > 0:
             seen = near[[np.linalg.norm(self.points[near] - end, axis=1).argmin()]]
         return seen
+
+    def taut(self, block: int) -> Array:
+        """The way through a block, drawn taut."""
+        return tightened(self.blocks.lattice, self.path(block), self.least)
 
     def path(self, block: int) -> Array:
         """The way from start to goal (P, d) through a block."""
@@ -178,7 +181,7 @@ def _in_the_plane(ways: Ways, count: int) -> list[Array]:
     _, first = np.unique(kind[order], return_index=True)
     chosen = live[order[np.sort(first)[:count]]]
     chosen = chosen[total[chosen] <= LONGEST * total[chosen[0]]]
-    return [tightened(ways.blocks.lattice, ways.path(int(v))) for v in chosen]
+    return [ways.taut(int(v)) for v in chosen]
 
 
 def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
@@ -202,11 +205,11 @@ def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
     shares = (ways.costs[0][ends] - begins[ends]) / best
     ends, shares = ends[total[ends] <= LONGEST * best], shares[total[ends] <= LONGEST * best]
     order = np.argsort(total[ends] / best - shares, kind="stable")[: TRIED * count]
-    lattice, found = ways.blocks.lattice, [tightened(ways.blocks.lattice, ways.path(int(total.argmin())))]
+    found = [ways.taut(int(total.argmin()))]
     for v in ends[order]:
         if len(found) == count:
             break
-        path = tightened(lattice, ways.path(int(v)))
+        path = ways.taut(int(v))
         if all(_apart(path, other) > unit for other in found):
             found.append(path)
     return found
@@ -285,18 +288,25 @@ def _crossings(lattice: Lattice, a: Array, b: Array) -> NDArray[np.int64]:
 # Taut strings -----------------------------------------------------------------------------------------------------
 
 
-def tightened(lattice: Lattice, path: Array) -> Array:
-    """A path drawn taut within its homotopy class: corners that aren't needed are left out, from either end in turn."""
-    least = min(0.0, *lattice.at(path[[0, -1]])) - ROUNDING
+def least_at(lattice: Lattice, ends: Array) -> float:
+    """The clearance of what begins or ends there: an end may be nearer to the map than the constraint admits."""
+    return min(0.0, *lattice.at(ends)) - ROUNDING
+
+
+def tightened(lattice: Lattice, path: Array, least: float) -> Array:
+    """A path drawn taut within its homotopy class: corners that aren't needed are left out, from either end in turn.
+
+    `least` is the clearance of its first and its last segment.
+    """
     taut = searched.tightened(lattice, path, least, POINTS, ROUNDS, LITTLE)
     if taut is not None:
         return taut
-    path = _shortcut(lattice, path)
+    path = _shortcut(lattice, path, least)
     step = max(2.0 * lattice.spacing, length(path) / POINTS)
     for _ in range(ROUNDS):
         before = length(path)
-        path = _shortcut(lattice, _dense(path, step)[::-1])[::-1]
-        path = _shortcut(lattice, _dense(path, step))
+        path = _shortcut(lattice, _dense(path, step)[::-1], least)[::-1]
+        path = _shortcut(lattice, _dense(path, step), least)
         if length(path) > (1.0 - LITTLE) * before:
             break
     return path
@@ -315,15 +325,11 @@ def _dense(path: Array, step: float) -> Array:
     return np.concatenate(parts)
 
 
-def _shortcut(lattice: Lattice, path: Array) -> Array:
+def _shortcut(lattice: Lattice, path: Array, least: float) -> Array:
     """From each kept corner straight on to the last point that it sees, and all points before it.
 
     The path is bent through the triangles between, which are free: it stays in its homotopy class.
     """
-    least = min(0.0, *lattice.at(path[[0, -1]])) - ROUNDING
-    marked = searched.shortcut(lattice, path, least)
-    if marked is not None:
-        return path[marked]
     kept, i, last = [0], 0, len(path) - 1
     while i < last:
         far = i

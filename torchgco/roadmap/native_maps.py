@@ -67,7 +67,6 @@ class String(Structure):
         ("const double *", "origin path"),  # (DIM), (points, DIM)
         ("int64_t", "points"),
         ("double", "least"),  # the clearance of segments at either end, m
-        ("uint8_t *", "corner"),  # (points): which of them are kept
         ("int64_t", "parts rounds"),  # steps of a path that is drawn taut, and how often that is done
         ("double", "little"),  # gain in length, as a share, below which there is no further round
         ("double *", "taut"),  # (room, DIM)

@@ -61,31 +61,71 @@ void tgco_measure(const Map *m, float *clearance) {
 
 typedef struct { int32_t node[3]; float clearance; } Cell;
 
+/* The nodes of a cell, and whether all of them are the map's own. */
+typedef struct { int64_t from[3], to[3]; int own; } Nodes;
+
+static Nodes nodes_of(const Graph *g, const int64_t *cell) {
+    const Map *m = g->map;
+    Nodes n = {{0, 0, 0}, {1, 1, 1}, 1};
+    for (int a = 0; a < DIM; a++) {
+        n.from[a] = cell[a] * g->side, n.to[a] = n.from[a] + g->side;
+        n.own &= n.from[a] >= m->low[a] && n.to[a] <= m->low[a] + m->shape[a];
+        n.to[a] = n.to[a] < m->size[a] ? n.to[a] : m->size[a];
+    }
+    return n;
+}
+
+/* The place of a node among those of a cell. */
+static inline int64_t place_in(const Graph *g, const Nodes *n, const int64_t *node) {
+    int64_t place = 0;
+    for (int a = 0; a < DIM; a++) place = place * g->side + node[a] - n->from[a];
+    return place;
+}
+
+/* The clearest node of a cell by the field's distances. */
+static Cell roughly_clearest(const Graph *g, const Nodes *n) {
+    const Map *m = g->map;
+    Cell best = {{0, 0, 0}, -INFINITY};
+    float most = -INFINITY, limit = (float)m->limit;
+    int64_t node[3], count = n->to[2] - n->from[2];
+    for (node[0] = n->from[0]; node[0] < n->to[0]; node[0]++)
+        for (node[1] = n->from[1]; node[1] < n->to[1]; node[1]++) {
+            node[2] = n->from[2];
+            const float *tie = g->tie + place_in(g, n, node), *row = NULL;
+            if (n->own) {
+                int64_t i = node[0] - m->low[0], j = node[1] - m->low[1], k = node[2] - m->low[2];
+                row = m->values + (i * m->shape[1] + j) * m->shape[2] + k;
+            }
+            for (int64_t k = 0; k < count; k++) {
+                node[2] = n->from[2] + k;
+                float found = row ? row[k] - limit : (float)clearance_at(m, node, 1), merit = found - tie[k];
+                if (!(merit > most)) continue;
+                most = merit, best.clearance = found;
+                for (int a = 0; a < 3; a++) best.node[a] = (int32_t)node[a];
+            }
+        }
+    return best;
+}
+
 /* The clearest node of a cell. Where that is sure to be free, or to be blocked, by the field's distances. */
 static Cell clearest(const Graph *g, const int64_t *cell) {
     const Map *m = g->map;
-    Cell best = {{0, 0, 0}, -INFINITY};
-    double sure = SURE * m->spacing;
-    for (int raw = 1; raw >= 0; raw--) {
-        float most = -INFINITY, before = best.clearance;
-        if (!raw && (before <= 0 || before >= sure)) break;
-        int64_t node[3], from[3], to[3], number = 0;
-        for (int a = 0; a < 3; a++) {
-            from[a] = a < DIM ? cell[a] * g->side : 0, to[a] = a < DIM ? from[a] + g->side : 1;
-        }
-        for (node[0] = from[0]; node[0] < to[0]; node[0]++)
-            for (node[1] = from[1]; node[1] < to[1]; node[1]++)
-                for (node[2] = from[2]; node[2] < to[2]; node[2]++) {
-                    float tie = g->tie[number++], found;
-                    if (node[0] >= m->size[0] || node[1] >= m->size[1] || node[2] >= m->size[2]) continue;
-                    found = (float)clearance_at(m, node, 1);
-                    if (!raw && (!(found > 0) || !(found - tie > most))) continue; /* it is no less than the other */
-                    if (!raw) found = (float)clearance_at(m, node, 0);
-                    if (!(found - tie > most)) continue;
-                    most = found - tie, best.clearance = found;
-                    for (int a = 0; a < 3; a++) best.node[a] = (int32_t)node[a];
-                }
-    }
+    Nodes n = nodes_of(g, cell);
+    Cell best = roughly_clearest(g, &n);
+    if (best.clearance <= 0 || best.clearance >= SURE * m->spacing) return best;
+    int64_t node[3] = {best.node[0], best.node[1], best.node[2]};
+    best.clearance = (float)clearance_at(m, node, 0);
+    float most = best.clearance - g->tie[place_in(g, &n, node)];
+    for (node[0] = n.from[0]; node[0] < n.to[0]; node[0]++)
+        for (node[1] = n.from[1]; node[1] < n.to[1]; node[1]++)
+            for (node[2] = n.from[2]; node[2] < n.to[2]; node[2]++) {
+                float tie = g->tie[place_in(g, &n, node)], found = (float)clearance_at(m, node, 1);
+                if (!(found > 0) || !(found - tie > most)) continue; /* it is no less than the other */
+                found = (float)clearance_at(m, node, 0);
+                if (!(found - tie > most)) continue;
+                most = found - tie, best.clearance = found;
+                for (int a = 0; a < 3; a++) best.node[a] = (int32_t)node[a];
+            }
     return best;
 }
 
@@ -289,8 +329,6 @@ static void mark_corners(const String *s, const double *path, int64_t points, ui
     }
 }
 
-void tgco_shortcut(const String *s) { mark_corners(s, s->path, s->points, s->corner); }
-
 typedef struct { double *point; int64_t count; } Path;
 
 static double apart(const double *a, const double *b) {
@@ -333,7 +371,7 @@ static void reversed(const Path *path, double step, Path *dense) {
 
 /* A path drawn taut within its homotopy class: corners that aren't needed are left out, from either end in turn. Returns
    how many points it has in `taut`; 0 without memory. */
-int64_t tgco_tighten(const String *s) {
+int32_t tgco_tighten(const String *s) {
     Path path = {s->taut, s->points}, dense = {malloc(s->room * DIM * sizeof(double)), 0};
     uint8_t *corner = malloc(s->room);
     if (!dense.point || !corner) { free(dense.point); free(corner); return 0; }
@@ -353,5 +391,5 @@ int64_t tgco_tighten(const String *s) {
     }
     free(dense.point);
     free(corner);
-    return path.count;
+    return (int32_t)path.count;
 }
