@@ -210,18 +210,26 @@ def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
         if len(found) == count:
             break
         path = ways.taut(int(v))
-        if all(_apart(path, other) > unit for other in found):
+        points = _spread(path)
+        if all(_apart(points, other) > unit for other in found):
             found.append(path)
     return found
 
 
-def _apart(path: Array, other: Array) -> float:
-    """The largest distance of a path's points from another path, m."""
+def _spread(path: Array) -> Array:
+    """Points (COMPARED, d) at equal shares of a path's length."""
+    along = np.concatenate(([0.0], np.sqrt((np.diff(path, axis=0) ** 2).sum(1)).cumsum()))
+    share = np.linspace(0.0, along[-1], COMPARED)
+    return np.stack([np.interp(share, along, x) for x in path.T], axis=1)
+
+
+def _apart(points: Array, other: Array) -> float:
+    """The largest distance of points (P, d) from a path, m."""
     a, along = other[:-1], np.diff(other, axis=0)
-    toward = _dense(path, length(path) / COMPARED)[:, None] - a
+    toward = points[:, None] - a
     share = (toward * along).sum(-1) / np.maximum((along * along).sum(-1), ROUNDING)
-    gap = np.linalg.norm(toward - np.clip(share, 0.0, 1.0)[..., None] * along, axis=-1)
-    return float(gap.min(1).max())
+    gap = toward - np.clip(share, 0.0, 1.0)[..., None] * along
+    return float(np.sqrt((gap * gap).sum(-1).min(1).max()))
 
 
 # Homotopy classes -------------------------------------------------------------------------------------------------

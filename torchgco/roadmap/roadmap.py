@@ -42,7 +42,8 @@ class Roadmap:
     """A graph of points around obstacles, and the cheapest paths over it.
 
     Args:
-        num_halton: points of a Halton sequence all over the scene, added to `NODES` points around the obstacles.
+        num_halton: points of a Halton sequence all over the scene, added to `NODES` points around the obstacles; none
+            are needed among maps.
         max_overlap: allowed penetration of a path into an obstacle, as a share of the inflated radius. Keep it below
             0.05, which the judge accepts between two knots. A gap closed by no more than this can be flown through.
 
@@ -70,6 +71,10 @@ class Roadmap:
         everyone = torch.arange(scene.start.shape[0], device=scene.start.device)
         parts = [self._paths(scene, rows, count, library) for rows in everyone.split(most)]
         return torch.cat([path for path, _ in parts]), torch.cat([found for _, found in parts])
+
+    def repeats(self, other: Roadmap, scene: Scene) -> bool:
+        """Whether another search finds the same paths: those among maps need no points all over the scene."""
+        return bool(scene.obstacles.maps) and self.max_overlap == other.max_overlap
 
     def _paths(self, scene: Scene, rows: Tensor, count: int, library: CDLL | None) -> tuple[Tensor, Tensor]:
         """Paths of the problems in `rows`; see `paths`."""

@@ -162,7 +162,9 @@ class PathProposals:
         R, unit = seen.scales(problem, scene, rest)
         usable, known = torch.isfinite(unit) & (unit > 0), []
         found = torch.zeros_like(usable)
-        for roadmap in self.roadmaps:
+        for number, roadmap in enumerate(self.roadmaps):
+            if any(roadmap.repeats(other, scene) for other in self.roadmaps[:number]):
+                continue
             corners, arrives = roadmap.paths(scene, self.num_paths)
             known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, self.num_paths)))
             found = found | (arrives & usable)
