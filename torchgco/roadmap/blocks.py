@@ -65,19 +65,43 @@ class Blocks:
         library = library_for(self.lattice.d)
         if library is None:
             return self._by_scipy(weight, seeds, seed_costs)
+        cost, before, _ = self._swept(library, weight, seeds, seed_costs)
+        return cost, before
+
+    def another(self, weight: Array, seeds: NDArray[np.int64], seed_costs: Array, ahead: Array, onward: Any) -> list[int]:
+        """The blocks of the cheapest way from some blocks to the goal, where prices have been raised.
+
+        Args:
+            ahead: costs (V,) of the cheapest ways to the goal before.
+            onward: the next block (V,) on them, -1 where they end.
+        """
+        library = library_for(self.lattice.d)
+        if library is None:
+            cost, before = self._by_scipy(weight, seeds, seed_costs)
+            end = int(np.where(onward < 0, cost + ahead, np.inf).argmin())
+        else:
+            _, before, end = self._swept(library, weight, seeds, seed_costs, ahead=_tensor(ahead), onward=_tensor(onward))
+        way = [end]
+        while before[way[-1]] >= 0:
+            way.append(int(before[way[-1]]))
+        return way[::-1]
+
+    def _swept(
+        self, library: ctypes.CDLL, weight: Array, seeds: NDArray[np.int64], seed_costs: Array, **goal: torch.Tensor
+    ) -> tuple[Array, NDArray[np.int32], int]:
         cost, before = torch.empty(len(weight), dtype=torch.float64), torch.empty(len(weight), dtype=torch.int32)
         graph = Graph(
             map=map_of(self.lattice.map), cells=torch.tensor(self.counts), side=self.side, blocks=len(weight),
             block=_tensor(self.block), first=_tensor(self.first), node=_tensor(self.room),
             layers=_tensor(self.layers).view(torch.bool), clearance=_tensor(self.own),
         )  # fmt: skip
-        done = library.tgco_sweep(ctypes.byref(Sweep(
+        sweep = Sweep(
             graph=graph, weight=_tensor(weight), seed=_tensor(seeds.astype(np.int64)), seed_cost=_tensor(seed_costs),
-            seeds=len(seeds), deepest=-DEEP * self.radius, cost=cost, before=before,
-        )))  # fmt: skip
-        if not done:
+            seeds=len(seeds), deepest=-DEEP * self.radius, cost=cost, before=before, end=-1, **goal,
+        )  # fmt: skip
+        if not library.tgco_sweep(ctypes.byref(sweep)):
             raise MemoryError("native kernels: no memory")
-        return cost.numpy(), before.numpy()
+        return cost.numpy(), before.numpy(), sweep.end
 
     def _joined(self, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the segments between blocks (E,) are nowhere deep in an obstacle; as in C."""
@@ -222,7 +246,9 @@ def _tensor(values: Any) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values))
 
 
-def tightened(lattice: Lattice, path: Array, least: float, parts: int, rounds: int, little: float) -> Array | None:
+def tightened(
+    lattice: Lattice, path: Array, least: float, reach: float, parts: int, rounds: int, little: float
+) -> Array | None:
     """A path (P, d) drawn taut; None where C can't serve. See `mapped.tightened`."""
     library = library_for(lattice.d) if lattice.alone else None
     if library is None:
@@ -231,7 +257,7 @@ def tightened(lattice: Lattice, path: Array, least: float, parts: int, rounds: i
     taut = torch.empty(room, lattice.d, dtype=torch.float64)
     string = String(
         map=map_of(lattice.map), origin=_tensor(lattice.origin), path=_tensor(path), points=len(path), least=least,
-        parts=parts, rounds=rounds, little=little, taut=taut, room=room,
+        reach=reach, parts=parts, rounds=rounds, little=little, taut=taut, room=room,
     )  # fmt: skip
     count = library.tgco_tighten(ctypes.byref(string))
     if count == 0:

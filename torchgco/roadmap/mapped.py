@@ -38,6 +38,8 @@ ROUNDS = 4  # of drawing taut, at most, and the gain in length, as a share, belo
 LITTLE = 1e-3
 WINDOWS = (8, 16, 64, 10**6)  # points ahead that are looked at together
 POINTS = 96  # of a path that is drawn taut
+SHORT = 10  # segments, at least, of a path that keeps off others, which it would be drawn onto
+DIVERSITY = 1.0  # extra price of later paths, as a share, next to an earlier one
 ROUNDING = 1e-9  # m
 KEY = 0x5DEECE66D  # seed of the numbers that stand for blocked regions
 
@@ -94,12 +96,13 @@ class Ways:
         rate = _smoothed(price, self.points, blocks.counts)
         usable = (blocks.clearance > least) & np.isfinite(rate)
         self.weight = np.where(usable, np.maximum(rate, 0.0) * close + LEAST, np.inf)
-        self.costs = np.empty((2, len(self.weight)))
+        self.costs, self.seeds = np.empty((2, len(self.weight))), list[tuple[NDArray[np.int64], Array]]()
         self.before = np.empty((2, len(self.weight)), np.int32)
         for i, end in enumerate(ends):
             seeds = self._seen(end, usable)
             apart = np.linalg.norm(self.points[seeds] - end, axis=1)
-            self.costs[i], self.before[i] = blocks.costs(self.weight, seeds, apart * self.weight[seeds])
+            self.seeds.append((seeds, apart * self.weight[seeds]))
+            self.costs[i], self.before[i] = blocks.costs(self.weight, *self.seeds[i])
 
     @property
     def total(self) -> Array:
@@ -124,6 +127,12 @@ class Ways:
     def taut(self, block: int) -> Array:
         """The way through a block, drawn taut."""
         return tightened(self.blocks.lattice, self.path(block), self.least)
+
+    def beside(self, raised: Array) -> Array:
+        """The cheapest way where prices are raised, with corners left out that are near."""
+        way = self.blocks.another(raised, *self.seeds[0], self.costs[1], self.before[1])
+        path = np.concatenate((self.ends[:1], self.points[way], self.ends[1:]))
+        return tightened(self.blocks.lattice, path, self.least, length(path) / SHORT)
 
     def path(self, block: int) -> Array:
         """The way from start to goal (P, d) through a block."""
@@ -213,7 +222,32 @@ def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
         points = _spread(path)
         if all(_apart(points, other) > unit for other in found):
             found.append(path)
-    return found
+    return found + _beside(ways, found, count - len(found), unit)
+
+
+def _beside(ways: Ways, found: list[Array], count: int, unit: float) -> list[Array]:
+    """Up to `count` further paths: the cheapest where prices near all paths before are raised."""
+    weight, others = ways.weight.copy(), list[Array]()
+    for path in found:
+        weight *= _raise(ways.points, path, unit)
+    for _ in range(count):
+        path = ways.beside(weight)
+        weight *= _raise(ways.points, path, unit)
+        points = _spread(path)
+        if all(_apart(points, other) > unit for other in (*found, *others)):
+            others.append(path)
+    return others
+
+
+def _raise(points: Array, path: Array, unit: float) -> Array:
+    """By which prices at points (V, d) rise next to a path."""
+    square = np.full(len(points), np.inf)
+    for a, along in zip(path[:-1], np.diff(path, axis=0), strict=True):
+        toward = points - a
+        share = np.clip(toward @ along / max(along @ along, ROUNDING), 0.0, 1.0)
+        gap = toward - share[:, None] * along
+        np.minimum(square, np.einsum("ij,ij->i", gap, gap), out=square)
+    return np.where(square < unit * unit, 1.0 + DIVERSITY, 1.0)
 
 
 def _spread(path: Array) -> Array:
@@ -301,17 +335,20 @@ def least_at(lattice: Lattice, ends: Array) -> float:
     return min(0.0, *lattice.at(ends)) - ROUNDING
 
 
-def tightened(lattice: Lattice, path: Array, least: float) -> Array:
+def tightened(lattice: Lattice, path: Array, least: float, reach: float = np.inf) -> Array:
     """A path drawn taut within its homotopy class: corners that aren't needed are left out, from either end in turn.
 
-    `least` is the clearance of its first and its last segment.
+    Args:
+        least: clearance of its first and its last segment, m.
+        reach: the longest segment, m: with one, corners are left out once.
     """
-    taut = searched.tightened(lattice, path, least, POINTS, ROUNDS, LITTLE)
+    rounds = ROUNDS if reach == np.inf else 0
+    taut = searched.tightened(lattice, path, least, reach, POINTS, rounds, LITTLE)
     if taut is not None:
         return taut
-    path = _shortcut(lattice, path, least)
+    path = _shortcut(lattice, path, least, reach)
     step = max(2.0 * lattice.spacing, length(path) / POINTS)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         before = length(path)
         path = _shortcut(lattice, _dense(path, step)[::-1], least)[::-1]
         path = _shortcut(lattice, _dense(path, step), least)
@@ -333,7 +370,7 @@ def _dense(path: Array, step: float) -> Array:
     return np.concatenate(parts)
 
 
-def _shortcut(lattice: Lattice, path: Array, least: float) -> Array:
+def _shortcut(lattice: Lattice, path: Array, least: float, reach: float = np.inf) -> Array:
     """From each kept corner straight on to the last point that it sees, and all points before it.
 
     The path is bent through the triangles between, which are free: it stays in its homotopy class.
@@ -346,6 +383,7 @@ def _shortcut(lattice: Lattice, path: Array, least: float) -> Array:
             beside_end = (ahead == last) | (i == 0)
             a = np.broadcast_to(path[i], path[ahead].shape)
             hidden = ~lattice.see(a, path[ahead], np.where(beside_end, least, 0.0))
+            hidden |= (np.linalg.norm(path[ahead] - path[i], axis=1) > reach) & (ahead > i + 1)
             far = int(ahead[hidden.argmax()]) - 1 if hidden.any() else int(ahead[-1])
             if hidden.any() or far == last:
                 break

@@ -53,7 +53,9 @@ class Sweep(Structure):
         ("const double *", "weight"),  # (blocks): price per metre, infinite where blocked
         ("const int64_t *", "seed"),  # (seeds): blocks at which ways begin
         ("const double *", "seed_cost"),
-        ("int64_t", "seeds"),
+        ("int64_t", "seeds end"),  # the block at which the cheapest way to the goal ends
+        ("const double *", "ahead"),  # (blocks): of ways to the goal, no more than they cost; or NULL
+        ("const int32_t *", "onward"),  # (blocks): -1 where ways to the goal end
         ("double", "deepest"),  # the clearance that joins two blocks, m
         ("double *", "cost"),  # (blocks)
         ("int32_t *", "before"),  # (blocks)
@@ -66,7 +68,7 @@ class String(Structure):
         ("const Map *", "map"),
         ("const double *", "origin path"),  # (DIM), (points, DIM)
         ("int64_t", "points"),
-        ("double", "least"),  # the clearance of segments at either end, m
+        ("double", "least reach"),  # the clearance of segments at either end, and the longest segment, m
         ("int64_t", "parts rounds"),  # steps of a path that is drawn taut, and how often that is done
         ("double", "little"),  # gain in length, as a share, below which there is no further round
         ("double *", "taut"),  # (room, DIM)
@@ -85,7 +87,8 @@ def library_for(d: int) -> ctypes.CDLL | None:
 def _library(d: int, compiler: Compiler) -> ctypes.CDLL | None:
     structures = [Map, Graph, Sweep, String]
     try:
-        return load(f"{head(structures, [], {'DIM': d, 'PARTS': PARTS, 'SURE': SURE})}\n{SOURCE.read_text()}", structures)
+        declared = head(structures, [], {"DIM": d, "PARTS": PARTS, "SURE": SURE})
+        return load(f"{declared}\n{SOURCE.read_text()}", structures)
     except NativeError as error:
         warnings.warn(f"paths in maps are sought by SciPy: {str(error).splitlines()[0]}", EagerWarning, stacklevel=3)
         return None

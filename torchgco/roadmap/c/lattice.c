@@ -241,9 +241,12 @@ static double blocks_apart(const Graph *g, int64_t a, int64_t b) {
     return 0.5 * sqrt(square);
 }
 
+static inline double rest(const Sweep *s, int64_t v) { return s->ahead ? s->ahead[v] : 0.0; }
+
 /* Costs of the cheapest ways from some blocks, whose costs are given, to all, and the block before each; -1 at the
-   beginning of a way, and where none leads. Returns 0 without memory. */
-int32_t tgco_sweep(const Sweep *s) {
+   beginning of a way, and where none leads. With the costs `ahead` to the goal, ways are sought only until one ends: at
+   the block that `end` becomes. Returns 0 without memory. */
+int32_t tgco_sweep(Sweep *s) {
     const Graph *g = s->graph;
     const int64_t *cells = g->cells;
     int64_t count = 0, room = 1024 + s->seeds;
@@ -253,12 +256,14 @@ int32_t tgco_sweep(const Sweep *s) {
     for (int64_t v = 0; v < g->blocks; v++) s->cost[v] = INFINITY, s->before[v] = -1;
     for (int64_t i = 0; i < s->seeds; i++) {
         s->cost[s->seed[i]] = s->seed_cost[i];
-        push(heap, &count, s->seed_cost[i], (int32_t)s->seed[i]);
+        push(heap, &count, s->seed_cost[i] + rest(s, s->seed[i]), (int32_t)s->seed[i]);
     }
     while (count > 0) {
         Entry top = pop(heap, &count);
         int64_t v = top.block, from[3], to[3], at[3];
-        if (top.cost > s->cost[v]) continue;
+        if (top.cost > s->cost[v] + rest(s, v)) continue;
+        top.cost = s->cost[v];
+        if (s->ahead && s->onward[v] < 0) { s->end = v; break; }
         if (count + 64 > room) {
             Entry *more = realloc(heap, 2 * room * sizeof *heap);
             if (!more) { free(heap); return 0; }
@@ -277,7 +282,7 @@ int32_t tgco_sweep(const Sweep *s) {
                     double cost = top.cost + 0.5 * (blocks_apart(g, v, w) * step) * (s->weight[v] + s->weight[w]);
                     if (!(cost < s->cost[w]) || !joined(s, v, w)) continue;
                     s->cost[w] = cost, s->before[w] = (int32_t)v;
-                    push(heap, &count, cost, (int32_t)w);
+                    push(heap, &count, cost + rest(s, w), (int32_t)w);
                 }
             }
     }
@@ -312,7 +317,14 @@ static int sees(const String *s, const double *a, const double *b, double least)
     }
 }
 
-/* From each kept corner straight on to the last point that it sees, and all points before it; the kept ones are marked. */
+static double apart(const double *a, const double *b) {
+    double square = 0.0;
+    for (int i = 0; i < DIM; i++) square += (b[i] - a[i]) * (b[i] - a[i]);
+    return sqrt(square);
+}
+
+/* From each kept corner straight on to the last point that it sees, and all points before it, no
+   farther than `reach`; the kept ones are marked. */
 static void mark_corners(const String *s, const double *path, int64_t points, uint8_t *corner) {
     int64_t last = points - 1, i = 0;
     memset(corner, 0, points);
@@ -321,7 +333,8 @@ static void mark_corners(const String *s, const double *path, int64_t points, ui
         int64_t far = i;
         while (far < last) {
             int ends = far + 1 == last || i == 0;
-            if (!sees(s, path + i * DIM, path + (far + 1) * DIM, ends ? s->least : 0.0)) break;
+            const double *from = path + i * DIM, *to = path + (far + 1) * DIM;
+            if ((far > i && apart(from, to) > s->reach) || !sees(s, from, to, ends ? s->least : 0.0)) break;
             far++;
         }
         i = far > i ? far : i + 1;
@@ -330,12 +343,6 @@ static void mark_corners(const String *s, const double *path, int64_t points, ui
 }
 
 typedef struct { double *point; int64_t count; } Path;
-
-static double apart(const double *a, const double *b) {
-    double square = 0.0;
-    for (int i = 0; i < DIM; i++) square += (b[i] - a[i]) * (b[i] - a[i]);
-    return sqrt(square);
-}
 
 static double length_of(const Path *path) {
     double sum = 0.0;
