@@ -22,7 +22,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-
 AT_ONCE = 2**15  # points that are looked up together, about: bounds the memory
 
 

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchgco.roadmap.clearances import SURE, Clearances
+from torchgco.roadmap.clearances import Clearances
 from torchgco.roadmap.lattice import Array, Lattice
-from torchgco.roadmap.native_maps import PARTS, Graph, String, Sweep, library_for, map_of
+from torchgco.roadmap.native_maps import PARTS, SURE, Graph, String, Sweep, library_for
 
 SIDE = 0.8  # of a cell, in vehicle's radii, where that takes no more cells than admitted
 DEEP = 0.2  # vehicle's radii beneath contact that the way between two blocks may lead
@@ -68,7 +68,9 @@ class Blocks:
         cost, before, _ = self._swept(library, weight, seeds, seed_costs)
         return cost, before
 
-    def another(self, weight: Array, seeds: NDArray[np.int64], seed_costs: Array, ahead: Array, onward: Any) -> list[int]:
+    def another(
+        self, weight: Array, seeds: NDArray[np.int64], seed_costs: Array, ahead: Array, onward: NDArray[np.int32]
+    ) -> list[int]:
         """The blocks of the cheapest way from some blocks to the goal, where prices have been raised.
 
         Args:
@@ -80,7 +82,8 @@ class Blocks:
             cost, before = self._by_scipy(weight, seeds, seed_costs)
             end = int(np.where(onward < 0, cost + ahead, np.inf).argmin())
         else:
-            _, before, end = self._swept(library, weight, seeds, seed_costs, ahead=_tensor(ahead), onward=_tensor(onward))
+            goal = {"ahead": _tensor(ahead), "onward": _tensor(onward)}
+            _, before, end = self._swept(library, weight, seeds, seed_costs, **goal)
         way = [end]
         while before[way[-1]] >= 0:
             way.append(int(before[way[-1]]))
@@ -91,7 +94,7 @@ class Blocks:
     ) -> tuple[Array, NDArray[np.int32], int]:
         cost, before = torch.empty(len(weight), dtype=torch.float64), torch.empty(len(weight), dtype=torch.int32)
         graph = Graph(
-            map=map_of(self.lattice.map), cells=torch.tensor(self.counts), side=self.side, blocks=len(weight),
+            map=self.lattice.map.native, cells=torch.tensor(self.counts), side=self.side, blocks=len(weight),
             block=_tensor(self.block), first=_tensor(self.first), node=_tensor(self.room),
             layers=_tensor(self.layers).view(torch.bool), clearance=_tensor(self.own),
         )  # fmt: skip
@@ -157,12 +160,11 @@ def blocks_of(lattice: Lattice, radius: float, most: int, least: float = 0.0, me
     key = ("blocks", size, least, merged)
     if key not in lattice.map.kept:
         lattice.map.kept[key] = _blocks(lattice.map, size, least, merged)
-    parts = lattice.map.kept[key]
-    counts, room, own = parts[0], parts[4], parts[5]
+    counts, block, first, layers, room, own = lattice.map.kept[key]
     clear = own.astype(float)
     if not lattice.alone:
         clear = np.minimum(clear, lattice.beside(lattice.position(room[:, : lattice.d].astype(np.int64))))
-    return Blocks(lattice, counts, size, *parts[1:5], clear, own, radius)
+    return Blocks(lattice, counts, size, block, first, layers, room, clear, own, radius)
 
 
 def _blocks(clearances: Clearances, size: int, least: float, merged: bool) -> tuple[Any, ...]:
@@ -180,7 +182,7 @@ def _blocks(clearances: Clearances, size: int, least: float, merged: bool) -> tu
     block, first, node = (torch.empty(n, dtype=torch.int32) for n in (cells, 3 * cells, 3 * cells))
     layers, clearance = torch.empty(cells, dtype=torch.bool), torch.empty(cells, dtype=torch.float32)
     graph = Graph(
-        map=map_of(clearances), cells=torch.tensor(counts), side=size, merged=int(merged), least=least,
+        map=clearances.native, cells=torch.tensor(counts), side=size, merged=int(merged), least=least,
         tie=_tensor(tie), block=block, first=first, node=node, layers=layers, clearance=clearance, blocks=0,
     )  # fmt: skip
     library.tgco_blocks(ctypes.byref(graph))
@@ -222,10 +224,10 @@ def _clearest(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """The clearest node of each cell, (cells, d), and its clearance; by the field's distances where that is sure."""
     d = clearances.d
-    every = np.moveaxis(np.indices(clearances.size), 0, -1)
+    every = np.moveaxis(np.indices(clearances.size.tolist()), 0, -1)
     beyond = [(0, c * size - n) for c, n in zip(counts, clearances.size, strict=True)]
 
-    def split(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    def split(values: NDArray[Any]) -> NDArray[np.float32]:
         padded = np.pad(values.astype(np.float32), beyond, constant_values=-np.inf)
         parts = padded.reshape([n for c in counts for n in (c, size)])
         return parts.transpose([2 * i for i in range(d)] + [2 * i + 1 for i in range(d)]).reshape(-1, size**d)
@@ -256,7 +258,7 @@ def tightened(
     room = parts + len(path) + 2
     taut = torch.empty(room, lattice.d, dtype=torch.float64)
     string = String(
-        map=map_of(lattice.map), origin=_tensor(lattice.origin), path=_tensor(path), points=len(path), least=least,
+        map=lattice.map.native, origin=_tensor(lattice.origin), path=_tensor(path), points=len(path), least=least,
         reach=reach, parts=parts, rounds=rounds, little=little, taut=taut, room=room,
     )  # fmt: skip
     count = library.tgco_tighten(ctypes.byref(string))

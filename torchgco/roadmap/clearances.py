@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from torchgco.roadmap.native_maps import SURE, Map, map_of, measured
+
 Nodes = NDArray[np.int64]
 Numbers = NDArray[np.float64]
 
-SURE = 2.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
 WEIGHTS = (0.125, 0.75, 0.125)  # of a quadratic B-spline at a node, along each axis
 
 
@@ -44,6 +45,12 @@ class Clearances:
     @property
     def d(self) -> int:
         return self.values.ndim
+
+    @cached_property
+    def native(self) -> Map:
+        """What C reads of them."""
+        numbers = {"core": self.core, "limit": self.limit, "smooth": int(self.smooth)}
+        return map_of(self.values, self.low, self.size, spacing=self.spacing, **numbers)
 
     def distances(self, nodes: Nodes) -> tuple[Numbers, Nodes, Numbers]:
         """The field's distances (...) at nodes (..., d), m; the nodes held in the map; squared distances from there."""
@@ -81,13 +88,11 @@ class Clearances:
     @cached_property
     def everywhere(self) -> NDArray[np.float32]:
         """At all nodes."""
-        from torchgco.roadmap.native_maps import measured
-
-        found = measured(self)
+        found = measured(self.native, self.size)
         if found is not None:
             return found
-        rows = np.indices(self.size[1:]).reshape(self.d - 1, -1).T
-        values = np.empty((self.size[0], len(rows)), np.float32)
+        rows = np.indices(self.size[1:].tolist()).reshape(self.d - 1, -1).T
+        values = np.empty((int(self.size[0]), len(rows)), np.float32)
         for i in range(self.size[0]):
             values[i] = self.at(np.concatenate((np.full((len(rows), 1), i), rows), axis=1))
         return values.reshape(self.size)

@@ -115,7 +115,7 @@ class Ways:
         axes = [np.unique(np.clip(int(i * lattice.spacing / blocks.step) + WINDOW, 0, n - 1))
                 for i, n in zip(lattice.node(end), blocks.counts, strict=False)]  # fmt: skip
         cells = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), blocks.counts[: lattice.d]).ravel()
-        near = np.unique(blocks.block[cells])
+        near = np.unique(blocks.block[cells]).astype(np.int64)
         near = near[near >= 0]
         near = near[usable[near]]
         a = np.broadcast_to(end, self.points[near].shape)

@@ -15,8 +15,8 @@ from torchgco.native.compiler import Compiler, NativeError, find_compiler
 from torchgco.native.declarations import Structure, fields, head, load
 from torchgco.native.dispatch import EagerWarning
 from torchgco.native.kernels import native
-from torchgco.roadmap.clearances import SURE, Clearances
 
+SURE = 2.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
 PARTS = 4  # of the way between two blocks, for each of the larger one's layers, between which it is looked at
 SOURCE = Path(__file__).parent / "c" / "lattice.c"
 
@@ -94,25 +94,20 @@ def _library(d: int, compiler: Compiler) -> ctypes.CDLL | None:
         return None
 
 
-def map_of(clearances: Clearances) -> Map:
-    """What C reads of a map."""
-    if "native" not in clearances.kept:
-        shape, low, size = np.ones(3, np.int64), np.zeros(3, np.int64), np.ones(3, np.int64)
-        for whole, part in ((shape, clearances.values.shape), (low, clearances.low), (size, clearances.size)):
-            whole[: clearances.d] = part
-        clearances.kept["native"] = Map.complete(
-            values=torch.from_numpy(clearances.values), shape=torch.from_numpy(shape), low=torch.from_numpy(low),
-            size=torch.from_numpy(size), spacing=clearances.spacing, core=clearances.core, limit=clearances.limit,
-            smooth=int(clearances.smooth),
-        )  # fmt: skip
-    return clearances.kept["native"]
+def map_of(values: NDArray[np.float32], low: NDArray[np.int64], size: NDArray[np.int64], **numbers: float) -> Map:
+    """What C reads of a map; see `Clearances`."""
+    three = [np.ones(3, np.int64), np.zeros(3, np.int64), np.ones(3, np.int64)]
+    for whole, part in zip(three, (values.shape, low, size), strict=True):
+        whole[: values.ndim] = part
+    shape, before, count = map(torch.from_numpy, three)
+    return Map.complete(values=torch.from_numpy(values), shape=shape, low=before, size=count, **numbers)
 
 
-def measured(clearances: Clearances) -> NDArray[np.float32] | None:
+def measured(of: Map, size: NDArray[np.int64]) -> NDArray[np.float32] | None:
     """Clearances at all nodes; None where C can't serve."""
-    library = library_for(clearances.d)
+    library = library_for(len(size))
     if library is None:
         return None
-    values = torch.empty(tuple(clearances.size), dtype=torch.float32)
-    library.tgco_measure(ctypes.byref(map_of(clearances)), ctypes.c_void_p(values.data_ptr()))
+    values = torch.empty(tuple(size.tolist()), dtype=torch.float32)
+    library.tgco_measure(ctypes.byref(of), ctypes.c_void_p(values.data_ptr()))
     return values.numpy()

@@ -23,7 +23,7 @@ PROBLEMS = {
 
 CONVERGED = {
     "first": "all, where there are no obstacles",
-    "mapped": "feasible in a map, not solved as tightly yet",
+    "mapped": "nearly feasible in a map, not solved as tightly yet",
     "last": "not solved as tightly yet",
 }
 
