@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchgco.base.tree import take
@@ -39,6 +41,7 @@ LITTLE = 1e-3
 WINDOWS = (8, 16, 64, 10**6)  # points ahead that are looked at together
 POINTS = 96  # of a path that is drawn taut
 SHORT = 10  # segments, at least, of a path that keeps off others, which it would be drawn onto
+STEPS = 0.5  # units between points at which it is looked for what is near a path
 DIVERSITY = 1.0  # extra price of later paths, as a share, next to an earlier one
 ROUNDING = 1e-9  # m
 KEY = 0x5DEECE66D  # seed of the numbers that stand for blocked regions
@@ -134,6 +137,16 @@ class Ways:
         path = np.concatenate((self.ends[:1], self.points[way], self.ends[1:]))
         return tightened(self.blocks.lattice, path, self.least, length(path) / SHORT)
 
+    def near(self, path: Array, unit: float) -> NDArray[np.int64]:
+        """The blocks nearer than `unit`, m, to a path, which is looked at in steps."""
+        lists = self.tree.query_ball_point(_dense(path, STEPS * unit), unit)
+        return np.unique(np.concatenate([np.asarray(some, np.int64) for some in lists]))
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the blocks' clearest nodes."""
+        return cKDTree(self.points)
+
     def path(self, block: int) -> Array:
         """The way from start to goal (P, d) through a block."""
         ways = [[block], [block]]
@@ -228,26 +241,15 @@ def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
 def _beside(ways: Ways, found: list[Array], count: int, unit: float) -> list[Array]:
     """Up to `count` further paths: the cheapest where prices near all paths before are raised."""
     weight, others = ways.weight.copy(), list[Array]()
-    for path in found:
-        weight *= _raise(ways.points, path, unit)
+    for path in found if count > 0 else ():
+        weight[ways.near(path, unit)] *= 1.0 + DIVERSITY
     for _ in range(count):
         path = ways.beside(weight)
-        weight *= _raise(ways.points, path, unit)
+        weight[ways.near(path, unit)] *= 1.0 + DIVERSITY
         points = _spread(path)
         if all(_apart(points, other) > unit for other in (*found, *others)):
             others.append(path)
     return others
-
-
-def _raise(points: Array, path: Array, unit: float) -> Array:
-    """By which prices at points (V, d) rise next to a path."""
-    square = np.full(len(points), np.inf)
-    for a, along in zip(path[:-1], np.diff(path, axis=0), strict=True):
-        toward = points - a
-        share = np.clip(toward @ along / max(along @ along, ROUNDING), 0.0, 1.0)
-        gap = toward - share[:, None] * along
-        np.minimum(square, np.einsum("ij,ij->i", gap, gap), out=square)
-    return np.where(square < unit * unit, 1.0 + DIVERSITY, 1.0)
 
 
 def _spread(path: Array) -> Array:
