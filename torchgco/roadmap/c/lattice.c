@@ -226,7 +226,11 @@ static int joined(const Sweep *s, int64_t a, int64_t b) {
     for (int part = 1; part < parts; part++) {
         int64_t at[3];
         for (int i = 0; i < 3; i++) at[i] = (from[i] * (parts - part) + to[i] * part + parts / 2) / parts;
-        if (!(clearance_at(g->map, at, 0) > s->deepest)) return 0;
+        double raw = clearance_at(g->map, at, 1);
+        if (!(raw > s->deepest)) return 0; /* interpolated, it is no more */
+        /* Nor is it less by as much as a spacing, farther than two from what is occupied. */
+        int sure = raw > s->deepest + g->map->spacing && raw + g->map->limit > 2.0 * g->map->spacing;
+        if (!sure && !(clearance_at(g->map, at, 0) > s->deepest)) return 0;
     }
     return 1;
 }
