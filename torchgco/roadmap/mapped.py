@@ -184,7 +184,7 @@ def _ways(lattice: Lattice, ends: Array, price: Price, radius: float, unit: floa
         if number == 1 and not lattice.may_join(ends):
             return None
         least = share * lattice.spacing
-        blocks = blocks_of(lattice, radius, most, least, merged)
+        blocks = blocks_of(lattice, radius, most, least, merged and lattice.d == 3)
         if len(blocks.nodes) == 0:
             continue
         ways = Ways(blocks, ends, price, unit, least)
