@@ -255,7 +255,9 @@ def test_the_figures_of_the_algorithm_are_drawn(tmp_path: Path) -> None:
     assert spec is not None and spec.loader is not None
     figures = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(figures)
+    before = page.read_text()
     assert figures.main(["--output", str(tmp_path)]) == 0
+    assert page.read_text() == before, "`make figures` brings the page up to date"
     shown = [link for link in links(page) if link.startswith("figures/")]
     assert shown == [f"figures/{path.name}" for path in sorted(tmp_path.iterdir())]
 

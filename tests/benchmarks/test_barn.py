@@ -11,7 +11,7 @@ from scipy.spatial import Delaunay
 
 from benchmarks.outside.barn import BODY, VEHICLE, Drives, drive, gap, main, problems, worlds
 from benchmarks.outside.barn_data import GOAL, RADIUS, START, cylinders, path_length
-from torchgco import Unicycle
+from torchgco import Unicycle, judge, solve
 
 MODEL = """<model name='{name}'><static>1</static><pose frame=''>{x} {y} 0 0 0 0</pose><link name='link'><collision
 name='collision'><geometry><{kind}><radius>{radius}</radius></{kind}></geometry></collision></link></model>"""
@@ -105,6 +105,14 @@ def test_four_worlds_from_end_to_end(capsys) -> None:
     assert main(["--first", "2"]) == 0
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| `gco`")]
     assert [row[2][:6] for row in rows] == ["2 of 2"] * 2 and [row[3] for row in rows] == ["0.500"] * 2
+
+
+def test_worlds_with_narrow_gaps_are_crossed_within_the_limit_on_speed() -> None:
+    """The way takes as long as the limit allows: candidates that hurry leave their paths, and fall into the traps."""
+    layouts, table = worlds(test=False)
+    problem = problems(layouts.take(np.flatnonzero(table["world"].isin((111, 181, 266)))))
+    verdict = judge(problem, solve(problem).U)
+    assert bool(verdict.sound.all()) and bool(verdict.reached.all())
 
 
 def test_a_vehicle_at_rest_succeeds_nowhere() -> None:

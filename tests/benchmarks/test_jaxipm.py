@@ -13,6 +13,7 @@ from torchgco import Status
 from torchgco.lagrangian.quality import violation
 from torchgco.lagrangian.rollout import open_loop
 
+pytestmark = pytest.mark.usefixtures("seldom_solved")
 NAMED = {scenario.name: scenario for scenario in SCENARIOS}
 # Of the first instance: by the published form of IPOPT at 1e-8.
 KNOWN = {

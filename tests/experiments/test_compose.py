@@ -23,7 +23,9 @@ EXPERIMENTS = options_of("experiment")
 MISSIONS = ("mission", "mission_study", "mission_unknown")
 OF_MODEL = {
     "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": ("yard",),
-    "quadrotor": ("crossing", "cylinders", "forest", "forest_mission", "forest_moving", "mazes", "walls", "woods"),
+    "quadrotor": (
+        "crossing", "cylinders", "forest", "forest_mission", "forest_moving", "mazes", "rooms", "walls", "woods",
+    ),
 }  # fmt: skip
 MODEL = {scenario: model for model, scenarios in OF_MODEL.items() for scenario in scenarios}
 FILES = {"forest30": "quadrotor", "planar_trap": "planar"}

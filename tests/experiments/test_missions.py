@@ -32,9 +32,12 @@ def trials(folder: Path) -> pd.DataFrame:
     return pd.read_parquet(folder / "out" / "trials.parquet")
 
 
-def test_one_mission_writes_log_figures_and_animation(run, tmp_path) -> None:
-    code, out, _ = run("experiment=mission", *SHORT)
+def test_one_mission_writes_log_figures_and_animation(run, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(study, "tqdm", partial(tqdm, mininterval=0))
+    code, out, err = run("experiment=mission", *SHORT)
     assert code == 0 and "forest 0, gco: TIMEOUT after 0.20 s" in out
+    assert "t = 0.1 of 0.2 s" in err and "step=" not in err and " 50%|" in err
+    assert err.index("drawing 7 figures") > err.index("t = 0.2 of 0.2 s")
     table, log = trials(tmp_path), pd.read_parquet(tmp_path / "out" / "mission.parquet")
     assert set(OWN) <= set(table.columns) and table["status"].tolist() == ["TIMEOUT"] and not table["reached"].any()
     assert log["step"].tolist() == [0, 1, 2, 3] and np.allclose(log["t"], [0.0, 0.05, 0.1, 0.15])
@@ -63,13 +66,6 @@ def test_the_figures_show_all_commands(run, tmp_path, monkeypatch) -> None:
         assert (
             by_step.min().tolist() == log[f"u{i}_low"].tolist() and by_step.max().tolist() == log[f"u{i}_high"].tolist()
         )
-
-
-def test_the_bar_shows_the_time_and_figures_are_announced(run, monkeypatch) -> None:
-    monkeypatch.setattr(study, "tqdm", partial(tqdm, mininterval=0))
-    _, _, err = run("experiment=mission", *SHORT)
-    assert "t = 0.1 of 0.2 s" in err and "step=" not in err and " 50%|" in err
-    assert err.index("drawing 7 figures") > err.index("t = 0.2 of 0.2 s")
 
 
 def test_missions_fly_without_figures_which_are_drawn_when_asked_for(run, tmp_path) -> None:
@@ -111,7 +107,7 @@ def test_a_study_of_missions_compares_planners_and_is_cut_as_one_likes(run, tmp_
     assert table.groupby("solver", sort=False).size().to_dict() == {"gco": 5, "al_ilqr": 5}
     assert table["success"].isna().all() and (tmp_path / "out" / "figures" / "outcomes.png").exists()
     assert not (tmp_path / "out" / "plans.npz").exists()
-    assert run(*words, "hydra.run.dir=whole")[0] == 0
+    assert run(*words, "hydra.run.dir=whole", "study.figures=false")[0] == 0
     whole = pd.read_parquet(tmp_path / "whole" / "trials.parquet")
     others = [name for name in table.columns if name not in (*CLOCK, "batch_size")]
     pd.testing.assert_frame_equal(table[others], whole[others], check_exact=True)
@@ -121,7 +117,7 @@ def test_a_start_in_contact_is_a_collision_and_the_others_fly(run, tmp_path) -> 
     centers = np.array([[[-0.8, 1.0, 0.0]], [[9.0, 9.0, 0.0]]])
     np.savez(tmp_path / "two.npz", centers=centers, radii=np.full((2, 1), 0.6), vehicle_radius=0.36)
     words = ["scenario=layouts", f"scenario.path={tmp_path / 'two.npz'}"]
-    code, out, _ = run("experiment=mission_study", *words, "mission.duration=0.1", *SHORT[2:])
+    code, out, _ = run("experiment=mission_study", *words, "mission.duration=0.1", "study.figures=false", *SHORT[2:])
     assert code == 0 and "two 0, gco: COLLISION after 0.00 s" in out and "no plan made" in out and "nan" not in out
     assert trials(tmp_path)["outcome"].tolist()[:2] == ["COLLISION", "TIMEOUT"]
 
@@ -152,7 +148,8 @@ def test_bad_missions_are_refused_in_one_line(run, tmp_path, words: list[str], f
     ids=["woods", "mazes"],
 )
 def test_missions_fly_through_woods_and_mazes(run, tmp_path, experiment: str, words: list[str]) -> None:
-    layouts = ["study.layouts=1", "study.baselines=[al_ilqr]"] if experiment == "mission_study" else []
+    several = experiment == "mission_study"  # whose figures are those of each mission, drawn for the other experiment
+    layouts = ["study.layouts=1", "study.baselines=[al_ilqr]", "study.figures=false"] if several else []
     short = [*words, "mission.duration=0.1", "study.workers=1", "hydra.run.dir=out"]
     code, out, _ = run(f"experiment={experiment}", *short, *layouts)
     assert code == 0 and f"{words[0].partition('=')[2]} 0, gco: TIMEOUT after 0.10 s" in out
@@ -160,7 +157,7 @@ def test_missions_fly_through_woods_and_mazes(run, tmp_path, experiment: str, wo
     assert (table["clearance"] > 0).all() and np.isfinite(table["clearance_knots"]).all()
     nearest = log.groupby("solver", sort=False)["clearance"].min()
     assert nearest.tolist() == pytest.approx(table["clearance_knots"].tolist())
-    assert (tmp_path / "out" / "figures" / "0-gco.gif").exists()
+    assert (tmp_path / "out" / "figures" / "0-gco.gif").exists() != several
     verified, unfinished = verify([tmp_path / "out"])
     assert not unfinished and not any(study.differs for study in verified)
 

@@ -142,6 +142,18 @@ def test_a_mission_has_the_same_bits_in_any_batch_and_order() -> None:
 
 
 @pytest.mark.parametrize("latency", [0, 1])
+def test_first_plans_are_those_of_the_flight(latency: int) -> None:
+    problem, flown = disturbed(3)
+    flown, ids = replace(flown, latency=latency), torch.tensor([4, 1, 7])
+    log = flown.fly(problem, seed=5, ids=ids)
+    posed, found = flown.first_plans(problem, seed=5, ids=ids)
+    assert torch.equal(log.plan[:, 0], found.X[..., :3]) and torch.equal(log.cost[:, 0], found.cost)
+    assert torch.equal(posed.x0, found.X[:, 0]) and not torch.equal(posed.x0, problem.x0)  # measured with noise
+    with pytest.raises(InputError, match=r"mission\.sensor"):
+        replace(flown, latency=0, sensor="lidar").first_plans(problem)
+
+
+@pytest.mark.parametrize("latency", [0, 1])
 def test_commands_follow_the_plan_of_their_period(latency: int) -> None:
     """With latency, from the second period on, a plan starts from where the former plan was to lead."""
     solver, problem = Recording(), varied(2)

@@ -213,7 +213,27 @@ def test_the_next_plan_starts_from_the_former_one(multipliers: Any, feedback: bo
     else:
         for mine, old in zip(second["warm"].lam, plan.multipliers.lam, strict=True):
             assert torch.equal(mine[:, :-1], old[:, 1:])
-        assert torch.equal(second["warm"].mu, plan.multipliers.mu)
+        largest = torch.stack([part.abs().flatten(1).amax(-1) for part in plan.multipliers.lam if part.numel()]).amax(0)
+        margin = Margin(planner.margin, planner.margin_growth, torch.zeros(4, **DOUBLE))
+        torch.testing.assert_close(second["warm"].mu, largest / (planner.tolerance + margin.between(problem)))
+
+
+class Idle(Recording):
+    """A solver whose constraints were never in the way: all multipliers are zero."""
+
+    def solve(self, problem: Problem, U0: Tensor, *arguments: Any, **options: Any) -> Solution:
+        solution = super().solve(problem, U0, *arguments, **options)
+        lam = tuple(torch.zeros_like(part) for part in solution.multipliers.lam)
+        return replace(solution, multipliers=replace(solution.multipliers, lam=lam))
+
+
+@pytest.mark.parametrize(("solver", "tolerance"), [(Idle(), 0.01), (Recording(), math.inf)])
+def test_without_a_measure_plans_continue_from_the_solves_own_penalty(solver: Recording, tolerance: float) -> None:
+    """Where all multipliers are zero, or plans are flown whatever their violation."""
+    problem, planner = varied(), Planner(solver, tolerance=tolerance)
+    plan, now = first_plan(planner, problem)
+    next_plan(planner, problem, now, plan, plan.measured)
+    assert torch.equal(solver.calls[-1]["warm"].mu, plan.multipliers.mu)
 
 
 @pytest.mark.parametrize("native", [True, False])
@@ -253,7 +273,7 @@ def test_penalties_do_not_pile_up_over_a_mission() -> None:
     solver, problem = Recording(replace(SOLVER, violation_tolerance=1e-9)), varied()
     planner = Planner(solver)
     plan, now = first_plan(planner, problem)
-    first = plan.multipliers.mu.clone()
+    first = plan.penalty.clone()
     for _ in range(3):
         plan, now = next_plan(planner, problem, now, plan, plan.measured)
         assert bool((plan.multipliers.mu > first).any())

@@ -17,7 +17,7 @@ from torchgco.obstacles.boxes import BoundBoxes
 @pytest.mark.parametrize(("phr", "rounded"), [(True, False), (False, False), (True, True)])
 @pytest.mark.parametrize("d", [2, 3])
 def test_values_and_expansions_are_pytorchs(d: int, phr: bool, rounded: bool, pushed: str) -> None:
-    problem, _ = boxed_batch(d, B=5, N=40, boxes=6, rounded=rounded)
+    problem, _ = boxed_batch(d, B=5, N=40, boxes=11, rounded=rounded)
     X, U = random_trajectory(problem, spread=0.5)
     (boxes,) = (c for c in problem.constraints if isinstance(c, BoundBoxes))
     generator = torch.Generator().manual_seed(6)

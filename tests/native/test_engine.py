@@ -237,6 +237,27 @@ def test_models_of_any_size(n: int, m: int, N: int) -> None:
     torch.testing.assert_close(b.U, a.U, rtol=1e-8, atol=1e-8)
 
 
+def test_multipliers_without_memory_are_zeros() -> None:
+    problem, U = boxed_batch(3, B=5, N=8)
+    zero = Multipliers.zero(problem, 4.0)
+    none = Multipliers.none(problem, zero.mu)
+    assert all(torch.equal(a, b) for a, b in zip(none.lam, zero.lam, strict=True))
+    some = replace(none, lam=tuple(torch.full_like(lam[:1, :1, :1], 0.3).expand_as(lam) for lam in none.lam))
+    assert not any(lam.untyped_storage().nbytes() > 8 for multipliers in (none, some) for lam in multipliers.lam)
+    engine, U = engine_of(problem), 0.3 * U
+    assert engine is not None
+    X = engine.open_loop(problem, U)
+    worth = []
+    for multipliers in (zero, none, some):
+        lagrangian = Lagrangian(problem, multipliers, None, True)
+        values = engine.value(lagrangian, X, U)
+        torch.testing.assert_close(values, lagrangian.value(X, U), rtol=1e-10, atol=1e-10)
+        end, status = ilqr.descend(ILQR(max_iterations=6), lagrangian, U)
+        worth.append((*values, end.X, end.U, end.merit, status))
+    assert all(torch.equal(a, b) for a, b in zip(worth[0], worth[1], strict=True))
+    assert not torch.equal(worth[1][1], worth[2][1])
+
+
 @pytest.mark.parametrize("B", [1, 2, 3, 7, 8, 9, 40])
 def test_a_problem_has_the_same_bits_in_every_batch(B: int) -> None:
     whole = planar_batch(B=40, N=15, obstacles=5)[0]

@@ -33,7 +33,8 @@ from torchgco.solvers.interior import FILTER
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
-    pytest.mark.filterwarnings("ignore::torchgco.ContactWarning"), pytest.mark.usefixtures("as_shipped"),
+    pytest.mark.filterwarnings("ignore::torchgco.ContactWarning"),
+    pytest.mark.usefixtures("as_shipped"),
 ]
 
 B, D = 9, torch.float64  # one problem more than lanes

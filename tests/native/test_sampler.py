@@ -21,7 +21,8 @@ from torchgco.native import dispatch, kernels
 from torchgco.native.compiler import find_compiler
 
 pytestmark = [
-    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"), pytest.mark.usefixtures("as_shipped")
+    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
+    pytest.mark.usefixtures("as_shipped"),
 ]
 
 

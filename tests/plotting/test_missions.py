@@ -5,11 +5,13 @@ import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
+from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from torchgco.base.errors import InputError
 from torchgco.dynamics.quadrotor import Airframe
+from torchgco.maps import DistanceField, OccupancyGrid
 from torchgco.missions.outcome import Outcome
 from torchgco.plotting import missions
 from torchgco.plotting.bodies import Ball, Box
@@ -81,6 +83,24 @@ def test_nothing_is_near_without_obstacles(frame: pd.DataFrame) -> None:
     empty = Course((), np.zeros(3), 0.5)
     assert np.isinf(empty.nearness(np.zeros((2, 3)), np.zeros(2))).all()
     assert missions.distance_figure({"gco": frame}, empty).axes
+
+
+def test_a_map_is_cut_where_the_vehicle_is(frame: pd.DataFrame, plans: np.ndarray) -> None:
+    """A wall of cells in x from 4 to 4.4 with a window in y from -1 to 1 and z from -0.6 to 0.6."""
+    cells = np.zeros((40, 20, 20), bool)
+    cells[20:22] = True
+    cells[20:22, 5:15, 7:13] = False
+    grid = OccupancyGrid(cells, [0.0, -2.0, -2.0], 0.2)
+    walled = Course((), np.array([6.0, 0.0, 0.0]), 0.5, 0.2, DistanceField.of(grid))
+    near = walled.nearness(np.array([[4.2, 0.0, 0.3], [3.5, 1.5, 0.0], [4.2, 1.5, 0.0]]), np.zeros(3))
+    assert near[:2] == pytest.approx([0.3 / 0.2, 0.5 / 0.2], abs=0.4) and near[2] < 0.5
+    assert walled.infeasible(np.array([[4.2, 1.5, 0.0], [2.0, 0.0, 0.0]]), np.zeros(2)).tolist() == [True, False]
+    above, side = panels_of(missions.snapshots_figure(frame, plans, walled, [3], PERIOD))
+    for ax in (above, side):  # both cut through the window: the wall is filled on both sides of it, and not within
+        (filled,) = [one for one in ax.collections if isinstance(one, QuadContourSet) and one.filled]
+        (path,) = filled.get_paths()
+        inside = path.contains_points([[4.2, 1.6], [4.2, -1.6], [4.2, 0.0], [3.0, 0.0]])
+        assert inside.tolist() == [True, True, False, False]
 
 
 def test_snapshots_show_plan_track_and_obstacles_of_their_own_time(frame: pd.DataFrame, plans: np.ndarray) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import label
 
 from benchmarks.lib.families import WORLDS
 from torchgco import compose
 from torchgco.base.errors import InputError
-from torchgco.scenarios import Crossing, Layouts, Mazes, Woods
+from torchgco.scenarios import Crossing, Layouts, Mazes, Rooms, Woods
 
-SCENARIOS = [Woods(), Mazes(), Crossing()]
+WALLS = 4 * 4 * 2 + 5 * 3 * 2 + 5 * 4  # between 5 x 4 x 2 rooms
+SCENARIOS = [Woods(), Mazes(), Crossing(), Rooms()]
 
 
 def rows(layouts: Layouts, i: int) -> list[np.ndarray]:
@@ -76,6 +78,30 @@ def test_a_wall_is_closed_but_for_its_opening() -> None:
     assert np.unique(x).tolist() == [5.75, 9.5, 13.25]
 
 
+def test_doors_join_all_rooms_by_one_way() -> None:
+    """Without loops: as many doors as rooms but one, so nothing is left to go around by."""
+    low, high, spacing = np.array([-2.0, -2.0, -1.5]), np.array([10.0, 6.0, 4.5]), 0.15
+    small = Rooms(rooms=(3, 2, 2), region=list(zip(low, high, strict=True)), goal=(8.0, 4.0, 3.0), loops=0.0)
+    drawn = small.draw(range(3), seed=0)
+    assert drawn.box_centers is not None and drawn.box_half_sizes is not None
+    axes = [np.arange(a + 0.5 * spacing, b, spacing) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    for centers, halves in zip(drawn.box_centers, drawn.box_half_sizes, strict=True):
+        there = ~np.isnan(centers[:, 0])
+        assert there.sum() == 6 + (2 * 2 * 2 + 3 * 2 + 3 * 2) + 3 * 11  # four boxes around each of 11 doors
+        solid = np.zeros(points.shape[:3], bool)
+        for center, half in zip(centers[there], halves[there], strict=True):
+            solid |= (np.maximum(np.abs(points - center) - half, 0.0) ** 2).sum(-1) <= 0.3**2
+        assert label(~solid)[1] == 1  # the vehicle gets from everywhere to everywhere
+
+
+def test_some_of_the_other_walls_have_doors_too() -> None:
+    few, all_of_them = Rooms(loops=0.0).draw([0], 0), Rooms(loops=1.0).draw([0], 0)
+    assert few.box_centers is not None and all_of_them.box_centers is not None
+    assert all_of_them.box_centers.shape[1] - few.box_centers.shape[1] == 3 * (WALLS - 39)
+    assert all_of_them.box_centers.shape[1] == 6 + 4 * WALLS
+
+
 def test_spheres_cross_the_corridor_within_the_horizon_and_spare_the_start() -> None:
     crossing = Crossing(num_obstacles=20)
     drawn = crossing.draw(range(50), seed=0)
@@ -97,6 +123,11 @@ def test_spheres_cross_the_corridor_within_the_horizon_and_spare_the_start() -> 
         (lambda: Woods(radii=[0.5, 0.2]), "scenario.radii: expected a list of 2 numbers above 0 m"),
         (lambda: Woods(height=[1.0]), "scenario.height: expected a list of 2 numbers"),
         (lambda: Mazes(opening=[20.0, 1.0], opening_region=[[-20, 20], [0, 0]]), "scenario.opening: expected openings"),
+        (lambda: Rooms(door=[4.0, 1.0]), "scenario.door: expected openings that fit into the walls of a room"),
+        (
+            lambda: Rooms(goal=[14.0, 12.0, 3.0]),
+            "scenario.goal: expected a point of scenario.region clear of its walls",
+        ),
         (lambda: Mazes(walls=-1), "scenario.walls: expected a whole number between 0 and 1000"),
         (lambda: Crossing(speeds=[-1, 2]), "scenario.speeds: expected a list of 2 numbers between 0 and 1e+06 m/s"),
         (

@@ -65,7 +65,7 @@ def test_picked_candidates_stay_with_their_problem() -> None:
     order = torch.tensor([[2, 0], [0, 1]])
     assert candidates.pick(order).U[:, 0, 0].tolist() == [2.0, 0.0, 3.0, 4.0]
     assert candidates.pick(order).count == 2 and candidates.rows(order).tolist() == [[2, 0], [3, 4]]
-    assert candidates.multipliers(torch.tensor([1, 5]), 3.0).mu.tolist() == [6.0, 6.0]
+    assert candidates.lagrangian(torch.tensor([1, 5]), 3.0).multipliers.mu.tolist() == [6.0, 6.0]
 
 
 def test_the_penetration_of_a_chord() -> None:

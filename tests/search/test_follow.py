@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 
 from tests.reference import boxes as brute_force
@@ -11,11 +10,22 @@ from tests.search.cup import GOAL, QUICK, controls, cost, cup
 from tests.search.rows import proposed, restarts, varied
 from tests.search.scenes import NONE, inflated
 from tests.search.test_paths import alone
-from torchgco import AugmentedLagrangian, PathProposals, Problem, compose, judge
+from torchgco import (
+    AugmentedLagrangian,
+    PathProposals,
+    Problem,
+    StateBounds,
+    compose,
+    judge,
+)
+from torchgco.base.tree import take
 from torchgco.lagrangian.rollout import open_loop
+from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.roadmap.scene import scene_of
 from torchgco.search.candidates import Candidates
-from torchgco.search.following import CUT, Paths, followed, travel
+from torchgco.search.following import CUT, Free, Paths, followed, travel, unconstrained
+from torchgco.search.nearby import without_obstacles
 from torchgco.search.proposals import propose
 from torchgco.solvers.ilqr import ILQR
 
@@ -78,6 +88,59 @@ def test_every_candidate_tracks_its_own_path_at_its_own_pace() -> None:
                 center = travel(path[None], follow.depart, arrive, follow.smoothing, 120)[0]
                 apart.append(float((X[:, :2] - center).norm(dim=-1).mean()))
         assert apart.index(min(apart)) == i // 4 * 2 + i % 2
+
+
+def limited(speed: float, N: int = 120) -> Problem:
+    """Cups for vehicles with limits of +-speed, m/s, on both parts of the velocity."""
+    problem = cup(B=2, N=N)
+    bound = [np.inf, np.inf, np.inf, speed, speed, np.inf]
+    return replace(problem, constraints=[*problem.constraints, StateBounds([-b for b in bound], bound)])
+
+
+def free(problem: Problem) -> Free:
+    """The trajectories without obstacles, in the unit of `make_candidates`."""
+    return unconstrained(problem, controls(problem), 40, torch.full((2,), 1e4, dtype=torch.float64))
+
+
+def among(corners: torch.Tensor) -> Paths:
+    """The paths (B, 1, P, 2) of `known`, for B problems."""
+    one, B = known(cup(B=1), corners[:1]), corners.shape[0]
+    none = inflated([[[0.0, 0.0]]] * B, [[NONE]] * B)
+    R, unit, live = one.R.repeat(B), one.unit.repeat(B), one.live.repeat(B, 1)
+    return replace(one, corners=corners, classes=one.classes.repeat(B, 1), obstacles=none, R=R, unit=unit, live=live)
+
+
+def test_limits_on_speed_make_free_trajectories_slower() -> None:
+    """A tenth of the way is left after at least 0.9 of its longer side over the speed."""
+    fast, slow, plain = free(limited(50.0)), free(limited(0.5)), free(cup(N=120))
+    assert torch.equal(fast.slower, torch.ones(2, dtype=torch.float64)) and torch.equal(fast.slower, plain.slower)
+    for one in (fast, slow):
+        torch.testing.assert_close(one.share, plain.share)
+        torch.testing.assert_close(one.cost, plain.cost)
+    least = (2.0 * 0.9 / 0.5) / (120 * 0.05)
+    assert bool((slow.share * slow.slower >= 0.95 * least).all()) and bool(
+        (slow.slower < 2.0 * least / slow.share).all()
+    )
+
+
+def test_paths_are_followed_as_slowly_as_limits_ask_for() -> None:
+    """From departure on, by as much as without obstacles, but never beyond the end of the horizon."""
+    problem = limited(0.5)
+    follow = replace(QUICK.follow[0], depart=0.1, arrive=(0.3, 0.9), stiffness=(1.0,), iterations=1)
+    paths = among(torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]]], dtype=torch.float64).repeat(2, 1, 1, 1))
+    U = controls(problem)[:, None].repeat(1, 2, 1, 1)
+    at_rest = Candidates.begin(problem, U, paths.R, paths.unit, torch.ones(2, 2, dtype=torch.bool))
+    timed = follow.track(at_rest, paths, free(problem)._replace(slower=torch.tensor([1.5, 9.0], dtype=torch.float64)))
+    for b, slower in enumerate((1.5, 9.0)):
+        for k, arrive in enumerate(follow.paces):
+            later = torch.tensor([min(0.1 + (arrive - 0.1) * slower, 1.0)], dtype=torch.float64)
+            alone = replace(follow, arrive=float(later))
+            torch.testing.assert_close(timed.X[2 * b + k], alone.track(at_rest, paths, None).X[2 * b + k])
+
+
+def test_kinds_of_obstacles_that_must_stay_set_no_pace(monkeypatch) -> None:
+    monkeypatch.setattr(BoundSpheres, "chosen", Obstacles.chosen)
+    assert without_obstacles(limited(0.5)) is None and bool((free(limited(0.5)).slower == 1.0).all())
 
 
 def test_candidates_that_are_not_among_the_first_are_not_relaxed(monkeypatch) -> None:
@@ -154,24 +217,38 @@ def test_corners_are_averaged_less_where_the_average_would_cut_an_obstacle() -> 
     centers = followed(corner, *options, spheres, torch.full((2,), 0.3, dtype=torch.float64))
     plain = travel(corner, *options)
     assert torch.equal(centers[1], plain[1])
-    deepest = [float(spheres.depth(points).amax(-1)[0]) for points in (plain, centers)]
-    assert deepest[1] <= CUT * 0.3 < deepest[0]
+    limit = torch.full((2,), CUT * 0.3, dtype=torch.float64)
+    assert [bool(spheres.deeper(points, limit)[0].any()) for points in (plain, centers)] == [True, False]
 
 
-def test_the_depth_of_points_against_brute_force() -> None:
+def test_every_path_is_averaged_as_it_is_alone() -> None:
+    corner = torch.tensor([[[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]], [[-1.0, 0.0], [0.0, 0.2], [1.0, 0.0]]]).double()
+    path, R = corner[[0, 1, 1, 0, 0, 1]], torch.tensor([0.3, 0.3, 0.2]).double()
+    spheres = inflated([[[0.0, 0.6]], [[0.0, -0.6]], [[0.1, 0.5]]], [[0.3], [0.3], [0.2]])
+    options = 0.0, END.expand(6), 0.5, 100
+    whole = followed(path, *options, spheres, R)
+    assert not torch.equal(whole, travel(path, *options))
+    for i in range(6):
+        b = torch.tensor([i // 2])
+        assert torch.equal(whole[i : i + 1], followed(path[i : i + 1], 0.0, END, 0.5, 100, take(spheres, b), R[b]))
+
+
+def test_how_deep_points_lie_against_brute_force() -> None:
     setup = compose(["scenario=mazes", "scenario.walls=1", "study.layouts=2"])
     layouts = setup.layouts()
     task = setup.task(layouts)
     scene = scene_of(task.problem, task.U0)
     assert scene is not None and layouts.box_centers is not None and layouts.box_half_sizes is not None
     assert layouts.box_rotations is not None
-    points = np.random.default_rng(3).uniform((3.0, -4.0, -3.0), (16.0, 6.0, 3.0), (2, 40, 3))
-    found = scene.obstacles.depth(torch.as_tensor(points))
+    points = np.random.default_rng(3).uniform((3.0, -4.0, -3.0), (16.0, 6.0, 3.0), (2, 150, 3))
+    limits = (0.0, 0.1, 0.3)
+    found = [scene.obstacles.deeper(torch.as_tensor(points), torch.full((2,), at).double()) for at in limits]
+    assert all(0 < int(deep.sum()) < 300 for deep in found)
     for b in range(2):
         boxes = list(zip(layouts.box_centers[b], layouts.box_half_sizes[b], layouts.box_rotations[b], strict=True))
-        for i in range(40):
+        for i in range(150):
             nearest = min(brute_force.distance(points[b, i], *box, 0.36) for box in boxes)
-            assert float(found[b, i]) == pytest.approx(-nearest, abs=1e-9)
+            assert [bool(deep[b, i]) for deep in found] == [-nearest > at for at in limits]
 
 
 def test_a_path_through_doors_is_followed_closer_where_no_candidate_arrives() -> None:

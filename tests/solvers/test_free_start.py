@@ -31,7 +31,9 @@ from torchgco import (
 from torchgco.baselines import CasADiSolver
 from torchgco.native.compiler import find_compiler
 
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+pytestmark = [
+    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"), pytest.mark.usefixtures("seldom_solved"),
+]  # fmt: skip
 
 D, INF = torch.float64, torch.inf
 Q, R, LAST, REF = [1.0, 2, 0.5, 1], [0.1, 0.2], [5.0, 5, 5, 5], [1.0, -1, 0.5, 2]

@@ -18,6 +18,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
@@ -197,3 +199,15 @@ def browser(program: str) -> Iterator[Callable[[], Tab]]:
         finally:
             process.terminate()
             process.wait(timeout=PATIENCE)
+
+
+@contextmanager
+def one_tab(width: int, height: int) -> Iterator[Tab]:
+    """A tab of that many pixels in a browser of its own; where there is no Chromium, the test is skipped."""
+    program = found()
+    if program is None:
+        pytest.skip("there is no Chromium")
+    with browser(program) as new:
+        tab = new()
+        tab.size(width, height)
+        yield tab

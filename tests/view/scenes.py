@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco import Boxes, Capsules, FunctionDynamics, Goal, Problem, QuadraticCost, Solution, Spheres
 from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.missions.sensing.grid import FREE, OCCUPIED
+from torchgco.missions.unknown.safety import SeenLog
 from torchgco.view.document import Document, SearchPart
-from torchgco.view.flights import flights_of
+from torchgco.view.flights import Flight, flights_of
+from torchgco.view.sensed import Sensed
 from torchgco.view.vehicles import Look
 
 N, RADIUS, DT = 40, 0.3, 0.1
@@ -57,6 +63,31 @@ def solution(task: Problem, X: Tensor, U: Tensor | None = None) -> Solution:
     return Solution(X, U, K, U, Multipliers.zero(task, 1.0), cost, none.double(), none, none, none, none)
 
 
+def sensed() -> Sensed:
+    """What the first trajectory's vehicle may have seen: free cells come behind it, an occupied one comes and goes.
+
+    Its grid has cells of 1 m, from (-1, -4, -2) on. In period k the column x = k / 4 of the middle rows becomes free.
+    """
+    shape, changes = (10, 8, 4), []
+    for k in range(N + 1):
+        cells = [(k // 4, y, z) for y in (3, 4) for z in range(4)] if k % 4 == 0 and k < 40 else []
+        states = [FREE] * len(cells)
+        if k in (10, 30):
+            cells, states = [*cells, (5, 6, 1)], [*states, OCCUPIED if k == 10 else FREE]
+        flat = np.array([np.ravel_multi_index(cell, shape) for cell in cells], dtype=np.int32)
+        changes.append((flat, np.array(states, dtype=np.uint8)))
+    path = trajectories(1)[SOLVERS[0]][0].numpy()
+    goal = np.array([8.0, 0, 0])
+    sought = [np.stack((place, place + 0.5 * (goal - place), goal)) for place in path]
+    return Sensed(SeenLog(np.array([-1.0, -4, -2]), shape, 1.0, changes), sought, np.arange(N + 1) % 2 == 0)
+
+
+def flown_by_a_mission(flight: Flight) -> Flight:
+    """A flight with plans, each 2 m on from where the vehicle is along y, and what `sensed` says."""
+    ahead = np.stack((np.zeros(9), np.linspace(0, 2, 9), np.zeros(9)), axis=-1)
+    return replace(flight, plan=flight.path[:, None] + ahead, sensed=sensed())
+
+
 def document(layouts: int = 3, search: SearchPart | None = None, mission: bool = False) -> Document:
     """The page's content; the title holds what would run if it were not escaped."""
     task, flown = problem(layouts), []
@@ -69,7 +100,9 @@ def document(layouts: int = 3, search: SearchPart | None = None, mission: bool =
         WORDS, "about " + WORDS, 3, DT, Look("quadrotor"), RADIUS, list(SOLVERS),
         ["spheres", WORDS, "trunks"], mission=mission,
     )  # fmt: skip
+    if mission:
+        flown[0] = [flown_by_a_mission(flight) for flight in flown[0]]
     for b in range(layouts):
-        times = UNEVEN if b == 1 else None
+        times = UNEVEN if b == 1 and not mission else None
         held.add(f"layout {b} {WORDS}", task, b, [flights[b] for flights in flown], search, times)
     return held

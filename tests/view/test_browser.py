@@ -173,6 +173,25 @@ def test_keys_play_step_and_choose(tab: Tab) -> None:
     assert tab.evaluate("torchgcoView.playing") is False
 
 
+def test_a_screen_reader_has_a_name_for_every_control(tab: Tab) -> None:
+    nodes = [one for one in tab.call("Accessibility.getFullAXTree")["nodes"] if not one.get("ignored")]
+    controls = [one for one in nodes if one["role"]["value"] in ("button", "checkbox", "slider", "combobox", "image")]
+    assert len(controls) > 15 and all(len(one["name"]["value"].strip()) > 1 for one in controls)
+    told = " ".join(one["name"]["value"] for one in nodes if "name" in one)
+    assert f"layout 0 {WORDS}, in perspective. gco: reached; al_ilqr: failed" in told
+
+
+def test_every_control_is_reached_by_the_tab_key(tab: Tab) -> None:
+    tab.evaluate(f"{PICTURE}.focus()")
+    reached = []
+    for _ in range(40):
+        for kind in ("rawKeyDown", "keyUp"):
+            tab.call("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab", windowsVirtualKeyCode=9)
+        reached.append(tab.evaluate("document.activeElement.id"))
+    shown = "[...document.querySelectorAll('button[id], select, input[id]')].filter((one) => one.offsetParent)"
+    assert set(tab.evaluate(f"{shown}.map((one) => one.id)")) <= set(reached)
+
+
 def test_dragging_turns_the_picture(tab: Tab) -> None:
     before = pixels(tab)
     tab.mouse("mousePressed", 300, 300, button="left", buttons=1, clickCount=1)
@@ -203,6 +222,13 @@ def test_the_search_is_shown_on_demand(tab: Tab) -> None:
     assert (np.abs(pixels(tab) - before).max(axis=-1) > 25).sum() < 20
 
 
+def test_a_trajectory_along_another_has_gaps(tab: Tab) -> None:
+    script = """torchgcoView.flights.all.map(({ line }) => Array.from(line.geometry.index.array))"""
+    first, second = (np.reshape(corners, (N, -1)) for corners in tab.evaluate(script))
+    first, second = (int((pieces == 0).all(axis=1).sum()) for pieces in (first, second))
+    assert first == 0 and 0 < second < 0.2 * N  # they share their start and their end alone
+
+
 def test_views_of_obstacles(tab: Tab) -> None:
     pictures = [pixels(tab)]
     for name in ("#grown", "#through", "#follow"):
@@ -212,6 +238,21 @@ def test_views_of_obstacles(tab: Tab) -> None:
         tab.click(view)
         pictures.append(pixels(tab))
     assert all((np.abs(a - b).max(axis=-1) > 8).sum() > 300 for a, b in pairwise(pictures))
+
+
+def test_nothing_is_shown_above_the_cut(tab: Tab) -> None:
+    tab.click("#view-side")
+    whole = stony(pixels(tab))
+    space = tab.evaluate("({ low: torchgcoView.space.low.z, top: torchgcoView.space.top })")
+    share = (0.05 - space["low"]) / (space["top"] - space["low"])  # through the middle of the sharp box
+    tab.evaluate(f"document.getElementById('cut').value = {share}")
+    tab.evaluate("document.getElementById('cut').dispatchEvent(new Event('input', { bubbles: true }))")
+    cut = stony(pixels(tab))
+    x, y = map(round, place(tab, [5.5, -3.0, 0.8]))  # the rounded box is wholly above 0.05 m
+    assert whole[y, x] and not cut[y - 3 : y + 4, x - 3 : x + 4].any()
+    x, y = map(round, place(tab, [4.5, -2.0, 0.4]))  # of the sharp one half is left
+    below = round(place(tab, [4.5, -2.3, -0.4])[1])
+    assert whole[y, x] and not cut[y, x] and cut[below, x]
 
 
 def test_light_and_dark(tab: Tab) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,10 @@ def read(sealed: str) -> Any:
 
     def array(held: dict[str, Any]) -> np.ndarray:
         count, at = int(np.prod(held["shape"])), held["$"]
+        if held.get("whole"):
+            parts = [planes[at + plane * count : at + (plane + 1) * count] for plane in range(4)]
+            steps = [sum(part[i] << 8 * plane for plane, part in enumerate(parts)) for i in range(count)]
+            return np.array(list(accumulate(steps, lambda a, b: (a + b) % 2**32)), dtype=np.int64)
         low, high = planes[at : at + count], planes[at + count : at + 2 * count]
         halves = np.frombuffer(bytes(b for pair in zip(low, high, strict=True) for b in pair), dtype="<f2")
         values = halves.astype(float).reshape(held["shape"])
@@ -45,6 +50,13 @@ def test_a_part_is_read_as_it_was_written() -> None:
     assert held["name"] == "ä </script>"
     np.testing.assert_allclose(held["one"], values, rtol=2e-3)
     np.testing.assert_array_equal(held["more"][0], values[:1])
+
+
+def test_whole_numbers_are_kept_as_they_are() -> None:
+    packing, values = Packing(), np.array([7, 7, 2**32 - 1, 0, 70_000, 3])
+    held = read(packing.sealed({"first": packing.put(np.ones(2)), "whole": packing.put_whole(values)}))
+    np.testing.assert_array_equal(held["whole"], values)
+    assert read(packing.sealed({"none": packing.put_whole(values[:0])}))["none"].shape == (0,)
 
 
 def test_rounding_of_a_path_does_not_add_up() -> None:

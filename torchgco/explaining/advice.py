@@ -68,9 +68,14 @@ def advice(facts: Facts) -> list[str]:
     elif facts.status in BY_STATUS:
         limits = [f"{name}={value}" for name, value in limits_of(facts.solver)][:MANY]
         found.append(BY_STATUS[facts.status].format(limits=f" ({', '.join(limits)})" if limits else ""))
-    if not (facts.status in FITS and facts.reached is not False) and facts.could_record:
+    if tells_to_record(facts):
         found.append("torchgco.solve(..., record=True), after which explain tells what each pass did.")
     return found
+
+
+def tells_to_record(facts: Facts) -> bool:
+    """Whether a record is worth making."""
+    return facts.could_record and not (facts.status in FITS and facts.reached is not False)
 
 
 def limits_of(solver: Any, prefix: str = "", deep: int = 0) -> Iterator[tuple[str, Any]]:

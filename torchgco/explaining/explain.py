@@ -12,7 +12,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import check_shape
 from torchgco.base.status import Status
 from torchgco.explaining.account import Account
-from torchgco.explaining.advice import Facts, advice
+from torchgco.explaining.advice import Facts, advice, tells_to_record
 from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
 from torchgco.explaining.places import caught_told, number, place_told
 from torchgco.explaining.record import SearchRecord
@@ -72,7 +72,7 @@ def explanation(solution: Any, b: int, problem: Problem | None = None, what: str
         ("", [f"{what or f'Problem {b} of {B}'}, solved{by}: {facts.status.name}."]),
         ("Result", _result(solved, b, facts, one)),
         ("Caught", _caught(solved, b, one)),
-        ("Passes", _passes(solved, b, account)),
+        ("Passes", _passes(solved, b, account, facts)),
         ("Iterations", _iterations(solved, b)),
         ("Why it ended", [facts.status.sentence]),
         ("What to try", advice(facts)),
@@ -181,9 +181,10 @@ def _caught(solved: Solved, b: int, one: _One | None) -> list[str]:
     return [f"the returned trajectory lies {told}"] if told else []
 
 
-def _passes(solved: Solved, b: int, account: Account) -> list[str]:
+def _passes(solved: Solved, b: int, account: Account, facts: Facts) -> list[str]:
     if solved.search is None:
-        return []
+        untold = facts.could_record and facts.seeks_paths and not tells_to_record(facts)
+        return ["not recorded; torchgco.solve(..., record=True) keeps what each did"] if untold else []
     table = getattr(account.solver, "table", None)
     return passes_told(solved.search, b, {} if table is None else table()["problems"].to_dict())
 

@@ -29,6 +29,12 @@ class Multipliers:
         lam = tuple(problem.x0.new_zeros(problem.B, *shape) for shape in problem.row_shapes)
         return cls(lam, problem.x0.new_full((problem.B,), mu))
 
+    @classmethod
+    def none(cls, problem: Problem, mu: Tensor) -> Multipliers:
+        """lam = 0 that takes no memory and can't be written to, and penalties mu (B,)."""
+        zero = problem.x0.new_zeros(())
+        return cls(tuple(zero.expand(problem.B, *shape) for shape in problem.row_shapes), mu)
+
     def scaled(self, factor: Tensor) -> Multipliers:
         """The multipliers and penalties of the same problems with their costs times `factor` (B,)."""
         return Multipliers(tuple(factor.view(-1, 1, 1) * lam for lam in self.lam), factor * self.mu)

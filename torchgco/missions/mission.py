@@ -31,6 +31,7 @@ from torchgco.missions.tracker import Reference, Tracker, Tracking
 from torchgco.missions.unknown.exploration import Exploration
 from torchgco.missions.unknown.explorer import Explorer, SensorName, Unknown
 from torchgco.problem.problem import Problem, check_problem
+from torchgco.solution import Solution
 from torchgco.solvers.contracts import check_ids
 
 LONGEST = 3600.0  # s of a mission
@@ -112,13 +113,26 @@ class Mission:
             InputError: another model, no goal, another precision, obstacles of a kind that can't be judged, a control
                 period that isn't a multiple of the plant's time step, or an argument of another kind.
         """
+        check_value(report, Callable | None, "report")
+        return self._flight(problem, seed, ids).run(report or (lambda step, flying: None))
+
+    def first_plans(self, problem: Problem, seed: int = 0, ids: Tensor | None = None) -> tuple[Problem, Solution]:
+        """The planning problems of the first control period, and the solutions that `fly` makes its first plans of.
+
+        Raises:
+            InputError: as `fly`, and for missions with a sensor, which plan on their maps.
+        """
+        if self.sensor != "full":
+            raise InputError("mission.sensor", "full for first plans", self.sensor)
+        flight = self._flight(problem, seed, ids)
+        return flight.planner.first(problem, measured(flight.x, flight.noise[:, 0]), flight.seed, flight.ids)
+
+    def _flight(self, problem: Problem, seed: int, ids: Tensor | None) -> _Flight:
         check_problem(problem)
         seed = check_value(seed, Seed, "seed")
-        check_value(report, Callable | None, "report")
         if ids is not None:
             check_ids(ids, problem)
-        ids = torch.arange(problem.B) if ids is None else ids
-        return _Flight(self, problem, seed, ids).run(report or (lambda step, flying: None))
+        return _Flight(self, problem, seed, torch.arange(problem.B) if ids is None else ids)
 
 
 class _Flight:

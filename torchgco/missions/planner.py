@@ -40,7 +40,7 @@ class Plan:
     U: Tensor  # (B, N, 4)
     K: Tensor  # (B, N, 4, 14): feedback gains
     multipliers: Multipliers
-    penalty: Tensor  # (B,): least mu of the searches that succeeded, which plans that continue this one start from
+    penalty: Tensor  # (B,): mu from which plans that continue this one start
     cost: Tensor
     violation: Tensor
     shifted: Tensor  # bool: the former plan one stage later, as the new one was infeasible
@@ -150,19 +150,31 @@ class Planner:
         """
         measured = x if measured is None else measured
         began = time.perf_counter()
+        now, margin, bias, U0 = self._posed(whole, now, x, step, before, measured)
+        solve = _Solve(self, now, seed, ids, began, self.tolerance + margin.between(whole))
+        if before is not None and self.feedback:
+            U0 = _brought_back(now, before)
+        plan = solve.first(U0) if before is None else solve.next(U0, before)
+        return replace(plan, measured=measured, bias=bias, step=step), now, time.perf_counter() - began
+
+    def first(self, whole: Problem, x: Tensor, seed: int, ids: Tensor) -> tuple[Problem, Solution]:
+        """The problems of the first plans from plants x (B, 17), and the solver's solutions, as `plan` makes them."""
+        now, _, _, U0 = self._posed(whole, self.problem(whole, x), x, 0, None, x)
+        solver, _ = self.solver.in_closed_loop(CONTINUED)
+        return now, solver.solve(now, U0, seed=seed, ids=ids, max_seconds=self.max_seconds)
+
+    def _posed(
+        self, whole: Problem, now: Problem, x: Tensor, step: int, before: Plan | None, measured: Tensor
+    ) -> tuple[Problem, Margin, Tensor, Tensor]:
+        """The problems of a control step, their margin, the estimated acceleration (B, 3), controls to begin with."""
         t, x0 = step * float(whole.dynamics.dt), planning_state(x, self.airframe)
         U0 = now.cost.rest_controls(x0.new_zeros(now.B, now.N, now.m)) if before is None else shifted(before.U)
         bias = self.estimated(measured, before, float(whole.dynamics.dt))
         dynamics = whole.dynamics if self.estimation == 0 else biased(whole.dynamics, bias)
         margin = self._margin(x, before)
         depth = margin.unavoidable_depth(whole.started_at(x0, whole.constraints), t, U0)
-        now = now.started_at(x0, self._constraints(whole, t, x, margin, depth), dynamics=dynamics)
-        allowed = self.tolerance + margin.between(whole)
-        solve = _Solve(self, now, seed, ids, began, allowed)
-        if before is not None and self.feedback:
-            U0 = _brought_back(now, before)
-        plan = solve.first(U0) if before is None else solve.next(U0, before)
-        return replace(plan, measured=measured, bias=bias, step=step), now, time.perf_counter() - began
+        constraints = self._constraints(whole, t, x, margin, depth)
+        return now.started_at(x0, constraints, dynamics=dynamics), margin, bias, U0
 
     def predicted(self, x: Tensor, plan: Plan) -> Tensor:
         """The plants (B, 17) one period later, from x (B, 17) at the plan's first knot: as the plan's model leads."""
@@ -224,24 +236,24 @@ class _Solve:
 
     def first(self, U0: Tensor) -> Plan:
         """The solver's plans, from controls U0 (B, N, 4)."""
-        return self._plan(self._solved(self.solver, self.problem, U0, None, self.ids))
+        return self._plan(self._solved(self.solver, self.problem, U0, None, self.ids), self.allowed)
 
     def next(self, U0: Tensor, before: Plan) -> Plan:
         """Plans that continue former ones, which are flown one stage later by U0 (B, N, 4)."""
         multipliers = before.continued(self.problem)
         warm = multipliers if self.planner.multipliers == "shifted" else None
-        plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids))
+        plan = self._plan(self._solved(self.local, self.problem, U0, warm, self.ids), self.allowed)
         plan.penalty.copy_(before.penalty)
         self._keep_former(plan, before, U0, multipliers)
         rows = (~(plan.violation <= self.allowed)).nonzero().flatten()
         left = self._time_left()
         if self.local is not self.solver and rows.numel() > 0 and (left is None or left > MIN_SECONDS):
-            found = self._plan(self._solved(self.solver, self.problem.take(rows), U0[rows], None, self.ids[rows]))
+            again = self._solved(self.solver, self.problem.take(rows), U0[rows], None, self.ids[rows])
+            found = self._plan(again, self.allowed[rows])
             self._replace(plan, rows, found)
             for name in ("guided", "iterations"):
                 getattr(plan, name)[rows] += getattr(found, name)
-        lower = (plan.penalty < before.penalty) & (plan.violation <= self.allowed)
-        return replace(plan, penalty=torch.where(lower, plan.penalty, before.penalty))
+        return replace(plan, penalty=torch.where(plan.violation <= self.allowed, plan.penalty, before.penalty))
 
     def _solved(self, solver: Solver, problem: Problem, U0: Tensor, warm: Multipliers | None, ids: Tensor) -> Solution:
         return solver.solve(problem, U0, seed=self.seed, ids=ids, warm=warm, max_seconds=self._time_left())
@@ -273,10 +285,23 @@ class _Solve:
         for name in TRAJECTORY:
             put(getattr(plan, name), rows[chosen], take(getattr(other, name), chosen))
 
-    def _plan(self, solution: Solution) -> Plan:
+    def _plan(self, solution: Solution, allowed: Tensor) -> Plan:
         none = torch.zeros_like(solution.cost, dtype=torch.bool)
         return Plan(
-            solution.X, solution.U, solution.K, solution.multipliers, solution.multipliers.mu.clone(), solution.cost,
-            solution.violation, none, solution.guided, solution.iterations, solution.X[:, 0], solution.X[:, 0, :3],
-            self.problem.dynamics, 0,
+            solution.X, solution.U, solution.K, solution.multipliers, _penalty(solution.multipliers, allowed),
+            solution.cost, solution.violation, none, solution.guided, solution.iterations, solution.X[:, 0],
+            solution.X[:, 0, :3], self.problem.dynamics, 0,
         )  # fmt: skip
+
+
+def _penalty(multipliers: Multipliers, allowed: Tensor) -> Tensor:
+    """mu (B,) with which multipliers that are wrong by as much as they are large leave the allowed violation (B,).
+
+    The mu of a solve's end is none to continue from: AL-iLQR raises it to where solves are stiff, and the interior
+    point has none.
+    """
+    largest = torch.zeros_like(multipliers.mu)
+    for lam in multipliers.lam:
+        if lam.numel() > 0:
+            largest = torch.maximum(largest, lam.abs().flatten(1).amax(-1))
+    return torch.where((largest > 0) & torch.isfinite(allowed), largest / allowed, multipliers.mu)

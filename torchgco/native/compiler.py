@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -90,7 +90,7 @@ def begin(source: str) -> None:
     flags = (*compiler.flags, *compiler.further)
     key = _key(compiler, source, flags)
     if key not in _begun and store.find(key, ".so") is None:
-        with suppress(OSError):
+        with suppress(OSError), _held():
             room = TemporaryDirectory(prefix="torchgco-")
             _begun[key] = _Begun(os.getpid(), room, _start(compiler, source, flags, Path(room.name)))
 
@@ -139,7 +139,7 @@ def _compile(
     compiler: Compiler, source: str, flags: tuple[str, ...], room: Path, begun: subprocess.Popen[str] | None = None
 ) -> Path:
     notice("compiling native kernels (once for this form of problem, some seconds) ...")
-    returncode, errors = _finished(_start(compiler, source, flags, room) if begun is None else begun)
+    returncode, errors = _finished(lambda: begun or _start(compiler, source, flags, room))
     if returncode:
         said = errors.splitlines() or [_ended(returncode)]
         shown = [line for line in said if "error" in line] or said
@@ -158,22 +158,45 @@ def _start(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) 
     )  # fmt: skip
 
 
-def _finished(process: subprocess.Popen[str]) -> tuple[int, str]:
-    """Wait for a compiler; returns its exit code and what it says on stderr.
+def _finished(start: Callable[[], subprocess.Popen[str]]) -> tuple[int, str]:
+    """Start a compiler, or take one that has begun, and wait for it; returns its exit code and what it says on stderr.
 
     Ctrl-C and SIGTERM end it here, with its group and the compilers that have begun: they would go on.
     """
+    started: list[subprocess.Popen[str]] = []
     try:
-        with _ending_by_sigterm(process):
-            _, said = process.communicate()
+        with _ending_by_sigterm(started):
+            with _held():  # a signal before the compiler is known would leave it running
+                started.append(start())
+            _, said = started[0].communicate()
     except BaseException:
-        _end_all(process)
+        _end_all(started)
         raise
-    return process.returncode, said
+    return started[0].returncode, said
 
 
-def _end_all(process: subprocess.Popen[str]) -> None:
-    for one in (process, *(begun.process for begun in _begun.values() if begun.owner == os.getpid())):
+@contextmanager
+def _held() -> Iterator[None]:
+    """Ctrl-C and SIGTERM wait for the end of this block."""
+    if threading.current_thread() is not threading.main_thread():  # Python handles signals in the main thread alone
+        yield
+        return
+    came: list[int] = []
+    usual = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    usual = {number: handler for number, handler in usual.items() if handler not in (signal.SIG_IGN, None)}
+    for number in usual:
+        signal.signal(number, lambda number, frame: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+        for number in came:
+            signal.raise_signal(number)
+
+
+def _end_all(started: Sequence[subprocess.Popen[str]]) -> None:
+    for one in (*started, *(begun.process for begun in _begun.values() if begun.owner == os.getpid())):
         _end(one)
     _begun.clear()
 
@@ -185,11 +208,11 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 @contextmanager
-def _ending_by_sigterm(process: subprocess.Popen[str]) -> Iterator[None]:
-    """In this block a SIGTERM that nobody handles, as in a study's workers, ends the compiler first."""
+def _ending_by_sigterm(started: Sequence[subprocess.Popen[str]]) -> Iterator[None]:
+    """In this block a SIGTERM that nobody handles, as in a study's workers, ends what is started by then first."""
 
     def end(number: int, frame: FrameType | None) -> None:
-        _end_all(process)
+        _end_all(started)
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 

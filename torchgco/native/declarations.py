@@ -38,11 +38,14 @@ class Structure(ctypes.Structure):
 
     declared: ClassVar[tuple[tuple[Any, str], ...]] = ()
     kinds: ClassVar[dict[str, Any]] = {}  # C type of each field
+    tensors: ClassVar[dict[str, torch.dtype]] = {}  # what the tensors hold that fields point to
     kept: list[Any]
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls.kinds = {name: kind for kind, names in cls.declared for name in names.split()}
+        known = {name: _held(kind) for name, kind in cls.kinds.items() if isinstance(kind, str) and kind.endswith("*")}
+        cls.tensors = {name: dtype for name, dtype in known.items() if dtype is not None}
 
     def __init__(self, **values: Any) -> None:
         super().__init__()
@@ -51,8 +54,14 @@ class Structure(ctypes.Structure):
 
     def fill(self, values: Mapping[str, Any]) -> None:
         """Set fields by name."""
+        tensors, kept = self.tensors, self.kept
         for name, value in values.items():
-            self.__setattr__(name, value)
+            # Most fields of a call are tensors, and each solve makes thousands of calls.
+            if type(value) is Tensor and value.dtype is tensors.get(name) and value.is_contiguous():
+                kept.append(value)
+                _set(self, name, value.data_ptr())
+            else:
+                self.__setattr__(name, value)
 
     @classmethod
     def complete(cls, **values: Any) -> Self:
@@ -133,11 +142,16 @@ def _in_c(name: str, kind: Any) -> str:
     return f"{kind} {name}" if isinstance(kind, str) else f"{kind.__name__} {name}"
 
 
+def _held(kind: str) -> torch.dtype | None:
+    """What a tensor holds that a pointer of this type points to; None for pointers to structures."""
+    return TENSORS.get(kind.removeprefix("const ").removesuffix(" *"))
+
+
 def _address(value: Any, kind: str, name: str) -> int:
     """Where a value begins that a pointer of this type may point to."""
     if not isinstance(value, Tensor):
         return ctypes.addressof(value)
-    expected = TENSORS[kind.removeprefix("const ").removesuffix(" *")]
+    expected = _held(kind)
     if value.dtype != expected or not value.is_contiguous():
         raise TypeError(f"{name}: expected a contiguous tensor of {expected}, got {value.dtype}, {value.stride()}")
     return value.data_ptr()

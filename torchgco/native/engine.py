@@ -194,7 +194,7 @@ class Engine:
         multipliers = lagrangian.multipliers
         rows = [constraint.copy() for constraint in self._fixed(lagrangian.problem)[1]]
         for row, lam in zip(rows, multipliers.lam, strict=True):
-            row.lam = lam.contiguous()
+            row.lam = None if _is_blank(lam) else lam.contiguous()
         for row, lam in zip(rows, () if best is None else best.lam, strict=best is not None):
             row.best = lam
         own = {"constraint": rows, "mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
@@ -258,6 +258,11 @@ def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> No
 def _measured(part: Constraint) -> bool:
     """Whether violations are what the base class says of rows."""
     return (type(part).violation, type(part).worst) == (Constraint.violation, Constraint.worst)
+
+
+def _is_blank(lam: Tensor) -> bool:
+    """Whether multipliers are `Multipliers.none`: one zero for all."""
+    return not any(lam.stride()) and lam.numel() > 0 and float(lam[0, 0, 0]) == 0.0
 
 
 def _flags(B: int) -> Tensor:

@@ -51,7 +51,8 @@ class Constraint(Structure):
         ("int32_t", "kind equality geometric rows"),  # rows of a knot
         ("const int32_t *", "place"),  # (N+1): index among the constraint's knots, or NOWHERE
         ("int64_t", "knots"),
-        ("double *", "lam best"),  # (E, knots, rows): multipliers, and those of the best iterate of an outer loop
+        # (E, knots, rows): multipliers, NULL where all are 0, and those of the best iterate of an outer loop
+        ("double *", "lam best"),
         ("const int32_t *", "variable"),  # BOUNDS: (rows) index into [x, u]
         ("const double *", "sign"),  # BOUNDS: (rows) +1 for an upper bound, -1 for a lower one
         # BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM); FUNCTION: p (E, knots, ...); BOXES, FIELD: see
@@ -171,7 +172,7 @@ def array(value: Tensor | None, knots: bool) -> Array:
     if value is None or value.numel() == 0:
         return Array()
     value = value.double().contiguous()
-    size = value[0, 0].numel() if knots else value[0].numel()
-    many = value.shape[1] if knots else 1
-    element, knot = 0 if value.shape[0] == 1 else many * size, size if many > 1 else 0
+    elements, many = value.shape[0], value.shape[1] if knots else 1
+    size = value.numel() // (elements * many)
+    element, knot = 0 if elements == 1 else many * size, size if many > 1 else 0
     return Array(data=value, element=element, knot=knot, size=size)

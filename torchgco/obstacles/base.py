@@ -55,6 +55,13 @@ class Solids:
         """Distances (B, V, M) of points (B, V, d) from the grown surfaces, m; negative inside."""
         return self.squares(points).sqrt_() - self.radii.unsqueeze(1)
 
+    def deeper(self, points: Tensor, than: Tensor) -> Tensor:
+        """Whether points (B, V, d) lie deeper than lengths (B,) >= 0, m, beneath the surface of one present, (B, V)."""
+        limit = self.radii - than.unsqueeze(-1)
+        limit = torch.where(self.absent | (limit <= 0), 0.0, limit.square()).unsqueeze(1)
+        axes = ((points[..., i, None] - self.centers[:, None, :, i]).square_() for i in range(points.shape[-1]))
+        return (reduce(torch.add, axes) < limit).any(-1)
+
 
 class Obstacles(Constraint):
     """Obstacles that the vehicle's position keeps clear of, M per problem, once bound.

@@ -19,6 +19,7 @@ from torch import Tensor
 from torchgco.obstacles.base import Solids
 
 Coordinates = Sequence[Tensor]
+SLACK = 1e-9  # share of lengths by which bounds are wider, more than rounding
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,7 @@ class Cuboids(Solids):
 
     def local(self, v: Coordinates) -> list[Tensor]:
         """Coordinates along the sides of each box, (B, V, M) each, of vectors (B, V, 1) or (B, V, M)."""
-        axes = self.axes.unsqueeze(1)
-        return [reduce(torch.add, (axes[..., i, j] * v[j] for j in range(len(v)))) for i in range(len(v))]
+        return _along(self.axes.unsqueeze(1), v)
 
     def seen_from(self, points: Tensor) -> list[Tensor]:
         """Coordinates along the sides of each box, from its centre, (B, V, M) each, of points (B, V, d)."""
@@ -60,6 +60,40 @@ class Cuboids(Solids):
 
     def signed_distance(self, points: Tensor) -> Tensor:
         return signed_distance(self.seen_from(points), self.halves()) - self.radii.unsqueeze(1)
+
+    def deeper(self, points: Tensor, than: Tensor) -> Tensor:
+        # Most points lie outside of the bounds of most boxes.
+        near, reach = ~self.absent.unsqueeze(1), self._reach()
+        for k in range(points.shape[-1]):
+            near = near & ((points[..., k, None] - self.centers[:, None, :, k]).abs() <= reach[:, None, :, k])
+        i, v, j = near.nonzero(as_tuple=True)
+        local = _along(self.axes[i, j], (points[i, v] - self.centers[i, j]).unbind(-1))
+        deep = signed_distance(local, self.half_sizes[i, j].unbind(-1)) - self.radii[i, j] < -than[i]
+        found = torch.zeros_like(points[..., 0], dtype=torch.bool)
+        found[i[deep], v[deep]] = True
+        return found
+
+    def _reach(self) -> Tensor:
+        """Half the side lengths (B, M, d) of boxes along the axes of space that hold the grown ones, m."""
+        reach = self.extent + self.radii.unsqueeze(-1)
+        return reach + SLACK * (reach + self.centers.abs())
+
+    def apart(self, a: Tensor, b: Tensor) -> Tensor:
+        """Lower bounds (B, V, M) of the distances of segments from a to b (B, V, d): along the axes of space, m."""
+        reach, gaps = self._reach(), []
+        for i in range(a.shape[-1]):
+            middle, half = 0.5 * (a[..., i] + b[..., i]), 0.5 * (a[..., i] - b[..., i]).abs()
+            gap = (middle.unsqueeze(-1) - self.centers[:, None, :, i]).abs()
+            gaps.append(gap - half.unsqueeze(-1) - reach[:, None, :, i])
+        return reduce(torch.maximum, gaps)
+
+    def segment_distance(self, pairs: tuple[Tensor, Tensor, Tensor], a: Tensor, b: Tensor) -> Tensor:
+        """Smallest signed distances (P,), m, of pairs (problem, segment, box) of segments from a to b (B, V, d)."""
+        i, e, j = pairs
+        o, axes, half = self.centers[i, j], self.axes[i, j], list(self.half_sizes[i, j].unbind(-1))
+        begin, end = (_along(axes, (p[i, e] - o).unbind(-1)) for p in (a, b))
+        along = [y - x for x, y in zip(begin, end, strict=True)]
+        return segment_distance(begin, along, half) - self.radii[i, j]
 
     def normals(self, points: Tensor) -> Tensor:
         """Unit vectors (B, V, M, d) along which the distance grows: away from the box, inside to the nearest side.
@@ -143,6 +177,11 @@ def from_quaternions(turns: Tensor) -> Tensor:
 def at_share(begin: Coordinates, along: Coordinates, share: Tensor) -> list[Tensor]:
     """The point of a segment at this share of it."""
     return [start + share * step for start, step in zip(begin, along, strict=True)]
+
+
+def _along(axes: Tensor, v: Coordinates) -> list[Tensor]:
+    """Coordinates of vectors along the rows of axes (..., d, d)."""
+    return [reduce(torch.add, (axes[..., i, j] * v[j] for j in range(len(v)))) for i in range(len(v))]
 
 
 def _square(v: Coordinates) -> Tensor:

@@ -12,8 +12,8 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, Sense, resolve_knots
-from torchgco.obstacles.base import ABSENT, Obstacles, least, picked
-from torchgco.obstacles.box_geometry import Cuboids, from_quaternions, segment_distance, signed_distance
+from torchgco.obstacles.base import ABSENT, Obstacles, picked
+from torchgco.obstacles.box_geometry import Cuboids, from_quaternions
 from torchgco.obstacles.inputs import dimension, own_radii, per_problem, points, rows, vehicle_radii
 
 DISTANCES_AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
@@ -160,23 +160,18 @@ class BoundBoxes(Obstacles):
         return torch.where(self.absent.unsqueeze(1), torch.inf, self._outside(p))
 
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
-        parts = self._parts(a.shape[1])
-        return torch.cat([self.take(rows)._segment_clearance(a[rows], b[rows]) for rows in parts])
-
-    def _segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
-        boxes = self.inflated()
-        begin, end, half = boxes.seen_from(a), boxes.seen_from(b), boxes.halves()
-        ends = signed_distance(begin, half), signed_distance(end, half)
-        # The distance changes no faster than the point moves. Of many pairs this shows that others are nearer.
-        radii, length = self.inflated_radii.unsqueeze(1), (b - a).square().sum(-1, keepdim=True).sqrt()
-        distance = 0.5 * (ends[0] + ends[1] - length) - radii
-        gap = (torch.minimum(*ends) - radii).masked_fill(self.absent.unsqueeze(1), torch.inf)
-        most = least(gap) + self.inflated_radii.amax(-1) if gap.numel() > 0 else least(gap)
-        i, e, j = ((distance <= most.view(-1, 1, 1)) & ~self.absent.unsqueeze(1)).nonzero(as_tuple=True)
-        start, stop = [x[i, e, j] for x in begin], [x[i, e, j] for x in end]
-        along, sides = [y - x for x, y in zip(start, stop, strict=True)], [h[i, 0, j] for h in half]
-        distance[i, e, j] = segment_distance(start, along, sides) - self.inflated_radii[i, j]
-        return distance.masked_fill(self.absent.unsqueeze(1), torch.inf)
+        boxes, here = self.inflated(), ~self.absent.unsqueeze(1)
+        apart = torch.cat([take(boxes, rows).apart(a[rows], b[rows]) for rows in self._parts(a.shape[1])])
+        apart = apart.masked_fill(~here, torch.inf)
+        if apart.numel() == 0:
+            return apart
+        # The pair that looks nearest bounds the smallest distance: no pair farther apart than that has to be measured.
+        i, first = torch.arange(len(apart), device=a.device), apart.flatten(1).argmin(-1)
+        e, j = first // apart.shape[2], first % apart.shape[2]
+        most = boxes.segment_distance((i, e, j), a, b) + self.inflated_radii.amax(-1)
+        k, e, j = ((apart <= most.view(-1, 1, 1)) & here).nonzero(as_tuple=True)
+        apart[k, e, j] = boxes.segment_distance((k, e, j), a, b)
+        return apart
 
     def grown(self, by: Tensor) -> Self:
         more = torch.where(self.absent, 0.0, by.unsqueeze(-1))

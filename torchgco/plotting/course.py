@@ -13,8 +13,10 @@ from matplotlib.collections import PolyCollection
 from matplotlib.patches import Circle
 
 from torchgco.base.errors import InputError
+from torchgco.maps.distance import DistanceField
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.bodies import Ball, Body
+from torchgco.plotting.maps import draw_map
 from torchgco.plotting.scene import Scene, view
 from torchgco.plotting.style import INK, PALETTE
 
@@ -33,6 +35,7 @@ class Course:
         goal: (3,).
         goal_radius: within which the goal counts as reached.
         vehicle_radius: r_veh.
+        map: of the same space, or None.
 
     Raises:
         InputError: a goal of another shape.
@@ -42,6 +45,7 @@ class Course:
     goal: np.ndarray
     goal_radius: float
     vehicle_radius: float = 0.36
+    map: DistanceField | None = None
 
     def __post_init__(self) -> None:
         if np.shape(self.goal) != (3,):
@@ -49,12 +53,15 @@ class Course:
 
     @property
     def reaches(self) -> np.ndarray:
-        """r_obs + r_veh of each obstacle, (M,); of a box, r_obs is the radius that rounds it."""
-        return np.array([body.radius + self.vehicle_radius for body in self.bodies])
+        """r_obs + r_veh of each obstacle, (M,); of a box, r_obs is the radius that rounds it, of a map, the last, 0."""
+        own = [body.radius + self.vehicle_radius for body in self.bodies]
+        return np.array(own if self.map is None else [*own, self.vehicle_radius])
 
     def distances(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Distances (M, T) of positions (T, 3) at times t (T,), s, from centres, and from the sides of boxes."""
-        return np.array([body.distance(positions, t) for body in self.bodies]).reshape(len(self.bodies), len(t))
+        """Distances (M, T) of positions (T, 3) at times t (T,), s, from centres, from sides of boxes, the map."""
+        found = [body.distance(positions, t) for body in self.bodies]
+        found += [] if self.map is None else [self.map.distance(positions).numpy()]
+        return np.array(found).reshape(len(found), len(t))
 
     def infeasible(self, positions: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Which positions (T, 3) at times t (T,), s, lie more than a millimetre inside an obstacle grown by r_veh."""
@@ -67,7 +74,7 @@ class Course:
     def limits(self, track: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of a box around goal and track (T, 3), a little wider where obstacles are."""
         ends = track[:1], self.goal[None]
-        scene = Scene((self.bodies,), *ends, self.vehicle_radius, self.goal_radius, 0.0, np.zeros(1))
+        scene = Scene((self.bodies,), *ends, self.vehicle_radius, self.goal_radius, 0.0, np.zeros(1), self.map)
         low, high = view(scene, [0], [track + side * self.vehicle_radius for side in (-1.0, 1.0)], [])
         return low, high
 
@@ -82,14 +89,17 @@ def draw_instant(
 ) -> None:
     """Other obstacles at time t, s, the track flown so far (T, 3) with the vehicle at its end, and the plan (N+1, 3).
 
-    Spheres are shown whole; boxes and capsules are cut where the vehicle is, as they may be higher or wider than the
-    view.
+    Spheres are shown whole; boxes, capsules and maps are cut where the vehicle is, as they may be higher or wider than
+    the view.
 
     Args:
         period: of the plan's knots, s; knots inside an obstacle at their own time are crossed.
     """
     changing = [body for body in course.bodies if not _is_still(body)]
     _draw_bodies(ax, course, changing, t, float(np.delete(track[-1], plane)[0]), plane)
+    if course.map is not None:
+        look = {"facecolor": draw.STONE, "edgecolor": draw.EDGE}
+        draw_map(ax, course.map, track[-1:], plane, course.vehicle_radius, look)
     draw.draw_ends(ax, track[0], course.goal, course.goal_radius, plane)
     ax.plot(*track[:, plane].T, color=INK, linewidth=1.4, zorder=3)
     infeasible = course.infeasible(plan, t + period * np.arange(len(plan)))

@@ -68,17 +68,18 @@ class Inflated(NamedTuple):
             high = torch.maximum(high, (part.centers + wide).masked_fill(absent, -torch.inf).amax(1))
         return low, high
 
-    def depth(self, points: Tensor) -> Tensor:
-        """How deep points (B, V, d) lie beneath the surface of an obstacle, (B, V), m; negative outside of all."""
+    def deeper(self, points: Tensor, than: Tensor) -> Tensor:
+        """Whether points (B, V, d) lie deeper than lengths (B,) >= 0, m, beneath the surface of an obstacle, (B, V)."""
         B, V = points.shape[:2]
         at_once = max(1, DISTANCES_AT_ONCE // max(1, V * self.scales.shape[1]))
         parts = torch.arange(B, device=points.device).split(at_once)
-        return torch.cat([take(self, rows)._depth(points[rows]) for rows in parts])
+        return torch.cat([take(self, rows)._deeper(points[rows], than[rows]) for rows in parts])
 
-    def _depth(self, points: Tensor) -> Tensor:
-        away = [part.signed_distance(points).masked_fill(part.absent.unsqueeze(1), torch.inf) for part in self.kinds]
-        away += [part.signed_distance(points, points.new_zeros(1)) for part in self.maps]
-        return -torch.cat(away, dim=-1).amin(-1)
+    def _deeper(self, points: Tensor, than: Tensor) -> Tensor:
+        found = [part.deeper(points, than) for part in self.kinds]
+        level = -than.view(-1, 1, 1)
+        found += [(part.signed_distance(points, points.new_zeros(1)) < level).any(-1) for part in self.maps]
+        return torch.stack(found).any(0)
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,12 @@ class Scene:
     goal: Tensor  # (B, d)
     obstacles: Inflated
     traversal_cost: Callable[[Tensor, Tensor], Tensor]  # per metre at points (B', V, d) of some problems, (B', V)
+
+    def take(self, rows: Tensor) -> Scene:
+        """The same of some problems."""
+        cost = self.traversal_cost
+        obstacles = take(self.obstacles, rows)
+        return Scene(self.start[rows], self.goal[rows], obstacles, lambda points, some: cost(points, rows[some]))
 
 
 def length(path: Tensor) -> Tensor:

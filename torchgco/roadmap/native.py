@@ -15,18 +15,27 @@ from torch import Tensor
 from torchgco.native.compiler import Compiler, NativeError, find_compiler
 from torchgco.native.declarations import Structure, fields, head, load
 from torchgco.native.dispatch import EagerWarning
+from torchgco.native.engine import run
 from torchgco.native.kernels import native
 from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.points import MIDWAY, RAYS, SHELLS, directions, of_boxes
-from torchgco.roadmap.search import CLEAR, EDGE_COST, HOPS, SMALL, TIE, Graph
+from torchgco.roadmap.search import CLEAR, EDGE_COST, HOPS, SMALL, TIE, Beside, Graph
 
 PROBLEMS_AT_ONCE = 64  # problems searched together
+GROUP = 4  # of them, at least so many by each thread
+BLOCK, SIDE = 32, 8  # edges measured side by side; of those near a box, so many at once
 
 SEARCH, BOXES = (Path(__file__).parent / "c" / name for name in ("search.c", "boxes.h"))
 BOX = Path(__file__).parents[1] / "native" / "c" / "box.h"
-SCALARS = "#define V double\n#define tgco_choose(where, a, b) ((where) ? (a) : (b))"  # box.h for one number at a time
+# What box.h needs, for SIDE edges in a vector.
+VECTORS = """
+typedef double V __attribute__((vector_size(SIDE * sizeof(double))));
+typedef __typeof__((V){0} == (V){0}) I;
+#define SET(c) ((double)(c) - (V){0})
+static inline V tgco_choose(I where, V a, V b) { return (V)((where & (I)a) | (~where & (I)b)); }
+"""
 # Fused products and sums would be rounded once where PyTorch rounds twice.
 FLAGS = ("-ffp-contract=off",)
 
@@ -37,7 +46,7 @@ class Arguments(Structure):
     """
 
     declared = (
-        ("int64_t", "problems spheres spread candidates points edges neighbours hubs corners directions shells midway"),
+        ("int64_t", "spheres spread candidates points edges neighbours hubs corners directions shells midway"),
         ("double", "margin least clear factor tie"),
         ("const double *", "centers distances"),  # (B, M, DIM), (B, M): radii, negative where absent
         ("const double *", "start goal"),  # (B, DIM)
@@ -69,14 +78,16 @@ class NativeSearch:
     obstacles: Inflated
     margin: float
 
-    def graph(self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int) -> Graph:
+    def graph(
+        self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int, beside: Beside = None
+    ) -> Graph:
         (B, d), (spheres, boxes, _) = start.shape, self.obstacles
         M = spheres.radii.shape[1]
         rays, shell = directions(start, goal), start.new_tensor(SHELLS[d])
         count, more = M * (RAYS * len(shell) + min(MIDWAY, M)), {}
         reach = torch.stack(self.obstacles.region(start, goal), dim=1)
         if boxes is not None:
-            more["beside"], more["exists"] = of_boxes(boxes, spheres, start, goal)
+            more["beside"], more["exists"] = beside or of_boxes(boxes, spheres, start, goal)
             count += more["beside"].shape[1]
         V, K = 2 + len(cube) + min(nodes, count), neighbours + hubs + 1
         made = Graph(start.new_empty(B, V, d), torch.empty(B, V, K, dtype=torch.int32), start.new_empty(B, V, K))
@@ -116,21 +127,20 @@ class NativeSearch:
         return price.to(o).expand(o.shape[0], points)
 
     def _run(self, name: str, read: dict[str, Tensor], written: dict[str, Tensor], **numbers: float) -> None:
-        """Call a function of the library on all problems."""
+        """Call a function of the library on all problems, by as many threads as PyTorch uses."""
         arguments = self._shared.copy()
         arguments.fill({**{field: tensor.contiguous() for field, tensor in read.items()}, **written, **numbers})
-        if not getattr(self.library, name)(ctypes.byref(arguments)):
-            raise MemoryError("native kernels: no memory")
+        run(getattr(self.library, name), self.obstacles.spheres.radii.shape[0], GROUP, arguments)
 
     @cached_property
     def _shared(self) -> Arguments:
         """The arguments of all calls: the obstacles, and constants."""
         spheres, boxes, _ = self.obstacles
-        (B, M), more = spheres.radii.shape, {}
+        M, more = spheres.radii.shape[1], {}
         if boxes is not None:
             more = {"boxes": boxes.radii.shape[1], "box": _numbers(boxes), "largest": boxes.sizes.amax(-1).contiguous()}
         return Arguments(
-            problems=B, spheres=M, corners=HOPS + 1, margin=self.margin, clear=CLEAR, least=EDGE_COST, tie=TIE,
+            spheres=M, corners=HOPS + 1, margin=self.margin, clear=CLEAR, least=EDGE_COST, tie=TIE,
             centers=spheres.centers.contiguous(), distances=marked(spheres.radii, spheres.absent).contiguous(), **more,
         )  # fmt: skip
 
@@ -155,11 +165,10 @@ def library_for(like: Tensor, boxes: bool = False) -> ctypes.CDLL | None:
 @functools.cache
 def _library(dimension: int, boxes: bool, compiler: Compiler | None) -> ctypes.CDLL | None:
     # Without boxes their code is left out, so that it can't change how the spheres' code is compiled.
-    constants = {"DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": SMALL}
-    parts = [BOX, BOXES, SEARCH] if boxes else [SEARCH]
-    texts = (SCALARS, *(part.read_text() for part in parts))
+    constants = {"DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": SMALL, "BLOCK": BLOCK, "SIDE": SIDE}
+    own = [VECTORS, BOX.read_text(), BOXES.read_text()] if boxes else []
     try:
-        return load("\n".join((head([Arguments], [], constants), *texts)), [Arguments], FLAGS)
+        return load("\n".join((head([Arguments], [], constants), *own, SEARCH.read_text())), [Arguments], FLAGS)
     except NativeError as error:
         reason = str(error).splitlines()[0]
         warnings.warn(f"solved by PyTorch's kernels where paths are sought: {reason}", EagerWarning, stacklevel=3)

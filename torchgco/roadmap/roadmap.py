@@ -19,9 +19,10 @@ from torchgco.base.options import AtLeast, Below, check_options
 from torchgco.base.tree import take
 from torchgco.roadmap import native as roadmap
 from torchgco.roadmap.geometry import Scene, length
+from torchgco.roadmap.known import Course, Known
 from torchgco.roadmap.mapped import paths_in_maps
 from torchgco.roadmap.native import NativeSearch
-from torchgco.roadmap.search import TorchSearch
+from torchgco.roadmap.search import HOPS, TorchSearch
 
 PROBLEMS_AT_ONCE = 4  # problems searched together by PyTorch: memory holds distances of all edges from all obstacles
 NODES = 128  # points around obstacles: those of the shortest detours
@@ -57,57 +58,79 @@ class Roadmap:
     def __post_init__(self) -> None:
         check_options(self, "roadmap")
 
-    def paths(self, scene: Scene, count: int = 1) -> tuple[Tensor, Tensor]:
+    def paths(
+        self, scene: Scene, count: int = 1, rows: Tensor | None = None, known: Known | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Different paths, the cheapest first; each further one avoids those before it unless that costs too much.
 
+        Args:
+            rows: problems (B',) of the scene, ascending; None: all.
+            known: of searches in this scene before, with which this one goes on; None: of none.
+
         Returns:
-            Corners (B, count, HOPS+1, d), m, the goal repeated at their ends, or the straight line where there is no
-            path; and whether there is a path (B,).
+            Corners (B', count, HOPS+1, d), m, the goal repeated at their ends, or the straight line where there is no
+            path; and whether there is a path (B',).
         """
         if scene.obstacles.maps:
-            return paths_in_maps(scene, count, self.max_overlap)
+            return paths_in_maps(scene if rows is None else scene.take(rows), count, self.max_overlap)
         library = roadmap.library_for(scene.start, scene.obstacles.boxes is not None)
         most = PROBLEMS_AT_ONCE if library is None else roadmap.PROBLEMS_AT_ONCE
-        everyone = torch.arange(scene.start.shape[0], device=scene.start.device)
-        parts = [self._paths(scene, rows, count, library) for rows in everyone.split(most)]
-        return torch.cat([path for path, _ in parts]), torch.cat([found for _, found in parts])
+        B, d = scene.start.shape
+        rows = torch.arange(B, device=scene.start.device) if rows is None else rows
+        place, found = torch.full((B,), -1, device=rows.device), torch.zeros_like(rows, dtype=torch.bool)
+        place[rows] = torch.arange(rows.numel(), device=rows.device)
+        corners = scene.start.new_empty(rows.numel(), count, HOPS + 1, d)
+        for first in range(0, B, most):
+            some = rows[(rows >= first) & (rows < first + most)]
+            for course in self._courses(scene, some, first, count, library, known or Known()):
+                corners[place[course.rows]] = torch.stack(course.paths[:count], dim=1)
+                found[place[course.rows]] = course.found
+        return corners, found
 
     def repeats(self, other: Roadmap, scene: Scene) -> bool:
         """Whether another search finds the same paths: those among maps need no points all over the scene."""
         return bool(scene.obstacles.maps) and self.max_overlap == other.max_overlap
 
-    def _paths(self, scene: Scene, rows: Tensor, count: int, library: CDLL | None) -> tuple[Tensor, Tensor]:
-        """Paths of the problems in `rows`; see `paths`."""
-        paths, found, is_full = self._search(scene, rows, count, library, NODES, NEIGHBOURS)
-        straight = length(torch.stack((scene.start[rows], scene.goal[rows]), dim=1))
-        again = (~found | (length(paths[:, 0]) > LONG * straight)).nonzero().flatten()
-        if is_full and again.numel() > 0:
-            more, arrives, _ = self._search(scene, rows[again], count, library, MANY_NODES, MANY_NEIGHBOURS)
-            paths[again[arrives]], found[again[arrives]] = more[arrives], True
-        return paths, found
+    def _courses(
+        self, scene: Scene, rows: Tensor, group: int, count: int, library: CDLL | None, known: Known
+    ) -> list[Course]:
+        """Courses with `count` paths, or more, of the problems in `rows`, which are of one group."""
+        if rows.numel() == 0:
+            return []
+        courses = known.courses((self, group), rows)
+        fresh = courses is None
+        if courses is None:
+            courses = self._begun(scene, rows, group, library, known)
+        for course in courses:
+            course.go_on(count)
+        if fresh:
+            known.keep((self, group), courses)
+        return courses
 
-    def _search(
-        self, scene: Scene, rows: Tensor, count: int, library: CDLL | None, nodes: int, neighbours: int
-    ) -> tuple[Tensor, Tensor, bool]:
-        """Paths (B', count, HOPS+1, d) over a graph of the problems in `rows`, where there are any (B'), and whether
-        there were as many points around obstacles as the graph takes."""
-        start, goal = scene.start[rows], scene.goal[rows]
-        obstacles = take(scene.obstacles, rows).reduced(self.max_overlap)
-        search = TorchSearch(obstacles, MARGIN) if library is None else NativeSearch(library, obstacles, MARGIN)
-        cube = halton(self.num_halton, start.shape[-1]).to(start)
-        graph = search.graph(start, goal, cube, nodes, neighbours, HALTON_NEIGHBOURS)
-        price = scene.traversal_cost(graph.points, rows)
-        paths: list[Tensor] = []
-        for _ in range(count):
-            path, string, arrives = search.cheapest(graph, price)
-            path = search.taut(path, string, scene.traversal_cost(string, rows))
-            if not paths:
-                found = arrives
-            else:  # a later path may have too many edges: the first stands in for it
-                path = torch.where(arrives.view(-1, 1, 1), path, paths[0])
-            paths.append(path)
-            price = search.raised(price, graph.points, path, 1.0 + DIVERSITY)
-        return torch.stack(paths, dim=1), found, graph.points.shape[1] == 2 + len(cube) + nodes
+    def _begun(self, scene: Scene, rows: Tensor, group: int, library: CDLL | None, known: Known) -> list[Course]:
+        """Courses with one path of the problems in `rows`, some of them over more points."""
+
+        def begin(rows: Tensor, nodes: int, neighbours: int) -> Course:
+            start, goal = scene.start[rows], scene.goal[rows]
+            obstacles = take(scene.obstacles, rows).reduced(self.max_overlap)
+            search = TorchSearch(obstacles, MARGIN) if library is None else NativeSearch(library, obstacles, MARGIN)
+            cube = halton(self.num_halton, start.shape[-1]).to(start)
+            beside = known.beside((self.max_overlap, group), rows, obstacles, scene)
+            graph = search.graph(start, goal, cube, nodes, neighbours, HALTON_NEIGHBOURS, beside)
+            course = Course(scene, rows, search, graph, 1.0 + DIVERSITY)
+            course.go_on(1)
+            return course
+
+        first = begin(rows, NODES, NEIGHBOURS)
+        straight = length(torch.stack((scene.start[rows], scene.goal[rows]), dim=1))
+        again = (~first.found | (length(first.paths[0]) > LONG * straight)).nonzero().flatten()
+        is_full = first.graph.points.shape[1] == 2 + self.num_halton + NODES
+        if not is_full or again.numel() == 0:
+            return [first]
+        second = begin(rows[again], MANY_NODES, MANY_NEIGHBOURS)
+        stays = torch.ones_like(first.found)
+        stays[again[second.found]] = False
+        return [first.among(rows[stays]), second.among(rows[~stays])]
 
 
 @cache

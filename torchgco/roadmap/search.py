@@ -9,7 +9,7 @@ are equal.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -25,6 +25,9 @@ TIE = 1e-12  # share of the cost by which equally cheap paths may differ
 EDGE_COST = 1e-6  # share of the distance from start to goal that is added to every edge: no edge may cost nothing
 SMALL = 1e-9  # m: the margin's unit is at least this
 CLASS = 8  # paths are drawn taut in groups: those of up to 8 edges, of up to 16, ...
+
+
+Beside: TypeAlias = tuple[Tensor, Tensor] | None  # points around boxes (B, C, d), and whether each exists (B, C)
 
 
 class Graph(NamedTuple):
@@ -47,7 +50,9 @@ class TorchSearch:
     obstacles: Inflated
     margin: float
 
-    def graph(self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int) -> Graph:
+    def graph(
+        self, start: Tensor, goal: Tensor, cube: Tensor, nodes: int, neighbours: int, hubs: int, beside: Beside = None
+    ) -> Graph:
         """Points, each joined to its nearest of all points, its nearest of the spread points, and the goal.
 
         Args:
@@ -56,9 +61,10 @@ class TorchSearch:
             nodes: number of free points around obstacles that are added, those of the shortest detours. Unused places
                 lie at the start, without edges.
             neighbours, hubs: edges of a point to its nearest of all points and of the spread points.
+            beside: `points.of_boxes`, where it is known.
         """
         given = torch.cat((torch.stack((start, goal), dim=1), self._spread(start, goal, cube)), dim=1)
-        kept, taken = self._beside(start, goal, nodes)
+        kept, taken = self._beside(start, goal, nodes, beside)
         points, free = torch.cat((given, kept), dim=1), torch.cat((self._is_free(given), taken), dim=1)
         free[:, :2] = True
         apart = squares(points, points).masked_fill(~free.unsqueeze(1), torch.inf)
@@ -137,12 +143,12 @@ class TorchSearch:
         low, high = (end.unsqueeze(1) for end in self.obstacles.region(start, goal))
         return low + cube * (high - low)
 
-    def _beside(self, start: Tensor, goal: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
+    def _beside(self, start: Tensor, goal: Tensor, nodes: int, beside: Beside) -> tuple[Tensor, Tensor]:
         """Free points around the obstacles and between them (B, nodes, d), and which places are taken (B, nodes)."""
         spheres, boxes, _ = self.obstacles
         parts = [around_spheres(spheres, start, goal), between_spheres(spheres)]
         if boxes is not None:
-            parts.append(of_boxes(boxes, spheres, start, goal))
+            parts.append(beside or of_boxes(boxes, spheres, start, goal))
         points, exists = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))
         detour = squares(points, torch.stack((start, goal), dim=1)).sqrt_().sum(-1)
         detour = torch.where(exists & self._is_free(points), detour, torch.inf).to(torch.float32)

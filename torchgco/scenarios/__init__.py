@@ -9,6 +9,7 @@ from torchgco.scenarios.maps import MapFile
 from torchgco.scenarios.mazes import Mazes
 from torchgco.scenarios.planar import PlanarRandom, PlanarTrap
 from torchgco.scenarios.quadrotor import Forest, ForestMoving, Walls
+from torchgco.scenarios.rooms import Rooms
 from torchgco.scenarios.vehicle import Task, Vehicle
 from torchgco.scenarios.woods import Woods
 from torchgco.scenarios.yard import Yard
@@ -24,6 +25,7 @@ __all__ = [
     "Mazes",
     "PlanarRandom",
     "PlanarTrap",
+    "Rooms",
     "Scenario",
     "Task",
     "Vehicle",

@@ -110,10 +110,10 @@ class Candidates:
         """The problems of the candidates in `rows` (b,)."""
         return self.selected.take(rows // self.count)
 
-    def multipliers(self, rows: Tensor, penalty: float) -> Multipliers:
-        """Zero multipliers and a penalty in q0 / R^4 for the candidates in `rows` (b,)."""
-        lam = (self.U.new_zeros(rows.numel(), *shape) for shape in self.problem.row_shapes)
-        return Multipliers(tuple(lam), penalty * self.unit[rows])
+    def lagrangian(self, rows: Tensor, penalty: float, attraction: Penalty | None = None) -> Lagrangian:
+        """The cost of the candidates in `rows` (b,), with a penalty of obstacles in q0 / R^4 and no multipliers."""
+        problem = self.of(rows)
+        return Lagrangian(problem, Multipliers.none(problem, penalty * self.unit[rows]), attraction, True)
 
     def parts(self) -> Iterator[Tensor]:
         """Rows of the live candidates, `CANDIDATES_AT_ONCE` at a time."""
@@ -141,8 +141,7 @@ class Candidates:
         done, total = 0, int(self.live.sum())
         for rows in self.parts():
             part = take(attraction, rows if place is None else place[rows])
-            lagrangian = Lagrangian(self.of(rows), self.multipliers(rows, penalty), part, True)
-            end, _ = descend(inner, lagrangian, U[rows])
+            end, _ = descend(inner, self.lagrangian(rows, penalty, part), U[rows])
             X[rows], U[rows] = end.X, end.U
             iterations = iterations.index_add(0, rows // self.count, end.iterations)
             done += rows.numel()
@@ -159,7 +158,8 @@ class Candidates:
             iterations: of an inner solve, at most.
         """
         everyone = torch.arange(self.live.numel(), device=sound.device)
-        multipliers, rows = self.multipliers(everyone, PENALTY), sound.nonzero().flatten()
+        lam = tuple(self.U.new_zeros(everyone.numel(), *shape) for shape in self.problem.row_shapes)
+        multipliers, rows = Multipliers(lam, PENALTY * self.unit), sound.nonzero().flatten()
         if refine.top == 1 or rows.numel() == 0:
             return Refined(self, multipliers, everyone[:: self.count], torch.full_like(self.unit, torch.inf))
         part, inner = self.of(rows), inner_solver(iterations, 0.1)
@@ -185,8 +185,7 @@ class Candidates:
         """
         merit, first = torch.full_like(self.unit, torch.inf), first & self.live
         for rows in self.parts():
-            lagrangian = Lagrangian(self.of(rows), self.multipliers(rows, PENALTY), None, True)
-            merit[rows] = value(lagrangian, self.X[rows], self.U[rows])[1]
+            merit[rows] = value(self.lagrangian(rows, PENALTY), self.X[rows], self.U[rows])[1]
         merit, order = merit.nan_to_num(torch.inf).view(-1, self.count).sort(dim=-1, stable=True)
         later = (~first).view(-1, self.count).gather(1, order).to(torch.int8)
         later, again = later.sort(dim=-1, stable=True)

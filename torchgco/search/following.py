@@ -13,12 +13,15 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import AtLeast, Below, Count, Positive, check_options
 from torchgco.base.shapes import check_shape, tensor
 from torchgco.base.tree import take
+from torchgco.constraints.bounds import ControlBounds
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
+from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.roadmap.geometry import Inflated, length, points_along
 from torchgco.search.candidates import Candidates, inner_solver
+from torchgco.search.nearby import without_obstacles
 from torchgco.solvers.ilqr import descend
 
 OFFSET_LASTS = 0.1  # share of the horizon that an initial offset lasts
@@ -34,6 +37,7 @@ class Free(NamedTuple):
 
     cost: Tensor  # (B,)
     share: Tensor  # (B,): of the horizon, until a tenth of the distance to the goal is left; infinite where never
+    slower: Tensor  # (B,): times as long as that takes within the limits on states, at least 1
     iterations: Tensor  # (B,) int64
 
 
@@ -65,7 +69,8 @@ class Follow:
             a vehicle that turns slowly find reversing and three-point turns. `Restarts` leaves them out where they
             don't fit the number of controls.
         depart, arrive: shares of the horizon at which the vehicle leaves the start and reaches the goal. Several
-            values of `arrive`: every path is tracked at each pace.
+            values of `arrive`: every path is tracked at each pace. Where rows limit states, all this takes as
+            much longer as they make the way without obstacles.
         pace: times the time that the vehicle takes without constraints, per length of the path: no path is followed
             more slowly than this, whatever `arrive` says. None: no such limit.
         smoothing: share of the horizon over which the corners of a path are averaged, at most (see `followed`).
@@ -126,9 +131,12 @@ class Follow:
         paces, K = len(self.paces), paths.corners.shape[1]
         path = paths.corners.flatten(0, 1).repeat_interleave(paces, dim=0)
         arrive = path.new_tensor(self.paces).repeat(path.shape[0] // paces)
+        if free is not None:
+            slower = free.slower.repeat_interleave(K * paces)
+            arrive = torch.minimum(self.depart + (arrive - self.depart) * slower, arrive.clamp(min=1.0))
         if self.pace is not None:
             assert free is not None
-            shares = (free.share.unsqueeze(-1) * paths.stretch()).nan_to_num(torch.inf)
+            shares = ((free.share * free.slower).unsqueeze(-1) * paths.stretch()).nan_to_num(torch.inf)
             latest = self.pace * shares.flatten().repeat_interleave(paces)
             arrive = torch.minimum(arrive, latest.clamp(min=self.depart + SHORTEST))
         center = self._centers(path, arrive, candidates.problem, paths)
@@ -156,19 +164,37 @@ class Follow:
         return center
 
 
-def unconstrained(problem: Problem, rest: Tensor, iterations: int) -> Free:
-    """The trajectories without constraints, from the controls `rest` (B, N, m)."""
+def unconstrained(problem: Problem, rest: Tensor, iterations: int, unit: Tensor) -> Free:
+    """The trajectories without constraints, from the controls `rest` (B, N, m); unit (B,): q0 / R^4."""
     end, _ = descend(inner_solver(iterations), plain(problem), rest)
+    share, slower, made = _share(problem, end.X), torch.ones_like(end.cost), end.iterations
+    bare = without_obstacles(problem) if limits_states(problem) else None
+    if bare is not None:
+        limits = Lagrangian(bare, Multipliers.none(bare, TRACK_PENALTY * unit), None, True)
+        limited, _ = descend(inner_solver(iterations), limits, end.U)
+        slower = (_share(problem, limited.X) / share).nan_to_num(1.0).clamp(min=1.0)
+        made = made + limited.iterations
+    return Free(end.cost, share, slower, made)
+
+
+def limits_states(problem: Problem) -> bool:
+    """Whether rows besides obstacles and control bounds may limit how fast a vehicle is."""
+    others = (part for part in problem.constraints if not isinstance(part, Obstacles | ControlBounds))
+    return any(part.sense == "inequality" for part in others)
+
+
+def _share(problem: Problem, X: Tensor) -> Tensor:
+    """Share (B,) of the horizon until a tenth of the distance to the goal is left; infinite where never."""
     assert problem.goal is not None
-    left = problem.goal.distance(end.X[..., problem.position])
+    left = problem.goal.distance(X[..., problem.position])
     near = left <= LAST_PART * left[:, :1]
     share = near.to(torch.int8).argmax(-1).to(left) / problem.stages
-    return Free(end.cost, torch.where(near.any(-1), share, torch.inf), end.iterations)
+    return torch.where(near.any(-1), share, torch.inf)
 
 
 def plain(problem: Problem) -> Lagrangian:
     """The cost alone: the constraints with multipliers and penalties of zero."""
-    return Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True)
+    return Lagrangian(problem, Multipliers.none(problem, torch.zeros_like(problem.x0[:, 0])), None, True)
 
 
 def travel(path: Tensor, depart: float, arrive: Tensor, smoothing: float, N: int) -> Tensor:
@@ -201,14 +227,18 @@ def followed(
         R: mean inflated radius (B,), m.
     """
     center, B = travel(path, depart, arrive, smoothing, N), R.shape[0]
-    while B > 0 and smoothing * N >= 2.0:
-        points = center[:, :: max(1, N // DEPTH_POINTS)]
-        deepest = obstacles.depth(points.reshape(B, -1, points.shape[-1])).view(B, -1, points.shape[1]).amax(-1)
-        deep = deepest > CUT * R.unsqueeze(-1)
-        if not bool(deep.any()):
+    each, some = path.shape[0] // max(1, B), torch.arange(B, device=path.device)  # the problems with deep paths
+    while some.numel() > 0 and smoothing * N >= 2.0:
+        points = center.view(B, each, N + 1, -1)[some, :, :: max(1, N // DEPTH_POINTS)]
+        deep = obstacles.deeper(points.flatten(1, 2), CUT * R).view(*points.shape[:3]).any(-1)
+        rows = (some.unsqueeze(-1) * each + torch.arange(each, device=path.device))[deep]
+        if rows.numel() == 0:
             break
         smoothing *= 0.5
-        center = torch.where(deep.view(-1, 1, 1), travel(path, depart, arrive, smoothing, N), center)
+        center[rows] = travel(path[rows], depart, arrive[rows], smoothing, N)
+        again = deep.any(-1)
+        if not bool(again.all()):
+            some, obstacles, R = some[again], take(obstacles, again.nonzero().flatten()), R[again]
     return center
 
 

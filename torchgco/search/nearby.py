@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.tree import put
+from torchgco.constraints.base import Constraint
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.dispatch import chord_clearance, measured
 from torchgco.obstacles.base import Obstacles, Solids
@@ -38,8 +39,7 @@ class Nearby:
         self.given, self.places = given, places
         parts = zip(given.problem.constraints, places, strict=True)
         constraints = tuple(c if at is None or not isinstance(c, Obstacles) else c.chosen(at) for c, at in parts)
-        problem = given.problem._with({"constraints": constraints}, form=dict(given.problem.form))
-        problem.form.pop(ROWS, None)
+        problem = _among(given.problem, constraints)
         warm = given.warm
         if warm is not None:
             warm = replace(warm, lam=tuple(map(_gathered, warm.lam, places)))
@@ -88,6 +88,20 @@ class Nearby:
         deeper = measured(whole, found.X, found.U, obstacles=True) > measured(part, found.X, found.U, obstacles=True)
         cut = chord_clearance(whole, found.X) < chord_clearance(part, found.X).clamp(max=0.0)
         return (deeper | cut).nonzero().flatten()
+
+
+def without_obstacles(problem: Problem) -> Problem | None:
+    """The problems with one absent obstacle of each kind, in the same native form; None for kinds that can't say."""
+    if any(type(part).chosen is Obstacles.chosen for part in problem.obstacles):
+        return None
+    none = torch.full((problem.B, 1), -1, dtype=torch.int64, device=problem.x0.device)
+    return _among(problem, tuple(c.chosen(none) if isinstance(c, Obstacles) else c for c in problem.constraints))
+
+
+def _among(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
+    other = problem._with({"constraints": constraints}, form=dict(problem.form))
+    other.form.pop(ROWS, None)
+    return other
 
 
 def merged(first: Solution, rows: Tensor, again: Solution) -> Solution:

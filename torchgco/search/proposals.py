@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
@@ -27,9 +27,10 @@ from torchgco.problem.problem import Problem
 from torchgco.roadmap import scene as seen
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.homotopy import classes
+from torchgco.roadmap.known import Known
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
-from torchgco.search.following import Follow, Free, Paths, plain, unconstrained
+from torchgco.search.following import Follow, Free, Paths, limits_states, plain, unconstrained
 from torchgco.search.record import comparison
 from torchgco.solution import SearchRecord
 
@@ -144,34 +145,36 @@ class PathProposals:
             return
         every = rows.numel() == whole.problem.B
         problem, rest = (whole.problem, whole.rest) if every else (whole.problem.take(rows), whole.rest[rows])
-        scene = whole.scene if every else seen.scene_of(problem, rest)
-        assert scene is not None
-        paths = self._paths(problem, rest, scene) if self.roadmaps else take(whole.paths, rows)
+        paths = self._paths(whole, rows) if self.roadmaps else take(whole.paths, rows)
         if not self.continues:
             whole.paths = paths
         note = None if whole.record is None else partial(whole.note, rows, paths, self.refine)
         for follow in self.follow:
-            free = None if follow.pace is None else take(whole.free(follow.iterations), rows)
+            paced = follow.pace is not None or limits_states(problem)
+            free = take(whole.free(follow.iterations), rows) if paced else None
             new, old = self._along(problem, rest, paths, follow, free, watch, note), take(whole.proposal, rows)
             better = (~old.found | (new.found & (new.cost < old.cost))).nonzero().flatten()
             put(whole.proposal, rows[better], take(new, better))
             whole.proposal.iterations[rows] = old.iterations + new.iterations
 
-    def _paths(self, problem: Problem, rest: Tensor, scene: Scene) -> Paths:
-        """The paths of all searches, one per homotopy class."""
-        R, unit = seen.scales(problem, scene, rest)
+    def _paths(self, whole: Part, rows: Tensor) -> Paths:
+        """The paths of all searches, one per homotopy class, of the problems in `rows`."""
+        assert whole.scene is not None
+        R, unit = (scale[rows] for scale in whole.scales)
         usable, known = torch.isfinite(unit) & (unit > 0), []
         found = torch.zeros_like(usable)
         for number, roadmap in enumerate(self.roadmaps):
-            if any(roadmap.repeats(other, scene) for other in self.roadmaps[:number]):
+            if any(roadmap.repeats(other, whole.scene) for other in self.roadmaps[:number]):
                 continue
-            corners, arrives = roadmap.paths(scene, self.num_paths)
+            corners, arrives = roadmap.paths(whole.scene, self.num_paths, rows, whole.known)
             known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, self.num_paths)))
             found = found | (arrives & usable)
         corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
-        label = classes(corners, scene.obstacles)
+        obstacles = whole.scene.obstacles
+        obstacles = obstacles if rows.numel() == whole.problem.B else take(obstacles, rows)
+        label = classes(corners, obstacles)
         first = label == torch.arange(label.shape[1], device=label.device)
-        return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), scene.obstacles)
+        return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), obstacles)
 
     def _along(
         self,
@@ -224,9 +227,16 @@ class Part:
     def __init__(self, problem: Problem, rest: Tensor, places: Tensor, record: SearchRecord | None) -> None:
         self.problem, self.rest, self.places, self.record = problem, rest, places, record
         self.scene: Scene | None = seen.scene_of(problem, rest)
+        self.known = Known()  # of the searches in the scene
         self.paths: Paths | None = None
         self.proposal = Proposal.none(problem, rest)
         self._free: Free | None = None
+
+    @cached_property
+    def scales(self) -> tuple[Tensor, Tensor]:
+        """R and q0 / R^4 (B,); see `scene.scales`."""
+        assert self.scene is not None
+        return seen.scales(self.problem, self.scene, self.rest)
 
     def note(self, rows: Tensor, paths: Paths, refine: Refine, *steps: Any) -> None:
         """Record a comparison for the problems in `rows`; see `record.comparison`."""
@@ -238,7 +248,8 @@ class Part:
     def free(self, iterations: int) -> Free:
         """The trajectories without constraints, solved at the first call; their iterations count as the proposals'."""
         if self._free is None:
-            self._free = unconstrained(self.problem, self.rest, iterations)
+            _, unit = self.scales
+            self._free = unconstrained(self.problem, self.rest, iterations, unit.nan_to_num(1.0, 1.0, 1.0))
             self.proposal.iterations.add_(self._free.iterations)
         return self._free
 

@@ -14,6 +14,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.view.packing import LARGEST, Packing, number
+from torchgco.view.sensed import Sensed
 from torchgco.view.vehicles import Look
 
 BETWEEN = 4  # places per stage at which contact is looked for
@@ -35,6 +36,7 @@ class Flight:
         contacts: (C, d) places where bodies touch, between knots too.
         plan: (K, P, d) what the vehicle planned at each knot, of missions; None: nothing.
         notes: one text per knot for the hover, of missions; none: nothing to say.
+        sensed: what the vehicle saw and sought, of missions with a sensor.
     """
 
     solver: str
@@ -47,6 +49,7 @@ class Flight:
     contacts: np.ndarray
     plan: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
+    sensed: Sensed | None = None
 
     def until(self, last: int) -> Flight:
         """The same up to a knot."""
@@ -68,6 +71,8 @@ class Flight:
         held["violated"] = [[int(k), number(self.violation[k], 3), int(self.worst[k])] for k in bad]
         if self.plan is not None:
             held["plan"] = packing.put(np.nan_to_num(self.plan), steps=True)
+        if self.sensed is not None:
+            held["sensed"] = self.sensed.until(len(self.path)).packed(packing, self.path[:, 2])
         return held
 
 

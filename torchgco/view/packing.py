@@ -1,8 +1,8 @@
 """Numbers for the page: half precision, compressed. `static/data.js` reads what is written here.
 
 A part of the page is a text (JSON) and arrays. The text refers to an array as {"$": place, "shape": [...], "steps":
-bool}; the arrays follow it, all low bytes of one, then all high bytes, which compresses better than the numbers one
-after the other.
+bool}, or "whole": true where its numbers are whole; the arrays follow it, all lowest bytes of one, then all higher
+ones, which compresses better than the numbers one after the other.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 
 LARGEST = 6e4  # the largest magnitude that is kept; half precision ends at 65,504
 KEY = "$"
+WHOLE = 4  # bytes of a whole number
 
 
 class Packing:
@@ -39,6 +40,15 @@ class Packing:
         self.planes.append(raw.T.tobytes())
         self.size += raw.size
         return {KEY: place, "shape": list(values.shape), "steps": steps}
+
+    def put_whole(self, values: np.ndarray) -> dict[str, Any]:
+        """Keep whole numbers (K,) from 0 up to below 2^32, as the differences between one and the next, modulo 2^32."""
+        steps = np.diff(np.asarray(values, dtype=np.uint32), prepend=np.uint32(0))
+        raw = np.frombuffer(steps.astype("<u4").tobytes(), dtype=np.uint8).reshape(-1, WHOLE)
+        place = self.size
+        self.planes.append(raw.T.tobytes())
+        self.size += raw.size
+        return {KEY: place, "shape": list(steps.shape), "whole": True}
 
     def sealed(self, text: dict[str, Any]) -> str:
         """Text and arrays in one, compressed, as base64."""

@@ -39,6 +39,7 @@ class Shapes:
         turn: (M | 1, 4) unit quaternions [w, x, y, z], or (M | 1,) angles in the plane; None: sides along the axes.
         velocity: (M | 1, d), m/s; None: at rest.
         until: s, when they stop to move and to count; None: never.
+        cells: of a map, which may have a ceiling that the page cuts off at first.
     """
 
     center: np.ndarray
@@ -47,10 +48,12 @@ class Shapes:
     turn: np.ndarray | None = None
     velocity: np.ndarray | None = None
     until: float | None = None
+    cells: bool = False
 
     def packed(self, packing: Packing, middle: np.ndarray) -> dict[str, Any]:
         """As the page reads them; centres count from `middle` (d,), near which half precision is finest."""
         held: dict[str, Any] = {"count": len(self.center), "until": self.until, "middle": middle.tolist()}
+        held["cells"] = self.cells
         arrays = {"center": self.center - middle, "half": self.half, "radius": self.radius, "turn": self.turn}
         arrays["velocity"] = self.velocity
         return held | {name: packing.put(once(part)) for name, part in arrays.items() if part is not None}
@@ -106,7 +109,7 @@ def _map(part: BoundField, b: int) -> Shapes:
     grid = field.source
     low, high = merged(grid.is_occupied if grid.batch is None else grid.is_occupied[g])
     center = np.broadcast_to(grid.origin, (max(1, grid.batch or 1), field.d))[g] + 0.5 * grid.resolution * (low + high)
-    return Shapes(center, 0.5 * grid.resolution * (high - low), np.zeros(1))
+    return Shapes(center, 0.5 * grid.resolution * (high - low), np.zeros(1), cells=True)
 
 
 # What the page draws for obstacles of each kind, once bound to a problem, and the place of a problem in its batch.

@@ -10,15 +10,17 @@ import pytest
 import torch
 
 from tests.missions.missions import REST
-from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, presets
+from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, Spheres, presets
 from torchgco.base.errors import InputError
 from torchgco.missions import Mission, Planner
 from torchgco.missions.contact import Contact
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import Outcome
+from torchgco.missions.plant import hovering
 from torchgco.missions.safe import safe_arrays
 from torchgco.missions.sensing import Depth, Lidar
 from torchgco.missions.tables import SENSED, ending, mission_frame, mission_row, packed, unpacked
+from torchgco.missions.unknown.exploration import Exploration
 from torchgco.missions.unknown.explorer import Explorer
 
 GOALS = torch.tensor([[4.0, 0.0, 0.0], [3.0, 0.5, 0.2]]).double()
@@ -142,3 +144,30 @@ def test_an_explorer_names_what_is_wrong() -> None:
 def test_a_depth_camera_flies_too() -> None:
     log = mission(sensor="depth", depth=Depth(rays=(60, 45)), duration=0.5).fly(walled())
     assert bool(torch.isfinite(log.x[:, 0]).all()) and len(log.seen) == 2
+
+
+@pytest.mark.parametrize("rate", [10.0, 20.0])
+def test_scans_and_searches_take_turns(rate: float) -> None:
+    problem, planner = walled(), Planner(presets.gco(3))
+    exploration = Exploration(EXPLORER, planner, replace(LIDAR, rate=rate), "occupied", problem, 0, torch.arange(2))
+    x, plan, searched, scanned = hovering(planner.airframe, problem.x0[:, :3]), None, [], []
+    for step in range(6):
+        exploration.sense(step, x, x)
+        before = [scout.search._round for scout in exploration.scouts]
+        plan, _ = exploration.plan(step, x, plan)
+        searched.append(
+            all(scout.search._round > round for scout, round in zip(exploration.scouts, before, strict=True))
+        )
+        scanned.append(exploration.scouts[0].scanned)
+    assert scanned == [True, rate == 20] * 3
+    assert searched == ([True] * 6 if rate == 20 else [True, True, False, True, False, True])
+
+
+def test_known_moving_bodies_are_made_way_for() -> None:
+    """A sphere comes along the straight way towards the vehicle."""
+    problem = walled(9.0)
+    sphere = Spheres([[8.0, 0.0, 0.0]], [0.6], 0.2, velocities=[[-1.5, 0.0, 0.0]])
+    problem = replace(problem, constraints=[sphere, problem.constraints[1]]).take(slice(0, 1))
+    log = mission(explorer=replace(EXPLORER, movers="known")).fly(problem, seed=1)
+    end = ending(log.arrays(), 0, log.period, Contact.among(problem), GOALS[0].numpy(), 0.5)
+    assert end.outcome is not Outcome.COLLISION and end.clearance > 0.1 and end.goal_distance < 2.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -98,7 +99,7 @@ def test_a_former_plan_asks_for_no_more_than_the_bounds() -> None:
     problem = exploration._problem(x, x.new_zeros(1, 3), reference, [reference[:, 1:, :3]])
     X, U = followed(problem, plan.X, plan.U, plan.K)
     assert float(unflyable(problem, X, U)[0]) > 1.0
-    X, U = within_bounds(problem, X, U, plan.X, plan.U, plan.K)
+    X, U = within_bounds(problem, plan.X, plan.U, plan.K)
     for i, (low, high) in enumerate(zip(LEAST, MOST, strict=True)):
         assert low <= float(U[..., i].min()) and float(U[..., i].max()) <= high
     state = X[:, 0]
@@ -106,3 +107,28 @@ def test_a_former_plan_asks_for_no_more_than_the_bounds() -> None:
     for k in range(U.shape[1]):
         state = problem.dynamics.at(k).step(state, U[:, k])
         assert torch.allclose(state, X[:, k + 1])
+
+
+def test_who_stays_in_one_place_looks_elsewhere() -> None:
+    exploration, x = exploring(1.0)
+    (scout,), points = exploration.scouts, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
+    for gaps, dear in ((np.array([0.9, 0.9, 0.1]), points[2]), (np.array([0.9, 0.9, 0.9]), points[2])):
+        scout.search.price[:] = 0.0
+        for period in range(20):  # of patience
+            assert (scout.search.price == 0).all(), period
+            exploration._wait(scout, x[0, :3].numpy(), points, gaps)
+        assert scout.search.price[tuple(scout.seen.cell(dear))] > 0
+        assert scout.search.price[tuple(scout.seen.cell(dear + np.array([4.0, 0.0, 0.0])))] == 0
+    scout.search.price[:] = 0.0
+    for period in range(60):  # it moves
+        exploration._wait(scout, x[0, :3].numpy() + np.array([0.03 * period, 0.0, 0.0]), points, gaps)
+    assert (scout.search.price == 0).all()
+
+
+def test_plans_of_a_vehicle_that_has_left_the_map_are_not_confined_to_it() -> None:
+    exploration, x = exploring(1.0)
+    (scout,) = exploration.scouts
+    assert np.array_equal(exploration._region(scout, x[0].numpy()), scout.seen.box(0.0))
+    x[:, 2] = LOW - 0.5
+    low, high = exploration._region(scout, x[0].numpy())
+    assert np.isclose(low[2], LOW - 1.5) and np.array_equal(high, scout.seen.box(0.0)[1])

@@ -27,7 +27,10 @@ from torchgco.scenarios.vehicle import BUILT_IN, fitting
 from torchgco.solvers.memory import free_memory, least_bytes
 
 DEFAULT_LAYOUTS = 64
-FLOWN = "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, walls, woods, or a layout file"
+FLOWN = (
+    "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, rooms, walls, woods, "
+    "or a layout file"
+)
 MAX_PROCESSES = 1024  # threads, too: PyTorch ends with an error of the system long before the system's own limit
 register()
 
@@ -191,20 +194,24 @@ def _mission(setup: Setup) -> Mission | None:
         raise InputError("device", "device=cpu in float64 for missions", f"{setup.device.type}, {setup.dtype}")
     if setup.scenario.dimension != 3:
         raise InputError("scenario", FLOWN, setup.scenario.name)
-    made, plant = _instantiate(node, "mission"), _instantiate(setup.config.plant, "plant")
+    mission = _closed_loop(node, setup.config.plant, setup.solver)
+    mission.check(setup.vehicle.dynamics)
+    return mission
+
+
+def _closed_loop(node: DictConfig, plant_node: DictConfig, solver: Any) -> Mission:
+    made, plant = _instantiate(node, "mission"), _instantiate(plant_node, "plant")
     if not isinstance(made, partial) or "planner" not in made.keywords:
         raise InputError(
             "mission", "keys that extend those of mission=default", "a node without its _target_ or planner"
         )
     field = "mission.planner"
     try:
-        planner = made.keywords["planner"](solver=setup.solver)
+        planner = made.keywords["planner"](solver=solver)
         field = "mission"
-        mission = made(planner=planner, plant=plant)
+        return made(planner=planner, plant=plant)
     except TypeError as error:
         raise as_input_error(error, field) from None
-    mission.check(setup.vehicle.dynamics)
-    return mission
 
 
 def solver_of(config: DictConfig) -> Any:
@@ -215,6 +222,12 @@ def solver_of(config: DictConfig) -> Any:
 def solver_from(settings: Mapping[str, Any]) -> Any:
     """A solver from its resolved settings in plain dicts, as study.json holds them."""
     return _instantiate(OmegaConf.create(dict(settings)), "solver", leave_out="name")
+
+
+def mission_from(configuration: Mapping[str, Any], solver: Any) -> Mission:
+    """The closed loop of a study of missions with a solver as its planner's, from its configuration in plain dicts."""
+    mission, plant = (OmegaConf.create(dict(configuration[part])) for part in ("mission", "plant"))
+    return _closed_loop(mission, plant, solver)
 
 
 def vehicle_of(configuration: Mapping[str, Any]) -> Vehicle:

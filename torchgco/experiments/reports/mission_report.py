@@ -143,5 +143,5 @@ def _course(setup: Setup, layouts: Layouts) -> tuple[Course, float]:
     radius = float(task.goal_radius) if near is None else near
     held = layouts.vehicle_radius
     vehicle = setup.vehicle.radius if held is None else held
-    course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle)
+    course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle, layouts.map)
     return course, float(task.problem.dynamics.dt)

@@ -2,42 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
 
+from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import solver_from
-from torchgco.scenarios import Layouts, Vehicle
+from torchgco.experiments.reports.finished import Study
+from torchgco.problem.problem import Problem
+from torchgco.solution import Solution
 from torchgco.solvers import AugmentedLagrangian
 from torchgco.view.document import SearchPart
 from torchgco.view.guides import Watched
 from torchgco.view.searches import search_of
 
 
-def searches(
-    vehicle: Vehicle, layouts: Layouts, solvers: Mapping[str, Mapping[str, Any]], seed: int, numbers: Sequence[int]
-) -> dict[int, SearchPart]:
-    """What each solver that keeps a record did on the layouts of these numbers, by number.
+def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
+    """What each solver that keeps a record did on the layouts of these numbers, by number; of missions, on first plans.
 
     Args:
-        layouts: of the study; numbers: some of their ids.
-        solvers: settings by name, as study.json holds them.
+        numbers: ids of some layouts of the study.
+
+    Raises:
+        InputError: missions with a sensor, whose search is that for a path on the map.
     """
-    places = [layouts.ids.tolist().index(number) for number in numbers]
-    task, ids = vehicle.task(layouts.take(places)), torch.tensor(numbers)
     found: dict[int, list[SearchPart]] = {number: [] for number in numbers}
-    for name, settings in solvers.items():
+    for name, settings in study.manifest.solvers.items():
         solver, seen = solver_from(settings).recording(), []
         if isinstance(solver, AugmentedLagrangian):
             if solver.guidance is None:
                 continue
             watched = Watched(solver.guidance)
             solver, seen = replace(solver, guidance=watched), watched.seen
-        solution = solver.solve(task.problem, task.U0, seed=seed, ids=ids)
+        problem, solution = _solved(study, numbers, name, solver)
         for b, number in enumerate(numbers):
-            part = search_of(solution, task.problem, b) or SearchPart([], [])
+            part = search_of(solution, problem, b) or SearchPart([], [])
             own = [one for one in seen if one.number == number]
             guides = [(f"outer iteration {one.outer}", one.balls, one.sample) for one in own]
             if part.passes or part.rounds or guides:
@@ -45,11 +46,25 @@ def searches(
     return {number: _joined(parts) for number, parts in found.items() if parts}
 
 
+def _solved(study: Study, numbers: Sequence[int], name: str, solver: Any) -> tuple[Problem, Solution]:
+    """The problems of the layouts of some numbers, and the solutions; of missions, those of first plans."""
+    places = [study.layouts.ids.tolist().index(number) for number in numbers]
+    task, ids = study.vehicle.task(study.layouts.take(places)), torch.tensor(numbers)
+    if not study.missions:
+        return task.problem, solver.solve(task.problem, task.U0, seed=study.seed, ids=ids)
+    mission = study.mission(name)
+    if mission.sensor != "full":
+        expected = "missions that know all obstacles; with a sensor the page shows the path sought on the map"
+        raise InputError("--search", expected, f"mission.sensor={mission.sensor}")
+    planner = replace(mission.planner, solver=solver)
+    return replace(mission, planner=planner).first_plans(task.problem, study.seed, ids)
+
+
 def _named(part: SearchPart, solver: str) -> SearchPart:
     return SearchPart(
         [f"{solver}: {text}" for text in part.passes],
         [(f"{solver}: {text}", lines) for text, lines in part.rounds],
-        [(f"{solver}: {text}", balls, sample) for text, balls, sample in part.guides],
+        [(f"{text}, {solver}", balls, sample) for text, balls, sample in part.guides],
     )
 
 

@@ -3,112 +3,44 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-import pandas as pd
 import torch
 from tqdm import tqdm
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.config.build import vehicle_of
 from torchgco.experiments.ending import ended, say
-from torchgco.experiments.reports.mission_report import PLANS
+from torchgco.experiments.reports.finished import Study, document_of
+from torchgco.experiments.reports.mission_view import missions
 from torchgco.experiments.reports.searched import searches
 from torchgco.experiments.results.files import damaged, write
-from torchgco.experiments.results.identity import Manifest
-from torchgco.experiments.results.records import DONE, LAYOUTS, MANIFEST, MISSION, SOLUTIONS, TRIALS, read_manifest
-from torchgco.experiments.results.runs import read_trials
+from torchgco.experiments.results.records import SOLUTIONS
 from torchgco.judging.judge import OTHERS_WITHIN
 from torchgco.lagrangian.rollout import open_loop
-from torchgco.problem.problem import Problem
-from torchgco.scenarios import Layouts, Vehicle
 from torchgco.view.document import Document, SearchPart
-from torchgco.view.flights import Flight, Rows, constraint_name, contacts, flights_of, whole
+from torchgco.view.flights import Rows, flights_of
 from torchgco.view.page import page
-from torchgco.view.vehicles import Look, look_of
+from torchgco.view.vehicles import look_of
 
 NAME = "view.html"
-BATCH = 64  # layouts whose trajectories are measured at once
 SLOW = 256  # layouts from which on a bar shows how far the page is
-QUADROTOR = Look("quadrotor", quaternion=slice(6, 10))  # of a mission's plant
-
-
-@dataclass(frozen=True)
-class Study:
-    """What a page needs of a finished study."""
-
-    folder: Path
-    manifest: Manifest
-    vehicle: Vehicle
-    layouts: Layouts
-    trials: pd.DataFrame
-
-    @classmethod
-    def read(cls, folder: Path) -> Study:
-        """The study in a folder.
-
-        Raises:
-            InputError: a folder without a finished study, or with damaged files.
-        """
-        if not (folder / MANIFEST).is_file():
-            raise InputError("RUN", f"the folder of a study, with its {MANIFEST}", folder)
-        if not (folder / DONE).is_file():
-            raise InputError("RUN", "a finished study (the same command resumes it)", folder)
-        manifest = read_manifest(folder / MANIFEST)
-        layouts, trials = Layouts.load(folder / LAYOUTS), read_trials(folder / TRIALS)
-        return cls(folder, manifest, vehicle_of(manifest.configuration), layouts, trials)
-
-    @property
-    def missions(self) -> bool:
-        return self.manifest.configuration.get("mission") is not None
-
-    def batches(self) -> Iterator[tuple[slice, Problem]]:
-        """Problems of some layouts at a time, and their places."""
-        for first in range(0, self.layouts.count, BATCH):
-            places = slice(first, min(first + BATCH, self.layouts.count))
-            yield places, self.vehicle.task(self.layouts.take(range(places.start, places.stop))).problem
-
-    @property
-    def rows(self) -> Mapping[tuple[str, int], Mapping[str, Any]]:
-        """The rows of the table by solver and layout."""
-        return {(row["solver"], row["layout"]): row for row in self.trials.to_dict("records")}  # type: ignore[misc]
 
 
 def study_page(folder: Path, searched: Sequence[int] = ()) -> str:
     """The page of a finished study, with the search on the layouts of some numbers, which are solved again.
 
     Raises:
-        InputError: as `Study.read`; a number of no layout, or one of a mission.
+        InputError: as `Study.read`; a number of no layout, or one of a mission with a sensor.
     """
     study = Study.read(folder)
     missing = sorted(set(searched) - set(study.layouts.ids.tolist()))
     if missing:
         raise InputError("--search", "numbers of layouts of the study", missing[0])
-    if study.missions:
-        if searched:
-            raise InputError("--search", "a study of single trajectories", "one of missions")
-        return page(_missions(study))
-    seed = study.manifest.configuration["seed"]
-    parts = searches(study.vehicle, study.layouts, study.manifest.solvers, seed, searched) if searched else {}
-    return page(_trajectories(study, parts))
-
-
-def _document(study: Study, problem: Problem, look: Look) -> Document:
-    solvers, configuration = list(study.manifest.solvers), study.manifest.configuration
-    at = problem.position
-    radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=study.vehicle.radius)
-    count = f"{study.layouts.count} layouts" if study.layouts.count > 1 else "1 layout"
-    return Document(
-        title=f"{study.trials['scenario'].iloc[0]}: {', '.join(solvers)}",
-        about=f"{count}, {study.vehicle.name}, seed {configuration['seed']}, {problem.N} stages of "
-        f"{problem.dynamics.dt:g} s",
-        dimension=at.stop - at.start, dt=float(problem.dynamics.dt), look=look, radius=radius, solvers=solvers,
-        constraints=[constraint_name(part) for part in problem.constraints], mission=study.missions,
-    )  # fmt: skip
+    parts = searches(study, searched) if searched else {}
+    return page(missions(study, parts) if study.missions else _trajectories(study, parts))
 
 
 def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
@@ -121,7 +53,7 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
     bar = tqdm(total=study.layouts.count, unit="layout", leave=False, disable=study.layouts.count < SLOW)
     for places, problem in study.batches():
         look = look_of(problem.dynamics)
-        document = document or _document(study, problem, look)
+        document = document or document_of(study, problem, look)
         ids, flown = study.layouts.ids[places].tolist(), []
         for name in document.solvers:
             U = torch.from_numpy(controls[names.index(name)][places])
@@ -147,62 +79,13 @@ def told(row: Mapping[str, Any]) -> Rows:
     """What the page says of a trajectory."""
     cost = f"{row['cost']:.6g}"
     if np.isfinite(row["best_cost"]) and row["best_cost"] != 0:
-        cost += f" ({row['cost'] / row['best_cost']:.3f} of the best)"
+        cost += f", {row['cost'] / row['best_cost']:.3f} × best"
     held: Rows = [("status", str(row["status"])), ("cost", cost)]
     held += [("clearance", f"{row['clearance']:.3f} m")] if np.isfinite(row["clearance"]) else []
     held += [("violation", f"{row['violation']:.2g}"), ("from the goal", f"{row['goal_distance']:.2f} m")]
-    return [*held, ("iterations", f"{row['iterations']:g}"), ("time", f"{1e3 * row['seconds']:.3g} ms")]
-
-
-def _missions(study: Study) -> Document:
-    """Flights in closed loop: the track at the control steps and, where few missions were flown, all plans."""
-    log = pd.read_parquet(study.folder / MISSION)
-    flights = {key: rows for key, rows in log.groupby(["solver", "mission"], sort=False)}
-    plans, rows, document = _plans(study), study.rows, None
-    for places, problem in study.batches():
-        document = document or _document(study, problem, QUADROTOR)
-        for b, number in enumerate(study.layouts.ids[places].tolist()):
-            held = []
-            for name in document.solvers:
-                steps = flights.get((name, number))
-                if steps is not None and len(steps):
-                    plan = plans.get(name)
-                    kept = None if plan is None else plan[places.start + b, : len(steps)]
-                    held.append(_mission(problem, b, name, steps, rows[name, number], kept))
-            document.add(f"mission {number}", problem, b, held)
-    assert document is not None
-    return document
-
-
-def _plans(study: Study) -> dict[str, np.ndarray]:
-    """Planned positions (L, K, N+1, 3) by solver; none where many missions were flown."""
-    if not (study.folder / PLANS).is_file():
-        return {}
-    with np.load(study.folder / PLANS, allow_pickle=False) as held:
-        return dict(zip(held["solver"].tolist(), held["plan"], strict=True))
-
-
-def _mission(
-    problem: Problem, b: int, solver: str, steps: pd.DataFrame, row: Mapping[str, Any], plan: np.ndarray | None
-) -> Flight:
-    X = whole(steps[[f"x{i}" for i in range(13)]].to_numpy(dtype=float))
-    path, part = X[:, :3], problem.take(torch.tensor([b]))
-    clear, violation = steps["clearance"].to_numpy(dtype=float), steps["violation"].to_numpy(dtype=float)
-    seconds = (steps["planner_seconds"] + steps["tracker_seconds"]).to_numpy(dtype=float)
-    notes = [
-        f"clearance {c:.3f} m; plan: {source}, violation {v:.2g}; {1e3 * s:.0f} ms"
-        for c, v, s, source in zip(clear, violation, seconds, steps["source"], strict=True)
-    ]
-    held: Rows = [("outcome", str(row["outcome"])), ("flight time", f"{row['flight_time']:.2f} s")]
-    held += [("clearance", f"{row['clearance']:.3f} m"), ("from the goal", f"{row['goal_distance']:.2f} m")]
-    held += [("missed deadlines", f"{row['missed_deadlines']:g}"), ("kept plans", f"{row['shifted_plans']:g}")]
-    bad = np.where(clear < 0, -clear, 0.0)[: len(path)]
-    place = next((i for i, one in enumerate(problem.constraints) if one in problem.obstacles), -1)
-    return Flight(
-        solver, path, QUADROTOR.attitude(X), "reached" if row["reached"] is True else "failed", held, bad,
-        np.where(bad > 0, place, -1), contacts(part.obstacles, path, float(problem.dynamics.dt)),
-        None if plan is None else plan[: len(path)], notes[: len(path)],
-    )  # fmt: skip
+    seconds = row["seconds"]
+    time = f"{seconds:.2f} s" if seconds >= 1.0 else f"{1e3 * seconds:.3g} ms"
+    return [*held, ("iterations", f"{row['iterations']:g}"), ("time", time)]
 
 
 class _Parser(argparse.ArgumentParser):

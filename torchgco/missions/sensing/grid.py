@@ -35,22 +35,20 @@ class SeenMap:
     shape: tuple[int, int, int]
     resolution: float
     reach: int = REACH
-    scans: int = 0
     odds: np.ndarray = field(init=False)  # (X, Y, Z) float32
     state: np.ndarray = field(init=False)  # (X, Y, Z) uint8
     from_occupied: np.ndarray = field(init=False)  # (X, Y, Z) float32, m, to occupied cells
-    from_blocked: np.ndarray = field(init=False)  # the same, to cells that aren't known to be free
 
     def __post_init__(self) -> None:
         self.corner = np.array(self.corner, np.float64)
         self.odds = np.zeros(self.shape, np.float32)
         self.state = np.zeros(self.shape, np.uint8)
         self.from_occupied = np.empty(self.shape, np.float32)
-        self.from_blocked = np.empty(self.shape, np.float32)
-        self._stamp = np.full(self.shape, -1, np.int64)
-        self._touched, self._changed = (np.empty(self.state.size, np.int32) for _ in range(2))
+        self._beside, self._counts = np.zeros(self.shape, np.uint8), np.zeros(self.shape, np.uint32)
+        self._touched, self._changed = (np.empty(self.state.size + 1, np.int32) for _ in range(2))
         self._size = np.array(self.shape, np.int64)
         self._work, self._scratch = np.empty(0, np.uint8), np.empty(0)
+        self._layers = np.empty(self.shape[0] + 1, np.int64)
         self.measure(np.zeros(3, np.int64), self._size)
 
     def add(self, scan: Scan, reach: float, before: float = 0.0) -> np.ndarray:
@@ -60,10 +58,9 @@ class SeenMap:
             reach: m, up to which a ray without a return shows free space.
             before: m before a return from which on a ray shows none.
         """
-        self.scans += 1
         found = call(
-            "tgco_add_scan", self._size, self.corner, self.resolution, self.odds, self.state, self._stamp, self.scans,
-            len(scan.distances), np.ascontiguousarray(scan.origin, np.float64),
+            "tgco_add_scan", self._size, self.corner, self.resolution, self.odds, self.state, self._beside,
+            self._counts, len(scan.distances), np.ascontiguousarray(scan.origin, np.float64),
             np.ascontiguousarray(scan.directions, np.float64), np.ascontiguousarray(scan.distances, np.float64),
             float(reach), float(before), CHORD * self.resolution,
             HIT, MISS, LEAST, MOST, FREE_AT, FREE_BESIDE, OCCUPIED_AT, self._touched, self._changed,
@@ -82,24 +79,28 @@ class SeenMap:
         return np.flatnonzero(new).astype(np.int32)
 
     def remeasure(self, changed: np.ndarray) -> None:
-        """Update the distances around cells that have changed, given by flat indices."""
-        if len(changed) == 0:
-            return
-        at = np.array(np.unravel_index(changed, self.shape))
-        first = np.maximum(at.min(axis=1) - self.reach, 0)
-        self.measure(first, np.minimum(at.max(axis=1) + self.reach + 1, self.shape))
+        """Update the distances around cells that have changed, given by flat indices, int32."""
+        if len(changed):
+            self._prepare(np.zeros(3, np.int64), self._size)
+            call(
+                "tgco_distances_around", self._size, self.resolution, self.state, self.reach, len(changed), changed,
+                self._touched, self._work, self.from_occupied,
+            )  # fmt: skip
 
     def measure(self, first: np.ndarray, last: np.ndarray) -> None:
         """Compute the distances of the cells from `first` up to before `last`, (3,)."""
         first, last = (np.ascontiguousarray(part, np.int64) for part in (first, last))
+        self._prepare(first, last)
+        call(
+            "tgco_distances", self._size, self.resolution, self.state, SEEN_OCCUPIED, 1, self.reach, first, last,
+            self._work, self.from_occupied,
+        )  # fmt: skip
+
+    def _prepare(self, first: np.ndarray, last: np.ndarray) -> None:
+        """Memory for a window."""
         need = 2 * int(np.prod(last - first + 2 * self.reach))
         if len(self._work) < need:
             self._work = np.empty(need, np.uint8)
-        for kinds, distance in ((SEEN_OCCUPIED, self.from_occupied), (NOT_FREE, self.from_blocked)):
-            call(
-                "tgco_distances", self._size, self.resolution, self.state, kinds, 1, self.reach, first, last,
-                self._work, distance,
-            )  # fmt: skip
 
     def cell(self, point: Sequence[float] | np.ndarray) -> np.ndarray:
         """The cell (3,) int64 that holds a point, or the nearest of the grid."""
@@ -122,11 +123,8 @@ class SeenMap:
         What lies outside of the grid is blocked.
         """
         points, gap = np.ascontiguousarray(points, np.float64), np.empty(len(points))
-        distance = self.from_blocked if kinds == NOT_FREE else self.from_occupied
-        call(
-            "tgco_gaps", self._size, self.corner, self.resolution, self.state, kinds, distance,
-            float(min(reach, self.reach * self.resolution)), len(points), points, gap,
-        )  # fmt: skip
+        reach = float(min(reach, self.reach * self.resolution))
+        call("tgco_gaps", self._size, self.corner, self.resolution, self.state, kinds, reach, len(points), points, gap)
         return gap
 
     def corridor(self, points: np.ndarray, reach: float, most: int, kinds: int = NOT_FREE) -> tuple[np.ndarray, ...]:
@@ -141,11 +139,11 @@ class SeenMap:
         points = np.ascontiguousarray(points, np.float64)
         planes, room = np.zeros((len(points), most, 4)), np.empty(len(points))
         low, high = self.cell(points.min(axis=0) - reach), self.cell(points.max(axis=0) + reach)
-        need = 6 * int(np.prod(high - low + 1))
+        need = 7 * int(np.prod(high - low + 1)) + 4
         if len(self._scratch) < need:
             self._scratch = np.empty(need)
         call(
             "tgco_corridor", self._size, self.corner, self.resolution, self.state, kinds, float(reach), len(points),
-            points, most, low, high, planes, room, self._scratch,
+            points, most, low, high, planes, room, self._scratch, self._layers,
         )  # fmt: skip
         return planes, room

@@ -39,6 +39,10 @@ class Scan:
         rays = self.directions @ turned(np.asarray(attitude)) @ turned(np.asarray(believed)).T
         return Scan(np.array(position, np.float64), rays, self.distances)
 
+    def take(self, rays: np.ndarray) -> Scan:
+        """The scan of some rays alone."""
+        return Scan(self.origin, self.directions[rays], self.distances[rays])
+
 
 class Sensor:
     """What a lidar and a depth camera have in common. A subclass gives the rays in the vehicle's frame."""
@@ -47,6 +51,14 @@ class Sensor:
     rate: float
     noise: float
     missed: float
+
+    rays: tuple[int, int]
+    field_of_view: tuple[float, float]
+
+    @property
+    def pitch(self) -> float:
+        """The larger angle between two rays side by side, rad."""
+        return float(np.radians(np.array(self.field_of_view) / self.rays).max())
 
     def pattern(self, shift: np.ndarray) -> np.ndarray:
         """Unit vectors (R, 3) in the vehicle's frame, the pattern moved by a share (2,) of the rays' distance."""

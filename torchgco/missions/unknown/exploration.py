@@ -36,9 +36,9 @@ from torchgco.missions.unknown.explorer import (
     unflyable,
     within_bounds,
 )
+from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
 from torchgco.missions.unknown.reference import motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
-from torchgco.native.dispatch import followed
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -49,10 +49,16 @@ LOCAL: dict[str, Any] = {"initial_penalty": 1.0, "penalty_growth": 3.0, "violati
 SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
 # Where no way is found, a search with less margin, then one over all cells: the share of the margin, and the stride.
 LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
+SEARCHED = 2  # control periods after which a new search is due
 HELD = 2.0  # s before a search with less margin ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
+ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joined to it
+STILL = 0.3  # m within which a vehicle has stayed in its place
+AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
+SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
 WAITS = 5  # knots before the first that is blocked
+MOST_MOVING = 4  # moving bodies that a knot keeps away from
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
 
@@ -67,13 +73,18 @@ class Scout:
     log: SeenLog
     goal: np.ndarray
     radius: float  # m, of the vehicle
+    movers: Movers
+    moving: Moving = field(default_factory=nothing)  # at this control step
     path: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # cells' centres, (K, 3), m
     corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
-    waited: int = 0  # control periods without a way on
+    waited: int = 0  # control periods near `place`
+    place: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))  # m
     level: int = 0  # of LEVELS
     since: int = 0  # control periods at this level
     seconds: dict[str, float] = field(default_factory=dict)
     changed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    scanned: bool = False  # in this control period
+    age: int = 0  # control periods since the last search; 0: there was none
 
 
 class Exploration:
@@ -110,9 +121,16 @@ class Exploration:
         size = seen.resolution
         search = Search(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH)
         log = SeenLog(seen.corner, seen.shape, seen.resolution)
-        scout = Scout(World.of(self.whole, b), seen, search, log, goal, radius)
+        world = World.of(self.whole, b)
+        scout = Scout(world, seen, search, log, goal, radius, self._movers(world))
         scout.changed = seen.clear(start, self.explorer.known)
         return scout
+
+    def _movers(self, world: World) -> Movers:
+        """What a vehicle of this world learns of moving bodies."""
+        if self.explorer.movers == "known":
+            return Known(world)
+        return Unaware() if self.explorer.movers == "none" else Tracks(self.sensor.pitch)
 
     def take(self, stay: Tensor) -> None:
         """Keep the missions in `stay`."""
@@ -123,13 +141,16 @@ class Exploration:
     def sense(self, step: int, x: Tensor, measured: Tensor) -> None:
         """Scan at a control step from plants x (B, 17), and put that into the maps where the vehicles believe to be."""
         for b, scout in enumerate(self.scouts):
-            took = [0.0, 0.0]
-            if step % self.every == 0:
+            took, scout.scanned = [0.0, 0.0], step % self.every == 0
+            if scout.scanned:
                 key = (self.seed, self.ids[b], step)
                 scan = self.sensor.scan(scout.world, x[b, :3].numpy(), x[b, 6:10].numpy(), step * self.dt, key)
                 scan = scan.seen_from(x[b, 6:10].numpy(), measured[b, :3].numpy(), measured[b, 6:10].numpy())
                 began = time.perf_counter()
+                keep = scout.movers.observe(scan, scout.seen, step * self.dt)
+                scan = scan if keep.all() else scan.take(keep)
                 changed = scout.seen.add(scan, self.sensor.range, 3.0 * self.sensor.noise)
+                scout.movers.note(scout.seen, changed)
                 scout.changed = np.concatenate([scout.changed, changed])
                 mapped = time.perf_counter()
                 scout.seen.remeasure(scout.changed)
@@ -143,12 +164,13 @@ class Exploration:
         began = time.perf_counter()
         sensed = sum(sum(scout.seconds.values()) for scout in self.scouts)
         bias = self.planner.estimated(x, before, self.dt)
-        for b, scout in enumerate(self.scouts):
-            self._seek(scout, x[b].numpy())
+        for scout in self.scouts:
+            scout.moving = scout.movers.now(step * self.dt)
+        self.seek(x)
         reference = self._reference(x)
         rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
         former = rest if before is None else self._clear_part(shifted(before.X[:, 1:, :3]))
-        seeds = [former, reference[:, 1:, :3]]
+        seeds = [former, reference[:, 1:, :3], *([] if self.explorer.movers == "none" else [rest])]
         problem = self._problem(x, bias, reference, seeds)
         kept = self._kept(problem, before).take(slice(0, len(self.scouts)))
         plan = self._chosen(problem, kept, len(seeds))
@@ -160,19 +182,23 @@ class Exploration:
         """Seconds of the last period by part, (B,)."""
         return {name: torch.tensor([s.seconds[name] for s in self.scouts], dtype=torch.float64) for name in PARTS}
 
+    def seek(self, x: Tensor) -> None:
+        """Find paths of vehicles measured at x (B, 17) to their goals, and the parts that are known to be free."""
+        for b, scout in enumerate(self.scouts):
+            self._seek(scout, x[b].numpy())
+
     def _seek(self, scout: Scout, x: np.ndarray) -> None:
-        """The path of a vehicle x (17,), and the part of it that is known to be free."""
         began, position = time.perf_counter(), x[:3]
         self._search(scout, position)
         keep = self.keep(scout)
         points = _halved(np.concatenate([position[None], scout.path[1:]]))
-        if np.linalg.norm(scout.path[-1] - scout.goal) <= 4.5 * scout.seen.resolution:
+        if np.linalg.norm(scout.path[-1] - scout.goal) <= ARRIVES * scout.seen.resolution:
             points = np.concatenate([points, scout.goal[None]])
         gaps = scout.seen.gaps(points, keep + 0.05, self.kinds)
         blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 3))
         free = points[: blocked[0] if len(blocked) else len(points)]
         scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
-        self._wait(scout, x, points, blocked)
+        self._wait(scout, position, points, gaps)
         scout.seconds["search_seconds"] += time.perf_counter() - began
 
     def keep(self, scout: Scout) -> float:
@@ -182,8 +208,17 @@ class Exploration:
         return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least
 
     def _search(self, scout: Scout, position: np.ndarray) -> None:
-        """The path to the goal; where none is found, with less margin from now on, for a while."""
+        """The path to the goal; where none is found, with less margin from now on, for a while.
+
+        Scan and search take turns where there are periods without a scan: both in one would be the longest.
+        """
         scout.since += 1
+        if scout.scanned and 0 < scout.age < SEARCHED and self.every > 1:
+            scout.age += 1
+            nearest = np.linalg.norm(scout.path - position, axis=1).argmin()
+            scout.path = scout.path[min(nearest, len(scout.path) - 2) :]
+            return
+        scout.age = 1
         if scout.level > 0 and scout.since * self.dt >= HELD:
             scout.level, scout.since = 0, 0
         while True:
@@ -193,13 +228,18 @@ class Exploration:
                 return
             scout.level, scout.since = scout.level + 1, 0
 
-    def _wait(self, scout: Scout, x: np.ndarray, points: np.ndarray, blocked: np.ndarray) -> None:
-        """Count the periods at rest in front of cells that stay unknown, and in the end look elsewhere."""
-        length = np.linalg.norm(np.diff(scout.corners, axis=0), axis=1).sum()
-        still = len(blocked) > 0 and length < 0.3 and np.linalg.norm(x[3:6]) < 0.2
-        scout.waited = scout.waited + 1 if still else 0
+    def _wait(self, scout: Scout, position: np.ndarray, points: np.ndarray, gaps: np.ndarray) -> None:
+        """Count the periods in one place, and in the end look elsewhere.
+
+        The way on may be cells that stay unknown, as no ray gets to them, or one that no plan can take.
+        """
+        if np.linalg.norm(position - scout.place) > STILL:
+            scout.place, scout.waited = position.copy(), 0
+        scout.waited += 1
         if scout.waited * self.dt >= self.explorer.patience:
-            scout.search.avoid(points[blocked[0]], 1.0)
+            blocked = np.flatnonzero(gaps < self.keep(scout))
+            first = blocked[blocked > 0][:1]
+            scout.search.avoid(points[first[0] if len(first) else min(AHEAD, len(points) - 1)], 1.0)
             scout.waited = 0
 
     def _reference(self, x: Tensor) -> Tensor:
@@ -221,16 +261,31 @@ class Exploration:
                 began, keep = time.perf_counter(), self.keep(scout)
                 knots = np.clip(seed[b].numpy(), *scout.seen.box(keep))
                 own, far = scout.seen.corridor(knots, CORRIDOR, PLANES, self.kinds)
+                if self.explorer.movers != "none":
+                    times = self.dt * np.arange(1, N + 1)
+                    own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING)], axis=1)
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
                 near = np.full(N, keep)
                 near[:EARLY] = min(keep, max(gap - 0.01, CONTACT_FACTOR * scout.radius))
-                new = ((planes, own), (room, far), (inside, knots), (allowed, near), (regions, scout.seen.box(0.0)))
+                new = (
+                    (planes, own),
+                    (room, far),
+                    (inside, knots),
+                    (allowed, near),
+                    (regions, self._region(scout, x[b].numpy())),
+                )
                 for parts, part in new:
                     parts.append(part)
                 scout.seconds["field_seconds"] += time.perf_counter() - began
         form = PlanningForm(self.explorer, self.planner, _repeated(self.whole, C))
         stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, inside, allowed, regions)]
         return form.problem(x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), *stack)
+
+    def _region(self, scout: Scout, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest point (3,), m, for plans: the map's, and around a vehicle that has left it."""
+        low, high = scout.seen.box(0.0)
+        out = (x[:3] < low) | (x[:3] > high)
+        return np.where(out, np.minimum(low, x[:3] - 1.0), low), np.where(out, np.maximum(high, x[:3] + 1.0), high)
 
     def _clear_part(self, former: Tensor) -> Tensor:
         """Positions (B, N, 3) of former plans; where one has become blocked, it waits some knots before that."""
@@ -254,7 +309,7 @@ class Exploration:
             C = problem.B // before.X.shape[0]
             X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
             X[:, -1], U[:, -1] = _resting(X[:, -1]), problem.cost.rest_controls(U[:, -1:])[:, 0]
-            X, U = within_bounds(problem, *followed(problem, X, U, K), X, U, K)
+            X, U = within_bounds(problem, X, U, K)
             penalty = before.penalty.repeat(C)
         none = torch.zeros(problem.B, dtype=torch.int64)
         return Plan(
@@ -297,7 +352,13 @@ class Exploration:
             return safe
         # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.
         most, own = max(order, key=lambda c: spare[c], default=None), self.spare(kept.numpy(), b, 3.0 * AT_REST)
-        return most if most is not None and own < 0 and spare[most] > own + BETTER else None
+        if most is not None and own < 0 and spare[most] > own + BETTER:
+            return most
+        if order and own == -np.inf:  # none stops as it should: better a plan that nearly does than one that doesn't
+            ends = X[:, -1, 3:6].norm(dim=-1)
+            slowest = min(order, key=lambda c: float(ends[c]))
+            return slowest if float(ends[slowest]) + SLOWER < float(kept[-1, 3:6].norm()) else None
+        return None
 
     def spare(self, X: np.ndarray, b: int, rest: float = 0.7 * AT_REST) -> float:
         """The least distance, m, of a plan (N+1, 14) from what isn't known to be free, beyond what is asked for.
@@ -314,6 +375,9 @@ class Exploration:
         share = np.arange(FINE)[:, None] / FINE
         points = np.concatenate([(p[:-1, None] + share * np.diff(p, axis=0)[:, None]).reshape(-1, 3), p[-1:]])
         gaps = scout.seen.gaps(points, least + 0.01, self.kinds)
+        gaps = np.minimum(gaps, scout.moving.gaps(points, self.dt / FINE * np.arange(len(points))))
+        low, high = scout.seen.box(0.0)
+        gaps = gaps - np.linalg.norm(points - points.clip(low, high), axis=1)  # how far outside of the map
         near = gaps[0] - least
         asked = np.zeros(len(gaps))
         if near < 0:

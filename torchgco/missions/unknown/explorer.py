@@ -20,6 +20,7 @@ from torchgco.missions.planning_problem import biased, first_step, planning_stat
 from torchgco.missions.sensing.grid import SeenMap
 from torchgco.missions.unknown.halfspaces import HalfSpaces, stacked
 from torchgco.missions.unknown.reference import Pace
+from torchgco.native.dispatch import followed
 from torchgco.problem.problem import Problem
 
 SensorName = Literal["full", "lidar", "depth"]
@@ -53,6 +54,8 @@ class Explorer:
         stages: of a plan, which is at rest after them.
         margin: m that plans keep from what isn't known to be free, beyond the vehicle's radius. A cell at least, as
             one that an obstacle fills in part may look free from afar; less is kept where there is no other way.
+        movers: moving bodies are "known" with their places and velocities, "tracked" in the sensor's returns, or "none"
+            are: all count as at rest.
         patience: s without a way on, after which the vehicle turns to another part of the unknown.
 
     Raises:
@@ -69,6 +72,7 @@ class Explorer:
     stages: Annotated[int, Within(20, 400)] = 60
     margin: NonNegative = 0.2
     patience: Seconds = 1.0
+    movers: Literal["none", "known", "tracked"] = "none"
 
     def __post_init__(self) -> None:
         check_options(self, "mission.explorer")
@@ -192,26 +196,23 @@ def unflyable(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     return torch.stack([part.flatten(1).amax(-1) for part in parts]).amax(0).nan_to_num(nan=torch.inf)
 
 
-def within_bounds(
-    problem: Problem, X: Tensor, U: Tensor, former: Tensor, controls: Tensor, K: Tensor
-) -> tuple[Tensor, Tensor]:
-    """X (B, N+1, n) and U (B, N, m) of feedback K around a former plan, with controls cut off at their bounds.
-
-    The vehicle wouldn't follow a plan that asks for more. `X`, `U`: the same without bounds, kept where those hold.
+def within_bounds(problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """The rollout, X (B, N+1, n) and U (B, N, m), of feedback K around former X and U, with controls cut off at their
+    bounds: the vehicle wouldn't follow a plan that asks for more. What exceeds them by `FLYABLE` at most stays.
     """
     bounds = problem.control_bounds
     assert bounds is not None
     lower, upper = (bound.expand(*U.shape) for bound in bounds.by_knot)
-    over = torch.maximum(lower - U, U - upper).flatten(1).amax(-1)
-    rows = (~(over <= FLYABLE)).nonzero().flatten()
-    if rows.numel() == 0:
-        return X, U
-    X, U, K = X.clone(), U.clone(), K.nan_to_num(0.0, 0.0, 0.0)
-    model, x = problem.dynamics.take(rows), problem.x0[rows]
-    X[rows, 0] = x
-    for k in range(U.shape[1]):
-        away = (K[rows, k] * (x - former[rows, k]).unsqueeze(1)).sum(-1)
-        u = torch.clamp(controls[rows, k] + away, lower[rows, k], upper[rows, k])
-        x = model.at(k).step(x, u)
-        U[rows, k], X[rows, k + 1] = u, x
+    former, controls, K = X, U.clone(), K.nan_to_num(0.0, 0.0, 0.0)
+    for _ in range(U.shape[1] + 1):  # once for each knot at most: what comes after one depends on it
+        X, U = followed(problem, former, controls, K)
+        over = (~(torch.maximum(lower - U, U - upper) <= FLYABLE)).any(-1)
+        rows = over.any(-1).nonzero().flatten()
+        if rows.numel() == 0:
+            break
+        first = over[rows].to(torch.int8).argmax(-1)
+        asked, low, high = U[rows, first], lower[rows, first], upper[rows, first]
+        out = ~(torch.maximum(low - asked, asked - high) <= FLYABLE)
+        controls[rows, first] = torch.where(out, asked.nan_to_num().clamp(low, high), controls[rows, first])
+        K[rows, first] = torch.where(out.unsqueeze(-1), 0.0, K[rows, first])
     return X, U

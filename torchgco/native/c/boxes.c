@@ -4,6 +4,8 @@
    most boxes are too far away for more. Then the factor of each box, which turns a distance into a squared length, and
    at last the numbers of each box (box.h). */
 
+#define TOGETHER 8 /* boxes that are looked at together: most groups are far away and add nothing */
+
 /* Whether a box of this radius counts at knot k: none does where time has stopped. */
 static inline I is_here(const Constraint *con, const Rows *rows, V radius, int64_t k) {
     I here = radius >= SET(0.0);
@@ -40,24 +42,44 @@ static inline V solid(const Constraint *con, const Rows *rows, int64_t j, int64_
     return tgco_choose(here, c, SET(ABSENT));
 }
 
-/* Whether the knot lies outside of the bounds of box j in every lane. */
-static inline int is_far(const Constraint *con, const Rows *rows, int64_t j, const V *x) {
+/* The lanes in which the knot lies within the bounds of box j. */
+static inline I is_near(const Constraint *con, const Rows *rows, int64_t j, const V *x) {
     I far = SET(0.0) != SET(0.0);
     for (int a = 0; a < DIM; a++) {
         const V *bounds = rows->bound + (a * con->rows + j) * 2;
         far |= tgco_fabs(x[POSITION + a] - bounds[0]) > bounds[1];
-        if (!any(~far)) return 1;
     }
-    return 0;
+    return ~far;
+}
+
+/* Whether one of the boxes first, ..., last - 1 may add anything in a lane: the knot is near it, or it has a multiplier
+   where some are `pushed`. Most groups of boxes are answered by one test. */
+static inline int some_matter(
+    const Constraint *con, const Rows *rows, const V *lam, int pushed, int64_t first, int64_t last, const V *x) {
+    I matters = SET(0.0) != SET(0.0);
+    for (int64_t j = first; j < last; j++) {
+        matters |= is_near(con, rows, j, x);
+        if (pushed) matters |= lam[j] != SET(0.0);
+    }
+    return any(matters);
+}
+
+/* The same of one box. */
+static inline int may_matter(const Constraint *con, const Rows *rows, const V *lam, int pushed, int64_t j, const V *x) {
+    return some_matter(con, rows, lam, pushed, j, j + 1, x);
 }
 
 static inline V boxes_value(const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total) {
     const V *lam = rows->lam + con->place[k] * con->rows;
     int pushed = any(rows->pushed[con->place[k]]);
-    for (int64_t j = 0; j < con->rows; j++) {
-        if (is_far(con, rows, j, x) && !(pushed && any(lam[j] != SET(0.0)))) continue;
-        V c = solid(con, rows, j, k, x, 0);
-        if (any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) total += worth(s, 0, c, lam[j]);
+    for (int64_t first = 0, last; first < con->rows; first = last) {
+        last = first + TOGETHER < con->rows ? first + TOGETHER : con->rows;
+        if (!some_matter(con, rows, lam, pushed, first, last, x)) continue;
+        for (int64_t j = first; j < last; j++) {
+            if (!may_matter(con, rows, lam, pushed, j, x)) continue;
+            V c = solid(con, rows, j, k, x, 0);
+            if (any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) total += worth(s, 0, c, lam[j]);
+        }
     }
     return total;
 }
@@ -67,14 +89,18 @@ static inline void boxes_expand(
     const V *lam = rows->lam + con->place[k] * con->rows;
     int pushed = any(rows->pushed[con->place[k]]);
     V slopes[DIM], rho;
-    for (int64_t j = 0; j < con->rows; j++) {
-        if (is_far(con, rows, j, x) && !(pushed && any(lam[j] != SET(0.0)))) continue;
-        V c = solid(con, rows, j, k, x, slopes);
-        if (!any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
-        V slope = pull(s, 0, c, lam[j], &rho);
-        for (int a = 0; a < DIM; a++) {
-            g[POSITION + a] += slope * slopes[a];
-            for (int b = a; b < DIM; b++) H[(POSITION + a) * S + POSITION + b] += rho * slopes[a] * slopes[b];
+    for (int64_t first = 0, last; first < con->rows; first = last) {
+        last = first + TOGETHER < con->rows ? first + TOGETHER : con->rows;
+        if (!some_matter(con, rows, lam, pushed, first, last, x)) continue;
+        for (int64_t j = first; j < last; j++) {
+            if (!may_matter(con, rows, lam, pushed, j, x)) continue;
+            V c = solid(con, rows, j, k, x, slopes);
+            if (!any(~(c <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
+            V slope = pull(s, 0, c, lam[j], &rho);
+            for (int a = 0; a < DIM; a++) {
+                g[POSITION + a] += slope * slopes[a];
+                for (int b = a; b < DIM; b++) H[(POSITION + a) * S + POSITION + b] += rho * slopes[a] * slopes[b];
+            }
         }
     }
 }

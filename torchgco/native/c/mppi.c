@@ -44,7 +44,7 @@ static V hits(const Samples *q, int64_t k, const V *x) {
         if (con->kind == BOXES) {
             const Rows *rows = q->s.rows + i;
             for (int j = 0; j < con->rows; j++)
-                if (!is_far(con, rows, j, x)) count += tgco_truth(solid(con, rows, j, k, x, 0) >= SET(0.0));
+                if (any(is_near(con, rows, j, x))) count += tgco_truth(solid(con, rows, j, k, x, 0) >= SET(0.0));
             continue;
         }
 #endif

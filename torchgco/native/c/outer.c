@@ -47,10 +47,14 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
     } else if (con->kind == BOXES) {
         const V *factors = rows->bound + con->rows * 2 * DIM;
         int known = any(rows->pushed[place]);
-        for (int64_t j = 0; j < con->rows; j++) {
-            if (is_far(con, rows, j, x) && !(known && any(lam[j] != zero))) continue;
-            V c = solid(con, rows, j, k, x, 0);
-            note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, &pushed, sweep);
+        for (int64_t first = 0, last; first < con->rows; first = last) {
+            last = first + TOGETHER < con->rows ? first + TOGETHER : con->rows;
+            if (!some_matter(con, rows, lam, known, first, last, x)) continue;
+            for (int64_t j = first; j < last; j++) {
+                if (!may_matter(con, rows, lam, known, j, x)) continue;
+                V c = solid(con, rows, j, k, x, 0);
+                note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, &pushed, sweep);
+            }
         }
 #endif
 #if WITH_FIELDS

@@ -146,13 +146,13 @@ static void enter(Lanes *s, int lane, int64_t e) {
     double squares = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *c = p->constraint + i;
+        if (!c->lam) continue; /* `start` has set them to 0, and only an outer loop changes them, which has some */
         const double *lam = c->lam + e * c->knots * c->rows;
         for (int64_t k = 0; k < c->knots; k++) {
             int pushed = 0;
             for (int j = 0; j < c->rows; j++, lam++) {
                 s->rows[i].lam[k * c->rows + j][lane] = *lam;
-                pushed |= *lam != 0;
-                squares += *lam * *lam;
+                if (*lam != 0) pushed = 1, squares += *lam * *lam;
             }
             s->rows[i].pushed[k][lane] = -pushed;
         }

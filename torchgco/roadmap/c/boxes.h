@@ -1,14 +1,14 @@
-/* Squared distances of points and of segments from boxes; box.h has the numbers of a box. */
+/* Squared distances of points and of segments from boxes; box.h has the numbers of a box. A vector V holds SIDE edges. */
 
 #include <float.h>
 #include <math.h>
 
-/* Squared distance of a point, and half its slope where the point moves along a segment. */
-static inline double square_at(
-    const double *half, const double *begin, const double *along, double share, double *slope) {
-    double square = 0.0, sum = 0.0;
+
+/* Squared distances of points, and half their slopes where the points move along segments. */
+static inline V square_at(const V *half, const V *begin, const V *along, V share, V *slope) {
+    V square = SET(0.0), sum = SET(0.0);
     for (int i = 0; i < DIM; i++) {
-        double away = beyond(begin[i] + share * along[i], half[i]);
+        V away = beyond(begin[i] + share * along[i], half[i]);
         square += away * away;
         sum += away * along[i];
     }
@@ -16,75 +16,103 @@ static inline double square_at(
     return square;
 }
 
-static double square_from_box(const double *box, const double *p) {
-    double local[DIM], none[DIM] = {0.0}, slope;
-    seen_from(box, p, local);
-    return square_at(BOX_HALF(box), local, none, 0.0, &slope);
+static inline void spread(const double *box, V *to) {
+    for (int i = 0; i < BOX_NUMBERS; i++) to[i] = SET(box[i]);
 }
 
-/* Smallest squared distance of the segment from `start` to `start + step`. */
-static inline double square_of_segment(const double *box, const double *start, const double *step) {
-    double begin[DIM], along[DIM], low = 0.0, high = 1.0, falls, rises, found;
-    const double *half = BOX_HALF(box);
+static double square_from_box(const double *box, const double *p) {
+    V numbers[BOX_NUMBERS], point[DIM], local[DIM], none[DIM], slope;
+    spread(box, numbers);
+    for (int i = 0; i < DIM; i++) point[i] = SET(p[i]), none[i] = SET(0.0);
+    seen_from(numbers, point, local);
+    return square_at(BOX_HALF(numbers), local, none, SET(0.0), &slope)[0];
+}
+
+static inline V held(V share) {
+    share = tgco_choose(share < SET(0.0), SET(0.0), share);
+    return tgco_choose(share > SET(1.0), SET(1.0), share);
+}
+
+/* Smallest squared distances of the segments from `start` to `start + step`. */
+static inline V square_of_segment(const V *box, const V *start, const V *step) {
+    V begin[DIM], along[DIM], zero = SET(0.0), low = zero, high = SET(1.0), falls, rises, found;
+    const V *half = BOX_HALF(box);
     seen_from(box, start, begin);
     along_sides(box, step, along);
     square_at(half, begin, along, low, &falls);
     square_at(half, begin, along, high, &rises);
     for (int i = 0; i < DIM; i++)
         for (int side = -1; side <= 1; side += 2) {
-            double share = (side * half[i] - begin[i]) / (along[i] == 0.0 ? 1.0 : along[i]);
-            share = share < 0.0 ? 0.0 : share > 1.0 ? 1.0 : share;
+            V share = held((SET(side) * half[i] - begin[i]) / tgco_choose(along[i] == zero, SET(1.0), along[i]));
             square_at(half, begin, along, share, &found);
-            int left = found < 0.0 && share > low, right = found >= 0.0 && share < high;
-            low = left ? share : low, falls = left ? found : falls;
-            high = right ? share : high, rises = right ? found : rises;
+            I left = (found < zero) & (share > low), right = (found >= zero) & (share < high);
+            low = tgco_choose(left, share, low), falls = tgco_choose(left, found, falls);
+            high = tgco_choose(right, share, high), rises = tgco_choose(right, found, rises);
         }
-    double change = rises - falls, part = -falls / (change > DBL_MIN ? change : DBL_MIN);
-    part = part < 0.0 ? 0.0 : part > 1.0 ? 1.0 : part;
-    return square_at(half, begin, along, falls < 0.0 ? low + (high - low) * part : low, &found);
+    V change = rises - falls, part = held(-falls / tgco_choose(change > SET(DBL_MIN), change, SET(DBL_MIN)));
+    return square_at(half, begin, along, tgco_choose(falls < zero, low + (high - low) * part, low), &found);
 }
 
-/* The extent of some segments from a to a + along. */
-static inline void extent(int count, double a[DIM][count], double along[DIM][count], double *least, double *most) {
-    for (int i = 0; i < DIM; i++) {
-        least[i] = INFINITY, most[i] = -INFINITY;
-        for (int e = 0; e < count; e++) {
-            double start = a[i][e], end = start + along[i][e], low = start < end ? start : end;
-            double high = start < end ? end : start;
-            least[i] = low < least[i] ? low : least[i];
-            most[i] = high > most[i] ? high : most[i];
-        }
-    }
-}
-
-/* Lowers `gap`, the distances of segments from a to a + along from the surface, and `open`, a measure with the same
-   sign. Distances above `margin` don't count: the segments whose extent, or that of all together (`least`, `most`),
-   shows that they are so far are left out, as well as those that another box blocks. */
-static inline void measure_box(
-    const double *box, int count, double a[DIM][count], double along[DIM][count], const double *least,
-    const double *most, double margin, double *gap, double *open
-) {
+/* The lower and upper bounds (2, DIM) of what lies no farther than `margin` from a box; none of an absent one. */
+static void bounds_of(const double *box, double margin, double *bounds) {
     const double *axes = box + DIM, *half = BOX_HALF(box), radius = BOX_RADIUS(box);
-    if (radius < 0) return;
-    double low[DIM], high[DIM];
     for (int i = 0; i < DIM; i++) {
         double reach = radius + margin;
         for (int j = 0; j < DIM; j++) reach += fabs(axes[j * DIM + i]) * half[j];
         reach += 1e-9 * (fabs(reach) + fabs(box[i])); /* more than rounding */
-        low[i] = box[i] - reach, high[i] = box[i] + reach;
-        if (least[i] > high[i] || most[i] < low[i]) return;
+        bounds[i] = radius < 0 ? INFINITY : box[i] - reach;
+        bounds[DIM + i] = radius < 0 ? -INFINITY : box[i] + reach;
     }
-    for (int e = 0; e < count; e++) {
-        double start[DIM], step[DIM];
-        int near = open[e] > 0.0;
-        for (int i = 0; i < DIM; i++) {
-            double end = a[i][e] + along[i][e];
-            start[i] = a[i][e], step[i] = along[i][e];
-            near &= (start[i] <= high[i] || end <= high[i]) && (start[i] >= low[i] || end >= low[i]);
+}
+
+/* Some segments from a to a + along, and the bounds of each and of all together. */
+typedef struct {
+    double (*a)[BLOCK], (*along)[BLOCK];
+    double low[DIM][BLOCK], high[DIM][BLOCK], least[DIM], most[DIM];
+} Segments;
+
+static inline void find_bounds(double a[DIM][BLOCK], double along[DIM][BLOCK], Segments *g) {
+    g->a = a, g->along = along;
+    for (int i = 0; i < DIM; i++) {
+        g->least[i] = INFINITY, g->most[i] = -INFINITY;
+        for (int e = 0; e < BLOCK; e++) {
+            double start = a[i][e], end = start + along[i][e], low = start < end ? start : end;
+            double high = start < end ? end : start;
+            g->low[i][e] = low, g->high[i][e] = high;
+            g->least[i] = low < g->least[i] ? low : g->least[i];
+            g->most[i] = high > g->most[i] ? high : g->most[i];
         }
-        if (!near) continue;
-        double away = square_of_segment(box, start, step), left = sqrt(away) - radius, more = away - radius * radius;
-        gap[e] = left < gap[e] ? left : gap[e];
-        open[e] = more < open[e] ? more : open[e];
+    }
+}
+
+/* Lowers `gap`, the distances of segments from the surface, and `open`, a measure with the same sign. What lies outside
+   of the box's bounds doesn't count: segments that don't reach them are left out, as well as those that another box
+   blocks. */
+static inline void measure_box(const double *box, const double *bounds, const Segments *g, double *gap, double *open) {
+    for (int i = 0; i < DIM; i++) if (g->least[i] > bounds[DIM + i] || g->most[i] < bounds[i]) return;
+    int64_t near[BLOCK];
+    int place[BLOCK], count = 0;
+    for (int e = 0; e < BLOCK; e++) {
+        near[e] = open[e] > 0.0;
+        for (int i = 0; i < DIM; i++) near[e] &= (g->low[i][e] <= bounds[DIM + i]) & (g->high[i][e] >= bounds[i]);
+    }
+    for (int e = 0; e < BLOCK; e++) place[count] = e, count += near[e] != 0;
+    if (count == 0) return;
+    V numbers[BOX_NUMBERS];
+    double radius = BOX_RADIUS(box);
+    spread(box, numbers);
+    for (int first = 0; first < count; first += SIDE) {
+        V start[DIM], step[DIM];
+        for (int l = 0; l < SIDE; l++) {
+            int e = place[first + l < count ? first + l : first];
+            for (int i = 0; i < DIM; i++) start[i][l] = g->a[i][e], step[i][l] = g->along[i][e];
+        }
+        V away = square_of_segment(numbers, start, step);
+        for (int l = 0; l < SIDE && first + l < count; l++) {
+            int e = place[first + l];
+            double left = sqrt(away[l]) - radius, more = away[l] - radius * radius;
+            gap[e] = left < gap[e] ? left : gap[e];
+            open[e] = more < open[e] ? more : open[e];
+        }
     }
 }

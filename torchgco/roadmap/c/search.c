@@ -3,13 +3,13 @@
    Both do the same operations in the same order, and none is fused here (-ffp-contract=off): all numbers but square
    roots, which PyTorch doesn't always round correctly, agree to the last bit. Clearance and nearness are therefore
    compared as squares, detours and costs with a tolerance, and ties are broken by the lowest index: the paths are the
-   same. DIM is the number of coordinates; the part before this file declares `Arguments` (roadmap/native.py). */
+   same. DIM is the number of coordinates, BLOCK of edges measured side by side; the part before this file declares
+   `Arguments` (roadmap/native.py). */
 
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-#define BLOCK 32  /* edges measured side by side */
 #define CLAMP(x, low, high) ((x) < (low) ? (low) : (x) > (high) ? (high) : (x))
 
 /* The spheres of a problem that are present: radii, their squares, centres coordinate by coordinate; boxes, some of
@@ -20,7 +20,7 @@ typedef struct {
     double largest;
 #if BOXES
     int64_t boxes;
-    const double *box;
+    const double *box, *bounds;  // of each box, what is too near it to be free or to cost no more
 #endif
 } Spheres;
 
@@ -29,6 +29,14 @@ typedef struct {
     double *edge, *cost, *before, *value, *through;
     int32_t *first, *source, *fresh, *next, *seen;
 } Room;
+
+/* The distance from obstacles below which an edge costs more. */
+static double margin_of(const Arguments *s, const Spheres *o) {
+    return s->margin * (o->largest < SMALL ? SMALL : o->largest);
+}
+
+/* How many numbers `spheres_of` needs room for. */
+static int64_t sphere_room(const Arguments *s) { return (DIM + 2) * s->spheres + 2 * DIM * s->boxes; }
 
 static Spheres spheres_of(const Arguments *s, int64_t b, double *room) {
     const double *R = s->distances + b * s->spheres;
@@ -44,6 +52,10 @@ static Spheres spheres_of(const Arguments *s, int64_t b, double *room) {
 #if BOXES
     if (s->largest[b] > o.largest) o.largest = s->largest[b];
     o.boxes = s->boxes, o.box = s->box + b * s->boxes * BOX_NUMBERS;
+    double *bounds = radius + s->spheres, margin = margin_of(s, &o), gap = s->clear * o.largest;
+    for (int64_t m = 0; m < s->boxes; m++)
+        bounds_of(o.box + m * BOX_NUMBERS, margin > gap ? margin : gap, bounds + m * 2 * DIM);
+    o.bounds = bounds;
 #endif
     return o;
 }
@@ -57,9 +69,11 @@ static int is_free(const double *p, const Spheres *o, double gap) {
     }
 #if BOXES
     for (int64_t m = 0; m < o->boxes; m++) {
-        const double *box = o->box + m * BOX_NUMBERS;
+        const double *box = o->box + m * BOX_NUMBERS, *bounds = o->bounds + m * 2 * DIM;
         double least = BOX_RADIUS(box) + gap;
-        if (BOX_RADIUS(box) >= 0) all &= square_from_box(box, p) > least * least;
+        int near = 1;
+        for (int i = 0; i < DIM; i++) near &= (p[i] >= bounds[i]) & (p[i] <= bounds[DIM + i]);
+        if (near) all &= square_from_box(box, p) > least * least;
     }
 #endif
     return all;
@@ -199,7 +213,7 @@ static void join(const Arguments *s, int64_t b, const uint8_t *usable, double *a
 static void measure(
     const Arguments *s, const Spheres *o, const double *p, int64_t n, int64_t k, const int32_t *ends, double *lengths
 ) {
-    double margin = s->margin * (o->largest < SMALL ? SMALL : o->largest), whole = 0.0;
+    double margin = margin_of(s, o), whole = 0.0;
     for (int i = 0; i < DIM; i++) whole += (p[DIM + i] - p[i]) * (p[DIM + i] - p[i]);
     double shortest = s->least * sqrt(whole);
     int64_t from = 0, slot = 0;
@@ -227,10 +241,10 @@ static void measure(
                 open[e] = more < open[e] ? more : open[e];
             }
 #if BOXES
-        double least[DIM], most[DIM];
-        extent(BLOCK, a, along, least, most);
+        Segments segments;
+        find_bounds(a, along, &segments);
         for (int64_t m = 0; m < o->boxes; m++)
-            measure_box(o->box + m * BOX_NUMBERS, BLOCK, a, along, least, most, margin, gap, open);
+            measure_box(o->box + m * BOX_NUMBERS, o->bounds + m * 2 * DIM, &segments, gap, open);
 #endif
         for (int e = 0; e < BLOCK && first + e < n * k; e++) {
             double close = 1.0 + CLAMP((margin - gap[e]) / margin, 0.0, 1.0);
@@ -359,17 +373,17 @@ static void lay(const double *path, int64_t corners, double *string) {
         }
 }
 
-/* Called from Python; 0 where there is no memory ------------------------------------------------------------------- */
+/* Called from Python for the problems begin, ..., end - 1; 0 where there is no memory ------------------------------ */
 
-int32_t tgco_graph(const Arguments *s) {
+int32_t tgco_graph(const Arguments *s, int64_t begin, int64_t end) {
     int64_t n = s->points, k = s->edges, list = n + k + s->midway;
-    int64_t size = (DIM + 2) * s->spheres + (DIM + 1) * n + DIM * s->candidates + list;
+    int64_t size = sphere_room(s) + (DIM + 1) * n + DIM * s->candidates + list;
     double *memory = malloc(size * sizeof(double) + list * sizeof(int32_t) + n);
     if (!memory) return 0;
-    double *at = memory + (DIM + 2) * s->spheres, *others = at + (DIM + 1) * n, *values = others + DIM * s->candidates;
+    double *at = memory + sphere_room(s), *others = at + (DIM + 1) * n, *values = others + DIM * s->candidates;
     int32_t *indices = (int32_t *)(memory + size);
     uint8_t *usable = (uint8_t *)(indices + list);
-    for (int64_t b = 0; b < s->problems; b++) {
+    for (int64_t b = begin; b < end; b++) {
         Spheres o = spheres_of(s, b, memory);
         int64_t count = propose(s, b, values, indices, others);
         choose(s, b, &o, others, count, values, indices, usable);
@@ -382,12 +396,12 @@ int32_t tgco_graph(const Arguments *s) {
     return 1;
 }
 
-int32_t tgco_cheapest(const Arguments *s) {
+int32_t tgco_cheapest(const Arguments *s, int64_t begin, int64_t end) {
     int64_t n = s->points, k = s->edges, size = s->corners * DIM;
     void *memory = malloc(room_size(n, k));
     if (!memory) return 0;
     Room room = room_at(memory, n, k);
-    for (int64_t b = 0; b < s->problems; b++) {
+    for (int64_t b = begin; b < end; b++) {
         const double *p = s->nodes + b * n * DIM;
         double *path = s->path + b * size;
         s->arrives[b] = cheapest(
@@ -401,16 +415,16 @@ int32_t tgco_cheapest(const Arguments *s) {
     return 1;
 }
 
-int32_t tgco_taut(const Arguments *s) {
+int32_t tgco_taut(const Arguments *s, int64_t begin, int64_t end) {
     int64_t most = 2 * s->corners - 1, size = s->corners * DIM;
     size_t lengths_size = most * most * sizeof(double), ends_size = most * most * sizeof(int32_t);
-    size_t room = room_size(most, most), spheres = (DIM + 2) * s->spheres * sizeof(double);
+    size_t room = room_size(most, most), spheres = sphere_room(s) * sizeof(double);
     char *memory = malloc(lengths_size + size * sizeof(double) + spheres + room + ends_size);
     if (!memory) return 0;
     double *lengths = (double *)memory, *taut = lengths + most * most, *at = taut + size;
-    void *rest = at + (DIM + 2) * s->spheres;
+    void *rest = at + sphere_room(s);
     int32_t *ends = (int32_t *)((char *)rest + room);
-    for (int64_t b = 0; b < s->problems; b++) {
+    for (int64_t b = begin; b < end; b++) {
         double *path = s->path + b * size;
         int64_t n = 2 * edges_of(path, s->corners) + 1;
         if (n == 1) continue;
@@ -426,11 +440,11 @@ int32_t tgco_taut(const Arguments *s) {
     return 1;
 }
 
-int32_t tgco_raise(const Arguments *s) {
+int32_t tgco_raise(const Arguments *s, int64_t begin, int64_t end) {
     int64_t n = s->points, M = s->spheres;
     double *at = malloc((DIM + 1) * n * sizeof(double)), *nearest = at + DIM * n;
     if (!at) return 0;
-    for (int64_t b = 0; b < s->problems; b++) {
+    for (int64_t b = begin; b < end; b++) {
         const double *path = s->path + b * s->corners * DIM, *R = s->distances + b * M;
         double reach = 0.0;
         for (int64_t m = 0; m < M; m++) reach = R[m] > reach ? R[m] : reach;

@@ -3,6 +3,7 @@ import * as THREE from "./three.module.min.js";
 
 const STEEPEST = 0.499 * Math.PI;
 const TURN = 0.006; // rad per pixel
+const MARGIN = 1.05; // of the distance from which a box fits into the picture
 const ZOOM = 1.0015; // per unit of the wheel
 const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
@@ -90,13 +91,21 @@ export class Orbit {
     this.place();
   }
 
-  /** Look at a point from an azimuth and an elevation, rad, so far away that a ball of a radius is in view. */
-  look(target, radius, azimuth, elevation) {
-    this.target.copy(target);
+  /** Look at the middle of a box from an azimuth and an elevation, rad, so far away that the box just fits in. */
+  look(box, azimuth, elevation) {
+    box.getCenter(this.target);
     this.azimuth = azimuth;
     this.elevation = Math.min(STEEPEST, Math.max(-STEEPEST, elevation));
-    const narrow = Math.min(1, this.camera.aspect) * Math.tan((this.camera.fov * Math.PI) / 360);
-    this.distance = radius / Math.sin(Math.atan(narrow));
+    this.distance = 1;
+    this.place();
+    const tall = Math.tan((this.camera.fov * Math.PI) / 360);
+    const inverse = this.camera.matrixWorldInverse.copy(this.camera.matrixWorld).invert();
+    const corner = new THREE.Vector3();
+    const far = Array.from({ length: 8 }, (_, i) => {
+      corner.set(...["x", "y", "z"].map((axis, bit) => (i & (1 << bit) ? box.max : box.min)[axis])).applyMatrix4(inverse);
+      return corner.z + 1 + Math.max(Math.abs(corner.x) / (tall * this.camera.aspect), Math.abs(corner.y) / tall);
+    });
+    this.distance = Math.max(...far, 1e-3) * MARGIN;
     this.place();
   }
 

@@ -23,8 +23,9 @@ function resolved(value, bytes) {
   return Object.fromEntries(Object.entries(value).map(([name, one]) => [name, resolved(one, bytes)]));
 }
 
-/** An array from its two planes of bytes: low ones, then high ones. */
-function array({ [KEY]: place, shape, steps }, bytes) {
+/** An array from its planes of bytes: lowest ones first, two for half precision, four for whole numbers. */
+function array({ [KEY]: place, shape, steps, whole }, bytes) {
+  if (whole) return wholes(place, shape, bytes);
   const count = shape.reduce((product, size) => product * size, 1);
   const width = count / Math.max(1, shape[0]);
   const data = new Float32Array(count);
@@ -34,6 +35,18 @@ function array({ [KEY]: place, shape, steps }, bytes) {
     data[i] = steps ? (sums[i % width] += number) : number;
   }
   return { data, shape, rows: shape[0], width };
+}
+
+/** Whole numbers from their differences, modulo 2^32. */
+function wholes(place, shape, bytes) {
+  const [count] = shape;
+  const data = new Uint32Array(count);
+  let sum = 0;
+  for (let i = 0; i < count; i++) {
+    for (let plane = 0; plane < 4; plane++) sum += bytes[place + plane * count + i] * 2 ** (8 * plane);
+    data[i] = sum %= 2 ** 32;
+  }
+  return { data, shape, rows: count, width: 1 };
 }
 
 /** The number that 16 bits stand for in half precision. */

@@ -1,48 +1,11 @@
 // The trajectories of a layout: tubes, marks where something is violated, and the vehicles that fly along.
 import * as THREE from "./three.module.min.js";
 import { between, point } from "./data.js";
+import { MissionParts } from "./missions.js";
+import { AROUND, dashWhereShared, tube } from "./tubes.js";
 import { vehicle } from "./vehicle.js";
 
-const AROUND = 6; // corners of a tube's section
 const BAD = 0xd02020;
-
-/** Straight pieces between points, as three.js wants them for tubes. */
-class Polyline extends THREE.Curve {
-  constructor(points) {
-    super();
-    this.points = points;
-  }
-
-  getPoint(share, out = new THREE.Vector3()) {
-    const at = share * (this.points.length - 1);
-    const k = Math.min(Math.floor(at), this.points.length - 2);
-    return out.copy(this.points[k]).lerp(this.points[k + 1], at - k);
-  }
-
-  getPointAt(share, out) {
-    return this.getPoint(share, out);
-  }
-
-  getTangentAt(share, out = new THREE.Vector3()) {
-    const step = 0.5 / (this.points.length - 1);
-    const [a, b] = [Math.max(0, share - step), Math.min(1, share + step)];
-    return out.copy(this.getPoint(b)).sub(this.getPoint(a)).normalize();
-  }
-}
-
-/** A tube through points; null where they don't leave their place. Each piece has the same number of corners. */
-export function tube(points, radius, material) {
-  const moved = points.filter((place, k) => k === 0 || place.distanceTo(points[k - 1]) > 1e-9);
-  if (moved.length < 2) return null;
-  // Points that coincide would have no direction: the same number of pieces, spread a little.
-  const spread = moved.length === points.length ? points : spreadOut(points);
-  return new THREE.Mesh(new THREE.TubeGeometry(new Polyline(spread), spread.length - 1, radius, AROUND), material);
-}
-
-function spreadOut(points) {
-  const tiny = 1e-7 * (1 + points[0].length());
-  return points.map((place, k) => place.clone().addScalar(tiny * k));
-}
 
 /** All flights of a layout, in the colours of their solvers. */
 export class Flights {
@@ -52,6 +15,10 @@ export class Flights {
     this.space = space;
     this.thick = 0.0035 * space.size;
     this.all = layout.flights.filter((flight) => flight.path.rows > 0).map((flight) => this.built(flight));
+    this.all.forEach(({ line, points }, i) => {
+      const before = this.all.slice(0, i).map((one) => one.points);
+      if (line) dashWhereShared(line.geometry, points, before, 1.5 * this.thick, 6 * this.thick);
+    });
     this.knots = Math.max(1, ...this.all.map((one) => one.flight.path.rows - 1));
     this.times = layout.times ? layout.times.data : null;
   }
@@ -87,8 +54,7 @@ export class Flights {
     const group = new THREE.Group();
     const points = this.points(flight.path);
     const paint = new THREE.MeshLambertMaterial({ color: colour });
-    // The first is the thinnest: one of the same course shows at its sides.
-    const line = tube(points, (flight.solver === 0 ? 1 : 1.4) * this.thick, paint);
+    const line = tube(points, (flight.solver === 0 ? 1 : 1.2) * this.thick, paint);
     if (line) {
       // Seen through whatever stands before it.
       const ghost = new THREE.Mesh(
@@ -102,10 +68,10 @@ export class Flights {
     const body = vehicle(this.head.body, this.head.radius || 0.012 * this.space.size, colour, this.space.flat);
     body.add(dot(colour));
     group.add(body, ...this.marks(flight, points));
-    const plan = flight.plan ? this.planned(flight, colour) : null;
-    if (plan) group.add(plan);
+    const parts = flight.plan ? new MissionParts(flight, colour, this.space) : null;
+    if (parts) group.add(parts.group);
     this.group.add(group);
-    return { flight, name, colour, group, points, line, body, plan };
+    return { flight, name, colour, group, points, line, body, parts };
   }
 
   /** Red where a constraint is violated, and a red mark at each contact. */
@@ -131,42 +97,30 @@ export class Flights {
     return found;
   }
 
-  /** The plan of a mission at one instant, as dots on a line. */
-  planned(flight, colour) {
-    const geometry = new THREE.BufferGeometry();
-    const positions = new THREE.BufferAttribute(new Float32Array(3 * flight.plan.shape[1]), 3);
-    geometry.setAttribute("position", positions);
-    const group = new THREE.Group();
-    group.add(new THREE.Points(geometry, new THREE.PointsMaterial({ color: colour, size: 4, sizeAttenuation: false })));
-    group.add(new THREE.Line(geometry, new THREE.LineBasicMaterial({ color: colour })));
-    group.children.forEach((one) => (one.frustumCulled = false));
-    group.userData.positions = positions;
-    return group;
-  }
-
   /** Move all vehicles to a time, s. */
   setTime(t) {
     const knots = this.knotsAt(t);
-    for (const { flight, body, line, plan } of this.all) {
+    for (const { flight, body, line, parts } of this.all) {
       const place = this.place(...between(flight.path, knots));
       body.position.copy(place);
       if (flight.attitude) body.quaternion.copy(attitude(flight.attitude, knots));
       const k = Math.min(Math.floor(knots), flight.path.rows - 1);
-      if (plan) this.showPlan(flight, plan, k);
+      if (parts) parts.show(k, place);
       if (this.head.mission && line) line.geometry.setDrawRange(0, Math.max(1, k) * AROUND * 6);
     }
   }
 
-  showPlan(flight, plan, k) {
-    const [, count, width] = flight.plan.shape;
-    const row = Math.min(k, flight.plan.rows - 1) * count * width;
-    const { positions } = plan.userData;
-    for (let i = 0; i < count; i++) positions.setXYZ(i, ...flight.plan.data.subarray(row + i * width, row + i * width + 3));
-    positions.needsUpdate = true;
-  }
-
   setVisible(names) {
     this.all.forEach((one) => (one.group.visible = names.has(one.name)));
+  }
+
+  /** Which of a mission's parts can be shown in this layout. */
+  get partNames() {
+    return new Set(this.all.flatMap(({ parts }) => (parts ? Object.keys(parts.layers) : [])));
+  }
+
+  setPart(name, on) {
+    for (const { parts } of this.all) if (parts && name in parts.layers) parts.layers[name].visible = on;
   }
 
   dispose() {

@@ -4,10 +4,11 @@ import { half, part } from "./data.js";
 import { obstacles } from "./shapes.js";
 import { Orbit } from "./camera.js";
 import { DARK, LIGHT, aim, lights, spaceOf, surroundings } from "./scenery.js";
+import { PARTS } from "./missions.js";
 import { Flights } from "./flights.js";
 import { Search } from "./search.js";
 import { linesOf, pick, showHover } from "./hover.js";
-import { build, by, showLayout, showSearch, showTime } from "./panel.js";
+import { build, by, showLayout, showParts, showSearch, showTime } from "./panel.js";
 
 const SLOW = 1 / 31; // s a frame, above which the picture gets coarser while it moves
 const TOLD = 100; // ms between two updates of the text while playing
@@ -38,7 +39,8 @@ class Page {
     this.orbit = new Orbit(this.canvas, () => this.redraw());
     this.visible = new Set(head.solvers.map(({ name }) => name));
     this.layers = new Set(["path", "caught", "refined"]);
-    this.shown = { follow: false, through: false, grown: false, searched: false };
+    const parts = Object.fromEntries(PARTS.map((name) => [name, true]));
+    this.shown = { follow: false, through: false, grown: false, searched: false, ...parts };
     this.time = 0;
     this.speed = 1;
     this.playing = false;
@@ -109,9 +111,12 @@ class Page {
     layout.obstacles = await Promise.all(layout.obstacles.map((one) => ("shared" in one ? part(`map-${one.shared}`) : one)));
     if (number !== this.number) return;
     this.layout = layout;
+    // Maps may have a ceiling: it is cut off at first.
+    if (!this.placed && this.head.dimension === 3 && layout.obstacles.some((one) => one.cells)) by("cut").value = 0.99;
     showLayout(layout, number, this.head, this.visible, this.actions());
     this.rebuild();
     if (!this.placed) this.view("perspective");
+    if (!this.placed && this.flights.partNames.has("sensed")) this.toggle("through", true); // the map is inside them
     this.placed = true; // from here on the camera is the user's
     this.setTime(Math.min(this.time, this.flights.duration));
   }
@@ -133,6 +138,7 @@ class Page {
     this.chosen = { round: 0, guide: 0 };
     this.cut(Number(by("cut").value));
     this.flights.setVisible(this.visible);
+    showParts(this.flights.partNames);
     for (const [name, on] of Object.entries(this.shown)) this.toggle(name, on);
     this.setTime(this.time);
   }
@@ -150,18 +156,15 @@ class Page {
   }
 
   view(name) {
-    const { low, high, size, flat } = this.space;
     const { start, goal } = this.layout;
-    const middle = this.space.box.getCenter(new THREE.Vector3());
     const ahead = start && goal ? Math.atan2(goal[1] - start[1], goal[0] - start[0]) : 0;
-    const radius = 0.5 * Math.max(size, 0.5 * high.distanceTo(low)) * 0.95;
     const views = {
-      perspective: [ahead - 0.5 * Math.PI - 0.45, flat ? 1.0 : 0.5],
+      perspective: [ahead - 0.5 * Math.PI - 0.45, this.space.flat ? 1.0 : 0.5],
       above: [-0.5 * Math.PI, 1.57],
       side: [ahead - 0.5 * Math.PI, 0.02],
       behind: [ahead + Math.PI, 0.3],
     };
-    this.orbit.look(middle, radius, ...views[name]);
+    this.orbit.look(this.space.near, ...views[name]);
   }
 
   /** Azimuth and elevation in degrees, the distance as a share of the scene's size, and where the camera looks. */
@@ -176,6 +179,9 @@ class Page {
   cut(share) {
     const { low, high, top } = this.space;
     high.z = low.z + share * (top - low.z);
+    const ceiling = share < 1 ? high.z : null;
+    this.obstacles.setCeiling(ceiling);
+    this.flights.all.forEach(({ parts }) => parts?.setCeiling(ceiling));
     this.redraw();
   }
 
@@ -184,6 +190,7 @@ class Page {
     by(name).checked = on;
     if (name === "grown") this.obstacles.setGrown(on);
     if (name === "through") this.obstacles.setSeeThrough(on);
+    if (PARTS.includes(name)) this.flights.setPart(name, on);
     if (name === "searched") this.setSearch({});
     if (name === "follow" && on) this.follow();
     this.redraw();

@@ -1,4 +1,5 @@
 // The controls beside and below the picture. All text is set as text: nothing that the data says becomes HTML.
+import { PARTS } from "./missions.js";
 import { LAYERS, classColour } from "./search.js";
 
 export const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
@@ -48,7 +49,7 @@ export function build(head, act) {
   );
   by("cut-label").hidden = head.dimension === 2;
   by("cut").addEventListener("input", (event) => act.cut(Number(event.target.value)));
-  for (const name of ["follow", "through", "grown", "searched"]) {
+  for (const name of ["follow", "through", "grown", "searched", ...PARTS]) {
     by(name).addEventListener("change", (event) => act.toggle(name, event.target.checked));
   }
   by("play").addEventListener("click", act.play);
@@ -93,6 +94,12 @@ export function showTime(t, duration, playing) {
   by("time").setAttribute("aria-valuetext", `${t.toFixed(2)} seconds`);
   by("play").textContent = playing ? "Pause" : "Play";
   by("play").setAttribute("aria-pressed", String(playing));
+}
+
+/** The switches of a mission's parts, those that this layout has. */
+export function showParts(names) {
+  for (const name of PARTS) by(name).parentElement.hidden = !names.has(name);
+  by("mission").hidden = names.size === 0;
 }
 
 /** The part of the panel that tells of the search; hidden where a layout has no record of one. */

@@ -5,11 +5,12 @@ import { SUN } from "./shapes.js";
 
 const SIDEWAYS = 0.25; // shares of the scene's size that are kept around the trajectories
 const UPWARDS = 0.1;
+const AROUND = 0.06; // that are in view around them at first
 
 export const LIGHT = { sky: 0xf7f8f9, obstacle: 0xcfc3ae, ground: 0xe9ebee, line: 0xc9ced6 };
 export const DARK = { sky: 0x16191d, obstacle: 0x8d8676, ground: 0x20242a, line: 0x3a414b };
 
-/** The box around start, goal and the trajectories that end well, and the room in which long obstacles are shown. */
+/** The box around start, goal and the trajectories that end well, what is in view at first, where long obstacles end. */
 export function spaceOf(layout, head) {
   const flat = head.dimension === 2;
   const box = new THREE.Box3();
@@ -25,7 +26,8 @@ export function spaceOf(layout, head) {
   const margin = new THREE.Vector3(SIDEWAYS, SIDEWAYS, UPWARDS).multiplyScalar(size).addScalar(head.radius);
   const low = box.min.clone().sub(margin);
   const high = box.max.clone().add(margin);
-  return { flat, box, size, low, high, radius: head.radius, height: 0.05 * size, top: high.z };
+  const near = box.clone().expandByScalar(AROUND * size + head.radius);
+  return { flat, box, near, size, low, high, radius: head.radius, height: 0.05 * size, top: high.z };
 }
 
 export function lights(scene) {

@@ -3,6 +3,7 @@
 import * as THREE from "./three.module.min.js";
 
 const MANY = 60; // shapes from which on each has fewer corners
+export const NONE = 1e9; // m: so high that there is no ceiling
 const LONG = 0.35; // half sides longer than this share of the scene are cut where the scene ends
 export const SUN = new THREE.Vector3(-0.25, -0.4, 0.88).normalize();
 
@@ -87,18 +88,23 @@ function quarterTurns(quarters, steps) {
   return found;
 }
 
-// Long shapes end where the scene does: their corners are moved there, which leaves a flat end.
+// Long shapes end where the scene does: their corners are moved there, which leaves a flat end. Above a ceiling nothing
+// is shown; `rise` holds half the height of a shape, and 1 where that can be cut, as its sides are straight.
 const SHAPE = `
 attribute vec3 corner; attribute vec3 middle; attribute vec3 sides; attribute float radius;
-attribute vec4 turn; attribute vec3 velocity; attribute vec3 cut;
-uniform float time; uniform float grown; uniform vec3 low; uniform vec3 high;
+attribute vec4 turn; attribute vec3 velocity; attribute vec3 cut; attribute vec2 rise;
+uniform float time; uniform float grown; uniform float ceiling; uniform vec3 low; uniform vec3 high;
 #ifdef STRAIGHT
 #define turned(q, v) (v)
 #else
 vec3 turned(vec4 q, vec3 v) { return v + 2.0 * cross(q.yzw, cross(q.yzw, v) + q.x * v); }
 #endif
 vec3 whole() { return middle + time * velocity + turned(turn, corner * sides + (radius + grown) * position); }
-vec3 placed(vec3 p) { return mix(p, clamp(p, low, high), cut); }
+vec3 placed(vec3 p) {
+  if (middle.z + time * velocity.z - rise.x > ceiling) return middle;
+  vec3 q = mix(p, clamp(p, low, high), cut);
+  return vec3(q.xy, rise.y > 0.5 ? min(q.z, ceiling) : q.z);
+}
 vec3 faced(vec3 p) {
   vec3 n = turned(turn, normal);
   vec3 over = cut * (step(high, p) - step(p, low));
@@ -143,7 +149,9 @@ function shaded(kind, options, uniforms) {
 /** The obstacles of a layout as meshes, and the numbers that the scene changes later. */
 export function obstacles(parts, space, colours, still) {
   const group = new THREE.Group();
-  const uniforms = { time: { value: 0 }, low: { value: space.low }, high: { value: space.high }, grown: { value: 0 } };
+  const uniforms = Object.fromEntries(
+    Object.entries({ time: 0, low: space.low, high: space.high, grown: 0, ceiling: NONE }).map(([name, value]) => [name, { value }]),
+  );
   const colour = new THREE.Color(colours.obstacle);
   const straight = parts.every((part) => !part.turn);
   const solids = still ? shaded("MeshLambertMaterial", { color: colour }, uniforms) : plain(colour, 1, uniforms, straight);
@@ -167,6 +175,7 @@ export function obstacles(parts, space, colours, still) {
   const until = Math.min(...parts.map((part) => part.until ?? Infinity), Infinity);
   return {
     group,
+    setCeiling: (z) => (uniforms.ceiling.value = z ?? NONE),
     setTime: (t) => (uniforms.time.value = Math.min(t, until)),
     setGrown: (on) => {
       if (on && !shells.length) {
@@ -209,7 +218,7 @@ function geometryOf(part, space, still, grown) {
   geometry.setAttribute("position", new THREE.Float32BufferAttribute(template.offsets, 3));
   geometry.setAttribute("normal", new THREE.Float32BufferAttribute(template.normals, 3));
   geometry.setAttribute("corner", new THREE.Float32BufferAttribute(template.corners, 3));
-  for (const [name, size] of Object.entries({ middle: 3, sides: 3, radius: 1, turn: 4, velocity: 3, cut: 3 })) {
+  for (const [name, size] of Object.entries({ middle: 3, sides: 3, radius: 1, turn: 4, velocity: 3, cut: 3, rise: 2 })) {
     geometry.setAttribute(name, new THREE.InstancedBufferAttribute(rows[name], size));
   }
   return geometry;
@@ -218,7 +227,7 @@ function geometryOf(part, space, still, grown) {
 /** Numbers per shape, in space also where they are given in the plane. */
 export function instances(part, space) {
   const row = (array, k) => (array ? Math.min(k, array.rows - 1) * array.width : 0);
-  const sizes = { middle: 3, sides: 3, radius: 1, turn: 4, velocity: 3, cut: 3 };
+  const sizes = { middle: 3, sides: 3, radius: 1, turn: 4, velocity: 3, cut: 3, rise: 2 };
   const found = Object.fromEntries(
     Object.entries(sizes).map(([name, size]) => [name, new Float32Array(size * part.count)]),
   );
@@ -231,7 +240,9 @@ export function instances(part, space) {
     if (space.flat) found.middle[3 * k + 2] = found.sides[3 * k + 2] = 0.5 * space.height;
     found.radius[k] = part.radius.data[row(part.radius, k)];
     found.turn.set(turnOf(part.turn, row(part.turn, k)), 4 * k);
-    if (!space.flat) found.cut.set(cuts(found, k, space), 3 * k);
+    if (space.flat) continue;
+    found.cut.set(cuts(found, k, space), 3 * k);
+    found.rise.set(riseOf(found, k), 2 * k);
   }
   return found;
 }
@@ -249,6 +260,15 @@ function cuts({ sides, radius, turn }, k, space) {
     if (along[axis] > 0.99999 && half > 0) found[axis] = 1;
   }
   return found;
+}
+
+/** Half the height of shape k, and whether it is a sharp box that stands upright. */
+function riseOf({ sides, radius, turn }, k) {
+  const [w, x, y, z] = turn.subarray(4 * k, 4 * k + 4);
+  const quaternion = new THREE.Quaternion(x, y, z, w);
+  const along = [0, 1, 2].map((i) => Math.abs(new THREE.Vector3().setComponent(i, 1).applyQuaternion(quaternion).z));
+  const half = along.reduce((sum, share, i) => sum + share * sides[3 * k + i], radius[k]);
+  return [half, radius[k] === 0 && along[2] > 0.99999 ? 1 : 0];
 }
 
 function turnOf(turn, at) {

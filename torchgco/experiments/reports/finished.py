@@ -1,0 +1,87 @@
+"""A finished study, as its page reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from torchgco.base.errors import InputError
+from torchgco.experiments.config.build import mission_from, solver_from, vehicle_of
+from torchgco.experiments.results.identity import Manifest
+from torchgco.experiments.results.records import DONE, LAYOUTS, MANIFEST, TRIALS, read_manifest
+from torchgco.experiments.results.runs import read_trials
+from torchgco.missions import Mission
+from torchgco.problem.problem import Problem
+from torchgco.scenarios import Layouts, Vehicle
+from torchgco.view.document import Document
+from torchgco.view.flights import constraint_name
+from torchgco.view.vehicles import Look
+
+BATCH = 64  # layouts whose trajectories are measured at once
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a page needs of a finished study."""
+
+    folder: Path
+    manifest: Manifest
+    vehicle: Vehicle
+    layouts: Layouts
+    trials: pd.DataFrame
+
+    @classmethod
+    def read(cls, folder: Path) -> Study:
+        """The study in a folder.
+
+        Raises:
+            InputError: a folder without a finished study, or with damaged files.
+        """
+        if not (folder / MANIFEST).is_file():
+            raise InputError("RUN", f"the folder of a study, with its {MANIFEST}", folder)
+        if not (folder / DONE).is_file():
+            raise InputError("RUN", "a finished study (the same command resumes it)", folder)
+        manifest = read_manifest(folder / MANIFEST)
+        layouts, trials = Layouts.load(folder / LAYOUTS), read_trials(folder / TRIALS)
+        return cls(folder, manifest, vehicle_of(manifest.configuration), layouts, trials)
+
+    @property
+    def missions(self) -> bool:
+        return self.manifest.configuration.get("mission") is not None
+
+    @property
+    def seed(self) -> int:
+        return self.manifest.configuration["seed"]
+
+    @property
+    def rows(self) -> Mapping[tuple[str, int], Mapping[str, Any]]:
+        """The rows of the table by solver and layout."""
+        return {(row["solver"], row["layout"]): row for row in self.trials.to_dict("records")}  # type: ignore[misc]
+
+    def batches(self) -> Iterator[tuple[slice, Problem]]:
+        """Problems of some layouts at a time, and their places."""
+        for first in range(0, self.layouts.count, BATCH):
+            places = slice(first, min(first + BATCH, self.layouts.count))
+            yield places, self.vehicle.task(self.layouts.take(range(places.start, places.stop))).problem
+
+    def mission(self, solver: str) -> Mission:
+        """The closed loop of a study of missions, as a solver's name flew it."""
+        return mission_from(self.manifest.configuration, solver_from(self.manifest.solvers[solver]))
+
+
+def document_of(study: Study, problem: Problem, look: Look) -> Document:
+    """The page of a study in the making, from the problems of some of its layouts."""
+    solvers, at = list(study.manifest.solvers), problem.position
+    radius = max((float(part.vehicle_radius.max()) for part in problem.obstacles), default=study.vehicle.radius)
+    count = f"{study.layouts.count} layouts" if study.layouts.count > 1 else "1 layout"
+    return Document(
+        title=f"{study.trials['scenario'].iloc[0]}: {', '.join(solvers)}",
+        about=f"{count}, {study.vehicle.name}, seed {study.seed}, {problem.N} stages of "
+        f"{problem.dynamics.dt:g} s",
+        dimension=at.stop - at.start, dt=float(problem.dynamics.dt), look=look, radius=radius, solvers=solvers,
+        constraints=[constraint_name(part) for part in problem.constraints], mission=study.missions,
+    )  # fmt: skip

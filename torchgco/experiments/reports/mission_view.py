@@ -1,0 +1,133 @@
+"""Missions of a finished study on its page: tracks, plans, and what vehicles with a sensor saw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from tqdm import tqdm
+
+from torchgco.base.errors import InputError
+from torchgco.experiments.reports.finished import Study, document_of
+from torchgco.experiments.reports.mission_report import PLANS
+from torchgco.experiments.results.records import MISSION
+from torchgco.missions import Mission
+from torchgco.missions.replay import replayed
+from torchgco.missions.tables import STATES
+from torchgco.native.compiler import NativeError
+from torchgco.problem.problem import Problem
+from torchgco.view.document import Document, SearchPart
+from torchgco.view.flights import Flight, Rows, contacts, whole
+from torchgco.view.sensed import Sensed
+from torchgco.view.vehicles import Look
+
+QUADROTOR = Look("quadrotor", quaternion=slice(6, 10))  # the plant
+SLOW = 100  # control periods from which on a bar shows how far a map is
+DRAWN = 13  # of its states: those that place it and turn it come before the rotors'
+
+
+def missions(study: Study, found: Mapping[int, SearchPart]) -> Document:
+    """Flights in closed loop: the track at the control steps and, where few missions were flown, plans and maps.
+
+    Args:
+        found: searches of first plans by the numbers of their missions.
+    """
+    log, document = _Log.read(study), None
+    for places, problem in study.batches():
+        document = document or document_of(study, problem, QUADROTOR)
+        for b, number in enumerate(study.layouts.ids[places].tolist()):
+            part = problem.take(torch.tensor([b]))
+            flights = [log.flight(study, part, name, number, document.notes) for name in document.solvers]
+            held = [flight for flight in flights if flight is not None]
+            document.add(f"mission {number}", problem, b, held, found.get(number))
+    assert document is not None
+    return document
+
+
+@dataclass(frozen=True)
+class _Log:
+    """What a study kept of its missions.
+
+    Args:
+        steps: rows of mission.parquet by solver and mission.
+        rows: of the table, likewise.
+        plans: positions (K, N+1, 3), m, likewise, of few missions.
+        loops: by solver, where few missions were flown with a sensor.
+    """
+
+    steps: Mapping[tuple[str, int], pd.DataFrame]
+    rows: Mapping[tuple[str, int], Mapping[str, Any]]
+    plans: Mapping[tuple[str, int], np.ndarray]
+    loops: Mapping[str, Mission]
+    missing: str = ""  # why there are no loops
+
+    @classmethod
+    def read(cls, study: Study) -> _Log:
+        table = pd.read_parquet(study.folder / MISSION)
+        steps = dict(iter(table.groupby(["solver", "mission"], sort=False)))
+        if not (study.folder / PLANS).is_file():
+            return cls(steps, study.rows, {}, {})  # type: ignore[arg-type]
+        with np.load(study.folder / PLANS, allow_pickle=False) as held:
+            names, numbers, plans = held["solver"].tolist(), held["layout"].tolist(), held["plan"]
+        kept = {(name, i): plans[s, b] for s, name in enumerate(names) for b, i in enumerate(numbers)}
+        if study.manifest.configuration["mission"].get("sensor", "full") == "full":
+            return cls(steps, study.rows, kept, {})  # type: ignore[arg-type]
+        try:
+            return cls(steps, study.rows, kept, {name: study.mission(name) for name in names})  # type: ignore[arg-type]
+        except InputError as error:  # an option that another version knew
+            return cls(steps, study.rows, kept, {}, f"no map: {error}")  # type: ignore[arg-type]
+
+    def flight(self, study: Study, problem: Problem, solver: str, number: int, notes: list[str]) -> Flight | None:
+        """The flight of a mission, the problem of which is given; None where it ended at its start."""
+        key = solver, number
+        steps, plan, loop = self.steps.get(key), self.plans.get(key), self.loops.get(solver)
+        if steps is None or not len(steps):
+            return None
+        flight = _flight(problem, solver, steps, self.rows[key])
+        plan = None if plan is None else plan[: len(steps)]
+        notes += [self.missing] if self.missing and self.missing not in notes else []
+        if plan is None or loop is None:
+            return replace(flight, plan=None if plan is None else plan[: len(flight.path)])
+        x = torch.tensor(steps[[f"x{i}" for i in range(STATES)]].to_numpy(dtype=float))
+        try:
+            with tqdm(total=len(x), desc="map", unit="period", leave=False, disable=len(x) < SLOW) as bar:
+                replay = replayed(loop, problem, x, study.seed, number, bar.update)
+        except NativeError as error:
+            notes += [] if notes else [f"no map: {str(error).splitlines()[0]}"]
+            return replace(flight, plan=plan[: len(flight.path)])
+        safe = steps["safe"].to_numpy() == 1
+        return replace(flight, plan=plan[: len(flight.path)], sensed=Sensed(replay.seen, replay.sought, safe))
+
+
+def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str, Any]) -> Flight:
+    X = whole(steps[[f"x{i}" for i in range(DRAWN)]].to_numpy(dtype=float))
+    path, clear = X[:, :3], steps["clearance"].to_numpy(dtype=float)
+    bad = np.where(clear < 0, -clear, 0.0)[: len(path)]
+    place = next((i for i, one in enumerate(problem.constraints) if one in problem.obstacles), -1)
+    return Flight(
+        solver, path, QUADROTOR.attitude(X), "reached" if row["reached"] is True else "failed", _told(row), bad,
+        np.where(bad > 0, place, -1), contacts(problem.obstacles, path, float(problem.dynamics.dt)),
+        notes=_notes(steps)[: len(path)],
+    )  # fmt: skip
+
+
+def _told(row: Mapping[str, Any]) -> Rows:
+    held: Rows = [("outcome", str(row["outcome"])), ("flight time", f"{row['flight_time']:.2f} s")]
+    held += [("clearance", f"{row['clearance']:.3f} m"), ("from the goal", f"{row['goal_distance']:.2f} m")]
+    held += [("missed deadlines", f"{row['missed_deadlines']:g}"), ("kept plans", f"{row['shifted_plans']:g}")]
+    share = row.get("safe_share", np.nan)
+    return [*held, ("periods with a safe plan", f"{100 * share:.4g} %")] if np.isfinite(share) else held
+
+
+def _notes(steps: pd.DataFrame) -> list[str]:
+    clear, violation = steps["clearance"].to_numpy(dtype=float), steps["violation"].to_numpy(dtype=float)
+    seconds = (steps["planner_seconds"] + steps["tracker_seconds"]).to_numpy(dtype=float)
+    safe = ["" if one else ", not safe" for one in steps["safe"] == 1] if "safe" in steps else [""] * len(steps)
+    return [
+        f"clearance {c:.3f} m; plan: {source}{word}, violation {v:.2g}; {1e3 * s:.0f} ms"
+        for c, v, s, source, word in zip(clear, violation, seconds, steps["source"], safe, strict=True)
+    ]

@@ -1,0 +1,276 @@
+"""Bodies that move, as balls at constant velocity: known, or followed in the returns of a sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from scipy.ndimage import label
+
+from torchgco.missions.sensing.grid import FREE, OCCUPIED, SeenMap
+from torchgco.missions.sensing.sensors import Scan
+from torchgco.missions.sensing.world import World
+
+BESIDE = 0.3  # m around a ball, within which returns are its own
+JOINED = 0.4  # m: returns closer than about this belong to one body
+LEAST = 2  # returns of a body at least
+GATE = 1.0  # m from where a body is expected, within which it is sought
+PLACE, SPEED = 0.6, 0.15  # gains of the filter of a body's place and velocity, per scan
+YOUNG = 5  # scans of a body before that filter, and between two looks whether it has moved
+SETTLE = 0.2  # s: a body that has been seen for as long is believed to move at half of its mean velocity
+STAYS = 0.25  # m: a body that has moved by less is at rest
+LOST = 0.6  # s without a return, after which a body is given up
+GROWTH, MOST_GROWTH = 0.25, 0.5  # m/s by which balls grow ahead of their time, as velocities are estimates; m at most
+
+
+@dataclass(frozen=True)
+class Moving:
+    """Balls that move at constant velocity: centres (M, 3), m, velocities (M, 3), m/s, radii (M,), m; growth, m/s."""
+
+    centers: np.ndarray
+    velocities: np.ndarray
+    radii: np.ndarray
+    growth: float = 0.0
+
+    def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (K, M, 3) and radii (K, M) after times t (K,), s."""
+        more = np.minimum(self.growth * t, MOST_GROWTH)
+        return self.centers + t[:, None, None] * self.velocities, self.radii + more[:, None]
+
+    def gaps(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Distances (K,), m, of points (K, 3) from the nearest surface at times t (K,), s; infinite without bodies."""
+        centers, radii = self.at(t)
+        return (np.linalg.norm(points[:, None] - centers, axis=-1) - radii).min(axis=1, initial=np.inf)
+
+    def planes(self, points: np.ndarray, t: np.ndarray, most: int) -> np.ndarray:
+        """Half-spaces n x >= b (K, most, 4) that part points (K, 3) at times t (K,), s, from the nearest balls.
+
+        Zeros where there are fewer.
+        """
+        centers, radii = self.at(t)
+        away = points[:, None] - centers
+        length = np.linalg.norm(away, axis=-1)
+        normals = np.where(length[..., None] > 1e-6, away / np.maximum(length, 1e-6)[..., None], [0.0, 0.0, 1.0])
+        offsets = (normals * centers).sum(-1) + radii
+        found, order = np.zeros((len(points), most, 4)), np.argsort(length - radii, axis=1)[:, :most]
+        rows = np.arange(len(points))[:, None]
+        found[:, : order.shape[1], :3], found[:, : order.shape[1], 3] = normals[rows, order], offsets[rows, order]
+        return found
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Which of some points (R, 3) belong to the balls where they are now, (R,) bool."""
+        away = np.linalg.norm(points[:, None] - self.centers, axis=-1) - self.radii
+        return (away <= BESIDE).any(axis=1)
+
+
+class Movers(Protocol):
+    """What a vehicle knows of moving bodies."""
+
+    def observe(self, scan: Scan, seen: SeenMap, t: float) -> np.ndarray:
+        """Take a scan at time t, s, before the map does. Returns which rays the map may have, (R,) bool."""
+        ...
+
+    def note(self, seen: SeenMap, changed: np.ndarray) -> None:
+        """Cells of the map have changed, given by flat indices."""
+        ...
+
+    def now(self, t: float) -> Moving:
+        """The bodies at time t, s."""
+        ...
+
+
+def nothing() -> Moving:
+    """No bodies."""
+    return Moving(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
+
+class Unaware:
+    """All bodies count as at rest."""
+
+    def observe(self, scan: Scan, seen: SeenMap, t: float) -> np.ndarray:
+        """See `Movers`."""
+        return np.ones(len(scan.distances), bool)
+
+    def note(self, seen: SeenMap, changed: np.ndarray) -> None:
+        """See `Movers`."""
+
+    def now(self, t: float) -> Moving:
+        """See `Movers`."""
+        return nothing()
+
+
+@dataclass
+class Known:
+    """The places and velocities of all moving bodies of a world are known, as balls around them."""
+
+    world: World
+
+    def observe(self, scan: Scan, seen: SeenMap, t: float) -> np.ndarray:
+        """See `Movers`."""
+        ended = np.isfinite(scan.distances)
+        keep = np.ones(len(ended), bool)
+        keep[ended] = ~self.now(t).holds(returns(scan)[ended])
+        return keep
+
+    def note(self, seen: SeenMap, changed: np.ndarray) -> None:
+        """See `Movers`."""
+
+    def now(self, t: float) -> Moving:
+        """See `Movers`."""
+        moves = (self.world.velocities != 0).any(axis=1)
+        boxes, v = self.world.boxes[moves], self.world.velocities[moves]
+        return Moving(boxes[:, :3] + t * v, v, boxes[:, 15] + np.linalg.norm(boxes[:, 12:15], axis=1))
+
+
+@dataclass(eq=False)
+class Track:
+    """A body that is followed.
+
+    Args:
+        center, velocity, radius: (3,), m, (3,), m/s, and m.
+        last, scans: time of the last scan with it, s, and the number of scans with it.
+        origin, began: where and when it was at the last look whether it moves, m and s.
+    """
+
+    center: np.ndarray
+    velocity: np.ndarray
+    radius: float
+    last: float
+    origin: np.ndarray
+    began: float
+    scans: int = 1
+
+    def take(self, center: np.ndarray, t: float) -> None:
+        """It is seen at a centre (3,), m, at time t, s."""
+        dt = max(t - self.last, 1e-3)
+        off = center - self.center - dt * self.velocity
+        self.center = center - (1.0 - PLACE) * off
+        if self.scans < YOUNG:
+            self.velocity = (self.center - self.origin) / (t - self.began + SETTLE)
+        else:
+            self.velocity = self.velocity + SPEED / dt * off
+        self.scans, self.last = self.scans + 1, t
+
+
+@dataclass
+class Tracks:
+    """Bodies that appear where space has been seen to be free, followed from scan to scan.
+
+    A body is a cluster of returns from free cells, away from surfaces in cells that never were free. Its centre lies
+    behind its nearest return, at the depth of half its width across the line of sight. An alpha-beta filter estimates
+    its place and velocity, which at first is the mean since it has appeared. Until it has been seen for some scans, and
+    while it moves, its returns stay out of the map; a body that turns out to be at rest goes into it.
+
+    Args:
+        pitch: angle between two rays, rad: a body may be wider than its returns by that.
+    """
+
+    pitch: float
+    tracks: list[Track] = field(default_factory=list)
+    _was_free: np.ndarray | None = None  # (cells,) bool
+
+    def observe(self, scan: Scan, seen: SeenMap, t: float) -> np.ndarray:
+        """See `Movers`."""
+        keep, points = np.ones(len(scan.distances), bool), returns(scan)
+        rays = np.flatnonzero(np.isfinite(scan.distances))
+        fresh = rays[self._fresh(seen, points[rays])]
+        claimed: set[int] = set()
+        for members in clusters(points[fresh]):
+            self._follow(points[fresh[members]], scan.origin, t, claimed)
+        self.tracks = [track for track in self.tracks if t - track.last <= LOST and not self._rests(track, seen, t)]
+        keep[rays] = ~self.now(t).holds(points[rays])
+        return keep
+
+    def _rests(self, track: Track, seen: SeenMap, t: float) -> bool:
+        """Whether a body has stayed where it was; its cells are then those of a surface."""
+        if track.scans % YOUNG or track.last < t:
+            return False
+        if np.linalg.norm(track.center - track.origin) > STAYS:
+            track.origin, track.began = track.center, t
+            return False
+        assert self._was_free is not None
+        low, high = (seen.cell(track.center + side * (track.radius + BESIDE)) for side in (-1.0, 1.0))
+        self._was_free.reshape(seen.shape)[tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))] = False
+        return True
+
+    def note(self, seen: SeenMap, changed: np.ndarray) -> None:
+        """See `Movers`."""
+        was_free = (seen.state == FREE).ravel() if self._was_free is None else self._was_free
+        was_free[changed[seen.state.ravel()[changed] == FREE]] = True
+        self._was_free = was_free
+
+    def now(self, t: float) -> Moving:
+        """See `Movers`."""
+        if not self.tracks:
+            return nothing()
+        v = np.array([track.velocity for track in self.tracks])
+        age = np.array([t - track.last for track in self.tracks])
+        centers = np.array([track.center for track in self.tracks]) + age[:, None] * v
+        return Moving(centers, v, np.array([track.radius for track in self.tracks]), GROWTH)
+
+    def _fresh(self, seen: SeenMap, points: np.ndarray) -> np.ndarray:
+        """Which points (R, 3) lie in free cells, not beside occupied ones that never were free, (R,) bool."""
+        cells = np.floor((points - seen.corner) / seen.resolution).astype(np.int64)
+        found = np.atleast_1d(((cells >= 1) & (cells < np.array(seen.shape) - 1)).all(axis=1))
+        if self._was_free is None:
+            return np.zeros(len(points), bool)
+        flat = np.atleast_1d(np.ravel_multi_index(tuple(cells[found].T), seen.shape))
+        was, state = self._was_free, seen.state.ravel()
+        good = np.atleast_1d(was[flat] & (state[flat] == FREE))
+        at = flat[good]
+        steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+        around = at[:, None] + steps @ np.array([seen.shape[1] * seen.shape[2], seen.shape[2], 1])
+        good[good] = ~((state[around] == OCCUPIED) & ~was[around]).any(axis=1)
+        found[found] = good
+        return found
+
+    def _follow(self, points: np.ndarray, origin: np.ndarray, t: float, claimed: set[int]) -> None:
+        """A cluster of returns (R, 3) continues the track that expects it, or begins one."""
+        center, radius = seen_ball(points, origin, self.pitch)
+        near = [(np.linalg.norm(track.center + (t - track.last) * track.velocity - center), i)
+                for i, track in enumerate(self.tracks) if i not in claimed]  # fmt: skip
+        off, i = min(near, default=(np.inf, -1))
+        if off > GATE:
+            claimed.add(len(self.tracks))
+            self.tracks.append(Track(center, np.zeros(3), radius, t, center, t))
+            return
+        claimed.add(i)
+        track = self.tracks[i]
+        if radius < track.radius:  # it is seen in part, or from farther away
+            center = center + (track.radius - radius) * unit(center - origin)
+        track.take(center, t)
+        track.radius = max(0.98 * track.radius, radius)
+
+
+def returns(scan: Scan) -> np.ndarray:
+    """Where the rays of a scan ended, (R, 3), m; anything where nothing came back."""
+    return scan.origin + np.where(np.isfinite(scan.distances), scan.distances, 0.0)[:, None] * scan.directions
+
+
+def clusters(points: np.ndarray) -> list[np.ndarray]:
+    """The indices of the points (R, 3) of each cluster: of cubes of `JOINED` that touch."""
+    if len(points) == 0:
+        return []
+    cubes = np.floor((points - points.min(axis=0)) / JOINED).astype(int)
+    grid = np.zeros(cubes.max(axis=0) + 1, bool)
+    grid[tuple(cubes.T)] = True
+    names, count = label(grid, np.ones((3, 3, 3)))
+    own = names[tuple(cubes.T)]
+    return [rows for rows in (np.flatnonzero(own == n + 1) for n in range(count)) if len(rows) >= LEAST]
+
+
+def seen_ball(points: np.ndarray, origin: np.ndarray, pitch: float) -> tuple[np.ndarray, float]:
+    """Centre (3,) and radius, m, of a ball whose near side gave the returns (R, 3), seen from `origin` (3,)."""
+    line = unit(points.mean(axis=0) - origin)
+    along = (points - origin) @ line
+    across = points - origin - along[:, None] * line
+    middle = 0.5 * (across.min(axis=0) + across.max(axis=0))
+    middle -= (middle @ line) * line
+    radius = float(np.linalg.norm(across - middle, axis=1).max() + 0.5 * pitch * along.min())
+    return origin + middle + (along.min() + radius) * line, radius
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    """A vector (3,) at length 1."""
+    return v / max(float(np.linalg.norm(v)), 1e-9)
