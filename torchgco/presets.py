@@ -13,7 +13,6 @@ from torchgco.base.errors import InputError, shown
 from torchgco.baselines import CasADiSolver, GuidedCasADi, Hold, IteratedMPPI
 from torchgco.guidance.gco import GCO
 from torchgco.guidance.mppi import MPPI
-from torchgco.maps.field import BoundField
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search import (
@@ -37,7 +36,6 @@ from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.interior import InteriorPoint
 
 Space = Problem | int
-SHORT = 100  # iterations of the interior point among maps
 
 # Turns, half turns, both controls, one control: initial offsets of a vehicle with two controls.
 OFFSETS = (
@@ -52,7 +50,7 @@ def gco(space: Space) -> Restarts:
     closer = _closer(proposals.follow[0])
     known = replace(proposals, when="unproposed", roadmaps=(), relax_top=None)
     rough = Refine(top=4, rounds=4, violation=1e-2, cut=0.3, needed=True)
-    plane, among_maps = _in_the_plane(space), Converge(InteriorPoint(max_iterations=SHORT), "mapped")
+    plane = _in_the_plane(space)
     followed_closer = replace(known, follow=(closer,))
     if not plane:  # a costly problem: repairing candidates that cut deep into an obstacle is worth its time
         followed_closer = replace(followed_closer, refine=rough, max_penetration=0.5)
@@ -76,15 +74,14 @@ def gco(space: Space) -> Restarts:
             followed_closer,
             FromProposal(),
             IntoGoal(),
-            among_maps,
             thorough,
             FromProposal(),
             FromSamples("unproposed"),
             samples,
             IntoGoal(),
-            among_maps,
+            Converge(when="mapped"),
             _finish(space),
-            _clear_chords(space),
+            ClearChords(),
             Converge(),
             Starts(),
         ),
@@ -99,7 +96,6 @@ def gco_fast(space: Space) -> Restarts:
     one = replace(proposals, num_paths=1, follow=(follow,), relax_iterations=0, relax_top=None, refine=Refine())
     closer = replace(one, when="unproposed", roadmaps=(), follow=(_closer(follow),))
     guidance = replace(guidance, sampler=replace(guidance.sampler, samples=64, rounds=10))
-    among_maps = Converge(InteriorPoint(max_iterations=SHORT), "mapped")
     return Restarts(
         local=replace(_local(space), guidance=guidance),
         passes=(
@@ -112,9 +108,9 @@ def gco_fast(space: Space) -> Restarts:
             IntoGoal(),
             FromSamples("unproposed"),
             IntoGoal(),
-            among_maps,
+            Converge(when="mapped"),
             _finish(space),
-            _clear_chords(space),
+            ClearChords(),
             Converge(),
         ),
     )
@@ -300,12 +296,6 @@ def _finish(space: Space) -> Finish:
     local = _local(space)
     inner = replace(local.inner, max_iterations=200, damp_below=0.125)
     return Finish(replace(local, inner=inner, max_outer_iterations=100, stalled_growth=10.0, patience=8))
-
-
-def _clear_chords(space: Space) -> ClearChords:
-    """Among maps, where solves that will succeed take tens of iterations, others end soon."""
-    mapped = isinstance(space, Problem) and any(isinstance(part, BoundField) for part in space.constraints)
-    return ClearChords(solver=InteriorPoint(max_iterations=SHORT)) if mapped else ClearChords()
 
 
 def _printed_sampler(space: Space) -> MPPI:

@@ -21,7 +21,6 @@ from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.state import Iterate, SolveEnd
 
-NEAR = 10.0  # tolerances of the violation at which a trajectory in a map is nearly feasible
 WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
 
 
@@ -34,9 +33,9 @@ class Converge:
     Args:
         solver: of these solves.
         when: "first": problems without obstacles, from the given guess; by AL-iLQR where that fails. "mapped": those
-            with maps whose best trajectory is nearly feasible and not yet solved as tightly, from there: a map has one
-            row per knot, along which AL-iLQR takes many short steps. "last": all that are not yet solved as tightly,
-            from the best trajectory; where that leads to none that is feasible, from the given guess.
+            with maps where a limit has ended the solve of the best trajectory, from there: a map has one row per knot,
+            along which AL-iLQR takes many short steps. "last": all that are not yet solved as tightly, from the best
+            trajectory; where that leads to none that is feasible, from the given guess.
 
     Raises:
         InputError: a field out of its range.
@@ -57,9 +56,7 @@ class Converge:
             self._tighten(search)
         elif self.when == "mapped":
             if any(isinstance(part, BoundField) for part in problem.geometric):
-                near = search.best.end.best.violation <= NEAR * search.solver.violation_tolerance
-                rows = _unsolved(search)
-                self._continue(search, rows[near[rows]])
+                self._continue(search, search.best.limited)
         elif self.begins(problem) and not search.begun:
             search.begin(self.solver.solved(search.call))
             if search.record is not None:

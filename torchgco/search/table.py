@@ -23,7 +23,7 @@ PROBLEMS = {
 
 CONVERGED = {
     "first": "all, where there are no obstacles",
-    "mapped": "nearly feasible in a map, not solved as tightly yet",
+    "mapped": "in maps, where a limit has ended the solve",
     "last": "not solved as tightly yet",
 }
 
