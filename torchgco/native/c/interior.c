@@ -170,7 +170,8 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     errors(t, &dual, &primal, &scale_z);
     *error = most(most(dual, primal), complementarity(t, SET(0.0)) * scale_z);
     I ended = running & ~running, astray = running & k->watching & ~finite(*error);
-    I small = ~k->restoring & (*error <= SET(how->tolerance)) & (primal <= SET(how->violation));
+    I small = (*error <= most(SET(how->tolerance), SET(how->rounding))) & (primal <= SET(how->violation));
+    small &= ~k->restoring; /* no step that can't be taken matters there */
     if (any(astray)) go_back(t, k, astray);
     for (int l = 0; l < LANES; l++) {
         if (!running[l] || astray[l]) continue;
@@ -195,7 +196,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
             status[l] = small[l] ? CONVERGED : NOT_POSITIVE_DEFINITE;
             ended[l] = -1;
         }
-    V tau = most(SET(how->boundary), SET(1.0) - t->mu);
+    V tau = least(most(SET(how->boundary), SET(1.0) - t->mu), SET(how->closest));
     I won = search(t, k, moving, tau);
     k->made += tgco_truth(running);
     /* Where only short steps are accepted, the step reaches further than the model: more curvature shortens it. */
