@@ -23,7 +23,7 @@ EXACT, USUAL = "gco_exact", "gco"
 WANTED = 1e-8  # of violation and KKT residual
 HEAD = (
     "set", "n", "violation <= 1e-8", "KKT residual <= 1e-8", "both", "largest KKT residual of these",
-    "time of `gco`, median of families", "of all families together",
+    "times the time of `gco`, median of families", "of all families together",
 )  # fmt: skip
 
 
