@@ -73,6 +73,7 @@ oracle: $(RUNTIME)
 general: $(PEERS)
 	$(BIN)/python -m benchmarks.families.general_peers
 	$(BIN)/python -m benchmarks.families.general --write --restart 3 $(ARGS)
+	$(BIN)/python -m benchmarks.families.general_exact --write
 
 maps: $(RUNTIME)
 	$(BIN)/python -m benchmarks.families.maps --write $(ARGS)

@@ -12,6 +12,7 @@ import torchgco
 from tests.problems import planar_batch
 from torchgco import InputError, Problem, QuadraticCost, judge, presets, solve
 from torchgco.presets import PRESETS
+from torchgco.solvers.interior import InteriorPoint
 
 MODELS = {"planar": (2, "planar_trap"), "quadrotor": (3, "forest"), "unicycle": (2, "yard")}
 
@@ -97,6 +98,16 @@ def test_the_most_thorough_preset_has_the_rows_of_the_default_and_more() -> None
         begin, end = usual.passes[:-4], (*usual.passes[-4:-1], replace(usual.passes[-1], when="all"))
         assert more.local == usual.local and len(more.passes) > len(usual.passes)
         assert more.passes[: len(begin)] == begin and more.passes[-4:] == end
+
+
+def test_the_exact_preset_has_the_rows_of_the_default_with_tighter_ends() -> None:
+    for space in (2, 3):
+        usual, exact = presets.gco(space), presets.gco_exact(space)
+        assert exact.local == usual.local and len(exact.passes) == len(usual.passes)
+        tight = {type(row).__name__ for row, old in zip(exact.passes, usual.passes, strict=True) if row != old}
+        assert tight == {"Converge", "ClearChords", "Starts"}
+        for row, old in zip(exact.passes, usual.passes, strict=True):
+            assert row == old or row == replace(old, solver=InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9))
 
 
 def test_a_problem_without_a_position_gets_the_planar_settings() -> None:

@@ -131,6 +131,19 @@ def gco_max(space: Space) -> Restarts:
     return replace(solver, passes=(*begin, chords, *more, finish, chords, converge, replace(starts, when="all")))
 
 
+def gco_exact(space: Space) -> Restarts:
+    """`gco` with its last steps taken to a violation and KKT residual of 1e-8; it needs native kernels.
+
+    The tolerance of the interior point is smaller: it counts in units of the cost's steepest slope or curvature, while
+    a residual is a share of the terms that cancel in a control's slope, which may be far smaller.
+    """
+    solver, exact = gco(space), InteriorPoint(tolerance=1e-12, violation_tolerance=1e-9)
+    ends = Converge | ClearChords | Starts
+    return replace(
+        solver, passes=tuple(replace(row, solver=exact) if isinstance(row, ends) else row for row in solver.passes)
+    )
+
+
 def gco_paper(space: Space) -> AugmentedLagrangian:
     """The paper's method: Algorithms 1 to 5 with Table 4 (in the plane: Table A3)."""
     return replace(al_ilqr(space), guidance=GCO(_printed_sampler(space)))
@@ -200,6 +213,7 @@ PRESETS: dict[str, Callable[[Space], Solver]] = {
         gco,
         gco_fast,
         gco_max,
+        gco_exact,
         gco_paper,
         al_ilqr,
         ilqr,

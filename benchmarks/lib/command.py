@@ -30,17 +30,25 @@ class Command:
 
     Args:
         doc: the docstring of its module, see `parser_of`.
-        name: of its page below results, and of the marks there.
+        name: of its page below results.
         text: the table in Markdown, and what follows it; called with the options by name.
         how: number of problems, seed, kind of time; the names of options in braces give their values.
         notes: further parts of the line above the table; "CasADi" gets its version.
+        mark: name of the marks there; None: that of the page.
         options: default and help of each, and `choices` as a third; a sequence takes several values.
     """
 
     def __init__(
-        self, doc: str | None, name: str, text: Callable[..., str], how: str, *notes: str, **options: tuple[Any, ...]
+        self,
+        doc: str | None,
+        name: str,
+        text: Callable[..., str],
+        how: str,
+        *notes: str,
+        mark: str | None = None,
+        **options: tuple[Any, ...],
     ) -> None:
-        self.name, self.text, self.how, self.notes = name, text, how, notes
+        self.name, self.text, self.how, self.notes, self.mark = name, text, how, notes, mark or name
         self.parser = parser_of(doc, f"results/{name}.md")
         for option, (default, words, *choices) in options.items():
             several = isinstance(default, (list, tuple))
@@ -60,5 +68,5 @@ class Command:
         if write:
             said = {key: ", ".join(map(str, v)) if isinstance(v, (list, tuple)) else v for key, v in asked.items()}
             head = page.measured(self.how.format(**said), *self.notes)
-            page.put(RESULTS / f"{self.name}.md", self.name, f"{head}\n\n{text}")
+            page.put(RESULTS / f"{self.name}.md", self.mark, f"{head}\n\n{text}")
         return 0

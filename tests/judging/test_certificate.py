@@ -186,15 +186,19 @@ def test_a_commanded_velocity_has_no_acceleration() -> None:
     assert float(certified(problem, U).clearance) == pytest.approx(0.1)
 
 
-def terms(problem: Problem, X: torch.Tensor, U: torch.Tensor, h: float = 1e-6) -> np.ndarray:
-    """Sum (N, m) of the absolute terms of dJ/du_k: the stage's own, and one through each state of knot k + 1."""
+def terms(problem: Problem, X: torch.Tensor, U: torch.Tensor, total=None, h: float = 1e-6) -> np.ndarray:
+    """Sum (N, m) of the absolute terms of dJ/du_k: the stage's own, and one through each state of knot k + 1.
+
+    J is the cost, or another function `total` of X and U.
+    """
+    total = total or problem.cost.total
 
     def cost_of(k: int, x: torch.Tensor) -> float:
         """J with knot k at x and the same controls after it."""
         path = [*X[0, :k], x]
         for u in U[0, k:]:
             path.append(problem.dynamics.step(path[-1][None], u[None])[0])
-        return float(problem.cost.total(torch.stack(path)[None], U))
+        return float(total(torch.stack(path)[None], U))
 
     def central(f, z: torch.Tensor) -> np.ndarray:
         steps = h * torch.eye(len(z), dtype=z.dtype)
@@ -203,7 +207,7 @@ def terms(problem: Problem, X: torch.Tensor, U: torch.Tensor, h: float = 1e-6) -
     sizes = np.empty(U.shape[1:])
     for k in range(problem.N):
         put = lambda u, k=k: torch.cat((U[:, :k], u[None, None], U[:, k + 1 :]), dim=1)
-        own = central(lambda u, put=put: problem.cost.total(X, put(u))[0], U[0, k])
+        own = central(lambda u, put=put: total(X, put(u))[0], U[0, k])
         by_u = central(lambda u, k=k: problem.dynamics.step(X[:, k], u[None])[0], U[0, k])  # (n, m)
         by_x = central(lambda x, k=k: cost_of(k + 1, x), X[0, k + 1])
         sizes[k] = np.abs(own) + np.abs(by_x) @ np.abs(by_u)
@@ -245,6 +249,84 @@ def test_the_residual_is_that_of_finite_differences(batch) -> None:
     assert float(certify(problem, X, U).kkt_residual) == pytest.approx(expected, rel=1e-4)
 
 
+def given(problem: Problem, U: torch.Tensor, *multipliers: float) -> float:
+    """The residual with given multipliers, one per constraint with one row at one knot."""
+    X = open_loop(problem.dynamics, problem.x0, U)
+    lams = [
+        torch.full((1, *shape), lam, dtype=U.dtype) for lam, shape in zip(multipliers, problem.row_shapes, strict=True)
+    ]
+    return float(certify(problem, X, U, multipliers=lams).kkt_residual)
+
+
+def test_multipliers_that_are_given_are_tested() -> None:
+    def residual(u: float, lam: float, row: FunctionConstraint) -> float:
+        return given(integrator_problem([row]), torch.full((1, 1, 1), u, dtype=torch.float64), lam)
+
+    def below(limit: float) -> FunctionConstraint:
+        return FunctionConstraint(lambda x: x - limit, knots=[1])
+
+    # The Lagrangian's gradient is u + (u - 2 + lam): two terms.
+    assert residual(0.5, 1.0, below(0.5)) == pytest.approx(0.0, abs=1e-15)
+    assert residual(0.5, 0.9, below(0.5)) == pytest.approx(0.1 / (0.5 + 0.6))
+    assert residual(0.5, 1.0 + 1e-6, below(0.5)) == pytest.approx(1e-6, rel=1e-5)
+    assert residual(1.5, -1.0, below(1.5)) == pytest.approx(1.0 / (1.5 + 0.5))  # an inequality can't pull
+    # Cost 1.25 at u = 0.5; a row that is 0.1 away doesn't push, nor does one that is violated by as much.
+    cost = pytest.approx(1.0 * 0.1 / 1.25, rel=1e-5)
+    assert residual(0.5, 1.0, below(0.6)) == cost == residual(0.5, 1.0, below(0.4))
+    assert residual(0.5, 1e-9, below(0.5)) == pytest.approx(1.0 / 2.0, rel=1e-6)
+    wall = FunctionConstraint(lambda x: x - 1.5, sense="equality", knots=[1])
+    assert residual(1.5, -1.0, wall) == pytest.approx(0.0, abs=1e-15)
+    assert residual(1.5, 1.0, wall) > 0.1
+    endless = ControlBounds([-np.inf], [0.5])
+    problem, U = integrator_problem([endless]), torch.full((1, 1, 1), 0.5, dtype=torch.float64)
+    X = open_loop(problem.dynamics, problem.x0, U)
+    finite = torch.isfinite(problem.constraints[0].value(X, U))
+    lam = torch.where(finite, 1.0, 7.0).double()  # a bound at infinity has no push
+    assert float(certify(problem, X, U, multipliers=[lam]).kkt_residual) < 1e-15
+
+
+def test_the_residual_with_given_multipliers_is_that_of_finite_differences() -> None:
+    """Central differences of the Lagrangian through the rollout."""
+    problem, U = planar_batch(B=2, N=8)
+    draws = torch.Generator().manual_seed(1)
+    U = U + 0.5 * torch.randn(U.shape, generator=draws, dtype=torch.float64)
+    X = open_loop(problem.dynamics, problem.x0, U)
+    lams = [torch.rand(2, *shape, generator=draws, dtype=torch.float64) for shape in problem.row_shapes]
+    b = torch.tensor([1])
+    one, mine, x = problem.take(b), [lam[b] for lam in lams], U[b]
+
+    def lagrangian(Y: torch.Tensor, V: torch.Tensor) -> torch.Tensor:
+        parts = zip(one.constraints, mine, strict=True)
+        return one.cost.total(Y, V) + sum((lam * part.value(Y, V)).sum() for part, lam in parts)
+
+    def value(u: np.ndarray) -> float:
+        V = torch.from_numpy(u).view_as(x)
+        return float(lagrangian(open_loop(one.dynamics, one.x0, V), V))
+
+    u, h = x.flatten().numpy().copy(), 1e-6
+    slope = np.array([(value(u + h * e) - value(u - h * e)) / (2 * h) for e in np.eye(len(u))])
+    stationarity = (np.abs(slope.reshape(x.shape[1:])).max(0) / terms(one, X[b], x, lagrangian).max(0)).max()
+    products = [float((lam * part.value(X[b], x)).abs().max()) for part, lam in zip(one.constraints, mine, strict=True)]
+    complementarity = max(products) / float(one.cost.total(X[b], x) + 1e-6 * one.N * one.cost_unit)
+    assert stationarity > 1e-2 and complementarity > 1e-2
+    found = certify(problem, X, U, torch.tensor([False, True]), lams).kkt_residual
+    assert bool(found[0].isnan()) and float(found[1]) == pytest.approx(max(stationarity, complementarity), rel=1e-4)
+    none = [torch.zeros_like(lam) for lam in lams]
+    bare = (np.abs(slope_of(one, x)).max(0) / terms(one, X[b], x).max(0)).max()
+    assert float(certify(problem, X, U, multipliers=none).kkt_residual[1]) == pytest.approx(bare, rel=1e-4)
+
+
+def slope_of(problem: Problem, U: torch.Tensor, h: float = 1e-6) -> np.ndarray:
+    """dJ/dU (N, m) by central differences through the rollout."""
+
+    def cost(V: torch.Tensor) -> float:
+        return float(problem.cost.total(open_loop(problem.dynamics, problem.x0, V), V))
+
+    steps = h * torch.eye(U.numel(), dtype=U.dtype)
+    found = [(cost(U + e.view_as(U)) - cost(U - e.view_as(U))) / (2 * h) for e in steps]
+    return np.array(found).reshape(U.shape[1:])
+
+
 def test_only_requested_problems_are_certified_each_on_its_own() -> None:
     problem, U = planar_batch(B=3, N=10)
     U = U.clone()
@@ -271,5 +353,10 @@ def test_bad_calls_are_named() -> None:
         certify(problem, X[:, 1:], U)
     with pytest.raises(InputError, match="asked: expected"):
         certify(problem, X, U, torch.tensor([True]))
+    lams = [torch.zeros(2, *shape, dtype=torch.float64) for shape in problem.row_shapes]
+    with pytest.raises(InputError, match="multipliers: expected 2 tensors, one per constraint"):
+        certify(problem, X, U, multipliers=lams[:1])
+    with pytest.raises(InputError, match=r"multipliers\[1\]: expected"):
+        certify(problem, X, U, multipliers=[lams[0], lams[1][:1]])
     with pytest.raises(InputError, match="float64"):
         certify(problem.cast(torch.float32), X.float(), U.float())

@@ -26,6 +26,7 @@ from torchgco import (
     Spheres,
     StateBounds,
     Status,
+    certify,
 )
 from torchgco.base.tree import take
 from torchgco.baselines import CasADiSolver
@@ -302,6 +303,32 @@ def test_all_that_a_problem_may_have_at_the_cost_of_ipopt() -> None:
     torch.testing.assert_close(solution.cost, continued.cost, rtol=1e-6, atol=0)
     binding = [float(part.value(solution.X, solution.U).max()) > -1e-6 for part in problem.constraints]
     assert all(binding[:5])  # every kind of rows binds somewhere
+
+
+@pytest.mark.parametrize("make", [everything, flights])
+def test_eight_digits_on_request(make) -> None:
+    """By the certificate, which tests the returned multipliers; it refuses others, and another trajectory."""
+    problem = make()
+    solution = solved(problem, tolerance=1e-12, violation_tolerance=1e-9)
+    assert_solved(problem, solution, 1e-9)
+    X, U, lams = solution.X, solution.U, solution.multipliers.lam
+    usual = solved(problem)
+    assert bool((solution.iterations - usual.iterations <= 12).all())
+
+    def residual(U: Tensor, lams: tuple[Tensor, ...]) -> Tensor:
+        return certify(problem, open_loop(problem.dynamics, problem.x0, U), U, multipliers=lams).kkt_residual
+
+    assert float(certify(problem, X, U, multipliers=lams).kkt_residual.max()) <= 1e-9
+    assert float(residual(U * (1 + 1e-5), lams).min()) > 1e-7
+    assert float(residual(U, tuple(1.001 * lam for lam in lams)).min()) > 1e-7
+    assert float(residual(U, tuple(0.0 * lam for lam in lams)).min()) > 1e-4
+
+
+def test_rounding_ends_a_solve_whose_tolerance_is_out_of_reach() -> None:
+    problem = flights()
+    best, usual = solved(problem, tolerance=1e-17, violation_tolerance=1e-9), solved(problem)
+    assert_solved(problem, best, 1e-9)
+    assert bool((best.iterations - usual.iterations <= 20).all())
 
 
 def test_flights_at_the_cost_of_ipopt() -> None:

@@ -2,12 +2,12 @@
 keeps its bounds and is a stationary point, or by how much it fails.
 
 The problem's own functions (step, cost, rows) are used, and no solver code: derivatives come from autograd, multipliers
-from a separate least-squares fit. docs/words.md defines the terms.
+from a separate least-squares fit, or from anywhere: those given are tested. docs/words.md defines the terms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from torchgco.base.autodiff import gradients
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import check_shape, check_tensor, computing_on
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
@@ -33,6 +33,7 @@ from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem, check_problem
 
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
+LEAST_COST = 1e-6  # the cost counts as at least this share of the cost of staying at the start
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
 
 
@@ -55,11 +56,20 @@ class Certificate:
     # multipliers (inequalities: at least 0) that make it smallest in the least-squares sense, as a share of the largest
     # terms that cancel in the gradient of J_var with respect to the same control: no unit of cost or control changes
     # it. Near 0 it proves a stationary point to first order, not a minimum, and says nothing about rows that are
-    # violated.
+    # violated. Of multipliers that are given: the larger of two numbers without units, which are those of IPOPT's end
+    # test (Waechter and Biegler 2006, equation 5) with scales of the trajectory instead of fixed ones. The first is the
+    # largest component of the Lagrangian's gradient, as a share of the largest terms that cancel in it with respect to
+    # the same control; the second the largest product of a multiplier and its row, as a share of the cost.
     kkt_residual: Tensor
 
 
-def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None) -> Certificate:
+def certify(
+    problem: Problem,
+    X: Tensor,
+    U: Tensor,
+    asked: Tensor | None = None,
+    multipliers: Sequence[Tensor] | None = None,
+) -> Certificate:
     """Certify trajectories X (B, N+1, n), U (B, N, m).
 
     The clearance includes collisions between knots that are both outside an obstacle. With Euler steps, positions and
@@ -70,15 +80,19 @@ def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None)
     known field (`integrator="none"`, a class that overrides `step` alone) have no path between knots; distances are
     then those of the chord. Geometric constraints other than obstacles count at their knots only, as violations.
 
-    Rows that may have a multiplier are equalities, and inequalities with a slack of at most 1e-3 (m for obstacles).
+    Rows that may have a fitted multiplier are equalities, and inequalities with a slack of at most 1e-3 (m for
+    obstacles). A test to many digits needs multipliers that are given: those of an interior point push a little from
+    far rows, too.
 
     Args:
         problem: the planning problems, float64.
         X, U: the trajectories that a solver returned.
         asked: (B,) bool, the problems to certify; NaN for the others. None: all.
+        multipliers: (B, K, p) of each constraint, such as `solution.multipliers.lam`; wherever they come from, they are
+            tested. Below 0 they count as 0, but for equalities. None: fitted.
 
     Raises:
-        InputError: X, U or asked don't fit the problem, or the problem isn't float64.
+        InputError: X, U, asked or multipliers don't fit the problem, or the problem isn't float64.
     """
     check_problem(problem)
     problem.check_controls(U, "U")
@@ -90,19 +104,34 @@ def certify(problem: Problem, X: Tensor, U: Tensor, asked: Tensor | None = None)
     check_shape(asked, (problem.B,), "asked")
     if asked.dtype != torch.bool:
         raise InputError("asked", "a tensor of bool", asked.dtype)
+    if multipliers is not None:
+        _check_multipliers(problem, multipliers)
     with computing_on(problem.x0.device):
-        return _certified(problem, X, U, asked)
+        return _certified(problem, X, U, asked, multipliers)
 
 
-def _certified(problem: Problem, X: Tensor, U: Tensor, asked: Tensor) -> Certificate:
+def _check_multipliers(problem: Problem, multipliers: Sequence[Tensor]) -> None:
+    count = len(problem.constraints)
+    if not isinstance(multipliers, list | tuple) or len(multipliers) != count:
+        raise InputError("multipliers", f"{count} tensors, one per constraint", shown(multipliers))
+    for i, (lam, shape) in enumerate(zip(multipliers, problem.row_shapes, strict=True)):
+        check_tensor(lam, f"multipliers[{i}]", problem.x0)
+        check_shape(lam, (problem.B, *shape), f"multipliers[{i}]")
+
+
+def _certified(
+    problem: Problem, X: Tensor, U: Tensor, asked: Tensor, multipliers: Sequence[Tensor] | None
+) -> Certificate:
     columns = torch.full((4, problem.B), torch.nan, dtype=X.dtype, device=X.device)
     finite = torch.isfinite(X).flatten(1).all(-1) & torch.isfinite(U).flatten(1).all(-1)
     for b in (asked & finite).nonzero().flatten():
         # One at a time: no number depends on the other problems, and memory stays that of one problem.
         row = b.view(1)
         part, x, u = within_horizons(problem.take(row)), X[row], U[row]
+        lams = None if multipliers is None else [lam[row] for lam in multipliers]
+        kkt = _fitted_kkt(part, x, u) if lams is None else _given_kkt(part, x, u, lams)
         columns[:, b] = torch.stack(
-            (_dynamics_residual(part, x, u), _clearance(part, x, u), _bound_violation(part, x, u), _kkt(part, x, u))
+            (_dynamics_residual(part, x, u), _clearance(part, x, u), _bound_violation(part, x, u), kkt)
         )
     return Certificate(*columns)
 
@@ -208,17 +237,50 @@ def _acceleration(problem: Problem, X: Tensor, U: Tensor, at: Tensor) -> Tensor:
     return (slopes * problem.along.field(X, U)).sum(-1).mT
 
 
-def _kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+def _fitted_kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     cost = _local(problem.cost.total, X, U)
     active = _active_rows(problem, X, U)
     gX, gU = (torch.cat([cost[i], *(rows[i] for _, rows in active)]) for i in (0, 1))
     reduced, terms, start = _reduced(problem, X, U, gX, gU)
-    free = torch.zeros_like(X[0, 0], dtype=torch.bool) if problem.free_start is None else problem.free_start[0]
+    free = _free(problem)
     slopes = torch.cat((reduced.flatten(1), start[0][:, free]), dim=1).cpu().numpy()
     senses = [equality for equality, (rows, _) in active for _ in rows]
-    rest = X.new_tensor(_fit(slopes[0], slopes[1:], np.array(senses, dtype=bool))).abs()
-    rest = torch.cat((rest[: U[0].numel()].view_as(U[0]).amax(0), rest[U[0].numel() :]))
-    scale = torch.cat((terms.amax(0), start[1][free]))
+    rest = X.new_tensor(_fit(slopes[0], slopes[1:], np.array(senses, dtype=bool)))
+    return _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])))
+
+
+def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]) -> Tensor:
+    rows = [constraint.value(X, U) for constraint in problem.constraints]
+    lams = [
+        torch.where(torch.isfinite(c), lam if constraint.sense == "equality" else lam.clamp(min=0.0), 0.0)
+        for constraint, lam, c in zip(problem.constraints, multipliers, rows, strict=True)
+    ]  # a bound at infinity pushes nobody
+
+    def lagrangian(x: Tensor, u: Tensor) -> Tensor:
+        parts = zip(problem.constraints, lams, strict=True)
+        pushes = (torch.where(lam != 0, lam * c.value(x, u), 0.0).flatten(1).sum(-1) for c, lam in parts)
+        return sum(pushes, problem.cost.total(x, u))
+
+    reduced, terms, start = _reduced(problem, X, U, *_local(lagrangian, X, U))
+    free = _free(problem)
+    rest = torch.cat((reduced[0].flatten(), start[0][0, free]))
+    unfit = _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])))
+    cost = (problem.cost.total(X, U) - problem.cost_scale.constant)[0].abs()
+    cost = cost + LEAST_COST * problem.N * problem.cost_unit[0]
+    products = [torch.where(lam != 0, lam * c, 0.0).abs().flatten() for lam, c in zip(lams, rows, strict=True)]
+    return torch.cat((unfit.view(1), *(product / cost for product in products))).amax()
+
+
+def _free(problem: Problem) -> Tensor:
+    """Which components of the start are free, (n,) bool."""
+    return torch.zeros_like(problem.x0[0], dtype=torch.bool) if problem.free_start is None else problem.free_start[0]
+
+
+def _share(rest: Tensor, U: Tensor, scale: Tensor) -> Tensor:
+    """The largest component of a gradient by U (N, m) and what is free in the start, (N m + f,), as a share of those
+    of `scale` (m + f,)."""
+    rest = rest.abs()
+    rest = torch.cat((rest[: U.numel()].view_as(U).amax(0), rest[U.numel() :]))
     scale = torch.maximum(scale, NEGLIGIBLE * scale.amax())
     return torch.where(rest > 0, rest / scale, 0.0).amax()
 

@@ -35,7 +35,7 @@ KNOWN: dict[str, tuple[str, Dash]] = {
     "gco": (PALETTE[0], DASHES[0]), "al_ilqr": (PALETTE[1], DASHES[1]), "gco_paper": (PALETTE[3], DASHES[2]),
     "fatrop": (PALETTE[2], DASHES[3]), "mppi": (PALETTE[4], DASHES[3]), "ilqr": (PALETTE[5], DASHES[4]),
     "hold": ("#7F7F7F", DASHES[4]), "ipopt": ("#882255", DASHES[5]), "gco_fast": ("#44AA99", DASHES[1]),
-    "interior_point": ("#AA4499", DASHES[1]),
+    "interior_point": ("#AA4499", DASHES[1]), "gco_exact": ("#88CCEE", DASHES[2]),
     "gco_max": ("#332288", DASHES[2]), "multistart": ("#999933", DASHES[5]), "fatrop_guided": ("#117733", DASHES[2]),
 }  # fmt: skip
 INK, FAINT = "#333333", "#BBBBBB"

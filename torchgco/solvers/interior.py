@@ -35,7 +35,7 @@ PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a m
 # Waechter and Biegler (2006), in whose words these have the names in brackets; where no name is given, ours.
 FILTER: dict[str, Any] = {
     "push": 1e-2,  # least slack at the start, and how far guesses are moved inside of their bounds (kappa_1)
-    "boundary": 0.99,  # share of the way to where a slack is 0 (tau_min)
+    "boundary": 0.99, "closest": 1.0 - 1e-12,  # share of the way to where a slack is 0 (tau_min), and at most: above 0
     "central": 1e10,  # factor by which s z may leave mu (kappa_Sigma)
     "barrier_error": 10.0, "barrier_share": 0.2, "barrier_floor": 0.1,  # kappa_epsilon, kappa_mu; tolerance times this
     "usual_multiplier": 100.0, "largest_multiplier": 1e3,  # s_max; costates at the start are 0 where larger
@@ -52,6 +52,7 @@ FILTER: dict[str, Any] = {
     "soft_growth": 100.0, "soft_decay": 0.1,
     "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
     "shift_recovery": 1e-3, "forced_growth": 10.0, "restored": 0.9, "failures": 6,
+    "rounding": 1e-10, "idle": 3,  # an error below this that doesn't fall by half for so long is due to rounding
 }  # fmt: skip
 
 

@@ -38,6 +38,7 @@ static void begin(Barrier *t, Track *k, I of) {
     t->objective = tgco_choose(of, one, t->objective);
     k->last = tgco_choose(of, zero, k->last); k->forced = tgco_choose(of, zero, k->forced);
     k->made = tgco_choose(of, zero, k->made);
+    k->least = tgco_choose(of, SET(INFINITY), k->least);
     k->restoring &= ~of; k->watching &= ~of;
     t->soft = tgco_choose(of, SET(how->soft), t->soft);
     for (int l = 0; l < LANES; l++) if (of[l]) k->failures[l] = k->shortened[l] = 0;
@@ -148,6 +149,17 @@ static void resume(Barrier *t, Track *k) {
     settle(t, k, done, 0);
 }
 
+/* Whether lane l ends here. Tolerances below the usual rounding are met as well as the iterate can be, as the rollout of
+   its controls amplifies gaps: it goes on while the error falls, and ends above them where rounding keeps it there. */
+static int is_solved(const Barrier *t, Track *k, int l, double error, double primal) {
+    const Interior *how = t->how;
+    k->idle[l] = error <= 0.5 * k->least[l] ? 0 : k->idle[l] + 1;
+    if (error < k->least[l]) k->least[l] = error;
+    if (k->restoring[l] || !(primal <= how->violation)) return 0;
+    if (error <= how->tolerance) return how->tolerance >= how->rounding || error <= 2.0 * t->mu[l] || k->idle[l] >= 1;
+    return k->idle[l] >= how->idle && error <= how->rounding && error <= 2.0 * k->least[l];
+}
+
 /* One iteration of the lanes `running`; returns those that end, with their status. */
 static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     const Interior *how = t->how;
@@ -158,12 +170,14 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     errors(t, &dual, &primal, &scale_z);
     *error = most(most(dual, primal), complementarity(t, SET(0.0)) * scale_z);
     I ended = running & ~running, astray = running & k->watching & ~finite(*error);
+    I small = (*error <= most(SET(how->tolerance), SET(how->rounding))) & (primal <= SET(how->violation));
+    small &= ~k->restoring; /* no step that can't be taken matters there */
     if (any(astray)) go_back(t, k, astray);
     for (int l = 0; l < LANES; l++) {
         if (!running[l] || astray[l]) continue;
-        if (!k->restoring[l] && (*error)[l] <= how->tolerance && primal[l] <= how->violation) status[l] = CONVERGED;
+        if (is_solved(t, k, l, (*error)[l], primal[l])) status[l] = CONVERGED;
         else if (!((*error)[l] - (*error)[l] == 0)) status[l] = NON_FINITE;
-        else if (k->made[l] >= how->max_iterations) status[l] = MAX_ITERATIONS;
+        else if (k->made[l] >= how->max_iterations) status[l] = small[l] ? CONVERGED : MAX_ITERATIONS;
         else continue;
         ended[l] = -1;
     }
@@ -178,8 +192,11 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     astray = running & ~moving & k->watching;
     if (any(astray)) go_back(t, k, astray);
     for (int l = 0; l < LANES; l++)
-        if (running[l] && !moving[l] && !astray[l]) { status[l] = NOT_POSITIVE_DEFINITE; ended[l] = -1; }
-    V tau = most(SET(how->boundary), SET(1.0) - t->mu);
+        if (running[l] && !moving[l] && !astray[l]) {
+            status[l] = small[l] ? CONVERGED : NOT_POSITIVE_DEFINITE;
+            ended[l] = -1;
+        }
+    V tau = least(most(SET(how->boundary), SET(1.0) - t->mu), SET(how->closest));
     I won = search(t, k, moving, tau);
     k->made += tgco_truth(running);
     /* Where only short steps are accepted, the step reaches further than the model: more curvature shortens it. */
@@ -190,7 +207,8 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     t->soft = tgco_choose(won, most(SET(how->soft), SET(how->soft_decay) * t->soft), t->soft);
     residuals(t, t->c, t->s, t->r);
     for (int l = 0; l < LANES; l++) if (won[l] && !k->restoring[l] && k->forced[l] == 0) k->failures[l] = 0;
-    I lost = recover(t, k, moving & ~won);
+    for (int l = 0; l < LANES; l++) if (moving[l] && !won[l] && small[l]) { status[l] = CONVERGED; ended[l] = -1; }
+    I lost = recover(t, k, moving & ~won & ~small);
     for (int l = 0; l < LANES; l++) if (lost[l]) { status[l] = LINE_SEARCH_FAILED; ended[l] = -1; }
     resume(t, k);
     return ended;

@@ -7,6 +7,7 @@ typedef struct { double theta, phi; } Pair;
 /* What the globalisation remembers of each lane. */
 typedef struct {
     V theta, phi, highest, lowest, last, forced, made, entered, slope, alpha;
+    V least, idle; /* the smallest error of the end test so far, and the iterations since it fell by half */
     Pair filter[LANES][PAIRS];
     int pairs[LANES], failures[LANES], shortened[LANES], ahead[LANES];
     I restoring, crawls;
