@@ -10,7 +10,7 @@ import torch
 import torchgco
 from tests.golden.linear import LinearQuadratic, saddle
 from torchgco import Constraint, ControlBounds, FunctionConstraint, Polish, Solution, StateBounds, Status, certify
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 
 pytestmark = pytest.mark.usefixtures("seldom_solved")
 SIZES = [(1, 1, 1), (4, 2, 13)]  # n, m, N

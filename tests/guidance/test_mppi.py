@@ -13,9 +13,9 @@ from tests.reference.guidance import active_spheres, cpuf, stuck_knots
 from tests.reference.mppi import MppiSettings, mppi
 from torchgco import GCO, MPPI, InputError
 from torchgco.base.draws import DrawKey, standard_normal
+from torchgco.dynamics.rollout import open_loop
 from torchgco.guidance.mppi import Flight, Noise, draw, fly
 from torchgco.lagrangian.penalties import GuideRegion
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.solvers.caught import active_counts, caught_knots
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}

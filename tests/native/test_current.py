@@ -75,7 +75,7 @@ def same(problem: Problem, fresh: Problem) -> None:
     """Both problems have the same solution, and the native one is that of PyTorch's own rollout and cost."""
     one, other = torchgco.solve(problem), torchgco.solve(fresh)
     assert torch.equal(one.X, other.X) and torch.equal(one.cost, other.cost)
-    eager = torchgco.lagrangian.rollout.open_loop(fresh.dynamics, fresh.x0, one.U)
+    eager = torchgco.dynamics.rollout.open_loop(fresh.dynamics, fresh.x0, one.U)
     torch.testing.assert_close(one.X, eager, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(one.cost, fresh.cost.total(one.X, one.U), rtol=1e-12, atol=1e-12)
 
