@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated
 
 import torch
@@ -38,8 +38,6 @@ class GCO:
             it (not in the paper).
         sample_from_rest: sample around the cost's reference controls (the vehicle at rest), not around the caught
             trajectory (not in the paper).
-        single_contact_after: from this outer iteration on, a knot inside one obstacle counts as caught, too; None:
-            never, as in the paper.
 
     Raises:
         InputError: a field out of its range; on `suited`, a covariance that doesn't fit the controls.
@@ -50,7 +48,6 @@ class GCO:
     penalty_growth: Annotated[float, AtLeast(1)] = 4.84
     start_from_sample: bool = False
     sample_from_rest: bool = False
-    single_contact_after: Count | None = None
 
     def __post_init__(self) -> None:
         check_options(self, "gco")
@@ -74,7 +71,7 @@ class GCO:
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
         """CPUF for every problem: a region where it is caught, none elsewhere; or the sampled controls themselves."""
         assert penalty is not None
-        knots = caught_knots(problem, X, U, key.outer, self.single_contact_after)
+        knots = self.caught(problem, X, U, key)
         region = GuideRegion.inactive(X, penalty.weight * self.penalty_growth, penalty.position)
         plan, taken = U.clone(), torch.zeros_like(knots[:, 0])
         rows = knots.any(-1).nonzero().flatten()
@@ -90,6 +87,27 @@ class GCO:
             )
             put(region, rows[~taken[rows]], take(attracted, (~taken[rows]).nonzero().flatten()))
         return Advice(region, plan, taken)
+
+    def caught(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
+        """Knots (B, N+1) that lie inside two obstacles."""
+        return caught_knots(problem, X, U)
+
+
+@dataclass(frozen=True)
+class GCOAfterSearch(GCO):
+    """The same, by the rule of the search that made the trajectories: see `Solve.single_contact_after`."""
+
+    single_contact_after: Count | None = None
+
+    @classmethod
+    def of(cls, gco: GCO, single_contact_after: int | None) -> GCOAfterSearch:
+        """That of a guidance."""
+        own = {field.name: getattr(gco, field.name) for field in fields(GCO)}
+        return cls(**own, single_contact_after=single_contact_after)
+
+    def caught(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
+        """Also knots inside one obstacle, from some outer iteration on."""
+        return caught_knots(problem, X, U, key.outer, self.single_contact_after)
 
 
 def _radius(problem: Problem, X: Tensor) -> Tensor:
