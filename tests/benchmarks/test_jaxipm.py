@@ -13,7 +13,6 @@ from torchgco import Status
 from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.quality import violation
 
-pytestmark = pytest.mark.usefixtures("seldom_solved")
 NAMED = {scenario.name: scenario for scenario in SCENARIOS}
 # Of the first instance: by the published form of IPOPT at 1e-8.
 KNOWN = {

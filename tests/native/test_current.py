@@ -31,7 +31,6 @@ from torchgco.base.shapes import lead
 from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.native.identity import signature
 
-pytestmark = pytest.mark.usefixtures("seldom_solved")
 D = torch.float64
 N = 25
 X0 = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.1, 0.0]], dtype=D)
