@@ -75,7 +75,8 @@ def fly(
     """
     X = open_loop(problem.dynamics, problem.x0, U)
     write(problem, torch.where(torch.isfinite(X), X, problem.x0.unsqueeze(1)), U, folder, program)
-    command = [str(ENVIRONMENT / "bin" / "python"), str(WORKER), str(folder)]
+    # Isolated, as `import acados` would find this file beside the worker.
+    command = [str(ENVIRONMENT / "bin" / "python"), "-I", str(WORKER), str(folder)]
     done = subprocess.run(command + ([] if limit is None else [str(limit)]), capture_output=True, text=True)
     if done.returncode == -signal.SIGXCPU:
         raise TimeoutError(f"acados took longer than {limit} s")

@@ -64,7 +64,7 @@ def _acados() -> Any:
     if libraries not in os.environ.get("LD_LIBRARY_PATH", "").split(":"):
         # The loader reads this only when a process starts.
         os.environ["LD_LIBRARY_PATH"] = f"{libraries}:{os.environ.get('LD_LIBRARY_PATH', '')}".rstrip(":")
-        os.execv(sys.executable, [sys.executable, *sys.argv])
+        os.execv(sys.executable, [sys.executable, "-I", *sys.argv])  # isolated, as it began
     os.environ["ACADOS_SOURCE_DIR"], os.environ["TERA_PATH"] = str(install), str(install / "bin" / "t_renderer")
     sys.path.insert(0, str(root))
     import acados_template

@@ -11,7 +11,8 @@ from pathlib import Path
 
 # The longest sections are last, as they take the time that is left; only `targets`, which reads the others, follows.
 SECTIONS = (
-    "first_use", "latency", "own_model", "paper", "mppi", "share", "growth", "batch", "families", "targets",
+    "first_use", "latency", "own_model", "paper", "mppi", "share", "growth", "cores", "batch", "scaling", "families",
+    "targets",
 )  # fmt: skip
 ON_GPU = ("mppi", "batch", "families")
 HERE = Path(__file__).resolve().parents[1]
@@ -39,7 +40,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("sections", nargs="*", metavar="section", help=", ".join(SECTIONS) + "; default: all")
     parser.add_argument("--quick", action="store_true", help="small sizes; the published tables stay unchanged")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cuda: " + ", ".join(ON_GPU))
-    parser.add_argument("--minutes", type=float, default=20.0, help="limit; longer measurements are left out (20)")
+    parser.add_argument("--minutes", type=float, default=30.0, help="limit; longer measurements are left out (30)")
     parser.add_argument("--results", type=Path, help="the csv; default benchmarks/results/speed.csv")
     parser.add_argument("--pages", type=Path, help="folder of README.md and results/speed.md; default benchmarks")
     return parser
@@ -58,9 +59,11 @@ def _measure(asked: argparse.Namespace) -> int:
 
     from benchmarks.lib.provenance import provenance
     from benchmarks.speed.bench import Bench
+    from benchmarks.speed.figure import figure
     from benchmarks.speed.results import Results, read_rows
     from benchmarks.speed.sizes import QUICK, Sizes
     from benchmarks.speed.tables import rewrite, section_table
+    from torchgco.plotting.style import save
 
     possible = ON_GPU if asked.device == "cuda" else SECTIONS
     unknown = sorted(set(asked.sections) - set(possible))
@@ -80,6 +83,7 @@ def _measure(asked: argparse.Namespace) -> int:
         print(f"\n{section_table(own)}\n\n{section} took {time.monotonic() - began:.0f} s\n", flush=True)
         if pages is not None:
             rewrite(pages, read_rows(asked.results))
+            save(figure(read_rows(asked.results)), pages / "results" / "speed.png")
     results.close()
     print(f"Written: {asked.results}" + (f", tables in {pages}" if pages else ""))
     return 0

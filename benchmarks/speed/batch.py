@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from benchmarks.lib import ROOT
+from benchmarks.lib.families import EVERY
 from benchmarks.speed.bench import Bench, Took
 from benchmarks.speed.sizes import Sizes
 from torchgco.experiments.config.build import Setup
@@ -23,11 +24,14 @@ from torchgco.scenarios import Task
 from torchgco.search import Restarts
 
 SECTION, SOLVER = "batch", "gco"
+WORLDS = ("woods40", "woods60")  # where a problem takes most time and memory
 START = 10.0  # seconds that a process takes before it solves anything
 SHARE = 0.15  # of the time left that one batch may take
 
 
 def run(bench: Bench) -> None:
+    for name in WORLDS if bench.sizes.world_batch else ():
+        _started(bench, f"{name}, B = {bench.sizes.world_batch}", bench.sizes.world_batch, False, name)
     for batches, limited in ((bench.sizes.whole_batches, False), (bench.sizes.limited_batches, True)):
         known = 0.0
         for batch in batches:
@@ -38,9 +42,9 @@ def run(bench: Bench) -> None:
                 known = _started(bench, case, batch, limited)
 
 
-def _started(bench: Bench, case: str, batch: int, limited: bool) -> float:
+def _started(bench: Bench, case: str, batch: int, limited: bool, family: str = "forest30") -> float:
     """Start the process and read its last line; returns its seconds per problem, 0 where it failed."""
-    order = {"batch": batch, "limited": limited, "device": bench.device}
+    order = {"batch": batch, "limited": limited, "family": family, "device": bench.device}
     words = [sys.executable, "-m", "benchmarks.speed.batch", json.dumps({**order, "sizes": asdict(bench.sizes)})]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     if done.returncode != 0:
@@ -63,7 +67,7 @@ def measure(order: dict[str, Any]) -> dict[str, Any]:
     """Seconds and iterations per problem, and the peak memory above the start, in bytes (None: unknown)."""
     sizes = Sizes(**order["sizes"])
     bench = Bench(sizes, device=order["device"])
-    setup = bench.setup("scenario=forest")
+    setup = bench.setup(*EVERY[order["family"]].generated)
     if order["limited"]:
         setup = replace(setup, solver=limited(setup.solver))
     batch = order["batch"]

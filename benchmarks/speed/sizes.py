@@ -32,8 +32,14 @@ class Sizes:
     whole_batches: tuple[int, ...] = (1, 8, 64)
     limited_batches: tuple[int, ...] = (1, 16, 256, 2048)
     fewest_layouts: int = 8  # smaller batches are repeated until so many layouts are flown
-    # growth
+    world_batch: int = 8
+    # cores
+    cores_batch: int = 256
+    # growth, scaling
     growth_batch: int = 16
+    peers_layouts: int = 4  # the first of them, flown by peers up to so many stages and obstacles:
+    peers_stages: int = 500
+    peers_obstacles: int = 100
     stages: tuple[int, ...] = (50, 100, 200, 500, 1000)
     obstacles: tuple[int, ...] = (10, 30, 100, 500)
     # mppi
@@ -50,6 +56,6 @@ class Sizes:
 QUICK = Sizes(
     family_batch=4, large_batch=8, layouts=2, slow_layouts=1, ipopt_layouts=1, latency_layouts=2, own_layouts=4,
     paper_layouts=2, models=1, whole_batches=(1, 8), limited_batches=(1, 64), fewest_layouts=2,
-    growth_batch=8, stages=(50, 100), obstacles=(10, 30), samples=(1000,), mppi_repeats=3, share_batch=8,
-    share_alone=4,
+    world_batch=2, cores_batch=16, growth_batch=8, peers_layouts=1, stages=(50, 100), obstacles=(10, 30),
+    samples=(1000,), mppi_repeats=3, share_batch=8, share_alone=4,
 )  # fmt: skip

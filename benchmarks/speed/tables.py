@@ -30,8 +30,12 @@ WORDS = {
     "and what the first solve takes more than the second, in processor seconds, the compiler's included.",
     "share": "Processor time of one solve, in percent: a line per phase of the method, a column per function of the\n"
     "native library that it calls. The problems are new to a process that has solved others.",
-    "batch": "Forests of 30 spheres. `2 outer` ends every problem after two outer iterations. Memory is the peak of\n"
-    "a separate process above its memory before the problems were made.",
+    "cores": "Elapsed time per problem of forests of 30 spheres, in processes with one core and with two.",
+    "batch": "Forests of 30 spheres, unless the row names other worlds. `2 outer` ends every problem after two outer\n"
+    "iterations. Memory is the peak of a separate process above its memory before the problems were made.",
+    "scaling": "Whole solves of forests, 16 layouts in a batch, and the first four of them by the peers, from the\n"
+    "vehicle at rest: 30 spheres and 100 stages unless the row says otherwise. Stages divide the same 5 s, spheres\n"
+    "fill the same region; the far ones lie 12 m and more beside it.",
     "growth": "`al_ilqr`, line search included. Quadrotor (n = 14), 100 stages, 30 spheres unless the row says\n"
     "otherwise; more stages divide the same 5 s, more spheres fill the same region. The planar vehicle has n = 6.",
 }

@@ -9,6 +9,7 @@ from benchmarks.speed.results import Row, read_rows
 
 SECTION = "targets"
 NOT_MEASURED = "not measured"
+BEFORE = "67fc464"  # on another processor: only its ratios compare
 
 
 @dataclass(frozen=True)
@@ -64,37 +65,65 @@ class Target:
         case, solver: the line's name.
         times: rows with the times of the case.
         ratios: by peer, rows that divide the peer's time by it.
+        before: what this table said at commit `BEFORE`, of time and ratios.
+        aim: what we want of time or ratios.
     """
 
     case: str
     solver: str
     times: tuple[Measured, ...]
     ratios: dict[str, tuple[Measured, ...]] = field(default_factory=dict)
+    before: str = ""
+    aim: str = ""
 
 
-def _batch(case: str) -> Target:
+def _batch(case: str, before: str = "", aim: str = "") -> Target:
     ratios = {"FATROP": _ratios(case, "fatrop"), "acados": _ratios(case, "acados")}
-    return Target(case, "gco", (_seconds(case),), ratios)
+    return Target(case, "gco", (_seconds(case),), ratios, before, aim)
 
 
-def _latency(case: str, kind: str) -> Target:
+def _latency(case: str, kind: str, before: str, aim: str) -> Target:
     ratio = Measured("latency", kind, "gco", "seconds fatrop / gco", "{} x")
-    return Target(case, "gco", (Measured("latency", kind, "gco", "mean", "{:.0f} ms"),), {"FATROP": (ratio,)})
+    longest = Measured("latency", kind, "gco", "longest", "longest {:.0f} ms")
+    times = (Measured("latency", kind, "gco", "mean", "{:.0f} ms"), longest)
+    return Target(case, "gco", times, {"FATROP": (ratio,)}, before, aim)
+
+
+def _times_typical(case: str, before: str, aim: str) -> Target:
+    times = Measured("scaling", case, "gco", "times 30 spheres", "{} x the time of 30 spheres")
+    return Target(f"{case}, B = 16", "gco", (times,), {}, before, aim)
 
 
 TARGETS = (
-    _batch("forest30, B = 256"),
-    _batch("forest60, B = 256"),
+    _batch("forest30, B = 256", "0.013 s, FATROP 22 x", "FATROP 30 x"),
+    _batch("forest60, B = 256", "0.024 s, FATROP 17 x", "FATROP 30 x"),
     _batch("forest30, B = 32"),
     _batch("forest60, B = 32"),
-    _batch("walls, B = 32"),
-    _batch("planar_trap, B = 32"),
-    _batch("planar_random, B = 32"),
-    _latency("forest30, B = 1, cold", "cold"),
-    _latency("forest30, B = 1, one stage later, warm", "warm"),
+    _batch("walls, B = 32", "0.068 s, FATROP 51 x", "FATROP 80 x"),
+    _batch("planar_trap, B = 32", "0.139 s, acados 0.55 x, 4.4 x", "acados 1.2 x, 9 x"),
+    _batch("planar_random, B = 32", "0.290 s, acados 0.52 x, 0.78 x", "acados 1.2 x, 1.8 x"),
+    _latency("forest30, B = 1, cold", "cold", "62 ms, longest 182 ms, FATROP 5.4 x", "longest 25 ms, FATROP 12 x"),
+    _latency("forest30, B = 1, one stage later, warm", "warm", "12 ms, FATROP 5.6 x", "5 ms, FATROP 12 x"),
+    Target(
+        "woods40, B = 8", "gco", (Measured("batch", "woods40, B = 8", "gco", "per problem", "{:.0f} ms"),),
+        before="920 ms", aim="250 ms",
+    ),
+    Target(
+        "memory of woods60, B = 8", "gco",
+        (Measured("batch", "woods60, B = 8", "gco", "memory per problem", "{:.1f} MiB per problem"),),
+        before="25 MiB", aim="4 MiB",
+    ),
+    _times_typical("500 spheres", "7.8 x", "2 x"),
+    _times_typical("30 spheres and 470 far", "9.6 x", "2 x"),
+    Target(
+        "two threads, B = 256", "gco",
+        (Measured("cores", "B = 256, threads: 2", "gco", "times one thread", "{} x as fast as one, by elapsed time"),),
+        before="", aim="1.8 x",
+    ),
     Target(
         "a user's unicycle, B = 1", "torchgco.solve",
         (Measured("own_model", "B = 1", "torchgco.solve", "seconds per problem", "{:.3f} s"),),
+        before="0.113 s", aim="0.025 s",
     ),
     Target(
         "planar_trap_paper, N = 1000, all of 8 problems", "gco_paper",
@@ -108,6 +137,7 @@ TARGETS = (
     Target(
         "first use of a model, the slowest", "torchgco.solve",
         (Measured("first_use", None, "torchgco.solve", "both", "{:.1f} s"),),
+        before="2.6 s", aim="1 s",
     ),
     Target(
         "import torchgco", "python",
@@ -124,6 +154,9 @@ def run(bench: Bench) -> None:
     for target in TARGETS:
         for quantity, measured in {"time": target.times, **target.ratios}.items():
             bench.row(SECTION, target.case, target.solver, quantity, ", ".join(_texts(measured, rows, commit)))
+        for quantity, text in ((f"at {BEFORE}", target.before), ("aim", target.aim)):
+            if text:
+                bench.row(SECTION, target.case, target.solver, quantity, text)
 
 
 def _texts(measured: tuple[Measured, ...], rows: list[Row], commit: str) -> list[str]:

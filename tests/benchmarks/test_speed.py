@@ -13,6 +13,7 @@ from benchmarks.lib import ROOT, acados
 from benchmarks.lib.provenance import provenance
 from benchmarks.speed import (
     batch,
+    cores,
     families,
     first_use,
     growth,
@@ -20,11 +21,13 @@ from benchmarks.speed import (
     mppi,
     own_model,
     paper,
+    scaling,
     share,
     targets,
 )
 from benchmarks.speed.__main__ import main
 from benchmarks.speed.bench import Bench
+from benchmarks.speed.figure import figure
 from benchmarks.speed.quadrotor_mppi import QuadrotorAmongSpheres
 from benchmarks.speed.results import COLUMNS, Results, Row, read_rows
 from benchmarks.speed.sizes import Sizes
@@ -35,19 +38,21 @@ TINY = Sizes(
     families=("forest30",), family_batch=2, large_batch=None, layouts=1, ipopt_layouts=1, ipopt_families=("forest30",),
     latency_layouts=1, own_layouts=1, paper_layouts=1, models=1,
     whole_batches=(), limited_batches=(2,), fewest_layouts=2,
-    growth_batch=2, stages=(6,), obstacles=(3,), samples=(16,), mppi_repeats=1,
+    world_batch=0, cores_batch=2, growth_batch=2, peers_layouts=1, stages=(6,), obstacles=(30,),
+    samples=(16,), mppi_repeats=1,
     share_batch=2, share_alone=2, num_stages=8, inner_iterations=2,
 )  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
 def few_processes(monkeypatch) -> None:
-    """Run the measurements of `first_use` in this process: a fixed number per import, a first solve per model."""
+    """Run the measurements of `first_use` and `cores` in this process, with a fixed number per import."""
 
     def started(words: list[str], environment: dict[str, str]) -> str:
         return "1.5" if words[0] == "-c" else json.dumps(first_use.measure(words[-1]))
 
     monkeypatch.setattr(first_use, "_started", started)
+    monkeypatch.setattr(cores, "_started", lambda bench, threads: cores.measure(1, bench.sizes))
 
 
 @pytest.fixture(autouse=True)
@@ -65,7 +70,7 @@ def numbers(bench: Bench, quantity: str) -> list[float]:
 
 
 @pytest.mark.parametrize(
-    "section", [batch, families, first_use, growth, latency, mppi, own_model, paper, share, targets]
+    "section", [batch, cores, families, first_use, growth, latency, mppi, own_model, paper, scaling, share, targets]
 )
 def test_a_section_gives_whole_rows(section, tmp_path: Path) -> None:
     bench = tiny(tmp_path)
@@ -126,6 +131,24 @@ def test_the_targets_are_read_off_the_rows(tmp_path: Path) -> None:
     assert values["walls, B = 32", "time"] == "not measured"
     assert values["planar_trap_paper, N = 1000, all of 8 problems", "time"] == "7.2 s (at 0000000)"
     assert [case for case, quantity in values if quantity == "time"] == [target.case for target in targets.TARGETS]
+
+
+def test_the_aim_and_the_former_figure_stand_beside_the_measured_one(tmp_path: Path) -> None:
+    bench = tiny(tmp_path)
+    targets.run(bench)
+    row = next(target for target in targets.TARGETS if target.case.startswith("two threads"))
+    values = {row["quantity"]: row["value"] for row in bench.results.rows if row["case"].startswith("two threads")}
+    assert values == {"time": targets.NOT_MEASURED, "aim": row.aim}
+
+
+def test_the_figure_has_a_line_per_solver(tmp_path: Path) -> None:
+    bench = tiny(tmp_path)
+    for case, solver, value in (("B = 8", "gco", 20.0), ("B = 1", "gco", 30.0), ("B = 8, 2 outer", "gco", 9.0)):
+        bench.row("batch", case, solver, "per problem", value, "ms")
+    for solver, value in (("gco", 0.01), ("fatrop", 0.2)):
+        bench.row("scaling", "50 stages", solver, "seconds per problem", value, "s")
+    lines = [[line.get_xydata().tolist() for line in ax.get_lines()] for ax in figure(bench.results.rows).axes]
+    assert lines == [[[[1.0, 30.0], [8.0, 20.0]]], [[[50.0, 10.0]], [[50.0, 200.0]]], []]
 
 
 def test_a_solver_that_takes_too_long_is_left_out_and_named(tmp_path: Path) -> None:

@@ -44,7 +44,8 @@ def test_the_vehicle_rests_first_and_last() -> None:
     assert float((center - corner).norm(dim=-1).min()) < 0.03 < float((rounded - corner).norm(dim=-1).min())
 
 
-def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
+def test_a_spring_is_followed_in_fewer_iterations_than_a_tube(monkeypatch) -> None:
+    monkeypatch.setattr("torchgco.search.following.ROUNDS", 1)
     problem, off = cup(B=1, N=120), []
     for tube, stiffness in ((0.05, 20.0), (None, 500.0)):
         follow = replace(QUICK.follow[0], tube=tube, stiffness=(stiffness,), iterations=4)
@@ -56,6 +57,21 @@ def test_a_spring_is_followed_in_fewer_iterations_than_a_tube() -> None:
         center = travel(path, follow.depart, END + 0.1, follow.smoothing, 120)
         off.append(float((X[..., :2] - center).norm(dim=-1).mean()))
     assert off[1] < 0.5 * off[0]
+
+
+def test_only_a_candidate_far_from_the_goal_takes_more_rounds(monkeypatch) -> None:
+    """Of two candidates, the one whose path doesn't lead to the goal goes on; the other has the bits of one round."""
+    problem, follow = cup(B=1, N=120), replace(QUICK.follow[0], stiffness=(20.0,), iterations=20)
+    paths = torch.tensor([[[-1.0, 0.0], [0.0, -0.9], [1.0, 0.4]], [[-1.0, 0.0], [-0.9, 0.0], [-0.8, 0.0]]])
+    at_rest = make_candidates(problem, controls(problem)[:, None].expand(-1, 2, -1, -1))
+    ends = []
+    for rounds in (1, 5):
+        monkeypatch.setattr("torchgco.search.following.ROUNDS", rounds)
+        ends.append(follow.track(at_rest, known(problem, paths[None].double()), None))
+    once, often = ends
+    assert once.arrive().tolist() == [True, False] and often.live.all()
+    assert torch.equal(once.X[0], often.X[0]) and not torch.equal(once.X[1], often.X[1])
+    assert int(once.iterations) < int(often.iterations)
 
 
 def make_candidates(problem: Problem, U: torch.Tensor) -> Candidates:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import torch
@@ -26,6 +26,7 @@ from torchgco.solvers.ilqr import descend
 
 OFFSET_LASTS = 0.1  # share of the horizon that an initial offset lasts
 TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
+ROUNDS = 5  # of `iterations`, at most, while a candidate isn't near the goal
 SHORTEST = 0.05  # share of the horizon between departure and arrival
 LAST_PART = 0.1  # of the distance to the goal: the last part is approached slowly
 CUT = 0.5  # depth in mean inflated radii; averaged corners that cut deeper into an obstacle are averaged less
@@ -79,7 +80,8 @@ class Follow:
             path in a tube.
         stiffness: of tube or spring, one solve per value, in units of the cost of resting at the start per squared
             distance to the goal.
-        iterations: of iLQR in each of these solves, at most.
+        iterations: of iLQR in each of these solves, at most; up to five times as many while a candidate
+            isn't near the goal: vehicles that tilt to move leave the start in small steps.
 
     Raises:
         InputError: a field out of its range.
@@ -143,11 +145,16 @@ class Follow:
         problem = torch.arange(candidates.problem.B, device=path.device).repeat_interleave(K * paces) * candidates.count
         number = torch.arange(candidates.live.numel(), device=path.device)
         place = number // (candidates.count // K) * paces + number % paces  # of each candidate's path and pace
-        at = candidates.problem.position
+        at, live = candidates.problem.position, candidates.live
         for stiffness in self.stiffness:
             weight = stiffness * candidates.unit[problem]
             penalty = attraction(center, path, at, candidates.R[problem], weight, self.tube)
-            candidates = candidates.solved(inner_solver(self.iterations), TRACK_PENALTY, penalty, place)
+            for _ in range(ROUNDS):
+                candidates = candidates.solved(inner_solver(self.iterations), TRACK_PENALTY, penalty, place)
+                candidates = replace(candidates, live=candidates.live & ~candidates.arrive())
+                if not bool(candidates.live.any()):
+                    break
+            candidates = replace(candidates, live=live)
         return candidates
 
     def _centers(self, path: Tensor, arrive: Tensor, problem: Problem, paths: Paths) -> Tensor:
