@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from torchgco.base.draws import DrawKey
-from torchgco.base.options import AtLeast, Count, Positive, check_options
+from torchgco.base.options import AtLeast, Positive, check_options
 from torchgco.base.tree import put, take
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
@@ -48,6 +48,7 @@ class GCO:
     penalty_growth: Annotated[float, AtLeast(1)] = 4.84
     start_from_sample: bool = False
     sample_from_rest: bool = False
+    single_contact_after: ClassVar[int | None] = None  # as of `Solve`, whose rule `in_search` takes over
 
     def __post_init__(self) -> None:
         check_options(self, "gco")
@@ -63,6 +64,12 @@ class GCO:
         warn_of_losses([] if lost is None else [lost], sampler is None)
         return None if sampler is None else replace(self, sampler=sampler)
 
+    def in_search(self, single_contact_after: int | None) -> Self:
+        """The same for trajectories that a search counts as caught by this rule."""
+        other = replace(self)
+        object.__setattr__(other, "single_contact_after", single_contact_after)
+        return other
+
     def start(self, problem: Problem, X: Tensor) -> GuideRegion:
         """An inactive region for every problem (Algorithm 4, lines 3-4)."""
         weight = X.new_full((problem.B,), self.initial_penalty)
@@ -71,7 +78,7 @@ class GCO:
     def update(self, problem: Problem, X: Tensor, U: Tensor, penalty: GuideRegion | None, key: DrawKey) -> Advice:
         """CPUF for every problem: a region where it is caught, none elsewhere; or the sampled controls themselves."""
         assert penalty is not None
-        knots = self.caught(problem, X, U, key)
+        knots = caught_knots(problem, X, U, key.outer, self.single_contact_after)
         region = GuideRegion.inactive(X, penalty.weight * self.penalty_growth, penalty.position)
         plan, taken = U.clone(), torch.zeros_like(knots[:, 0])
         rows = knots.any(-1).nonzero().flatten()
@@ -87,27 +94,6 @@ class GCO:
             )
             put(region, rows[~taken[rows]], take(attracted, (~taken[rows]).nonzero().flatten()))
         return Advice(region, plan, taken)
-
-    def caught(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
-        """Knots (B, N+1) that lie inside two obstacles."""
-        return caught_knots(problem, X, U)
-
-
-@dataclass(frozen=True)
-class GCOAfterSearch(GCO):
-    """The same, by the rule of the search that made the trajectories: see `Solve.single_contact_after`."""
-
-    single_contact_after: Count | None = None
-
-    @classmethod
-    def of(cls, gco: GCO, single_contact_after: int | None) -> GCOAfterSearch:
-        """That of a guidance."""
-        own = {field.name: getattr(gco, field.name) for field in fields(GCO)}
-        return cls(**own, single_contact_after=single_contact_after)
-
-    def caught(self, problem: Problem, X: Tensor, U: Tensor, key: DrawKey) -> Tensor:
-        """Also knots inside one obstacle, from some outer iteration on."""
-        return caught_knots(problem, X, U, key.outer, self.single_contact_after)
 
 
 def _radius(problem: Problem, X: Tensor) -> Tensor:

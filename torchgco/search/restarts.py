@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_options
-from torchgco.guidance.gco import GCO, GCOAfterSearch
+from torchgco.guidance.gco import GCO
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
 from torchgco.native.dispatch import expect_interior, interior_of
 from torchgco.problem.problem import Problem
@@ -133,7 +133,7 @@ class Restarts(Solver):
             sampler, unsampled = suited_guide(guidance.sampler, problem)
             solves = (one for one in self.passes if isinstance(one, Solve) and one.until == "caught")
             after = next((solve.single_contact_after for solve in solves), None)
-            guidance = None if sampler is None else GCOAfterSearch.of(replace(guidance, sampler=sampler), after)
+            guidance = None if sampler is None else replace(guidance, sampler=sampler).in_search(after)
             losses += [] if unsampled is None else [unsampled]
         elif guidance is not None:
             guidance = guidance.suited(problem)
