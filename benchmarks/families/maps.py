@@ -55,11 +55,12 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--cells", nargs="+", type=float, default=[0.1, 0.2], help="m")
     parser.add_argument("--count", type=int, default=64, help="worlds of each kind")
     parser.add_argument("--seed", type=int, default=33)
+    parser.add_argument("--centres", action="store_true", help="mark cells by their centres, not where shapes reach in")
     asked = parser.parse_args(words)
     torch.set_num_threads(1)
     rows = []
     for name in asked.worlds:
-        flights = pd.DataFrame(flown_worlds(name, asked.cells, asked.count, asked.seed))
+        flights = pd.DataFrame(flown_worlds(name, asked.cells, asked.count, asked.seed, not asked.centres))
         rows += [row_of(name, cells, held) for cells, held in flights.groupby("cells", sort=False)]
         print(markdown(HEAD, rows[-len(asked.cells) :]), flush=True)
     if asked.write:
@@ -68,7 +69,7 @@ def main(words: Sequence[str] | None = None) -> int:
     return 0
 
 
-def flown_worlds(name: str, sizes: Sequence[float], count: int, seed: int) -> Iterator[dict[str, Any]]:
+def flown_worlds(name: str, sizes: Sequence[float], count: int, seed: int, touching: bool) -> Iterator[dict[str, Any]]:
     """The flights of `count` worlds of a kind, as shapes and as cells of some sizes."""
     setup = torchgco.compose([*EVERY[name].generated, f"seed={seed}", "device.threads=1"])
     for number in range(count):
@@ -79,7 +80,7 @@ def flown_worlds(name: str, sizes: Sequence[float], count: int, seed: int) -> It
         for size in sizes:
             cells = SCALES.get(name, 1.0) * size
             begun = time.process_time()
-            field = DistanceField.of(rasterised(task.layouts, 0, cells))
+            field = DistanceField.of(rasterised(task.layouts, 0, cells, touching))
             made = time.process_time() - begun
             problem = as_map(task.problem, field)
             if number == 0:

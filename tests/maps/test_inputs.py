@@ -20,6 +20,17 @@ def test_a_grid_says_where_its_cells_lie() -> None:
     assert grid.is_occupied[2, 1] and grid.is_occupied.sum() == 1 and not grid.is_unknown.any()
 
 
+def test_an_enclosed_grid_has_a_rim_of_occupied_cells() -> None:
+    unknown = np.array([[0.2, np.nan], [0.9, 0.0]])
+    for cells in (unknown, np.stack([unknown, unknown]), unknown > 0.5):
+        grid = OccupancyGrid(cells, [1.0, 2.0], 0.5) if cells.ndim == 2 else OccupancyGrid(cells, [[1.0, 2.0]] * 2, 0.5)
+        closed = grid.enclosed()
+        inner = closed.occupied[..., 1:-1, 1:-1]
+        np.testing.assert_array_equal(inner, grid.occupied)
+        assert closed.is_occupied.sum() - grid.is_occupied.sum() == 12 * (grid.batch or 1)
+        np.testing.assert_allclose(closed.origin, grid.origin - 0.5)
+
+
 def test_numbers_are_probabilities_and_a_third_value_is_unknown() -> None:
     grid = OccupancyGrid([[0.1, 0.5], [np.nan, 1.0]], [0, 0], 1)
     assert grid.is_occupied.tolist() == [[False, True], [False, True]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ from torchgco.roadmap.blocks import blocks_of
 from torchgco.roadmap.geometry import Inflated, length
 from torchgco.roadmap.homotopy import classes
 from torchgco.roadmap.lattice import lattice_of
-from torchgco.roadmap.mapped import Ways, _shortcut, _swept_on_the_way, keys, swept
+from torchgco.roadmap.mapped import Ways, _swept_on_the_way, keys, swept, tightened
 from torchgco.roadmap.scene import has_paths, scene_of
 from torchgco.solvers.contracts import Solver
 
@@ -194,32 +195,39 @@ def test_batches_take_each_problems_own_map_and_give_the_same_paths() -> None:
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_scipy_finds_ways_of_the_same_costs_and_draws_them_taut_alike(d: int) -> None:
+@pytest.mark.parametrize("merged", [True, False])
+def test_numpy_finds_the_same_blocks_ways_and_taut_paths(d: int, merged: bool) -> None:
     rng = np.random.default_rng(1)
     cells = rng.random([24] * d) < 0.03
     problem = problem_in(cells, [0.1] * d, [2.3] * d, radius=0.15)
     field = problem.constraints[0]
     assert isinstance(field, BoundField)
     ends = np.array([[0.1] * d, [2.3] * d])
-    lattice = lattice_of([field], [], ends)
 
     def price(points: np.ndarray) -> np.ndarray:
         return 1.0 + points[:, 0] ** 2
 
-    found = []
+    made = []
     for native in (True, False):
         kernels.use_native(native)
-        ways = Ways(blocks_of(lattice, 0.15, 2**12), ends, price, R, 0.0)
-        path = ways.path(int(ways.total.argmin()))
-        found.append((ways.costs, ways.path(int(found[0][0].sum(0).argmin())) if found else path, path))
-    np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-9)
-    assert np.isfinite(found[0][0]).all(0).any()
+        lattice = lattice_of([replace(field, field=replace(field.field))], [], ends)
+        blocks = blocks_of(lattice, 0.15, 2**12, 0.01, merged)
+        made.append((lattice.map.everywhere, blocks, Ways(blocks, ends, price, R)))
     kernels.use_native(True)
-    taut = _shortcut(lattice, found[0][2])
+    (clear, blocks, ways), (other_clear, other, other_ways) = made
+    np.testing.assert_allclose(clear, other_clear, rtol=1e-6, atol=1e-7)
+    assert (blocks.layers == 2).any() == merged and len(blocks.nodes) == len(other.nodes)
+    held = blocks.block >= 0  # blocks are numbered in another order
+    np.testing.assert_array_equal(held, other.block >= 0)
+    for a, b in ((blocks.room, other.room), (blocks.own, other.own), *zip(ways.costs, other_ways.costs, strict=True)):
+        np.testing.assert_allclose(a[blocks.block[held]], b[other.block[held]], rtol=1e-6)
+    assert np.isfinite(ways.costs[0][blocks.block[held]]).any()
+    path = ways.path(int(ways.total.argmin()))
+    taut = tightened(ways.blocks.lattice, path, ways.least)
     kernels.use_native(False)
-    np.testing.assert_array_equal(_shortcut(lattice, found[0][2]), taut)
+    np.testing.assert_allclose(tightened(other_ways.blocks.lattice, path, ways.least), taut, atol=1e-12)
     kernels.use_native(True)
-    assert 2 <= len(taut) < len(found[0][2])
+    assert 2 <= len(taut) < len(path)
 
 
 def solver_of(problem: Problem) -> Solver:

@@ -65,6 +65,20 @@ def test_one_end_is_given(tmp_path: Path) -> None:
     assert (layouts.start == [0, 3]).all() and (layouts.goal[:, 0] < -1 + 33 * 0.25).all()
 
 
+def test_what_lies_around_the_cells_is_free_or_occupied(tmp_path: Path) -> None:
+    path = samples.write(
+        tmp_path, "open.npz", samples.npz(occupied=np.zeros((6, 8), bool), origin=[0.0, 1.0], resolution=0.5)
+    )
+    beyond, inside = [[-0.25, 3.0], [3.2, 5.2]], [0.5, 3.0]
+    assert (MapFile(path).map.distance(beyond) > 1e3).all()
+    closed = MapFile(path, outside="occupied").map
+    assert (closed.distance(beyond) < 0).all() and closed.distance(inside, smooth=False) == pytest.approx(0.5)
+    cloud = tmp_path / "cloud.npy"
+    np.save(cloud, np.zeros((3, 2)))
+    with pytest.raises(InputError, match=r"scenario.outside: expected free"):
+        MapFile(cloud, radius=0.1, outside="occupied")
+
+
 def test_unknown_cells_count_as_asked(tmp_path: Path) -> None:
     cells = np.where(np.arange(100).reshape(10, 10) < 50, 0.0, np.nan)
     path = samples.write(tmp_path, "half.npz", samples.npz(occupied=cells, origin=[0.0, 0.0]))
@@ -81,6 +95,7 @@ def test_unknown_cells_count_as_asked(tmp_path: Path) -> None:
     ({"vehicle_radius": -1.0}, "vehicle_radius", "0"),
     ({"stages": 0}, "stages", "1"),
     ({"unknown": "maybe"}, "unknown", "occupied"),
+    ({"outside": "maybe"}, "outside", "occupied"),
     ({"resolution": 0.1}, "resolution", "no use for it"),
     ({"path": "gone.npz"}, "path", "No such file"),
 ])  # fmt: skip

@@ -96,6 +96,12 @@ class OccupancyGrid:
         """Whether cells are unknown, of the shape of `occupied`."""
         return np.zeros(1, bool) & self.occupied if self.occupied.dtype == np.bool_ else np.isnan(self.occupied)
 
+    def enclosed(self) -> OccupancyGrid:
+        """The grid with one more occupied cell on every side, so that no way leads out of it."""
+        rim = [(0, 0)] * (self.occupied.ndim - self.d) + [(1, 1)] * self.d
+        cells = np.pad(self.occupied, rim, constant_values=1)
+        return OccupancyGrid(cells, self.origin - self.resolution, self.resolution)
+
     def cell(self, points: Any) -> np.ndarray:
         """Indices (..., d) of the cells that hold points (..., d), m; outside of the grid they aren't in its shape.
 

@@ -22,6 +22,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+AT_ONCE = 2**15  # points that are looked up together, about: bounds the memory
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -36,24 +38,30 @@ class Lattice:
 
 @dataclass(frozen=True)
 class _Taps:
-    """The nodes along one axis around points (B, K): weights, their derivatives, and places held in the lattice."""
+    """The T nodes along each axis around points (B, K): weights and their derivatives (B, K, d, T)."""
 
-    held: list[Tensor]  # int64
-    weights: list[Tensor]
-    slopes: list[Tensor]
-    more: Tensor  # what the axis adds to G, in squared steps: distances beyond the edge, less the variance V
+    held: Tensor  # int64: places held in the lattice
+    weights: Tensor
+    slopes: Tensor
+    more: Tensor  # (B, K, d): what each axis adds to G, in squared steps: beyond the edge, less the variance V
     more_slope: Tensor
 
 
 def squares(lattice: Lattice, p: Tensor, cores: Tensor) -> Tensor:
     """G (B, K), m^2, at points p (B, K, d), m, with the core r (B,), m."""
-    return _contracted(lattice, _taps(lattice, p), cores)[0]
+    return torch.cat([_contracted(lattice, _taps(lattice, part), cores, 0)[0] for part in _parts(p)], dim=1)
 
 
 def squares_and_slopes(lattice: Lattice, p: Tensor, cores: Tensor) -> tuple[Tensor, Tensor]:
     """G (B, K), m^2, and its derivatives by p (B, K, d), m."""
-    value, slopes = _contracted(lattice, _taps(lattice, p), cores)
-    return value, torch.stack(slopes, dim=-1)
+    found = [_contracted(lattice, _taps(lattice, part), cores, 1) for part in _parts(p)]
+    slopes = [torch.stack(some, dim=-1) for _, some in found]
+    return torch.cat([value for value, _ in found], dim=1), torch.cat(slopes, dim=1)
+
+
+def _parts(p: Tensor) -> tuple[Tensor, ...]:
+    """Points (B, K, d), some of each problem at a time."""
+    return p.split(max(1, AT_ONCE // max(1, len(p))), dim=1)
 
 
 def distances(lattice: Lattice, p: Tensor, cores: Tensor) -> Tensor:
@@ -67,49 +75,54 @@ def lengths(square: Tensor, core: Tensor) -> Tensor:
     return torch.where(square < least, (square + least) / (2.0 * core), torch.maximum(square, least).sqrt())
 
 
-def _taps(lattice: Lattice, p: Tensor) -> list[_Taps]:
+def _taps(lattice: Lattice, p: Tensor) -> _Taps:
     u = (p - lattice.origins.unsqueeze(1)) * (1.0 / lattice.spacing)
-    return [_axis(x, size, lattice.smooth) for x, size in zip(u.unbind(-1), lattice.nodes.shape[1:], strict=True)]
-
-
-def _axis(u: Tensor, size: int, smooth: bool) -> _Taps:
-    base = (u.detach() + 0.5).floor() if smooth else u.detach().floor()
+    base = (u.detach() + 0.5).floor() if lattice.smooth else u.detach().floor()
     f = u - base
-    if smooth:
+    if lattice.smooth:
         low, high = 0.5 - f, 0.5 + f
         weights, slopes = [0.5 * low * low, 0.75 - f * f, 0.5 * high * high], [-low, -2.0 * f, high]
         more, more_slope, first = torch.full_like(f, -0.25), torch.zeros_like(f), -1
     else:
         weights, slopes = [1.0 - f, f], [-torch.ones_like(f), torch.ones_like(f)]
         more, more_slope, first = -f * (1.0 - f), 2.0 * f - 1.0, 0
-    held = []
-    for i, (weight, slope) in enumerate(zip(weights, slopes, strict=True)):
-        place = base + (i + first)
-        inside = place.clamp(0.0, size - 1.0)
-        beyond = (place - inside) * (place - inside)
-        more, more_slope = more + weight * beyond, more_slope + slope * beyond
-        held.append(inside.nan_to_num(0.0).long())
-    return _Taps(held, weights, slopes, more, more_slope)
+    weight, slope = torch.stack(weights, dim=-1), torch.stack(slopes, dim=-1)
+    place = base.unsqueeze(-1) + torch.arange(first, first + len(weights), dtype=p.dtype, device=p.device)
+    last = torch.tensor(lattice.nodes.shape[1:], dtype=p.dtype, device=p.device).unsqueeze(-1) - 1.0
+    held = torch.minimum(place.clamp(min=0.0), last)
+    beyond = (place - held).square()
+    more, more_slope = more + _summed(weight * beyond), more_slope + _summed(slope * beyond)
+    return _Taps(held.nan_to_num(0.0).long(), weight, slope, more, more_slope)
 
 
-def _contracted(lattice: Lattice, taps: list[_Taps], cores: Tensor) -> tuple[Tensor, list[Tensor]]:
-    shape, core = lattice.nodes.shape[1:], cores.unsqueeze(-1)
-    flat = lattice.nodes.reshape(-1)
-
-    def along(axis: int, place: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """The sums over the nodes of this axis and all later ones, and their derivatives by these axes."""
-        if axis == len(shape):
-            distance = flat[place].to(cores.dtype)
-            return torch.where(distance < core, core * (2.0 * distance - core), distance * distance), []
-        value, slopes = torch.zeros_like(taps[axis].more), [torch.zeros_like(taps[axis].more) for _ in shape[axis:]]
-        for held, weight, slope in zip(taps[axis].held, taps[axis].weights, taps[axis].slopes, strict=True):
-            inner, others = along(axis + 1, place * shape[axis] + held)
-            value = value + weight * inner
-            slopes = [slopes[0] + slope * inner, *(a + weight * b for a, b in zip(slopes[1:], others, strict=True))]
-        return value, slopes
-
-    value, slopes = along(0, lattice.which.unsqueeze(-1))
+def _contracted(lattice: Lattice, taps: _Taps, cores: Tensor, order: int) -> tuple[Tensor, list[Tensor]]:
+    """G (B, K), and its derivatives by each coordinate where `order` is 1."""
+    shape, core, d = lattice.nodes.shape[1:], cores.unsqueeze(-1), len(lattice.nodes.shape) - 1
+    index = lattice.which.view(-1, *([1] * (d + 1)))
+    for axis, size in enumerate(shape):
+        index = index * size + taps.held[..., axis, :].view(*taps.held.shape[:2], *_along(axis, d))
+    distance = lattice.nodes.reshape(-1)[index].to(cores.dtype)
+    core = core.view(-1, *([1] * (d + 1)))
+    value, slopes = torch.where(distance < core, core * (2.0 * distance - core), distance * distance), list[Tensor]()
+    for axis in reversed(range(d)):  # the last axis of `value` is summed over
+        weight, slope = (t[..., axis, :].view(*t.shape[:2], *[1] * axis, -1) for t in (taps.weights, taps.slopes))
+        if order == 1:
+            slopes = [_summed(slope * value), *(_summed(weight * one) for one in slopes)]
+        value = _summed(weight * value)
     h = lattice.spacing
-    for axis in taps:
-        value = value + (h * h) * axis.more
-    return value, [(1.0 / h) * slope + h * axis.more_slope for slope, axis in zip(slopes, taps, strict=True)]
+    for axis in range(d):
+        value = value + (h * h) * taps.more[..., axis]
+    return value, [(1.0 / h) * slope + h * taps.more_slope[..., i] for i, slope in enumerate(slopes)]
+
+
+def _along(axis: int, d: int) -> list[int]:
+    """The shape of numbers along one of d axes."""
+    return [-1 if i == axis else 1 for i in range(d)]
+
+
+def _summed(values: Tensor) -> Tensor:
+    """The sum over the last axis, one after the other."""
+    total = values[..., 0]
+    for i in range(1, values.shape[-1]):
+        total = total + values[..., i]
+    return total

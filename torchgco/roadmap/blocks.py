@@ -1,72 +1,54 @@
 """Blocks of a lattice's nodes, each represented by its clearest node, and the cheapest ways over them.
 
-A narrow door in a fine map is so known at a coarser grid, too. The search runs in C (c/lattice.c) or, where there is no
-compiler, in SciPy; both find ways of the same cost, but may choose others of the same cost.
+A narrow door in a fine map is so known at a coarser grid, too. Where all is free, cells of that grid are joined to
+larger blocks. The search runs in C (c/lattice.c) or, where there is no compiler, in NumPy and SciPy; both find ways of
+the same cost, but may choose others of the same cost.
 """
 
 from __future__ import annotations
 
 import ctypes
-import functools
-import warnings
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchgco.native.compiler import Compiler, NativeError, find_compiler
-from torchgco.native.declarations import Structure, fields, head, load
-from torchgco.native.dispatch import EagerWarning
-from torchgco.native.kernels import native
+from torchgco.roadmap.clearances import Clearances
 from torchgco.roadmap.lattice import Array, Lattice
+from torchgco.roadmap.native_maps import PARTS, SURE, Graph, String, Sweep, library_for
 
-SIDE = 0.8  # of a block, in vehicle's radii, where that takes no more blocks than admitted
+SIDE = 0.8  # of a cell, in vehicle's radii, where that takes no more cells than admitted
 DEEP = 0.2  # vehicle's radii beneath contact that the way between two blocks may lead
-PARTS = 4  # of it, between which it is looked at
-SOURCE = Path(__file__).parent / "c" / "lattice.c"
-
-
-class Sweep(Structure):
-    declared = (
-        ("const int64_t *", "blocks size"),  # (3): along each axis, and nodes
-        ("const float *", "clearance"),  # at the nodes
-        ("const int32_t *", "node"),  # (blocks, 3): of each block
-        ("const double *", "weight"),  # (blocks): price per metre, infinite where blocked
-        ("const int64_t *", "seed"),  # (seeds): blocks at which ways begin
-        ("const double *", "seed_cost"),
-        ("int64_t", "seeds"),
-        ("double", "step spacing least"),  # sides of blocks, of nodes; the clearance that joins two blocks, m
-        ("double *", "cost"),  # (blocks)
-        ("int32_t *", "before"),  # (blocks)
-    )
-    _fields_ = fields(declared)
-
-
-class String(Structure):
-    declared = (
-        ("const int64_t *", "size"),  # (DIM): nodes
-        ("const float *", "clearance"),
-        ("const double *", "origin path"),  # (DIM), (points, DIM)
-        ("int64_t", "points"),
-        ("double", "inverse least"),  # of the spacing; the clearance of segments at either end
-        ("uint8_t *", "corner"),  # (points): which of them are kept
-    )
-    _fields_ = fields(declared)
+TIE = 1e-6  # m: so much less clear a node counts, per squared step from the middle of its cell
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Blocks (X, Y, Z) of a lattice; Z is 1 in the plane. V is the number of all, in the order of their indices."""
+    """The free blocks of a lattice, V, and the cells (X, Y, Z) that they are made of; Z is 1 in the plane."""
 
     lattice: Lattice
-    counts: tuple[int, ...]
-    step: float  # side of a block, m
-    nodes: NDArray[np.int64]  # (V, d): the clearest node of each
-    clearance: Array  # (V,), m
+    counts: tuple[int, ...]  # of cells
+    side: int  # of a cell, in spacings of the nodes
+    block: NDArray[np.int32]  # (X Y Z): the block of each cell, -1 where there is none
+    first: NDArray[np.int32]  # (V, 3): its first cell
+    layers: NDArray[np.uint8]  # (V,): cells along its side, 1 or 2
+    room: NDArray[np.int32]  # (V, 3): its clearest node
+    clearance: Array  # (V,): there, m; from what is beside the map, too
+    own: NDArray[np.float32]  # (V,): from the map alone
     radius: float  # vehicle's, m
+
+    @property
+    def nodes(self) -> NDArray[np.int64]:
+        """The clearest nodes, (V, d)."""
+        return self.room[:, : self.lattice.d].astype(np.int64)
+
+    @property
+    def step(self) -> float:
+        """The side of a cell, m."""
+        return self.side * self.lattice.spacing
 
     @property
     def points(self) -> Array:
@@ -83,111 +65,203 @@ class Blocks:
         library = library_for(self.lattice.d)
         if library is None:
             return self._by_scipy(weight, seeds, seed_costs)
+        cost, before, _ = self._swept(library, weight, seeds, seed_costs)
+        return cost, before
+
+    def another(
+        self, weight: Array, seeds: NDArray[np.int64], seed_costs: Array, ahead: Array, onward: NDArray[np.int32]
+    ) -> list[int]:
+        """The blocks of the cheapest way from some blocks to the goal, where prices have been raised.
+
+        Args:
+            ahead: costs (V,) of the cheapest ways to the goal before.
+            onward: the next block (V,) on them, -1 where they end.
+        """
+        library = library_for(self.lattice.d)
+        if library is None:
+            cost, before = self._by_scipy(weight, seeds, seed_costs)
+            end = int(np.where(onward < 0, cost + ahead, np.inf).argmin())
+        else:
+            goal = {"ahead": _tensor(ahead), "onward": _tensor(onward)}
+            _, before, end = self._swept(library, weight, seeds, seed_costs, **goal)
+        way = [end]
+        while before[way[-1]] >= 0:
+            way.append(int(before[way[-1]]))
+        return way[::-1]
+
+    def _swept(
+        self, library: ctypes.CDLL, weight: Array, seeds: NDArray[np.int64], seed_costs: Array, **goal: torch.Tensor
+    ) -> tuple[Array, NDArray[np.int32], int]:
         cost, before = torch.empty(len(weight), dtype=torch.float64), torch.empty(len(weight), dtype=torch.int32)
-        room, size = np.zeros((len(self.nodes), 3), np.int32), np.ones(3, np.int64)
-        room[:, : self.lattice.d], size[: self.lattice.d] = self.nodes, self.lattice.clearance.shape
-        done = library.tgco_sweep(ctypes.byref(Sweep(
-            blocks=torch.tensor(self.counts), size=torch.from_numpy(size), node=torch.from_numpy(room),
-            clearance=torch.from_numpy(self.lattice.clearance), weight=torch.from_numpy(weight),
-            seed=torch.from_numpy(seeds.astype(np.int64)), seed_cost=torch.from_numpy(seed_costs), seeds=len(seeds),
-            step=self.step, spacing=self.lattice.spacing, least=-DEEP * self.radius, cost=cost, before=before,
-        )))  # fmt: skip
-        if not done:
+        graph = Graph(
+            map=self.lattice.map.native, cells=torch.tensor(self.counts), side=self.side, blocks=len(weight),
+            block=_tensor(self.block), first=_tensor(self.first), node=_tensor(self.room),
+            layers=_tensor(self.layers).view(torch.bool), clearance=_tensor(self.own),
+        )  # fmt: skip
+        sweep = Sweep(
+            graph=graph, weight=_tensor(weight), seed=_tensor(seeds.astype(np.int64)), seed_cost=_tensor(seed_costs),
+            seeds=len(seeds), deepest=-DEEP * self.radius, cost=cost, before=before, end=-1, **goal,
+        )  # fmt: skip
+        if not library.tgco_sweep(ctypes.byref(sweep)):
             raise MemoryError("native kernels: no memory")
-        return cost.numpy(), before.numpy()
+        return cost.numpy(), before.numpy(), sweep.end
 
     def _joined(self, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the segments between blocks (E,) are nowhere deep in an obstacle; as in C."""
-        clearance, start, end = self.lattice.clearance, self.nodes[a], self.nodes[b]
+        start, end = self.nodes[a], self.nodes[b]
         long = self.lattice.spacing * np.linalg.norm(end - start, axis=1)
-        sure = clearance[tuple(start.T)] + clearance[tuple(end.T)] - long > 0
+        sure = self.own[a].astype(float) + self.own[b] - long > 0
+        parts = PARTS * np.maximum(self.layers[a], self.layers[b]).astype(np.int64)[:, None]
         shallow = np.ones(len(a), bool)
-        for part in range(1, PARTS):
-            middle = (start * (PARTS - part) + end * part + PARTS // 2) // PARTS
-            shallow &= clearance[tuple(middle.T)] > -DEEP * self.radius
+        for part in range(1, 2 * PARTS):
+            middle = (start * (parts - part) + end * part + parts // 2) // parts
+            shallow &= (part >= parts[:, 0]) | (self.lattice.map.at(middle) > -DEEP * self.radius)
         return sure | shallow
 
     def _by_scipy(self, weight: Array, seeds: NDArray[np.int64], seed_costs: Array) -> tuple[Array, NDArray[np.int32]]:
         from scipy.sparse import csr_matrix
         from scipy.sparse.csgraph import dijkstra
 
-        V, number = len(weight), np.arange(len(weight)).reshape(self.counts)
-        tails, heads, lengths = [np.full(len(seeds), V)], [seeds], [np.maximum(seed_costs, 1e-300)]
+        V, number = len(weight), self.block.reshape(self.counts)
+        pairs = []
         for move in product((-1, 0, 1), repeat=3):
             if move <= (0, 0, 0):
                 continue
             axes = list(zip(move, self.counts, strict=True))
             here = tuple(slice(max(0, -k), n - max(0, k)) for k, n in axes)
             there = tuple(slice(max(0, k), n - max(0, -k)) for k, n in axes)
-            a, b = number[here].ravel(), number[there].ravel()
-            known = np.isfinite(weight[a]) & np.isfinite(weight[b])
-            a, b = a[known], b[known]
-            known = self._joined(a, b)
-            tails.append(a[known])
-            heads.append(b[known])
-            long = self.step * float(np.linalg.norm(move))
-            lengths.append(0.5 * long * (weight[a] + weight[b])[known])
-        tail, head, length = map(np.concatenate, (tails, heads, lengths))
+            both = np.stack((number[here].ravel(), number[there].ravel()))
+            pairs.append(np.sort(both[:, (both[0] != both[1]) & (both >= 0).all(0)], axis=0))
+        a, b = np.unique(np.concatenate(pairs, axis=1), axis=1).astype(np.int64)
+        known = np.isfinite(weight[a]) & np.isfinite(weight[b])
+        a, b = a[known], b[known]
+        known = self._joined(a, b)
+        a, b = a[known], b[known]
+        middle = (self.first + 0.5 * self.layers[:, None])[:, : self.lattice.d]
+        long = self.step * np.linalg.norm(middle[b] - middle[a], axis=1)
+        tail, head = np.concatenate((np.full(len(seeds), V), a)), np.concatenate((seeds, b))
+        length = np.concatenate((np.maximum(seed_costs, 1e-300), 0.5 * long * (weight[a] + weight[b])))
         graph = csr_matrix((length, (tail, head)), shape=(V + 1, V + 1))
         cost, before = dijkstra(graph, directed=False, indices=V, return_predecessors=True)
         return cost[:V], np.where((before[:V] == V) | (before[:V] < 0), -1, before[:V]).astype(np.int32)
 
 
-def blocks_of(lattice: Lattice, radius: float, most: int) -> Blocks:
-    """Blocks of a lattice for a vehicle of this radius, m; `most` of them at most."""
+def blocks_of(lattice: Lattice, radius: float, most: int, least: float = 0.0, merged: bool = True) -> Blocks:
+    """Blocks of a lattice for a vehicle of this radius, m, from at most `most` cells.
+
+    Args:
+        least: clearance, m, above which a block is free.
+        merged: whether cells become one block where that is free for sure.
+    """
     size = max(1, round(SIDE * radius / lattice.spacing))
-    while np.prod([-(-n // size) for n in lattice.clearance.shape], dtype=float) > most:
+    while np.prod([-(-n // size) for n in lattice.shape], dtype=float) > most:
         size += 1
-    nodes = _clearest(lattice.clearance, size)
-    flat = nodes.reshape(-1, lattice.d)
-    clear = lattice.clearance[tuple(flat.T)].astype(float)
-    if lattice.solids or lattice.others:
-        free = clear > 0
-        clear[free] = np.minimum(clear[free], lattice.beside(lattice.position(flat[free])))
-    return Blocks(lattice, (*nodes.shape[:-1], 1)[:3], size * lattice.spacing, flat, clear, radius)
+    merged = merged and lattice.alone
+    key = ("blocks", size, least, merged)
+    if key not in lattice.map.kept:
+        lattice.map.kept[key] = _blocks(lattice.map, size, least, merged)
+    counts, block, first, layers, room, own = lattice.map.kept[key]
+    clear = own.astype(float)
+    if not lattice.alone:
+        clear = np.minimum(clear, lattice.beside(lattice.position(room[:, : lattice.d].astype(np.int64))))
+    return Blocks(lattice, counts, size, block, first, layers, room, clear, own, radius)
 
 
-def _clearest(clearance: NDArray[np.float32], size: int) -> NDArray[np.int64]:
-    """The clearest node of each block, (blocks along each axis, d)."""
-    d = clearance.ndim
-    if size == 1:
-        return np.stack(list(np.indices(clearance.shape)), axis=-1)
-    counts = [-(-n // size) for n in clearance.shape]
-    beyond = [(0, c * size - n) for c, n in zip(counts, clearance.shape, strict=True)]
-    padded = np.pad(clearance, beyond, constant_values=-np.inf)
-    split = padded.reshape([n for c in counts for n in (c, size)])
-    split = split.transpose([2 * i for i in range(d)] + [2 * i + 1 for i in range(d)]).reshape(*counts, -1)
-    # Of equally clear nodes the one next to the block's middle: far from obstacles blocks are evenly spaced then.
-    middle = ((np.indices([size] * d) - 0.5 * (size - 1)) ** 2).sum(0).ravel()
-    within = np.stack(np.unravel_index((split - 1e-6 * middle.astype(np.float32)).argmax(-1), [size] * d), axis=-1)
-    return np.stack(list(np.indices(counts)), axis=-1) * size + within
+def _blocks(clearances: Clearances, size: int, least: float, merged: bool) -> tuple[Any, ...]:
+    """Cells along each axis, and the parts of `Blocks` that the map alone decides."""
+    d = clearances.d
+    counts = [1, 1, 1]
+    counts[:d] = [-(-int(n) // size) for n in clearances.size]
+    middle = ((np.indices([size] * d) - 0.5 * (size - 1)) ** 2).sum(0)
+    # Of equally clear nodes the one next to the cell's middle: far from obstacles blocks are evenly spaced then.
+    tie = (TIE * middle).astype(np.float32)
+    library = library_for(d)
+    if library is None:
+        return _by_numpy(clearances, counts, size, least, merged, tie)
+    cells = int(np.prod(counts))
+    block, first, node = (torch.empty(n, dtype=torch.int32) for n in (cells, 3 * cells, 3 * cells))
+    layers, clearance = torch.empty(cells, dtype=torch.bool), torch.empty(cells, dtype=torch.float32)
+    graph = Graph(
+        map=clearances.native, cells=torch.tensor(counts), side=size, merged=int(merged), least=least,
+        tie=_tensor(tie), block=block, first=first, node=node, layers=layers, clearance=clearance, blocks=0,
+    )  # fmt: skip
+    library.tgco_blocks(ctypes.byref(graph))
+    V = graph.blocks
+    held = first.view(-1, 3)[:V], layers.view(torch.uint8)[:V], node.view(-1, 3)[:V], clearance[:V]
+    return (tuple(counts), block.numpy(), *(part.clone().numpy() for part in held))
 
 
-def shortcut(lattice: Lattice, path: Array, least: float) -> NDArray[np.bool_] | None:
-    """Which points of a path (P, d) are kept as corners; None where C can't serve. See `mapped.tightened`."""
-    library = None if lattice.solids or lattice.others else library_for(lattice.d)
+def _by_numpy(
+    clearances: Clearances, counts: list[int], size: int, least: float, merged: bool, tie: NDArray[np.float32]
+) -> tuple[Any, ...]:
+    """As tgco_blocks."""
+    d = clearances.d
+    nodes, clear = _clearest(clearances, counts[:d], size, tie)
+    number = np.arange(len(clear)).reshape(counts)
+    cells = np.stack(np.unravel_index(number.ravel(), counts), axis=-1)
+    free = clear > least
+    into = np.where(free, number.ravel(), -1)  # the cell that stands for each cell's block
+    layers, stands = np.ones(len(clear), np.uint8), np.arange(len(clear))
+    if merged:
+        pairs = number[tuple(slice(0, n - n % 2) for n in counts[:d])]
+        split = pairs.reshape([n for count in pairs.shape[:d] for n in (count // 2, 2)])
+        groups = split.transpose([2 * i for i in range(d)] + [2 * i + 1 for i in range(d)]).reshape(-1, 2**d)
+        best = np.take_along_axis(groups, clear[groups].argmax(1)[:, None], axis=1)
+        apart = clearances.spacing * np.linalg.norm(nodes[groups] - nodes[best], axis=-1)
+        whole = free[groups].all(1) & (clear[groups].astype(float) + clear[best] - apart > 0).all(1)
+        into[groups[whole]] = groups[whole][:, :1]
+        layers[groups[whole, 0]], stands[groups[whole, 0]] = 2, best[whole, 0]
+    kept, block = np.unique(into[into >= 0], return_inverse=True)
+    numbers = np.full(len(clear), -1, np.int32)
+    numbers[into >= 0] = block
+    room = np.zeros((len(kept), 3), np.int32)
+    room[:, :d] = nodes[stands[kept]]
+    return tuple(counts), numbers, cells[kept].astype(np.int32), layers[kept], room, clear[stands[kept]]
+
+
+def _clearest(
+    clearances: Clearances, counts: list[int], size: int, tie: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The clearest node of each cell, (cells, d), and its clearance; by the field's distances where that is sure."""
+    d = clearances.d
+    every = np.moveaxis(np.indices(clearances.size.tolist()), 0, -1)
+    beyond = [(0, c * size - n) for c, n in zip(counts, clearances.size, strict=True)]
+
+    def split(values: NDArray[Any]) -> NDArray[np.float32]:
+        padded = np.pad(values.astype(np.float32), beyond, constant_values=-np.inf)
+        parts = padded.reshape([n for c in counts for n in (c, size)])
+        return parts.transpose([2 * i for i in range(d)] + [2 * i + 1 for i in range(d)]).reshape(-1, size**d)
+
+    raw, fine = split(clearances.raw(every)), split(clearances.everywhere)
+    own = tie.ravel()
+    rough, exact = (raw - own).argmax(1), np.where(raw > 0, fine - own, -np.inf).argmax(1)
+    most = np.take_along_axis(raw, rough[:, None], axis=1)[:, 0]
+    near = (most > 0) & (most < SURE * clearances.spacing)
+    place = np.where(near, exact, rough)
+    clear = np.where(near, np.take_along_axis(fine, exact[:, None], axis=1)[:, 0], most)
+    within = np.stack(np.unravel_index(place, [size] * d), axis=-1)
+    first = np.stack(np.unravel_index(np.arange(len(place)), counts), axis=-1)
+    return first * size + within, clear
+
+
+def _tensor(values: Any) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values))
+
+
+def tightened(
+    lattice: Lattice, path: Array, least: float, reach: float, parts: int, rounds: int, little: float
+) -> Array | None:
+    """A path (P, d) drawn taut; None where C can't serve. See `mapped.tightened`."""
+    library = library_for(lattice.d) if lattice.alone else None
     if library is None:
         return None
-    kept = torch.empty(len(path), dtype=torch.bool)
-    library.tgco_shortcut(ctypes.byref(String(
-        size=torch.tensor(lattice.clearance.shape), clearance=torch.from_numpy(lattice.clearance),
-        origin=torch.from_numpy(lattice.origin), path=torch.from_numpy(np.ascontiguousarray(path)), points=len(path),
-        inverse=1.0 / lattice.spacing, least=least, corner=kept,
-    )))  # fmt: skip
-    return kept.numpy()
-
-
-def library_for(d: int) -> ctypes.CDLL | None:
-    """The library for space of this dimension; None without a compiler, or where the process uses PyTorch's kernels."""
-    compiler = find_compiler()
-    return None if compiler is None or not native() else _library(d, compiler)
-
-
-@functools.cache
-def _library(d: int, compiler: Compiler) -> ctypes.CDLL | None:
-    try:
-        structures = [Sweep, String]
-        return load(f"{head(structures, [], {'DIM': d, 'PARTS': PARTS})}\n{SOURCE.read_text()}", structures)
-    except NativeError as error:
-        warnings.warn(f"paths in maps are sought by SciPy: {str(error).splitlines()[0]}", EagerWarning, stacklevel=3)
-        return None
+    room = parts + len(path) + 2
+    taut = torch.empty(room, lattice.d, dtype=torch.float64)
+    string = String(
+        map=lattice.map.native, origin=_tensor(lattice.origin), path=_tensor(path), points=len(path), least=least,
+        reach=reach, parts=parts, rounds=rounds, little=little, taut=taut, room=room,
+    )  # fmt: skip
+    count = library.tgco_tighten(ctypes.byref(string))
+    if count == 0:
+        raise MemoryError("native kernels: no memory")
+    return taut[:count].numpy()

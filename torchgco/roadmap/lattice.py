@@ -11,11 +11,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import convolve1d, label
 
-from torchgco.maps.distance import FAR
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Solids
+from torchgco.roadmap.clearances import Clearances
 
 Array = NDArray[np.float64]
 
@@ -26,26 +25,6 @@ BESIDE = 1.3  # times as large as they are, spheres and boxes beside a map lie w
 LARGEST = 2**24  # nodes of a lattice; one that would need more doesn't extend to start and goal
 
 
-@dataclass(frozen=True, eq=False)
-class Clearances:
-    """Distances to contact at the nodes of one map for one vehicle, m, negative where it would touch."""
-
-    values: NDArray[np.float32]
-
-    @cached_property
-    def rooms(self) -> NDArray[np.int32]:
-        """Numbers of the connected regions of free nodes; 0 where blocked."""
-        return np.asarray(label(self.values > 0, np.ones([3] * self.values.ndim))[0])
-
-    @cached_property
-    def marks(self) -> NDArray[np.int64]:
-        """A node (M, d) of each connected region of blocked nodes."""
-        regions = np.asarray(label(self.values < 0, np.ones([3] * self.values.ndim))[0])
-        _, first = np.unique(regions, return_index=True)
-        nodes = np.stack(np.unravel_index(first, regions.shape), axis=-1)
-        return nodes[regions.flat[first] > 0]
-
-
 @dataclass(frozen=True)
 class Lattice:
     """Clearances of one problem.
@@ -53,25 +32,33 @@ class Lattice:
     Args:
         map: the clearances of the finest map.
         origin: the first node, (d,), m.
-        spacing: of the nodes, m.
         others: the other maps, of this problem alone.
         solids: spheres and boxes beside, of this problem alone.
     """
 
     map: Clearances
     origin: Array
-    spacing: float
     others: tuple[BoundField, ...]
     solids: tuple[Solids, ...]
 
     @property
-    def clearance(self) -> NDArray[np.float32]:
-        """At the nodes."""
-        return self.map.values
+    def spacing(self) -> float:
+        """Of the nodes, m."""
+        return self.map.spacing
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Nodes along each axis."""
+        return tuple(self.map.size.tolist())
 
     @property
     def d(self) -> int:
         return len(self.origin)
+
+    @property
+    def alone(self) -> bool:
+        """Whether the map is all that there is."""
+        return not self.solids and not self.others
 
     def may_join(self, ends: Array) -> bool:
         """Whether free nodes next to two points (2, d) are connected; what is beside the map may still part them."""
@@ -88,18 +75,17 @@ class Lattice:
     def node(self, points: Array) -> NDArray[np.int64]:
         """The nodes (..., d) nearest to points, held within the lattice."""
         nodes = np.rint((points - self.origin) * (1.0 / self.spacing)).astype(np.int64)
-        return np.minimum(np.maximum(nodes, 0), np.array(self.clearance.shape) - 1)
+        return np.minimum(np.maximum(nodes, 0), self.map.size - 1)
 
     def at(self, points: Array) -> Array:
         """Clearances (...) at the nodes nearest to points (..., d), and from spheres, boxes and other maps."""
-        nodes = self.node(points)
-        gap = self.clearance[tuple(nodes[..., i] for i in range(self.d))].astype(float)
-        return np.minimum(gap, self.beside(points)) if self.solids or self.others else gap
+        gap = self.map.at(self.node(points))
+        return gap if self.alone else np.minimum(gap, self.beside(points))
 
     def beside(self, points: Array) -> Array:
         """Clearances (...) from all but the map."""
         gap = np.full(points.shape[:-1], np.inf)
-        if not self.solids and not self.others:
+        if self.alone:
             return gap
         p = torch.from_numpy(np.ascontiguousarray(points.reshape(1, -1, self.d)))
         for part in self.solids:
@@ -144,16 +130,15 @@ def lattice_of(fields: Sequence[BoundField], solids: Sequence[Solids], ends: Arr
     for part in present:
         here, reach = ~part.absent[0], part.extent[0] + part.radii[0].unsqueeze(-1)
         points += [(part.centers[0] + side * BESIDE * reach)[here].numpy() for side in (-1.0, 1.0)]
-    clearance, pad = _clearance(first, np.concatenate(points))
-    origin = np.asarray(first.origins[0].numpy() - first.field.spacing * pad, np.float64)
-    return Lattice(clearance, origin, first.field.spacing, tuple(others), present)
+    clearances = _clearances(first, np.concatenate(points))
+    origin = np.asarray(first.origins[0].numpy() - first.field.spacing * clearances.low, np.float64)
+    return Lattice(clearances, origin, tuple(others), present)
 
 
-def _clearance(field: BoundField, points: Array) -> tuple[Clearances, NDArray[np.int64]]:
-    """Clearances at the nodes of a field's map and around it, and how many nodes lie before its first one.
+def _clearances(field: BoundField, points: Array) -> Clearances:
+    """Clearances at the nodes of a field's map and around it, so that points (P, d) lie within.
 
-    Args:
-        points: (P, d) that lie within, unless that takes too many nodes.
+    They don't where that would take too many nodes.
     """
     R, which = float(field.vehicle_radius[0]), int(field.which[0])
     h, shape = field.field.spacing, np.array(field.field.values.shape[1:])
@@ -163,35 +148,15 @@ def _clearance(field: BoundField, points: Array) -> tuple[Clearances, NDArray[np
     before, after = np.maximum(low, room - reach.min(0)), np.maximum(high, reach.max(0) + room - shape + 1)
     if np.prod(before + shape + after) <= max(LARGEST, np.prod(shape + 2.0 * room)):
         low, high = before.astype(int), after.astype(int)
-    key = (which, R, *low, *high)
+    key = (which, R, field.smooth, *low, *high)
     kept = _kept.setdefault(field.field, {})
     if key not in kept:
-        kept[key] = Clearances(_measured(field, which, R, low, high))
+        values, smooth = field.field.values[which], field.smooth and not bool(field.absent[0, 0])
+        numbers = float(field.cores[0]), float(field.limits[0])
+        kept[key] = Clearances(values, low, low + shape + high, h, *numbers, smooth)
         while len(kept) > KEPT:
             del kept[next(iter(kept))]
-    return kept[key], low
+    return kept[key]
 
 
 _kept: WeakKeyDictionary[Any, dict[tuple[float, ...], Clearances]] = WeakKeyDictionary()
-
-
-def _measured(field: BoundField, which: int, R: float, low: Any, high: Any) -> NDArray[np.float32]:
-    """What the constraint's own lookup gives at the nodes, and the same bound beyond them."""
-    if bool(field.absent[0, 0]):
-        return np.full(np.array(field.field.values.shape[1:]) + low + high, FAR, np.float32)
-    distance, h = field.field.values[which], field.field.spacing
-    core, limit = float(field.cores[0]), float(field.limits[0])
-    if field.smooth:
-        square = np.where(distance < core, core * (2 * distance - core), distance * distance)
-        for axis in range(square.ndim):
-            square = convolve1d(square, (0.125, 0.75, 0.125), axis, mode="nearest")
-        square -= 0.25 * square.ndim * h * h
-        near = (square + core * core) / (2 * core)
-        distance = np.where(square < core * core, near, np.sqrt(np.maximum(square, core * core)))
-    beyond = np.zeros([1] * distance.ndim)
-    for axis, (before, after, size) in enumerate(zip(low, high, distance.shape, strict=True)):
-        away = h * np.concatenate((np.arange(before, 0, -1), np.zeros(size), np.arange(1, after + 1)))
-        beyond = beyond + (away * away).reshape([-1 if i == axis else 1 for i in range(distance.ndim)])
-    padded = np.pad(distance, list(zip(low, high, strict=True)), mode="edge")
-    padded = np.where(beyond > 0, np.sqrt(np.maximum(padded, 0.0) ** 2 + beyond), padded)
-    return (padded - limit).astype(np.float32)

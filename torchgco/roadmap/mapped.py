@@ -9,22 +9,26 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchgco.base.tree import take
-from torchgco.roadmap.blocks import Blocks, blocks_of, shortcut
+from torchgco.roadmap import blocks as searched
+from torchgco.roadmap.blocks import Blocks, blocks_of
 from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.lattice import Array, Lattice, lattice_of
 from torchgco.roadmap.search import HOPS
 
-# The most blocks of a search, and the clearance of free ones in spacings of the nodes; of further searches where there
-# is no path yet. Through gaps with less clearance than the nodes are apart no trajectory may fit between its knots.
-SEARCHES = ((2**18, 0.5), (2**18, 0.0), (2**21, 0.0))
+# The most cells of a search, the clearance of free ones in spacings of the nodes, and whether free ones are merged; of
+# further searches where there is no path yet. Through gaps with less clearance than the nodes are apart no trajectory
+# may fit between its knots.
+SEARCHES = ((2**18, 0.5, True), (2**18, 0.5, False), (2**18, 0.0, False), (2**21, 0.0, False))
 MARGIN = 0.5  # of closeness: within so many units an edge costs up to double
 LEAST = 1e-6  # of the price: no edge may cost nothing
 LONGEST = 2.0  # times as dear as the cheapest one other paths may be
@@ -36,6 +40,9 @@ ROUNDS = 4  # of drawing taut, at most, and the gain in length, as a share, belo
 LITTLE = 1e-3
 WINDOWS = (8, 16, 64, 10**6)  # points ahead that are looked at together
 POINTS = 96  # of a path that is drawn taut
+SHORT = 10  # segments, at least, of a path that keeps off others, which it would be drawn onto
+STEPS = 0.5  # units between points at which it is looked for what is near a path
+DIVERSITY = 1.0  # extra price of later paths, as a share, next to an earlier one
 ROUNDING = 1e-9  # m
 KEY = 0x5DEECE66D  # seed of the numbers that stand for blocked regions
 
@@ -83,21 +90,22 @@ class Ways:
         ends: start and goal, (2, d), m.
         price: per metre.
         unit: m, of closeness to obstacles.
-        least: clearance from which a block is free, m.
     """
 
-    def __init__(self, blocks: Blocks, ends: Array, price: Price, unit: float, least: float) -> None:
+    def __init__(self, blocks: Blocks, ends: Array, price: Price, unit: float, least: float = 0.0) -> None:
         self.blocks, self.ends, self.points = blocks, ends, blocks.points
+        self.least = least_at(blocks.lattice, ends)
         close = 1.0 + np.clip(1.0 - blocks.clearance / (MARGIN * unit), 0.0, 1.0)
         rate = _smoothed(price, self.points, blocks.counts)
         usable = (blocks.clearance > least) & np.isfinite(rate)
         self.weight = np.where(usable, np.maximum(rate, 0.0) * close + LEAST, np.inf)
-        self.costs = np.empty((2, len(self.weight)))
+        self.costs, self.seeds = np.empty((2, len(self.weight))), list[tuple[NDArray[np.int64], Array]]()
         self.before = np.empty((2, len(self.weight)), np.int32)
         for i, end in enumerate(ends):
             seeds = self._seen(end, usable)
             apart = np.linalg.norm(self.points[seeds] - end, axis=1)
-            self.costs[i], self.before[i] = blocks.costs(self.weight, seeds, apart * self.weight[seeds])
+            self.seeds.append((seeds, apart * self.weight[seeds]))
+            self.costs[i], self.before[i] = blocks.costs(self.weight, *self.seeds[i])
 
     @property
     def total(self) -> Array:
@@ -109,15 +117,35 @@ class Ways:
         blocks, lattice = self.blocks, self.blocks.lattice
         axes = [np.unique(np.clip(int(i * lattice.spacing / blocks.step) + WINDOW, 0, n - 1))
                 for i, n in zip(lattice.node(end), blocks.counts, strict=False)]  # fmt: skip
-        near = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), blocks.counts[: lattice.d]).ravel()
+        cells = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), blocks.counts[: lattice.d]).ravel()
+        near = np.unique(blocks.block[cells]).astype(np.int64)
+        near = near[near >= 0]
         near = near[usable[near]]
-        # An end may be a little nearer to the map than the constraint admits: the way leads out of there.
-        least = min(0.0, float(lattice.at(end[None])[0])) - ROUNDING
         a = np.broadcast_to(end, self.points[near].shape)
-        seen = near[lattice.see(a, self.points[near], np.full(len(near), least))]
+        seen = near[lattice.see(a, self.points[near], np.full(len(near), self.least))]
         if len(seen) == 0 and len(near) > 0:
             seen = near[[np.linalg.norm(self.points[near] - end, axis=1).argmin()]]
         return seen
+
+    def taut(self, block: int) -> Array:
+        """The way through a block, drawn taut."""
+        return tightened(self.blocks.lattice, self.path(block), self.least)
+
+    def beside(self, raised: Array) -> Array:
+        """The cheapest way where prices are raised, with corners left out that are near."""
+        way = self.blocks.another(raised, *self.seeds[0], self.costs[1], self.before[1])
+        path = np.concatenate((self.ends[:1], self.points[way], self.ends[1:]))
+        return tightened(self.blocks.lattice, path, self.least, length(path) / SHORT)
+
+    def near(self, path: Array, unit: float) -> NDArray[np.int64]:
+        """The blocks nearer than `unit`, m, to a path, which is looked at in steps."""
+        lists = self.tree.query_ball_point(_dense(path, STEPS * unit), unit)
+        return np.unique(np.concatenate([np.asarray(some, np.int64) for some in lists]))
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the blocks' clearest nodes."""
+        return cKDTree(self.points)
 
     def path(self, block: int) -> Array:
         """The way from start to goal (P, d) through a block."""
@@ -143,16 +171,26 @@ def paths(
     lattice: Lattice, ends: Array, price: Price, count: int, radius: float, unit: float, corners: int
 ) -> list[Array]:
     """Up to `count` taut paths (P, d), P <= corners, between two points (2, d), the cheapest first."""
-    if not lattice.may_join(ends):
-        return []
-    for most, share in SEARCHES:
-        ways = Ways(blocks_of(lattice, radius, most), ends, price, unit, share * lattice.spacing)
-        if np.isfinite(ways.total).any():
-            break
-    if not np.isfinite(ways.total).any():
+    ways = _ways(lattice, ends, price, radius, unit)
+    if ways is None:
         return []
     found = _in_the_plane(ways, count) if lattice.d == 2 else _in_space(ways, count, unit)
     return [path for path in found if len(path) <= corners]
+
+
+def _ways(lattice: Lattice, ends: Array, price: Price, radius: float, unit: float) -> Ways | None:
+    """The ways of the first search that finds any; None where none does."""
+    for number, (most, share, merged) in enumerate(SEARCHES):
+        if number == 1 and not lattice.may_join(ends):
+            return None
+        least = share * lattice.spacing
+        blocks = blocks_of(lattice, radius, most, least, merged and lattice.d == 3)
+        if len(blocks.nodes) == 0:
+            continue
+        ways = Ways(blocks, ends, price, unit, least)
+        if np.isfinite(ways.total).any():
+            return ways
+    return None
 
 
 def _in_the_plane(ways: Ways, count: int) -> list[Array]:
@@ -165,7 +203,7 @@ def _in_the_plane(ways: Ways, count: int) -> list[Array]:
     _, first = np.unique(kind[order], return_index=True)
     chosen = live[order[np.sort(first)[:count]]]
     chosen = chosen[total[chosen] <= LONGEST * total[chosen[0]]]
-    return [tightened(ways.blocks.lattice, ways.path(int(v))) for v in chosen]
+    return [ways.taut(int(v)) for v in chosen]
 
 
 def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
@@ -189,23 +227,45 @@ def _in_space(ways: Ways, count: int, unit: float) -> list[Array]:
     shares = (ways.costs[0][ends] - begins[ends]) / best
     ends, shares = ends[total[ends] <= LONGEST * best], shares[total[ends] <= LONGEST * best]
     order = np.argsort(total[ends] / best - shares, kind="stable")[: TRIED * count]
-    lattice, found = ways.blocks.lattice, [tightened(ways.blocks.lattice, ways.path(int(total.argmin())))]
+    found = [ways.taut(int(total.argmin()))]
     for v in ends[order]:
         if len(found) == count:
             break
-        path = tightened(lattice, ways.path(int(v)))
-        if all(_apart(path, other) > unit for other in found):
+        path = ways.taut(int(v))
+        points = _spread(path)
+        if all(_apart(points, other) > unit for other in found):
             found.append(path)
-    return found
+    return found + _beside(ways, found, count - len(found), unit)
 
 
-def _apart(path: Array, other: Array) -> float:
-    """The largest distance of a path's points from another path, m."""
+def _beside(ways: Ways, found: list[Array], count: int, unit: float) -> list[Array]:
+    """Up to `count` further paths: the cheapest where prices near all paths before are raised."""
+    weight, others = ways.weight.copy(), list[Array]()
+    for path in found if count > 0 else ():
+        weight[ways.near(path, unit)] *= 1.0 + DIVERSITY
+    for _ in range(count):
+        path = ways.beside(weight)
+        weight[ways.near(path, unit)] *= 1.0 + DIVERSITY
+        points = _spread(path)
+        if all(_apart(points, other) > unit for other in (*found, *others)):
+            others.append(path)
+    return others
+
+
+def _spread(path: Array) -> Array:
+    """Points (COMPARED, d) at equal shares of a path's length."""
+    along = np.concatenate(([0.0], np.sqrt((np.diff(path, axis=0) ** 2).sum(1)).cumsum()))
+    share = np.linspace(0.0, along[-1], COMPARED)
+    return np.stack([np.interp(share, along, x) for x in path.T], axis=1)
+
+
+def _apart(points: Array, other: Array) -> float:
+    """The largest distance of points (P, d) from a path, m."""
     a, along = other[:-1], np.diff(other, axis=0)
-    toward = _dense(path, length(path) / COMPARED)[:, None] - a
+    toward = points[:, None] - a
     share = (toward * along).sum(-1) / np.maximum((along * along).sum(-1), ROUNDING)
-    gap = np.linalg.norm(toward - np.clip(share, 0.0, 1.0)[..., None] * along, axis=-1)
-    return float(gap.min(1).max())
+    gap = toward - np.clip(share, 0.0, 1.0)[..., None] * along
+    return float(np.sqrt((gap * gap).sum(-1).min(1).max()))
 
 
 # Homotopy classes -------------------------------------------------------------------------------------------------
@@ -252,7 +312,7 @@ def _swept_on_the_way(ways: Ways, end: int) -> NDArray[np.int64]:
 
 def _crossings(lattice: Lattice, a: Array, b: Array) -> NDArray[np.int64]:
     """Sums of the numbers of regions whose rays short segments from a to b (E, 2) cross, in steps of the lattice."""
-    marks, columns = lattice.marks, lattice.clearance.shape
+    marks, columns = lattice.marks, lattice.shape
     below = np.zeros((columns[0], columns[1] + 1), np.int64)
     np.add.at(below, (marks[:, 0], marks[:, 1] + 1), keys(len(marks)))
     below = below.cumsum(axis=1)  # [column, row]: of the marks below a row
@@ -272,14 +332,28 @@ def _crossings(lattice: Lattice, a: Array, b: Array) -> NDArray[np.int64]:
 # Taut strings -----------------------------------------------------------------------------------------------------
 
 
-def tightened(lattice: Lattice, path: Array) -> Array:
-    """A path drawn taut within its homotopy class: corners that aren't needed are left out, from either end in turn."""
-    path = _shortcut(lattice, path)
+def least_at(lattice: Lattice, ends: Array) -> float:
+    """The clearance of what begins or ends there: an end may be nearer to the map than the constraint admits."""
+    return min(0.0, *lattice.at(ends)) - ROUNDING
+
+
+def tightened(lattice: Lattice, path: Array, least: float, reach: float = np.inf) -> Array:
+    """A path drawn taut within its homotopy class: corners that aren't needed are left out, from either end in turn.
+
+    Args:
+        least: clearance of its first and its last segment, m.
+        reach: the longest segment, m: with one, corners are left out once.
+    """
+    rounds = ROUNDS if reach == np.inf else 0
+    taut = searched.tightened(lattice, path, least, reach, POINTS, rounds, LITTLE)
+    if taut is not None:
+        return taut
+    path = _shortcut(lattice, path, least, reach)
     step = max(2.0 * lattice.spacing, length(path) / POINTS)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         before = length(path)
-        path = _shortcut(lattice, _dense(path, step)[::-1])[::-1]
-        path = _shortcut(lattice, _dense(path, step))
+        path = _shortcut(lattice, _dense(path, step)[::-1], least)[::-1]
+        path = _shortcut(lattice, _dense(path, step), least)
         if length(path) > (1.0 - LITTLE) * before:
             break
     return path
@@ -298,15 +372,11 @@ def _dense(path: Array, step: float) -> Array:
     return np.concatenate(parts)
 
 
-def _shortcut(lattice: Lattice, path: Array) -> Array:
+def _shortcut(lattice: Lattice, path: Array, least: float, reach: float = np.inf) -> Array:
     """From each kept corner straight on to the last point that it sees, and all points before it.
 
     The path is bent through the triangles between, which are free: it stays in its homotopy class.
     """
-    least = min(0.0, *lattice.at(path[[0, -1]])) - ROUNDING
-    marked = shortcut(lattice, path, least)
-    if marked is not None:
-        return path[marked]
     kept, i, last = [0], 0, len(path) - 1
     while i < last:
         far = i
@@ -315,6 +385,7 @@ def _shortcut(lattice: Lattice, path: Array) -> Array:
             beside_end = (ahead == last) | (i == 0)
             a = np.broadcast_to(path[i], path[ahead].shape)
             hidden = ~lattice.see(a, path[ahead], np.where(beside_end, least, 0.0))
+            hidden |= (np.linalg.norm(path[ahead] - path[i], axis=1) > reach) & (ahead > i + 1)
             far = int(ahead[hidden.argmax()]) - 1 if hidden.any() else int(ahead[-1])
             if hidden.any() or far == last:
                 break

@@ -43,7 +43,8 @@ class Roadmap:
     """A graph of points around obstacles, and the cheapest paths over it.
 
     Args:
-        num_halton: points of a Halton sequence all over the scene, added to `NODES` points around the obstacles.
+        num_halton: points of a Halton sequence all over the scene, added to `NODES` points around the obstacles; none
+            are needed among maps.
         max_overlap: allowed penetration of a path into an obstacle, as a share of the inflated radius. Keep it below
             0.05, which the judge accepts between two knots. A gap closed by no more than this can be flown through.
 
@@ -85,6 +86,10 @@ class Roadmap:
                 corners[place[course.rows]] = torch.stack(course.paths[:count], dim=1)
                 found[place[course.rows]] = course.found
         return corners, found
+
+    def repeats(self, other: Roadmap, scene: Scene) -> bool:
+        """Whether another search finds the same paths: those among maps need no points all over the scene."""
+        return bool(scene.obstacles.maps) and self.max_overlap == other.max_overlap
 
     def _courses(
         self, scene: Scene, rows: Tensor, group: int, count: int, library: CDLL | None, known: Known

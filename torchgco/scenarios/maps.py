@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Seed, check_options, check_value
 from torchgco.maps.distance import DistanceField, Unknown
 from torchgco.maps.files import read, read_task
-from torchgco.maps.grid import coordinates
+from torchgco.maps.grid import OccupancyGrid, coordinates
 from torchgco.scenarios import checks
 from torchgco.scenarios.base import MAX_DRAWS, Scenario, generator
 from torchgco.scenarios.layouts import Layouts
@@ -35,6 +35,7 @@ class MapFile(Scenario):
     Args:
         path, resolution, radius, origin, height, topic, layer: see `read`.
         unknown: what unknown cells count as.
+        outside: what lies around a map's cells: "free", or "occupied", a rim of one cell.
         start, goal: positions (d,), m.
         vehicle_radius, goal_radius: m; None: the file's, or 0.25 and 0.3.
         stages: N.
@@ -52,6 +53,7 @@ class MapFile(Scenario):
     topic: str | None = None
     layer: Any = None
     unknown: Unknown = "occupied"
+    outside: Unknown = "free"
     start: Any = None
     goal: Any = None
     vehicle_radius: checks.Length | None = None
@@ -69,6 +71,10 @@ class MapFile(Scenario):
         check_options(self, "scenario")
         options = {key: getattr(self, key) for key in ("resolution", "radius", "origin", "height", "topic", "layer")}
         found = read(self.path, field="scenario", **options)
+        if self.outside == "occupied":
+            if not isinstance(found, OccupancyGrid):
+                raise InputError("scenario.outside", "free: a cloud of points has no edge", self.outside)
+            found = found.enclosed()
         put("map", DistanceField.of(found, self.unknown))
         put("name", Path(self.path).stem)
         task = read_task(Path(self.path)) | {

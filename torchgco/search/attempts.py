@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchgco.base.status import STOPPED
+from torchgco.base.status import STOPPED, Status
 from torchgco.base.tree import copied, put, take
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import has_arrived, is_preferred
@@ -52,6 +52,12 @@ class Best:
             fits = best.violation <= self.solver.violation_tolerance
             self._arrived[tolerances] = fits & has_arrived(self.call.problem, best.X, tolerances)
         return self._arrived[tolerances]
+
+    @property
+    def limited(self) -> Tensor:
+        """The problems (b,) whose best trajectory is of a solve that a limit has ended."""
+        limits = (Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, STOPPED)
+        return torch.stack([self.end.status == int(limit) for limit in limits]).any(0).nonzero().flatten()
 
     def next_attempt(self) -> None:
         """Count attempts in the trace, also those that no problem of this batch needs."""

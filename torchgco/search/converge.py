@@ -12,6 +12,7 @@ from torchgco.base.options import check_options
 from torchgco.base.status import SOLVED, Status
 from torchgco.base.tree import put, take
 from torchgco.lagrangian.quality import has_arrived, is_preferred
+from torchgco.maps.field import BoundField
 from torchgco.native.dispatch import chord_clearance, interior_of
 from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
@@ -31,16 +32,17 @@ class Converge:
 
     Args:
         solver: of these solves.
-        when: "first": problems without obstacles, from the given guess; by AL-iLQR where that fails. "last": all that
-            are not yet solved as tightly, from the best trajectory; where that leads to none that is feasible, from the
-            given guess.
+        when: "first": problems without obstacles, from the given guess; by AL-iLQR where that fails. "mapped": those
+            with maps where a limit has ended the solve of the best trajectory, from there: a map has one row per knot,
+            along which AL-iLQR takes many short steps. "last": all that are not yet solved as tightly, from the best
+            trajectory; where that leads to none that is feasible, from the given guess.
 
     Raises:
         InputError: a field out of its range.
     """
 
     solver: InteriorPoint = InteriorPoint()
-    when: Literal["first", "last"] = "last"
+    when: Literal["first", "mapped", "last"] = "last"
 
     def __post_init__(self) -> None:
         check_options(self, "converge")
@@ -52,6 +54,9 @@ class Converge:
             return
         if self.when == "last":
             self._tighten(search)
+        elif self.when == "mapped":
+            if any(isinstance(part, BoundField) for part in problem.geometric):
+                self._continue(search, search.best.limited)
         elif self.begins(problem) and not search.begun:
             search.begin(self.solver.solved(search.call))
             if search.record is not None:
@@ -76,15 +81,16 @@ class Converge:
 
     def _tighten(self, search: Search) -> None:
         best, rows = search.best, _unsolved(search)
-        if rows.numel() == 0:
-            return
-        start = take(best.end.best, rows)
-        whole = replace(search.call, callback=None)  # a few iterations: not worth a report
-        call = whole.take(rows)
-        self._keep(search, rows, continued(self.solver, call, start))
+        self._continue(search, rows)
+        whole = replace(search.call, callback=None)
         lost = rows[best.end.best.violation[rows] > search.solver.violation_tolerance]
         if lost.numel() > 0:
             self._keep(search, lost, self.solver.solved(whole.take(lost)))
+
+    def _continue(self, search: Search, rows: Tensor) -> None:
+        if rows.numel() > 0:
+            call = replace(search.call.take(rows), callback=None)  # a few iterations: not worth a report
+            self._keep(search, rows, continued(self.solver, call, take(search.best.end.best, rows)))
 
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
         """Keep solved trajectories, unless the old ones are better by more than a small violation is worth.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import Positive, check_options
-from torchgco.base.status import STALLED, STOPPED, Status
+from torchgco.base.status import STALLED
 from torchgco.base.tree import take
 from torchgco.constraints.bounds import ControlBounds
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
@@ -51,9 +51,7 @@ class Finish:
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         best = search.best
-        limits = (Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, STOPPED)
-        cut = torch.stack([best.end.status == int(limit) for limit in limits]).any(0)
-        self._attempt(search, cut.nonzero().flatten(), _from_best)
+        self._attempt(search, best.limited, _from_best)
         best.next_attempt()
         stalled = (best.end.status == STALLED) & (best.end.best.violation > self.solver.violation_tolerance)
         self._attempt(search, stalled.nonzero().flatten(), self._from_changed)

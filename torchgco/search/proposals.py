@@ -163,7 +163,9 @@ class PathProposals:
         R, unit = (scale[rows] for scale in whole.scales)
         usable, known = torch.isfinite(unit) & (unit > 0), []
         found = torch.zeros_like(usable)
-        for roadmap in self.roadmaps:
+        for number, roadmap in enumerate(self.roadmaps):
+            if any(roadmap.repeats(other, whole.scene) for other in self.roadmaps[:number]):
+                continue
             corners, arrives = roadmap.paths(whole.scene, self.num_paths, rows, whole.known)
             known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, self.num_paths)))
             found = found | (arrives & usable)

@@ -21,6 +21,12 @@ PROBLEMS = {
     "unproposed": "caught, without a proposal",
 }
 
+CONVERGED = {
+    "first": "all, where there are no obstacles",
+    "mapped": "in maps, where a limit has ended the solve",
+    "last": "not solved as tightly yet",
+}
+
 
 def rows_of(passes: Sequence[Pass]) -> list[dict[str, str]]:
     """A row per pass, with the columns `COLUMNS`; empty where one says nothing.
@@ -48,7 +54,7 @@ def _described(one: Pass) -> dict[str, str]:
             draws = "continued once" if one.redraws == 0 else f"{one.redraws} times, other draws"
             return {"problems": f"{PROBLEMS[one.when]}: {draws}"}
         case Converge():
-            problems = "all, where there are no obstacles" if one.when == "first" else "not solved as tightly yet"
+            problems = CONVERGED[one.when]
             tight = f"violation {one.solver.violation_tolerance:g}, optimality {one.solver.tolerance:g}"
             return {"problems": f"{problems}: interior point", "accepted": tight}
         case Finish():

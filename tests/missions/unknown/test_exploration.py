@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.missions.missions import REST
-from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, Spheres, presets
+from torchgco import Airframe, Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, Spheres, presets
 from torchgco.base.errors import InputError
 from torchgco.missions import Mission, Planner
 from torchgco.missions.contact import Contact
@@ -21,7 +21,7 @@ from torchgco.missions.safe import safe_arrays
 from torchgco.missions.sensing import Depth, Lidar
 from torchgco.missions.tables import SENSED, ending, mission_frame, mission_row, packed, unpacked
 from torchgco.missions.unknown.exploration import Exploration
-from torchgco.missions.unknown.explorer import Explorer
+from torchgco.missions.unknown.explorer import Explorer, steady_yaw
 
 GOALS = torch.tensor([[4.0, 0.0, 0.0], [3.0, 0.5, 0.2]]).double()
 EXPLORER = Explorer(around=(2.5, 1.5), stages=40)
@@ -171,3 +171,14 @@ def test_known_moving_bodies_are_made_way_for() -> None:
     log = mission(explorer=replace(EXPLORER, movers="known")).fly(problem, seed=1)
     end = ending(log.arrays(), 0, log.period, Contact.among(problem), GOALS[0].numpy(), 0.5)
     assert end.outcome is not Outcome.COLLISION and end.clearance > 0.1 and end.goal_distance < 2.0
+
+
+def test_plans_yaw_no_faster_than_costs_no_thrust() -> None:
+    """From turning one way to turning the other in a period, the rotors that rise do so by half of what they can."""
+    airframe, model = Airframe(), QuadrotorPlanning(dt=0.05)
+    most = steady_yaw(airframe, model, torch.zeros(1).double())
+    turn = 2.0 * most / float(model.rate_time_constant)  # rad/s^2
+    change = turn * airframe.inertia[2][2] / (4.0 * airframe.rotor_torque)  # N per rotor
+    hover = torch.tensor(airframe.mass * 9.81 / 4.0).double()
+    rise = 0.05 * airframe.thrust_rate(hover, torch.tensor(airframe.rotor_speeds[1]).double())
+    assert change == pytest.approx(0.5 * float(rise)) and 0.5 < most < 2.0

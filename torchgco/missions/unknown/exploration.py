@@ -52,6 +52,7 @@ LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
 SEARCHED = 2  # control periods after which a new search is due
 HELD = 2.0  # s before a search with less margin ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
+DRIFT = 0.01  # m by which a plan may come nearer while it is flown, as a vehicle isn't exactly where it should be
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
 ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joined to it
 STILL = 0.3  # m within which a vehicle has stayed in its place
@@ -203,7 +204,7 @@ class Exploration:
 
     def keep(self, scout: Scout) -> float:
         """The distance, m, that plans keep from what isn't known to be free."""
-        least = CONTACT_FACTOR * scout.radius + SPARE + 0.01
+        least = CONTACT_FACTOR * scout.radius + SPARE + 2.0 * DRIFT
         share = LEVELS[scout.level][0]
         return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least
 
@@ -347,11 +348,13 @@ class Exploration:
         """
         order = [int(c) for c in cost.argsort() if bool(torch.isfinite(cost[c]))]
         spare = {c: self.spare(X[c].numpy(), b) for c in order}
-        safe = next((c for c in order if spare[c] >= 0 and bool(flyable[c])), None)
+        own = self.spare(kept.numpy(), b, 3.0 * AT_REST)
+        asked = min(max(own, 0.0), DRIFT)
+        safe = next((c for c in order if spare[c] >= asked and bool(flyable[c])), None)
         if safe is not None:
             return safe
         # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.
-        most, own = max(order, key=lambda c: spare[c], default=None), self.spare(kept.numpy(), b, 3.0 * AT_REST)
+        most = max(order, key=lambda c: spare[c], default=None)
         if most is not None and own < 0 and spare[most] > own + BETTER:
             return most
         if order and own == -np.inf:  # none stops as it should: better a plan that nearly does than one that doesn't
@@ -374,7 +377,7 @@ class Exploration:
         p = X[:, :3]
         share = np.arange(FINE)[:, None] / FINE
         points = np.concatenate([(p[:-1, None] + share * np.diff(p, axis=0)[:, None]).reshape(-1, 3), p[-1:]])
-        gaps = scout.seen.gaps(points, least + 0.01, self.kinds)
+        gaps = scout.seen.gaps(points, least + 2.0 * DRIFT, self.kinds)
         gaps = np.minimum(gaps, scout.moving.gaps(points, self.dt / FINE * np.arange(len(points))))
         low, high = scout.seen.box(0.0)
         gaps = gaps - np.linalg.norm(points - points.clip(low, high), axis=1)  # how far outside of the map

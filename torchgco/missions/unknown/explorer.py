@@ -15,6 +15,8 @@ from torchgco.base.shapes import Dimensions
 from torchgco.constraints import ControlBounds, StateBounds
 from torchgco.constraints.base import Constraint
 from torchgco.costs.quadratic import QuadraticCost
+from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.planner import Planner
 from torchgco.missions.planning_problem import biased, first_step, planning_state
 from torchgco.missions.sensing.grid import SeenMap
@@ -148,10 +150,13 @@ class PlanningForm:
         return Problem(dynamics, cost, constraints, x0, N)
 
     def _controls(self) -> ControlBounds:
-        bounds = self.whole.control_bounds
+        """The bounds, and yaw that costs no thrust from the second stage on; the first stage is the rotors'."""
+        bounds, N = self.whole.control_bounds, self.explorer.stages
         assert bounds is not None
-        lower, upper = bounds.by_knot
-        return ControlBounds(lower[:, 0], upper[:, 0])
+        lower, upper = (bound[:, :1].repeat(1, N, 1) for bound in bounds.by_knot)
+        most = steady_yaw(self.planner.airframe, self.whole.dynamics, lower)
+        lower[:, 1:, 2], upper[:, 1:, 2] = lower[:, 1:, 2].clamp(min=-most), upper[:, 1:, 2].clamp(max=most)
+        return ControlBounds(lower, upper)
 
     def _limits(self, seeds: Tensor, room: Tensor, allowed: Tensor, region: Tensor) -> StateBounds:
         """Speeds, and positions within the map, around the seeds as far as the half-spaces hold."""
@@ -185,6 +190,18 @@ class PlanningForm:
             middle = HOVER if i == 13 else 0.0
             lower[i], upper[i] = middle - size, middle + size
         return StateBounds(lower, upper, knots=[N - 1, N])
+
+
+def steady_yaw(airframe: Airframe, model: Dynamics, like: Tensor) -> float:
+    """The commanded yaw rate, rad/s, that one period's change of thrusts gives, with as much left for tilting.
+
+    A rotor's thrust falls at once, but rises slowly: a vehicle asked to yaw more loses thrust, and sinks. Yawing takes
+    five times the thrust that tilting does.
+    """
+    hover = like.new_tensor(airframe.mass * HOVER / 4.0)
+    rise = float(model.dt) * airframe.thrust_rate(hover, like.new_tensor(airframe.rotor_speeds[1]))
+    turn = 0.5 * rise * airframe.allocation(like)[2].abs().sum() / airframe.inertia[2][2]  # rad/s^2, from none
+    return float(0.5 * turn * model.rate_time_constant)  # from turning one way to turning the other
 
 
 def unflyable(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
