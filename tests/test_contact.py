@@ -23,7 +23,7 @@ from torchgco import (
     Spheres,
     Status,
 )
-from torchgco.contact import touches
+from torchgco.api import touches
 
 FAST = AugmentedLagrangian()
 

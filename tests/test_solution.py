@@ -23,7 +23,7 @@ from torchgco import (
     StateBounds,
 )
 from torchgco.baselines import Hold, IteratedMPPI
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 
 
 def test_save_and_load(tmp_path) -> None:

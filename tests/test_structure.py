@@ -18,7 +18,7 @@ LAYERS = [
     ["lagrangian", "judging"],
     ["explaining"],
     ["solution", "native"],
-    ["solvers", "roadmap", "contact"],
+    ["solvers", "roadmap"],
     ["guidance", "missions", "scenarios"],
     ["search", "plotting"],
     ["view"],

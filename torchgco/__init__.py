@@ -3,6 +3,12 @@
     problem  = Problem(dynamics, cost, constraints, x0, N)
     solution = torchgco.solve(problem)
 
+What a solve does, folder by folder: `problem` checks the parts and binds them to a batch; `tracing` records their
+functions, and `native` compiles them. `solvers` holds the local solvers: AL-iLQR (with the `lagrangian`) and an
+interior point. Where obstacles catch a trajectory, `search` runs the table of passes that `presets.gco` lists, along
+paths from the `roadmap` and from samples of the `guidance`, and keeps the best. `judging` measures the result by code
+of its own.
+
 `torchgco.compose` needs Hydra and is imported lazily: importing torchgco loads neither Hydra nor matplotlib.
 """
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -9,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError, shown
+from torchgco.base.errors import ContactWarning, InputError, shown
 from torchgco.base.options import check_value
 from torchgco.base.shapes import check_shape, computing_on
+from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
-from torchgco.contact import warned_of_contact
+from torchgco.judging.judge import CLEARANCES, by_kind
 from torchgco.native.dispatch import current, open_loop
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
@@ -25,6 +27,9 @@ from torchgco.solvers.watching import Watcher
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+CLAIMS = (Status.CONVERGED, Status.FEASIBLE)  # that the constraints hold
+NAMED = 5  # problems that the warning names
 
 
 def solve(
@@ -82,7 +87,7 @@ def solve(
         watcher.close()
     if name is not None and found.account is not None:
         found = replace(found, account=found.account.of_preset(name))
-    return warned_of_contact(problem, found)
+    return _warned_of_contact(problem, found)
 
 
 def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:
@@ -107,6 +112,37 @@ def _start(problem: Problem, warm: Solution | None, solver: Solver) -> tuple[Pro
     solver.announce(traced)
     problem = traced if whole is problem else problem  # traced once, for the guess and for the solve
     return problem, _guess(problem, traced)
+
+
+def _warned_of_contact(problem: Problem, solution: Solution) -> Solution:
+    """The solution, with a ContactWarning at the caller's caller where trajectories touch obstacles between knots.
+
+    Only trajectories with a status of CLAIMS count; obstacles of a kind that the judge doesn't know are left out.
+    """
+    touching = touches(problem, solution).nonzero().flatten().tolist()
+    if touching:
+        named = ", ".join(map(str, touching[:NAMED])) + (", ..." if len(touching) > NAMED else "")
+        warnings.warn(
+            f"{len(touching)} of {problem.B} trajectories touch an obstacle between the knots, which their status does "
+            f"not show: problem {named} (to_frame(problem) has their clearance; shorter time steps help)",
+            ContactWarning,
+            stacklevel=3,
+        )
+    return solution
+
+
+def touches(problem: Problem, solution: Solution) -> Tensor:
+    """Which trajectories (B,) claim to be feasible and come below a clearance of 0 m, by the judge's distances."""
+    found = torch.stack([solution.status == status for status in CLAIMS]).any(0)
+    rows = found.nonzero().flatten()
+    if rows.numel() == 0:
+        return found
+    nearest = torch.full_like(solution.cost[rows], torch.inf)
+    for part in problem.constraints:
+        if isinstance(part, tuple(CLEARANCES)):
+            nearest = torch.minimum(nearest, by_kind(CLEARANCES, part)(part.take(rows), solution.X[rows])[1])
+    found[rows] = nearest < 0
+    return found
 
 
 def plot(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:

@@ -286,12 +286,12 @@ def _guidance(space: Space) -> GCO:
             samples=256, covariance=None, spread=0.35, temperature=0.01, rounds=20, noise_knots=8, decay=0.93,
             dwell_cost=1.0, elite=5, dtype="float32",
         )  # fmt: skip
-        return GCO(sampler, 2.0, start_from_sample=True, sample_from_rest=True, single_contact_after=3)
+        return GCO(sampler, 2.0, start_from_sample=True, sample_from_rest=True)
     sampler = MPPI(
         samples=128, covariance=None, spread=0.1, temperature=0.01, rounds=12, noise_knots=10, decay=0.9, elite=5,
         dtype="float32",
     )  # fmt: skip
-    return GCO(sampler, 0.09, start_from_sample=True, single_contact_after=6)
+    return GCO(sampler, 0.09, start_from_sample=True)
 
 
 def _local(space: Space) -> AugmentedLagrangian:

@@ -22,7 +22,7 @@ from torchgco.base.errors import InputError
 from torchgco.baselines.nlp import Program, transcribe
 from torchgco.constraints.base import Constraint
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 

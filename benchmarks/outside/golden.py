@@ -19,8 +19,8 @@ from benchmarks.lib.page import SET_UP
 from benchmarks.outside.golden_problems import GOLDEN, Golden
 from torchgco import Polish, Problem, certify, solve
 from torchgco.baselines import CasADiSolver
+from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.quality import violation
-from torchgco.lagrangian.rollout import open_loop
 
 TOLERANCE = 1e-6
 # At its own tolerance of 1e-8 and with relaxed bounds, a rollout of IPOPT's controls can miss a goal by 5e-5.

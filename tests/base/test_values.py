@@ -16,7 +16,6 @@ from torchgco.base.values import NONE
 from torchgco.native import kernels
 from torchgco.native.dispatch import EagerWarning, engine_of, measured
 
-pytestmark = pytest.mark.usefixtures("seldom_solved")
 D = torch.float64
 B, N = 3, 20
 GOALS = torch.tensor([[1.0, 0.0], [2.0, 1.0], [0.0, 2.0]], dtype=D)

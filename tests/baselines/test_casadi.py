@@ -25,9 +25,9 @@ from torchgco import (
 )
 from torchgco.baselines import CasADiSolver, Hold
 from torchgco.constraints import Constraint
+from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.flying.flight import Flight
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.solvers.contracts import Call, Solver
 
 PLUGINS = ["ipopt", "fatrop"]

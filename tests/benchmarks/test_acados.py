@@ -20,7 +20,7 @@ from tests.benchmarks.test_speed import TINY
 from tests.problems import boxed_batch, planar_batch, quadrotor_batch
 from torchgco import ControlBounds, InputError, Problem, QuadraticCost, Spheres, StateBounds
 from torchgco.baselines import CasADiSolver
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 
 needs_acados = pytest.mark.skipif(not acados.installed(), reason="acados isn't installed: `make benchmark` does")
 

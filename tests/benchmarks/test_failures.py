@@ -49,7 +49,7 @@ def test_only_the_last_outer_iterations_count() -> None:
 
 def test_the_witness_changes_nothing() -> None:
     problem, U0 = planar_batch(B=3, N=25, obstacles=9, seed=4)
-    guidance = GCO(sampler=MPPI(samples=20), single_contact_after=1)
+    guidance = GCO(sampler=MPPI(samples=20))
     solver = AugmentedLagrangian(inner=ILQR(max_iterations=4), guidance=guidance, max_outer_iterations=4)
     witness = Witness(guidance)
     seen, unseen = (replace(solver, guidance=g).solve(problem, U0, seed=2) for g in (witness, guidance))

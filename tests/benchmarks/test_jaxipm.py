@@ -10,10 +10,9 @@ import torch
 from benchmarks.outside.jaxipm import MX, OURS, PUBLISHED, TOLERANCE, by_ipopt, extremes, main, versus
 from benchmarks.outside.jaxipm_problems import SCENARIOS, Scenario, centers, spread
 from torchgco import Status
+from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.quality import violation
-from torchgco.lagrangian.rollout import open_loop
 
-pytestmark = pytest.mark.usefixtures("seldom_solved")
 NAMED = {scenario.name: scenario for scenario in SCENARIOS}
 # Of the first instance: by the published form of IPOPT at 1e-8.
 KNOWN = {

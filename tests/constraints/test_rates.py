@@ -38,7 +38,6 @@ from torchgco.native import kernels
 from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.problem.rates import with_controls_before
 
-pytestmark = pytest.mark.usefixtures("seldom_solved")
 D = torch.float64
 B, N = 3, 30
 BRIEF = AugmentedLagrangian(inner=ILQR(max_iterations=2), max_outer_iterations=2)

@@ -27,7 +27,7 @@ from torchgco import (
     presets,
 )
 from torchgco.baselines import CasADiSolver
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 from torchgco.native.dispatch import EagerWarning, chord_clearance
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # unless a test asks for it

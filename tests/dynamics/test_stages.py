@@ -14,9 +14,9 @@ import torchgco
 from tests.native.users import N, with_stages
 from torchgco import ILQR, AugmentedLagrangian, FunctionCost, FunctionDynamics, InputError, Problem, Status
 from torchgco.baselines import CasADiSolver
+from torchgco.dynamics import rollout
 from torchgco.judging.certificate import certify
 from torchgco.judging.judge import judge
-from torchgco.lagrangian import rollout
 from torchgco.native import kernels
 from torchgco.native.dispatch import EagerWarning, engine_of, open_loop
 

@@ -32,7 +32,7 @@ from torchgco import (
     QuadraticCost,
     Solution,
 )
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 from torchgco.native import kernels
 
 D = torch.float64

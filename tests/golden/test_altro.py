@@ -10,7 +10,7 @@ import torch
 from benchmarks.outside.golden import IPOPT, main
 from benchmarks.outside.golden_problems import GOLDEN
 from torchgco import Polish, Problem, Solution, Status, certify
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 
 # IPOPT's costs from the published starts, the least of several initial guesses (escape: from the solution found here).
 KNOWN = {

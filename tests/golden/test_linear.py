@@ -10,9 +10,8 @@ import torch
 import torchgco
 from tests.golden.linear import LinearQuadratic, saddle
 from torchgco import Constraint, ControlBounds, FunctionConstraint, Polish, Solution, StateBounds, Status, certify
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 
-pytestmark = pytest.mark.usefixtures("seldom_solved")
 SIZES = [(1, 1, 1), (4, 2, 13)]  # n, m, N
 MORE = [(n, m, N) for n in (1, 2, 5, 8) for m in (1, 3, 4) for N in (2, 11, 40)]
 CASES = SIZES + [pytest.param(*size, marks=pytest.mark.slow) for size in MORE]

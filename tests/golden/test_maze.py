@@ -22,8 +22,8 @@ from benchmarks.outside.maze_problem import (
     waypoint_guess,
 )
 from torchgco import ControlBounds, StateBounds
+from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.quality import violation
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.obstacles.spheres import BoundSpheres
 
 

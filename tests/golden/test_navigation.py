@@ -10,8 +10,8 @@ import torch
 from benchmarks.outside.navigation import COMPARISON, TOLERANCE, local, main
 from benchmarks.outside.navigation_problem import FASTEST, HOVER, SLOWEST, fan, line_guess, navigation, recount
 from torchgco import ControlBounds, StateBounds
+from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.quality import violation
-from torchgco.lagrangian.rollout import open_loop
 
 # Costs of the source's script with IPOPT, by the place among 80 starts of the fan of 180 degrees.
 KNOWN = {0: 497.919359, 20: 498.304044, 60: 498.304012, 79: 497.919359}

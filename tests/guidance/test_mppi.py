@@ -13,9 +13,9 @@ from tests.reference.guidance import active_spheres, cpuf, stuck_knots
 from tests.reference.mppi import MppiSettings, mppi
 from torchgco import GCO, MPPI, InputError
 from torchgco.base.draws import DrawKey, standard_normal
+from torchgco.dynamics.rollout import open_loop
 from torchgco.guidance.mppi import Flight, Noise, draw, fly
 from torchgco.lagrangian.penalties import GuideRegion
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.solvers.caught import active_counts, caught_knots
 
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
@@ -113,7 +113,7 @@ def test_a_single_sphere_counts_after_some_iterations() -> None:
     X = through_the_obstacles(problem)
     X[..., 1] = problem.constraints[0].centers[:, :1, 1]
     start = GuideRegion.inactive(X, torch.full((3,), 20.0, dtype=torch.float64), problem.dynamics.position)
-    gco = GCO(sampler=MPPI(samples=3), single_contact_after=2)
+    gco = GCO(sampler=MPPI(samples=3)).in_search(2)
     assert not gco.update(problem, X, U, start, key(3, outer=1)).penalty.is_active.any()
     present = ~problem.constraints[0].absent[:, 0]
     assert torch.equal(gco.update(problem, X, U, start, key(3, outer=2)).penalty.is_active, present)

@@ -21,10 +21,10 @@ from torchgco import (
     StateBounds,
     certify,
 )
+from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.results.records import COLUMNS
 from torchgco.judging.certificate import frame_columns
 from torchgco.judging.judge import judge
-from torchgco.lagrangian.rollout import open_loop
 
 # Thin obstacles are the subject here.
 pytestmark = pytest.mark.filterwarnings("ignore::torchgco.ScaleWarning")

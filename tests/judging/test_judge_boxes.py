@@ -9,10 +9,10 @@ import torch
 from tests.problems import boxed_batch, random_trajectory
 from tests.reference import boxes as brute_force
 from torchgco import Boxes, Problem, certify, judge
+from torchgco.dynamics.rollout import open_loop
 from torchgco.judging.certificate import CHORDS
 from torchgco.judging.distances import box_segment_distance
 from torchgco.judging.judge import box_clearance
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.obstacles.boxes import BoundBoxes
 
 SAMPLES = 601

@@ -12,7 +12,7 @@ from torch import Tensor
 from tests.missions.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
 from tests.reference import models
 from torchgco import Airframe, ControlBounds, FirstStepRates, InputError, Planar, Problem, QuadraticCost, Restarts
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 from torchgco.missions.disturbance import Disturbance
 from torchgco.missions.planner import Plan, Planner
 from torchgco.missions.planning_problem import Margin

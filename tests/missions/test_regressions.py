@@ -21,7 +21,7 @@ from torchgco import (
     StateBounds,
 )
 from torchgco.constraints import Constraint, ControlBounds
-from torchgco.lagrangian.rollout import open_loop as eager_rollout
+from torchgco.dynamics.rollout import open_loop as eager_rollout
 from torchgco.missions.planning_problem import BiasedPlanning
 from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler

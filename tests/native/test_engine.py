@@ -26,10 +26,10 @@ from torchgco import (
     Spheres,
     StateBounds,
 )
+from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.native import kernels
 from torchgco.native.dispatch import EagerWarning, engine_of
 from torchgco.solvers import ilqr

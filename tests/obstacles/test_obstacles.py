@@ -13,7 +13,7 @@ from torch import Tensor
 from tests.problems import planar_batch
 from torchgco import InputError, Problem, certify, judge
 from torchgco.base.shapes import Dimensions
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles import CONTACT_FACTOR, Obstacles
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.roadmap.scene import scene_of

@@ -27,7 +27,6 @@ from torchgco import (
 from torchgco.judging.judge import judge
 from torchgco.native import kernels
 
-pytestmark = pytest.mark.usefixtures("seldom_solved")
 D = torch.float64
 HORIZONS = [30, 18, 24]
 

@@ -102,7 +102,7 @@ def slopes_of(function: Callable[[Tensor], Tensor], w: Array) -> tuple[Array, Ar
     values = function(at)
     if values.numel() == 0:
         return np.zeros(0), np.zeros((0, len(w)))
-    slopes = torch.autograd.functional.jacobian(function, at)
+    slopes = torch.autograd.functional.jacobian(function, at, vectorize=True)
     return values.numpy(), np.asarray(slopes)
 
 
@@ -122,7 +122,7 @@ def curvature(program: Program, point: Point) -> Array:
         constrained = y @ program.gaps(w) + e @ program.equalities(w) + z @ program.inequalities(w)
         return point.scale * program.cost(w) + constrained
 
-    return np.asarray(torch.autograd.functional.hessian(lagrangian, torch.from_numpy(point.w)))
+    return np.asarray(torch.autograd.functional.hessian(lagrangian, torch.from_numpy(point.w), vectorize=True))
 
 
 def residual(at: Linear, point: Point) -> Array:

@@ -32,7 +32,7 @@ SAMPLER = MPPI(
     samples=32, covariance=None, spread=0.35, temperature=0.01, rounds=3, noise_knots=8, decay=0.93, dwell_cost=1.0,
     elite=5,
 )  # fmt: skip
-SAMPLING = GCO(SAMPLER, 2.0, start_from_sample=True, sample_from_rest=True, single_contact_after=3)
+SAMPLING = GCO(SAMPLER, 2.0, start_from_sample=True, sample_from_rest=True)
 PATHS = PathProposals(follow=(Follow(iterations=8),), max_penetration=0.5)
 SOLVER = restarts(LOCAL, PATHS, SAMPLING, attempts=2)
 FREE, PASSES, SHORT, CLOSED = range(4)

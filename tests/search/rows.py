@@ -58,14 +58,15 @@ def restarts(
     attempts: int = 4,
     every: bool = False,
     last: Sequence[Pass] = (ClearChords(),),
+    after: int | None = 3,
 ) -> Restarts:
     """A table like the default's: along paths, more thoroughly where that fails, then from samples.
 
     attempts  after a trajectory is caught
     every     all of them, even where one arrives
+    after     outer iterations after which a single contact counts as caught, where there is guidance
     """
-    when, after = ("caught" if every else "unarrived"), None if guidance is None else guidance.single_contact_after
-    first = Solve(single_contact_after=after)
+    when, first = "caught" if every else "unarrived", Solve(single_contact_after=None if guidance is None else after)
     passes: list[Pass] = [Solve("end", "pathless"), first]
     if proposals is not None:
         passes += [*rounds(replace(proposals, when=when)), FromProposal(), IntoGoal()]

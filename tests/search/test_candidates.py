@@ -6,7 +6,7 @@ import torch
 
 from tests.search.cup import QUICK, controls, cup
 from torchgco import Problem
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 from torchgco.native.dispatch import chord_clearance
 from torchgco.search.candidates import Candidates
 

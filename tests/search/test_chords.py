@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -15,6 +18,7 @@ from torchgco import (
     Planar,
     Problem,
     QuadraticCost,
+    Solution,
     Spheres,
     compose,
     judge,
@@ -49,15 +53,20 @@ def corners(B: int = 8) -> Problem:
     return planar([Boxes(centers, half, 0.06, rng.uniform(0, 3.1, (B, 10)))], B, dt=0.05, N=160)
 
 
+@cache
+def cleared(make: Callable[[], Problem]) -> tuple[Problem, Solution]:
+    problem = make()
+    return problem, solve(problem)
+
+
 def without_clearing(problem: Problem) -> Tensor:
     return solve(problem, solver=without(presets.gco(problem), ClearChords)).U
 
 
 @pytest.mark.parametrize("make", [coarse_disc, corners])
 def test_chords_are_cleared_and_nothing_else_changes(make) -> None:
-    problem = make()
+    problem, solution = cleared(make)
     before = without_clearing(problem)
-    solution = solve(problem)
     old, new = judge(problem, before), judge(problem, solution.U)
     cut = old.feasible & (old.clearance < 0)
     assert bool(cut.any()) and int(new.sound.sum()) > int(old.sound.sum())
@@ -67,8 +76,8 @@ def test_chords_are_cleared_and_nothing_else_changes(make) -> None:
 
 
 def test_a_coarse_disc_is_cleared_for_every_start() -> None:
-    problem = coarse_disc()
-    assert bool(judge(problem, solve(problem).U).sound.all())
+    problem, solution = cleared(coarse_disc)
+    assert bool(judge(problem, solution.U).sound.all())
 
 
 def test_growth_counts_from_the_clearance_that_the_last_solve_missed() -> None:
@@ -93,8 +102,7 @@ def test_more_effort_loses_no_clear_trajectory() -> None:
 
 
 def test_a_problem_is_cleared_alike_in_every_batch() -> None:
-    problem = corners()
-    whole = solve(problem)
+    problem, whole = cleared(corners)
     order = torch.tensor([5, 0, 3])
     part = presets.gco(problem).solve(problem.take(order), problem.x0.new_zeros(3, problem.N, 2), ids=order)
     assert torch.equal(part.U, whole.U[order]) and torch.equal(part.iterations, whole.iterations[order])

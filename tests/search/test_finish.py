@@ -89,7 +89,7 @@ def finished(problem: Problem) -> Restarts:
 
 
 def feasible(problem: Problem, solution: Solution) -> bool:
-    X = torchgco.lagrangian.rollout.open_loop(problem.dynamics, problem.x0, solution.U)
+    X = torchgco.dynamics.rollout.open_loop(problem.dynamics, problem.x0, solution.U)
     return all(float(part.worst(X, solution.U).max()) <= 1e-3 for part in problem.constraints)
 
 
@@ -175,7 +175,7 @@ def rocket() -> Problem:
 
 def test_a_guess_that_overflows_starts_in_the_middle_of_the_bounds() -> None:
     problem = rocket()
-    X = torchgco.lagrangian.rollout.open_loop(problem.dynamics, problem.x0, torch.zeros(2, 60, 1, dtype=D))
+    X = torchgco.dynamics.rollout.open_loop(problem.dynamics, problem.x0, torch.zeros(2, 60, 1, dtype=D))
     assert not bool(torch.isfinite(X).all())
     solution = torchgco.solve(problem)
     assert set(solution.statuses) <= {Status.CONVERGED, Status.FEASIBLE} and feasible(problem, solution)

@@ -19,7 +19,7 @@ from torchgco import (
     judge,
 )
 from torchgco.base.tree import take
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.roadmap.scene import scene_of

@@ -59,7 +59,7 @@ def test_the_budget_counts_the_iterations_of_every_start(monkeypatch) -> None:
     problem, U0 = planar_batch(B=4, N=25, obstacles=9, seed=4)
     problem.x0[2, :2] = problem.constraints[0].centers[2, 0]  # inside an obstacle: no guess helps
     monkeypatch.setattr(AugmentedLagrangian, "outer_loop", noted)
-    guided = replace(LOCAL, guidance=GCO(MPPI(samples=8), single_contact_after=1))
+    guided = replace(LOCAL, guidance=GCO(MPPI(samples=8)))
     budget = 40
     solution = MultiStart(guided, starts=50, budget=budget, covariance=9.0, noise_knots=5).solve(problem, U0)
     assert solution.iterations.tolist() == [sum(made[b]) for b in range(4)] and made[2] == [0]

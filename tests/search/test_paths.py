@@ -14,8 +14,8 @@ from tests.problems import quadrotor_batch
 from tests.search.cup import GOAL, QUICK, controls, cost, cup, cups
 from tests.search.rows import proposed, varied
 from torchgco import ControlBounds, InputError, PathProposals, Problem, Roadmap, judge
+from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.homotopy import classes
 from torchgco.search import Follow, Refine

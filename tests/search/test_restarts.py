@@ -211,7 +211,7 @@ def test_a_single_contact_counts_as_caught_from_the_given_iteration(solves: list
     counts = []
     for after in (1, 2, None):
         solves.clear()
-        restarts(LOCAL, None, replace(SAMPLING, single_contact_after=after), attempts=1).solve(problem, U0)
+        restarts(LOCAL, None, SAMPLING, attempts=1, after=after).solve(problem, U0)
         counts.append((int(solves[0].end.status) == STOPPED, int(solves[0].end.outer), len(solves)))
     assert counts[:2] == [(True, 1, 2), (True, 2, 2)] and counts[2][0] is False and counts[2][2] == 1
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from tests.search.rows import proposed, varied, without
 from torchgco import PathProposals, Problem, Restarts, Status, compose, presets
+from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.roadmap.scene import has_paths
 from torchgco.search import Converge, Follow
 from torchgco.search.following import Paths, followed

@@ -11,9 +11,9 @@ from scipy import optimize
 from tests.problems import planar_batch, quadrotor_batch
 from tests.solvers.problems import linear_problem, zeros
 from torchgco import ILQR, AugmentedLagrangian, FunctionConstraint, InputError, Status, solve
+from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.solvers import augmented_lagrangian
 from torchgco.solvers.contracts import Advice
 

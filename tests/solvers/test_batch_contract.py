@@ -52,9 +52,9 @@ SOLVERS = {
         GCO(
             sampler=MPPI(samples=40, covariance=4.0, rounds=3, noise_knots=5, decay=0.8, elite=3, dwell_cost=1.0),
             start_from_sample=True,
-            single_contact_after=2,
         ),
         attempts=3,
+        after=2,
     ),
     "mppi": IteratedMPPI(sampler=SAMPLER, iterations=4),
 }

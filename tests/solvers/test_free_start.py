@@ -32,7 +32,7 @@ from torchgco.baselines import CasADiSolver
 from torchgco.native.compiler import find_compiler
 
 pytestmark = [
-    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"), pytest.mark.usefixtures("seldom_solved"),
+    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
 ]  # fmt: skip
 
 D, INF = torch.float64, torch.inf

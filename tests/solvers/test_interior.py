@@ -30,7 +30,7 @@ from torchgco import (
 )
 from torchgco.base.tree import take
 from torchgco.baselines import CasADiSolver
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 from torchgco.native import kernels
 from torchgco.native.compiler import find_compiler
 from torchgco.solvers import interior

@@ -9,11 +9,11 @@ import torch
 
 from tests.problems import planar_batch, quadrotor_batch
 from torchgco import InputError
+from torchgco.base.memory import free_memory
 from torchgco.native.dispatch import engine_of
 from torchgco.solvers.memory import (
     CPU_LIMIT,
     element_bytes,
-    free_memory,
     is_out_of_memory,
     least_bytes,
     plan_batch,

@@ -26,8 +26,7 @@ CHANGES = {
     ),
     ILQR: dict(as_printed=False, tolerance=1e3, max_iterations=3),
     GCO: dict(
-        sampler=MPPI(samples=5), initial_penalty=2.0, penalty_growth=1.0, single_contact_after=1,
-        sample_from_rest=True,
+        sampler=MPPI(samples=5), initial_penalty=2.0, penalty_growth=1.0, sample_from_rest=True,
     ),
     MPPI: dict(
         samples=7, covariance=4.0, spread=0.2, temperature=100.0, saturation=None, rounds=1,

@@ -28,8 +28,8 @@ from torchgco import (
     certify,
 )
 from torchgco.baselines import Hold
+from torchgco.dynamics.rollout import open_loop
 from torchgco.judging.judge import judge, sphere_clearance
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.solvers.polish import polish
 from torchgco.solvers.polish.active_set import multipliers, projected
 from torchgco.solvers.polish.condensed import Condensed

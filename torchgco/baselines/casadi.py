@@ -20,7 +20,7 @@ from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import Status
 from torchgco.baselines.hold import rolled_out
-from torchgco.lagrangian.rollout import open_loop
+from torchgco.dynamics.rollout import open_loop
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Callback, Progress, Solver

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from torchgco.base.draws import DrawKey
-from torchgco.base.options import AtLeast, Count, Positive, check_options
+from torchgco.base.options import AtLeast, Positive, check_options
 from torchgco.base.tree import put, take
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_guide, warn_of_losses
@@ -38,8 +38,6 @@ class GCO:
             it (not in the paper).
         sample_from_rest: sample around the cost's reference controls (the vehicle at rest), not around the caught
             trajectory (not in the paper).
-        single_contact_after: from this outer iteration on, a knot inside one obstacle counts as caught, too; None:
-            never, as in the paper.
 
     Raises:
         InputError: a field out of its range; on `suited`, a covariance that doesn't fit the controls.
@@ -50,7 +48,7 @@ class GCO:
     penalty_growth: Annotated[float, AtLeast(1)] = 4.84
     start_from_sample: bool = False
     sample_from_rest: bool = False
-    single_contact_after: Count | None = None
+    single_contact_after: ClassVar[int | None] = None  # as of `Solve`, whose rule `in_search` takes over
 
     def __post_init__(self) -> None:
         check_options(self, "gco")
@@ -65,6 +63,12 @@ class GCO:
         sampler, lost = suited_guide(self.sampler, problem)
         warn_of_losses([] if lost is None else [lost], sampler is None)
         return None if sampler is None else replace(self, sampler=sampler)
+
+    def in_search(self, single_contact_after: int | None) -> Self:
+        """The same for trajectories that a search counts as caught by this rule."""
+        other = replace(self)
+        object.__setattr__(other, "single_contact_after", single_contact_after)
+        return other
 
     def start(self, problem: Problem, X: Tensor) -> GuideRegion:
         """An inactive region for every problem (Algorithm 4, lines 3-4)."""

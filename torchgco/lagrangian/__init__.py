@@ -1,1 +1,1 @@
-"""The augmented Lagrangian, its expansion, rollouts, and how good a trajectory is."""
+"""The augmented Lagrangian, its expansion, and how good a trajectory is."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.constraints.separation import Separation
-from torchgco.lagrangian import rollout
+from torchgco.dynamics import rollout
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
 from torchgco.native.compiler import NativeError, find_compiler

@@ -16,11 +16,11 @@ import numpy as np
 
 from torchgco.base.errors import InputError
 from torchgco.base.files import read_arrays, write_whole
+from torchgco.base.memory import free_memory
 from torchgco.base.options import Natural, check_value
 from torchgco.maps.distance import DistanceField
 from torchgco.scenarios import checks, stored_maps
 from torchgco.scenarios.stored_maps import map_arrays, map_of
-from torchgco.solvers.memory import free_memory
 
 # Arrays of a file, in the order of the fields of Layouts. `layout` holds the ids, if they are not 0..L-1.
 REQUIRED = ("centers", "radii")

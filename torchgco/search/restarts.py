@@ -131,7 +131,9 @@ class Restarts(Solver):
         guidance, losses = self.local.guidance, list[str]()
         if isinstance(guidance, GCO):
             sampler, unsampled = suited_guide(guidance.sampler, problem)
-            guidance = None if sampler is None else replace(guidance, sampler=sampler)
+            solves = (one for one in self.passes if isinstance(one, Solve) and one.until == "caught")
+            after = next((solve.single_contact_after for solve in solves), None)
+            guidance = None if sampler is None else replace(guidance, sampler=sampler).in_search(after)
             losses += [] if unsampled is None else [unsampled]
         elif guidance is not None:
             guidance = guidance.suited(problem)

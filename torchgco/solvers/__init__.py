@@ -1,4 +1,4 @@
-"""Batched solvers: iLQR, and the augmented Lagrangian around it."""
+"""Batched local solvers: iLQR with the augmented Lagrangian around it, and an interior point; a polish."""
 
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian as AugmentedLagrangian
 from torchgco.solvers.ilqr import ILQR as ILQR

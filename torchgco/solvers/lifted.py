@@ -10,9 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.dynamics.rollout import closed_loop
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.lagrangian.rollout import closed_loop
 from torchgco.native.dispatch import engine_of
 from torchgco.solvers.line_search import Rollouts
 from torchgco.solvers.riccati import backward

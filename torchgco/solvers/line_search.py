@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import Natural, check_options
+from torchgco.dynamics.rollout import closed_loop
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.lagrangian.rollout import closed_loop
 from torchgco.solvers.riccati import BackwardPass
 
 SIDE_BY_SIDE = 256  # rollouts that cost little more than one

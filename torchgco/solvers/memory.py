@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
-
 import torch
 
+from torchgco.base.memory import free_memory
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import check_device
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -57,12 +56,3 @@ def plan_batch(problem: Problem, device: str | torch.device | None = None, proce
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether an error says that memory ran out, on any device."""
     return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "can't allocate memory" in str(error)
-
-
-def free_memory() -> int:
-    """Bytes that can be allocated without swapping: the kernel's own estimate, else unused pages."""
-    try:
-        with open("/proc/meminfo") as lines:
-            return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

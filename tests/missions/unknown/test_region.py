@@ -52,7 +52,7 @@ def test_the_cheapest_plan_near_the_floor_of_the_map_stays_within() -> None:
     before = None
     for step in range(3):
         before, _ = exploration.plan(step, x, before)
-        assert not before.shifted[0] and exploration.is_safe(before.X[0].numpy(), 0)
+        assert not before.shifted[0] and exploration.spare(before.X[0].numpy(), 0) >= 0
     assert len(lowest) == 3 and min(lowest) > LOW
 
 
@@ -71,7 +71,7 @@ def test_what_leaves_the_map_breaks_the_planning_problem(axis: int, side: int) -
     U = problem.cost.rest_controls(x.new_zeros(1, exploration.explorer.stages, 4))
     X[:, 1:, :3], X[..., 3:6] = seed, 0.0
     assert max(float(problem.constraints[i].value(X, U).max()) for i in PLACES) >= 0.1
-    assert not exploration.is_safe(X[0].numpy(), 0)
+    assert exploration.spare(X[0].numpy(), 0) < 0
 
 
 def test_a_plan_that_cannot_be_flown_is_not() -> None:

@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchgco.base.errors import InputError
+from torchgco.base.memory import free_memory
 from torchgco.base.options import Count, Within, check_options, check_value
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
 from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register, scenarios_for
@@ -24,7 +25,7 @@ from torchgco.missions import Mission
 from torchgco.native.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 from torchgco.scenarios.vehicle import BUILT_IN, fitting
-from torchgco.solvers.memory import free_memory, least_bytes
+from torchgco.solvers.memory import least_bytes
 
 DEFAULT_LAYOUTS = 64
 FLOWN = (

@@ -17,6 +17,7 @@ from tqdm import tqdm
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
 from torchgco.base.version import VERSION
+from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.config.launching import side_by_side
 from torchgco.experiments.ending import say
@@ -41,7 +42,6 @@ from torchgco.experiments.results.provenance import recorded
 from torchgco.experiments.results.records import DONE, JUDGED, TRIALS, Records
 from torchgco.experiments.results.runs import read_trials
 from torchgco.experiments.results.success import sound, with_success
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.missions import Mission
 from torchgco.native.kernels import native
 from torchgco.scenarios import Layouts, Task

@@ -12,6 +12,7 @@ import torch
 from tqdm import tqdm
 
 from torchgco.base.errors import InputError
+from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_view import missions
@@ -19,7 +20,6 @@ from torchgco.experiments.reports.searched import searches
 from torchgco.experiments.results.files import damaged, write
 from torchgco.experiments.results.records import SOLUTIONS
 from torchgco.judging.judge import OTHERS_WITHIN
-from torchgco.lagrangian.rollout import open_loop
 from torchgco.view.document import Document, SearchPart
 from torchgco.view.flights import Rows, flights_of
 from torchgco.view.page import page

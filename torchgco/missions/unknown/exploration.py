@@ -387,10 +387,6 @@ class Exploration:
             asked[: FINE * EARLY] = near - 0.02
         return float((gaps - least - asked).min())
 
-    def is_safe(self, X: np.ndarray, b: int) -> bool:
-        """Whether a plan (N+1, 14) comes to rest, no faster than allowed, in space that is known to be free."""
-        return self.spare(X, b) >= 0
-
 
 def _resting(x: Tensor) -> Tensor:
     """States (B, 14) at rest and upright in the same positions, with the same yaw."""

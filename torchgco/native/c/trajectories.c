@@ -40,33 +40,8 @@ int tgco_gains(const Problem *p, int64_t first, int64_t last) {
     return 1;
 }
 
-/* Rollout of U from the first knot of X. */
-int tgco_open_loop(const Problem *p, int64_t first, int64_t last) {
-    int64_t N = p->N;
-    V parameters[NP ? NP : 1], x[2 * NX], u[NU];
-    for (int64_t e = first; e < last; e += LANES) {
-        for (int l = 0; l < LANES; l++) {
-            int64_t element = e + l < last ? e + l : e;
-            fill_stage(parameters, &p->parameters, 0, l, element);
-            for (int i = 0; i < NX; i++) x[i][l] = p->X[element * (N + 1) * NX + i];
-        }
-        for (int64_t k = 0; k < N; k++) {
-            for (int l = 0; l < LANES; l++) {
-                int64_t element = e + l < last ? e + l : e;
-                if (p->parameters.knot) fill_stage(parameters, &p->parameters, k, l, element);
-                for (int j = 0; j < NU; j++) u[j][l] = p->U[(element * N + k) * NU + j];
-            }
-            model_step(x, u, parameters, x + NX);
-            memcpy(x, x + NX, NX * sizeof(V));
-            for (int l = 0; l < LANES && e + l < last; l++)
-                for (int i = 0; i < NX; i++) p->X[((e + l) * (N + 1) + k + 1) * NX + i] = x[i][l];
-        }
-    }
-    return 1;
-}
-
-/* Rollout of U + K (x - X) from the first knot of X, in place of X and U; gains (E, N, NU, NZ), of which K is used. */
-int tgco_closed_loop(const Problem *p, int64_t first, int64_t last) {
+/* Rollout from the first knot of X, in place: of U, or with feedback of U + K (x - X), in place of U, too. */
+static inline __attribute__((always_inline)) int roll_out(const Problem *p, int64_t first, int64_t last, int feedback) {
     int64_t N = p->N;
     V parameters[NP ? NP : 1], x[2 * NX], u[NU];
     for (int64_t e = first; e < last; e += LANES) {
@@ -80,14 +55,14 @@ int tgco_closed_loop(const Problem *p, int64_t first, int64_t last) {
                 int64_t element = e + l < last ? e + l : e;
                 if (p->parameters.knot) fill_stage(parameters, &p->parameters, k, l, element);
                 double *X = p->X + (element * (N + 1) + k) * NX, *U = p->U + (element * N + k) * NU;
-                const double *K = p->gains + (element * N + k) * NU * NZ;
+                const double *K = feedback ? p->gains + (element * N + k) * NU * NZ : NULL;
                 for (int j = 0; j < NU; j++) {
                     u[j][l] = U[j];
-                    for (int i = 0; i < NX; i++) u[j][l] += K[j * NZ + i] * (x[i][l] - X[i]);
+                    for (int i = 0; feedback && i < NX; i++) u[j][l] += K[j * NZ + i] * (x[i][l] - X[i]);
                 }
             }
             for (int l = 0; l < LANES && e + l < last; l++) {
-                for (int j = 0; j < NU; j++) p->U[((e + l) * N + k) * NU + j] = u[j][l];
+                for (int j = 0; feedback && j < NU; j++) p->U[((e + l) * N + k) * NU + j] = u[j][l];
                 for (int i = 0; i < NX; i++) p->X[((e + l) * (N + 1) + k) * NX + i] = x[i][l];
             }
             model_step(x, u, parameters, x + NX);
@@ -98,6 +73,12 @@ int tgco_closed_loop(const Problem *p, int64_t first, int64_t last) {
     }
     return 1;
 }
+
+/* Rollout of U from the first knot of X. */
+int tgco_open_loop(const Problem *p, int64_t first, int64_t last) { return roll_out(p, first, last, 0); }
+
+/* Rollout of U + K (x - X) from the first knot of X, in place of X and U; gains (E, N, NU, NZ), of which K is used. */
+int tgco_closed_loop(const Problem *p, int64_t first, int64_t last) { return roll_out(p, first, last, 1); }
 
 /* Gradients (E, N+1, S) and upper triangles of the Hessians (E, N+1, S, S) of all terms. */
 int tgco_expand(const Problem *p, int64_t first, int64_t last) {
