@@ -15,8 +15,7 @@ from torchgco.base.shapes import Dimensions
 from torchgco.constraints import ControlBounds, StateBounds
 from torchgco.constraints.base import Constraint
 from torchgco.costs.quadratic import QuadraticCost
-from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.quadrotor import Airframe
+from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
 from torchgco.missions.planner import Planner
 from torchgco.missions.planning_problem import biased, first_step, planning_state
 from torchgco.missions.sensing.grid import SeenMap
@@ -154,6 +153,7 @@ class PlanningForm:
         bounds, N = self.whole.control_bounds, self.explorer.stages
         assert bounds is not None
         lower, upper = (bound[:, :1].repeat(1, N, 1) for bound in bounds.by_knot)
+        assert isinstance(self.whole.dynamics, QuadrotorPlanning)
         most = steady_yaw(self.planner.airframe, self.whole.dynamics, lower)
         lower[:, 1:, 2], upper[:, 1:, 2] = lower[:, 1:, 2].clamp(min=-most), upper[:, 1:, 2].clamp(max=most)
         return ControlBounds(lower, upper)
@@ -192,7 +192,7 @@ class PlanningForm:
         return StateBounds(lower, upper, knots=[N - 1, N])
 
 
-def steady_yaw(airframe: Airframe, model: Dynamics, like: Tensor) -> float:
+def steady_yaw(airframe: Airframe, model: QuadrotorPlanning, like: Tensor) -> float:
     """The commanded yaw rate, rad/s, that one period's change of thrusts gives, with as much left for tilting.
 
     A rotor's thrust falls at once, but rises slowly: a vehicle asked to yaw more loses thrust, and sinks. Yawing takes
