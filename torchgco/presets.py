@@ -260,12 +260,13 @@ def _closer(follow: Follow) -> Follow:
     """Follows the same paths closer, where candidates leave them for a trap.
 
     A spring gives way to the cost: it gets stiffer, and then takes more iterations to reach the path. So does a tube
-    around sharper corners.
+    around sharper corners; in it obstacles only bar the way from rest to the path, such as a wall between the two.
     """
     spring = follow.tube is None
     return replace(
         follow, smoothing=follow.smoothing / 4.0, iterations=(3 if spring else 2) * follow.iterations,
         stiffness=(10.0 * follow.stiffness[-1],) if spring else follow.stiffness,
+        obstacles=follow.obstacles if spring else 0.0,
     )  # fmt: skip
 
 

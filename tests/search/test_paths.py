@@ -13,9 +13,22 @@ import torch
 from tests.problems import quadrotor_batch
 from tests.search.cup import GOAL, QUICK, controls, cost, cup, cups
 from tests.search.rows import proposed, varied
-from torchgco import ControlBounds, InputError, PathProposals, Problem, Roadmap, judge
+from torchgco import (
+    ControlBounds,
+    Field,
+    Goal,
+    InputError,
+    PathProposals,
+    Planar,
+    Problem,
+    QuadraticCost,
+    Roadmap,
+    judge,
+    solve,
+)
 from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.maps import OccupancyGrid
 from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.homotopy import classes
 from torchgco.search import Follow, Refine
@@ -176,12 +189,11 @@ PASS = dict(
 )  # fmt: skip
 FOLLOW = dict(
     initial_offsets=((0.7, -0.7),), depart=0.2, arrive=(0.7,), smoothing=0.2, tube=None, stiffness=(50.0,),
-    iterations=2, pace=0.5,
+    iterations=2, pace=0.5, obstacles=50.0,
 )  # fmt: skip
 REFINE = dict(top=1, rounds=1, violation=1e-9, cut=1e-9, needed=True)
 CONSTANTS = {
-    "candidates.TOLERANCE": 0.5, "following.TRACK_PENALTY": 50.0, "proposals.PENALTY": 5.0,
-    "following.OFFSET_LASTS": 0.3,
+    "candidates.TOLERANCE": 0.5, "proposals.PENALTY": 5.0, "following.OFFSET_LASTS": 0.3,
 }  # fmt: skip
 
 
@@ -221,6 +233,18 @@ def test_no_option_is_forgotten_above() -> None:
 def test_every_constant_is_read(name: str, usual: list[tuple], monkeypatch) -> None:
     monkeypatch.setattr(f"torchgco.search.{name}", CONSTANTS[name])
     assert outcome(BASE) != usual
+
+
+def test_walls_between_rest_and_the_path_dont_bar_the_way() -> None:
+    """A flat of 12 x 8 m whose walls join the outer ones: one class, and a path around two corners."""
+    walls = np.zeros((120, 80), bool)
+    walls[[0, -1]], walls[:, [0, -1]] = True, True
+    walls[40:42, 29:], walls[80:82, :50], walls[80:101, 49:51] = True, True, True
+    weights = QuadraticCost([5, 5, 0, 1, 1, 0], [0.1, 0.1], [50, 50, 0, 1, 1, 0], x_ref=[11, 4, 0, 0, 0, 0])
+    x0 = torch.tensor([[1.0, 4.0, 0, 0, 0, 0]], dtype=torch.float64)
+    parts = [Field(OccupancyGrid(walls, [0.0, 0.0], 0.1), 0.15), ControlBounds(-10, 10)]
+    problem = Problem(Planar(dt=0.05), weights, parts, x0, 400, Goal([11.0, 4.0], 0.2))
+    assert bool(judge(problem, solve(problem).U).reached)
 
 
 def test_a_quadrotor_is_guided_too() -> None:

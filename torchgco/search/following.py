@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.options import AtLeast, Below, Count, Positive, check_options
+from torchgco.base.options import AtLeast, Below, Count, NonNegative, Positive, check_options
 from torchgco.base.shapes import check_shape, tensor
 from torchgco.base.tree import take
 from torchgco.constraints.bounds import ControlBounds
@@ -25,7 +25,7 @@ from torchgco.search.nearby import without_obstacles
 from torchgco.solvers.ilqr import descend
 
 OFFSET_LASTS = 0.1  # share of the horizon that an initial offset lasts
-TRACK_PENALTY = 10.0  # of obstacles while a path is tracked, in q0 / R^4
+LIMITS_PENALTY = 10.0  # of limits on states, where these alone bind, in q0 / R^4
 ROUNDS = 5  # of `iterations`, at most, while a candidate isn't near the goal
 SHORTEST = 0.05  # share of the horizon between departure and arrival
 LAST_PART = 0.1  # of the distance to the goal: the last part is approached slowly
@@ -80,6 +80,8 @@ class Follow:
             path in a tube.
         stiffness: of tube or spring, one solve per value, in units of the cost of resting at the start per squared
             distance to the goal.
+        obstacles: penalty of obstacles in these solves, in q0 / R^4. With 0, obstacles between the vehicle at rest and
+            its path don't bar the way to it.
         iterations: of iLQR in each of these solves, at most; up to five times as many while a candidate
             isn't near the goal: vehicles that tilt to move leave the start in small steps.
 
@@ -94,6 +96,7 @@ class Follow:
     smoothing: Annotated[float, AtLeast(0), Below(1)] = 0.08
     tube: Positive | None = 0.05
     stiffness: tuple[Positive, ...] = (20.0, 200.0)
+    obstacles: NonNegative = 10.0
     iterations: Count = 20
 
     def __post_init__(self) -> None:
@@ -150,7 +153,7 @@ class Follow:
             weight = stiffness * candidates.unit[problem]
             penalty = attraction(center, path, at, candidates.R[problem], weight, self.tube)
             for _ in range(ROUNDS):
-                candidates = candidates.solved(inner_solver(self.iterations), TRACK_PENALTY, penalty, place)
+                candidates = candidates.solved(inner_solver(self.iterations), self.obstacles, penalty, place)
                 candidates = replace(candidates, live=candidates.live & ~candidates.arrive())
                 if not bool(candidates.live.any()):
                     break
@@ -177,7 +180,7 @@ def unconstrained(problem: Problem, rest: Tensor, iterations: int, unit: Tensor)
     share, slower, made = _share(problem, end.X), torch.ones_like(end.cost), end.iterations
     bare = without_obstacles(problem) if limits_states(problem) else None
     if bare is not None:
-        limits = Lagrangian(bare, Multipliers.none(bare, TRACK_PENALTY * unit), None, True)
+        limits = Lagrangian(bare, Multipliers.none(bare, LIMITS_PENALTY * unit), None, True)
         limited, _ = descend(inner_solver(iterations), limits, end.U)
         slower = (_share(problem, limited.X) / share).nan_to_num(1.0).clamp(min=1.0)
         made = made + limited.iterations

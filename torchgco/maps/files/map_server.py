@@ -89,7 +89,7 @@ def _keys(source: Source) -> dict[str, Any]:
     """The mapping of the yaml file: no tags beyond the plain ones, no aliases, which can multiply without end."""
     import yaml
 
-    class Plain(yaml.SafeLoader):
+    class Plain(yaml.loader.SafeLoader):
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
                 raise yaml.YAMLError("an alias")
