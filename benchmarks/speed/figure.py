@@ -6,6 +6,7 @@ import re
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from benchmarks.speed.results import Row
 from torchgco.plotting.style import legend, panels, solver_colours, tidy
@@ -20,7 +21,7 @@ SOLVERS = ("gco", "fatrop", "acados")
 
 
 def figure(rows: list[Row]) -> Figure:
-    """The rows of sections `batch` and `scaling` on the CPU, a panel per axis; both axes are logarithmic."""
+    """The rows of `batch` and `scaling` on the CPU, a panel per axis, on logarithmic axes; dashed, the peers alone."""
     picture, axes = panels(len(PANELS), len(PANELS), (3.0, 2.8))
     colours = solver_colours(list(SOLVERS))
     for ax, (title, label, section, case, quantity, unit) in zip(axes, PANELS, strict=True):
@@ -33,8 +34,16 @@ def figure(rows: list[Row]) -> Figure:
             ]
             if found:
                 ax.plot(*zip(*sorted(found), strict=True), color=colours[solver], marker="o", markersize=3)
+        if section == "batch":  # the peers solve one problem after the other
+            for row in rows:
+                alone = re.fullmatch(r"forest30, first \d+", row["case"]) and row["quantity"] == "seconds per problem"
+                if alone and row["solver"] in SOLVERS[1:]:
+                    ax.axhline(1000.0 * float(row["value"]), color=colours[row["solver"]], linestyle="--", linewidth=1)
         ax.set_xscale("log")
         ax.set_yscale("log")
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_formatter(ScalarFormatter())
+            axis.set_minor_formatter(NullFormatter())
         ax.set_xlabel(label)
         tidy(ax, title)
     axes[0].set_ylabel("ms per problem")
