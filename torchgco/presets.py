@@ -51,7 +51,8 @@ def gco(space: Space) -> Restarts:
     known = replace(proposals, when="unproposed", roadmaps=(), relax_top=None)
     rough = Refine(top=4, rounds=4, violation=1e-2, cut=0.3, needed=True)
     plane = _in_the_plane(space)
-    followed_closer = replace(known, follow=(closer,))
+    # Obstacles may bar the way from rest to the path, such as a wall between the two.
+    followed_closer = replace(known, follow=(closer, replace(closer, obstacles=0.0)))
     if not plane:  # a costly problem: repairing candidates that cut deep into an obstacle is worth its time
         followed_closer = replace(followed_closer, refine=rough, max_penetration=0.5)
     costly = replace(
@@ -260,13 +261,12 @@ def _closer(follow: Follow) -> Follow:
     """Follows the same paths closer, where candidates leave them for a trap.
 
     A spring gives way to the cost: it gets stiffer, and then takes more iterations to reach the path. So does a tube
-    around sharper corners; in it obstacles only bar the way from rest to the path, such as a wall between the two.
+    around sharper corners.
     """
     spring = follow.tube is None
     return replace(
         follow, smoothing=follow.smoothing / 4.0, iterations=(3 if spring else 2) * follow.iterations,
         stiffness=(10.0 * follow.stiffness[-1],) if spring else follow.stiffness,
-        obstacles=follow.obstacles if spring else 0.0,
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from benchmarks.speed.sizes import Sizes
 from torchgco.experiments.config.build import Setup
 from torchgco.native.dispatch import engine_of
 from torchgco.scenarios import Task
-from torchgco.search import Restarts
+from torchgco.search import FromProposal, FromSamples, PathProposals, Restarts
 
 SECTION, SOLVER = "batch", "gco"
 WORLDS = ("woods40", "woods60")  # where a problem takes most time and memory
@@ -92,7 +92,12 @@ def _task(setup: Setup, start: int, batch: int) -> Task:
 
 def limited(solver: Restarts) -> Restarts:
     """Two outer iterations, and one attempt: neither a second round of proposals nor other draws of samples."""
-    passes = (*solver.passes[:8], solver.passes[10], *solver.passes[12:])
+    again = [one for one in solver.passes if isinstance(one, FromProposal)][1:]
+    passes = tuple(
+        one for one in solver.passes
+        if not any(one is other for other in again) and not (isinstance(one, PathProposals) and one.when == "far")
+        and not (isinstance(one, FromSamples) and one.when != "unproposed")
+    )  # fmt: skip
     return replace(solver, local=replace(solver.local, max_outer_iterations=2), passes=passes)
 
 

@@ -78,7 +78,7 @@ def test_a_candidate_that_is_too_deep_counts_where_refining_mends_it(woods) -> N
     shallow = replace(FIRST, max_penetration=1e-9)
     some, times = noted([shallow, CLOSER], woods)
     again = times[1][1]
-    assert times == [(3, LAYOUTS, False), (3, again, True)] and again > 0
+    assert times == [(3, LAYOUTS, False), *len(CLOSER.follow) * [(3, again, True)]] and again > 0
     X = open_loop(woods.dynamics, woods.x0, some.U)
     depth = torch.stack([c.worst(X, some.U) for c in woods.geometric]).amax(0)
     refined = some.cost.isfinite()

@@ -81,7 +81,7 @@ class Follow:
         stiffness: of tube or spring, one solve per value, in units of the cost of resting at the start per squared
             distance to the goal.
         obstacles: penalty of obstacles in these solves, in q0 / R^4. With 0, obstacles between the vehicle at rest and
-            its path don't bar the way to it.
+            its path don't bar the way to it; such candidates count only as refined.
         iterations: of iLQR in each of these solves, at most; up to five times as many while a candidate
             isn't near the goal: vehicles that tilt to move leave the start in small steps.
 

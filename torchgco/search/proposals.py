@@ -199,7 +199,8 @@ class PathProposals:
         best, some = refined.best, paths.live.any(-1)
         multipliers, cost = take(refined.multipliers, best), refined.cost[best]
         multipliers = replace(multipliers, mu=torch.where(some, multipliers.mu, torch.nan))
-        found = some & (cost.isfinite() if self.refine.needed else picked[best])
+        needed = self.refine.needed or follow.obstacles == 0.0
+        found = some & (cost.isfinite() if needed else picked[best])
         if note is not None:
             note(tracked, relaxed, sound, refined, found)
         return Proposal(refined.candidates.U[best], found, multipliers, refined.candidates.iterations, cost)

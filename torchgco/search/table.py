@@ -94,4 +94,5 @@ def _follow(follow: Follow) -> str:
     stiffness = ", ".join(f"{value:g}" for value in follow.stiffness)
     starts, paces = 1 + len(follow.initial_offsets), len(follow.paces)
     several = f", {starts * paces} candidates" if starts * paces > 1 else ""
-    return f"{guide} {stiffness}, {follow.iterations} iterations, corners over {follow.smoothing:g} N{several}"
+    bare = ", without obstacles" if follow.obstacles == 0 else ""
+    return f"{guide} {stiffness}, {follow.iterations} iterations, corners over {follow.smoothing:g} N{several}{bare}"
