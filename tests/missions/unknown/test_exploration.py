@@ -176,9 +176,11 @@ def test_known_moving_bodies_are_made_way_for() -> None:
 def test_plans_yaw_no_faster_than_costs_no_thrust() -> None:
     """From turning one way to turning the other in a period, the rotors that rise do so by half of what they can."""
     airframe, model = Airframe(), QuadrotorPlanning(dt=0.05)
-    most = steady_yaw(airframe, model, torch.zeros(1).double())
+    most = float(steady_yaw(airframe, model, torch.zeros(1).double()))
     turn = 2.0 * most / float(model.rate_time_constant)  # rad/s^2
     change = turn * airframe.inertia[2][2] / (4.0 * airframe.rotor_torque)  # N per rotor
     hover = torch.tensor(airframe.mass * 9.81 / 4.0).double()
     rise = 0.05 * airframe.thrust_rate(hover, torch.tensor(airframe.rotor_speeds[1]).double())
     assert change == pytest.approx(0.5 * float(rise)) and 0.5 < most < 2.0
+    several = QuadrotorPlanning(dt=0.05, rate_time_constant=torch.tensor([1.5, 3.0]).double())
+    assert steady_yaw(airframe, several, torch.zeros(1).double()).flatten().tolist() == pytest.approx([most, 2 * most])

@@ -55,8 +55,8 @@ class Explorer:
         stages: of a plan, which is at rest after them.
         margin: m that plans keep from what isn't known to be free, beyond the vehicle's radius. A cell at least, as
             one that an obstacle fills in part may look free from afar; less is kept where there is no other way.
-        movers: moving bodies are "known" with their places and velocities, "tracked" in the sensor's returns, or "none"
-            are: all count as at rest.
+        movers: moving bodies are "known" with their places and velocities, "tracked" in the sensor's returns, or with
+            "none" all count as at rest.
         patience: s without a way on, after which the vehicle turns to another part of the unknown.
 
     Raises:
@@ -155,7 +155,8 @@ class PlanningForm:
         lower, upper = (bound[:, :1].repeat(1, N, 1) for bound in bounds.by_knot)
         assert isinstance(self.whole.dynamics, QuadrotorPlanning)
         most = steady_yaw(self.planner.airframe, self.whole.dynamics, lower)
-        lower[:, 1:, 2], upper[:, 1:, 2] = lower[:, 1:, 2].clamp(min=-most), upper[:, 1:, 2].clamp(max=most)
+        lower[:, 1:, 2] = torch.maximum(lower[:, 1:, 2], -most)
+        upper[:, 1:, 2] = torch.minimum(upper[:, 1:, 2], most)
         return ControlBounds(lower, upper)
 
     def _limits(self, seeds: Tensor, room: Tensor, allowed: Tensor, region: Tensor) -> StateBounds:
@@ -192,8 +193,8 @@ class PlanningForm:
         return StateBounds(lower, upper, knots=[N - 1, N])
 
 
-def steady_yaw(airframe: Airframe, model: QuadrotorPlanning, like: Tensor) -> float:
-    """The commanded yaw rate, rad/s, that one period's change of thrusts gives, with as much left for tilting.
+def steady_yaw(airframe: Airframe, model: QuadrotorPlanning, like: Tensor) -> Tensor:
+    """The commanded yaw rate (B, 1) or (1, 1), rad/s, that half of one period's change of thrusts gives.
 
     A rotor's thrust falls at once, but rises slowly: a vehicle asked to yaw more loses thrust, and sinks. Yawing takes
     five times the thrust that tilting does.
@@ -201,7 +202,8 @@ def steady_yaw(airframe: Airframe, model: QuadrotorPlanning, like: Tensor) -> fl
     hover = like.new_tensor(airframe.mass * HOVER / 4.0)
     rise = float(model.dt) * airframe.thrust_rate(hover, like.new_tensor(airframe.rotor_speeds[1]))
     turn = 0.5 * rise * airframe.allocation(like)[2].abs().sum() / airframe.inertia[2][2]  # rad/s^2, from none
-    return float(0.5 * turn * model.rate_time_constant)  # from turning one way to turning the other
+    constant = torch.as_tensor(model.rate_time_constant, dtype=like.dtype).reshape(-1, 1)
+    return 0.5 * turn * constant  # half: from turning one way to turning the other
 
 
 def unflyable(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
