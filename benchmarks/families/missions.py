@@ -17,7 +17,7 @@ import pandas as pd
 import torch
 
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import put_between
+from benchmarks.lib.page import markdown, put, put_between
 from benchmarks.lib.provenance import provenance
 from torchgco import compose
 from torchgco.experiments.statistics.statistics import wilson
@@ -112,6 +112,25 @@ def table(trials: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
+def many(count: int, outputs: Path) -> str:
+    """Markdown: missions of the first case by `gco`, as many as it takes to bound the rate of collisions."""
+    trials = fly(next(iter(CASES)), "gco", count, outputs)
+    counts = {outcome.name: int((trials["outcome"] == outcome.name).sum()) for outcome in Outcome}
+    hits = counts[Outcome.COLLISION.name]
+    low, high = (100 * end for end in wilson(hits, count))
+    row = (
+        f"{count:,}", *(f"{held:,}" for held in counts.values()),
+        f"{100 * hits / count:.3g} % [{low:.3g}, {high:.3g}]", f"{trials['flight_time'].median():.2f} s",
+        f"{trials['seconds'].mean():.2f}",
+    )  # fmt: skip
+    head = ("missions", *counts, "rate of collisions", "flight time", "s per mission")
+    lines = [
+        f"Number {row.layout}: {row.outcome} after {row.flight_time:.2f} s, {row.clearance:.3f} m clear: {row.cause}."
+        for row in trials[trials["outcome"] != Outcome.REACHED.name].itertuples()
+    ]
+    return "\n\n".join([markdown(head, [row]), *lines])
+
+
 def timing(outputs: Path, alone: int, together: int) -> str:
     """Markdown: planner and tracker of missions that fly alone, and seconds per mission of a batch against those."""
     periods, totals = [], []
@@ -158,7 +177,16 @@ def main(words: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "missions")
     parser.add_argument("--write", action="store_true", help="put the tables into benchmarks/results/missions.md")
+    parser.add_argument(
+        "--many", type=int, default=0, help="only so many missions of the first case by gco, for results/maps.md"
+    )
     asked = parser.parse_args(words)
+    if asked.many > 0:
+        text = f"{_origin('Flown')}\n\n{many(asked.many, asked.outputs)}"
+        print(text)
+        if asked.write:
+            put(RESULTS / "maps.md", "many", text)
+        return 0
     parts = []
     for case in list(CASES)[: asked.cases]:
         for solver in asked.planners if case in WITH_PEERS else asked.planners[:1]:

@@ -1,7 +1,8 @@
-"""python -m benchmarks.families.unknown: missions in worlds that the vehicle sees through a lidar alone.
+"""python -m benchmarks.families.unknown: missions in worlds that the vehicle sees on the way, at rest and moving.
 
 Every case is a study of missions below outputs/unknown, so that a run that was stopped resumes where it was. Missions
-fly alone, one after the other. With --write the tables are put into results/unknown.md, with date and commit.
+fly alone, each in one thread, two at the same time. With --write the tables are put into results/maps.md, with date and
+commit: those of `--count` missions per case, and with --long those of the long rows, in a table of their own.
 """
 
 from __future__ import annotations
@@ -10,43 +11,73 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from benchmarks.lib import RESULTS, ROOT
-from benchmarks.lib.page import put_between
-from benchmarks.lib.provenance import provenance
+from benchmarks.lib.page import machine, markdown, origin, put
 from torchgco.experiments.statistics.statistics import wilson
 from torchgco.missions.outcome import Outcome
 
-FLAT = ["scenario=cylinders", "mission.goal_radius=0.5", "mission.explorer.region=[[-5,110],[-21,21],[0,4]]"]
+
+@dataclass(frozen=True)
+class Case:
+    """A kind of world.
+
+    Args:
+        overrides: of `torchgco experiment=mission_unknown`.
+        count, long: missions that the short and the long table fly.
+        at_rest: whether nothing moves, so that plans can be safe.
+    """
+
+    overrides: tuple[str, ...]
+    count: int
+    long: int
+    at_rest: bool = True
+
+
+def _flat(count: int) -> tuple[str, ...]:
+    """SANDO's static forests."""
+    region = "mission.explorer.region=[[-5,110],[-21,21],[0,4]]"
+    return "scenario=cylinders", "mission.goal_radius=0.5", region, f"scenario.num_obstacles={count}"
+
+
+LONG_FOREST = (
+    "scenario=cylinders", "scenario.num_obstacles=569", "scenario.region=[[5,305],[-20,20]]", "scenario.start=[0,0,3]",
+    "scenario.goal=[305,0,3]", "mission.goal_radius=0.5", "mission.explorer.region=[[-5,310],[-21,21],[0,6]]",
+    "mission.explorer.speed=4", "mission.duration=150",
+)  # fmt: skip
 CASES = {
-    "41 cylinders": [*FLAT, "scenario.num_obstacles=41"],
-    "81 cylinders": [*FLAT, "scenario.num_obstacles=81"],
-    "162 cylinders": [*FLAT, "scenario.num_obstacles=162"],
-    "forest, 30 spheres": ["scenario=forest_mission"],
-    "walls": ["scenario=walls", "scenario.start=[1,1,0]"],
-    "mazes, 3 walls": ["scenario=mazes", "mission.duration=90"],
+    "41 cylinders": Case(_flat(41), 8, 100),
+    "81 cylinders": Case(_flat(81), 8, 100),
+    "162 cylinders": Case(_flat(162), 8, 100),
+    "300 m, 569 cylinders": Case(LONG_FOREST, 2, 100),
+    "forest, 30 spheres": Case(("scenario=forest_mission",), 8, 100),
+    "walls": Case(("scenario=walls", "scenario.start=[1,1,0]"), 8, 100),
+    "mazes, 3 walls": Case(("scenario=mazes", "mission.duration=90"), 8, 100),
+    "rooms with doors": Case(("scenario=rooms", "mission.duration=90"), 8, 200),
 }
 HEAD = (
     "world", "n", *(outcome.name for outcome in Outcome), "safe periods", "flight time", "clearance", "speed",
-    "acceleration", "jerk", "kept plans",
+    "acceleration", "jerk", "kept plans", "above 50 ms",
 )  # fmt: skip
 PERIOD = 0.05  # s
 
 
-def fly(case: str, count: int, outputs: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
+def fly(name: str, count: int, outputs: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     """The trials of one case and the rows of their control periods, flown now or read."""
-    folder = outputs / f"{''.join(letter if letter.isalnum() else '-' for letter in case)}-{count}"
+    folder = outputs / f"{''.join(letter if letter.isalnum() else '-' for letter in name)}-{count}"
     command = [
-        sys.executable, "-m", "torchgco", "experiment=mission_unknown", *CASES[case], f"study.layouts={count}",
-        "study.workers=1", "study.shard_size=1", "study.figures=false", "device.threads=1", f"hydra.run.dir={folder}",
+        sys.executable, "-m", "torchgco", "experiment=mission_unknown", *CASES[name].overrides,
+        f"study.layouts={count}", "study.workers=2", "study.shard_size=1", "study.figures=false", "device.threads=1",
+        f"hydra.run.dir={folder}",
     ]  # fmt: skip
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     trials, log = pd.read_parquet(folder / "trials.parquet"), pd.read_parquet(folder / "mission.parquet")
-    return trials.assign(case=case), log.assign(case=case)
+    return trials.assign(case=name), log.assign(case=name)
 
 
 def largest(log: pd.DataFrame) -> tuple[float, float, float]:
@@ -66,7 +97,7 @@ def largest(log: pd.DataFrame) -> tuple[float, float, float]:
 
 def table(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     """Markdown: a row per case, outcomes with 95 % Wilson intervals in percent."""
-    lines = ["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|"]
+    lines = []
     for case, rows in trials.groupby("case", sort=False):
         steps, cells = log[log["case"] == case], [case, len(rows)]
         for outcome in Outcome:
@@ -74,67 +105,69 @@ def table(trials: pd.DataFrame, log: pd.DataFrame) -> str:
             low, high = wilson(count, len(rows))
             cells.append(f"{count} [{100 * low:.0f}, {100 * high:.0f}]" if count else "0")
         reached, (speed, acceleration, jerk) = rows[rows["outcome"] == Outcome.REACHED.name], largest(steps)
-        cells += [f"{int(steps['safe'].sum())} of {len(steps)}", f"{reached['flight_time'].median():.1f} s"]
-        cells += [f"{rows['clearance'].min():.3f} m", f"{speed:.2f}", f"{acceleration:.1f}", f"{jerk:.0f}"]
-        cells.append(f"{rows['shifted_plans'].mean():.1f}")
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
+        safe = f"{int(steps['safe'].sum())} of {len(steps)}" if CASES[str(case)].at_rest else "-"
+        late = steps["planner_seconds"][steps["step"] > 0] > PERIOD
+        cells += [safe, f"{reached['flight_time'].median():.1f} s", f"{rows['clearance'].min():.3f} m"]
+        cells += [f"{speed:.2f}", f"{acceleration:.1f}", f"{jerk:.0f}", f"{rows['shifted_plans'].mean():.1f}"]
+        cells.append(f"{100 * late.mean():.1f} %")
+        lines.append(cells)
+    return markdown(HEAD, lines)
 
 
 def misses(trials: pd.DataFrame, log: pd.DataFrame) -> str:
-    """Markdown: a row per mission that missed its goal, and per mission with a period without a safe plan."""
-    lines = [
-        "| world | number | outcome | after | clearance | from the goal | periods without a safe plan |",
-        "|---" * 7 + "|",
-    ]
+    """Markdown: a row per mission that missed its goal, and per mission at rest with a period without a safe plan."""
+    lines = []
     for row in trials.itertuples():
         steps = log[(log["case"] == row.case) & (log["mission"] == row.layout)]
-        without = int((steps["safe"] == 0).sum())
+        without = int((steps["safe"] == 0).sum()) if CASES[str(row.case)].at_rest else 0
         if row.outcome != Outcome.REACHED.name or without:
             lines.append(
-                f"| {row.case} | {row.layout} | {row.outcome} | {row.flight_time:.1f} s | {row.clearance:.3f} m | "
-                f"{row.goal_distance:.1f} m | {without} of {len(steps)} |"
-            )
-    return (
-        "\n".join(lines) if len(lines) > 2 else "Every mission reached its goal, and held a safe plan in every period."
-    )
+                (
+                    row.case, row.layout, row.outcome, f"{row.flight_time:.1f} s", f"{row.clearance:.3f} m",
+                    f"{row.goal_distance:.1f} m", f"{without} of {len(steps)}",
+                )
+            )  # fmt: skip
+    head = ("world", "number", "outcome", "after", "clearance", "from the goal", "periods without a safe plan")
+    none = "Every mission reached its goal, and among obstacles at rest every period held a safe plan."
+    return markdown(head, lines) if lines else none
 
 
 def times(log: pd.DataFrame) -> str:
     """Markdown: milliseconds of the planner and of its parts, over the periods of all missions but their first."""
-    later, lines = log[log["step"] > 0], ["| milliseconds | median | 90 % | 99 % | longest |", "|---" * 5 + "|"]
+    later = log[log["step"] > 0]
     names = {
         "map: a scan's cells": "map_seconds", "field: distances and corridors": "field_seconds",
         "search for paths": "search_seconds", "planner, all of it": "planner_seconds",
     }  # fmt: skip
-    for label, name in names.items():
-        values = 1000.0 * later[name].to_numpy()
-        lines.append(
-            f"| {label} | " + " | ".join(f"{np.quantile(values, q):.1f}" for q in (0.5, 0.9, 0.99, 1.0)) + " |"
-        )
+    parts = {label: 1000.0 * later[name].to_numpy() for label, name in names.items()}
+    rows = [
+        (label, *(f"{np.quantile(values, q):.1f}" for q in (0.5, 0.9, 0.99, 1.0))) for label, values in parts.items()
+    ]
     over = int((later["planner_seconds"] > PERIOD).sum())
-    return "\n".join([*lines, "", f"{over} of {len(later)} periods took longer than 50 ms."])
+    head = ("milliseconds", "median", "90 %", "99 %", "longest")
+    return f"{markdown(head, rows)}\n\n{over} of {len(later)} periods took longer than 50 ms."
 
 
 def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.families.unknown", description="Fly what isn't known.")
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES), metavar="NAME")
-    parser.add_argument("--count", type=int, default=8, help="missions of a case")
+    parser.add_argument("--count", type=int, help="missions of each case; by default its own number")
+    parser.add_argument("--long", action="store_true", help="the long table")
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "unknown")
-    parser.add_argument("--write", action="store_true", help="put the tables into benchmarks/results/unknown.md")
+    parser.add_argument("--write", action="store_true", help="put the tables into benchmarks/results/maps.md")
     asked = parser.parse_args(words)
-    flown = [fly(case, asked.count, asked.outputs) for case in asked.cases]
+    counts = {name: asked.count or (CASES[name].long if asked.long else CASES[name].count) for name in asked.cases}
+    flown = [fly(name, count, asked.outputs) for name, count in counts.items()]
     trials, log = (pd.concat(parts, ignore_index=True) for parts in zip(*flown, strict=True))
-    origin = provenance("cpu")
     head = (
-        f"Flown on {origin['date']} at commit {origin['commit']}, seed 0, 95 % Wilson intervals in percent; one\n"
-        f"thread, {origin['processor']}, shared."
+        f"{origin('Flown')}, seed 0, 95 % Wilson intervals in percent; two missions at a time, each in one thread, "
+        f"{machine()}, shared."
     )
     blocks = {"worlds": f"{head}\n\n{table(trials, log)}\n\n{misses(trials, log)}", "times": times(log)}
     for name, text in blocks.items():
         print(text)
         if asked.write:
-            put_between(RESULTS / "unknown.md", f"<!-- {name} -->", f"<!-- end {name} -->", text)
+            put(RESULTS / "maps.md", f"long {name}" if asked.long else name, text)
     return 0
 
 

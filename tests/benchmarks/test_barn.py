@@ -11,6 +11,7 @@ from scipy.spatial import Delaunay
 
 from benchmarks.outside.barn import BODY, VEHICLE, Drives, drive, gap, main, problems, worlds
 from benchmarks.outside.barn_data import GOAL, RADIUS, START, cylinders, path_length
+from benchmarks.outside.barn_lidar import CELL, CORNER, RETURNS, Robot, braking, run, world_of
 from torchgco import Unicycle, judge, solve
 
 MODEL = """<model name='{name}'><static>1</static><pose frame=''>{x} {y} 0 0 0 0</pose><link name='link'><collision
@@ -121,3 +122,42 @@ def test_a_vehicle_at_rest_succeeds_nowhere() -> None:
     drives = Drives.of(problem, layouts, torch.zeros(1, problem.N, 2, dtype=torch.float64))
     assert not drives.sound.any() and np.isinf(drives.seconds).all() and drives.clearance[0] > 1.0
     assert drives.score(known["optimal"].to_numpy()).tolist() == [0.0]
+
+
+def robot(*returns: tuple[float, float]) -> Robot:
+    """A robot at the origin that has marked cells at some points, m."""
+    one = Robot(world_of(np.full((1, 2), np.nan)), 0, np.array([0.0, 3.0, np.pi / 2, 2.0]))
+    for point in returns:
+        one.counts[tuple(np.floor((np.array(point) - CORNER) / CELL).astype(int))] = RETURNS
+    return one
+
+
+def test_braking_stops_within_the_limits_and_turns_on_as_much_as_the_change_of_rate_asks_for() -> None:
+    x, before = np.array([0.0, 0.0, 0.0, 2.0]), np.array([0.0, 1.57])
+    U = braking(x, before)
+    assert np.abs(U[:, 0]).max() <= 10.0 and abs(np.abs(np.diff(U[:, 1], prepend=1.57)).max()) <= 2.0
+    assert 2.0 + 0.1 * U[:, 0].sum() == pytest.approx(0.0, abs=1e-12) and not U[3:].any()
+
+
+def test_a_stage_is_flown_where_the_robot_can_stop_behind_it() -> None:
+    x, straight = np.array([0.0, 3.0, np.pi / 2, 2.0]), np.zeros(2)  # at 2 m/s it stops after 0.2 + 0.2 m
+    assert robot().clear_until_rest(x, straight)
+    assert robot((0.0, 3.0 + 0.45 + BODY)).clear_until_rest(x, straight)
+    assert not robot((0.0, 3.0 + 0.35 + BODY)).clear_until_rest(x, straight)
+    assert robot((0.0, 3.0 - BODY + 0.01)).clear_until_rest(x, straight)  # in contact, but on its way out of it
+
+
+def test_a_scan_marks_the_near_sides_of_cylinders() -> None:
+    one = Robot(world_of(np.array([[0.0, 5.0], [np.nan, np.nan]])), 0, np.array([0.0, 3.0, np.pi / 2, 0.0]))
+    one.sense(0, seed=0)
+    cells = CORNER + (np.argwhere(one.counts) + 0.5) * CELL
+    away = np.linalg.norm(cells - [0.0, 5.0], axis=1)
+    assert len(cells) > 3 and (np.abs(away - RADIUS) <= CELL).all() and (cells[:, 1] < 5.0).all()
+
+
+def test_a_world_is_driven_through_a_lidar() -> None:
+    layouts, known = worlds()
+    assert layouts.start is not None
+    found = run(layouts.start[12], layouts.centers[12], int(layouts.ids[12]), seed=0)
+    assert found.outcome == "REACHED" and found.clearance > 0 and found.turn_change <= 20.0
+    assert found.seconds <= 2 * known["optimal"].iloc[12] and len(found.period) * 0.1 == pytest.approx(found.seconds)
