@@ -47,7 +47,7 @@ class OscillatingBoxes(Constraint):
         if dims.dt is None:
             raise InputError("boxes.amplitudes", "dynamics with a time step dt", "dynamics without one")
         B, M, d = boxes.centers.shape
-        sines = []
+        sines: list[Tensor] = []
         for name in ("amplitudes", "rates", "phases"):
             part = per_problem(getattr(self, name), f"boxes.{name}", 4, dims)
             check_shape(part, (B, M, part.shape[2], d), f"boxes.{name}")
@@ -56,7 +56,8 @@ class OscillatingBoxes(Constraint):
             if not bool(torch.isfinite(part).all()):
                 raise InputError(f"boxes.{name}", "finite numbers for every box that is there", "NaN or infinity")
             sines.append(part)
-        return BoundOscillatingBoxes(boxes, *sines, boxes.knots, boxes.dt)
+        amplitudes, rates, phases = sines
+        return BoundOscillatingBoxes(boxes, amplitudes, rates, phases, boxes.knots, boxes.dt)
 
 
 @dataclass(frozen=True)
