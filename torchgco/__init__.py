@@ -59,6 +59,7 @@ from torchgco.missions.constraints import FirstStepRates as FirstStepRates
 from torchgco.native import kernels as kernels
 from torchgco.obstacles import Boxes as Boxes
 from torchgco.obstacles import Capsules as Capsules
+from torchgco.obstacles import OscillatingBoxes as OscillatingBoxes
 from torchgco.obstacles import Spheres as Spheres
 from torchgco.problem.goal import Goal as Goal
 from torchgco.problem.problem import Problem as Problem
@@ -82,8 +83,9 @@ if TYPE_CHECKING:
 __all__ = [  # noqa: RUF022
     # the problem
     "Problem", "Goal", "Dynamics", "FunctionDynamics", "Planar", "Unicycle", "QuadrotorPlanning", "QuadrotorPlant",
-    "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules", "ControlBounds",
-    "StateBounds", "RateBounds", "Separation", "FirstStepRates", "FunctionConstraint", "FunctionCost",
+    "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Boxes", "Capsules",
+    "OscillatingBoxes", "ControlBounds", "StateBounds", "RateBounds", "Separation", "FirstStepRates",
+    "FunctionConstraint", "FunctionCost",
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it

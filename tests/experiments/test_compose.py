@@ -24,7 +24,8 @@ MISSIONS = ("mission", "mission_study", "mission_unknown")
 OF_MODEL = {
     "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": ("yard",),
     "quadrotor": (
-        "crossing", "cylinders", "forest", "forest_mission", "forest_moving", "mazes", "rooms", "walls", "woods",
+        "crossing", "cylinders", "forest", "forest_mission", "forest_moving", "mazes", "rooms", "trefoils", "walls",
+        "woods",
     ),
 }  # fmt: skip
 MODEL = {scenario: model for model, scenarios in OF_MODEL.items() for scenario in scenarios}

@@ -22,12 +22,13 @@ from torchgco.base.shapes import check_shape, check_tensor, computing_on
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.separation import Separation
-from torchgco.judging.distances import box_distance, box_segment_distance
+from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances
 from torchgco.judging.judge import by_kind, segment_distance
 from torchgco.judging.maps import segment_distances
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem, check_problem
@@ -204,6 +205,11 @@ def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
     return (box_segment_distance(boxes, p, close + radii) - radii)[0]
 
 
+def _oscillating_chords(swings: BoundOscillatingBoxes, X: Tensor) -> Tensor:
+    radii = torch.where(swings.absent, -torch.inf, swings.boxes.inflated_radii).unsqueeze(1)
+    return (oscillating_distances(swings, X[None, :, swings.position])[1] - radii)[0]
+
+
 def _field_chords(field: BoundField, X: Tensor) -> Tensor:
     return segment_distances(field, X[None, :, field.position])[0].unsqueeze(-1) - field.vehicle_radius
 
@@ -213,6 +219,7 @@ def _field_chords(field: BoundField, X: Tensor) -> Tensor:
 CHORDS: dict[type[Constraint], Callable[[Any, Tensor], Tensor]] = {
     BoundSpheres: _sphere_chords,
     BoundBoxes: _box_chords,
+    BoundOscillatingBoxes: _oscillating_chords,
     BoundField: _field_chords,
 }
 

@@ -17,11 +17,12 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape, computing_on, tensor
 from torchgco.constraints.base import CONTACT_FACTOR, Constraint
 from torchgco.constraints.separation import Separation
-from torchgco.judging.distances import box_distance, box_segment_distance
+from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances
 from torchgco.judging.maps import segment_distances
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem, check_problem
@@ -252,6 +253,18 @@ def box_clearance(boxes: BoundBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
     return at_knots, torch.minimum(between, at_knots)
 
 
+def oscillating_clearance(swings: BoundOscillatingBoxes, X: Tensor) -> tuple[Tensor, Tensor]:
+    """As `box_clearance`, of boxes that move; between the knots a lower bound, by dt^2 / 8 of their accelerations."""
+    p, boxes = X[..., swings.position], swings.boxes
+    if boxes.centers.shape[1] == 0:
+        far = torch.full_like(p[:, 0, 0], torch.inf)
+        return far, far
+    contact = torch.where(boxes.absent, -torch.inf, CONTACT_FACTOR * boxes.inflated_radii).unsqueeze(1)
+    ends, ways = oscillating_distances(swings, p)
+    at_knots, between = ((part - contact).flatten(1).amin(-1) for part in (ends, ways))
+    return at_knots, torch.minimum(between, at_knots)
+
+
 def separation_clearance(separation: Separation, X: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest distance (B,) of a pair, less 0.95 of that to keep, at the knots and along the segments between, m.
 
@@ -280,6 +293,7 @@ def field_clearance(field: BoundField, X: Tensor) -> tuple[Tensor, Tensor]:
 CLEARANCES: dict[type[Constraint], Callable[[Any, Tensor], tuple[Tensor, Tensor]]] = {
     BoundSpheres: sphere_clearance,
     BoundBoxes: box_clearance,
+    BoundOscillatingBoxes: oscillating_clearance,
     BoundField: field_clearance,
     Separation: separation_clearance,
 }

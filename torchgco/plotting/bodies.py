@@ -62,32 +62,43 @@ class Box:
     """A box, rounded outwards by `radius`; lengths in metres.
 
     center, half (d,): half the sides' lengths; sides (d, d): their directions, as rows
+    swing: amplitudes, rates and phases (3, S, d) of the sines along which the centre moves; None: it rests
     """
 
     center: np.ndarray
     half: np.ndarray
     sides: np.ndarray
     radius: float = 0.0
-    moving = False
+    swing: np.ndarray | None = None
+
+    @property
+    def moving(self) -> bool:
+        return self.swing is not None and bool(self.swing[0].any())
 
     @property
     def corners(self) -> np.ndarray:
-        """The corners (2^d, d) before rounding; those of a side differ in one bit of their index."""
+        """The corners (2^d, d) before rounding, at t = 0; those of a side differ in one bit of their index."""
+        return self._corners(0.0)
+
+    def _corners(self, t: float) -> np.ndarray:
         signs = np.array(list(product((-1.0, 1.0), repeat=len(self.center))))
-        return self.center + (signs * self.half) @ self.sides
+        return self.at(t) + (signs * self.half) @ self.sides
 
     def at(self, t: np.ndarray | float) -> np.ndarray:
-        """Centres (..., d) at times t (...), s: boxes don't move."""
-        return np.broadcast_to(self.center, (*np.shape(t), len(self.center)))
+        """Centres (..., d) at times t (...), s."""
+        if self.swing is None:
+            return np.broadcast_to(self.center, (*np.shape(t), len(self.center)))
+        amplitudes, rates, phases = self.swing
+        return self.center + (amplitudes * np.sin(np.asarray(t)[..., None, None] * rates + phases)).sum(axis=-2)
 
     def distance(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Signed distances (K,) of points (K, d) from the box before rounding."""
-        over = np.abs((points - self.center) @ self.sides.T) - self.half
+        over = np.abs((points - self.at(t)) @ self.sides.T) - self.half
         return np.linalg.norm(np.maximum(over, 0.0), axis=-1) + np.minimum(over.max(axis=-1), 0.0)
 
     def outline(self, margin: float = 0.0, plane: Plane = ABOVE, t: float = 0.0) -> np.ndarray:
         """The silhouette (P, 2) of all points within `margin`; counterclockwise."""
-        seen, reach = self.corners[:, plane], self.radius + margin
+        seen, reach = self._corners(t)[:, plane], self.radius + margin
         # Rounded boxes may have sides of length 0, and then no hull of their corners.
         return _around(seen, reach) if reach > 0 else seen[ConvexHull(seen).vertices]
 
@@ -97,7 +108,7 @@ class Box:
         A cut through a rounded box is the hull of cuts through the sharp one nearby, each grown by what the rounding
         has left at this distance.
         """
-        corners, hidden, reach = self.corners, _hidden(plane), self.radius + margin
+        corners, hidden, reach = self._corners(t), _hidden(plane), self.radius + margin
         heights = corners[:, hidden] - at
         if abs(heights.mean()) > np.ptp(heights) / 2 + reach:
             return None
@@ -126,10 +137,16 @@ def _boxes(layouts: Mapping[str, np.ndarray], i: int) -> tuple[Box, ...]:
         return ()
     centers, halves = (np.asarray(layouts[name], dtype=float)[i] for name in ("box_centers", "box_half_sizes"))
     turns, rounding = layouts.get("box_rotations"), layouts.get("box_radii")
+    swings = None
+    if "box_amplitudes" in layouts:
+        swings = np.stack(
+            [np.asarray(layouts[f"box_{name}"], dtype=float)[i] for name in ("amplitudes", "rates", "phases")]
+        )
     found = []
     for k in np.flatnonzero(np.isfinite(centers).all(axis=1)):
         sides = np.eye(centers.shape[1]) if turns is None else _sides(np.asarray(turns, dtype=float)[i, k])
-        found.append(Box(centers[k], halves[k], sides, 0.0 if rounding is None else float(np.asarray(rounding)[i, k])))
+        radius = 0.0 if rounding is None else float(np.asarray(rounding)[i, k])
+        found.append(Box(centers[k], halves[k], sides, radius, None if swings is None else swings[:, k]))
     return tuple(found)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.plotting.bodies import Ball, Body, Box, Plane
 from torchgco.plotting.scene import Scene
@@ -44,7 +45,7 @@ def world_of(problem: Problem, b: int) -> World:
     by_radius: dict[float, list[Body]] = {}
     others = []
     for part in one.obstacles:
-        if isinstance(part, BoundSpheres | BoundBoxes):
+        if isinstance(part, BoundSpheres | BoundBoxes | BoundOscillatingBoxes):
             by_radius.setdefault(float(part.vehicle_radius[0]), []).extend(_bodies(part))
         else:
             others.append(part)
@@ -60,7 +61,11 @@ def world_of(problem: Problem, b: int) -> World:
     return World(tuple(scenes), tuple(others))
 
 
-def _bodies(part: BoundSpheres | BoundBoxes) -> list[Body]:
+def _bodies(part: BoundSpheres | BoundBoxes | BoundOscillatingBoxes) -> list[Body]:
+    if isinstance(part, BoundOscillatingBoxes):
+        swings = torch.stack((part.amplitudes[0], part.rates[0], part.phases[0]), dim=1).cpu().numpy()
+        here = swings[~part.absent[0].cpu().numpy()]
+        return [replace(box, swing=own) for box, own in zip(_bodies(part.boxes), here, strict=True)]  # type: ignore
     centers, radii = part.centers[0].cpu().numpy(), (part.inflated_radii[0] - part.vehicle_radius[0]).cpu().numpy()
     here = np.flatnonzero(~part.absent[0].cpu().numpy())
     if isinstance(part, BoundSpheres):

@@ -10,6 +10,7 @@ from torchgco.scenarios.mazes import Mazes
 from torchgco.scenarios.planar import PlanarRandom, PlanarTrap
 from torchgco.scenarios.quadrotor import Forest, ForestMoving, Walls
 from torchgco.scenarios.rooms import Rooms
+from torchgco.scenarios.trefoils import Trefoils
 from torchgco.scenarios.vehicle import Task, Vehicle
 from torchgco.scenarios.woods import Woods
 from torchgco.scenarios.yard import Yard
@@ -28,6 +29,7 @@ __all__ = [
     "Rooms",
     "Scenario",
     "Task",
+    "Trefoils",
     "Vehicle",
     "Walls",
     "Woods",

@@ -144,6 +144,30 @@ def boxes(centers: Any, halves: Any, turns: Any, radii: Any, like: np.ndarray) -
     return middle, half, _turns(turns, absent, d), rounding
 
 
+def sines(values: Sequence[Any], centers: np.ndarray | None) -> tuple[np.ndarray | None, ...]:
+    """Amplitudes, rates and phases (L, K, S, d) of boxes, NaN where there is no box; or None."""
+    names = ("layouts.box_amplitudes", "layouts.box_rates", "layouts.box_phases")
+    given = [name for name, value in zip(names, values, strict=True) if value is not None]
+    if not given:
+        return None, None, None
+    if centers is None:
+        raise InputError(given[0], "none without box_centers", "some")
+    absent, found = np.isnan(centers).all(axis=2), []
+    for name, value in zip(names, values, strict=True):
+        if value is None:
+            raise InputError(name, f"this array with {given[0].removeprefix('layouts.')}", "none")
+        part, (count, boxes, d) = array(value, name), centers.shape
+        if part.ndim != 4 or part.shape != (count, boxes, part.shape[2], d):
+            raise InputError(name, f"shape ({count}, {boxes}, S, {d})", f"shape {part.shape}")
+        if found and part.shape != found[0].shape:
+            raise InputError(name, f"shape {found[0].shape} as box_amplitudes", f"shape {part.shape}")
+        _none_of(~absent & ~np.isfinite(part).all(axis=(2, 3)), name, "finite numbers where the centre is finite", part)
+        part[absent] = np.nan
+        _bounded(part, name)
+        found.append(part)
+    return tuple(found)
+
+
 def _rounding(value: Any, absent: np.ndarray) -> np.ndarray | None:
     """Radii (L, K) of the boxes' edges, NaN where there is no box."""
     if value is None:

@@ -26,7 +26,8 @@ from torchgco.scenarios.stored_maps import map_arrays, map_of
 REQUIRED = ("centers", "radii")
 CONTROLS = ("control_lower", "control_upper")
 BOXES = ("box_centers", "box_half_sizes", "box_rotations", "box_radii")
-NAMED = (*REQUIRED, "velocities", *BOXES, "start", "goal", *checks.SCALARS, *CONTROLS, "best_cost")
+SINES = ("box_amplitudes", "box_rates", "box_phases")
+NAMED = (*REQUIRED, "velocities", *BOXES, *SINES, "start", "goal", *checks.SCALARS, *CONTROLS, "best_cost")
 IDS = "layout"
 
 
@@ -49,6 +50,8 @@ class Layouts:
             axes of space, NaN where absent; None: sides along the axes.
         box_radii: (L, K) m by which boxes are rounded outwards, NaN where absent; None: sharp boxes. Where above 0,
             half sides may be 0: a capsule has one side above 0.
+        box_amplitudes, box_rates, box_phases: (L, K, S, d) m, rad/s and rad of S sines along each axis: at time t a box
+            is at box_centers + sum_s amplitudes sin(rates t + phases). NaN where absent, or None if all boxes rest.
         map: the distance field of a map that all layouts share, or None. In a file: the arrays `map_occupied`,
             `map_origin` and `map_resolution`, or `map_points` and `map_radius`, and `map_unknown`.
         name: of the family, or the stem of the file.
@@ -73,6 +76,9 @@ class Layouts:
     box_half_sizes: np.ndarray | None = None
     box_rotations: np.ndarray | None = None
     box_radii: np.ndarray | None = None
+    box_amplitudes: np.ndarray | None = None
+    box_rates: np.ndarray | None = None
+    box_phases: np.ndarray | None = None
     map: DistanceField | None = None
     name: str = "layouts"
     ids: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))  # empty stands for 0..L-1
@@ -87,6 +93,9 @@ class Layouts:
         put("velocities", checks.velocities(self.velocities, centers))
         boxes = checks.boxes(self.box_centers, self.box_half_sizes, self.box_rotations, self.box_radii, centers)
         for name, value in zip(BOXES, boxes, strict=True):
+            put(name, value)
+        sines = checks.sines([getattr(self, name) for name in SINES], self.box_centers)
+        for name, value in zip(SINES, sines, strict=True):
             put(name, value)
         for name in ("start", "goal"):
             put(name, checks.states(getattr(self, name), f"layouts.{name}", centers))
@@ -138,7 +147,7 @@ class Layouts:
         index = checks.indices(indices, "layouts.take")
         if index.max() >= self.count:
             raise InputError("layouts.take", f"positions in 0..{self.count - 1}", int(index.max()))
-        rows = ("centers", "radii", "velocities", *BOXES, "start", "goal", "best_cost", "ids")
+        rows = ("centers", "radii", "velocities", *BOXES, *SINES, "start", "goal", "best_cost", "ids")
         held = {name: getattr(self, name) for name in rows if getattr(self, name) is not None}
         return replace(self, **{name: value[index] for name, value in held.items()})
 
@@ -217,7 +226,7 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
         columns["best_cost"] = [
             np.full(part.count, np.nan) if part.best_cost is None else part.best_cost for part in parts
         ]
-    columns |= _joined_boxes(parts)
+    columns |= _joined_boxes(parts) | _joined_sines(parts)
     return Layouts(
         centers=np.concatenate([part.centers for part in parts]),
         radii=np.concatenate([part.radii for part in parts]),
@@ -256,9 +265,23 @@ def _joined_boxes(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
     return {name: column if name in kept else [None] for name, column in columns.items()}
 
 
+def _joined_sines(parts: Sequence[Layouts]) -> dict[str, list[Any]]:
+    """The sines of the boxes of all parts, as many for each; boxes of parts without any rest. None where none moves."""
+    counts = [0 if part.box_centers is None else part.box_centers.shape[1] for part in parts]
+    sines = max((part.box_amplitudes.shape[2] for part in parts if part.box_amplitudes is not None), default=0)
+    columns: dict[str, list[Any]] = {name: [] for name in SINES}
+    for part, count in zip(parts, counts, strict=True):
+        for name in SINES:
+            value = getattr(part, name)
+            value = np.zeros((part.count, count, sines, part.dimension)) if value is None else value
+            value = np.pad(value, [(0, 0), (0, 0), (0, sines - value.shape[2]), (0, 0)])
+            columns[name].append(np.pad(value, _behind(value, max(counts) - count), constant_values=np.nan))
+    return columns if sines and max(counts) else {name: [None] for name in SINES}
+
+
 def _behind(value: np.ndarray, missing: int) -> list[tuple[int, int]]:
     """The widths with which np.pad adds `missing` rows along the second axis."""
-    return [(0, 0), (0, missing), (0, 0)][: value.ndim]
+    return [(0, 0), (0, missing), (0, 0), (0, 0)][: value.ndim]
 
 
 def _same(name: str, values: list[Any]) -> Any:

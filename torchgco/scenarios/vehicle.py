@@ -19,10 +19,11 @@ from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.base import Dynamics
 from torchgco.maps.field import Field
 from torchgco.obstacles.boxes import Boxes
+from torchgco.obstacles.oscillating import OscillatingBoxes
 from torchgco.obstacles.spheres import Spheres
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem
-from torchgco.scenarios.layouts import Layouts
+from torchgco.scenarios.layouts import SINES, Layouts
 
 STATES = ("state_weight", "terminal_weight", "start", "goal")  # fields with one number per state
 CONTROLS = ("control_weight", "control_reference", "control_lower", "control_upper")
@@ -130,7 +131,9 @@ class Vehicle:
                 None if value is None else tensor(value) for value in (layouts.box_rotations, layouts.box_radii)
             )
             radius = _given(layouts.vehicle_radius, self.radius)
-            constraints.append(Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns, radii))
+            boxes = Boxes(tensor(layouts.box_centers), tensor(layouts.box_half_sizes), radius, turns, radii)
+            sines = [getattr(layouts, name) for name in SINES]
+            constraints.append(boxes if sines[0] is None else OscillatingBoxes(boxes, *map(tensor, sines)))
         if layouts.map is not None:
             constraints.append(Field(layouts.map, _given(layouts.vehicle_radius, self.radius)))
         cost = QuadraticCost(

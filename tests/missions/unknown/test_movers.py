@@ -69,12 +69,12 @@ def test_known_bodies_are_where_they_are() -> None:
 
 def test_half_spaces_and_gaps_agree_with_the_balls() -> None:
     rng = np.random.default_rng(0)
-    moving = Moving(rng.uniform(-3, 3, (6, 3)), rng.uniform(-1, 1, (6, 3)), rng.uniform(0.2, 0.6, 6), growth=0.1)
+    moving = Moving.balls(rng.uniform(-3, 3, (6, 3)), rng.uniform(-1, 1, (6, 3)), rng.uniform(0.2, 0.6, 6), growth=0.1)
     points, t = rng.uniform(-3, 3, (50, 3)), rng.uniform(0, 2, 50)
     slow = [
         [
             np.linalg.norm(p - c - s * v) - r - 0.1 * s
-            for c, v, r in zip(moving.centers, moving.velocities, moving.radii, strict=True)
+            for c, v, r in zip(moving.centers, moving.motion.velocities, moving.radii, strict=True)
         ]
         for p, s in zip(points, t, strict=True)
     ]

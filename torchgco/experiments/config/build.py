@@ -29,8 +29,8 @@ from torchgco.solvers.memory import least_bytes
 
 DEFAULT_LAYOUTS = 64
 FLOWN = (
-    "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, rooms, walls, woods, "
-    "or a layout file"
+    "one in space for a mission: crossing, cylinders, forest, forest_moving, mazes, rooms, trefoils, walls, "
+    "woods, or a layout file"
 )
 MAX_PROCESSES = 1024  # threads, too: PyTorch ends with an error of the system long before the system's own limit
 register()

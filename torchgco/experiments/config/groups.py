@@ -35,6 +35,7 @@ from torchgco.scenarios import (
     PlanarRandom,
     PlanarTrap,
     Rooms,
+    Trefoils,
     Walls,
     Woods,
     Yard,
@@ -42,7 +43,7 @@ from torchgco.scenarios import (
 from torchgco.scenarios.vehicle import BUILT_IN
 
 FAMILIES: tuple[type[Any], ...] = (
-    Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, PlanarTrap, PlanarRandom, Yard,
+    Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, Trefoils, PlanarTrap, PlanarRandom, Yard,
 )  # fmt: skip
 BY_DIMENSION = "torchgco.by_dimension"
 ALIKE = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each

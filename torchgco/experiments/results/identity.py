@@ -17,7 +17,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from torchgco.scenarios import Layouts
-from torchgco.scenarios.layouts import BOXES
+from torchgco.scenarios.layouts import BOXES, SINES
 from torchgco.scenarios.stored_maps import map_arrays
 
 ARITHMETIC = ("name", "dtype", "kernels")  # keys of `device` that decide results
@@ -164,6 +164,7 @@ def layout_digests(
             if held["box_radii"] is not None and not held["box_radii"][i][here].any():
                 del held["box_radii"]  # sharp boxes, as without the array
             if here.any():
+                held |= {name: getattr(layouts, name) for name in SINES}
                 own |= {name: value[i][here] for name, value in held.items() if value is not None}
         for name in ("start", "goal"):
             if getattr(layouts, name) is not None:

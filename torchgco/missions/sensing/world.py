@@ -17,12 +17,76 @@ from torchgco.maps.grid import OccupancyGrid
 from torchgco.missions.sensing.library import call
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
 
 def _no_cells() -> np.ndarray:
     return np.zeros((0, 0, 0), np.uint8)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How M bodies move away from where they are placed: at constant velocity, and along S sines.
+
+    Args:
+        velocities: (M, 3), m/s.
+        amplitudes, rates, phases: (M, S, 3), m, rad/s, rad: at time t a body is sum_s amplitudes sin(rates t + phases)
+            off.
+    """
+
+    velocities: np.ndarray
+    amplitudes: np.ndarray
+    rates: np.ndarray
+    phases: np.ndarray
+
+    @classmethod
+    def steady(cls, velocities: np.ndarray) -> Self:
+        """Without sines."""
+        none = np.zeros((len(velocities), 0, 3))
+        return cls(velocities, none, none, none)
+
+    @property
+    def moves(self) -> np.ndarray:
+        """Which bodies move, (M,) bool."""
+        return (self.velocities != 0).any(axis=1) | (self.amplitudes != 0).any(axis=(1, 2))
+
+    @property
+    def reach(self) -> np.ndarray:
+        """How far sines lead bodies away at most, (M,), m."""
+        return np.linalg.norm(np.abs(self.amplitudes).sum(axis=1), axis=-1)
+
+    def off(self, t: np.ndarray) -> np.ndarray:
+        """How far they are off (K, M, 3), m, at times t (K,), s."""
+        found = t[:, None, None] * self.velocities
+        for s in range(self.amplitudes.shape[1]):
+            angle = t[:, None, None] * self.rates[:, s] + self.phases[:, s]
+            found = found + self.amplitudes[:, s] * np.sin(angle)
+        return found
+
+    def take(self, rows: np.ndarray) -> Self:
+        """The motion of some bodies."""
+        return replace(self, **{name: part[rows] for name, part in vars(self).items()})
+
+    def later(self, t: float) -> Self:
+        """The same with time t, s, as time 0; what velocities have led to by then isn't counted."""
+        return replace(self, phases=self.phases + t * self.rates)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The motion of the bodies of all parts."""
+        most = max((part.amplitudes.shape[1] for part in parts), default=0)
+
+        def padded(value: np.ndarray) -> np.ndarray:
+            return np.pad(value, [(0, 0), (0, most - value.shape[1]), (0, 0)])
+
+        none = cls.steady(np.zeros((0, 3)))
+        sines = (
+            np.concatenate([padded(getattr(part, name)) for part in (none, *parts)])
+            for name in ("amplitudes", "rates", "phases")
+        )
+        return cls(np.concatenate([part.velocities for part in (none, *parts)]), *sines)
 
 
 @dataclass(frozen=True)
@@ -36,6 +100,7 @@ class World:
         occupied: (X, Y, Z) uint8, 1 where a cell is occupied.
         corner: (3,), m, where cell (0, 0, 0) begins.
         resolution: side of a cell, m.
+        swings: how the boxes swing around where they are placed, with their velocities; None: none does.
     """
 
     boxes: np.ndarray
@@ -43,6 +108,7 @@ class World:
     occupied: np.ndarray = field(default_factory=_no_cells)
     corner: tuple[float, float, float] = (0.0, 0.0, 0.0)
     resolution: float = 1.0
+    swings: Motion | None = None
 
     @classmethod
     def of(cls, problem: Problem, b: int) -> Self:
@@ -56,25 +122,31 @@ class World:
         if len(maps) > 1:
             raise InputError("constraints", "one map at most, for a sensor", len(maps))
         parts = [_bodies(part) for part in one.constraints if isinstance(part, Obstacles) and part not in maps]
-        boxes, velocities = zip(*parts, strict=True) if parts else ((np.zeros((0, 16)),), (np.zeros((0, 3)),))
-        world = cls(np.concatenate(boxes), np.concatenate(velocities))
+        boxes = np.concatenate([np.zeros((0, 16)), *(part[0] for part in parts)])
+        motion = Motion.joined([part[1] for part in parts])
+        world = cls(boxes, motion.velocities, swings=motion)
         if not maps:
             return world
         occupied, corner, resolution = _cells(maps[0])
         return replace(world, occupied=occupied, corner=corner, resolution=resolution)
 
     @property
+    def motion(self) -> Motion:
+        """How the boxes move away from where they are placed."""
+        return Motion.steady(self.velocities) if self.swings is None else self.swings
+
+    @property
     def moving(self) -> bool:
         """Whether any body moves."""
-        return bool((self.velocities != 0).any())
+        return bool(self.motion.moves.any())
 
     def at(self, t: float) -> Self:
-        """The same bodies where they are at time t, s."""
+        """The same bodies where they are at time t, s, and rest."""
         if not self.moving:
             return self
         boxes = self.boxes.copy()
-        boxes[:, :3] += t * self.velocities
-        return replace(self, boxes=boxes)
+        boxes[:, :3] += self.motion.off(np.array([t]))[0]
+        return replace(self, boxes=boxes, velocities=np.zeros((len(boxes), 3)), swings=None)
 
     def cast(self, origin: Sequence[float] | np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
         """Distances (R,), m, to the first body along unit vectors (R, 3) from a point (3,), m.
@@ -107,8 +179,13 @@ def _cells(part: BoundField) -> tuple[np.ndarray, tuple[float, float, float], fl
     return np.ascontiguousarray(occupied, np.uint8), (x, y, z), source.resolution
 
 
-def _bodies(part: Obstacles) -> tuple[np.ndarray, np.ndarray]:
-    """The boxes (M, 16) and velocities (M, 3) of obstacles of one problem, without the absent ones."""
+def _bodies(part: Obstacles) -> tuple[np.ndarray, Motion]:
+    """The boxes (M, 16) of obstacles, and how they move, of one problem, without the absent ones."""
+    if isinstance(part, BoundOscillatingBoxes):
+        boxes, _ = _bodies(part.boxes)
+        here = ~part.absent[0].numpy()
+        sines = (values[0].numpy()[here] for values in (part.amplitudes, part.rates, part.phases))
+        return boxes, Motion(np.zeros((len(boxes), 3)), *sines)
     there = ~part.absent[0].numpy()
     vehicle = float(part.vehicle_radius[0])
     if isinstance(part, BoundSpheres):
@@ -123,4 +200,5 @@ def _bodies(part: Obstacles) -> tuple[np.ndarray, np.ndarray]:
         kinds = "spheres, boxes, capsules or a map for a sensor"
         raise InputError("scenario", kinds, type(part).__name__)
     radii = np.where(radii < 1e-12, 0.0, radii)  # what rounding leaves of a sharp box
-    return np.concatenate([centers, axes, half, radii[:, None]], axis=1)[there], velocities[there]
+    boxes = np.concatenate([centers, axes, half, radii[:, None]], axis=1)[there]
+    return boxes, Motion.steady(velocities[there])

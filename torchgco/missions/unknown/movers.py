@@ -1,16 +1,16 @@
-"""Bodies that move, as balls at constant velocity: known, or followed in the returns of a sensor."""
+"""Bodies that move: known, or followed in the returns of a sensor, as balls at constant velocity."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Protocol, Self
 
 import numpy as np
 from scipy.ndimage import label
 
 from torchgco.missions.sensing.grid import FREE, OCCUPIED, SeenMap
 from torchgco.missions.sensing.sensors import Scan
-from torchgco.missions.sensing.world import World
+from torchgco.missions.sensing.world import Motion, World
 
 BESIDE = 0.3  # m around a ball, within which returns are its own
 JOINED = 0.4  # m: returns closer than about this belong to one body
@@ -26,42 +26,80 @@ GROWTH, MOST_GROWTH = 0.25, 0.5  # m/s by which balls grow ahead of their time, 
 
 @dataclass(frozen=True)
 class Moving:
-    """Balls that move at constant velocity: centres (M, 3), m, velocities (M, 3), m/s, radii (M,), m; growth, m/s."""
+    """Rounded boxes that move; balls have no sides.
+
+    Args:
+        centers: (M, 3), m, where they are placed.
+        motion: away from there.
+        radii: (M,), m, by which the boxes are rounded.
+        growth: m/s by which they are wider later.
+        half_sizes: half the sides (M, 3), m.
+        sides: their directions, as rows, (M, 3, 3).
+    """
 
     centers: np.ndarray
-    velocities: np.ndarray
+    motion: Motion
     radii: np.ndarray
-    growth: float = 0.0
+    growth: float
+    half_sizes: np.ndarray
+    sides: np.ndarray
+
+    @classmethod
+    def balls(cls, centers: np.ndarray, velocities: np.ndarray, radii: np.ndarray, growth: float = 0.0) -> Self:
+        """Balls at constant velocity: centres (M, 3), m, velocities (M, 3), m/s, radii (M,), m; growth, m/s."""
+        straight = np.broadcast_to(np.eye(3), (len(centers), 3, 3))
+        return cls(centers, Motion.steady(velocities), radii, growth, np.zeros_like(centers), straight)
 
     def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Centres (K, M, 3) and radii (K, M) after times t (K,), s."""
         more = np.minimum(self.growth * t, MOST_GROWTH)
-        return self.centers + t[:, None, None] * self.velocities, self.radii + more[:, None]
+        return self.centers + self.motion.off(t), self.radii + more[:, None]
+
+    def take(self, rows: np.ndarray) -> Self:
+        """Some of the bodies."""
+        names = ("centers", "motion", "radii", "half_sizes", "sides")
+        parts = {name: getattr(self, name) for name in names}
+        parts = {name: part.take(rows) if name == "motion" else part[rows] for name, part in parts.items()}
+        return replace(self, **parts)
+
+    def near(self, point: np.ndarray, reach: float, horizon: float) -> Self:
+        """Those that may come within `reach`, m, of a point (3,) within the horizon, s."""
+        size = np.linalg.norm(self.half_sizes, axis=1) + self.radii + self.motion.reach + MOST_GROWTH
+        size = size + horizon * np.linalg.norm(self.motion.velocities, axis=1)
+        return self.take(np.linalg.norm(self.centers - point, axis=1) <= reach + size)
 
     def gaps(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Distances (K,), m, of points (K, 3) from the nearest surface at times t (K,), s; infinite without bodies."""
+        return self._apart(points, t)[0].min(axis=1, initial=np.inf)
+
+    def _apart(self, points: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distances (K, M), m, of points (K, 3) from the surfaces, and the unit vectors (K, M, 3) away."""
         centers, radii = self.at(t)
-        return (np.linalg.norm(points[:, None] - centers, axis=-1) - radii).min(axis=1, initial=np.inf)
+        local = np.einsum("mij,kmj->kmi", self.sides, points[:, None] - centers)
+        over = np.abs(local) - self.half_sizes
+        deepest = over.max(axis=-1)
+        away = np.sign(local) * np.maximum(over, 0.0)
+        length = np.linalg.norm(away, axis=-1)
+        side = np.where(local < 0, -1.0, 1.0) * (np.arange(3) == over.argmax(axis=-1)[..., None])
+        outside = length[..., None] > 1e-9
+        normals = np.where(outside, away / np.maximum(length, 1e-9)[..., None], side)
+        return np.where(deepest > 0, length, deepest) - radii, np.einsum("mij,kmi->kmj", self.sides, normals)
 
     def planes(self, points: np.ndarray, t: np.ndarray, most: int) -> np.ndarray:
-        """Half-spaces n x >= b (K, most, 4) that part points (K, 3) at times t (K,), s, from the nearest balls.
+        """Half-spaces n x >= b (K, most, 4) that part points (K, 3) at times t (K,), s, from the nearest bodies.
 
         Zeros where there are fewer.
         """
-        centers, radii = self.at(t)
-        away = points[:, None] - centers
-        length = np.linalg.norm(away, axis=-1)
-        normals = np.where(length[..., None] > 1e-6, away / np.maximum(length, 1e-6)[..., None], [0.0, 0.0, 1.0])
-        offsets = (normals * centers).sum(-1) + radii
-        found, order = np.zeros((len(points), most, 4)), np.argsort(length - radii, axis=1)[:, :most]
+        gaps, normals = self._apart(points, t)
+        offsets = (normals * points[:, None]).sum(-1) - gaps
+        found, order = np.zeros((len(points), most, 4)), np.argsort(gaps, axis=1)[:, :most]
         rows = np.arange(len(points))[:, None]
         found[:, : order.shape[1], :3], found[:, : order.shape[1], 3] = normals[rows, order], offsets[rows, order]
         return found
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """Which of some points (R, 3) belong to the balls where they are now, (R,) bool."""
-        away = np.linalg.norm(points[:, None] - self.centers, axis=-1) - self.radii
-        return (away <= BESIDE).any(axis=1)
+        """Which of some points (R, 3) belong to the bodies where they are now, (R,) bool."""
+        return self.gaps(points, np.zeros(len(points))) <= BESIDE
 
 
 class Movers(Protocol):
@@ -82,7 +120,7 @@ class Movers(Protocol):
 
 def nothing() -> Moving:
     """No bodies."""
-    return Moving(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    return Moving.balls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
 class Unaware:
@@ -102,7 +140,7 @@ class Unaware:
 
 @dataclass
 class Known:
-    """The places and velocities of all moving bodies of a world are known, as balls around them."""
+    """All moving bodies of a world are known, with their motion."""
 
     world: World
 
@@ -118,9 +156,11 @@ class Known:
 
     def now(self, t: float) -> Moving:
         """See `Movers`."""
-        moves = (self.world.velocities != 0).any(axis=1)
-        boxes, v = self.world.boxes[moves], self.world.velocities[moves]
-        return Moving(boxes[:, :3] + t * v, v, boxes[:, 15] + np.linalg.norm(boxes[:, 12:15], axis=1))
+        motion = self.world.motion
+        boxes, motion = self.world.boxes[motion.moves], motion.take(motion.moves)
+        centers = boxes[:, :3] + t * motion.velocities
+        sides = boxes[:, 3:12].reshape(-1, 3, 3)
+        return Moving(centers, motion.later(t), boxes[:, 15], 0.0, boxes[:, 12:15], sides)
 
 
 @dataclass(eq=False)
@@ -207,7 +247,7 @@ class Tracks:
         v = np.array([track.velocity for track in self.tracks])
         age = np.array([t - track.last for track in self.tracks])
         centers = np.array([track.center for track in self.tracks]) + age[:, None] * v
-        return Moving(centers, v, np.array([track.radius for track in self.tracks]), GROWTH)
+        return Moving.balls(centers, v, np.array([track.radius for track in self.tracks]), GROWTH)
 
     def _fresh(self, seen: SeenMap, points: np.ndarray) -> np.ndarray:
         """Which points (R, 3) lie in free cells, not beside occupied ones that never were free, (R,) bool."""

@@ -1,0 +1,167 @@
+"""Boxes that move along sums of sines: their centres swing along the axes of space, their sides keep their directions.
+
+They are evaluated in PyTorch. No path is sought among them, as among spheres that move.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import Dimensions, check_shape
+from torchgco.constraints.base import Constraint, Sense
+from torchgco.obstacles.base import ABSENT, TOUCH, Obstacles, least, picked
+from torchgco.obstacles.box_geometry import Cuboids, excess, segment_distance, signed_distance
+from torchgco.obstacles.boxes import BoundBoxes, Boxes
+from torchgco.obstacles.inputs import per_problem
+
+
+@dataclass(frozen=True)
+class OscillatingBoxes(Constraint):
+    """Boxes as `Boxes`, whose centres at time t are centers + sum_s amplitudes sin(rates t + phases).
+
+    Args:
+        boxes: at the middle of their motion.
+        amplitudes, rates, phases: (M, S, d), or (B, M, S, d) one set per problem: S sines along each axis, m, rad/s and
+            rad. Those of absent boxes don't count; a box with amplitudes of 0 rests.
+
+    Raises:
+        InputError: on `Problem(...)`: as `Boxes`; other shapes, NaN or infinity, dynamics without a time step.
+    """
+
+    boxes: Boxes
+    amplitudes: Any
+    rates: Any
+    phases: Any
+
+    sense: ClassVar[Sense] = "inequality"
+    geometric: ClassVar[bool] = True
+
+    def bind(self, dims: Dimensions) -> Constraint:
+        boxes = self.boxes.bind(dims)
+        assert isinstance(boxes, BoundBoxes)
+        if dims.dt is None:
+            raise InputError("boxes.amplitudes", "dynamics with a time step dt", "dynamics without one")
+        B, M, d = boxes.centers.shape
+        sines: list[Tensor] = []
+        for name in ("amplitudes", "rates", "phases"):
+            part = per_problem(getattr(self, name), f"boxes.{name}", 4, dims)
+            check_shape(part, (B, M, part.shape[2], d), f"boxes.{name}")
+            check_shape(part, tuple(sines[0].shape) if sines else tuple(part.shape), f"boxes.{name}")
+            part = torch.where(boxes.absent[..., None, None], 0.0, part)
+            if not bool(torch.isfinite(part).all()):
+                raise InputError(f"boxes.{name}", "finite numbers for every box that is there", "NaN or infinity")
+            sines.append(part)
+        amplitudes, rates, phases = sines
+        return BoundOscillatingBoxes(boxes, amplitudes, rates, phases, boxes.knots, boxes.dt)
+
+
+@dataclass(frozen=True)
+class BoundOscillatingBoxes(Obstacles):
+    """Oscillating boxes shaped for their problem."""
+
+    boxes: BoundBoxes  # in the middle of their motion
+    amplitudes: Tensor  # (B, M, S, d)
+    rates: Tensor  # (B, M, S, d)
+    phases: Tensor  # (B, M, S, d), at t = 0
+    knots: Any
+    dt: float
+
+    batched: ClassVar[tuple[str, ...]] = ("boxes", "amplitudes", "rates", "phases")
+
+    absent = property(lambda self: self.boxes.absent)  # type: ignore[assignment]
+    vehicle_radius = property(lambda self: self.boxes.vehicle_radius)  # type: ignore[assignment]
+    position = property(lambda self: self.boxes.position)  # type: ignore[assignment]
+    margins = property(lambda self: self.boxes.margins)  # type: ignore[assignment]
+    sizes = property(lambda self: self.boxes.sizes)  # type: ignore[assignment]
+    moving = property(lambda self: bool((self.amplitudes != 0).any()))  # type: ignore[assignment]
+
+    def bind(self, dims: Dimensions) -> Self:
+        return self
+
+    def places(self, t: Tensor) -> Tensor:
+        """Centres (B, K, M, d), m, at times t (K,), s."""
+        angle = t.view(1, -1, 1, 1, 1) * self.rates.unsqueeze(1) + self.phases.unsqueeze(1)
+        return self.boxes.centers.unsqueeze(1) + (self.amplitudes.unsqueeze(1) * angle.sin()).sum(-2)
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self._rows(X[:, self.knots, self.position], self.times(X))
+
+    def at(self, x: Tensor, k: int) -> Tensor:
+        return self._rows(x[..., self.position], x.new_full((1,), k * self.dt))
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        n, at = X.shape[-1], self.position
+        p, t = X[:, self.knots, at], self.times(X)
+        cp = -2.0 * self.boxes.depths[:, None, :, None] * self._normals(p, t)
+        gradient = (g.unsqueeze(-2) @ cp).squeeze(-2)
+        H[:, self.knots, at, n] += gradient
+        H[:, self.knots, n, at] += gradient
+        H[:, self.knots, at, at] += (h.unsqueeze(-1) * cp).mT @ cp
+
+    def violation(self, X: Tensor, U: Tensor) -> Tensor:
+        """Depth beneath the full surface, (B, K, M), m."""
+        return (-self.signed_distance(X[:, self.knots, self.position], self.times(X))).clamp(min=0.0)
+
+    def signed_distance(self, p: Tensor, t: Tensor) -> Tensor:
+        return torch.where(self.absent.unsqueeze(1), torch.inf, self._outside(p, t))
+
+    def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
+        now = self.places(a.new_zeros(1))[:, 0]
+        return replace(self.boxes, centers=now).segment_clearance(a, b)
+
+    def chord_clearance(self, X: Tensor, share: float = TOUCH) -> Tensor:
+        t = torch.arange(X.shape[1], dtype=X.dtype, device=X.device) * self.dt
+        local = torch.stack(self._local(X[..., self.position], t), dim=-1)
+        begin, along = local[:, :-1].unbind(-1), local.diff(dim=1).unbind(-1)
+        gap = segment_distance(begin, along, self._solids.halves()) - self.bulge.unsqueeze(1)
+        gap = gap + (share * self.margins - self.boxes.inflated_radii).unsqueeze(1)
+        return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
+
+    @property
+    def bulge(self) -> Tensor:
+        """How far a centre's path may leave its chord between two knots, (B, M), m: dt^2 / 8 of its acceleration."""
+        most = (self.amplitudes.abs() * self.rates.square()).sum(-2).square().sum(-1).sqrt()
+        return self.dt**2 / 8.0 * most
+
+    def grown(self, by: Tensor) -> Self:
+        return replace(self, boxes=self.boxes.grown(by))
+
+    def later(self, t: float) -> Self:
+        return replace(self, phases=self.phases + t * self.rates)
+
+    def chosen(self, at: Tensor) -> Self:
+        parts = {name: picked(getattr(self, name), at) for name in ("amplitudes", "rates", "phases")}
+        return replace(self, boxes=self.boxes.chosen(at), **parts)
+
+    @property
+    def _solids(self) -> Cuboids:
+        return self.boxes.inflated()
+
+    def _local(self, p: Tensor, t: Tensor) -> list[Tensor]:
+        """Coordinates along the sides from where the centres are, d tensors (B, K, M), of points p (B, K, d)."""
+        return self._solids.local((p.unsqueeze(2) - self.places(t)).unbind(-1))
+
+    def _outside(self, p: Tensor, t: Tensor) -> Tensor:
+        """Distances (B, K, M) from the full surfaces, as if none were absent."""
+        distance = signed_distance(self._local(p, t), self._solids.halves())
+        return distance - self.boxes.inflated_radii.unsqueeze(1)
+
+    def _rows(self, p: Tensor, t: Tensor) -> Tensor:
+        c = -2.0 * self.boxes.depths.unsqueeze(1) * self._outside(p, t)
+        return torch.where(self.absent.unsqueeze(1), ABSENT, c)
+
+    def _normals(self, p: Tensor, t: Tensor) -> Tensor:
+        """Unit vectors (B, K, M, d) along which the distances of points (B, K, d) grow."""
+        local, half = self._local(p, t), self._solids.halves()
+        away, place = torch.stack(excess(local, half), dim=-1), torch.stack(local, dim=-1)
+        square = away.square().sum(-1, keepdim=True)
+        outside = away / torch.where(square > 0, square, 1.0).sqrt()
+        inner = place.abs() - torch.stack(half, dim=-1)
+        side = torch.nn.functional.one_hot(inner.argmax(-1), place.shape[-1]).to(p.dtype)
+        normal = torch.where(square > 0, outside, torch.where(place < 0, -side, side))
+        return (self.boxes.axes.unsqueeze(1) * normal.unsqueeze(-1)).sum(-2)
