@@ -5,8 +5,8 @@
 #                solvers, "--fresh 256" for drawn layouts); make oracle: seek the best known costs (an hour or more)
 # make general   48 families of constrained problems, compared with IPOPT and FATROP (ARGS="--solvers gco al_ilqr" for others)
 # make worlds   woods, mazes, crossing spheres and the outside benchmarks, with pages in benchmarks/results (half an hour)
-# make unknown   missions in worlds that a lidar sees on the way (an hour; ARGS="--count 32" for more)
-# make maps   drawn worlds as occupancy grids against the same worlds as shapes (ARGS="--count 8" for fewer)
+# make maps   drawn worlds as occupancy grids, and missions in worlds that are seen on the way: benchmarks/results/maps.md (under
+#             forty minutes on two cores); maps-long: the same with 100 and more missions of a kind (a day)
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: the same on a GPU
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
@@ -39,8 +39,8 @@ FIND := import sys; from torchgco.native.compiler import find_compiler; sys.exit
 
 SPEED := $(BIN)/python -m benchmarks.speed
 
-.PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle general worlds maps benchmark benchmark-gpu ladder \
-    docs figures paper unknown
+.PHONY: study test test-all test-slurm robustness versions lint types clean quality oracle general worlds maps maps-known maps-seen maps-long \
+    benchmark benchmark-gpu ladder docs figures paper
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -76,7 +76,18 @@ general: $(PEERS)
 	$(BIN)/python -m benchmarks.families.general_exact --write
 
 maps: $(RUNTIME)
-	$(BIN)/python -m benchmarks.families.maps --write $(ARGS)
+	$(MAKE) -j2 maps-known maps-seen
+
+maps-known: $(RUNTIME)
+	$(BIN)/python -m benchmarks.families.maps --write
+	$(BIN)/python -m benchmarks.outside.barn_lidar --write
+
+maps-seen: $(RUNTIME)
+	$(BIN)/python -m benchmarks.families.unknown --write
+
+maps-long: $(RUNTIME)
+	$(BIN)/python -m benchmarks.families.unknown --long --write
+	$(BIN)/python -m benchmarks.families.missions --many 10000 --write
 
 worlds: $(PEERS)
 	$(BIN)/python -m benchmarks.families.worlds --write $(ARGS)
@@ -84,9 +95,6 @@ worlds: $(PEERS)
 	$(BIN)/python -m benchmarks.outside.maze --write --fatrop 8
 	$(BIN)/python -m benchmarks.outside.navigation --write
 	$(BIN)/python -m benchmarks.outside.jaxipm --write
-
-unknown: $(RUNTIME)
-	$(BIN)/python -m benchmarks.families.unknown --write $(ARGS)
 
 benchmark: $(PEERS)
 	$(MAKE) $(ACADOS)/.ready || echo "acados can't be installed here: the tables will say so."

@@ -40,7 +40,8 @@ def picture(world: str, number: int) -> Image.Image:
     vehicle = float(task.problem.obstacles[0].vehicle_radius[0])
     course = Course(bodies(layouts.arrays(), 0), goal.position[0].numpy(), radius, vehicle, layouts.map)
     figure = seen_figure(log, 0, course, int(log.steps()[0]) - 1)
-    figure.axes[0].set_title(f"{world}, {number}: {figure.axes[0].get_title()}")
+    ax = figure.axes[0]
+    ax.set_title(f"{world}, {number}: {ax.get_title(loc='left')}", loc="left")
     held = BytesIO()
     figure.savefig(held, dpi=DPI)
     return Image.open(held).convert("RGB")

@@ -1,7 +1,7 @@
 """python -m benchmarks.families.unknown: missions in worlds that the vehicle sees on the way, at rest and moving.
 
 Every case is a study of missions below outputs/unknown, so that a run that was stopped resumes where it was. Missions
-fly alone, each in one thread, two at the same time. With --write the tables are put into results/maps.md, with date and
+fly alone, one after the other, in one thread. With --write the tables are put into results/maps.md, with date and
 commit: those of `--count` missions per case, and with --long those of the long rows, in a table of their own.
 """
 
@@ -72,7 +72,7 @@ def fly(name: str, count: int, outputs: Path) -> tuple[pd.DataFrame, pd.DataFram
     folder = outputs / f"{''.join(letter if letter.isalnum() else '-' for letter in name)}-{count}"
     command = [
         sys.executable, "-m", "torchgco", "experiment=mission_unknown", *CASES[name].overrides,
-        f"study.layouts={count}", "study.workers=2", "study.shard_size=1", "study.figures=false", "device.threads=1",
+        f"study.layouts={count}", "study.workers=1", "study.shard_size=1", "study.figures=false", "device.threads=1",
         f"hydra.run.dir={folder}",
     ]  # fmt: skip
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
@@ -160,8 +160,7 @@ def main(words: Sequence[str] | None = None) -> int:
     flown = [fly(name, count, asked.outputs) for name, count in counts.items()]
     trials, log = (pd.concat(parts, ignore_index=True) for parts in zip(*flown, strict=True))
     head = (
-        f"{origin('Flown')}, seed 0, 95 % Wilson intervals in percent; two missions at a time, each in one thread, "
-        f"{machine()}, shared."
+        f"{origin('Flown')}, seed 0, 95 % Wilson intervals in percent; one thread, {machine()}, shared."
     )
     blocks = {"worlds": f"{head}\n\n{table(trials, log)}\n\n{misses(trials, log)}", "times": times(log)}
     for name, text in blocks.items():
