@@ -24,6 +24,7 @@ from torchgco.missions.sensing.grid import NOT_FREE, SEEN_OCCUPIED, SeenMap
 from torchgco.missions.sensing.search import Search
 from torchgco.missions.sensing.sensors import Sensor
 from torchgco.missions.sensing.world import World
+from torchgco.missions.unknown.evading import evaded
 from torchgco.missions.unknown.explorer import (
     CORRIDOR,
     EARLY,
@@ -60,6 +61,7 @@ AHEAD = 4  # points of a path, of which the last is looked at where none is bloc
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
 WAITS = 5  # knots before the first that is blocked
 MOST_MOVING = 4  # moving bodies that a knot keeps away from
+HOLD = 1.0  # s after a plan's end in which its place stays clear: about what it takes to get away from there
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
 
@@ -169,9 +171,10 @@ class Exploration:
             scout.moving = scout.movers.now(step * self.dt)
         self.seek(x)
         reference = self._reference(x)
+        reference = self._evading(reference)
         rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
         former = rest if before is None else self._clear_part(shifted(before.X[:, 1:, :3]))
-        seeds = [former, reference[:, 1:, :3], *([] if self.explorer.movers == "none" else [rest])]
+        seeds = [former, reference[:, 1:, :3]]
         problem = self._problem(x, bias, reference, seeds)
         kept = self._kept(problem, before).take(slice(0, len(self.scouts)))
         plan = self._chosen(problem, kept, len(seeds))
@@ -253,6 +256,19 @@ class Exploration:
             found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
         return found
 
+    def _evading(self, reference: Tensor) -> Tensor:
+        """The states (B, N+1, 14) with ways around moving bodies."""
+        for b, scout in enumerate(self.scouts):
+            p, keep = reference[b, :, :3].numpy(), self.keep(scout)
+            scout.moving = scout.moving.near(p[0], self.explorer.stages * self.dt * self.explorer.speed, HOLD)
+            if len(scout.moving.radii):
+                static = lambda q, scout=scout, keep=keep: scout.seen.gaps(q, keep + 0.3, self.kinds)
+                way = evaded(p, scout.moving, static, keep, self.dt, HOLD)
+                if way is not p:
+                    reference[b, :, :3] = torch.from_numpy(way)
+                    reference[b, :, 3:6] = torch.from_numpy(np.gradient(way, self.dt, axis=0))
+        return reference
+
     def _problem(self, x: Tensor, bias: Tensor, reference: Tensor, seeds: Sequence[Tensor]) -> Problem:
         """The planning problems, seed by seed."""
         C, N = len(seeds), self.explorer.stages
@@ -264,7 +280,7 @@ class Exploration:
                 own, far = scout.seen.corridor(knots, CORRIDOR, PLANES, self.kinds)
                 if self.explorer.movers != "none":
                     times = self.dt * np.arange(1, N + 1)
-                    own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING)], axis=1)
+                    own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING, HOLD)], axis=1)
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
                 near = np.full(N, keep)
                 near[:EARLY] = min(keep, max(gap - 0.01, CONTACT_FACTOR * scout.radius))
@@ -379,6 +395,9 @@ class Exploration:
         points = np.concatenate([(p[:-1, None] + share * np.diff(p, axis=0)[:, None]).reshape(-1, 3), p[-1:]])
         gaps = scout.seen.gaps(points, least + 2.0 * DRIFT, self.kinds)
         gaps = np.minimum(gaps, scout.moving.gaps(points, self.dt / FINE * np.arange(len(points))))
+        if len(scout.moving.radii):
+            late = self.dt * (len(p) - 1) + np.linspace(0.0, HOLD, FINE)
+            gaps[-1] = min(gaps[-1], scout.moving.gaps(np.repeat(p[-1:], FINE, axis=0), late).min())
         low, high = scout.seen.box(0.0)
         gaps = gaps - np.linalg.norm(points - points.clip(low, high), axis=1)  # how far outside of the map
         near = gaps[0] - least

@@ -21,6 +21,7 @@ YOUNG = 5  # scans of a body before that filter, and between two looks whether i
 SETTLE = 0.2  # s: a body that has been seen for as long is believed to move at half of its mean velocity
 STAYS = 0.25  # m: a body that has moved by less is at rest
 LOST = 0.6  # s without a return, after which a body is given up
+LOOKS = 6  # moments at which bodies are looked at while a point stays clear
 GROWTH, MOST_GROWTH = 0.25, 0.5  # m/s by which balls grow ahead of their time, as velocities are estimates; m at most
 
 
@@ -85,12 +86,17 @@ class Moving:
         normals = np.where(outside, away / np.maximum(length, 1e-9)[..., None], side)
         return np.where(deepest > 0, length, deepest) - radii, np.einsum("mij,kmi->kmj", self.sides, normals)
 
-    def planes(self, points: np.ndarray, t: np.ndarray, most: int) -> np.ndarray:
+    def planes(self, points: np.ndarray, t: np.ndarray, most: int, hold: float = 0.0) -> np.ndarray:
         """Half-spaces n x >= b (K, most, 4) that part points (K, 3) at times t (K,), s, from the nearest bodies.
 
-        Zeros where there are fewer.
+        Zeros where there are fewer. The last point stays clear for `hold`, s: each body counts where it comes nearest.
         """
         gaps, normals = self._apart(points, t)
+        if hold > 0 and len(self.radii):
+            later = t[-1] + np.linspace(0.0, hold, LOOKS)
+            apart, away = self._apart(np.repeat(points[-1:], LOOKS, axis=0), later)
+            first = apart.argmin(axis=0)
+            gaps[-1], normals[-1] = apart.min(axis=0), away[first, np.arange(len(first))]
         offsets = (normals * points[:, None]).sum(-1) - gaps
         found, order = np.zeros((len(points), most, 4)), np.argsort(gaps, axis=1)[:, :most]
         rows = np.arange(len(points))[:, None]
