@@ -33,7 +33,10 @@ def evaded(points: np.ndarray, moving: Moving, static: Gaps, keep: float, dt: fl
         keep: distance from bodies, m.
         hold: s after the last point, in which that has to stay clear.
     """
-    t = dt * np.arange(len(points))
+    t, aside = dt * np.arange(len(points)), APART * np.array([ASIDE, ASIDE, LIFT]) + keep + CLOSE
+    moving = moving.within(points.min(axis=0) - aside, points.max(axis=0) + aside, t[-1] + hold)
+    if len(moving.radii) == 0:
+        return points
     late = t[-1] + np.linspace(0.0, hold, 6)
     clear = moving.gaps(points, t).min(), moving.gaps(np.repeat(points[-1:], 6, axis=0), late).min()
     if min(clear) >= keep:

@@ -260,7 +260,9 @@ class Exploration:
         """The states (B, N+1, 14) with ways around moving bodies."""
         for b, scout in enumerate(self.scouts):
             p, keep = reference[b, :, :3].numpy(), self.keep(scout)
-            scout.moving = scout.moving.near(p[0], self.explorer.stages * self.dt * self.explorer.speed, HOLD)
+            horizon = self.explorer.stages * self.dt
+            around = horizon * self.explorer.speed
+            scout.moving = scout.moving.within(p[0] - around, p[0] + around, horizon + HOLD)
             if len(scout.moving.radii):
                 static = lambda q, scout=scout, keep=keep: scout.seen.gaps(q, keep + 0.3, self.kinds)
                 way = evaded(p, scout.moving, static, keep, self.dt, HOLD)

@@ -63,15 +63,31 @@ class Moving:
         parts = {name: part.take(rows) if name == "motion" else part[rows] for name, part in parts.items()}
         return replace(self, **parts)
 
-    def near(self, point: np.ndarray, reach: float, horizon: float) -> Self:
-        """Those that may come within `reach`, m, of a point (3,) within the horizon, s."""
-        size = np.linalg.norm(self.half_sizes, axis=1) + self.radii + self.motion.reach + MOST_GROWTH
-        size = size + horizon * np.linalg.norm(self.motion.velocities, axis=1)
-        return self.take(np.linalg.norm(self.centers - point, axis=1) <= reach + size)
+    @property
+    def straight(self) -> bool:
+        """Whether all sides lie along the axes."""
+        return bool((self.sides == np.eye(3)).all())
+
+    def within(self, low: np.ndarray, high: np.ndarray, horizon: float) -> Self:
+        """Those that may come into a box from `low` to `high` (3,), m, within the horizon, s."""
+        size = np.abs(self.sides * self.half_sizes[..., None]).sum(axis=1) + self.radii[:, None] + self.motion.reach
+        size = size + min(self.growth * horizon, MOST_GROWTH)
+        ways = np.stack([self.centers, self.centers + horizon * self.motion.velocities])
+        inside = (ways.min(axis=0) - size <= high) & (ways.max(axis=0) + size >= low)
+        return self.take(inside.all(axis=1))
 
     def gaps(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Distances (K,), m, of points (K, 3) from the nearest surface at times t (K,), s; infinite without bodies."""
-        return self._apart(points, t)[0].min(axis=1, initial=np.inf)
+        moments, at = np.unique(t, return_inverse=True)
+        centers, radii = (part[at] for part in self.at(moments))
+        square, deepest = np.zeros(radii.shape), np.full(radii.shape, -np.inf)
+        away = [points[:, i, None] - centers[..., i] for i in range(3)]
+        for i in range(3):
+            along = away[i] if self.straight else sum(self.sides[:, i, j] * away[j] for j in range(3))
+            over = np.abs(along) - self.half_sizes[:, i]
+            np.maximum(deepest, over, out=deepest)
+            square += np.square(np.maximum(over, 0.0, out=over), out=over)
+        return (np.where(deepest > 0, np.sqrt(square), deepest) - radii).min(axis=1, initial=np.inf)
 
     def _apart(self, points: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Signed distances (K, M), m, of points (K, 3) from the surfaces, and the unit vectors (K, M, 3) away."""
@@ -154,7 +170,10 @@ class Known:
         """See `Movers`."""
         ended = np.isfinite(scan.distances)
         keep = np.ones(len(ended), bool)
-        keep[ended] = ~self.now(t).holds(returns(scan)[ended])
+        points = returns(scan)[ended]
+        if len(points):
+            low, high = points.min(axis=0) - BESIDE, points.max(axis=0) + BESIDE
+            keep[ended] = ~self.now(t).within(low, high, 0.0).holds(points)
         return keep
 
     def note(self, seen: SeenMap, changed: np.ndarray) -> None:
