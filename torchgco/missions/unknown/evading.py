@@ -89,7 +89,7 @@ def _costs(
 
 def _cheapest(cost: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The delays and sides (L,) of the cheapest way that begins without either."""
-    L, D, S = cost.shape
+    L, D, _ = cost.shape
     shape = (D, 2 * ASIDE + 1, 2 * LIFT + 1)
     moves = list(product((0, 1), (-1, 0, 1), (-1, 0, 1)))  # of delay, aside, up
     total = np.full(shape, np.inf)
