@@ -15,10 +15,11 @@ from torchgco.missions.sensing.world import Motion, World
 BESIDE = 0.3  # m around a ball, within which returns are its own
 JOINED = 0.4  # m: returns closer than about this belong to one body
 LEAST = 2  # returns of a body at least
-GATE = 1.0  # m from where a body is expected, within which it is sought
-PLACE, SPEED = 0.6, 0.15  # gains of the filter of a body's place and velocity, per scan
-YOUNG = 5  # scans of a body before that filter, and between two looks whether it has moved
-SETTLE = 0.2  # s: a body that has been seen for as long is believed to move at half of its mean velocity
+LARGEST = 1.6  # m: what is wider along an axis is no body that moves
+SEEN = 0.2  # m: standard deviation of a centre as it is seen
+ACCELERATION = 1.0  # m/s^2: standard deviation of what bodies do between two scans
+FASTEST = 1.0  # m/s: standard deviation of a velocity before anything is known of it
+LOOK = 10  # scans of a body between two looks whether it has moved
 STAYS = 0.25  # m: a body that has moved by less is at rest
 LOST = 0.6  # s without a return, after which a body is given up
 LOOKS = 6  # moments at which bodies are looked at while a point stays clear
@@ -205,16 +206,23 @@ class Track:
     origin: np.ndarray
     began: float
     scans: int = 1
+    spread: np.ndarray = field(default_factory=lambda: np.diag([SEEN**2, FASTEST**2]))  # of place and velocity, (2, 2)
+
+    def expected(self, t: float) -> np.ndarray:
+        """Where it should be at time t, s, (3,), m."""
+        return self.center + (t - self.last) * self.velocity
 
     def take(self, center: np.ndarray, t: float) -> None:
-        """It is seen at a centre (3,), m, at time t, s."""
+        """It is seen at a centre (3,), m, at time t, s: a step of a Kalman filter, the same along each axis."""
         dt = max(t - self.last, 1e-3)
+        ahead = np.array([[1.0, dt], [0.0, 1.0]])
+        push = ACCELERATION * np.array([0.5 * dt**2, dt])
+        spread = ahead @ self.spread @ ahead.T + np.outer(push, push)
+        gain = spread[:, 0] / (spread[0, 0] + SEEN**2)
         off = center - self.center - dt * self.velocity
-        self.center = center - (1.0 - PLACE) * off
-        if self.scans < YOUNG:
-            self.velocity = (self.center - self.origin) / (t - self.began + SETTLE)
-        else:
-            self.velocity = self.velocity + SPEED / dt * off
+        self.center = self.center + dt * self.velocity + gain[0] * off
+        self.velocity = self.velocity + gain[1] * off
+        self.spread = spread - np.outer(gain, spread[0])
         self.scans, self.last = self.scans + 1, t
 
 
@@ -239,17 +247,23 @@ class Tracks:
         """See `Movers`."""
         keep, points = np.ones(len(scan.distances), bool), returns(scan)
         rays = np.flatnonzero(np.isfinite(scan.distances))
-        fresh = rays[self._fresh(seen, points[rays])]
-        claimed: set[int] = set()
-        for members in clusters(points[fresh]):
-            self._follow(points[fresh[members]], scan.origin, t, claimed)
+        points = points[rays]
+        loose = self._loose(seen, points)
+        for track in sorted(self.tracks, key=lambda track: -track.scans):
+            away = np.linalg.norm(points - track.expected(t), axis=1)
+            own = loose & (away <= track.radius + BESIDE)
+            if own.sum() >= LEAST:
+                self._follow(track, points[own], scan.origin, t)
+                loose &= ~own
+        for members in clusters(points[loose]):
+            self._begin(points[loose][members], scan.origin, t)
         self.tracks = [track for track in self.tracks if t - track.last <= LOST and not self._rests(track, seen, t)]
-        keep[rays] = ~self.now(t).holds(points[rays])
+        keep[rays] = ~self.now(t).holds(points)
         return keep
 
     def _rests(self, track: Track, seen: SeenMap, t: float) -> bool:
         """Whether a body has stayed where it was; its cells are then those of a surface."""
-        if track.scans % YOUNG or track.last < t:
+        if track.scans % LOOK or track.last < t:
             return False
         if np.linalg.norm(track.center - track.origin) > STAYS:
             track.origin, track.began = track.center, t
@@ -274,34 +288,28 @@ class Tracks:
         centers = np.array([track.center for track in self.tracks]) + age[:, None] * v
         return Moving.balls(centers, v, np.array([track.radius for track in self.tracks]), GROWTH)
 
-    def _fresh(self, seen: SeenMap, points: np.ndarray) -> np.ndarray:
-        """Which points (R, 3) lie in free cells, not beside occupied ones that never were free, (R,) bool."""
+    def _loose(self, seen: SeenMap, points: np.ndarray) -> np.ndarray:
+        """Which points (R, 3) aren't in or beside occupied cells that never were free, (R,) bool."""
         cells = np.floor((points - seen.corner) / seen.resolution).astype(np.int64)
         found = np.atleast_1d(((cells >= 1) & (cells < np.array(seen.shape) - 1)).all(axis=1))
-        if self._was_free is None:
+        if self._was_free is None or not found.any():
             return np.zeros(len(points), bool)
-        flat = np.atleast_1d(np.ravel_multi_index(tuple(cells[found].T), seen.shape))
-        was, state = self._was_free, seen.state.ravel()
-        good = np.atleast_1d(was[flat] & (state[flat] == FREE))
-        at = flat[good]
+        at, was, state = np.ravel_multi_index(tuple(cells[found].T), seen.shape), self._was_free, seen.state.ravel()
         steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
         around = at[:, None] + steps @ np.array([seen.shape[1] * seen.shape[2], seen.shape[2], 1])
-        good[good] = ~((state[around] == OCCUPIED) & ~was[around]).any(axis=1)
-        found[found] = good
+        found[found] = ~((state[around] == OCCUPIED) & ~was[around]).any(axis=1)
         return found
 
-    def _follow(self, points: np.ndarray, origin: np.ndarray, t: float, claimed: set[int]) -> None:
-        """A cluster of returns (R, 3) continues the track that expects it, or begins one."""
-        center, radius = seen_ball(points, origin, self.pitch)
-        near = [(np.linalg.norm(track.center + (t - track.last) * track.velocity - center), i)
-                for i, track in enumerate(self.tracks) if i not in claimed]  # fmt: skip
-        off, i = min(near, default=(np.inf, -1))
-        if off > GATE:
-            claimed.add(len(self.tracks))
-            self.tracks.append(Track(center, np.zeros(3), radius, t, center, t))
+    def _begin(self, points: np.ndarray, origin: np.ndarray, t: float) -> None:
+        """A cluster of returns (R, 3) that no track expects begins one, unless it is too large for a body."""
+        if np.ptp(points, axis=0).max() > LARGEST:
             return
-        claimed.add(i)
-        track = self.tracks[i]
+        center, radius = seen_ball(points, origin, self.pitch)
+        self.tracks.append(Track(center, np.zeros(3), radius, t, center, t))
+
+    def _follow(self, track: Track, points: np.ndarray, origin: np.ndarray, t: float) -> None:
+        """Returns (R, 3) of a body continue its track."""
+        center, radius = seen_ball(points, origin, self.pitch)
         if radius < track.radius:  # it is seen in part, or from farther away
             center = center + (track.radius - radius) * unit(center - origin)
         track.take(center, t)
