@@ -371,6 +371,8 @@ class Exploration:
         safe = next((c for c in order if spare[c] >= asked and bool(flyable[c])), None)
         if safe is not None:
             return safe
+        if self.explorer.movers != "none":  # bodies are where they weren't expected: what can't be flown is no help
+            order = [c for c in order if bool(flyable[c])]
         # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.
         most = max(order, key=lambda c: spare[c], default=None)
         if most is not None and own < 0 and spare[most] > own + BETTER:
