@@ -174,6 +174,8 @@ class Exploration:
         reference = self._evading(reference)
         rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
         former = rest if before is None else self._clear_part(shifted(before.X[:, 1:, :3]))
+        if before is not None and self.explorer.movers != "none":
+            former = torch.where(_ends_at_rest(before.X).view(-1, 1, 1), former, self._braking(x))
         seeds = [former, reference[:, 1:, :3]]
         problem = self._problem(x, bias, reference, seeds)
         kept = self._kept(problem, before).take(slice(0, len(self.scouts)))
@@ -262,7 +264,7 @@ class Exploration:
             p, keep = reference[b, :, :3].numpy(), self.keep(scout)
             horizon = self.explorer.stages * self.dt
             around = horizon * self.explorer.speed
-            scout.moving = scout.moving.within(p[0] - around, p[0] + around, horizon + HOLD)
+            scout.moving = scout.moving.within(p[0] - around, p[0] + around, horizon + HOLD).clear_of(p[0], keep)
             if len(scout.moving.radii):
                 static = lambda q, scout=scout, keep=keep: scout.seen.gaps(q, keep + 0.3, self.kinds)
                 way = evaded(p, scout.moving, static, keep, self.dt, HOLD)
@@ -317,6 +319,14 @@ class Exploration:
                 former[b, at:] = former[b, at].clone()
         return former
 
+    def _braking(self, x: Tensor) -> Tensor:
+        """Positions (B, N, 3) of vehicles measured at x (B, 17) that brake straight ahead."""
+        speed = x[:, 3:6].norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        t = self.dt * torch.arange(1, self.explorer.stages + 1, dtype=x.dtype)
+        t = torch.minimum(t, speed / self.explorer.deceleration)
+        way = speed * t - 0.5 * self.explorer.deceleration * t.square()
+        return x[:, None, :3] + way.unsqueeze(-1) * (x[:, 3:6] / speed).unsqueeze(1)
+
     def _kept(self, problem: Problem, before: Plan | None) -> Plan:
         """The former plans one stage later, brought back to by feedback; of a first plan, rest."""
         if before is None:
@@ -343,7 +353,11 @@ class Exploration:
         Where that isn't safe either, as cells have turned out to be occupied, the one that keeps the most distance.
         """
         B = len(self.scouts)
-        found = self.local.solve(problem, kept.U.repeat(count, 1, 1), seed=self.seed)
+        U = kept.U
+        if self.explorer.movers != "none":  # a plan that was spoiled on the way is no start for others
+            hover = problem.cost.rest_controls(torch.zeros_like(U.repeat(count, 1, 1)))[:B]
+            U = torch.where(_ends_at_rest(kept.X).view(-1, 1, 1), U, hover)
+        found = self.local.solve(problem, U.repeat(count, 1, 1), seed=self.seed)
         # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
         K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
         flyable = unflyable(problem, found.X, found.U) <= FLYABLE
@@ -409,6 +423,11 @@ class Exploration:
         if near < 0:
             asked[: FINE * EARLY] = near - 0.02
         return float((gaps - least - asked).min())
+
+
+def _ends_at_rest(X: Tensor) -> Tensor:
+    """Whether plans (B, N+1, 14) come to rest, (B,)."""
+    return X[:, -1, 3:6].abs().amax(-1) <= 3.0 * AT_REST
 
 
 def _resting(x: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from torchgco.missions.sensing.world import Motion, World
 BESIDE = 0.3  # m around a ball, within which returns are its own
 JOINED = 0.4  # m: returns closer than about this belong to one body
 LEAST = 2  # returns of a body at least
+SMALLEST = 0.05  # m: radius of a body at least
 LARGEST = 1.6  # m: what is wider along an axis is no body that moves
 SEEN = 0.2  # m: standard deviation of a centre as it is seen
 ACCELERATION = 1.0  # m/s^2: standard deviation of what bodies do between two scans
@@ -119,6 +120,16 @@ class Moving:
         rows = np.arange(len(points))[:, None]
         found[:, : order.shape[1], :3], found[:, : order.shape[1], 3] = normals[rows, order], offsets[rows, order]
         return found
+
+    def clear_of(self, point: np.ndarray, least: float) -> Self:
+        """Estimated balls that are smaller where the vehicle at a point (3,) would be nearer than `least`, m, now.
+
+        It hasn't touched them, so their sizes are wrong by that much; what is known stays as it is.
+        """
+        if self.growth == 0 or len(self.radii) == 0:
+            return self
+        gaps = self._apart(point[None], np.zeros(1))[0][0]
+        return replace(self, radii=np.maximum(self.radii - np.maximum(least - gaps, 0.0), SMALLEST))
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Which of some points (R, 3) belong to the bodies where they are now, (R,) bool."""
