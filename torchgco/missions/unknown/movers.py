@@ -239,12 +239,12 @@ class Track:
 
 @dataclass
 class Tracks:
-    """Bodies that appear where space has been seen to be free, followed from scan to scan.
+    """Bodies that may move, followed from scan to scan.
 
-    A body is a cluster of returns from free cells, away from surfaces in cells that never were free. Its centre lies
-    behind its nearest return, at the depth of half its width across the line of sight. An alpha-beta filter estimates
-    its place and velocity, which at first is the mean since it has appeared. Until it has been seen for some scans, and
-    while it moves, its returns stay out of the map; a body that turns out to be at rest goes into it.
+    A body is a cluster of returns of limited size, away from surfaces in cells that never were free. Its centre lies
+    behind its nearest return, at the depth of half its width across the line of sight. A Kalman filter estimates its
+    place and velocity. Until it has been seen for some scans, and while it moves, its returns stay out of the map; a
+    body that turns out to be at rest goes into it.
 
     Args:
         pitch: angle between two rays, rad: a body may be wider than its returns by that.
@@ -305,7 +305,8 @@ class Tracks:
         found = np.atleast_1d(((cells >= 1) & (cells < np.array(seen.shape) - 1)).all(axis=1))
         if self._was_free is None or not found.any():
             return np.zeros(len(points), bool)
-        at, was, state = np.ravel_multi_index(tuple(cells[found].T), seen.shape), self._was_free, seen.state.ravel()
+        at = np.atleast_1d(np.ravel_multi_index(tuple(cells[found].T), seen.shape))
+        was, state = self._was_free, seen.state.ravel()
         steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
         around = at[:, None] + steps @ np.array([seen.shape[1] * seen.shape[2], seen.shape[2], 1])
         found[found] = ~((state[around] == OCCUPIED) & ~was[around]).any(axis=1)
