@@ -74,9 +74,10 @@ def oscillating_distances(swings: BoundOscillatingBoxes, p: Tensor) -> tuple[Ten
     near = (least - boxes.inflated_radii.unsqueeze(1)).masked_fill(boxes.absent.unsqueeze(1), torch.inf)
     known = (ends - boxes.inflated_radii.unsqueeze(1)).masked_fill(boxes.absent.unsqueeze(1), torch.inf)
     within = known.flatten(1).amin(-1) + boxes.inflated_radii.amax(-1) + bulge.amax(-1)
-    i, k, j = (near < within.view(-1, 1, 1)).nonzero(as_tuple=True)
-    origin = torch.zeros_like(off[i, k, j])
-    least[i, k, j] = closest(boxes.axes[i, j], origin, boxes.half_sizes[i, j], off[i, k, j], along[i, k, j])
+    i, k, j = ((near < within.view(-1, 1, 1)) & (along != 0).any(-1)).nonzero(as_tuple=True)
+    if i.numel() > 0:
+        origin = torch.zeros_like(off[i, k, j])
+        least[i, k, j] = closest(boxes.axes[i, j], origin, boxes.half_sizes[i, j], off[i, k, j], along[i, k, j])
     return ends, least - bulge.unsqueeze(1)
 
 

@@ -54,8 +54,8 @@ class Motion:
 
     @property
     def reach(self) -> np.ndarray:
-        """How far sines lead bodies away at most, (M,), m."""
-        return np.linalg.norm(np.abs(self.amplitudes).sum(axis=1), axis=-1)
+        """How far sines lead bodies away along each axis at most, (M, 3), m."""
+        return np.abs(self.amplitudes).sum(axis=1)
 
     def off(self, t: np.ndarray) -> np.ndarray:
         """How far they are off (K, M, 3), m, at times t (K,), s."""

@@ -24,6 +24,7 @@ from torchgco.missions.sensing.grid import NOT_FREE, SEEN_OCCUPIED, SeenMap
 from torchgco.missions.sensing.search import Search
 from torchgco.missions.sensing.sensors import Sensor
 from torchgco.missions.sensing.world import World
+from torchgco.missions.unknown.evading import evaded
 from torchgco.missions.unknown.explorer import (
     CORRIDOR,
     EARLY,
@@ -60,6 +61,7 @@ AHEAD = 4  # points of a path, of which the last is looked at where none is bloc
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
 WAITS = 5  # knots before the first that is blocked
 MOST_MOVING = 4  # moving bodies that a knot keeps away from
+HOLD = 1.0  # s after a plan's end in which its place stays clear: about what it takes to get away from there
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
 
@@ -169,9 +171,12 @@ class Exploration:
             scout.moving = scout.movers.now(step * self.dt)
         self.seek(x)
         reference = self._reference(x)
+        reference = self._evading(reference)
         rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
         former = rest if before is None else self._clear_part(shifted(before.X[:, 1:, :3]))
-        seeds = [former, reference[:, 1:, :3], *([] if self.explorer.movers == "none" else [rest])]
+        if before is not None and self.explorer.movers != "none":
+            former = torch.where(_ends_at_rest(before.X).view(-1, 1, 1), former, self._braking(x))
+        seeds = [former, reference[:, 1:, :3]]
         problem = self._problem(x, bias, reference, seeds)
         kept = self._kept(problem, before).take(slice(0, len(self.scouts)))
         plan = self._chosen(problem, kept, len(seeds))
@@ -253,6 +258,21 @@ class Exploration:
             found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
         return found
 
+    def _evading(self, reference: Tensor) -> Tensor:
+        """The states (B, N+1, 14) with ways around moving bodies."""
+        for b, scout in enumerate(self.scouts):
+            p, keep = reference[b, :, :3].numpy(), self.keep(scout)
+            horizon = self.explorer.stages * self.dt
+            around = horizon * self.explorer.speed
+            scout.moving = scout.moving.within(p[0] - around, p[0] + around, horizon + HOLD).clear_of(p[0], keep)
+            if len(scout.moving.radii):
+                static = lambda q, scout=scout, keep=keep: scout.seen.gaps(q, keep + 0.3, self.kinds)
+                way = evaded(p, scout.moving, static, keep, self.dt, HOLD)
+                if way is not p:
+                    reference[b, :, :3] = torch.from_numpy(way)
+                    reference[b, :, 3:6] = torch.from_numpy(np.gradient(way, self.dt, axis=0))
+        return reference
+
     def _problem(self, x: Tensor, bias: Tensor, reference: Tensor, seeds: Sequence[Tensor]) -> Problem:
         """The planning problems, seed by seed."""
         C, N = len(seeds), self.explorer.stages
@@ -264,7 +284,7 @@ class Exploration:
                 own, far = scout.seen.corridor(knots, CORRIDOR, PLANES, self.kinds)
                 if self.explorer.movers != "none":
                     times = self.dt * np.arange(1, N + 1)
-                    own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING)], axis=1)
+                    own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING, HOLD)], axis=1)
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
                 near = np.full(N, keep)
                 near[:EARLY] = min(keep, max(gap - 0.01, CONTACT_FACTOR * scout.radius))
@@ -299,6 +319,14 @@ class Exploration:
                 former[b, at:] = former[b, at].clone()
         return former
 
+    def _braking(self, x: Tensor) -> Tensor:
+        """Positions (B, N, 3) of vehicles measured at x (B, 17) that brake straight ahead."""
+        speed = x[:, 3:6].norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        t = self.dt * torch.arange(1, self.explorer.stages + 1, dtype=x.dtype)
+        t = torch.minimum(t, speed / self.explorer.deceleration)
+        way = speed * t - 0.5 * self.explorer.deceleration * t.square()
+        return x[:, None, :3] + way.unsqueeze(-1) * (x[:, 3:6] / speed).unsqueeze(1)
+
     def _kept(self, problem: Problem, before: Plan | None) -> Plan:
         """The former plans one stage later, brought back to by feedback; of a first plan, rest."""
         if before is None:
@@ -325,7 +353,11 @@ class Exploration:
         Where that isn't safe either, as cells have turned out to be occupied, the one that keeps the most distance.
         """
         B = len(self.scouts)
-        found = self.local.solve(problem, kept.U.repeat(count, 1, 1), seed=self.seed)
+        U = kept.U
+        if self.explorer.movers != "none":  # a plan that was spoiled on the way is no start for others
+            hover = problem.cost.rest_controls(torch.zeros_like(U.repeat(count, 1, 1)))[:B]
+            U = torch.where(_ends_at_rest(kept.X).view(-1, 1, 1), U, hover)
+        found = self.local.solve(problem, U.repeat(count, 1, 1), seed=self.seed)
         # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
         K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
         flyable = unflyable(problem, found.X, found.U) <= FLYABLE
@@ -353,6 +385,8 @@ class Exploration:
         safe = next((c for c in order if spare[c] >= asked and bool(flyable[c])), None)
         if safe is not None:
             return safe
+        if self.explorer.movers != "none":  # bodies are where they weren't expected: what can't be flown is no help
+            order = [c for c in order if bool(flyable[c])]
         # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.
         most = max(order, key=lambda c: spare[c], default=None)
         if most is not None and own < 0 and spare[most] > own + BETTER:
@@ -379,6 +413,9 @@ class Exploration:
         points = np.concatenate([(p[:-1, None] + share * np.diff(p, axis=0)[:, None]).reshape(-1, 3), p[-1:]])
         gaps = scout.seen.gaps(points, least + 2.0 * DRIFT, self.kinds)
         gaps = np.minimum(gaps, scout.moving.gaps(points, self.dt / FINE * np.arange(len(points))))
+        if len(scout.moving.radii):
+            late = self.dt * (len(p) - 1) + np.linspace(0.0, HOLD, FINE)
+            gaps[-1] = min(gaps[-1], scout.moving.gaps(np.repeat(p[-1:], FINE, axis=0), late).min())
         low, high = scout.seen.box(0.0)
         gaps = gaps - np.linalg.norm(points - points.clip(low, high), axis=1)  # how far outside of the map
         near = gaps[0] - least
@@ -386,6 +423,11 @@ class Exploration:
         if near < 0:
             asked[: FINE * EARLY] = near - 0.02
         return float((gaps - least - asked).min())
+
+
+def _ends_at_rest(X: Tensor) -> Tensor:
+    """Whether plans (B, N+1, 14) come to rest, (B,)."""
+    return X[:, -1, 3:6].abs().amax(-1) <= 3.0 * AT_REST
 
 
 def _resting(x: Tensor) -> Tensor:

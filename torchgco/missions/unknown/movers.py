@@ -15,12 +15,15 @@ from torchgco.missions.sensing.world import Motion, World
 BESIDE = 0.3  # m around a ball, within which returns are its own
 JOINED = 0.4  # m: returns closer than about this belong to one body
 LEAST = 2  # returns of a body at least
-GATE = 1.0  # m from where a body is expected, within which it is sought
-PLACE, SPEED = 0.6, 0.15  # gains of the filter of a body's place and velocity, per scan
-YOUNG = 5  # scans of a body before that filter, and between two looks whether it has moved
-SETTLE = 0.2  # s: a body that has been seen for as long is believed to move at half of its mean velocity
+SMALLEST = 0.05  # m: radius of a body at least
+LARGEST = 1.6  # m: what is wider along an axis is no body that moves
+SEEN = 0.2  # m: standard deviation of a centre as it is seen
+ACCELERATION = 1.0  # m/s^2: standard deviation of what bodies do between two scans
+FASTEST = 1.0  # m/s: standard deviation of a velocity before anything is known of it
+LOOK = 10  # scans of a body between two looks whether it has moved
 STAYS = 0.25  # m: a body that has moved by less is at rest
 LOST = 0.6  # s without a return, after which a body is given up
+LOOKS = 6  # moments at which bodies are looked at while a point stays clear
 GROWTH, MOST_GROWTH = 0.25, 0.5  # m/s by which balls grow ahead of their time, as velocities are estimates; m at most
 
 
@@ -62,15 +65,31 @@ class Moving:
         parts = {name: part.take(rows) if name == "motion" else part[rows] for name, part in parts.items()}
         return replace(self, **parts)
 
-    def near(self, point: np.ndarray, reach: float, horizon: float) -> Self:
-        """Those that may come within `reach`, m, of a point (3,) within the horizon, s."""
-        size = np.linalg.norm(self.half_sizes, axis=1) + self.radii + self.motion.reach + MOST_GROWTH
-        size = size + horizon * np.linalg.norm(self.motion.velocities, axis=1)
-        return self.take(np.linalg.norm(self.centers - point, axis=1) <= reach + size)
+    @property
+    def straight(self) -> bool:
+        """Whether all sides lie along the axes."""
+        return bool((self.sides == np.eye(3)).all())
+
+    def within(self, low: np.ndarray, high: np.ndarray, horizon: float) -> Self:
+        """Those that may come into a box from `low` to `high` (3,), m, within the horizon, s."""
+        size = np.abs(self.sides * self.half_sizes[..., None]).sum(axis=1) + self.radii[:, None] + self.motion.reach
+        size = size + min(self.growth * horizon, MOST_GROWTH)
+        ways = np.stack([self.centers, self.centers + horizon * self.motion.velocities])
+        inside = (ways.min(axis=0) - size <= high) & (ways.max(axis=0) + size >= low)
+        return self.take(inside.all(axis=1))
 
     def gaps(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Distances (K,), m, of points (K, 3) from the nearest surface at times t (K,), s; infinite without bodies."""
-        return self._apart(points, t)[0].min(axis=1, initial=np.inf)
+        moments, at = np.unique(t, return_inverse=True)
+        centers, radii = (part[at] for part in self.at(moments))
+        square, deepest = np.zeros(radii.shape), np.full(radii.shape, -np.inf)
+        away = [points[:, i, None] - centers[..., i] for i in range(3)]
+        for i in range(3):
+            along = away[i] if self.straight else sum(self.sides[:, i, j] * away[j] for j in range(3))
+            over = np.abs(along) - self.half_sizes[:, i]
+            np.maximum(deepest, over, out=deepest)
+            square += np.square(np.maximum(over, 0.0, out=over), out=over)
+        return (np.where(deepest > 0, np.sqrt(square), deepest) - radii).min(axis=1, initial=np.inf)
 
     def _apart(self, points: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Signed distances (K, M), m, of points (K, 3) from the surfaces, and the unit vectors (K, M, 3) away."""
@@ -85,17 +104,32 @@ class Moving:
         normals = np.where(outside, away / np.maximum(length, 1e-9)[..., None], side)
         return np.where(deepest > 0, length, deepest) - radii, np.einsum("mij,kmi->kmj", self.sides, normals)
 
-    def planes(self, points: np.ndarray, t: np.ndarray, most: int) -> np.ndarray:
+    def planes(self, points: np.ndarray, t: np.ndarray, most: int, hold: float = 0.0) -> np.ndarray:
         """Half-spaces n x >= b (K, most, 4) that part points (K, 3) at times t (K,), s, from the nearest bodies.
 
-        Zeros where there are fewer.
+        Zeros where there are fewer. The last point stays clear for `hold`, s: each body counts where it comes nearest.
         """
         gaps, normals = self._apart(points, t)
+        if hold > 0 and len(self.radii):
+            later = t[-1] + np.linspace(0.0, hold, LOOKS)
+            apart, away = self._apart(np.repeat(points[-1:], LOOKS, axis=0), later)
+            first = apart.argmin(axis=0)
+            gaps[-1], normals[-1] = apart.min(axis=0), away[first, np.arange(len(first))]
         offsets = (normals * points[:, None]).sum(-1) - gaps
         found, order = np.zeros((len(points), most, 4)), np.argsort(gaps, axis=1)[:, :most]
         rows = np.arange(len(points))[:, None]
         found[:, : order.shape[1], :3], found[:, : order.shape[1], 3] = normals[rows, order], offsets[rows, order]
         return found
+
+    def clear_of(self, point: np.ndarray, least: float) -> Self:
+        """Estimated balls that are smaller where the vehicle at a point (3,) would be nearer than `least`, m, now.
+
+        It hasn't touched them, so their sizes are wrong by that much; what is known stays as it is.
+        """
+        if self.growth == 0 or len(self.radii) == 0:
+            return self
+        gaps = self._apart(point[None], np.zeros(1))[0][0]
+        return replace(self, radii=np.maximum(self.radii - np.maximum(least - gaps, 0.0), SMALLEST))
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Which of some points (R, 3) belong to the bodies where they are now, (R,) bool."""
@@ -148,7 +182,10 @@ class Known:
         """See `Movers`."""
         ended = np.isfinite(scan.distances)
         keep = np.ones(len(ended), bool)
-        keep[ended] = ~self.now(t).holds(returns(scan)[ended])
+        points = returns(scan)[ended]
+        if len(points):
+            low, high = points.min(axis=0) - BESIDE, points.max(axis=0) + BESIDE
+            keep[ended] = ~self.now(t).within(low, high, 0.0).holds(points)
         return keep
 
     def note(self, seen: SeenMap, changed: np.ndarray) -> None:
@@ -180,27 +217,34 @@ class Track:
     origin: np.ndarray
     began: float
     scans: int = 1
+    spread: np.ndarray = field(default_factory=lambda: np.diag([SEEN**2, FASTEST**2]))  # of place and velocity, (2, 2)
+
+    def expected(self, t: float) -> np.ndarray:
+        """Where it should be at time t, s, (3,), m."""
+        return self.center + (t - self.last) * self.velocity
 
     def take(self, center: np.ndarray, t: float) -> None:
-        """It is seen at a centre (3,), m, at time t, s."""
+        """It is seen at a centre (3,), m, at time t, s: a step of a Kalman filter, the same along each axis."""
         dt = max(t - self.last, 1e-3)
+        ahead = np.array([[1.0, dt], [0.0, 1.0]])
+        push = ACCELERATION * np.array([0.5 * dt**2, dt])
+        spread = ahead @ self.spread @ ahead.T + np.outer(push, push)
+        gain = spread[:, 0] / (spread[0, 0] + SEEN**2)
         off = center - self.center - dt * self.velocity
-        self.center = center - (1.0 - PLACE) * off
-        if self.scans < YOUNG:
-            self.velocity = (self.center - self.origin) / (t - self.began + SETTLE)
-        else:
-            self.velocity = self.velocity + SPEED / dt * off
+        self.center = self.center + dt * self.velocity + gain[0] * off
+        self.velocity = self.velocity + gain[1] * off
+        self.spread = spread - np.outer(gain, spread[0])
         self.scans, self.last = self.scans + 1, t
 
 
 @dataclass
 class Tracks:
-    """Bodies that appear where space has been seen to be free, followed from scan to scan.
+    """Bodies that may move, followed from scan to scan.
 
-    A body is a cluster of returns from free cells, away from surfaces in cells that never were free. Its centre lies
-    behind its nearest return, at the depth of half its width across the line of sight. An alpha-beta filter estimates
-    its place and velocity, which at first is the mean since it has appeared. Until it has been seen for some scans, and
-    while it moves, its returns stay out of the map; a body that turns out to be at rest goes into it.
+    A body is a cluster of returns of limited size, away from surfaces in cells that never were free. Its centre lies
+    behind its nearest return, at the depth of half its width across the line of sight. A Kalman filter estimates its
+    place and velocity. Until it has been seen for some scans, and while it moves, its returns stay out of the map; a
+    body that turns out to be at rest goes into it.
 
     Args:
         pitch: angle between two rays, rad: a body may be wider than its returns by that.
@@ -214,17 +258,23 @@ class Tracks:
         """See `Movers`."""
         keep, points = np.ones(len(scan.distances), bool), returns(scan)
         rays = np.flatnonzero(np.isfinite(scan.distances))
-        fresh = rays[self._fresh(seen, points[rays])]
-        claimed: set[int] = set()
-        for members in clusters(points[fresh]):
-            self._follow(points[fresh[members]], scan.origin, t, claimed)
+        points = points[rays]
+        loose = self._loose(seen, points)
+        for track in sorted(self.tracks, key=lambda track: -track.scans):
+            away = np.linalg.norm(points - track.expected(t), axis=1)
+            own = loose & (away <= track.radius + BESIDE)
+            if own.sum() >= LEAST:
+                self._follow(track, points[own], scan.origin, t)
+                loose &= ~own
+        for members in clusters(points[loose]):
+            self._begin(points[loose][members], scan.origin, t)
         self.tracks = [track for track in self.tracks if t - track.last <= LOST and not self._rests(track, seen, t)]
-        keep[rays] = ~self.now(t).holds(points[rays])
+        keep[rays] = ~self.now(t).holds(points)
         return keep
 
     def _rests(self, track: Track, seen: SeenMap, t: float) -> bool:
         """Whether a body has stayed where it was; its cells are then those of a surface."""
-        if track.scans % YOUNG or track.last < t:
+        if track.scans % LOOK or track.last < t:
             return False
         if np.linalg.norm(track.center - track.origin) > STAYS:
             track.origin, track.began = track.center, t
@@ -249,34 +299,29 @@ class Tracks:
         centers = np.array([track.center for track in self.tracks]) + age[:, None] * v
         return Moving.balls(centers, v, np.array([track.radius for track in self.tracks]), GROWTH)
 
-    def _fresh(self, seen: SeenMap, points: np.ndarray) -> np.ndarray:
-        """Which points (R, 3) lie in free cells, not beside occupied ones that never were free, (R,) bool."""
+    def _loose(self, seen: SeenMap, points: np.ndarray) -> np.ndarray:
+        """Which points (R, 3) aren't in or beside occupied cells that never were free, (R,) bool."""
         cells = np.floor((points - seen.corner) / seen.resolution).astype(np.int64)
         found = np.atleast_1d(((cells >= 1) & (cells < np.array(seen.shape) - 1)).all(axis=1))
-        if self._was_free is None:
+        if self._was_free is None or not found.any():
             return np.zeros(len(points), bool)
-        flat = np.atleast_1d(np.ravel_multi_index(tuple(cells[found].T), seen.shape))
+        at = np.atleast_1d(np.ravel_multi_index(tuple(cells[found].T), seen.shape))
         was, state = self._was_free, seen.state.ravel()
-        good = np.atleast_1d(was[flat] & (state[flat] == FREE))
-        at = flat[good]
         steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
         around = at[:, None] + steps @ np.array([seen.shape[1] * seen.shape[2], seen.shape[2], 1])
-        good[good] = ~((state[around] == OCCUPIED) & ~was[around]).any(axis=1)
-        found[found] = good
+        found[found] = ~((state[around] == OCCUPIED) & ~was[around]).any(axis=1)
         return found
 
-    def _follow(self, points: np.ndarray, origin: np.ndarray, t: float, claimed: set[int]) -> None:
-        """A cluster of returns (R, 3) continues the track that expects it, or begins one."""
-        center, radius = seen_ball(points, origin, self.pitch)
-        near = [(np.linalg.norm(track.center + (t - track.last) * track.velocity - center), i)
-                for i, track in enumerate(self.tracks) if i not in claimed]  # fmt: skip
-        off, i = min(near, default=(np.inf, -1))
-        if off > GATE:
-            claimed.add(len(self.tracks))
-            self.tracks.append(Track(center, np.zeros(3), radius, t, center, t))
+    def _begin(self, points: np.ndarray, origin: np.ndarray, t: float) -> None:
+        """A cluster of returns (R, 3) that no track expects begins one, unless it is too large for a body."""
+        if np.ptp(points, axis=0).max() > LARGEST:
             return
-        claimed.add(i)
-        track = self.tracks[i]
+        center, radius = seen_ball(points, origin, self.pitch)
+        self.tracks.append(Track(center, np.zeros(3), radius, t, center, t))
+
+    def _follow(self, track: Track, points: np.ndarray, origin: np.ndarray, t: float) -> None:
+        """Returns (R, 3) of a body continue its track."""
+        center, radius = seen_ball(points, origin, self.pitch)
         if radius < track.radius:  # it is seen in part, or from farther away
             center = center + (track.radius - radius) * unit(center - origin)
         track.take(center, t)
