@@ -281,8 +281,7 @@ class Exploration:
                 scout.seconds["field_seconds"] += time.perf_counter() - began
         form = PlanningForm(self.explorer, self.planner, _repeated(self.whole, C))
         stack = [torch.from_numpy(np.stack(part)) for part in (planes, room, inside, allowed, regions)]
-        even = torch.tensor([scout.level > 0 or not self.explorer.brisk for scout in self.scouts]).repeat(C)
-        return form.problem(x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), *stack, even)
+        return form.problem(x.repeat(C, 1), bias.repeat(C, 1), reference.repeat(C, 1, 1), *stack)
 
     def _region(self, scout: Scout, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The lowest and the highest point (3,), m, for plans: the map's, and around a vehicle that has left it."""

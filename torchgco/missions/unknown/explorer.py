@@ -60,8 +60,6 @@ class Explorer:
         stages: of a plan, which is at rest after them.
         margin: m that plans keep from what isn't known to be free, beyond the vehicle's radius. A cell at least, as
             one that an obstacle fills in part may look free from afar; less is kept where there is no other way.
-        brisk: plans weigh their beginning more than their end, and turning less: faster in forests. Not where a margin
-            had to shrink; in mazes more periods are without a safe plan.
         movers: moving bodies are "known" with their places and velocities, "tracked" in the sensor's returns, or with
             "none" all count as at rest.
         patience: s without a way on, after which the vehicle turns to another part of the unknown.
@@ -80,7 +78,6 @@ class Explorer:
     stages: Annotated[int, Within(20, 400)] = 60
     margin: NonNegative = 0.2
     patience: Seconds = 1.0
-    brisk: bool = False
     movers: Literal["none", "known", "tracked"] = "none"
 
     def __post_init__(self) -> None:
@@ -131,7 +128,6 @@ class PlanningForm:
         seeds: Tensor,
         allowed: Tensor,
         region: Tensor,
-        even: Tensor,
     ) -> Problem:
         """The problems from plants x (B, 17).
 
@@ -141,12 +137,11 @@ class PlanningForm:
             planes: (B, N, R, 4), see `SeenMap.corridor`; room (B, N), m; seeds (B, N, 3), m: where they were made.
             allowed: (B, N), m: distance that each knot keeps from what isn't known to be free.
             region: (B, 2, 3), m: the lowest and the highest point of the map, which half-spaces don't know.
-            even: (B,) bool: plans weigh all their knots alike.
         """
         whole, N = self.whole, self.explorer.stages
         x0 = planning_state(x, self.planner.airframe)
         dynamics = whole.dynamics if self.planner.estimation == 0 else biased(whole.dynamics, bias)
-        cost = QuadraticCost(*weights(N, even), x_ref=reference, u_ref=[0, 0, 0, HOVER])
+        cost = QuadraticCost(*weights(N), x_ref=reference, u_ref=[0, 0, 0, HOVER])
         normals, offsets = stacked(planes, allowed.unsqueeze(-1))
         constraints: list[Constraint] = [
             HalfSpaces(normals, offsets),
@@ -203,15 +198,13 @@ class PlanningForm:
         return StateBounds(lower, upper, knots=[N - 1, N])
 
 
-def weights(N: int, even: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Q (B, N, 14, 14), R (B, N, 4, 4) and Qf (B, 14, 14) of plans with N stages, `even` (B,) or fading."""
+def weights(N: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Q (N, 14, 14), R (N, 4, 4) and Qf (14,) of a plan with N stages."""
     share = np.interp(np.arange(N + 1), FADES, [1.0, LATE])[:, None]
-    fading, full = (torch.from_numpy(1.0 - np.array(part) * (1.0 - share)) for part in FADING), even.view(-1, 1, 1)
-    states, controls = (torch.where(full, 1.0, part) for part in fading)
+    states, controls = (torch.from_numpy(1.0 - np.array(part) * (1.0 - share)) for part in FADING)
     states = states * states.new_tensor(STATE)
-    tilting = torch.where(full, 1.0, controls.new_tensor([TILTING, TILTING, 1.0, 1.0]))
-    controls = controls * controls.new_tensor(CONTROL) * tilting
-    return torch.diag_embed(states[:, :-1]), torch.diag_embed(controls[:, :-1]), 2.0 * torch.diag_embed(states[:, -1])
+    controls = controls * controls.new_tensor(CONTROL) * controls.new_tensor([TILTING, TILTING, 1.0, 1.0])
+    return torch.diag_embed(states[:-1]), torch.diag_embed(controls[:-1]), 2.0 * states[-1]
 
 
 def followed_closely(problem: Problem) -> Problem:
