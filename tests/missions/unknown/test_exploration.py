@@ -12,8 +12,6 @@ import torch
 from tests.missions.missions import REST
 from torchgco import Airframe, Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, Spheres, presets
 from torchgco.base.errors import InputError
-from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.missions import Mission, Planner
 from torchgco.missions.contact import Contact
 from torchgco.missions.log import MissionLog
@@ -23,17 +21,7 @@ from torchgco.missions.safe import safe_arrays
 from torchgco.missions.sensing import Depth, Lidar
 from torchgco.missions.tables import SENSED, ending, mission_frame, mission_row, packed, unpacked
 from torchgco.missions.unknown.exploration import Exploration
-from torchgco.missions.unknown.explorer import (
-    FADING,
-    LATE,
-    STATE,
-    Explorer,
-    PlanningForm,
-    followed_closely,
-    steady_yaw,
-    weights,
-)
-from torchgco.solvers.ending import optimality
+from torchgco.missions.unknown.explorer import Explorer, steady_yaw
 
 GOALS = torch.tensor([[4.0, 0.0, 0.0], [3.0, 0.5, 0.2]]).double()
 EXPLORER = Explorer(around=(2.5, 1.5), stages=40)
@@ -196,27 +184,3 @@ def test_plans_yaw_no_faster_than_costs_no_thrust() -> None:
     assert change == pytest.approx(0.5 * float(rise)) and 0.5 < most < 2.0
     several = QuadrotorPlanning(dt=0.05, rate_time_constant=torch.tensor([1.5, 3.0]).double())
     assert steady_yaw(airframe, several, torch.zeros(1).double()).flatten().tolist() == pytest.approx([most, 2 * most])
-
-
-def test_weights_fall_where_a_plan_only_has_to_come_to_rest() -> None:
-    Q, R, Qf = weights(40)
-    late = torch.tensor([LATE if fades else 1.0 for fades in FADING[0]]).double()
-    states = torch.tensor(STATE).double()
-    assert torch.allclose(Q[0].diagonal(), states) and torch.allclose(Q[-1].diagonal(), late * states)
-    assert torch.allclose(Qf, 2.0 * late * states) and torch.allclose(R[0, 2:, 2:], R[-1, 2:, 2:])
-    height, yaw = (2, 5, 13), (6, 9, 12)
-    assert all(late[i] == 1.0 for i in (*height, *yaw))  # else they would be put off from plan to plan
-
-
-def test_gains_of_plans_keep_their_weights_to_the_end() -> None:
-    x, stages = hovering(Airframe(), walled().x0[:, :3]), 40
-    blank = {"bias": x.new_zeros(2, 3), "reference": x.new_zeros(2, stages + 1, 14), "seeds": x.new_zeros(2, stages, 3)}
-    blank |= {"planes": x.new_zeros(2, stages, 1, 4), "room": x.new_ones(2, stages), "allowed": x.new_ones(2, stages)}
-    region = x.new_tensor([[-9.0] * 3, [9.0] * 3]).repeat(2, 1, 1)
-    form = PlanningForm(EXPLORER, Planner(presets.gco(3)), walled())
-    near = followed_closely(form.problem(x, region=region, **blank))
-    X = near.x0.unsqueeze(1).repeat(1, stages + 1, 1)
-    U = near.cost.rest_controls(x.new_zeros(2, stages, 4))
-    K = optimality(Lagrangian(near, Multipliers.zero(near, 0.0), None, True), X, U).K
-    assert torch.isfinite(K).all() and isinstance(near.cost, BoundQuadratic)
-    assert torch.equal(near.cost.Qf, 2.0 * near.cost.Q[:, 0]) and near.cost.Q.shape[1] == 1

@@ -33,7 +33,6 @@ from torchgco.missions.unknown.explorer import (
     Explorer,
     PlanningForm,
     Unknown,
-    followed_closely,
     unflyable,
     within_bounds,
 )
@@ -328,8 +327,7 @@ class Exploration:
         B = len(self.scouts)
         found = self.local.solve(problem, kept.U.repeat(count, 1, 1), seed=self.seed)
         # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
-        near = followed_closely(problem)
-        K = optimality(Lagrangian(near, Multipliers.zero(near, 0.0), None, True), found.X, found.U).K
+        K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
         flyable = unflyable(problem, found.X, found.U) <= FLYABLE
         best = [self._best(found.X[b::B], found.cost[b::B], flyable[b::B], kept.X[b], b) for b in range(B)]
         rows = torch.tensor([b + B * (choice or 0) for b, choice in enumerate(best)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ from torchgco.base.options import Above, Meters, NonNegative, Seconds, Within, c
 from torchgco.base.shapes import Dimensions
 from torchgco.constraints import ControlBounds, StateBounds
 from torchgco.constraints.base import Constraint
-from torchgco.costs.quadratic import BoundQuadratic, QuadraticCost
+from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
 from torchgco.missions.planner import Planner
 from torchgco.missions.planning_problem import biased, first_step, planning_state
@@ -37,11 +37,6 @@ EARLY = 10  # knots in which a vehicle may leave a margin that it has entered
 # Weights of a plan: positions and velocities along the reference, attitude with yaw, body rates, thrust; controls.
 STATE = [4.0, 4.0, 8.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 8.0, 0.5, 0.5, 0.5, 0.1]
 CONTROL = [0.5, 0.5, 0.5, 0.05]
-TILTING = 0.05  # share of the controls' weight for roll and pitch rates: what they cost would make plans brake early
-# Knots between which weights fall to a share: the beginning of a plan is what is flown, its end only has to come to
-# rest. Those of height and yaw don't, as thrust and yaw change slowly: plans would put off for ever what they need.
-FADES, LATE = (10, 20), 0.1
-FADING = [1, 1, 0, 1, 1, 0, 0, 1, 1, 0, 1, 1, 0, 0], [1, 1, 0, 0]  # which states and controls do
 HOVER = 9.81  # m/s^2
 
 
@@ -141,7 +136,7 @@ class PlanningForm:
         whole, N = self.whole, self.explorer.stages
         x0 = planning_state(x, self.planner.airframe)
         dynamics = whole.dynamics if self.planner.estimation == 0 else biased(whole.dynamics, bias)
-        cost = QuadraticCost(*weights(N), x_ref=reference, u_ref=[0, 0, 0, HOVER])
+        cost = QuadraticCost(Q=STATE, R=CONTROL, Qf=[2.0 * w for w in STATE], x_ref=reference, u_ref=[0, 0, 0, HOVER])
         normals, offsets = stacked(planes, allowed.unsqueeze(-1))
         constraints: list[Constraint] = [
             HalfSpaces(normals, offsets),
@@ -196,23 +191,6 @@ class PlanningForm:
             middle = HOVER if i == 13 else 0.0
             lower[i], upper[i] = middle - size, middle + size
         return StateBounds(lower, upper, knots=[N - 1, N])
-
-
-def weights(N: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Q (N, 14, 14), R (N, 4, 4) and Qf (14,) of a plan with N stages."""
-    share = np.interp(np.arange(N + 1), FADES, [1.0, LATE])[:, None]
-    states, controls = (torch.from_numpy(1.0 - np.array(part) * (1.0 - share)) for part in FADING)
-    states = states * states.new_tensor(STATE)
-    controls = controls * controls.new_tensor(CONTROL) * controls.new_tensor([TILTING, TILTING, 1.0, 1.0])
-    return torch.diag_embed(states[:-1]), torch.diag_embed(controls[:-1]), 2.0 * states[-1]
-
-
-def followed_closely(problem: Problem) -> Problem:
-    """A planning problem whose cost keeps all its weights to the end, for gains that bring a vehicle to rest there."""
-    assert isinstance(problem.cost, BoundQuadratic)
-    Q, R = (problem.x0.new_tensor(part) for part in (STATE, CONTROL))
-    cost = replace(problem.cost, Q=Q[None, None], R=R[None, None], Qf=2.0 * Q[None])
-    return replace(problem, cost=cost)
 
 
 def steady_yaw(airframe: Airframe, model: QuadrotorPlanning, like: Tensor) -> Tensor:
