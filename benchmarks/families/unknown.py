@@ -22,10 +22,13 @@ from torchgco.experiments.statistics.statistics import wilson
 from torchgco.missions.outcome import Outcome
 
 FLAT = ["scenario=cylinders", "mission.goal_radius=0.5", "mission.explorer.region=[[-5,110],[-21,21],[0,4]]"]
+# About the rays of the published set-up's lidar: 20,000 in a scan, over 59 degrees.
+DENSE = ["mission.lidar.rays=[480,40]", "mission.lidar.field_of_view=[360,60]"]
 CASES = {
     "41 cylinders": [*FLAT, "scenario.num_obstacles=41"],
     "81 cylinders": [*FLAT, "scenario.num_obstacles=81"],
     "162 cylinders": [*FLAT, "scenario.num_obstacles=162"],
+    "162 cylinders, dense lidar": [*FLAT, "scenario.num_obstacles=162", *DENSE],
     "forest, 30 spheres": ["scenario=forest_mission"],
     "walls": ["scenario=walls", "scenario.start=[1,1,0]"],
     "mazes, 3 walls": ["scenario=mazes", "mission.duration=90"],
