@@ -39,27 +39,44 @@ class Case:
     at_rest: bool = True
 
 
+# About the rays of the published set-ups' lidar: 20,000 in a scan, over 59 degrees.
+DENSE = ("mission.lidar.rays=[480,40]", "mission.lidar.field_of_view=[360,60]")
+START = ("mission.goal_radius=0.5", "scenario.start=[0,0,3]", "scenario.goal=[305,0,3]")
+
+
 def _flat(count: int) -> tuple[str, ...]:
     """SANDO's static forests."""
     region = "mission.explorer.region=[[-5,110],[-21,21],[0,4]]"
-    return "scenario=cylinders", "mission.goal_radius=0.5", region, f"scenario.num_obstacles={count}"
+    return "scenario=cylinders", "mission.goal_radius=0.5", region, f"scenario.num_obstacles={count}", *DENSE
 
 
-LONG_FOREST = (
-    "scenario=cylinders", "scenario.num_obstacles=569", "scenario.region=[[5,305],[-20,20]]", "scenario.start=[0,0,3]",
-    "scenario.goal=[305,0,3]", "mission.goal_radius=0.5", "mission.explorer.region=[[-5,310],[-21,21],[0,6]]",
-    "mission.explorer.speed=4", "mission.duration=150",
-)  # fmt: skip
+def _moving(count: int, movers: str) -> tuple[str, ...]:
+    """SANDO's fields of trefoils."""
+    region = "mission.explorer.region=[[-5,110],[-12,12],[0,6]]"
+    known = (f"mission.explorer.movers={movers}", "mission.duration=50")
+    return "scenario=trefoils", f"scenario.num_obstacles={count}", "mission.goal_radius=0.5", region, *known
+
+
 CASES = {
-    "41 cylinders": Case(_flat(41), 8, 100),
-    "81 cylinders": Case(_flat(81), 8, 100),
-    "162 cylinders": Case(_flat(162), 8, 100),
-    "300 m, 569 cylinders": Case(LONG_FOREST, 2, 100),
+    **{f"{count} cylinders": Case(_flat(count), 6, 100) for count in (41, 81, 162)},
+    "300 m, 569 cylinders": Case(
+        (
+            "scenario=cylinders", "scenario.num_obstacles=569", "scenario.region=[[5,305],[-20,20]]", *START, *DENSE,
+            "mission.explorer.region=[[-5,310],[-21,21],[0,6]]", "mission.explorer.speed=4", "mission.duration=150",
+        ), 2, 100,
+    ),
     "forest, 30 spheres": Case(("scenario=forest_mission",), 8, 100),
     "walls": Case(("scenario=walls", "scenario.start=[1,1,0]"), 8, 100),
-    "mazes, 3 walls": Case(("scenario=mazes", "mission.duration=90"), 8, 100),
-    "rooms with doors": Case(("scenario=rooms", "mission.duration=90"), 8, 200),
-}
+    "mazes, 3 walls": Case(("scenario=mazes", "mission.duration=90"), 6, 100),
+    "rooms with doors": Case(
+        (
+            "scenario=rooms", "mission.duration=120", "mission.explorer.speed=3",
+            "mission.explorer.region=[[-2,18],[-2,14],[-1.5,4.5]]",
+        ), 6, 200,
+    ),
+    **{f"{count} moving, known": Case(_moving(count, "known"), 4, 1000, at_rest=False) for count in (50, 100, 200)},
+    **{f"{count} moving, seen": Case(_moving(count, "tracked"), 4, 1000, at_rest=False) for count in (50, 100, 200)},
+}  # fmt: skip
 HEAD = (
     "world", "n", *(outcome.name for outcome in Outcome), "safe periods", "flight time", "clearance", "speed",
     "acceleration", "jerk", "kept plans", "above 50 ms",
