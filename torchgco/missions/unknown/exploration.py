@@ -58,6 +58,7 @@ ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joi
 STILL = 0.3  # m within which a vehicle has stayed in its place
 AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
+WEAK = 20  # stages whose gains hardly correct anything, as nearly nothing comes after them
 WAITS = 5  # knots before the first that is blocked
 MOST_MOVING = 4  # moving bodies that a knot keeps away from
 FINE = 4  # points tested per step of a plan
@@ -310,6 +311,7 @@ class Exploration:
             C = problem.B // before.X.shape[0]
             X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
             X[:, -1], U[:, -1] = _resting(X[:, -1]), problem.cost.rest_controls(U[:, -1:])[:, 0]
+            K[:, -WEAK:] = K[:, -WEAK - 1 : -WEAK]
             X, U = within_bounds(problem, X, U, K)
             penalty = before.penalty.repeat(C)
         none = torch.zeros(problem.B, dtype=torch.int64)
