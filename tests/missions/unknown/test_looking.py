@@ -6,7 +6,7 @@ import pytest
 from torchgco.missions.sensing import Depth, Lidar
 from torchgco.missions.sensing.grid import FREE, OCCUPIED, UNKNOWN, SeenMap
 from torchgco.missions.sensing.sensors import Sensor
-from torchgco.missions.unknown.looking import Look, in_view, states, unknown_near, viewpoint
+from torchgco.missions.unknown.looking import Look, goes_there, in_view, states, unknown_near, viewpoint
 
 KEEP = 0.5
 AT = np.array([0.1, 0.1, -0.1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 2.5, 2.5, 2.5, 2.5])
@@ -70,3 +70,18 @@ def test_a_look_ends_where_it_was_to_go_or_when_all_is_known() -> None:
     assert look.begin(seen, sensor, AT, cells, KEEP)
     seen.state[:] = FREE
     assert not look.goes_on(seen, AT[:3], 60)
+
+
+def test_a_vehicle_goes_on_to_the_end_of_what_is_known() -> None:
+    seen = under_a_door()
+    path = np.column_stack([np.full(10, 0.1), np.full(10, 0.1), np.arange(-0.1, 3.6, 0.4)])
+    end = np.array([0.1, 0.1, 1.1])
+    assert goes_there(seen, AT[:3], path, end, KEEP)
+    assert goes_there(seen, path[1] + 0.05, path[1:], end, KEEP)
+    assert not goes_there(seen, AT[:3], path, None, KEEP)
+    assert not goes_there(seen, AT[:3] - [0, 0, 4.0], path, end, KEEP)
+    assert not goes_there(seen, AT[:3], path, end - [0, 0, 0.6], KEEP)
+    for state, layers in ((FREE, slice(16, 20)), (OCCUPIED, slice(24, 26))):
+        seen = under_a_door()
+        seen.state[:, :, layers] = state
+        assert not goes_there(seen, AT[:3], path, end, KEEP)

@@ -36,7 +36,7 @@ from torchgco.missions.unknown.explorer import (
     unflyable,
     within_bounds,
 )
-from torchgco.missions.unknown.looking import Look, unknown_near
+from torchgco.missions.unknown.looking import Look, goes_there, halved, unknown_near
 from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
 from torchgco.missions.unknown.reference import lengths, motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
@@ -53,6 +53,7 @@ LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
 MOST_SEARCHED = 24_000  # cells that searches of a control period look at: 15 ms
 SEARCHED = 2  # control periods after which a new search is due
 HELD = 2.0  # s before a search with less margin ends
+ROUNDING = 1e-6  # m: distances of cells' centres are often multiples of half a cell, as margins are
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 DRIFT = 0.01  # m by which a plan may come nearer while it is flown, as a vehicle isn't exactly where it should be
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
@@ -83,6 +84,7 @@ class Scout:
     moving: Moving = field(default_factory=nothing)  # at this control step
     path: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # cells' centres, (K, 3), m
     target: np.ndarray | None = None  # of the path
+    end: np.ndarray | None = None  # of its free part when it was found
     corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
     waited: int = 0  # control periods near `place`
     place: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))  # m
@@ -200,7 +202,7 @@ class Exploration:
         looks = scout.look.goes_on(scout.seen, position, round(LOOKS[1] / self.dt))
         self._search(scout, position)
         keep, end = self.keep(scout), scout.goal if scout.look.place is None else scout.look.place
-        points = _halved(np.concatenate([position[None], scout.path[1:]]))
+        points = halved(np.concatenate([position[None], scout.path[1:]]))
         if np.linalg.norm(scout.path[-1] - end) <= ARRIVES * scout.seen.resolution:
             points = np.concatenate([points, end[None]])
         gaps = scout.seen.gaps(points, keep + 0.05, self.kinds)
@@ -208,6 +210,8 @@ class Exploration:
         free = points[: blocked[0] if len(blocked) else len(points)]
         scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
         self._wait(scout, position, points, gaps)
+        if scout.end is None and len(blocked):
+            scout.end = points[blocked[0]]
         at_end = lengths(scout.corners)[-1] <= STILL
         if not looks and len(blocked) and at_end and scout.waited % round(LOOKS[0] / self.dt) == 0:
             self._look(scout, x, points[blocked], gaps[blocked])
@@ -216,7 +220,7 @@ class Exploration:
     def keep(self, scout: Scout) -> float:
         """The distance, m, that plans keep from what isn't known to be free."""
         least, share = self.least(scout), LEVELS[scout.level][0]
-        return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least
+        return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least - ROUNDING
 
     def least(self, scout: Scout) -> float:
         """The least of these distances, where there is no other way, m."""
@@ -233,7 +237,11 @@ class Exploration:
             scout.age += 1
             self._along(scout, position)
             return
-        scout.age = 1
+        if scout.target is target is scout.goal and scout.search.pending is None:
+            self._along(scout, position)
+            if goes_there(scout.seen, position, scout.path, scout.end, self.keep(scout)):
+                return
+        scout.age, scout.end = 1, None
         if scout.level > 0 and scout.since * self.dt >= HELD and scout.search.pending is None:
             scout.level, scout.since = 0, 0
         left = MOST_SEARCHED
@@ -271,7 +279,7 @@ class Exploration:
             blocked = np.flatnonzero(gaps < self.keep(scout))
             first = blocked[blocked > 0][:1]
             scout.search.avoid(points[first[0] if len(first) else min(AHEAD, len(points) - 1)], 1.0)
-            scout.waited = 0
+            scout.waited, scout.end = 0, None
 
     def _look(self, scout: Scout, x: np.ndarray, blocked: np.ndarray, gaps: np.ndarray) -> None:
         """Where the way on (K, 3) is blocked by unknown cells, pass with less margin, or see them from elsewhere."""
@@ -435,13 +443,6 @@ def _resting(x: Tensor) -> Tensor:
     yaw = torch.hypot(x[:, 6], x[:, 9]).clamp(min=1e-9)
     rest[:, 6], rest[:, 9] = x[:, 6] / yaw, x[:, 9] / yaw
     return rest
-
-
-def _halved(points: np.ndarray) -> np.ndarray:
-    """The points (K, 3) of a path, and those midway between them."""
-    found = np.repeat(points, 2, axis=0)[:-1]
-    found[1::2] = 0.5 * (points[:-1] + points[1:])
-    return found
 
 
 def _repeated(problem: Problem, count: int) -> Problem:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchgco.missions.sensing.grid import FREE, NOT_FREE, UNKNOWN, SeenMap
+from torchgco.missions.sensing.grid import FREE, NOT_FREE, SEEN_OCCUPIED, UNKNOWN, SeenMap
 from torchgco.missions.sensing.sensors import Sensor, turned
 
 AROUND = 3.5  # m from what is to be seen, within which places are sought
@@ -20,7 +20,32 @@ MOST_CELLS, MOST_PLACES = 40, 60  # that are tested for a free line of sight
 OTHER = 0.3  # m: places are tried again where the middle of what is to be seen has moved by more
 AWAY = 0.6  # m from places that have been tried
 WORTH = 4.0  # m of a longer way that seeing all cells instead of none is worth
+COMMITS = 4.0  # m from the end of what is known, within which a vehicle goes there before it turns elsewhere
 THERE = 0.25  # m from a place, at which it has been reached
+
+
+def goes_there(
+    seen: SeenMap, position: np.ndarray, path: np.ndarray, end: np.ndarray | None, keep: float
+) -> bool:
+    """Whether a path (K, 3) from a position still leads to unknown space at the point `end` (3,), through free cells.
+
+    A vehicle that is near such an end goes there first. What is unknown is dear near a vehicle alone, and becomes so as
+    it comes nearer, and other ends cheap: it could go to and fro between two of them for ever.
+    """
+    if end is None or np.linalg.norm(end - position) > COMMITS:
+        return False
+    points = halved(np.concatenate([position[None], path[1:]]))
+    blocked = np.flatnonzero((seen.gaps(points, keep, NOT_FREE) < keep) & (np.arange(len(points)) > 3))
+    if not len(blocked) or np.linalg.norm(points[blocked[0]] - end) > 2 * seen.resolution:
+        return False
+    return bool((seen.gaps(path[2:], keep, SEEN_OCCUPIED) >= keep).all())
+
+
+def halved(points: np.ndarray) -> np.ndarray:
+    """The points (K, 3) of a path, and those midway between them."""
+    found = np.repeat(points, 2, axis=0)[:-1]
+    found[1::2] = 0.5 * (points[:-1] + points[1:])
+    return found
 
 
 @dataclass
