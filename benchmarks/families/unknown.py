@@ -29,7 +29,11 @@ CASES = {
     "forest, 30 spheres": ["scenario=forest_mission"],
     "walls": ["scenario=walls", "scenario.start=[1,1,0]"],
     "mazes, 3 walls": ["scenario=mazes", "mission.duration=90"],
-}
+    "rooms": [
+        "scenario=rooms", "mission.duration=120", "mission.explorer.speed=3",
+        "mission.explorer.region=[[-2,18],[-2,14],[-1.5,4.5]]",
+    ],
+}  # fmt: skip
 HEAD = (
     "world", "n", *(outcome.name for outcome in Outcome), "safe periods", "flight time", "clearance", "speed",
     "acceleration", "jerk", "kept plans",

@@ -24,9 +24,7 @@ COMMITS = 4.0  # m from the end of what is known, within which a vehicle goes th
 THERE = 0.25  # m from a place, at which it has been reached
 
 
-def goes_there(
-    seen: SeenMap, position: np.ndarray, path: np.ndarray, end: np.ndarray | None, keep: float
-) -> bool:
+def goes_there(seen: SeenMap, position: np.ndarray, path: np.ndarray, end: np.ndarray | None, keep: float) -> bool:
     """Whether a path (K, 3) from a position still leads to unknown space at the point `end` (3,), through free cells.
 
     A vehicle that is near such an end goes there first. What is unknown is dear near a vehicle alone, and becomes so as
@@ -38,7 +36,8 @@ def goes_there(
     blocked = np.flatnonzero((seen.gaps(points, keep, NOT_FREE) < keep) & (np.arange(len(points)) > 3))
     if not len(blocked) or np.linalg.norm(points[blocked[0]] - end) > 2 * seen.resolution:
         return False
-    return bool((seen.gaps(path[2:], keep, SEEN_OCCUPIED) >= keep).all())
+    gaps = seen.gaps(np.concatenate([position[None], path[1:]]), keep, SEEN_OCCUPIED)
+    return bool((gaps[1:] >= gaps[0] - 0.5 * seen.resolution)[:2].all() and (gaps[3:] >= keep).all())
 
 
 def halved(points: np.ndarray) -> np.ndarray:
