@@ -74,8 +74,8 @@ class Search:
         count = call(
             "tgco_search", np.array(seen.shape, np.int64), seen.from_occupied, seen.state, self.price, self.radius,
             self.band, self.shy, self.unseen, self.nearby / size, self.greed, leave, float(out), self.stride,
-            self.pending[0], seen.cell(goal), self.near / size, self._round, self._sum, self._from, self._seen, self._room, self._heap,
-            self._path, self.limit or np.iinfo(np.int64).max, self._left, expanded,
+            self.pending[0], seen.cell(goal), self.near / size, self._round, self._sum, self._from, self._seen,
+            self._room, self._heap, self._path, self.limit or np.iinfo(np.int64).max, self._left, expanded,
         )  # fmt: skip
         self.expanded = int(expanded[0])
         if count == 0:
