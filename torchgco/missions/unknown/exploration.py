@@ -36,7 +36,7 @@ from torchgco.missions.unknown.explorer import (
     unflyable,
     within_bounds,
 )
-from torchgco.missions.unknown.looking import Look, goes_there, halved, unknown_near
+from torchgco.missions.unknown.looking import Look, barred, goes_there, halved, unknown_near
 from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
 from torchgco.missions.unknown.reference import lengths, motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
@@ -206,7 +206,7 @@ class Exploration:
         if np.linalg.norm(scout.path[-1] - end) <= ARRIVES * scout.seen.resolution:
             points = np.concatenate([points, end[None]])
         gaps = scout.seen.gaps(points, keep + 0.05, self.kinds)
-        blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 3))
+        blocked = barred(gaps, keep, scout.seen.resolution)
         free = points[: blocked[0] if len(blocked) else len(points)]
         scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
         self._wait(scout, position, points, gaps)

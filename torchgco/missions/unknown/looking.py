@@ -21,6 +21,7 @@ OTHER = 0.3  # m: places are tried again where the middle of what is to be seen 
 AWAY = 0.6  # m from places that have been tried
 WORTH = 4.0  # m of a longer way that seeing all cells instead of none is worth
 COMMITS = 4.0  # m from the end of what is known, within which a vehicle goes there before it turns elsewhere
+EARLY = 4  # points of a path, the vehicle's own among them, that may be nearer
 THERE = 0.25  # m from a place, at which it has been reached
 
 
@@ -33,11 +34,20 @@ def goes_there(seen: SeenMap, position: np.ndarray, path: np.ndarray, end: np.nd
     if end is None or np.linalg.norm(end - position) > COMMITS:
         return False
     points = halved(np.concatenate([position[None], path[1:]]))
-    blocked = np.flatnonzero((seen.gaps(points, keep, NOT_FREE) < keep) & (np.arange(len(points)) > 3))
+    blocked = barred(seen.gaps(points, keep, NOT_FREE), keep, seen.resolution)
     if not len(blocked) or np.linalg.norm(points[blocked[0]] - end) > 2 * seen.resolution:
         return False
     gaps = seen.gaps(np.concatenate([position[None], path[1:]]), keep, SEEN_OCCUPIED)
     return bool((gaps[1:] >= gaps[0] - 0.5 * seen.resolution)[:2].all() and (gaps[3:] >= keep).all())
+
+
+def barred(gaps: np.ndarray, keep: float, resolution: float) -> np.ndarray:
+    """Indices of the points of a path (K,) that come nearer than `keep`, m, to something, by their gaps.
+
+    At first, half a cell less than where the vehicle is will do, so that it can leave a place that is too near.
+    """
+    asked = np.where(np.arange(len(gaps)) < EARLY, min(keep, gaps[0] - 0.5 * resolution), keep)
+    return np.flatnonzero(gaps < asked)
 
 
 def halved(points: np.ndarray) -> np.ndarray:
