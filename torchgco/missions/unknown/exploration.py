@@ -36,9 +36,9 @@ from torchgco.missions.unknown.explorer import (
     unflyable,
     within_bounds,
 )
-from torchgco.missions.unknown.looking import Look, barred, goes_there, halved, unknown_near
+from torchgco.missions.unknown.looking import Look, barred, goes_there, halved, rest_of, unknown_near
 from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
-from torchgco.missions.unknown.reference import lengths, motion, taut
+from torchgco.missions.unknown.reference import motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
@@ -58,7 +58,9 @@ SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at poi
 DRIFT = 0.01  # m by which a plan may come nearer while it is flown, as a vehicle isn't exactly where it should be
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
 ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joined to it
-LOOKS = 0.25, 3.0  # s in one place after which a vehicle looks from aside, and that the way there takes at most
+AT_END = 0.8  # m from what blocks a path, within which a vehicle has come to its end
+LOOKS = 0.9, 3.0  # s in one place after turning elsewhere, before it looks from aside; of the way there at most
+SLOWS = 0.45, 0.6, 0.75  # s in one place, after each of which the motion to follow is half as fast
 BEYOND = 6  # points of a path from the first that is blocked, around which it looks for unknown cells
 STILL = 0.3  # m within which a vehicle has stayed in its place
 AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
@@ -87,6 +89,7 @@ class Scout:
     end: np.ndarray | None = None  # of its free part when it was found
     corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
     waited: int = 0  # control periods near `place`
+    turned: int = 0  # how often it has turned to other ways there
     place: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))  # m
     look: Look = field(default_factory=Look)
     level: int = 0  # of LEVELS
@@ -206,15 +209,16 @@ class Exploration:
         if np.linalg.norm(scout.path[-1] - end) <= ARRIVES * scout.seen.resolution:
             points = np.concatenate([points, end[None]])
         gaps = scout.seen.gaps(points, keep + 0.05, self.kinds)
-        blocked = barred(gaps, keep, scout.seen.resolution)
+        blocked = barred(gaps, keep)
         free = points[: blocked[0] if len(blocked) else len(points)]
         scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
         self._wait(scout, position, points, gaps)
         if scout.end is None and len(blocked):
             scout.end = points[blocked[0]]
-        at_end = lengths(scout.corners)[-1] <= STILL
-        if not looks and len(blocked) and at_end and scout.waited % round(LOOKS[0] / self.dt) == 0:
-            self._look(scout, x, points[blocked], gaps[blocked])
+        ends = barred(gaps, keep, gaps[0] - 0.5 * scout.seen.resolution)[:1]
+        at_end = len(ends) > 0 and np.linalg.norm(points[ends[0]] - position) <= AT_END
+        if not looks and at_end and scout.turned and scout.waited == round(LOOKS[0] / self.dt):
+            self._look(scout, x, points[ends[0] :], gaps[ends[0] :])
         scout.seconds["search_seconds"] += time.perf_counter() - began
 
     def keep(self, scout: Scout) -> float:
@@ -235,10 +239,10 @@ class Exploration:
         target = scout.goal if scout.look.place is None else scout.look.place
         if scout.scanned and 0 < scout.age < SEARCHED and self.every > 1 and scout.target is target:
             scout.age += 1
-            self._along(scout, position)
+            scout.path = rest_of(scout.path, position)
             return
         if scout.target is target is scout.goal and scout.search.pending is None:
-            self._along(scout, position)
+            scout.path = rest_of(scout.path, position)
             if goes_there(scout.seen, position, scout.path, scout.end, self.keep(scout)):
                 return
         scout.age, scout.end = 1, None
@@ -251,7 +255,7 @@ class Exploration:
             found = scout.search.path(position, target)
             left -= scout.search.expanded
             if found is None:
-                self._along(scout, position)
+                scout.path = rest_of(scout.path, position)
                 return
             scout.path, arrives = found
             if target is scout.look.place and not arrives:
@@ -262,24 +266,19 @@ class Exploration:
                 return
             scout.level, scout.since = scout.level + 1, 0
 
-    def _along(self, scout: Scout, position: np.ndarray) -> None:
-        """Leave out the part of a former path that has been flown."""
-        nearest = np.linalg.norm(scout.path - position, axis=1).argmin()
-        scout.path = scout.path[min(nearest, len(scout.path) - 2) :]
-
     def _wait(self, scout: Scout, position: np.ndarray, points: np.ndarray, gaps: np.ndarray) -> None:
         """Count the periods in one place, and in the end look elsewhere.
 
         The way on may be cells that stay unknown, as no ray gets to them, or one that no plan can take.
         """
         if np.linalg.norm(position - scout.place) > STILL:
-            scout.place, scout.waited = position.copy(), 0
+            scout.place, scout.waited, scout.turned = position.copy(), 0, 0
         scout.waited += scout.search.pending is None
         if scout.waited * self.dt >= self.explorer.patience:
             blocked = np.flatnonzero(gaps < self.keep(scout))
             first = blocked[blocked > 0][:1]
             scout.search.avoid(points[first[0] if len(first) else min(AHEAD, len(points) - 1)], 1.0)
-            scout.waited, scout.end = 0, None
+            scout.waited, scout.end, scout.turned = 0, None, scout.turned + 1
 
     def _look(self, scout: Scout, x: np.ndarray, blocked: np.ndarray, gaps: np.ndarray) -> None:
         """Where the way on (K, 3) is blocked by unknown cells, pass with less margin, or see them from elsewhere."""
@@ -296,7 +295,9 @@ class Exploration:
         found[..., 6], found[..., 13] = 1.0, HOVER
         for b, scout in enumerate(self.scouts):
             state = x[b].numpy()
-            p, v = motion(scout.corners, state[3:6], self.explorer.pace, N, self.dt)
+            slow = sum(scout.waited * self.dt >= after for after in SLOWS)  # no plan follows it: seek a shorter one
+            pace = replace(self.explorer.pace, speed=self.explorer.pace.speed / 2**slow)
+            p, v = motion(scout.corners, state[3:6], pace, N, self.dt)
             found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
         return found
 

@@ -34,20 +34,25 @@ def goes_there(seen: SeenMap, position: np.ndarray, path: np.ndarray, end: np.nd
     if end is None or np.linalg.norm(end - position) > COMMITS:
         return False
     points = halved(np.concatenate([position[None], path[1:]]))
-    blocked = barred(seen.gaps(points, keep, NOT_FREE), keep, seen.resolution)
+    blocked = barred(seen.gaps(points, keep, NOT_FREE), keep)
     if not len(blocked) or np.linalg.norm(points[blocked[0]] - end) > 2 * seen.resolution:
         return False
     gaps = seen.gaps(np.concatenate([position[None], path[1:]]), keep, SEEN_OCCUPIED)
     return bool((gaps[1:] >= gaps[0] - 0.5 * seen.resolution)[:2].all() and (gaps[3:] >= keep).all())
 
 
-def barred(gaps: np.ndarray, keep: float, resolution: float) -> np.ndarray:
-    """Indices of the points of a path (K,) that come nearer than `keep`, m, to something, by their gaps.
+def rest_of(path: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """A path (K, 3) from its point nearest to a position on, two points at least where it has them."""
+    nearest = np.linalg.norm(path - position, axis=1).argmin()
+    return path[min(nearest, len(path) - 2) :]
 
-    At first, half a cell less than where the vehicle is will do, so that it can leave a place that is too near.
+
+def barred(gaps: np.ndarray, keep: float, early: float = 0.0) -> np.ndarray:
+    """Indices of the points of a path (K,) that come nearer than `keep`, m, to something, by their gaps (K,), m.
+
+    Near the vehicle `early` m will do: it leaves a place that is too near.
     """
-    asked = np.where(np.arange(len(gaps)) < EARLY, min(keep, gaps[0] - 0.5 * resolution), keep)
-    return np.flatnonzero(gaps < asked)
+    return np.flatnonzero(gaps < np.where(np.arange(len(gaps)) < EARLY, min(early, keep), keep))
 
 
 def halved(points: np.ndarray) -> np.ndarray:
