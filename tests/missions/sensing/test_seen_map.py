@@ -170,6 +170,12 @@ def dijkstra_cost(seen: SeenMap, radius: float, band: float, shy: float, start: 
     return dijkstra(graph.tocsr(), indices=index[start])[index[goal]]
 
 
+def whole(search: Search, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, bool]:
+    found = search.path(start, goal)
+    assert found is not None and search.pending is None
+    return found
+
+
 @pytest.mark.parametrize("shy", [0.0, 1.5])
 def test_the_cheapest_path_is_that_of_dijkstra(shy: float) -> None:
     rng = np.random.default_rng(6)
@@ -179,7 +185,7 @@ def test_the_cheapest_path_is_that_of_dijkstra(shy: float) -> None:
         search = Search(seen, radius=0.12, band=0.5, shy=shy)
         start, goal = (1, 1, 1), (15, 11, 7)
         slow = dijkstra_cost(seen, 0.12, 0.5, shy, start, goal)
-        path, arrives = search.path(*(CORNER + (np.array(c) + 0.5) * SIZE for c in (start, goal)))
+        path, arrives = whole(search, *(CORNER + (np.array(c) + 0.5) * SIZE for c in (start, goal)))
         assert arrives == np.isfinite(slow)
         if arrives:
             found += 1
@@ -196,8 +202,25 @@ def test_where_no_path_leads_to_the_goal_it_ends_at_the_nearest_cell() -> None:
     seen.state[:] = FREE
     seen.state[9] = OCCUPIED  # a wall from side to side
     seen.measure(np.zeros(3), np.array(SHAPE))
-    path, arrives = Search(seen, radius=0.1).path(CORNER + 0.6, CORNER + SPAN - 0.6)
+    path, arrives = whole(Search(seen, radius=0.1), CORNER + 0.6, CORNER + SPAN - 0.6)
     assert not arrives and seen.cell(path[-1])[0] == 8
+
+
+@pytest.mark.parametrize("share", [0.9, 0.6])
+def test_a_search_in_parts_ends_as_one_in_whole(share: float) -> None:
+    """Also where the vehicle moves on meanwhile; another goal begins another search."""
+    rng = np.random.default_rng(7)
+    seen = drawn(rng, share)
+    one, parts = Search(seen, radius=0.12), Search(seen, radius=0.12, limit=9)
+    start, goal = CORNER + 0.4, CORNER + SPAN - 0.4
+    path, arrives = whole(one, start, goal)
+    calls, looked, found = 0, 0, None
+    assert parts.path(start, start + SPAN / 2) is None
+    while found is None:
+        found = parts.path(start + 0.1 * calls, goal)
+        calls, looked = calls + 1, looked + parts.expanded
+        assert parts.expanded <= 9
+    assert found[1] == arrives and np.array_equal(found[0], path) and looked == one.expanded > 9
 
 
 def test_a_seen_world_is_free_where_it_is_free() -> None:

@@ -28,6 +28,12 @@ def test_a_plan_that_stops_in_free_space_is_safe() -> None:
     assert safe_periods(log_of(FREE_ALL, PLAN), 0.3, 0.05).tolist() == [True]
 
 
+def test_a_plan_far_from_all_is_safe_whatever_rounding_does() -> None:
+    for end, radius in zip(np.linspace(0.5, 2.5, 200), np.linspace(0.1, 0.4, 200), strict=True):
+        plan = stopping(np.array([0.0, 0.2, 0.0]), np.array([end, 0.2, 0.0]))
+        assert least_gap(log_of(FREE_ALL, plan), FREE_ALL, plan, radius) == radius
+
+
 def test_a_plan_that_does_not_stop_is_not() -> None:
     assert safe_periods(log_of(FREE_ALL, PLAN[:20]), 0.3, 0.05).tolist() == [False]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,8 @@ class Search:
         greed: paths cost at most so many times what the cheapest does; more than 1 is quicker.
         stride: cells between two of a path: the search passes every so many along each axis.
         near: m from the goal at which a path has arrived.
-        leave: m around the start in which the path may be nearer to occupied cells.
+        leave: m around the start in which the path may be nearer to occupied cells, by half a cell than the start is.
+        limit: cells that one call looks at, at most; the next call goes on. 0: all that it needs.
     """
 
     seen: SeenMap
@@ -41,7 +43,9 @@ class Search:
     stride: int = 1
     near: float = 0.0
     leave: float = 0.0
-    expanded: int = 0  # cells in the last search
+    limit: int = 0
+    expanded: int = 0  # cells in the last call
+    pending: tuple[Any, ...] | None = None  # of a search that hasn't ended: where it began, and its goal and options
     _round: int = 0
     price: np.ndarray = field(init=False)  # (X, Y, Z) float32: further cost of a step into a cell, per cell of length
 
@@ -53,22 +57,30 @@ class Search:
         self._room = ENTRIES * self._sum.size
         self._heap = np.empty(self._room * ENTRY_BYTES, np.uint8)
         self._path = np.empty(self._sum.size, np.int32)
+        self._left = np.zeros(2, np.int64)
 
-    def path(self, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, bool]:
+    def path(self, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, bool] | None:
         """Centres (K, 3), m, of the cells from start to goal, (3,), m; and whether it arrives.
 
-        Where no path leads to the goal, it ends at the nearest cell to it that can be reached.
+        Where no path leads to the goal, it ends at the nearest cell to it that can be reached. None: the search hasn't
+        ended within its limit. It then goes on from where it began, over the map as it is by then.
         """
-        seen, self._round = self.seen, self._round + 1
-        expanded = np.zeros(1, np.int64)
+        seen, asked = self.seen, (tuple(self.seen.cell(goal)), self.radius, self.stride)
+        if self.pending is None or self.pending[1:] != asked:
+            self._round, self._left[:] = self._round + 1, 0
+            self.pending = (seen.cell(start), *asked)
+        expanded, out = np.zeros(1, np.int64), seen.from_occupied[tuple(self.pending[0])] - 0.5 * seen.resolution
         leave, size = int(np.ceil(self.leave / seen.resolution)), seen.resolution
         count = call(
             "tgco_search", np.array(seen.shape, np.int64), seen.from_occupied, seen.state, self.price, self.radius,
-            self.band, self.shy, self.unseen, self.nearby / size, self.greed, leave, self.stride, seen.cell(start),
-            seen.cell(goal), self.near / size, self._round, self._sum, self._from, self._seen, self._room, self._heap,
-            self._path, expanded,
+            self.band, self.shy, self.unseen, self.nearby / size, self.greed, leave, float(out), self.stride,
+            self.pending[0], seen.cell(goal), self.near / size, self._round, self._sum, self._from, self._seen,
+            self._room, self._heap, self._path, self.limit or np.iinfo(np.int64).max, self._left, expanded,
         )  # fmt: skip
         self.expanded = int(expanded[0])
+        if count == 0:
+            return None
+        self.pending = None
         return seen.centers(self._path[: abs(count)][::-1]), count > 0
 
     def avoid(self, point: np.ndarray, radius: float) -> None:

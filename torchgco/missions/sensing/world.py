@@ -158,7 +158,8 @@ class World:
         call(
             "tgco_cast", len(directions), np.array(origin, np.float64), directions, float(reach), len(self.boxes),
             np.ascontiguousarray(self.boxes), np.array(self.occupied.shape, np.int64),
-            np.ascontiguousarray(self.occupied), np.array(self.corner, np.float64), float(self.resolution), distance,
+            np.ascontiguousarray(self.occupied), np.array(self.corner, np.float64), float(self.resolution),
+            np.empty(8 * len(directions)), distance,
         )  # fmt: skip
         return distance
 

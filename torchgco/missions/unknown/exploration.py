@@ -37,6 +37,7 @@ from torchgco.missions.unknown.explorer import (
     unflyable,
     within_bounds,
 )
+from torchgco.missions.unknown.looking import Look, barred, goes_there, halved, rest_of, unknown_near
 from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
 from torchgco.missions.unknown.reference import motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
@@ -50,15 +51,22 @@ LOCAL: dict[str, Any] = {"initial_penalty": 1.0, "penalty_growth": 3.0, "violati
 SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
 # Where no way is found, a search with less margin, then one over all cells: the share of the margin, and the stride.
 LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
+MOST_SEARCHED = 24_000  # cells that searches of a control period look at: 15 ms
 SEARCHED = 2  # control periods after which a new search is due
 HELD = 2.0  # s before a search with less margin ends
+ROUNDING = 1e-6  # m: distances of cells' centres are often multiples of half a cell, as margins are
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 DRIFT = 0.01  # m by which a plan may come nearer while it is flown, as a vehicle isn't exactly where it should be
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
 ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joined to it
+AT_END = 0.8  # m from what blocks a path, within which a vehicle has come to its end
+LOOKS = 0.9, 3.0  # s in one place after turning elsewhere, before it looks from aside; of the way there at most
+SLOWS = 0.45, 0.6, 0.75  # s in one place, after each of which the motion to follow is half as fast
+BEYOND = 6  # points of a path from the first that is blocked, around which it looks for unknown cells
 STILL = 0.3  # m within which a vehicle has stayed in its place
 AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
+WEAK = 20  # stages whose gains hardly correct anything, as nearly nothing comes after them
 WAITS = 5  # knots before the first that is blocked
 MOST_MOVING = 4  # moving bodies that a knot keeps away from
 HOLD = 1.0  # s after a plan's end in which its place stays clear: about what it takes to get away from there
@@ -79,9 +87,13 @@ class Scout:
     movers: Movers
     moving: Moving = field(default_factory=nothing)  # at this control step
     path: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # cells' centres, (K, 3), m
+    target: np.ndarray | None = None  # of the path
+    end: np.ndarray | None = None  # of its free part when it was found
     corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
     waited: int = 0  # control periods near `place`
+    turned: int = 0  # how often it has turned to other ways there
     place: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))  # m
+    look: Look = field(default_factory=Look)
     level: int = 0  # of LEVELS
     since: int = 0  # control periods at this level
     seconds: dict[str, float] = field(default_factory=dict)
@@ -195,23 +207,33 @@ class Exploration:
 
     def _seek(self, scout: Scout, x: np.ndarray) -> None:
         began, position = time.perf_counter(), x[:3]
+        looks = scout.look.goes_on(scout.seen, position, round(LOOKS[1] / self.dt))
         self._search(scout, position)
-        keep = self.keep(scout)
-        points = _halved(np.concatenate([position[None], scout.path[1:]]))
-        if np.linalg.norm(scout.path[-1] - scout.goal) <= ARRIVES * scout.seen.resolution:
-            points = np.concatenate([points, scout.goal[None]])
+        keep, end = self.keep(scout), scout.goal if scout.look.place is None else scout.look.place
+        points = halved(np.concatenate([position[None], scout.path[1:]]))
+        if np.linalg.norm(scout.path[-1] - end) <= ARRIVES * scout.seen.resolution:
+            points = np.concatenate([points, end[None]])
         gaps = scout.seen.gaps(points, keep + 0.05, self.kinds)
-        blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 3))
+        blocked = barred(gaps, keep)
         free = points[: blocked[0] if len(blocked) else len(points)]
         scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
         self._wait(scout, position, points, gaps)
+        if scout.end is None and len(blocked):
+            scout.end = points[blocked[0]]
+        ends = barred(gaps, keep, gaps[0] - 0.5 * scout.seen.resolution)[:1]
+        at_end = len(ends) > 0 and np.linalg.norm(points[ends[0]] - position) <= AT_END
+        if not looks and at_end and scout.turned and scout.waited == round(LOOKS[0] / self.dt):
+            self._look(scout, x, points[ends[0] :], gaps[ends[0] :])
         scout.seconds["search_seconds"] += time.perf_counter() - began
 
     def keep(self, scout: Scout) -> float:
         """The distance, m, that plans keep from what isn't known to be free."""
-        least = CONTACT_FACTOR * scout.radius + SPARE + 2.0 * DRIFT
-        share = LEVELS[scout.level][0]
-        return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least
+        least, share = self.least(scout), LEVELS[scout.level][0]
+        return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least - ROUNDING
+
+    def least(self, scout: Scout) -> float:
+        """The least of these distances, where there is no other way, m."""
+        return CONTACT_FACTOR * scout.radius + SPARE + 2.0 * DRIFT
 
     def _search(self, scout: Scout, position: np.ndarray) -> None:
         """The path to the goal; where none is found, with less margin from now on, for a while.
@@ -219,17 +241,32 @@ class Exploration:
         Scan and search take turns where there are periods without a scan: both in one would be the longest.
         """
         scout.since += 1
-        if scout.scanned and 0 < scout.age < SEARCHED and self.every > 1:
+        target = scout.goal if scout.look.place is None else scout.look.place
+        if scout.scanned and 0 < scout.age < SEARCHED and self.every > 1 and scout.target is target:
             scout.age += 1
-            nearest = np.linalg.norm(scout.path - position, axis=1).argmin()
-            scout.path = scout.path[min(nearest, len(scout.path) - 2) :]
+            scout.path = rest_of(scout.path, position)
             return
-        scout.age = 1
-        if scout.level > 0 and scout.since * self.dt >= HELD:
+        if scout.target is target is scout.goal and scout.search.pending is None:
+            scout.path = rest_of(scout.path, position)
+            if goes_there(scout.seen, position, scout.path, scout.end, self.keep(scout)):
+                return
+        scout.age, scout.end = 1, None
+        if scout.level > 0 and scout.since * self.dt >= HELD and scout.search.pending is None:
             scout.level, scout.since = 0, 0
+        left = MOST_SEARCHED
         while True:
             scout.search.radius, scout.search.stride = self.keep(scout), LEVELS[scout.level][1]
-            scout.path, arrives = scout.search.path(position, scout.goal)
+            scout.search.limit = max(left, 1)
+            found = scout.search.path(position, target)
+            left -= scout.search.expanded
+            if found is None:
+                scout.path = rest_of(scout.path, position)
+                return
+            scout.path, arrives = found
+            if target is scout.look.place and not arrives:
+                scout.look.place, target = None, scout.goal
+                continue
+            scout.target = target
             if arrives or scout.level + 1 == len(LEVELS):
                 return
             scout.level, scout.since = scout.level + 1, 0
@@ -240,13 +277,22 @@ class Exploration:
         The way on may be cells that stay unknown, as no ray gets to them, or one that no plan can take.
         """
         if np.linalg.norm(position - scout.place) > STILL:
-            scout.place, scout.waited = position.copy(), 0
-        scout.waited += 1
+            scout.place, scout.waited, scout.turned = position.copy(), 0, 0
+        scout.waited += scout.search.pending is None
         if scout.waited * self.dt >= self.explorer.patience:
             blocked = np.flatnonzero(gaps < self.keep(scout))
             first = blocked[blocked > 0][:1]
             scout.search.avoid(points[first[0] if len(first) else min(AHEAD, len(points) - 1)], 1.0)
-            scout.waited = 0
+            scout.waited, scout.end, scout.turned = 0, None, scout.turned + 1
+
+    def _look(self, scout: Scout, x: np.ndarray, blocked: np.ndarray, gaps: np.ndarray) -> None:
+        """Where the way on (K, 3) is blocked by unknown cells, pass with less margin, or see them from elsewhere."""
+        keep = self.keep(scout)
+        cells = unknown_near(scout.seen, blocked[:BEYOND], keep)
+        if scout.level == 0 and len(cells) and (gaps[:BEYOND] >= self.least(scout)).all():
+            scout.level, scout.since = 1, 0
+        elif len(cells):
+            scout.look.begin(scout.seen, self.sensor, x, cells, keep)
 
     def _reference(self, x: Tensor) -> Tensor:
         """States (B, N+1, 14) that the plans are to follow."""
@@ -254,7 +300,9 @@ class Exploration:
         found[..., 6], found[..., 13] = 1.0, HOVER
         for b, scout in enumerate(self.scouts):
             state = x[b].numpy()
-            p, v = motion(scout.corners, state[3:6], self.explorer.pace, N, self.dt)
+            slow = sum(scout.waited * self.dt >= after for after in SLOWS)  # no plan follows it: seek a shorter one
+            pace = replace(self.explorer.pace, speed=self.explorer.pace.speed / 2**slow)
+            p, v = motion(scout.corners, state[3:6], pace, N, self.dt)
             found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
         return found
 
@@ -338,6 +386,7 @@ class Exploration:
             C = problem.B // before.X.shape[0]
             X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
             X[:, -1], U[:, -1] = _resting(X[:, -1]), problem.cost.rest_controls(U[:, -1:])[:, 0]
+            K[:, -WEAK:] = K[:, -WEAK - 1 : -WEAK]
             X, U = within_bounds(problem, X, U, K)
             penalty = before.penalty.repeat(C)
         none = torch.zeros(problem.B, dtype=torch.int64)
@@ -437,13 +486,6 @@ def _resting(x: Tensor) -> Tensor:
     yaw = torch.hypot(x[:, 6], x[:, 9]).clamp(min=1e-9)
     rest[:, 6], rest[:, 9] = x[:, 6] / yaw, x[:, 9] / yaw
     return rest
-
-
-def _halved(points: np.ndarray) -> np.ndarray:
-    """The points (K, 3) of a path, and those midway between them."""
-    found = np.repeat(points, 2, axis=0)[:-1]
-    found[1::2] = 0.5 * (points[:-1] + points[1:])
-    return found
 
 
 def _repeated(problem: Problem, count: int) -> Problem:

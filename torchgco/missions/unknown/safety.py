@@ -79,7 +79,7 @@ def least_gap(log: SeenLog, state: np.ndarray, plan: Sequence[np.ndarray] | np.n
     blocked = outside | (state[at[..., 0], at[..., 1], at[..., 2]] != FREE)
     centers = log.corner + (cells + 0.5) * log.resolution
     away = np.maximum(np.abs(points[:, None] - centers) - 0.5 * log.resolution, 0.0)
-    gap = np.where(blocked, np.linalg.norm(away, axis=-1), reach + slack).min()
+    gap = np.where(blocked, np.linalg.norm(away, axis=-1), np.inf).min()
     # Along a straight piece the distance from a convex cube is convex: its least value between two points that are
     # `d` apart lies below theirs by less than d / 2.
     return float(min(gap - slack, reach))

@@ -12,21 +12,28 @@
 #define NEWTON 80
 #define NEAR 1e-9 /* m */
 
-/* Where the ray o + t d (in the box's frame) meets the box rounded by r, t within [0, far]; infinite where it misses. */
-static double meets(const double *o, const double *d, const double *half, double r, double far) {
-    double low = 0.0, high = far;
+/* enter (rays): where rays o + t d (in the box's frame, d by axes) enter the box with faces `half` + r from its middle, t
+ * within [0, range]; infinite where they miss it. Rays are side by side, so that a compiler can take some at a time. */
+static void enters(
+    int64_t rays, const double *o, const double *restrict d, const double *half, double r, double range,
+    double *restrict enter, double *restrict leave) {
+    for (int64_t k = 0; k < rays; k++) enter[k] = 0.0, leave[k] = range;
     for (int i = 0; i < 3; i++) {
-        double reach = half[i] + r;
-        if (fabs(d[i]) < 1e-12) {
-            if (fabs(o[i]) > reach) return INFINITY;
-            continue;
+        double reach = half[i] + r, first = -reach - o[i], second = reach - o[i];
+        double beside = fabs(o[i]) > reach ? INFINITY : -INFINITY;
+        const double *along = d + i * rays;
+        for (int64_t k = 0; k < rays; k++) {
+            double size = fabs(along[k]), a = first / along[k], b = second / along[k];
+            double low = a < b ? a : b, high = a < b ? b : a;
+            low = size < 1e-12 ? beside : low, high = size < 1e-12 ? INFINITY : high;
+            enter[k] = low > enter[k] ? low : enter[k], leave[k] = high < leave[k] ? high : leave[k];
         }
-        double a = (-reach - o[i]) / d[i], b = (reach - o[i]) / d[i];
-        low = fmax(low, fmin(a, b)), high = fmin(high, fmax(a, b));
     }
-    if (low > high) return INFINITY;
-    if (r == 0.0) return low;
-    double t = low;
+    for (int64_t k = 0; k < rays; k++) enter[k] = enter[k] > leave[k] ? INFINITY : enter[k];
+}
+
+/* Where the ray o + t d meets the box rounded by r > 0, from t on, where it enters the box with larger sides. */
+static double meets(const double *o, const double *d, const double *half, double r, double t, double far) {
     for (int n = 0; n < NEWTON && t <= far; n++) {
         double square = 0.0, slope = 0.0;
         for (int i = 0; i < 3; i++) {
@@ -75,13 +82,19 @@ static double first_cell(
     return INFINITY;
 }
 
-/* distance (rays): to the first body within `range`, infinite where there is none, 0 inside of a body. */
+/* distance (rays): to the first body within `range`, infinite where there is none, 0 inside of a body. scratch holds 8
+ * numbers for each ray. */
 void tgco_cast(
     int64_t rays, const double *origin, const double *directions, double range, int64_t boxes, const double *box,
-    const int64_t *shape, const uint8_t *occupied, const double *corner, double size, double *distance) {
-    for (int64_t k = 0; k < rays; k++) distance[k] = INFINITY;
+    const int64_t *shape, const uint8_t *occupied, const double *corner, double size, double *scratch,
+    double *distance) {
+    double *enter = scratch, *leave = enter + rays, *by_axis = leave + rays, *turned = by_axis + 3 * rays;
+    for (int64_t k = 0; k < rays; k++) {
+        distance[k] = INFINITY;
+        for (int i = 0; i < 3; i++) by_axis[i * rays + k] = directions[3 * k + i];
+    }
     for (int64_t j = 0; j < boxes; j++) {
-        const double *b = box + j * NUMBERS, *axes = b + 3, *half = b + 12;
+        const double *b = box + j * NUMBERS, *axes = b + 3, *half = b + 12, *own = by_axis;
         double o[3], reach = b[15], gap = 0.0;
         for (int i = 0; i < 3; i++) {
             o[i] = 0.0;
@@ -91,13 +104,16 @@ void tgco_cast(
         }
         if (sqrt(gap) - reach > range) continue;
         int straight = axes[0] == 1.0 && axes[4] == 1.0 && axes[8] == 1.0;
+        for (int i = 0; i < 3 && !straight; i++)
+            for (int64_t k = 0; k < rays; k++)
+                turned[i * rays + k] = axes[3 * i] * directions[3 * k] + axes[3 * i + 1] * directions[3 * k + 1] +
+                                       axes[3 * i + 2] * directions[3 * k + 2];
+        if (!straight) own = turned;
+        enters(rays, o, own, half, reach, range, enter, leave);
         for (int64_t k = 0; k < rays; k++) {
-            double d[3], far = distance[k] < range ? distance[k] : range;
-            for (int i = 0; i < 3; i++)
-                d[i] = straight ? directions[3 * k + i]
-                                : axes[3 * i] * directions[3 * k] + axes[3 * i + 1] * directions[3 * k + 1] +
-                                      axes[3 * i + 2] * directions[3 * k + 2];
-            double t = meets(o, d, half, reach, far);
+            if (!(enter[k] < distance[k])) continue;
+            double d[3] = {own[k], own[rays + k], own[2 * rays + k]}, far = distance[k] < range ? distance[k] : range;
+            double t = reach == 0.0 ? enter[k] : meets(o, d, half, reach, enter[k], far);
             if (t < distance[k]) distance[k] = t;
         }
     }
