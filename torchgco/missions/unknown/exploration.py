@@ -35,8 +35,8 @@ from torchgco.missions.unknown.explorer import (
     PlanningForm,
     Unknown,
     unflyable,
-    within_bounds,
 )
+from torchgco.missions.unknown.former import braking, ends_at_rest, former_plans
 from torchgco.missions.unknown.looking import Look, barred, goes_there, halved, rest_of, unknown_near
 from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
 from torchgco.missions.unknown.reference import motion, taut
@@ -66,7 +66,6 @@ BEYOND = 6  # points of a path from the first that is blocked, around which it l
 STILL = 0.3  # m within which a vehicle has stayed in its place
 AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
-WEAK = 20  # stages whose gains hardly correct anything, as nearly nothing comes after them
 WAITS = 5  # knots before the first that is blocked
 MOST_MOVING = 4  # moving bodies that a knot keeps away from
 HOLD = 1.0  # s after a plan's end in which its place stays clear: about what it takes to get away from there
@@ -187,10 +186,10 @@ class Exploration:
         rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
         former = rest if before is None else self._clear_part(shifted(before.X[:, 1:, :3]))
         if before is not None and self.explorer.movers != "none":
-            former = torch.where(_ends_at_rest(before.X).view(-1, 1, 1), former, self._braking(x))
+            former = torch.where(ends_at_rest(before.X).view(-1, 1, 1), former, braking(x, self.explorer, self.dt))
         seeds = [former, reference[:, 1:, :3]]
         problem = self._problem(x, bias, reference, seeds)
-        kept = self._kept(problem, before).take(slice(0, len(self.scouts)))
+        kept = former_plans(problem, before).take(slice(0, len(self.scouts)))
         plan = self._chosen(problem, kept, len(seeds))
         for b, scout in enumerate(self.scouts):
             scout.log.safe.append(plan.X[b, :, :3].numpy().copy())
@@ -367,35 +366,6 @@ class Exploration:
                 former[b, at:] = former[b, at].clone()
         return former
 
-    def _braking(self, x: Tensor) -> Tensor:
-        """Positions (B, N, 3) of vehicles measured at x (B, 17) that brake straight ahead."""
-        speed = x[:, 3:6].norm(dim=-1, keepdim=True).clamp(min=1e-6)
-        t = self.dt * torch.arange(1, self.explorer.stages + 1, dtype=x.dtype)
-        t = torch.minimum(t, speed / self.explorer.deceleration)
-        way = speed * t - 0.5 * self.explorer.deceleration * t.square()
-        return x[:, None, :3] + way.unsqueeze(-1) * (x[:, 3:6] / speed).unsqueeze(1)
-
-    def _kept(self, problem: Problem, before: Plan | None) -> Plan:
-        """The former plans one stage later, brought back to by feedback; of a first plan, rest."""
-        if before is None:
-            x0, B, N = problem.x0, problem.B, problem.N
-            U = problem.cost.rest_controls(x0.new_zeros(B, N, 4))
-            X, K = x0.unsqueeze(1).repeat(1, N + 1, 1), x0.new_zeros(B, N, 4, 14)
-            penalty = torch.full_like(x0[:, 0], 1.0)
-        else:
-            C = problem.B // before.X.shape[0]
-            X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
-            X[:, -1], U[:, -1] = _resting(X[:, -1]), problem.cost.rest_controls(U[:, -1:])[:, 0]
-            K[:, -WEAK:] = K[:, -WEAK - 1 : -WEAK]
-            X, U = within_bounds(problem, X, U, K)
-            penalty = before.penalty.repeat(C)
-        none = torch.zeros(problem.B, dtype=torch.int64)
-        return Plan(
-            X, U.nan_to_num(), K, Multipliers.zero(problem, 1.0), penalty, problem.cost.total(X, U),
-            problem.x0.new_zeros(problem.B), torch.ones(problem.B, dtype=torch.bool), none, none.clone(),
-            problem.x0, problem.x0[:, :3], problem.dynamics, 0,
-        )  # fmt: skip
-
     def _chosen(self, problem: Problem, kept: Plan, count: int) -> Plan:
         """Of the new plans, `count` for each mission, the cheapest that is safe, or else the one that is kept.
 
@@ -405,7 +375,7 @@ class Exploration:
         U = kept.U
         if self.explorer.movers != "none":  # a plan that was spoiled on the way is no start for others
             hover = problem.cost.rest_controls(torch.zeros_like(U.repeat(count, 1, 1)))[:B]
-            U = torch.where(_ends_at_rest(kept.X).view(-1, 1, 1), U, hover)
+            U = torch.where(ends_at_rest(kept.X).view(-1, 1, 1), U, hover)
         found = self.local.solve(problem, U.repeat(count, 1, 1), seed=self.seed)
         # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
         K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
@@ -472,20 +442,6 @@ class Exploration:
         if near < 0:
             asked[: FINE * EARLY] = near - 0.02
         return float((gaps - least - asked).min())
-
-
-def _ends_at_rest(X: Tensor) -> Tensor:
-    """Whether plans (B, N+1, 14) come to rest, (B,)."""
-    return X[:, -1, 3:6].abs().amax(-1) <= 3.0 * AT_REST
-
-
-def _resting(x: Tensor) -> Tensor:
-    """States (B, 14) at rest and upright in the same positions, with the same yaw."""
-    rest = torch.zeros_like(x)
-    rest[:, :3], rest[:, 13] = x[:, :3], HOVER
-    yaw = torch.hypot(x[:, 6], x[:, 9]).clamp(min=1e-9)
-    rest[:, 6], rest[:, 9] = x[:, 6] / yaw, x[:, 9] / yaw
-    return rest
 
 
 def _repeated(problem: Problem, count: int) -> Problem:

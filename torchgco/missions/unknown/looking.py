@@ -173,7 +173,7 @@ def in_sight(seen: SeenMap, places: np.ndarray, cells: np.ndarray) -> np.ndarray
     until = np.maximum(far - 3**0.5 * seen.resolution, 0.0) / np.maximum(far, 1e-9)
     count = int(np.ceil(far.max(initial=0.0) / (0.7 * seen.resolution))) + 1
     share = np.linspace(0.0, 1.0, count)[:, None, None, None] * until
-    return (states(seen, places[:, None] + share * to) == FREE).all(axis=0)
+    return np.asarray(states(seen, places[:, None] + share * to) == FREE).all(axis=0)
 
 
 def straight(seen: SeenMap, position: np.ndarray, places: np.ndarray, keep: float) -> np.ndarray:
