@@ -51,9 +51,9 @@ def _flat(count: int) -> tuple[str, ...]:
 
 
 def _moving(count: int, movers: str) -> tuple[str, ...]:
-    """SANDO's fields of trefoils."""
+    """SANDO's fields of trefoils. Behind each body lies space that was never seen: it counts as empty."""
     region = "mission.explorer.region=[[-5,110],[-12,12],[0,6]]"
-    known = (f"mission.explorer.movers={movers}", "mission.duration=50")
+    known = (f"mission.explorer.movers={movers}", "mission.duration=50", "mission.unknown=free")
     return "scenario=trefoils", f"scenario.num_obstacles={count}", "mission.goal_radius=0.5", region, *known
 
 

@@ -173,10 +173,10 @@ def in_sight(seen: SeenMap, places: np.ndarray, cells: np.ndarray) -> np.ndarray
     until = np.maximum(far - 3**0.5 * seen.resolution, 0.0) / np.maximum(far, 1e-9)
     count = int(np.ceil(far.max(initial=0.0) / (0.7 * seen.resolution))) + 1
     share = np.linspace(0.0, 1.0, count)[:, None, None, None] * until
-    return np.asarray(states(seen, places[:, None] + share * to) == FREE).all(axis=0)
+    return np.all(states(seen, places[:, None] + share * to) == FREE, axis=0)
 
 
 def straight(seen: SeenMap, position: np.ndarray, places: np.ndarray, keep: float) -> np.ndarray:
     """Whether straight ways from a position (3,) to places (P, 3) keep `keep`, m, after their first third, (P,)."""
     points = position + np.linspace(0.3, 1.0, 12)[:, None, None] * (places - position)
-    return (seen.gaps(points.reshape(-1, 3), keep, NOT_FREE) >= keep).reshape(12, -1).all(axis=0)
+    return np.all((seen.gaps(points.reshape(-1, 3), keep, NOT_FREE) >= keep).reshape(12, -1), axis=0)
