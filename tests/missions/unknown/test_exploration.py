@@ -154,8 +154,6 @@ def test_scans_and_searches_take_turns(rate: float) -> None:
     for step in range(6):
         exploration.sense(step, x, x)
         before = [scout.search._round for scout in exploration.scouts]
-        for scout in exploration.scouts:
-            scout.end = None  # to which it would go without another search
         plan, _ = exploration.plan(step, x, plan)
         searched.append(
             all(scout.search._round > round for scout, round in zip(exploration.scouts, before, strict=True))

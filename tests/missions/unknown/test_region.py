@@ -134,7 +134,7 @@ def test_a_door_as_wide_as_the_margin_asks_for_is_passed() -> None:
         scout.seen.state[40] = OCCUPIED
         scout.seen.state[40, first : first + 3, first : first + 3] = FREE
         scout.seen.measure(np.zeros(3), np.array(scout.seen.shape))
-        scout.end, scout.age = None, 0
+        scout.age = 0
         exploration.seek(x)
         assert scout.level == 0 and scout.path[-1][0] > 11.0 and scout.corners[-1][0] > 11.0, first
 

@@ -29,7 +29,7 @@ class Search:
         greed: paths cost at most so many times what the cheapest does; more than 1 is quicker.
         stride: cells between two of a path: the search passes every so many along each axis.
         near: m from the goal at which a path has arrived.
-        leave: m around the start in which the path may be nearer to occupied cells, by half a cell than the start is.
+        leave: m around the start in which the path may be nearer to occupied cells.
         limit: cells that one call looks at, at most; the next call goes on. 0: all that it needs.
     """
 
@@ -69,11 +69,11 @@ class Search:
         if self.pending is None or self.pending[1:] != asked:
             self._round, self._left[:] = self._round + 1, 0
             self.pending = (seen.cell(start), *asked)
-        expanded, out = np.zeros(1, np.int64), seen.from_occupied[tuple(self.pending[0])] - 0.5 * seen.resolution
+        expanded = np.zeros(1, np.int64)
         leave, size = int(np.ceil(self.leave / seen.resolution)), seen.resolution
         count = call(
             "tgco_search", np.array(seen.shape, np.int64), seen.from_occupied, seen.state, self.price, self.radius,
-            self.band, self.shy, self.unseen, self.nearby / size, self.greed, leave, float(out), self.stride,
+            self.band, self.shy, self.unseen, self.nearby / size, self.greed, leave, self.stride,
             self.pending[0], seen.cell(goal), self.near / size, self._round, self._sum, self._from, self._seen,
             self._room, self._heap, self._path, self.limit or np.iinfo(np.int64).max, self._left, expanded,
         )  # fmt: skip

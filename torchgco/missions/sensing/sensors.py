@@ -64,10 +64,6 @@ class Sensor:
         """Unit vectors (R, 3) in the vehicle's frame, the pattern moved by a share (2,) of the rays' distance."""
         raise NotImplementedError
 
-    def views(self, directions: np.ndarray) -> np.ndarray:
-        """Whether the field of view holds directions (..., 3) in the vehicle's frame, and not only at its edge."""
-        raise NotImplementedError
-
     def spread(self, distances: np.ndarray) -> np.ndarray:
         """Standard deviations (R,), m, of measured distances."""
         raise NotImplementedError
@@ -141,13 +137,6 @@ class Lidar(Sensor):
         flat = np.cos(elevation)
         return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
-    def views(self, directions: np.ndarray) -> np.ndarray:
-        """See `Sensor`."""
-        x, y, z = np.moveaxis(directions, -1, 0)
-        around, up = 0.5 * np.radians(self.field_of_view) * (1.0 - 1.0 / np.array(self.rays))
-        within = True if self.field_of_view[0] == 360.0 else np.abs(np.arctan2(y, x)) <= around
-        return within & (np.abs(np.arctan2(z, np.hypot(x, y))) <= up)
-
     def spread(self, distances: np.ndarray) -> np.ndarray:
         """See `Sensor`."""
         return np.full_like(distances, self.noise)
@@ -189,12 +178,6 @@ class Depth(Sensor):
         )
         y, z = (part.ravel() for part in np.meshgrid(across, down, indexing="ij"))
         return np.column_stack([np.ones_like(y), y, z])
-
-    def views(self, directions: np.ndarray) -> np.ndarray:
-        """See `Sensor`."""
-        x, y, z = np.moveaxis(directions, -1, 0)
-        across, down = np.tan(0.5 * np.radians(self.field_of_view)) * (1.0 - 1.0 / np.array(self.rays))
-        return (x > 0) & (np.abs(y) <= across * x) & (np.abs(z) <= down * x)
 
     def spread(self, distances: np.ndarray) -> np.ndarray:
         """See `Sensor`."""

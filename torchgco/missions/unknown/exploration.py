@@ -37,7 +37,6 @@ from torchgco.missions.unknown.explorer import (
     unflyable,
 )
 from torchgco.missions.unknown.former import braking, ends_at_rest, former_plans
-from torchgco.missions.unknown.looking import Look, barred, goes_there, halved, rest_of, unknown_near
 from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
 from torchgco.missions.unknown.reference import motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
@@ -59,10 +58,6 @@ SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at poi
 DRIFT = 0.01  # m by which a plan may come nearer while it is flown, as a vehicle isn't exactly where it should be
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
 ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joined to it
-AT_END = 0.8  # m from what blocks a path, within which a vehicle has come to its end
-LOOKS = 0.9, 3.0  # s in one place after turning elsewhere, before it looks from aside; of the way there at most
-SLOWS = 0.45, 0.6, 0.75  # s in one place, after each of which the motion to follow is half as fast
-BEYOND = 6  # points of a path from the first that is blocked, around which it looks for unknown cells
 STILL = 0.3  # m within which a vehicle has stayed in its place
 AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
@@ -86,13 +81,9 @@ class Scout:
     movers: Movers
     moving: Moving = field(default_factory=nothing)  # at this control step
     path: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # cells' centres, (K, 3), m
-    target: np.ndarray | None = None  # of the path
-    end: np.ndarray | None = None  # of its free part when it was found
     corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
     waited: int = 0  # control periods near `place`
-    turned: int = 0  # how often it has turned to other ways there
     place: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))  # m
-    look: Look = field(default_factory=Look)
     level: int = 0  # of LEVELS
     since: int = 0  # control periods at this level
     seconds: dict[str, float] = field(default_factory=dict)
@@ -206,23 +197,16 @@ class Exploration:
 
     def _seek(self, scout: Scout, x: np.ndarray) -> None:
         began, position = time.perf_counter(), x[:3]
-        looks = scout.look.goes_on(scout.seen, position, round(LOOKS[1] / self.dt))
         self._search(scout, position)
-        keep, end = self.keep(scout), scout.goal if scout.look.place is None else scout.look.place
-        points = halved(np.concatenate([position[None], scout.path[1:]]))
-        if np.linalg.norm(scout.path[-1] - end) <= ARRIVES * scout.seen.resolution:
-            points = np.concatenate([points, end[None]])
+        keep = self.keep(scout)
+        points = _halved(np.concatenate([position[None], scout.path[1:]]))
+        if np.linalg.norm(scout.path[-1] - scout.goal) <= ARRIVES * scout.seen.resolution:
+            points = np.concatenate([points, scout.goal[None]])
         gaps = scout.seen.gaps(points, keep + 0.05, self.kinds)
-        blocked = barred(gaps, keep)
+        blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 3))
         free = points[: blocked[0] if len(blocked) else len(points)]
         scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
         self._wait(scout, position, points, gaps)
-        if scout.end is None and len(blocked):
-            scout.end = points[blocked[0]]
-        ends = barred(gaps, keep, gaps[0] - 0.5 * scout.seen.resolution)[:1]
-        at_end = len(ends) > 0 and np.linalg.norm(points[ends[0]] - position) <= AT_END
-        if not looks and at_end and scout.turned and scout.waited == round(LOOKS[0] / self.dt):
-            self._look(scout, x, points[ends[0] :], gaps[ends[0] :])
         scout.seconds["search_seconds"] += time.perf_counter() - began
 
     def keep(self, scout: Scout) -> float:
@@ -240,32 +224,23 @@ class Exploration:
         Scan and search take turns where there are periods without a scan: both in one would be the longest.
         """
         scout.since += 1
-        target = scout.goal if scout.look.place is None else scout.look.place
-        if scout.scanned and 0 < scout.age < SEARCHED and self.every > 1 and scout.target is target:
+        if scout.scanned and 0 < scout.age < SEARCHED and self.every > 1:
             scout.age += 1
-            scout.path = rest_of(scout.path, position)
+            scout.path = _rest_of(scout.path, position)
             return
-        if scout.target is target is scout.goal and scout.search.pending is None:
-            scout.path = rest_of(scout.path, position)
-            if goes_there(scout.seen, position, scout.path, scout.end, self.keep(scout)):
-                return
-        scout.age, scout.end = 1, None
+        scout.age = 1
         if scout.level > 0 and scout.since * self.dt >= HELD and scout.search.pending is None:
             scout.level, scout.since = 0, 0
         left = MOST_SEARCHED
         while True:
             scout.search.radius, scout.search.stride = self.keep(scout), LEVELS[scout.level][1]
             scout.search.limit = max(left, 1)
-            found = scout.search.path(position, target)
+            found = scout.search.path(position, scout.goal)
             left -= scout.search.expanded
             if found is None:
-                scout.path = rest_of(scout.path, position)
+                scout.path = _rest_of(scout.path, position)
                 return
             scout.path, arrives = found
-            if target is scout.look.place and not arrives:
-                scout.look.place, target = None, scout.goal
-                continue
-            scout.target = target
             if arrives or scout.level + 1 == len(LEVELS):
                 return
             scout.level, scout.since = scout.level + 1, 0
@@ -276,22 +251,13 @@ class Exploration:
         The way on may be cells that stay unknown, as no ray gets to them, or one that no plan can take.
         """
         if np.linalg.norm(position - scout.place) > STILL:
-            scout.place, scout.waited, scout.turned = position.copy(), 0, 0
+            scout.place, scout.waited = position.copy(), 0
         scout.waited += scout.search.pending is None
         if scout.waited * self.dt >= self.explorer.patience:
             blocked = np.flatnonzero(gaps < self.keep(scout))
             first = blocked[blocked > 0][:1]
             scout.search.avoid(points[first[0] if len(first) else min(AHEAD, len(points) - 1)], 1.0)
-            scout.waited, scout.end, scout.turned = 0, None, scout.turned + 1
-
-    def _look(self, scout: Scout, x: np.ndarray, blocked: np.ndarray, gaps: np.ndarray) -> None:
-        """Where the way on (K, 3) is blocked by unknown cells, pass with less margin, or see them from elsewhere."""
-        keep = self.keep(scout)
-        cells = unknown_near(scout.seen, blocked[:BEYOND], keep)
-        if scout.level == 0 and len(cells) and (gaps[:BEYOND] >= self.least(scout)).all():
-            scout.level, scout.since = 1, 0
-        elif len(cells):
-            scout.look.begin(scout.seen, self.sensor, x, cells, keep)
+            scout.waited = 0
 
     def _reference(self, x: Tensor) -> Tensor:
         """States (B, N+1, 14) that the plans are to follow."""
@@ -299,9 +265,7 @@ class Exploration:
         found[..., 6], found[..., 13] = 1.0, HOVER
         for b, scout in enumerate(self.scouts):
             state = x[b].numpy()
-            slow = sum(scout.waited * self.dt >= after for after in SLOWS)  # no plan follows it: seek a shorter one
-            pace = replace(self.explorer.pace, speed=self.explorer.pace.speed / 2**slow)
-            p, v = motion(scout.corners, state[3:6], pace, N, self.dt)
+            p, v = motion(scout.corners, state[3:6], self.explorer.pace, N, self.dt)
             found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
         return found
 
@@ -446,3 +410,16 @@ class Exploration:
 
 def _repeated(problem: Problem, count: int) -> Problem:
     return problem.take(torch.arange(problem.B).repeat(count))
+
+
+def _halved(points: np.ndarray) -> np.ndarray:
+    """The points (K, 3) of a path, and those midway between them."""
+    found = np.repeat(points, 2, axis=0)[:-1]
+    found[1::2] = 0.5 * (points[:-1] + points[1:])
+    return found
+
+
+def _rest_of(path: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """A path (K, 3) from its point nearest to a position on, two points at least where it has them."""
+    nearest = np.linalg.norm(path - position, axis=1).argmin()
+    return path[min(nearest, len(path) - 2) :]

@@ -40,7 +40,7 @@ static inline float octile(const int64_t *a, const int64_t *b) {
  * writes its cells from the goal's end to the start.
  *
  * distance (cells): from obstacles, m. A cell is passable from `radius` on; around the start, within `leave` cells, from
- * `out` on, above 0; so is the one midway to a neighbour. A step costs its length times a price: 1, plus `shy` at
+ * any distance above 0; so is the one midway to a neighbour. A step costs its length times a price: 1, plus `shy` at
  * `radius`, falling to 0 at radius + band, plus `unseen` where the state is 0, up to
  * `nearby` cells from the start, four times as much within the band, as walls go on more often than they have holes, plus the cell's own `price`. Estimates of
  * what is left count `greed` times: paths cost at most so much more than the cheapest. Scratch for each cell: sum, from,
@@ -50,7 +50,7 @@ static inline float octile(const int64_t *a, const int64_t *b) {
 int64_t tgco_search(
     const int64_t *shape, const float *distance, const uint8_t *state, const float *price, double radius, double band,
     double shy, double unseen, double nearby, double greed,
-    int64_t leave, double out, int64_t stride, const int64_t *start, const int64_t *goal,
+    int64_t leave, int64_t stride, const int64_t *start, const int64_t *goal,
     double near, int64_t round, float *sum, int32_t *from, int32_t *seen, int64_t room, uint8_t *heap_bytes,
     int32_t *path, int64_t limit, int64_t *left, int64_t *expanded) {
     Entry *heap = (Entry *)heap_bytes;
@@ -90,7 +90,7 @@ int64_t tgco_search(
                     if (seen[to] == closed) continue;
                     int64_t halfway = at + (((s / 2) * dx * ny) + (s / 2) * dy) * nz + (s / 2) * dz;
                     float d = distance[to], least = s > 1 && distance[halfway] < d ? distance[halfway] : d;
-                    if (least < r && !(least > 0.0f && least >= (float)out && octile(n, begin) <= (float)leave)) continue;
+                    if (least < r && !(least > 0.0f && octile(n, begin) <= (float)leave)) continue;
                     int64_t axes = dx * dx + dy * dy + dz * dz;
                     float length = (float)s * (axes == 1 ? 1.0f : axes == 2 ? 1.41421356f : 1.73205081f);
                     float close = 1.0f - (d - r) / (float)band, each = 1.0f + price[to];
