@@ -70,12 +70,12 @@ CASES = {
     "mazes, 3 walls": Case(("scenario=mazes", "mission.duration=90"), 6, 100),
     "rooms with doors": Case(
         (
-            "scenario=rooms", "mission.duration=120", "mission.explorer.speed=3",
+            "scenario=rooms", "mission.duration=90", "mission.explorer.speed=3",
             "mission.explorer.region=[[-2,18],[-2,14],[-1.5,4.5]]",
-        ), 6, 200,
+        ), 4, 200,
     ),
-    **{f"{count} moving, known": Case(_moving(count, "known"), 4, 1000, at_rest=False) for count in (50, 100, 200)},
-    **{f"{count} moving, seen": Case(_moving(count, "tracked"), 4, 1000, at_rest=False) for count in (50, 100, 200)},
+    **{f"{count} moving, known": Case(_moving(count, "known"), 3, 1000, at_rest=False) for count in (50, 100, 200)},
+    **{f"{count} moving, seen": Case(_moving(count, "tracked"), 3, 1000, at_rest=False) for count in (50, 100, 200)},
 }  # fmt: skip
 HEAD = (
     "world", "n", *(outcome.name for outcome in Outcome), "safe periods", "flight time", "clearance", "speed",

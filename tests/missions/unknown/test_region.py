@@ -14,7 +14,7 @@ from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, Quadrot
 from torchgco.missions import Planner
 from torchgco.missions.plant import hovering
 from torchgco.missions.sensing import Lidar
-from torchgco.missions.sensing.grid import FREE, OCCUPIED
+from torchgco.missions.sensing.grid import FREE
 from torchgco.missions.unknown.exploration import Exploration
 from torchgco.missions.unknown.explorer import FLYABLE, PLACES, Explorer, unflyable, within_bounds
 from torchgco.native.dispatch import followed
@@ -123,20 +123,6 @@ def test_who_stays_in_one_place_looks_elsewhere() -> None:
     for period in range(60):  # it moves
         exploration._wait(scout, x[0, :3].numpy() + np.array([0.03 * period, 0.0, 0.0]), points, gaps)
     assert (scout.search.price == 0).all()
-
-
-def test_a_door_as_wide_as_the_margin_asks_for_is_passed() -> None:
-    """Distances of cells' centres are then exactly those that are kept, but for rounding."""
-    exploration, x = exploring(1.0)
-    (scout,) = exploration.scouts
-    assert exploration.keep(scout) == pytest.approx(0.3, abs=1e-5)
-    for first in range(5, 13, 2):  # the search passes every second cell
-        scout.seen.state[40] = OCCUPIED
-        scout.seen.state[40, first : first + 3, first : first + 3] = FREE
-        scout.seen.measure(np.zeros(3), np.array(scout.seen.shape))
-        scout.age = 0
-        exploration.seek(x)
-        assert scout.level == 0 and scout.path[-1][0] > 11.0 and scout.corners[-1][0] > 11.0, first
 
 
 def test_plans_of_a_vehicle_that_has_left_the_map_are_not_confined_to_it() -> None:

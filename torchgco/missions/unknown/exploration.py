@@ -53,7 +53,6 @@ LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
 MOST_SEARCHED = 24_000  # cells that searches of a control period look at: 15 ms
 SEARCHED = 2  # control periods after which a new search is due
 HELD = 2.0  # s before a search with less margin ends
-ROUNDING = 1e-6  # m: distances of cells' centres are often multiples of half a cell, as margins are
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 DRIFT = 0.01  # m by which a plan may come nearer while it is flown, as a vehicle isn't exactly where it should be
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
@@ -211,12 +210,8 @@ class Exploration:
 
     def keep(self, scout: Scout) -> float:
         """The distance, m, that plans keep from what isn't known to be free."""
-        least, share = self.least(scout), LEVELS[scout.level][0]
-        return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least - ROUNDING
-
-    def least(self, scout: Scout) -> float:
-        """The least of these distances, where there is no other way, m."""
-        return CONTACT_FACTOR * scout.radius + SPARE + 2.0 * DRIFT
+        least, share = CONTACT_FACTOR * scout.radius + SPARE + 2.0 * DRIFT, LEVELS[scout.level][0]
+        return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least
 
     def _search(self, scout: Scout, position: np.ndarray) -> None:
         """The path to the goal; where none is found, with less margin from now on, for a while.
@@ -359,17 +354,16 @@ class Exploration:
     def _best(self, X: Tensor, cost: Tensor, flyable: Tensor, kept: Tensor, b: int) -> int | None:
         """Which of some plans (C, N+1, 14) of mission b is flown; None: the kept one (N+1, 14).
 
-        flyable (C,): whether it could be flown as it is. Where no plan is safe, nearly may do.
+        flyable (C,): whether it could be flown as it is. Where no plan is safe, one that nearly is may do.
         """
-        order = [int(c) for c in cost.argsort() if bool(torch.isfinite(cost[c]))]
+        # The vehicle would fall out of a plan that can't be flown.
+        order = [int(c) for c in cost.argsort() if bool(torch.isfinite(cost[c]) & flyable[c])]
         spare = {c: self.spare(X[c].numpy(), b) for c in order}
         own = self.spare(kept.numpy(), b, 3.0 * AT_REST)
         asked = min(max(own, 0.0), DRIFT)
-        safe = next((c for c in order if spare[c] >= asked and bool(flyable[c])), None)
+        safe = next((c for c in order if spare[c] >= asked), None)
         if safe is not None:
             return safe
-        if self.explorer.movers != "none":  # bodies are where they weren't expected: what can't be flown is no help
-            order = [c for c in order if bool(flyable[c])]
         # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.
         most = max(order, key=lambda c: spare[c], default=None)
         if most is not None and own < 0 and spare[most] > own + BETTER:

@@ -11,8 +11,6 @@ from torchgco.missions.unknown.explorer import HOVER, Explorer, within_bounds
 from torchgco.missions.unknown.safety import AT_REST
 from torchgco.problem.problem import Problem
 
-WEAK = 20  # stages whose gains hardly correct anything, as nearly nothing comes after them
-
 
 def former_plans(problem: Problem, before: Plan | None) -> Plan:
     """The former plans one stage later, brought back to by feedback; of a first plan, rest."""
@@ -25,7 +23,6 @@ def former_plans(problem: Problem, before: Plan | None) -> Plan:
         C = problem.B // before.X.shape[0]
         X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
         X[:, -1], U[:, -1] = resting(X[:, -1]), problem.cost.rest_controls(U[:, -1:])[:, 0]
-        K[:, -WEAK:] = K[:, -WEAK - 1 : -WEAK]
         X, U = within_bounds(problem, X, U, K)
         penalty = before.penalty.repeat(C)
     none = torch.zeros(problem.B, dtype=torch.int64)
