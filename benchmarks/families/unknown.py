@@ -124,7 +124,7 @@ def table(trials: pd.DataFrame, log: pd.DataFrame) -> str:
         reached, (speed, acceleration, jerk) = rows[rows["outcome"] == Outcome.REACHED.name], largest(steps)
         safe = f"{int(steps['safe'].sum())} of {len(steps)}" if CASES[str(case)].at_rest else "-"
         late = steps["planner_seconds"][steps["step"] > 0] > PERIOD
-        cells += [safe, f"{reached['flight_time'].median():.1f} s", f"{rows['clearance'].min():.3f} m"]
+        cells += [safe, f"{reached['flight_time'].median():.1f} s" if len(reached) else "-", f"{rows['clearance'].min():.3f} m"]
         cells += [f"{speed:.2f}", f"{acceleration:.1f}", f"{jerk:.0f}", f"{rows['shifted_plans'].mean():.1f}"]
         cells.append(f"{100 * late.mean():.1f} %")
         lines.append(cells)
@@ -136,12 +136,12 @@ def misses(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     lines = []
     for row in trials.itertuples():
         steps = log[(log["case"] == row.case) & (log["mission"] == row.layout)]
-        without = int((steps["safe"] == 0).sum()) if CASES[str(row.case)].at_rest else 0
-        if row.outcome != Outcome.REACHED.name or without:
+        at_rest, without = CASES[str(row.case)].at_rest, int((steps["safe"] == 0).sum())
+        if row.outcome != Outcome.REACHED.name or (at_rest and without):
             lines.append(
                 (
                     row.case, row.layout, row.outcome, f"{row.flight_time:.1f} s", f"{row.clearance:.3f} m",
-                    f"{row.goal_distance:.1f} m", f"{without} of {len(steps)}",
+                    f"{row.goal_distance:.1f} m", f"{without} of {len(steps)}" if at_rest else "-",
                 )
             )  # fmt: skip
     head = ("world", "number", "outcome", "after", "clearance", "from the goal", "periods without a safe plan")

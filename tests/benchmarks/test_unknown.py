@@ -44,6 +44,12 @@ def test_among_moving_bodies_no_period_counts_as_safe() -> None:
     assert misses(trials, log).startswith("Every mission reached its goal")
 
 
+def test_a_miss_among_moving_bodies_says_nothing_of_safe_plans() -> None:
+    trials, log = frames(MOVING, [0, 0, 0, 0], ["COLLISION", "TIMEOUT"])
+    assert [line.split(" | ")[-1] for line in misses(trials, log).splitlines()[2:]] == ["- |", "- |"]
+    assert table(trials, log).splitlines()[-1].split(" | ")[7] == "-"  # none reached: no flight time
+
+
 def test_limits_are_those_of_each_mission_by_itself() -> None:
     _, log = frames(WORLD, [1, 1, 1, 1], ["REACHED", "REACHED"])
     speed, acceleration, jerk = largest(log)

@@ -98,7 +98,7 @@ int64_t tgco_search(
                     if (state[to] == 0 && octile(n, begin) <= (float)nearby) each += (float)unseen * (close > 0.0f ? 4.0f : 1.0f);
                     float cost = sum[at] + length * each;
                     if (seen[to] == open && sum[to] <= cost) continue;
-                    if (count >= room) continue; /* never yet */
+                    if (count >= room) continue; /* the heap is full: this neighbour is left out */
                     seen[to] = open, sum[to] = cost, from[to] = at;
                     push(heap, &count, cost + g * octile(n, goal), to);
                 }
