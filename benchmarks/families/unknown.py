@@ -124,7 +124,8 @@ def table(trials: pd.DataFrame, log: pd.DataFrame) -> str:
         reached, (speed, acceleration, jerk) = rows[rows["outcome"] == Outcome.REACHED.name], largest(steps)
         safe = f"{int(steps['safe'].sum())} of {len(steps)}" if CASES[str(case)].at_rest else "-"
         late = steps["planner_seconds"][steps["step"] > 0] > PERIOD
-        cells += [safe, f"{reached['flight_time'].median():.1f} s" if len(reached) else "-", f"{rows['clearance'].min():.3f} m"]
+        cells += [safe, f"{reached['flight_time'].median():.1f} s" if len(reached) else "-"]
+        cells.append(f"{rows['clearance'].min():.3f} m")
         cells += [f"{speed:.2f}", f"{acceleration:.1f}", f"{jerk:.0f}", f"{rows['shifted_plans'].mean():.1f}"]
         cells.append(f"{100 * late.mean():.1f} %")
         lines.append(cells)
