@@ -2,9 +2,10 @@
 
 Woods, mazes, walls of spheres and discs in the plane are drawn under a seed of this benchmark and flown by `gco`, world
 by world, as spheres, capsules and boxes, and as occupancy grids of two resolutions. A cell is occupied where a shape
-reaches into it, or with --centres where its centre lies in one; the outermost cells always are. Every flight is judged in the world that it was planned in; how many of the maps' flights clear the
-shapes themselves is said too. Times are processor time of one thread, without compiling and making grid and field.
-With --write the table goes into benchmarks/results/maps.md.
+reaches into it, or with --centres where its centre lies in one; the outermost cells always are. Every flight is judged
+in the world that it was planned in; how many of the maps' flights clear the shapes themselves is said too. Times are
+processor time of one thread, without compiling and making grid and field. With --write the table goes into
+benchmarks/results/maps.md.
 """
 
 from __future__ import annotations
