@@ -21,20 +21,23 @@ def rollout(x0, U, dt, parameters):
     return np.array(X)
 
 
-def cost(X, U, rates, parameters):
-    """1/2 of the weighted squares: rates by 1, thrusts and speeds from hover by b^2 and 1e-2 b^2; rates (N+1, 3)."""
+def cost(X, U, rates, parameters, effort=1e-2):
+    """1/2 of the weighted squares: rates by 1, thrusts and speeds from hover by b^2 and effort b^2; rates (N+1, 3)."""
     b, hover = parameters.b, parameters.mass * parameters.gravity / 4
     J = 0.0
     for k in range(len(X)):
         w, F = X[k][:3], X[k][3:]
         J = J + 0.5 * ((w - rates[k]) ** 2).sum() + 0.5 * b**2 * ((F - hover) ** 2).sum()
         if k < len(U):
-            J = J + 0.5 * 1e-2 * b**2 * ((U[k] - parameters.hover_rpm) ** 2).sum()
+            J = J + 0.5 * effort * b**2 * ((U[k] - parameters.hover_rpm) ** 2).sum()
     return J
 
 
-def solve(x0, rates, acceleration, dt, parameters=None):
-    """Optimal states (N+1, 7) and rotor speeds (N, 4), for references rates (N+1, 3), acceleration (N,) at 1..N."""
+def solve(x0, rates, acceleration, dt, parameters=None, commands=False, effort=1e-2):
+    """Optimal states (N+1, 7) and rotor speeds (N, 4), for references rates (N+1, 3), acceleration (N,) at 1..N.
+
+    With `commands`, rotor speeds are those that hold thrusts within their limits.
+    """
     parameters = parameters or models.QuadrotorParameters()
     N = len(acceleration)
 
@@ -51,18 +54,30 @@ def solve(x0, rates, acceleration, dt, parameters=None):
         return np.array(X), np.array(U)
 
     def objective(z):
-        return SCALE * cost(*trajectory(z), rates, parameters)
+        return SCALE * cost(*trajectory(z), rates, parameters, effort)
 
     def gradient(z):
         return np.array([objective(z + 1e-30j * unit).imag / 1e-30 for unit in np.eye(len(z))])
 
+    def room(z):
+        """How far rotor speeds are from the lowest and the highest, as shares of the latter."""
+        lowest, highest = (np.sqrt(limit / parameters.b) for limit in (parameters.f_min, parameters.f_max))
+        U = trajectory(z)[1].ravel()
+        return np.concatenate([U - lowest, highest - U]) / highest
+
+    def room_gradient(z):
+        return np.array([room(z + 1e-30j * unit).imag / 1e-30 for unit in np.eye(len(z))]).T
+
     sums = np.kron(np.eye(N), np.ones(4))
+    constraints = [{"type": "eq", "fun": lambda z: sums @ z - parameters.mass * acceleration, "jac": lambda z: sums}]
+    if commands:
+        constraints.append({"type": "ineq", "fun": room, "jac": room_gradient})
     found = minimize(
         objective,
         np.repeat(parameters.mass * acceleration / 4, 4),
         jac=gradient,
         bounds=[(parameters.f_min, parameters.f_max)] * (4 * N),
-        constraints={"type": "eq", "fun": lambda z: sums @ z - parameters.mass * acceleration, "jac": lambda z: sums},
+        constraints=constraints,
         method="SLSQP",
         options={"ftol": 1e-9, "maxiter": 200},
     )

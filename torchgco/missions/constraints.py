@@ -106,3 +106,44 @@ class ThrustSum(Constraint):
         H[:, self.knots, 3:n, n] += g
         H[:, self.knots, n, 3:n] += g
         H[:, self.knots, 3:n, 3:n] += h.unsqueeze(-1)
+
+
+@dataclass(frozen=True)
+class RotorLimits(Constraint):
+    """Commanded speeds are those that rotors can turn at: rows s (u - u_max), s (u_min - u) at knots 0..N-1.
+
+    In newtons, as the other rows of the tracking problem: s = 2 b Omega_h is the change of thrust by speed at hover.
+    Thrusts that start within their limits then stay there.
+
+    Args:
+        airframe: the quadrotor's parameters.
+
+    Raises:
+        InputError: on `Problem(...)`: dynamics without the tracking model's 4 rotors.
+    """
+
+    airframe: Airframe = Airframe()
+
+    knots: Any = None
+    batched: ClassVar[tuple[str, ...]] = ()
+
+    def bind(self, dims: Dimensions) -> Self:
+        if dims.n != 7:
+            raise InputError("rotor_limits.dynamics", "the tracking model with 7 states", f"{dims.n} states")
+        return replace(self, knots=slice(0, dims.N))
+
+    @property
+    def scale(self) -> float:
+        """N per rpm."""
+        return 2.0 * self.airframe.thrust_coefficient * self.airframe.hover_speed
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        slowest, fastest = self.airframe.rotor_speeds
+        return self.scale * torch.cat((U - fastest, slowest - U), dim=-1)
+
+    def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
+        n, at = X.shape[-1], slice(X.shape[-1] + 1, X.shape[-1] + 5)
+        gradient = self.scale * (g[..., :4] - g[..., 4:])
+        H[:, self.knots, at, n] += gradient
+        H[:, self.knots, n, at] += gradient
+        H[:, self.knots, at, at].diagonal(dim1=-2, dim2=-1).add_(self.scale**2 * (h[..., :4] + h[..., 4:]))

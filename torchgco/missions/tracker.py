@@ -9,14 +9,14 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from torchgco.base.options import AtLeast, Count, Positive, Seconds, check_options
+from torchgco.base.options import AtLeast, Count, NonNegative, Positive, Seconds, check_options
 from torchgco.base.tree import Rows, take
 from torchgco.constraints import StateBounds
 from torchgco.costs import QuadraticCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.quadrotor import GRAVITY, Airframe, RotorTracking
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted, update_and_raise_penalty
-from torchgco.missions.constraints import ThrustSum
+from torchgco.missions.constraints import RotorLimits, ThrustSum
 from torchgco.native.dispatch import measured
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
@@ -63,7 +63,7 @@ class Tracking:
 
 @dataclass(frozen=True)
 class Tracker:
-    """AL-iLQR on the rotor model: rates follow the plan, thrusts sum up to its acceleration and keep their limits.
+    """AL-iLQR on the rotor model: rates follow the plan, thrusts sum up to its acceleration, rotors keep their limits.
 
     Successive tracking problems are alike, so by default the augmented Lagrangian goes on from call to call: one inner
     solve and one update of the multipliers each, from the controls and multipliers of the call before (three at first).
@@ -72,6 +72,11 @@ class Tracker:
     Args:
         airframe: as the planner knows it.
         inner: iLQR; with `inner.as_printed`, inequalities have the printed form, too (`lagrangian.penalty_weights`).
+        limits: of the "commands", the speeds that rotors can turn at; or as printed of the "thrusts", which leaves the
+            commands free: where a plan turns faster than rotors speed up, the vehicle then loses thrust and sinks.
+        effort: weight of the squared distance of rotor speeds from hovering, in units of b^2. By default 1000 rpm weigh
+            as much as 0.005 rad/s. With 0.01, of Table 5, a step of the rates is asked for within 20 ms; with 1e5 the
+            little that remains of a period's turn at its end is left out, and a vehicle may stay where it is.
         multipliers: "shifted" goes on from the call before, with a constant penalty; "reset" starts every call from
             rotor speeds that hover, multipliers of zero and the first penalty.
         penalty: mu, in units of the cost per N^2; the first one with "reset".
@@ -85,6 +90,8 @@ class Tracker:
 
     airframe: Airframe = Airframe()
     inner: ILQR = ILQR(tolerance=1e-4, max_iterations=10)
+    limits: Literal["commands", "thrusts"] = "commands"
+    effort: NonNegative = 1e3
     multipliers: Literal["shifted", "reset"] = "shifted"
     penalty: Positive = 1e3
     penalty_growth: Annotated[float, AtLeast(1)] = 2.0
@@ -102,10 +109,10 @@ class Tracker:
         if before is None:
             problem = self._problem(x0, x_ref, acceleration)
         else:
-            cost, (thrust_sum, bounds) = before.problem.cost, before.problem.constraints
+            cost, (thrust_sum, limits) = before.problem.cost, before.problem.constraints
             assert isinstance(cost, BoundQuadratic) and isinstance(thrust_sum, ThrustSum)
             sums = replace(thrust_sum, acceleration=acceleration)
-            problem = before.problem.started_at(x0, [sums, bounds], cost.toward(x_ref))
+            problem = before.problem.started_at(x0, [sums, limits], cost.toward(x_ref))
         reset = self.multipliers == "reset"
         if before is None or reset:
             U = x.new_full((problem.B, self.stages, 4), self.airframe.hover_speed)
@@ -131,10 +138,8 @@ class Tracker:
         frame = self.airframe
         b = frame.thrust_coefficient
         weight = [1.0] * 3 + [b * b] * 4
-        cost = QuadraticCost(weight, [1e-2 * b * b] * 4, weight, x_ref, [frame.hover_speed] * 4)
-        bounds = StateBounds(
-            [-math.inf] * 3 + [frame.thrust_min] * 4,
-            [math.inf] * 3 + [frame.thrust_max] * 4,
-        )
+        cost = QuadraticCost(weight, [self.effort * b * b] * 4, weight, x_ref, [frame.hover_speed] * 4)
+        lower, upper = [-math.inf] * 3 + [frame.thrust_min] * 4, [math.inf] * 3 + [frame.thrust_max] * 4
+        limits = RotorLimits(frame) if self.limits == "commands" else StateBounds(lower, upper)
         model = RotorTracking(self.dt, airframe=frame)
-        return Problem(model, cost, [ThrustSum(acceleration, frame.mass), bounds], x0, self.stages)
+        return Problem(model, cost, [ThrustSum(acceleration, frame.mass), limits], x0, self.stages)
