@@ -41,6 +41,8 @@ class Case:
 
 # About the rays of the published set-ups' lidar: 20,000 in a scan, over 59 degrees.
 DENSE = ("mission.lidar.rays=[480,40]", "mission.lidar.field_of_view=[360,60]")
+# Doors in ceilings lie straight above: rays in all directions.
+ALL_AROUND = ("mission.lidar.rays=[240,64]", "mission.lidar.field_of_view=[360,180]")
 START = ("mission.goal_radius=0.5", "scenario.start=[0,0,3]", "scenario.goal=[305,0,3]")
 
 
@@ -71,7 +73,7 @@ CASES = {
     "rooms with doors": Case(
         (
             "scenario=rooms", "mission.duration=90", "mission.explorer.speed=3",
-            "mission.explorer.region=[[-2,18],[-2,14],[-1.5,4.5]]",
+            "mission.explorer.region=[[-2,18],[-2,14],[-1.5,4.5]]", *ALL_AROUND,
         ), 4, 200,
     ),
     **{f"{count} moving, known": Case(_moving(count, "known"), 3, 1000, at_rest=False) for count in (50, 100, 200)},
