@@ -194,6 +194,7 @@ def test_the_cheapest_path_is_that_of_dijkstra(shy: float) -> None:
             steps = np.linalg.norm(np.diff(cells, axis=0), axis=1)
             price = 1.0 + shy * np.clip(1.0 - (d - 0.12) / 0.5, 0.0, None)
             assert (steps * price[1:]).sum() == pytest.approx(slow, rel=1e-5)
+            assert search.cost(path) == pytest.approx(slow, rel=1e-5)
     assert found >= 3
 
 

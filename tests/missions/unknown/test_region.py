@@ -14,7 +14,7 @@ from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, Quadrot
 from torchgco.missions import Planner
 from torchgco.missions.plant import hovering
 from torchgco.missions.sensing import Lidar
-from torchgco.missions.sensing.grid import FREE
+from torchgco.missions.sensing.grid import FREE, OCCUPIED
 from torchgco.missions.unknown.exploration import Exploration
 from torchgco.missions.unknown.explorer import FLYABLE, PLACES, Explorer, unflyable, within_bounds
 from torchgco.native.dispatch import followed
@@ -79,8 +79,12 @@ def test_a_plan_that_cannot_be_flown_is_not() -> None:
     plan, _ = exploration.plan(0, x, None)
     cost, X = torch.zeros(2).double(), plan.X.repeat(2, 1, 1)
     kept = plan.X[0]
-    assert exploration._best(X, cost, torch.tensor([False, True]), kept, 0) == 1
-    assert exploration._best(X, cost, torch.tensor([False, False]), kept, 0) is None
+    for excess, best in (([1.0, 0.0], 1), ([1.0, 1.0], None), ([0.0, 0.0], 0), ([0.1, 0.15], None)):
+        assert exploration._best(X, cost, torch.tensor(excess), kept, 0) == best
+    lost = kept.clone()
+    lost[-1, 3] = 2.0  # it doesn't come to rest: rather one that nearly can be flown, and the nearest to that
+    for excess, best in (([0.15, 0.1], 1), ([1.0, 1.0], None), ([0.0, 0.1], 0)):
+        assert exploration._best(X, cost, torch.tensor(excess), lost, 0) == best
     reference = exploration._reference(x)
     problem = exploration._problem(x, x.new_zeros(1, 3), reference, [reference[:, 1:, :3]])
     assert float(unflyable(problem, plan.X, plan.U)[0]) <= FLYABLE
@@ -89,6 +93,46 @@ def test_a_plan_that_cannot_be_flown_is_not() -> None:
     falling = plan.X.clone()
     falling[:, -1, 13] -= 2.0  # its velocity is still that of rest, its thrust isn't
     assert float(unflyable(problem, falling, plan.U)[0]) > 1.0
+
+
+def test_a_vehicle_within_a_margin_has_time_to_leave_it() -> None:
+    """What it is asked for grows with the time in which it can get away."""
+    exploration, x = exploring(1.0)
+    scout = exploration.scouts[0]
+    scout.seen.state[:] = FREE
+    wall = scout.seen.cell([0.4, 0.0, 1.0])
+    scout.seen.state[wall[0], wall[1], wall[2]] = OCCUPIED
+    scout.seen.remeasure(np.array([np.ravel_multi_index(tuple(wall), scout.seen.shape)], np.int32))
+    gap, keep = float(scout.seen.gaps(x[:, :3].numpy(), 1.0, exploration.kinds)[0]), exploration.keep(scout)
+    assert gap == pytest.approx(0.2) and keep == pytest.approx(0.3)
+    reference = exploration._reference(x)
+    problem = exploration._problem(x, x.new_zeros(1, 3), reference, [x[:, None, :3].repeat(1, 60, 1)])
+    X, U = reference.clone(), problem.cost.rest_controls(x.new_zeros(1, 60, 4))
+    X[..., :3], X[..., 3:6] = x[:, None, :3], 0.0
+    rows = problem.constraints[0].value(X, U)[0].amax(-1)  # of a vehicle that stays where it is
+    assert bool((rows[:10] <= 0).all()) and bool((rows.diff() >= -1e-12).all())
+    assert 0.0 < float(rows[15]) < 0.1 and float(rows[-1]) == pytest.approx(keep - gap, abs=1e-6)
+
+
+def test_a_path_is_followed_until_it_is_blocked_or_another_is_cheaper() -> None:
+    exploration, x = exploring(1.0)
+    scout, position = exploration.scouts[0], x[0, :3].numpy()
+    scout.seen.state[:] = FREE
+    scout.seen.remeasure(np.arange(scout.seen.state.size, dtype=np.int32))
+    along, goal = np.linspace(0.0, 12.0, 61)[:, None], np.array([1.0, 0.0, 0.0])
+    straight = position + along * goal
+    around = straight + np.array([0.0, 1.0, 0.0]) * np.sin(np.linspace(0.0, np.pi, 61))[:, None]
+    far = straight + np.array([0.0, 1.6, 1.0]) * np.sin(np.linspace(0.0, np.pi, 61))[:, None]
+    scout.path = straight
+    assert exploration._steady(scout, position, around) is not around
+    scout.path = far
+    assert exploration._steady(scout, position, straight) is straight
+    scout.path = around
+    wall = scout.seen.cell(around[30])
+    scout.seen.state[tuple(wall)] = OCCUPIED
+    scout.seen.remeasure(np.array([np.ravel_multi_index(tuple(wall), scout.seen.shape)], np.int32))
+    assert scout.search.cost(around) == np.inf > scout.search.cost(straight)
+    assert exploration._steady(scout, position, straight) is straight
 
 
 def test_a_former_plan_asks_for_no_more_than_the_bounds() -> None:

@@ -12,7 +12,7 @@ from torchgco.missions.sensing.library import call
 
 ENTRIES = 8  # of the heap, for each cell
 ENTRY_BYTES = 8
-DEAR = 20.0  # by which share a step into an avoided cell costs more
+COSTLY = 20.0  # by which share a step into an avoided cell costs more
 
 
 @dataclass
@@ -83,9 +83,25 @@ class Search:
         self.pending = None
         return seen.centers(self._path[: abs(count)][::-1]), count > 0
 
+    def cost(self, path: np.ndarray) -> float:
+        """What a path (K, 3), m, costs on the map as it is, in cells; infinity where it is blocked.
+
+        Unknown cells cost more wherever they are. With `nearby`, each of two paths may be the cheapest where the other
+        one leads: a vehicle that takes the cheapest would fly to and fro.
+        """
+        seen = self.seen
+        cells = tuple(np.floor((path - seen.corner) / seen.resolution).astype(int).clip(0, np.array(seen.shape) - 1).T)
+        distance = seen.from_occupied[cells]
+        if (distance[np.linalg.norm(path - path[0], axis=1) > self.leave] < self.radius).any():
+            return np.inf
+        close = (1.0 - (distance - self.radius) / self.band).clip(0.0)
+        unseen = self.unseen * np.where(close > 0, 4.0, 1.0) * (seen.state[cells] == 0)
+        each = 1.0 + self.price[cells] + self.shy * close + unseen
+        return float(np.linalg.norm(np.diff(path, axis=0), axis=1) @ each[1:]) / seen.resolution
+
     def avoid(self, point: np.ndarray, radius: float) -> None:
-        """Make the cells within `radius`, m, of a point (3,) dear: nothing more is seen of them from before."""
+        """Make the cells within `radius`, m, of a point (3,) costly: nothing more is seen of them from before."""
         seen = self.seen
         axes = [seen.corner[i] + (np.arange(seen.shape[i]) + 0.5) * seen.resolution - point[i] for i in range(3)]
         near = sum(np.meshgrid(*(axis**2 for axis in axes), indexing="ij")) <= radius**2
-        self.price[near] += DEAR
+        self.price[near] += COSTLY

@@ -38,7 +38,7 @@ from torchgco.missions.unknown.explorer import (
 )
 from torchgco.missions.unknown.former import braking, ends_at_rest, former_plans
 from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
-from torchgco.missions.unknown.reference import motion, taut
+from torchgco.missions.unknown.reference import between, motion, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
@@ -59,6 +59,8 @@ BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the on
 ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joined to it
 STILL = 0.3  # m within which a vehicle has stayed in its place
 AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
+AWAY = 1.0  # m/s^2 with which a vehicle gets out of a margin that it has entered
+NEARLY = 0.2  # at most, by which a plan exceeds what can be flown where the one that is kept isn't safe
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
 WAITS = 5  # knots before the first that is blocked
 MOST_MOVING = 4  # moving bodies that a knot keeps away from
@@ -88,6 +90,7 @@ class Scout:
     seconds: dict[str, float] = field(default_factory=dict)
     changed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     scanned: bool = False  # in this control period
+    arrives: bool = False  # whether the path leads to the goal
     age: int = 0  # control periods since the last search; 0: there was none
 
 
@@ -175,7 +178,7 @@ class Exploration:
         reference = self._evading(reference)
         rest = x[:, None, :3].expand(-1, self.explorer.stages, -1)
         former = rest if before is None else self._clear_part(shifted(before.X[:, 1:, :3]))
-        if before is not None and self.explorer.movers != "none":
+        if before is not None:
             former = torch.where(ends_at_rest(before.X).view(-1, 1, 1), former, braking(x, self.explorer, self.dt))
         seeds = [former, reference[:, 1:, :3]]
         problem = self._problem(x, bias, reference, seeds)
@@ -235,10 +238,20 @@ class Exploration:
             if found is None:
                 scout.path = _rest_of(scout.path, position)
                 return
-            scout.path, arrives = found
+            new, arrives = found
+            scout.path = self._steady(scout, position, new) if arrives and scout.arrives else new
+            scout.arrives = arrives
             if arrives or scout.level + 1 == len(LEVELS):
                 return
             scout.level, scout.since = scout.level + 1, 0
+
+    def _steady(self, scout: Scout, position: np.ndarray, new: np.ndarray) -> np.ndarray:
+        """Of two paths to the goal the one that is followed, unless it is lost, or a new one (K, 3) is cheaper."""
+        former = _rest_of(scout.path, position)
+        gaps = scout.seen.gaps(between(position, former[min(1, len(former) - 1)]), self.keep(scout), SEEN_OCCUPIED)
+        joins = bool((gaps >= gaps[0] - 0.5 * scout.seen.resolution).all())
+        costs = [scout.search.cost(_halved(path)) for path in (former, new)]
+        return former if joins and costs[0] <= costs[1] else new
 
     def _wait(self, scout: Scout, position: np.ndarray, points: np.ndarray, gaps: np.ndarray) -> None:
         """Count the periods in one place, and in the end look elsewhere.
@@ -292,13 +305,13 @@ class Exploration:
                     times = self.dt * np.arange(1, N + 1)
                     own = np.concatenate([own, scout.moving.planes(knots, times, MOST_MOVING, HOLD)], axis=1)
                 gap = float(scout.seen.gaps(x[b : b + 1, :3].numpy(), keep, self.kinds)[0])
-                near = np.full(N, keep)
-                near[:EARLY] = min(keep, max(gap - 0.01, CONTACT_FACTOR * scout.radius))
+                late = self.dt * (np.arange(1, N + 1) - EARLY).clip(0)
+                near = max(gap - 0.01, CONTACT_FACTOR * scout.radius) + 0.5 * AWAY * late**2
                 new = (
                     (planes, own),
                     (room, far),
                     (inside, knots),
-                    (allowed, near),
+                    (allowed, near.clip(max=keep)),
                     (regions, self._region(scout, x[b].numpy())),
                 )
                 for parts, part in new:
@@ -332,14 +345,13 @@ class Exploration:
         """
         B = len(self.scouts)
         U = kept.U
-        if self.explorer.movers != "none":  # a plan that was spoiled on the way is no start for others
-            hover = problem.cost.rest_controls(torch.zeros_like(U.repeat(count, 1, 1)))[:B]
-            U = torch.where(ends_at_rest(kept.X).view(-1, 1, 1), U, hover)
+        hover = problem.cost.rest_controls(torch.zeros_like(U.repeat(count, 1, 1)))[:B]
+        U = torch.where(ends_at_rest(kept.X).view(-1, 1, 1), U, hover)  # one that doesn't end at rest is no start
         found = self.local.solve(problem, U.repeat(count, 1, 1), seed=self.seed)
         # Gains of the cost alone: with penalties of constraints they are as stiff as walls, and rollouts may diverge.
         K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
-        flyable = unflyable(problem, found.X, found.U) <= FLYABLE
-        best = [self._best(found.X[b::B], found.cost[b::B], flyable[b::B], kept.X[b], b) for b in range(B)]
+        excess = unflyable(problem, found.X, found.U)
+        best = [self._best(found.X[b::B], found.cost[b::B], excess[b::B], kept.X[b], b) for b in range(B)]
         rows = torch.tensor([b + B * (choice or 0) for b, choice in enumerate(best)])
         new = torch.tensor([choice is not None for choice in best])
         wide = new.view(-1, 1, 1)
@@ -351,24 +363,23 @@ class Exploration:
             found.guided[rows], found.iterations[rows], one.x0, one.x0[:, :3], one.dynamics, 0,
         )  # fmt: skip
 
-    def _best(self, X: Tensor, cost: Tensor, flyable: Tensor, kept: Tensor, b: int) -> int | None:
+    def _best(self, X: Tensor, cost: Tensor, excess: Tensor, kept: Tensor, b: int) -> int | None:
         """Which of some plans (C, N+1, 14) of mission b is flown; None: the kept one (N+1, 14).
 
-        flyable (C,): whether it could be flown as it is. Where no plan is safe, one that nearly is may do.
+        excess (C,): by how much each asks for more than the vehicle can do, which would fall out of such a plan.
         """
-        # The vehicle would fall out of a plan that can't be flown.
-        order = [int(c) for c in cost.argsort() if bool(torch.isfinite(cost[c]) & flyable[c])]
+        order = [int(c) for c in cost.argsort() if bool(torch.isfinite(cost[c]) & (excess[c] <= NEARLY))]
         spare = {c: self.spare(X[c].numpy(), b) for c in order}
         own = self.spare(kept.numpy(), b, 3.0 * AT_REST)
         asked = min(max(own, 0.0), DRIFT)
-        safe = next((c for c in order if spare[c] >= asked), None)
-        if safe is not None:
+        safe = next((c for c in order if excess[c] <= FLYABLE and spare[c] >= asked), None)
+        if safe is not None or own >= 0 or not order:
             return safe
         # The kept one was safe when it was made: a cell that an obstacle fills in part has turned out to be occupied.
-        most = max(order, key=lambda c: spare[c], default=None)
-        if most is not None and own < 0 and spare[most] > own + BETTER:
+        most = min(order, key=lambda c: (spare[c] < 0, float(excess[c]) if spare[c] >= 0 else -spare[c]))
+        if spare[most] >= 0 or spare[most] > own + BETTER:
             return most
-        if order and own == -np.inf:  # none stops as it should: better a plan that nearly does than one that doesn't
+        if own == -np.inf:  # none stops as it should: better a plan that nearly does than one that doesn't
             ends = X[:, -1, 3:6].norm(dim=-1)
             slowest = min(order, key=lambda c: float(ends[c]))
             return slowest if float(ends[slowest]) + SLOWER < float(kept[-1, 3:6].norm()) else None
