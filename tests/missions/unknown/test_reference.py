@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from torchgco.missions.unknown.reference import Pace, along, between, lengths, motion, taut
+from torchgco.missions.unknown.reference import Pace, along, between, lengths, motion, swings, taut
 
 PACE, DT = Pace(4.0, 5.0, 3.0), 0.05
 STILL = np.zeros(3)
@@ -46,6 +46,20 @@ def test_corners_are_taken_slowly_and_rounded() -> None:
     assert lengths(ends[1])[-1] < lengths(ends[0])[-1] - 0.3
     turns = np.diff(ends[1], n=2, axis=0) / DT**2
     assert np.linalg.norm(turns, axis=1).max() < 20.0  # m/s^2: no jump of the velocity
+
+
+def test_turns_are_slower_where_there_is_no_room_and_where_they_go_up() -> None:
+    """A turn by 90 degrees at v with a m/s^2 misses its corner by about v^2 / (4 a)."""
+    aside, up = (np.array([[0.0, 0, 0], [3, 0, 0], end]) for end in ([3.0, 3, 0], [3.0, 0, 3]))
+    closest = []
+    for corners, beyond in ((aside, 0.0), (aside, 0.13), (aside, 1.0), (up, 1.0)):
+        swing = swings(corners, lambda p, beyond=beyond: p[:, 0] <= 3.0 + beyond)
+        assert swing == pytest.approx([{0.0: 0.02, 0.13: 0.125, 1.0: 0.25}[beyond]])
+        p, v = motion(corners, STILL, PACE, 80, DT, swing)
+        closest.append(float(np.linalg.norm(v, axis=1)[np.linalg.norm(p - corners[1], axis=1).argmin()]))
+    assert closest[0] < closest[1] < closest[2] and closest[3] < closest[2]
+    straight = np.array([[0.0, 0, 0], [3, 0, 0]])
+    assert swings(straight, lambda p: np.zeros(0, bool)).shape == (0,)
 
 
 def test_shortcuts_avoid_what_is_not_free() -> None:

@@ -38,7 +38,7 @@ from torchgco.missions.unknown.explorer import (
 )
 from torchgco.missions.unknown.former import braking, ends_at_rest, former_plans
 from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
-from torchgco.missions.unknown.reference import between, motion, taut
+from torchgco.missions.unknown.reference import between, motion, swings, taut
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
@@ -272,8 +272,10 @@ class Exploration:
         N, found = self.explorer.stages, x.new_zeros(x.shape[0], self.explorer.stages + 1, 14)
         found[..., 6], found[..., 13] = 1.0, HOVER
         for b, scout in enumerate(self.scouts):
-            state = x[b].numpy()
-            p, v = motion(scout.corners, state[3:6], self.explorer.pace, N, self.dt)
+            velocity, keep = x[b, 3:6].numpy(), self.keep(scout)
+            is_free = lambda p, seen=scout.seen, keep=keep: seen.gaps(p, keep + 0.05, self.kinds) >= keep
+            swing = swings(scout.corners, is_free)
+            p, v = motion(scout.corners, velocity, self.explorer.pace, N, self.dt, swing)
             found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
         return found
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SWERVE = 1.0  # m: the radius of the turn that cuts a corner
+SWERVE = 0.25  # m at most, by which a turn misses its corner
+TIGHT = 0.02  # m by which it may where nothing is free beyond the corner: of what plans keep beyond contact
 STEEP = 2.5  # m/s^2 at most, straight up and down: thrust changes more slowly than a vehicle tilts
 SMOOTH = 5  # steps before and after, over which positions are averaged: that limits the jerk
 SETTLED = 0.3  # s before the horizon's end in which the reference rests
@@ -68,13 +69,19 @@ def along(corners: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def motion(
-    corners: np.ndarray, velocity: np.ndarray, pace: Pace, count: int, dt: float
+    corners: np.ndarray,
+    velocity: np.ndarray,
+    pace: Pace,
+    count: int,
+    dt: float,
+    swing: np.ndarray | float = SWERVE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities (count + 1, 3) along a polyline (K, 3) that begins at the vehicle, every dt, s.
 
     It starts with the vehicle's velocity (3,), and rests at the polyline's end, or shortly before the last of them.
+    Turns miss the inner corners by `swing` (K-2,), m.
     """
-    at, last, slow = lengths(corners), count * dt - SETTLED, _corner_speeds(corners, pace)
+    at, last, slow = lengths(corners), count * dt - SETTLED, _corner_speeds(corners, pace, swing)
     steps = np.diff(corners, axis=0) / np.maximum(np.diff(at), 1e-9)[:, None]
     places, s = np.zeros(count + 1), 0.0
     v = max(0.0, float(steps[0] @ velocity)) if len(steps) else 0.0
@@ -112,9 +119,33 @@ def _smoothed(points: np.ndarray, velocity: np.ndarray, dt: float) -> tuple[np.n
     return mean, speeds
 
 
-def _corner_speeds(corners: np.ndarray, pace: Pace) -> np.ndarray:
-    """The speeds at the inner corners of a polyline, (K-2,), m/s: slower where it turns more."""
+def swings(corners: np.ndarray, is_free) -> np.ndarray:
+    """How far, m, turns may miss the inner corners of a polyline (K, 3), (K-2,): as far as their outside is free.
+
+    Args:
+        is_free: which of some points (M, 3) are free, (M,) bool.
+    """
+    turn = _turns(corners)
+    outward = -turn / np.maximum(np.linalg.norm(turn, axis=1, keepdims=True), 1e-9)
+    found, free = np.full(len(turn), TIGHT), np.ones(len(turn), bool)
+    for far in SWERVE * np.array([0.25, 0.5, 0.75, 1.0]) if len(turn) else ():
+        free &= is_free(corners[1:-1] + far * outward)
+        found[free] = far
+    return found
+
+
+def _turns(corners: np.ndarray) -> np.ndarray:
+    """The changes of direction at the inner corners of a polyline (K, 3), (K-2, 3)."""
     steps = np.diff(corners, axis=0)
-    steps = steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
-    turn = 1.0 - (steps[1:] * steps[:-1]).sum(axis=1)  # 1 - cos
-    return np.minimum(pace.speed, np.sqrt(pace.acceleration * SWERVE / np.maximum(turn, 1e-6)))
+    return np.diff(steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9), axis=0)
+
+
+def _corner_speeds(corners: np.ndarray, pace: Pace, swing: np.ndarray | float) -> np.ndarray:
+    """The speeds at the inner corners of a polyline, (K-2,), m/s: slower where it turns more, or up or down.
+
+    A turn of radius r misses its corner by about r a^2 / 8, with a the change of direction.
+    """
+    turn = _turns(corners)
+    size = np.maximum(np.linalg.norm(turn, axis=1), 1e-6)
+    most = np.array([_acceleration(one, pace) for one in turn / size[:, None]])
+    return np.minimum(pace.speed, np.sqrt(8.0 * swing * most) / size)
