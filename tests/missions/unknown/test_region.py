@@ -156,17 +156,36 @@ def test_a_former_plan_asks_for_no_more_than_the_bounds() -> None:
 def test_who_stays_in_one_place_looks_elsewhere() -> None:
     exploration, x = exploring(1.0)
     (scout,), points = exploration.scouts, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
-    for gaps, dear in ((np.array([0.9, 0.9, 0.1]), points[2]), (np.array([0.9, 0.9, 0.9]), points[2])):
+    for gaps, costly in ((np.array([0.9, 0.9, 0.1]), points[2]), (np.array([0.9, 0.9, 0.9]), points[2])):
         scout.search.price[:] = 0.0
         for period in range(20):  # of patience
             assert (scout.search.price == 0).all(), period
             exploration._wait(scout, x[0, :3].numpy(), points, gaps)
-        assert scout.search.price[tuple(scout.seen.cell(dear))] > 0
-        assert scout.search.price[tuple(scout.seen.cell(dear + np.array([4.0, 0.0, 0.0])))] == 0
+        assert scout.search.price[tuple(scout.seen.cell(costly))] > 0
+        assert scout.search.price[tuple(scout.seen.cell(costly + np.array([4.0, 0.0, 0.0])))] == 0
     scout.search.price[:] = 0.0
     for period in range(60):  # it moves
         exploration._wait(scout, x[0, :3].numpy() + np.array([0.03 * period, 0.0, 0.0]), points, gaps)
     assert (scout.search.price == 0).all()
+
+
+def test_a_reference_that_no_plan_follows_becomes_slow_until_the_place_is_left() -> None:
+    exploration, x = exploring(1.0)
+    (scout,), position = exploration.scouts, x[0, :3].numpy()
+    exploration.seek(x)
+    fast = exploration._reference(x)
+    for period in range(4):  # in one place, after one more in `seek`
+        assert scout.slow == 0, period
+        exploration._wait(scout, position, position[None], np.ones(1))
+        exploration._slow_down(scout, False)
+    assert scout.slow == 40 and scout.waited == 0
+    slow = exploration._reference(x)
+    speeds = [float(reference[..., 3:6].norm(dim=-1).max()) for reference in (fast, slow)]
+    assert speeds[1] == pytest.approx(0.45 * speeds[0], rel=0.2)
+    exploration._slow_down(scout, True)
+    assert scout.slow == 39
+    exploration._wait(scout, position + 1.0, position[None], np.ones(1))
+    assert scout.slow == 0
 
 
 def test_plans_of_a_vehicle_that_has_left_the_map_are_not_confined_to_it() -> None:

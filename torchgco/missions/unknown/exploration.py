@@ -52,7 +52,7 @@ SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
 LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
 MOST_SEARCHED = 24_000  # cells that searches of a control period look at: 15 ms
 SEARCHED = 2  # control periods after which a new search is due
-HELD = 2.0  # s before a search with less margin ends
+HELD = 2.0  # s before a search with less margin, or a slow reference, ends
 SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
 DRIFT = 0.01  # m by which a plan may come nearer while it is flown, as a vehicle isn't exactly where it should be
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
@@ -62,6 +62,8 @@ AHEAD = 4  # points of a path, of which the last is looked at where none is bloc
 AWAY = 1.0  # m/s^2 with which a vehicle gets out of a margin that it has entered
 NEARLY = 0.2  # at most, by which a plan exceeds what can be flown where the one that is kept isn't safe
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
+SLOW = 0.45  # of a slow reference's speed: its accelerations, 1 m/s^2, lead away from a place within `patience`
+PAUSE = 0.25  # s in one place after which a reference that no plan follows becomes slow, for `HELD`
 WAITS = 5  # knots before the first that is blocked
 MOST_MOVING = 4  # moving bodies that a knot keeps away from
 HOLD = 1.0  # s after a plan's end in which its place stays clear: about what it takes to get away from there
@@ -87,6 +89,7 @@ class Scout:
     place: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))  # m
     level: int = 0  # of LEVELS
     since: int = 0  # control periods at this level
+    slow: int = 0  # control periods for which the reference stays slow, in this place
     seconds: dict[str, float] = field(default_factory=dict)
     changed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     scanned: bool = False  # in this control period
@@ -259,7 +262,7 @@ class Exploration:
         The way on may be cells that stay unknown, as no ray gets to them, or one that no plan can take.
         """
         if np.linalg.norm(position - scout.place) > STILL:
-            scout.place, scout.waited = position.copy(), 0
+            scout.place, scout.waited, scout.slow = position.copy(), 0, 0
         scout.waited += scout.search.pending is None
         if scout.waited * self.dt >= self.explorer.patience:
             blocked = np.flatnonzero(gaps < self.keep(scout))
@@ -273,9 +276,10 @@ class Exploration:
         found[..., 6], found[..., 13] = 1.0, HOVER
         for b, scout in enumerate(self.scouts):
             velocity, keep = x[b, 3:6].numpy(), self.keep(scout)
-            is_free = lambda p, seen=scout.seen, keep=keep: seen.gaps(p, keep + 0.05, self.kinds) >= keep
+            is_free = lambda p, seen=scout.seen, keep=keep: seen.gaps(p, keep + 0.05, SEEN_OCCUPIED) >= keep
+            pace = self.explorer.pace.slower(SLOW if scout.slow else 1.0)
             swing = swings(scout.corners, is_free)
-            p, v = motion(scout.corners, velocity, self.explorer.pace, N, self.dt, swing)
+            p, v = motion(scout.corners, velocity, pace, N, self.dt, swing)
             found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
         return found
 
@@ -354,6 +358,10 @@ class Exploration:
         K = optimality(Lagrangian(problem, Multipliers.zero(problem, 0.0), None, True), found.X, found.U).K
         excess = unflyable(problem, found.X, found.U)
         best = [self._best(found.X[b::B], found.cost[b::B], excess[b::B], kept.X[b], b) for b in range(B)]
+        for b, scout in enumerate(self.scouts):
+            last = B * (count - 1) + b  # the plan that follows the reference
+            came_through = float(excess[last]) <= FLYABLE and self.spare(found.X[last].numpy(), b) >= 0
+            self._slow_down(scout, came_through)
         rows = torch.tensor([b + B * (choice or 0) for b, choice in enumerate(best)])
         new = torch.tensor([choice is not None for choice in best])
         wide = new.view(-1, 1, 1)
@@ -364,6 +372,15 @@ class Exploration:
             torch.where(new, found.cost[rows], kept.cost), torch.where(new, found.violation[rows], 0.0), ~new,
             found.guided[rows], found.iterations[rows], one.x0, one.x0[:, :3], one.dynamics, 0,
         )  # fmt: skip
+
+    def _slow_down(self, scout: Scout, came_through: bool) -> None:
+        """Make the reference of a vehicle in one place slow, where no plan comes through that follows it.
+
+        Plans within the former one's corridor do, but may lead nowhere: each of them may begin by hovering.
+        """
+        scout.slow = max(0, scout.slow - 1)
+        if not came_through and scout.slow == 0 and scout.waited * self.dt >= PAUSE:
+            scout.slow, scout.waited = round(HELD / self.dt), 0
 
     def _best(self, X: Tensor, cost: Tensor, excess: Tensor, kept: Tensor, b: int) -> int | None:
         """Which of some plans (C, N+1, 14) of mission b is flown; None: the kept one (N+1, 14).

@@ -21,6 +21,10 @@ class Pace:
     acceleration: float
     deceleration: float
 
+    def slower(self, share: float) -> Pace:
+        """The limits of the same motion with times longer by 1 / share."""
+        return Pace(share * self.speed, share**2 * self.acceleration, share**2 * self.deceleration)
+
 
 def taut(path: np.ndarray, is_free) -> np.ndarray:
     """The corners of a path (K, 3) with shortcuts: from each corner on to the farthest point in a free straight line.
