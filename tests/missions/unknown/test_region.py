@@ -180,8 +180,8 @@ def test_a_reference_that_no_plan_follows_becomes_slow_until_the_place_is_left()
         exploration._slow_down(scout, False)
     assert scout.slow == 40 and scout.waited == 0
     slow = exploration._reference(x)
-    speeds = [float(reference[..., 3:6].norm(dim=-1).max()) for reference in (fast, slow)]
-    assert speeds[1] == pytest.approx(0.45 * speeds[0], rel=0.2)
+    ways = [(reference[0, 20, :3] - x[0, :3]).norm() for reference in (fast, slow)]  # within the patience of 1 s
+    assert 0.3 < float(ways[1]) < 0.5 * float(ways[0])
     exploration._slow_down(scout, True)
     assert scout.slow == 39
     exploration._wait(scout, position + 1.0, position[None], np.ones(1))
