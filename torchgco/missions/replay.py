@@ -17,8 +17,8 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.missions.disturbance import measured
 from torchgco.missions.mission import Mission
-from torchgco.missions.unknown.exploration import ARRIVES
 from torchgco.missions.unknown.safety import SeenLog
+from torchgco.missions.unknown.scout import ARRIVES
 from torchgco.problem.problem import Problem
 
 

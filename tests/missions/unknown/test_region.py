@@ -103,7 +103,7 @@ def test_a_vehicle_within_a_margin_has_time_to_leave_it() -> None:
     wall = scout.seen.cell([0.4, 0.0, 1.0])
     scout.seen.state[wall[0], wall[1], wall[2]] = OCCUPIED
     scout.seen.remeasure(np.array([np.ravel_multi_index(tuple(wall), scout.seen.shape)], np.int32))
-    gap, keep = float(scout.seen.gaps(x[:, :3].numpy(), 1.0, exploration.kinds)[0]), exploration.keep(scout)
+    gap, keep = float(scout.seen.gaps(x[:, :3].numpy(), 1.0, exploration.kinds)[0]), scout.keep
     assert gap == pytest.approx(0.2) and keep == pytest.approx(0.3)
     reference = exploration._reference(x)
     problem = exploration._problem(x, x.new_zeros(1, 3), reference, [x[:, None, :3].repeat(1, 60, 1)])
@@ -124,15 +124,15 @@ def test_a_path_is_followed_until_it_is_blocked_or_another_is_cheaper() -> None:
     around = straight + np.array([0.0, 1.0, 0.0]) * np.sin(np.linspace(0.0, np.pi, 61))[:, None]
     far = straight + np.array([0.0, 1.6, 1.0]) * np.sin(np.linspace(0.0, np.pi, 61))[:, None]
     scout.path = straight
-    assert exploration._steady(scout, position, around) is not around
+    assert scout._steady(position, around) is not around
     scout.path = far
-    assert exploration._steady(scout, position, straight) is straight
+    assert scout._steady(position, straight) is straight
     scout.path = around
     wall = scout.seen.cell(around[30])
     scout.seen.state[tuple(wall)] = OCCUPIED
     scout.seen.remeasure(np.array([np.ravel_multi_index(tuple(wall), scout.seen.shape)], np.int32))
     assert scout.search.cost(around) == np.inf > scout.search.cost(straight)
-    assert exploration._steady(scout, position, straight) is straight
+    assert scout._steady(position, straight) is straight
 
 
 def test_a_former_plan_asks_for_no_more_than_the_bounds() -> None:
@@ -160,12 +160,12 @@ def test_who_stays_in_one_place_looks_elsewhere() -> None:
         scout.search.price[:] = 0.0
         for period in range(20):  # of patience
             assert (scout.search.price == 0).all(), period
-            exploration._wait(scout, x[0, :3].numpy(), points, gaps)
+            scout._wait(x[0, :3].numpy(), points, gaps)
         assert scout.search.price[tuple(scout.seen.cell(costly))] > 0
         assert scout.search.price[tuple(scout.seen.cell(costly + np.array([4.0, 0.0, 0.0])))] == 0
     scout.search.price[:] = 0.0
     for period in range(60):  # it moves
-        exploration._wait(scout, x[0, :3].numpy() + np.array([0.03 * period, 0.0, 0.0]), points, gaps)
+        scout._wait(x[0, :3].numpy() + np.array([0.03 * period, 0.0, 0.0]), points, gaps)
     assert (scout.search.price == 0).all()
 
 
@@ -176,15 +176,15 @@ def test_a_reference_that_no_plan_follows_becomes_slow_until_the_place_is_left()
     fast = exploration._reference(x)
     for period in range(4):  # in one place, after one more in `seek`
         assert scout.slow == 0, period
-        exploration._wait(scout, position, position[None], np.ones(1))
-        exploration._slow_down(scout, False)
+        scout._wait(position, position[None], np.ones(1))
+        scout.slow_down(False)
     assert scout.slow == 40 and scout.waited == 0
     slow = exploration._reference(x)
     ways = [(reference[0, 20, :3] - x[0, :3]).norm() for reference in (fast, slow)]  # within the patience of 1 s
     assert 0.3 < float(ways[1]) < 0.5 * float(ways[0])
-    exploration._slow_down(scout, True)
+    scout.slow_down(True)
     assert scout.slow == 39
-    exploration._wait(scout, position + 1.0, position[None], np.ones(1))
+    scout._wait(position + 1.0, position[None], np.ones(1))
     assert scout.slow == 0
 
 

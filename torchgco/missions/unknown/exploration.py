@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from torchgco.base.errors import InputError
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
 from torchgco.missions.log import PARTS
 from torchgco.missions.planner import Plan, Planner
-from torchgco.missions.sensing.grid import NOT_FREE, SEEN_OCCUPIED, SeenMap
+from torchgco.missions.sensing.grid import NOT_FREE, SEEN_OCCUPIED
 from torchgco.missions.sensing.search import Search
 from torchgco.missions.sensing.sensors import Sensor
 from torchgco.missions.sensing.world import World
@@ -37,9 +37,9 @@ from torchgco.missions.unknown.explorer import (
     unflyable,
 )
 from torchgco.missions.unknown.former import braking, ends_at_rest, former_plans
-from torchgco.missions.unknown.movers import Known, Movers, Moving, Tracks, Unaware, nothing
-from torchgco.missions.unknown.reference import between, motion, swings, taut
+from torchgco.missions.unknown.movers import Known, Movers, Tracks, Unaware
 from torchgco.missions.unknown.safety import AT_REST, SeenLog
+from torchgco.missions.unknown.scout import DRIFT, SEARCH, SPARE, Scout
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
@@ -47,54 +47,15 @@ from torchgco.solvers.ending import optimality
 
 OUTER = 12  # outer iterations of a plan at most
 LOCAL: dict[str, Any] = {"initial_penalty": 1.0, "penalty_growth": 3.0, "violation_tolerance": 5e-3}
-SEARCH: dict[str, Any] = {"unseen": 1.0, "greed": 1.1, "stride": 2}
-# Where no way is found, a search with less margin, then one over all cells: the share of the margin, and the stride.
-LEVELS = (1.0, 2), (0.0, 2), (0.0, 1)
-MOST_SEARCHED = 24_000  # cells that searches of a control period look at: 15 ms
-SEARCHED = 2  # control periods after which a new search is due
-HELD = 2.0  # s before a search with less margin, or a slow reference, ends
-SPARE = 0.03  # m that a plan keeps beyond contact at least: it is tested at points, and flown with small errors
-DRIFT = 0.01  # m by which a plan may come nearer while it is flown, as a vehicle isn't exactly where it should be
 BETTER = 0.02  # m by which an unsafe plan has to keep more distance than the one that is kept
-ARRIVES = 4.5  # cells between the end of a path and the goal, which is then joined to it
-STILL = 0.3  # m within which a vehicle has stayed in its place
-AHEAD = 4  # points of a path, of which the last is looked at where none is blocked
 AWAY = 1.0  # m/s^2 with which a vehicle gets out of a margin that it has entered
 NEARLY = 0.2  # at most, by which a plan exceeds what can be flown where the one that is kept isn't safe
 SLOWER = 0.5  # m/s by which an unsafe plan has to end slower than the one that is kept
-SLOW = 0.45  # of a slow reference's speed: its accelerations, 1 m/s^2, lead away from a place within `patience`
-PAUSE = 0.25  # s in one place after which a reference that no plan follows becomes slow, for `HELD`
 WAITS = 5  # knots before the first that is blocked
 MOST_MOVING = 4  # moving bodies that a knot keeps away from
 HOLD = 1.0  # s after a plan's end in which its place stays clear: about what it takes to get away from there
 FINE = 4  # points tested per step of a plan
 OVER = 0.2  # m/s by which a plan may exceed the speed
-
-
-@dataclass
-class Scout:
-    """What one vehicle knows, and seeks."""
-
-    world: World
-    seen: SeenMap
-    search: Search
-    log: SeenLog
-    goal: np.ndarray
-    radius: float  # m, of the vehicle
-    movers: Movers
-    moving: Moving = field(default_factory=nothing)  # at this control step
-    path: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # cells' centres, (K, 3), m
-    corners: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))  # of its part that is known to be free
-    waited: int = 0  # control periods near `place`
-    place: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))  # m
-    level: int = 0  # of LEVELS
-    since: int = 0  # control periods at this level
-    slow: int = 0  # control periods for which the reference stays slow, in this place
-    seconds: dict[str, float] = field(default_factory=dict)
-    changed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
-    scanned: bool = False  # in this control period
-    arrives: bool = False  # whether the path leads to the goal
-    age: int = 0  # control periods since the last search; 0: there was none
 
 
 class Exploration:
@@ -132,7 +93,9 @@ class Exploration:
         search = Search(seen, radius + self.explorer.margin, near=4 * size, leave=4 * size, **SEARCH)
         log = SeenLog(seen.corner, seen.shape, seen.resolution)
         world = World.of(self.whole, b)
-        scout = Scout(world, seen, search, log, goal, radius, self._movers(world))
+        scout = Scout(
+            self.explorer, world, seen, search, log, goal, radius, self._movers(world), self.dt, self.every, self.kinds
+        )
         scout.changed = seen.clear(start, self.explorer.known)
         return scout
 
@@ -198,95 +161,21 @@ class Exploration:
     def seek(self, x: Tensor) -> None:
         """Find paths of vehicles measured at x (B, 17) to their goals, and the parts that are known to be free."""
         for b, scout in enumerate(self.scouts):
-            self._seek(scout, x[b].numpy())
-
-    def _seek(self, scout: Scout, x: np.ndarray) -> None:
-        began, position = time.perf_counter(), x[:3]
-        self._search(scout, position)
-        keep = self.keep(scout)
-        points = _halved(np.concatenate([position[None], scout.path[1:]]))
-        if np.linalg.norm(scout.path[-1] - scout.goal) <= ARRIVES * scout.seen.resolution:
-            points = np.concatenate([points, scout.goal[None]])
-        gaps = scout.seen.gaps(points, keep + 0.05, self.kinds)
-        blocked = np.flatnonzero((gaps < keep) & (np.arange(len(points)) > 3))
-        free = points[: blocked[0] if len(blocked) else len(points)]
-        scout.corners = taut(free, lambda p: bool((scout.seen.gaps(p, keep + 0.05, self.kinds)[1:] >= keep).all()))
-        self._wait(scout, position, points, gaps)
-        scout.seconds["search_seconds"] += time.perf_counter() - began
-
-    def keep(self, scout: Scout) -> float:
-        """The distance, m, that plans keep from what isn't known to be free."""
-        least, share = CONTACT_FACTOR * scout.radius + SPARE + 2.0 * DRIFT, LEVELS[scout.level][0]
-        return share * max(least, scout.radius + self.explorer.margin) + (1.0 - share) * least
-
-    def _search(self, scout: Scout, position: np.ndarray) -> None:
-        """The path to the goal; where none is found, with less margin from now on, for a while.
-
-        Scan and search take turns where there are periods without a scan: both in one would be the longest.
-        """
-        scout.since += 1
-        if scout.scanned and 0 < scout.age < SEARCHED and self.every > 1:
-            scout.age += 1
-            scout.path = _rest_of(scout.path, position)
-            return
-        scout.age = 1
-        if scout.level > 0 and scout.since * self.dt >= HELD and scout.search.pending is None:
-            scout.level, scout.since = 0, 0
-        left = MOST_SEARCHED
-        while True:
-            scout.search.radius, scout.search.stride = self.keep(scout), LEVELS[scout.level][1]
-            scout.search.limit = max(left, 1)
-            found = scout.search.path(position, scout.goal)
-            left -= scout.search.expanded
-            if found is None:
-                scout.path = _rest_of(scout.path, position)
-                return
-            new, arrives = found
-            scout.path = self._steady(scout, position, new) if arrives and scout.arrives else new
-            scout.arrives = arrives
-            if arrives or scout.level + 1 == len(LEVELS):
-                return
-            scout.level, scout.since = scout.level + 1, 0
-
-    def _steady(self, scout: Scout, position: np.ndarray, new: np.ndarray) -> np.ndarray:
-        """Of two paths to the goal the one that is followed, unless it is lost, or a new one (K, 3) is cheaper."""
-        former = _rest_of(scout.path, position)
-        gaps = scout.seen.gaps(between(position, former[min(1, len(former) - 1)]), self.keep(scout), SEEN_OCCUPIED)
-        joins = bool((gaps >= gaps[0] - 0.5 * scout.seen.resolution).all())
-        costs = [scout.search.cost(_halved(path)) for path in (former, new)]
-        return former if joins and costs[0] <= costs[1] else new
-
-    def _wait(self, scout: Scout, position: np.ndarray, points: np.ndarray, gaps: np.ndarray) -> None:
-        """Count the periods in one place, and in the end look elsewhere.
-
-        The way on may be cells that stay unknown, as no ray gets to them, or one that no plan can take.
-        """
-        if np.linalg.norm(position - scout.place) > STILL:
-            scout.place, scout.waited, scout.slow = position.copy(), 0, 0
-        scout.waited += scout.search.pending is None
-        if scout.waited * self.dt >= self.explorer.patience:
-            blocked = np.flatnonzero(gaps < self.keep(scout))
-            first = blocked[blocked > 0][:1]
-            scout.search.avoid(points[first[0] if len(first) else min(AHEAD, len(points) - 1)], 1.0)
-            scout.waited = 0
+            scout.seek(x[b, :3].numpy())
 
     def _reference(self, x: Tensor) -> Tensor:
         """States (B, N+1, 14) that the plans are to follow."""
         N, found = self.explorer.stages, x.new_zeros(x.shape[0], self.explorer.stages + 1, 14)
         found[..., 6], found[..., 13] = 1.0, HOVER
         for b, scout in enumerate(self.scouts):
-            velocity, keep = x[b, 3:6].numpy(), self.keep(scout)
-            is_free = lambda p, seen=scout.seen, keep=keep: seen.gaps(p, keep + 0.05, SEEN_OCCUPIED) >= keep
-            pace = self.explorer.pace.slower(SLOW if scout.slow else 1.0)
-            swing = swings(scout.corners, is_free)
-            p, v = motion(scout.corners, velocity, pace, N, self.dt, swing)
+            p, v = scout.motion(x[b, 3:6].numpy(), N)
             found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)
         return found
 
     def _evading(self, reference: Tensor) -> Tensor:
         """The states (B, N+1, 14) with ways around moving bodies."""
         for b, scout in enumerate(self.scouts):
-            p, keep = reference[b, :, :3].numpy(), self.keep(scout)
+            p, keep = reference[b, :, :3].numpy(), scout.keep
             horizon = self.explorer.stages * self.dt
             around = horizon * self.explorer.speed
             scout.moving = scout.moving.within(p[0] - around, p[0] + around, horizon + HOLD).clear_of(p[0], keep)
@@ -304,7 +193,7 @@ class Exploration:
         planes, room, allowed, inside, regions = [], [], [], [], []
         for seed in seeds:
             for b, scout in enumerate(self.scouts):
-                began, keep = time.perf_counter(), self.keep(scout)
+                began, keep = time.perf_counter(), scout.keep
                 knots = np.clip(seed[b].numpy(), *scout.seen.box(keep))
                 own, far = scout.seen.corridor(knots, CORRIDOR, PLANES, self.kinds)
                 if self.explorer.movers != "none":
@@ -361,7 +250,7 @@ class Exploration:
         for b, scout in enumerate(self.scouts):
             last = B * (count - 1) + b  # the plan that follows the reference
             came_through = float(excess[last]) <= FLYABLE and self.spare(found.X[last].numpy(), b) >= 0
-            self._slow_down(scout, came_through)
+            scout.slow_down(came_through)
         rows = torch.tensor([b + B * (choice or 0) for b, choice in enumerate(best)])
         new = torch.tensor([choice is not None for choice in best])
         wide = new.view(-1, 1, 1)
@@ -372,15 +261,6 @@ class Exploration:
             torch.where(new, found.cost[rows], kept.cost), torch.where(new, found.violation[rows], 0.0), ~new,
             found.guided[rows], found.iterations[rows], one.x0, one.x0[:, :3], one.dynamics, 0,
         )  # fmt: skip
-
-    def _slow_down(self, scout: Scout, came_through: bool) -> None:
-        """Make the reference of a vehicle in one place slow, where no plan comes through that follows it.
-
-        Plans within the former one's corridor do, but may lead nowhere: each of them may begin by hovering.
-        """
-        scout.slow = max(0, scout.slow - 1)
-        if not came_through and scout.slow == 0 and scout.waited * self.dt >= PAUSE:
-            scout.slow, scout.waited = round(HELD / self.dt), 0
 
     def _best(self, X: Tensor, cost: Tensor, excess: Tensor, kept: Tensor, b: int) -> int | None:
         """Which of some plans (C, N+1, 14) of mission b is flown; None: the kept one (N+1, 14).
@@ -434,16 +314,3 @@ class Exploration:
 
 def _repeated(problem: Problem, count: int) -> Problem:
     return problem.take(torch.arange(problem.B).repeat(count))
-
-
-def _halved(points: np.ndarray) -> np.ndarray:
-    """The points (K, 3) of a path, and those midway between them."""
-    found = np.repeat(points, 2, axis=0)[:-1]
-    found[1::2] = 0.5 * (points[:-1] + points[1:])
-    return found
-
-
-def _rest_of(path: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """A path (K, 3) from its point nearest to a position on, two points at least where it has them."""
-    nearest = np.linalg.norm(path - position, axis=1).argmin()
-    return path[min(nearest, len(path) - 2) :]
