@@ -1,7 +1,8 @@
 """python -m benchmarks.causes.unknown "WORLD:NUMBER" ...: missions of benchmarks.families.unknown, as they ended.
 
-Each is flown again and drawn from above at its last control step: what the vehicle knows at its height, the way that it
-flew, and the plan that it holds. With --write the pictures go into results/unknown.png, one below the other.
+Each is flown again and drawn from above at its last control step, or with "WORLD:NUMBER:SECONDS" at a time: what the
+vehicle knows at its height, the way that it flew, and the plan that it holds. With --write the pictures go into
+results/unknown.png, one below the other.
 """
 
 from __future__ import annotations
@@ -26,9 +27,11 @@ DPI = 100
 WIDTH = 900  # pixels
 
 
-def picture(world: str, number: int) -> Image.Image:
-    """Mission `number` of a world, flown now, at its last control step."""
-    setup = compose(["experiment=mission_unknown", *CASES[world].overrides, f"study.layouts={number + 1}"])
+def picture(world: str, number: int, until: float | None = None) -> Image.Image:
+    """Mission `number` of a world, flown now, at its last control step, that of `until`, s, at the latest."""
+    until_then = [] if until is None else [f"mission.duration={until:g}"]
+    overrides = (*CASES[world].overrides, *until_then)
+    setup = compose(["experiment=mission_unknown", *overrides, f"study.layouts={number + 1}"])
     layouts = setup.layouts(number + 1).take([number])
     assert setup.mission is not None
     mission = replace(setup.mission, planner=replace(setup.mission.planner, solver=setup.solver))
@@ -60,12 +63,12 @@ def below(pictures: Sequence[Image.Image]) -> Image.Image:
 
 def main(words: Sequence[str] | None = None) -> int:
     parser = parser_of(__doc__, "results/unknown.png")
-    parser.add_argument("missions", nargs="+", metavar="WORLD:NUMBER")
+    parser.add_argument("missions", nargs="+", metavar="WORLD:NUMBER[:SECONDS]")
     parser.add_argument("--path", type=Path, help="another file for the pictures")
     asked = parser.parse_args(words)
     torch.set_num_threads(1)
-    named = [mission.rsplit(":", 1) for mission in asked.missions]
-    whole = below([picture(world, int(number)) for world, number in named])
+    named = [mission.split(":") for mission in asked.missions]
+    whole = below([picture(world, int(number), *map(float, until)) for world, number, *until in named])
     if asked.write or asked.path:
         whole.save(asked.path or RESULTS / "unknown.png", optimize=True)
     return 0

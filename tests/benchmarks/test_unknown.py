@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 
+from benchmarks.causes import unknown as causes
 from benchmarks.families.unknown import CASES, largest, misses, table, times
 from torchgco.experiments.config.build import compose
 
@@ -62,3 +66,10 @@ def test_limits_are_those_of_each_mission_by_itself() -> None:
 def test_a_case_is_a_mission_that_can_be_composed(name: str) -> None:
     setup = compose(["experiment=mission_unknown", *CASES[name].overrides])
     assert setup.mission is not None and setup.mission.sensor == "lidar"
+
+
+def test_a_mission_is_drawn_at_a_time(tmp_path: Path) -> None:
+    target = tmp_path / "one.png"
+    assert causes.main(["walls:0:0.5", "--path", str(target)]) == 0
+    with Image.open(target) as image:
+        assert image.width == causes.WIDTH and image.height > 100
