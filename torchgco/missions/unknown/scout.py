@@ -121,7 +121,8 @@ class Scout:
         former = _rest_of(self.path, position)
         gaps = self.seen.gaps(between(position, former[min(1, len(former) - 1)]), self.keep, SEEN_OCCUPIED)
         joins = bool((gaps >= gaps[0] - 0.5 * self.seen.resolution).all())
-        costs = [self.search.cost(_halved(path)) for path in (former, new)]
+        joined = np.concatenate([position[None], former[1:]])
+        costs = [self.search.cost(_halved(path)) for path in (joined, new)]
         return former if joins and costs[0] <= costs[1] else new
 
     def _wait(self, position: np.ndarray, points: np.ndarray, gaps: np.ndarray) -> None:
