@@ -2,11 +2,12 @@
 
 Each picture shows a world from above: its cells, in space those at the start's height, its shapes, and the flights that
 were planned among both, or among the shapes alone where the cells close every way. With --write they go into
-results/maps.png, side by side.
+results/maps.png, three in a row, with costs and processor times.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,16 +19,20 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 import torchgco
-from benchmarks.families.maps import SCALES, as_map, closed, flown
+from benchmarks.families.maps import SCALES, Flown, as_map, closed, flown
 from benchmarks.lib import RESULTS
 from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY
 from benchmarks.lib.rasters import rasterised
+from torchgco import Problem
 from torchgco.maps import DistanceField
 from torchgco.native.dispatch import open_loop
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.bodies import bodies
 from torchgco.plotting.style import INK, PALETTE, tidy
+from torchgco.scenarios import Task
+
+COLUMNS = 3
 
 
 def panel(ax: Axes, world: str, number: int, size: float, seed: int) -> None:
@@ -36,15 +41,16 @@ def panel(ax: Axes, world: str, number: int, size: float, seed: int) -> None:
     task = setup.task(setup.scenario.draw([number], seed))
     grid = rasterised(task.layouts, 0, SCALES.get(world, 1.0) * size, True)
     problem = as_map(task.problem, DistanceField.of(grid))
-    shapes = flown(task.problem, task)
-    ends = f"shapes {float(shapes.verdict.cost):.0f}"
+    shapes = _second(task.problem, task)
+    ends = f"shapes {float(shapes.verdict.cost):.0f} ({shapes.seconds:.2f} s)"
     _flight(ax, task.problem, shapes.U, PALETTE[1])
     if closed(problem):
         ends += ", closed as cells"
     else:
-        cells = flown(problem, task)
+        cells = _second(problem, task)
         _flight(ax, problem, cells.U, PALETTE[0])
-        ends += f", cells {float(cells.verdict.cost):.0f}" + ("" if bool(cells.verdict.reached) else ", not reached")
+        ends += f", cells {float(cells.verdict.cost):.0f} ({cells.seconds:.2f} s)"
+        ends += "" if bool(cells.verdict.reached) else ", not reached"
     start = task.problem.x0[0, task.problem.position].numpy()
     _cells(ax, grid, start)
     height = None if len(start) == 2 else float(start[2])
@@ -57,7 +63,13 @@ def panel(ax: Axes, world: str, number: int, size: float, seed: int) -> None:
     ax.set_xlim(ends_at[:, 0].min() - 0.3 * beside, ends_at[:, 0].max() + 0.3 * beside)
     ax.set_ylim(ends_at[:, 1].min() - beside, ends_at[:, 1].max() + beside)
     ax.set_aspect("equal")
-    tidy(ax, f"{world} {number}, {SCALES.get(world, 1.0) * size:g} m: {ends}", grid=None)
+    tidy(ax, f"{world} {number}, {SCALES.get(world, 1.0) * size:g} m\n{ends}", grid=None)
+
+
+def _second(problem: Problem, task: Task) -> Flown:
+    """A flight, and its time without compiling and tracing, which the first one has."""
+    flown(problem, task)
+    return flown(problem, task)
 
 
 def _flight(ax: Axes, problem: Any, U: torch.Tensor, color: Any) -> None:
@@ -82,8 +94,13 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--path", type=Path, help="another file for the pictures")
     asked = parser.parse_args(words)
     torch.set_num_threads(1)
-    figure = Figure(figsize=(6.0 * len(asked.worlds), 5.0), layout="constrained")
-    for ax, named in zip(figure.subplots(1, len(asked.worlds), squeeze=False)[0], asked.worlds, strict=True):
+    columns = min(COLUMNS, len(asked.worlds))
+    rows = math.ceil(len(asked.worlds) / columns)
+    figure = Figure(figsize=(6.0 * columns, 5.0 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).flat
+    for ax in axes[len(asked.worlds) :]:
+        ax.set_axis_off()
+    for ax, named in zip(axes, asked.worlds, strict=False):
         world, number, size = named.split(":")
         panel(ax, world, int(number), float(size), asked.seed)
     if asked.write or asked.path:
