@@ -29,9 +29,8 @@ WIDTH = 900  # pixels
 
 def picture(world: str, number: int, until: float | None = None) -> Image.Image:
     """Mission `number` of a world, flown now, at its last control step, that of `until`, s, at the latest."""
-    until_then = [] if until is None else [f"mission.duration={until:g}"]
-    overrides = (*CASES[world].overrides, *until_then)
-    setup = compose(["experiment=mission_unknown", *overrides, f"study.layouts={number + 1}"])
+    ends = [] if until is None else [f"mission.duration={until:g}"]
+    setup = compose(["experiment=mission_unknown", *CASES[world].overrides, *ends, f"study.layouts={number + 1}"])
     layouts = setup.layouts(number + 1).take([number])
     assert setup.mission is not None
     mission = replace(setup.mission, planner=replace(setup.mission.planner, solver=setup.solver))
