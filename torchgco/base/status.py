@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class Status(IntEnum):
@@ -29,6 +33,7 @@ class Status(IntEnum):
 STOPPED = -1  # ended by guidance, for another attempt
 STALLED = -2  # neither the violation nor the cost of a feasible trajectory falls any more
 SOLVED = -3  # the optimality conditions hold to the solver's own tolerance
+BARRED = -4  # the same without rows that are violated whatever the controls: no solve makes them better
 
 _SENTENCES = {
     Status.RUNNING: "The solve has not ended.",
@@ -48,3 +53,8 @@ _SENTENCES = {
     "add a cost that keeps them small.",
     Status.INVALID_START: "The start lies inside an obstacle; nothing was solved.",
 }
+
+
+def is_over(status: Tensor) -> Tensor:
+    """Whether nothing is left to solve, by statuses within a solve, of any shape."""
+    return (status == SOLVED) | (status == BARRED)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import Count, check_options
-from torchgco.base.status import SOLVED
+from torchgco.base.status import is_over
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.native.dispatch import chord_clearance, interior_of, measured
@@ -66,7 +66,7 @@ class ClearChords:
             serves, now[rows] = self._kept(search, rows, new, clearance[rows])
             if interior_of(problem) is not None:
                 tight = continued(self.solver, replace(call, callback=None), new.best)
-                least = torch.where(serves & (tight.status == SOLVED), now[rows].clamp(max=0.0), torch.inf)
+                least = torch.where(serves & is_over(tight.status), now[rows].clamp(max=0.0), torch.inf)
                 too, clear = self._kept(search, rows, tight, least)
                 now[rows] = torch.where(too, clear, now[rows])
             clearance[rows] = torch.where(serves, now[rows], clearance[rows])

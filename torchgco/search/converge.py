@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import check_options
-from torchgco.base.status import SOLVED, Status
+from torchgco.base.status import Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.lagrangian.quality import has_arrived, is_preferred
 from torchgco.maps.field import BoundField
@@ -83,7 +83,8 @@ class Converge:
         best, rows = search.best, _unsolved(search)
         self._continue(search, rows)
         whole = replace(search.call, callback=None)
-        lost = rows[best.end.best.violation[rows] > search.solver.violation_tolerance]
+        lost = best.end.best.violation[rows] > search.solver.violation_tolerance
+        lost = rows[lost & ~is_over(best.end.status[rows])]
         if lost.numel() > 0:
             self._keep(search, lost, self.solver.solved(whole.take(lost)))
 
@@ -101,7 +102,7 @@ class Converge:
         old, new = take(search.best.end.best, rows), end.best
         arrives = has_arrived(problem, new.X) | ~has_arrived(problem, old.X)
         near = new.cost <= old.cost + WORTH * old.cost.abs()
-        serves = is_preferred(problem, new, old, limit) | ((end.status == SOLVED) & arrives & near)
+        serves = is_preferred(problem, new, old, limit) | (is_over(end.status) & arrives & near)
         clear = (chord_clearance(problem, new.X) >= 0) | ~(chord_clearance(problem, old.X) >= 0)
         clear |= old.violation > limit
         search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
@@ -109,7 +110,7 @@ class Converge:
 
 def _unsolved(search: Search) -> Tensor:
     status = search.best.end.status
-    return ((status != SOLVED) & (status != Status.INVALID_START)).nonzero().flatten()
+    return (~is_over(status) & (status != Status.INVALID_START)).nonzero().flatten()
 
 
 def continued(solver: InteriorPoint, call: Call, start: Iterate) -> SolveEnd:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import Count, Positive, check_options
-from torchgco.base.status import SOLVED, Status
+from torchgco.base.status import BARRED, SOLVED, Status, is_over
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import is_preferred
 from torchgco.search.attempts import Search
@@ -71,8 +71,9 @@ class Starts:
         if self.when == "all":
             return torch.arange(search.call.problem.B, device=search.call.ids.device)
         first = search.caught.status
-        failed = (first != SOLVED) & (first != Status.CONVERGED)
-        return (failed | ~(search.best.end.best.violation <= search.solver.violation_tolerance)).nonzero().flatten()
+        failed = ~is_over(first) & (first != Status.CONVERGED)
+        lost = ~(search.best.end.best.violation <= search.solver.violation_tolerance) & (first != BARRED)
+        return (failed | lost).nonzero().flatten()
 
     def _solve(self, search: Search, rows: Tensor) -> None:
         """All starts of the problems in `rows` as one batch."""

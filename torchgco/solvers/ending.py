@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.base.status import SOLVED, STALLED, Status
+from torchgco.base.status import BARRED, STALLED, Status, is_over
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.dispatch import cost_unit, engine_of
@@ -86,16 +86,18 @@ def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: floa
     """The status (B,) of the returned trajectories, for statuses `ended` that say why the solve stopped.
 
     CONVERGED: stationary and feasible. FEASIBLE: feasible but not stationary, for problems with constraints.
-    INFEASIBLE: not feasible, although higher penalties were tried for as long as they gained anything. Where neither
+    INFEASIBLE: not feasible, although higher penalties were tried for as long as they gained anything, or for rows that
+    no control moves. Where neither
     holds, and where a solve failed, the reason stays.
     """
-    stationary, fits = (left <= STATIONARY) | (ended == SOLVED), violation <= tolerance
+    over, fits = is_over(ended), violation <= tolerance
+    stationary = (left <= STATIONARY) | over
     limit = torch.full_like(ended, int(Status.MAX_ITERATIONS))
-    reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED) | (ended == SOLVED), limit, ended)
+    reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED) | over, limit, ended)
     status = torch.where(fits & constrained, int(Status.FEASIBLE), reason)
     status = torch.where(stationary & fits, int(Status.CONVERGED), status)
-    status = torch.where(~fits & (ended == STALLED), int(Status.INFEASIBLE), status)
-    status = torch.where(torch.isinf(left) & (ended != SOLVED), int(Status.NOT_POSITIVE_DEFINITE), status)
+    status = torch.where(~fits & ((ended == STALLED) | (ended == BARRED)), int(Status.INFEASIBLE), status)
+    status = torch.where(torch.isinf(left) & ~over, int(Status.NOT_POSITIVE_DEFINITE), status)
     status = torch.where((ended == Status.TIME_LIMIT) & ~fits, ended, status)  # more time might find more
     failed = (ended == Status.NON_FINITE) | (ended == Status.NOT_POSITIVE_DEFINITE) | (ended == Status.INVALID_START)
     return torch.where(failed, ended, status)

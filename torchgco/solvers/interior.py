@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.shapes import check_shape, check_tensor
-from torchgco.base.status import SOLVED, STALLED, Status
+from torchgco.base.status import BARRED, SOLVED, STALLED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -159,7 +159,7 @@ class InteriorPoint(Solver):
         cost, worst = problem.cost.total(X, call.U0), measured(problem, X, call.U0)
         lost = ~(torch.isfinite(found.cost) & torch.isfinite(found.violation))
         worse = is_better(cost, worst, found.cost, found.violation, self.violation_tolerance) | lost
-        rows = (worse & (end.status != SOLVED) & torch.isfinite(cost) & torch.isfinite(worst)).nonzero().flatten()
+        rows = (worse & ~is_over(end.status) & torch.isfinite(cost) & torch.isfinite(worst)).nonzero().flatten()
         if rows.numel() > 0:
             multipliers = take(found.multipliers, rows)
             none = Multipliers(tuple(torch.zeros_like(lam) for lam in multipliers.lam), multipliers.mu)
@@ -202,7 +202,8 @@ class InteriorPoint(Solver):
         put(end.best, rows, found)
         put(end.last, rows, found)
         status = out["status"].long()
-        end.status[rows] = torch.where(status == Status.CONVERGED, SOLVED, status)
+        status = torch.where(status == Status.CONVERGED, SOLVED, status)
+        end.status[rows] = torch.where(status == Status.INFEASIBLE, BARRED, status)
         end.iterations[rows] = out["iterations"]
 
     def _without_kernels(self) -> AugmentedLagrangian:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchgco.base.status import SOLVED, STOPPED, Status
+from torchgco.base.status import STOPPED, Status, is_over
 from torchgco.base.tree import spread, take
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.dispatch import reproducible
@@ -57,7 +57,7 @@ class Session:
         K, d, left = (torch.cat(column) for column in zip(*parts, strict=True))
         found = self.trajectories(end, lambda rows: K[rows])
         if problem.free_start is not None:  # stationary for this start alone, unless the interior point chose it
-            left = torch.where(problem.free_start.any(-1) & (end.status != SOLVED), left.clamp(min=1.0), left)
+            left = torch.where(problem.free_start.any(-1) & ~is_over(end.status), left.clamp(min=1.0), left)
         limit = Status.TIME_LIMIT if self.given.late else Status.MAX_ITERATIONS
         ended = torch.where(end.status == STOPPED, int(limit), end.status)
         constrained = bool(problem.constraints) or problem.free_start is not None

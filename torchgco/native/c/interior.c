@@ -1,12 +1,19 @@
 /* A primal-dual interior point with a filter (Waechter and Biegler 2006) for problems side by side: states, controls
    and slacks move together, and the lanes are kept filled. solvers/interior says what it does. */
 
-/* Values and an empty filter of the lanes `of`; `anew`: slacks, too. */
+/* Values and an empty filter of the lanes `of`; `anew`: slacks, too, and which rows have one. */
 static void settle(Barrier *t, Track *k, I of, int anew) {
     const Interior *how = t->how;
     Lanes *s = &t->lanes;
     V cost = values(t, s->X, s->U, t->c, t->gap);
-    if (anew) ROWS(t, 0, t->s[q] = tgco_choose(of, most(-t->c[q], SET(how->push)), t->s[q]))
+    if (anew) {
+        sort_rows(t, of);
+        ROWS(t, 0, {
+            V slack = most(-t->c[q], SET(how->push));
+            if (t->some_out) slack = tgco_choose(t->out[q], SET(1.0), slack);
+            t->s[q] = tgco_choose(of, slack, t->s[q]);
+        })
+    }
     residuals(t, t->c, t->s, t->r);
     V theta = size_of(t, t->gap, t->r), phi = cost - t->mu * logarithms(t, t->s);
     k->theta = tgco_choose(of, theta, k->theta);
@@ -54,7 +61,11 @@ static void begin(Barrier *t, Track *k, I of) {
     t->scale = tgco_choose(of & finite(scale) & (largest > zero), scale, t->scale);
     settle(t, k, of, 1);
     if (how->warm) {
-        ROWS(t, 0, t->z[q] = tgco_choose(of, most(t->scale * t->z[q], t->mu / (SET(how->central) * t->s[q])), t->z[q]))
+        if (t->some_out) join_multipliers(t, of);
+        ROWS(t, 0, {
+            V z = t->scale * t->z[q], lowest = t->mu / (SET(how->central) * t->s[q]);
+            t->z[q] = tgco_choose(of, by_role(t, q, most(z, lowest), z), t->z[q]);
+        })
         ROWS(t, 1, t->z[q] = tgco_choose(of, t->scale * t->z[q], t->z[q]))
         expand(t);
         adjoin(t, of);
@@ -110,6 +121,7 @@ static I soften(Barrier *t, const Track *k, I moving) {
     for (;;) {
         V largest = SET(0.0);
         ROWS(t, 1, largest = most(tgco_fabs(t->z[q] + t->dz[q]), largest))
+        if (t->some_out) ROWS(t, 0, largest = most(tgco_if(t->fixes[q], tgco_fabs(t->z[q] + t->dz[q])), largest))
         I large = moving & (largest > SET(how->explodes)) & (t->soft < SET(how->softest));
         if (!any(large)) return moving;
         t->soft = tgco_choose(large, SET(how->soft_growth) * t->soft, t->soft);
@@ -160,6 +172,23 @@ static int is_solved(const Barrier *t, Track *k, int l, double error, double pri
     return k->idle[l] >= how->idle && error <= how->rounding && error <= 2.0 * k->least[l];
 }
 
+/* Whether lane l, solved without rows that it breaks, goes on with those of them that something moves now. */
+static int readmitted(Barrier *t, Track *k, int l) {
+    I one = t->mu != t->mu;
+    int count = 0;
+    if (!breaks_rows_left_out(t, l)) return 0;
+    one[l] = -1;
+    ROWS(t, 0, count += t->out[q][l] != 0)
+    visit_tight(t, one, come_in);
+    ROWS(t, 0, count -= t->out[q][l] != 0)
+    if (!count) return 0;
+    t->mu[l] = t->how->barrier[t->lanes.element[l]];
+    k->least[l] = INFINITY;
+    settle(t, k, one, 0);
+    renew(t, one);
+    return 1;
+}
+
 /* One iteration of the lanes `running`; returns those that end, with their status. */
 static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     const Interior *how = t->how;
@@ -175,7 +204,10 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     if (any(astray)) go_back(t, k, astray);
     for (int l = 0; l < LANES; l++) {
         if (!running[l] || astray[l]) continue;
-        if (is_solved(t, k, l, (*error)[l], primal[l])) status[l] = CONVERGED;
+        if (is_solved(t, k, l, (*error)[l], primal[l])) {
+            if (readmitted(t, k, l)) continue;
+            status[l] = CONVERGED;
+        }
         else if (!((*error)[l] - (*error)[l] == 0)) status[l] = NON_FINITE;
         else if (k->made[l] >= how->max_iterations) status[l] = small[l] ? CONVERGED : MAX_ITERATIONS;
         else continue;
@@ -224,12 +256,13 @@ static void leave_barrier(Barrier *t, const Track *k, int lane, int32_t status, 
         const Constraint *con = p->constraint + i;
         for (int64_t j = 0; j < con->knots * con->rows; j++)
             con->lam[e * con->knots * con->rows + j] = t->z[t->first[i] + j][lane] / t->scale[lane];
+        if (t->some_out && con->kind == BOUNDS) split_multipliers(t, i, lane);
     }
     t->how->barrier[e] = t->mu[lane];
     t->how->error[e] = error;
     t->how->theta[e] = k->theta[lane];
     p->iterations[e] += (int64_t)k->made[lane];
-    p->status[e] = status;
+    p->status[e] = status == CONVERGED && breaks_rows_left_out(t, lane) ? INFEASIBLE : status;
 }
 
 static void enter_barrier(Barrier *t, int lane, int64_t e) {

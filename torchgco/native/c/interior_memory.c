@@ -28,6 +28,7 @@ static int64_t shape(Barrier *t, V *memory) {
     t->dx = cut(&m, (N + 1) * NX); t->du = cut(&m, N * NU);
     t->c = cut(&m, rows); t->cn = cut(&m, rows); t->s = cut(&m, rows); t->sn = cut(&m, rows); t->z = cut(&m, rows);
     t->r = cut(&m, rows); t->ds = cut(&m, rows); t->dz = cut(&m, rows);
+    t->out = (I *)cut(&m, rows); t->fixes = (I *)cut(&m, rows);
     t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
     return m - memory;
 }
@@ -109,7 +110,7 @@ static void adjoin(Barrier *t, I of) {
 
 /* Multipliers anew for the lanes `of`: those of the central path, and none of equalities. */
 static void renew(Barrier *t, I of) {
-    ROWS(t, 0, t->z[q] = tgco_choose(of, t->mu / t->s[q], t->z[q]))
+    ROWS(t, 0, t->z[q] = tgco_choose(of, by_role(t, q, t->mu / t->s[q], SET(0.0)), t->z[q]))
     ROWS(t, 1, t->z[q] = tgco_choose(of, SET(0.0), t->z[q]))
     V objective = t->objective;
     t->objective = tgco_choose(of, SET(1.0), objective);
@@ -133,7 +134,10 @@ static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
         }
     }
     for (int64_t i = 0; i < p->N * NX; i++) gap = most(tgco_fabs(t->gap[i]), gap);
-    for (int64_t q = 0; q < t->rows; q++) { gap = most(tgco_fabs(t->r[q]), gap); sum_z += tgco_fabs(t->z[q]); }
+    for (int64_t q = 0; q < t->rows; q++) {
+        gap = most(tgco_fabs(t->r[q]), gap);
+        sum_z += least(tgco_fabs(t->z[q]), SET(t->how->explodes)); /* one that explodes says nothing of the others */
+    }
     V usual = SET(t->how->usual_multiplier), count = SET((double)(p->N * NX + t->rows));
     V mean = (sum_y + sum_z) / count, mean_z = sum_z / SET((double)(t->rows ? t->rows : 1));
     *dual = slope * usual / most(mean, usual);
@@ -143,7 +147,7 @@ static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
 
 static V complementarity(const Barrier *t, V mu) {
     V worst = SET(0.0);
-    ROWS(t, 0, worst = most(tgco_fabs(t->s[q] * t->z[q] - mu), worst))
+    ROWS(t, 0, worst = most(by_role(t, q, tgco_fabs(t->s[q] * t->z[q] - mu), SET(0.0)), worst))
     return worst;
 }
 

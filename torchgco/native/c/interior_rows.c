@@ -18,6 +18,8 @@ typedef struct {
     V *is_free, *L_start;        /* (NX): 1 where the start is free; (NX, NX): its factor. None where none is free */
     V *dx, *du;                  /* (N+1, NX), (N, NU) */
     V *c, *cn, *s, *sn, *z, *r, *ds, *dz; /* (rows): values, slacks, multipliers, residuals, and of trial and step */
+    I *out, *fixes; /* (rows): rows of inequalities outside the barrier, and those of them that hold as equalities */
+    int some_out;   /* whether there are any in a lane; see interior_fixed.c */
     int64_t *first, rows;        /* the first row of each constraint, and how many there are */
     V mu, shift, scale;
     V objective; /* 0 where feasibility alone is sought */
@@ -54,6 +56,11 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, con
     } else tgco_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), c);
 }
 
+/* `inside` of rows in the barrier, `fixed` of bounds that coincide, and nothing of rows that no variable moves. */
+static inline V by_role(const Barrier *t, int64_t q, V inside, V fixed) {
+    return t->some_out ? tgco_choose(t->out[q], tgco_if(t->fixes[q], fixed), inside) : inside;
+}
+
 /* What row q adds: by[0] its multiplier, by[1] the condensed residual, by[2] mu's factor, and the curvature across. */
 static inline V weigh(const Barrier *t, int equality, int64_t q, V *by) {
     by[0] = t->z[q];
@@ -62,10 +69,10 @@ static inline V weigh(const Barrier *t, int equality, int64_t q, V *by) {
         by[2] = SET(0.0);
         return SET(1.0) / t->soft;
     }
-    V sigma = t->z[q] / t->s[q];
-    by[1] = sigma * t->r[q];
-    by[2] = SET(1.0) / t->s[q];
-    return sigma;
+    V sigma = t->z[q] / t->s[q], one = SET(1.0);
+    by[1] = by_role(t, q, sigma * t->r[q], t->objective * t->z[q] + t->r[q] / t->soft);
+    by[2] = by_role(t, q, one / t->s[q], SET(0.0));
+    return by_role(t, q, sigma, one / t->soft);
 }
 
 #if DIM > 0

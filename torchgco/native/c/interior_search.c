@@ -64,10 +64,13 @@ static void attempt(Barrier *t, V alpha, V *theta, V *phi) {
     for (int64_t i = 0; i < N * NU; i++) s->Un[i] = s->U[i] + alpha * t->du[i];
     V cost = values(t, s->Xn, s->Un, t->cn, t->gapn);
     /* A slack that the row leaves more room for takes it: theta and phi fall both. */
-    ROWS(t, 0, { V moved = t->s[q] + alpha * t->ds[q]; t->sn[q] = tgco_choose(-t->cn[q] > moved, -t->cn[q], moved); })
+    ROWS(t, 0, {
+        V moved = t->s[q] + alpha * t->ds[q], roomy = tgco_choose(-t->cn[q] > moved, -t->cn[q], moved);
+        t->sn[q] = t->some_out ? tgco_choose(t->out[q], t->s[q], roomy) : roomy;
+    })
     V sum = SET(0.0);
     for (int64_t i = 0; i < N * NX; i++) sum += tgco_fabs(t->gapn[i]);
-    ROWS(t, 0, sum += tgco_fabs(t->cn[q] + t->sn[q]))
+    ROWS(t, 0, sum += tgco_fabs(by_role(t, q, t->cn[q] + t->sn[q], t->cn[q])))
     ROWS(t, 1, sum += tgco_fabs(t->cn[q]))
     *theta = sum;
     *phi = cost - t->mu * logarithms(t, t->sn);
@@ -90,7 +93,10 @@ static V descent(const Barrier *t) {
 static void correct(Barrier *t, I of, V alpha) {
     for (int64_t i = 0; i < t->lanes.of->N * NX; i++)
         t->aim[i] = tgco_choose(of, alpha * t->aim[i] + t->gapn[i], t->aim[i]);
-    ROWS(t, 0, t->r[q] = tgco_choose(of, alpha * t->r[q] + t->cn[q] + t->sn[q], t->r[q]))
+    ROWS(t, 0, {
+        V left = alpha * t->r[q] + t->cn[q];
+        t->r[q] = tgco_choose(of, by_role(t, q, left + t->sn[q], left), t->r[q]);
+    })
     ROWS(t, 1, t->r[q] = tgco_choose(of, alpha * t->r[q] + t->cn[q], t->r[q]))
     expand(t);
     solve(t);
@@ -120,7 +126,7 @@ static void accept(Barrier *t, I won, V alpha, V dual) {
     ROWS(t, 0, {
         V z = t->z[q] + dual * t->dz[q], center = t->mu / t->sn[q];
         z = most(least(z, bound * center), center / bound);
-        t->z[q] = tgco_choose(won, z, t->z[q]);
+        t->z[q] = tgco_choose(won, by_role(t, q, z, t->z[q] + step * t->dz[q]), t->z[q]);
         t->s[q] = tgco_choose(won, t->sn[q], t->s[q]);
     })
     for (int64_t q = 0; q < t->rows; q++) t->c[q] = tgco_choose(won, t->cn[q], t->c[q]);

@@ -23,7 +23,7 @@ static void residuals(const Barrier *t, const V *c, const V *s, V *r) {
     const Problem *p = t->lanes.of;
     for (int64_t i = 0, q = 0; i < p->constraints; i++)
         for (int64_t end = q + p->constraint[i].knots * p->constraint[i].rows; q < end; q++)
-            r[q] = p->constraint[i].equality ? c[q] : c[q] + s[q];
+            r[q] = p->constraint[i].equality ? c[q] : by_role(t, q, c[q] + s[q], c[q]);
 }
 
 /* Slopes and curvatures of all knots at the iterate. */
@@ -193,8 +193,8 @@ static void solve_rows(Barrier *t) {
                     t->ds[q] = SET(0.0);
                     t->dz[q] = change / t->soft;
                 } else {
-                    t->ds[q] = -change;
-                    t->dz[q] = (t->mu + t->z[q] * change) / t->s[q] - t->z[q];
+                    t->ds[q] = by_role(t, q, -change, SET(0.0));
+                    t->dz[q] = by_role(t, q, (t->mu + t->z[q] * change) / t->s[q] - t->z[q], change / t->soft);
                 }
             }
         }

@@ -1,0 +1,166 @@
+/* Rows of inequalities that have no place in a barrier: those that no variable moves, such as a bound on a given start
+   or a row that is constantly 0, and bounds that coincide.
+
+   A slack has no room in them, and their multipliers would explode. The first kind stays out of the solve, and is judged
+   at its end: what is feasible there, with no multiplier, is optimal with the row, too. Of two bounds that coincide, the
+   upper one becomes an equality, and the lower one stays out. */
+
+#define NUDGE 1e-3 /* how far from the iterate a row's slope is looked at again: it may vanish in one point alone */
+
+/* A number in [1, 2) for variable i: no row and no model is likely to let a sum of these cancel. */
+static inline double uneven(int64_t i) {
+    double golden = 0.6180339887498949 * (double)(i + 1);
+    return 1.0 + golden - __builtin_floor(golden);
+}
+
+/* Whether rows j, the upper, and l, the lower bound of constraint i, are of one variable. */
+static inline int are_a_pair(const Constraint *con, int j, int l) {
+    return con->variable[j] == con->variable[l] && con->sign[j] > 0 && con->sign[l] < 0;
+}
+
+/* The lanes whose bounds of a variable coincide: the upper ones of knot k hold as equalities. */
+static void find_fixed(Barrier *t, I of, int64_t i, int64_t k) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    int64_t q = row_of(t, i, k);
+    if (con->kind != BOUNDS) return;
+    for (int j = 0; j < con->rows; j++) for (int l = j + 1; l < con->rows; l++) {
+        if (!are_a_pair(con, j, l)) continue;
+        I same = of & (t->c[q + j] + t->c[q + l] == SET(0.0));
+        t->out[q + j] |= same; t->out[q + l] |= same; t->fixes[q + j] |= same;
+    }
+}
+
+/* The controls du of knot k that are free, each changed by a number of its own. */
+static void vary_controls(const Barrier *t, int64_t k, V *du) {
+    const Problem *p = t->lanes.of;
+    for (int j = 0; j < NU; j++) du[j] = SET(uneven(k * NU + j));
+    for (int64_t i = 0; i < p->constraints; i++) {
+        const Constraint *con = p->constraint + i;
+        if (con->kind != BOUNDS || con->place[k] == NOWHERE) continue;
+        for (int j = 0; j < con->rows; j++) if (con->variable[j] >= NX) {
+            V *own = du + con->variable[j] - NX;
+            *own = tgco_if(~t->fixes[row_of(t, i, k) + j], *own);
+        }
+    }
+}
+
+/* The rows of constraint i at knot k that a change z of states and controls moves, at x, u or near them, into `moves`. */
+static void find_moved(const Barrier *t, int64_t i, int64_t k, const V *x, const V *u, const V *z, I *moves) {
+    int rows = t->lanes.of->constraint[i].rows;
+    V near[S], change[rows];
+    for (int j = 0; j < NX; j++) near[j] = x[j] + SET(NUDGE) * z[j];
+    for (int j = 0; j < NU; j++) near[NX + j] = u ? u[j] + SET(NUDGE) * z[NX + j] : SET(0.0);
+    along(t, i, k, x, u, z, change);
+    for (int j = 0; j < rows; j++) moves[j] = tgco_is(change[j]);
+    along(t, i, k, near, u ? near + NX : 0, z, change);
+    for (int j = 0; j < rows; j++) moves[j] |= tgco_is(change[j]);
+}
+
+/* Whether rows of a knot have less room than a slack is given at first, in a lane of `of`. */
+static int is_tight(const Barrier *t, I of, int64_t q, int rows) {
+    I tight = of & ~of;
+    for (int j = 0; j < rows; j++) tight |= of & (t->c[q + j] > SET(-t->how->push));
+    return any(tight);
+}
+
+/* What to do with the tight rows of constraint i at knot k in the lanes `of`, where z is how they vary. */
+typedef void Visit(Barrier *t, I of, int64_t i, int64_t k, const V *z);
+
+/* Visits the tight rows of all knots, with the change that a change of all free variables brings along. */
+static void visit_tight(Barrier *t, I of, Visit *visit) {
+    Lanes *s = &t->lanes;
+    const Problem *p = s->of;
+    V z[S], next[NX];
+    for (int i = 0; i < NX; i++) z[i] = t->is_free ? tgco_if(tgco_is(t->is_free[i]), SET(uneven(~i))) : SET(0.0);
+    for (int64_t k = 0; k <= p->N; k++) {
+        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
+        if (u) vary_controls(t, k, z + NX);
+        else for (int j = 0; j < NU; j++) z[NX + j] = SET(0.0);
+        for (int64_t i = 0; i < p->constraints; i++) {
+            const Constraint *con = p->constraint + i;
+            if (con->equality || con->place[k] == NOWHERE) continue;
+            if (is_tight(t, of, row_of(t, i, k), con->rows)) visit(t, of, i, k, z);
+        }
+        if (!u) break;
+        tgco_jacobian(x, u, model_at(s, k), t->f + k * NJ);
+        tgco_push(t->f + k * NJ, z, next);
+        for (int i = 0; i < NX; i++) z[i] = next[i];
+    }
+}
+
+/* Rows that nothing moves leave the barrier, and so do bounds that coincide but that nothing moves. */
+static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    const V *x = t->lanes.X + k * NX, *u = k < t->lanes.of->N ? t->lanes.U + k * NU : 0;
+    int64_t q = row_of(t, i, k);
+    I moves[con->rows];
+    find_moved(t, i, k, x, u, z, moves);
+    for (int j = 0; j < con->rows; j++) {
+        I tight = of & (t->c[q + j] > SET(-t->how->push)), is_state = of & ~of;
+        if (con->kind == BOUNDS && con->variable[j] < NX) is_state = ~is_state;
+        t->out[q + j] |= tight & ~moves[j];
+        t->fixes[q + j] &= ~of | moves[j] | ~is_state; /* controls that are fixed weren't varied */
+    }
+}
+
+/* Violated rows that were left out, but that something moves now, come into the barrier. */
+static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    const V *x = t->lanes.X + k * NX, *u = k < t->lanes.of->N ? t->lanes.U + k * NU : 0;
+    int64_t q = row_of(t, i, k);
+    I moves[con->rows];
+    find_moved(t, i, k, x, u, z, moves);
+    for (int j = 0; j < con->rows; j++) {
+        I in = of & t->out[q + j] & ~t->fixes[q + j] & moves[j] & (t->c[q + j] > SET(t->how->violation));
+        t->out[q + j] &= ~in;
+        t->s[q + j] = tgco_choose(in, SET(t->how->push), t->s[q + j]);
+    }
+}
+
+/* Which rows of the lanes `of`, whose iterate and values c are new, stay out of the barrier. */
+static void sort_rows(Barrier *t, I of) {
+    const Problem *p = t->lanes.of;
+    for (int64_t q = 0; q < t->rows; q++) { t->out[q] &= ~of; t->fixes[q] &= ~of; }
+    for (int64_t k = 0; k <= p->N; k++)
+        for (int64_t i = 0; i < p->constraints; i++)
+            if (p->constraint[i].place[k] != NOWHERE && !p->constraint[i].equality) find_fixed(t, of, i, k);
+    visit_tight(t, of, leave_out);
+    I some = of & ~of;
+    for (int64_t q = 0; q < t->rows; q++) some |= t->out[q];
+    t->some_out = any(some);
+}
+
+/* Whether rows that were left out of lane l are violated. */
+static int breaks_rows_left_out(const Barrier *t, int l) {
+    int breaks = 0;
+    if (t->some_out) ROWS(t, 0, breaks |= t->out[q][l] && !t->fixes[q][l] && !(t->c[q][l] <= t->how->violation))
+    return breaks;
+}
+
+/* The multipliers that lane l leaves for two bounds that coincide: each has the sign of an inequality's. */
+static void split_multipliers(const Barrier *t, int64_t i, int l) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    for (int64_t first = 0; first < con->knots * con->rows; first += con->rows) {
+        double *lam = con->lam + t->lanes.element[l] * con->knots * con->rows + first;
+        for (int j = 0; j < con->rows; j++) for (int m = j + 1; m < con->rows; m++) {
+            if (!are_a_pair(con, j, m) || !t->fixes[t->first[i] + first + j][l] || !(lam[j] < 0)) continue;
+            lam[m] = -lam[j];
+            lam[j] = 0;
+        }
+    }
+}
+
+/* The same the other way round for a warm start: the equality takes both. */
+static void join_multipliers(Barrier *t, I of) {
+    const Problem *p = t->lanes.of;
+    for (int64_t i = 0; i < p->constraints; i++) {
+        const Constraint *con = p->constraint + i;
+        if (con->kind != BOUNDS) continue;
+        for (int64_t first = t->first[i]; first < t->first[i] + con->knots * con->rows; first += con->rows)
+            for (int j = 0; j < con->rows; j++) for (int m = j + 1; m < con->rows; m++) {
+                if (!are_a_pair(con, j, m)) continue;
+                V *z = t->z + first;
+                z[j] = tgco_choose(of & t->fixes[first + j], z[j] - z[m], z[j]);
+            }
+    }
+}
