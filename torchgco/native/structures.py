@@ -157,7 +157,7 @@ class Interior(Structure):
         ("double", "barrier_error barrier_share barrier_floor usual_multiplier largest_multiplier"),
         ("double", "highest lowest gain_theta gain_phi armijo switching power_theta power_phi"),
         ("double", "shift_first shift_least shift_decay shift_growth shift_growth_first shift_max"),
-        ("double", "shift_recovery recovery_decay recovery_growth shift_crawl crawl soft softest explodes"),
+        ("double", "shift_recovery recovery_decay recovery_growth shift_crawl crawl soft softest explodes relaxes"),
         ("double", "pivot noise rounding soft_growth soft_decay forced_growth"),
     )
     _fields_ = fields(declared)

@@ -47,6 +47,7 @@ static void begin(Barrier *t, Track *k, I of) {
     k->made = tgco_choose(of, zero, k->made);
     k->least = tgco_choose(of, SET(INFINITY), k->least);
     k->restoring &= ~of; k->watching &= ~of;
+    t->relaxed = tgco_choose(of, zero, t->relaxed);
     t->soft = tgco_choose(of, SET(how->soft), t->soft);
     for (int l = 0; l < LANES; l++) if (of[l]) k->failures[l] = k->shortened[l] = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
@@ -172,6 +173,18 @@ static int is_solved(const Barrier *t, Track *k, int l, double error, double pri
     return k->idle[l] >= how->idle && error <= how->rounding && error <= 2.0 * k->least[l];
 }
 
+/* Where a multiplier of an inequality explodes, rows leave each other no room: all are relaxed, as IPOPT's bounds are. */
+static void relax(Barrier *t, Track *k, I running) {
+    V largest = SET(0.0), room = SET(t->how->relaxes * t->how->violation);
+    ROWS(t, 0, largest = most(t->z[q], largest))
+    I lacks = running & (largest > SET(t->how->explodes)) & (t->relaxed == SET(0.0)) & ~k->watching;
+    if (!any(lacks)) return;
+    t->relaxed = tgco_choose(lacks, room, t->relaxed);
+    ROWS(t, 0, t->s[q] += by_role(t, q, tgco_if(lacks, room), SET(0.0)))
+    settle(t, k, lacks, 0);
+    renew(t, lacks);
+}
+
 /* Whether lane l, solved without rows that it breaks, goes on with those of them that something moves now. */
 static int readmitted(Barrier *t, Track *k, int l) {
     I one = t->mu != t->mu;
@@ -193,6 +206,7 @@ static int readmitted(Barrier *t, Track *k, int l) {
 static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     const Interior *how = t->how;
     V dual, primal, scale_z;
+    relax(t, k, running);
     residuals(t, t->c, t->s, t->r);
     memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
     expand(t);

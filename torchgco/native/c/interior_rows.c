@@ -23,6 +23,7 @@ typedef struct {
     int64_t *first, rows;        /* the first row of each constraint, and how many there are */
     V mu, shift, scale;
     V objective; /* 0 where feasibility alone is sought */
+    V relaxed;   /* by how much inequalities are relaxed */
     V soft;      /* dual regularisation: a step fulfils equalities up to so much of the change of their multipliers */
     V *kept; /* the iterate before the steps on trial */
     V *memory;

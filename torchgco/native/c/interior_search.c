@@ -52,7 +52,9 @@ static void longest(const Barrier *t, V tau, V *primal, V *dual) {
     ROWS(t, 0, {
         V a = -tau * t->s[q] / t->ds[q], b = -tau * t->z[q] / t->dz[q];
         *primal = tgco_choose((t->ds[q] < SET(0.0)) & (a < *primal), a, *primal);
-        *dual = tgco_choose((t->dz[q] < SET(0.0)) & (b < *dual), b, *dual);
+        I falls = t->dz[q] < SET(0.0);
+        if (t->some_out) falls &= ~t->out[q];
+        *dual = tgco_choose(falls & (b < *dual), b, *dual);
     })
 }
 

@@ -7,8 +7,12 @@ static V values(const Barrier *t, const V *X, const V *U, V *c, V *gap) {
     V total = SET(0.0);
     for (int64_t k = 0; k <= p->N; k++) {
         const V *x = X + k * NX, *u = k < p->N ? U + k * NU : 0;
-        for (int64_t i = 0; i < p->constraints; i++)
-            if (p->constraint[i].place[k] != NOWHERE) rows_at(s, i, k, x, u, c + row_of(t, i, k));
+        for (int64_t i = 0; i < p->constraints; i++) {
+            if (p->constraint[i].place[k] == NOWHERE) continue;
+            int64_t q = row_of(t, i, k), end = q + p->constraint[i].rows;
+            rows_at(s, i, k, x, u, c + q);
+            if (!p->constraint[i].equality) for (; q < end; q++) c[q] -= by_role(t, q, t->relaxed, SET(0.0));
+        }
         total += cost_value(s, k, x, u);
         if (!u) break;
         V next[NX];
