@@ -37,10 +37,13 @@ def violation(constraints: Sequence[Constraint], X: Tensor, U: Tensor) -> Tensor
 def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, limit: float) -> Tensor:
     """Whether a trajectory is better than an old one, (B,).
 
-    Feasible is better than infeasible; of two feasible ones the cheaper, of two infeasible ones the less violated.
+    Feasible is better than infeasible; of two feasible ones the cheaper, of two infeasible ones the less violated. What
+    has a cost or a violation that isn't finite is worse than all that have none.
     """
-    fits, old_fits = worst <= limit, old_worst <= limit
-    return (fits & (~old_fits | (cost < old_cost))) | (~fits & ~old_fits & (worst < old_worst))
+    sound, old_sound = (torch.isfinite(c) & torch.isfinite(v) for c, v in ((cost, worst), (old_cost, old_worst)))
+    fits, old_fits = (worst <= limit) & sound, (old_worst <= limit) & old_sound
+    less = (worst < old_worst) | (sound & ~old_sound)
+    return (fits & (~old_fits | (cost < old_cost))) | (~fits & ~old_fits & less & (sound | ~old_sound))
 
 
 def goal_tolerance(problem: Problem) -> Tensor | None:

@@ -204,7 +204,9 @@ class InteriorPoint(Solver):
         put(end.last, rows, found)
         status = out["status"].long()
         status = torch.where(status == Status.CONVERGED, SOLVED, status)
-        end.status[rows] = torch.where(status == Status.INFEASIBLE, BARRED, status)
+        status = torch.where(status == Status.INFEASIBLE, BARRED, status)
+        sound = torch.isfinite(found.cost) & torch.isfinite(found.violation)
+        end.status[rows] = torch.where(sound, status, int(Status.NON_FINITE))
         end.iterations[rows] = out["iterations"]
 
     def _without_kernels(self) -> AugmentedLagrangian:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchgco.base.status import STOPPED, Status, is_over
 from torchgco.base.tree import spread, take
 from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.lagrangian.quality import violation
 from torchgco.native.dispatch import reproducible
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
@@ -61,9 +62,11 @@ class Session:
         limit = Status.TIME_LIMIT if self.given.late else Status.MAX_ITERATIONS
         ended = torch.where(end.status == STOPPED, int(limit), end.status)
         constrained = bool(problem.constraints) or problem.free_start is not None
+        finite = torch.isfinite(found.cost) & torch.isfinite(found.violation)
+        ended = torch.where(finite | (ended == Status.INVALID_START), ended, int(Status.NON_FINITE))
         status = final_status(ended, left, found.violation, tolerance, constrained)
         user = self.given.problem
-        falls = falls_without_end(user, self.given.U0, found.X, found.U, found.cost, found.violation, tolerance)
+        falls = falls_without_end(user, self.given.U0, found, left, tolerance)
         status[falls] = Status.UNBOUNDED
         return Solution(
             found.X, found.U, K, d, found.multipliers, found.cost, found.violation, status,
@@ -72,7 +75,7 @@ class Session:
         )  # fmt: skip
 
     def trajectories(self, end: SolveEnd, gains: Callable[[Tensor], Tensor] | None = None) -> Iterate:
-        """The best trajectories in the user's units, as PyTorch's rollouts give them.
+        """The best trajectories in the user's units, as PyTorch's rollouts give them, with their own cost and violation.
 
         Args:
             gains: those of some rows (b,), (b, N, m, n), where they are known.
@@ -80,8 +83,9 @@ class Session:
         best = end.best
         known = gains or (lambda rows: self._optimality(best, rows).K)
         X, U = reproducible(self.call.problem, best.X, best.U, known)
-        cost = self.given.problem.cost.total(X, U)
-        return Iterate(X, U, best.multipliers.scaled(self.unit), cost, best.violation)
+        user = self.given.problem
+        cost, worst = user.cost.total(X, U), violation(user.constraints, X, U)
+        return Iterate(X, U, best.multipliers.scaled(self.unit), cost, worst)
 
     def _optimality(self, best: Iterate, rows: Tensor) -> Optimality:
         part = Lagrangian(self.call.problem.take(rows), take(best.multipliers, rows), None, self.rules.phr)

@@ -7,38 +7,51 @@ from torch import Tensor
 
 from torchgco.native.dispatch import cost_unit, measured, open_loop
 from torchgco.problem.problem import Problem
+from torchgco.solvers.ending import STATIONARY
+from torchgco.solvers.state import Iterate
 
 # Falls of the cost from that of the guess, as multiples of the size of that cost plus the cost unit of all stages.
 DEEP = 1e6  # a fall that asks for a closer look
-BOTTOMLESS = 1e20  # one that needs none: IPOPT's diverging_iterates_tol
+BOTTOMLESS = 1e20  # one that needs none, or a way of controls that asks for one: IPOPT's diverging_iterates_tol
 FARTHER = 10.0, 1e3, 1e6  # times the way from the guess, for that look
 GROWING = 1e-3  # controls that moved by less than this share of the largest move stay where they are
 
 
-def falls_without_end(
-    problem: Problem, U0: Tensor, X: Tensor, U: Tensor, cost: Tensor, violation: Tensor, tolerance: float
-) -> Tensor:
-    """Whether the cost (B,) of feasible trajectories X (B, N+1, n), U (B, N, m) falls without end, (B,) bool.
+def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor, tolerance: float) -> Tensor:
+    """Whether the cost of feasible trajectories falls without end, (B,) bool.
 
-    It does where it lies deep below that of the guess U0 (B, N, m), and falls as fast again where the controls that
-    have moved most go on in their directions, at no violation. That is tested, for a large fall may also be a reward
-    that ends, such as one at wide bounds.
+    It does where the controls that have moved most from the guess U0 (B, N, m) go on in their directions, at no
+    violation, and the cost falls as it did, or by as much for every power of ten, as a logarithm does. That is tried
+    where the cost lies deep below that of the guess, for this may also be a reward that ends, such as one at wide
+    bounds; and where a Newton step would still save a share `left` (B,) of the cost, or controls have gone far beyond all sizes.
     """
     unit = problem.N * cost_unit(problem)
-    found = (cost < -DEEP * unit) & (violation <= tolerance)
-    rows = found.nonzero().flatten()
+    open_ended = (left > STATIONARY) | ((found.U - U0).abs().flatten(1).amax(-1) >= BOTTOMLESS)
+    falls = ((found.cost < -DEEP * unit) | open_ended) & (found.violation <= tolerance)
+    rows = falls.nonzero().flatten()
     if rows.numel() == 0:
-        return found
-    held, U0, U, cost, unit = problem.take(rows).held_at(X[rows, 0]), U0[rows], U[rows], cost[rows], unit[rows]
+        return falls
+    X, U0, U, cost, unit = (part[rows] for part in (found.X, U0, found.U, found.cost, unit))
+    held = problem.take(rows).held_at(X[:, 0])
     before = held.cost.total(open_loop(held, U0), U0)
-    fall, size = before - cost, before.abs() + unit
-    move = U - U0
+    farther, clear = _farther(held, U0, U, tolerance)
+    costs = torch.stack([cost, *farther])
+    fall, size, times = before - costs, before.abs() + unit, cost.new_tensor([1.0, *FARTHER]).unsqueeze(-1)
+    linear = (fall >= 0.5 * times * fall[0]).all(0) & (fall[0] >= DEEP * size)
+    rate = (costs[:-1] - costs[1:]) / times.log10().diff(dim=0)
+    by_decades = (rate >= 0.5 * rate[0]).all(0) & (rate[0] > STATIONARY * (cost.abs() + unit)) & open_ended[rows]
+    falls[rows] = (fall[0] >= BOTTOMLESS * size) | ((linear | by_decades) & clear)
+    return falls
+
+
+def _farther(problem: Problem, U0: Tensor, U: Tensor, tolerance: float) -> tuple[list[Tensor], Tensor]:
+    """The costs (b,) at multiples of the way from U0 to U (b, N, m), and whether none of these places is violated."""
+    move, clear = U - U0, torch.ones_like(U[:, 0, 0], dtype=torch.bool)
     large = move.abs() >= GROWING * move.abs().flatten(1).amax(-1).view(-1, 1, 1)
-    goes_on = torch.ones_like(rows, dtype=torch.bool)
+    costs = list[Tensor]()
     for times in FARTHER:
         beyond = U + torch.where(large, (times - 1) * move, 0.0)
-        path = open_loop(held, beyond)
-        goes_on &= before - held.cost.total(path, beyond) >= 0.5 * times * fall
-        goes_on &= measured(held, path, beyond) <= tolerance
-    found[rows] = (fall >= BOTTOMLESS * size) | ((fall >= DEEP * size) & goes_on)
-    return found
+        path = open_loop(problem, beyond)
+        costs.append(problem.cost.total(path, beyond))
+        clear &= measured(problem, path, beyond) <= tolerance
+    return costs, clear
