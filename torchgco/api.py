@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import ContactWarning, InputError, shown
+from torchgco.base.errors import ContactWarning, InputError, ScaleWarning, shown
 from torchgco.base.options import check_value
 from torchgco.base.shapes import check_shape, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
 from torchgco.judging.judge import CLEARANCES, by_kind
+from torchgco.judging.scale import SHARE, TIGHT, dwarfed
+from torchgco.judging.worst import NONE, kind_of
 from torchgco.native.dispatch import current, open_loop
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
@@ -46,7 +48,8 @@ def solve(
 ) -> Solution:
     """Solve every problem of the batch.
 
-    A ContactWarning names the trajectories whose status says feasible although they touch an obstacle between knots.
+    A ContactWarning names the trajectories whose status says feasible although they touch an obstacle between knots, a
+    ScaleWarning those whose violation is tolerated but large beside the values of the constraint.
 
     Args:
         problem: B problems.
@@ -87,6 +90,7 @@ def solve(
         watcher.close()
     if name is not None and found.account is not None:
         found = replace(found, account=found.account.of_preset(name))
+    _warn_of_scale(problem, U0, found)
     return _warned_of_contact(problem, found)
 
 
@@ -129,6 +133,28 @@ def _warned_of_contact(problem: Problem, solution: Solution) -> Solution:
             stacklevel=3,
         )
     return solution
+
+
+def _warn_of_scale(problem: Problem, U0: Tensor, solution: Solution) -> None:
+    """A ScaleWarning where a violation that counts as feasible leaves little of a constraint."""
+    claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
+    rows = (claims & (solution.violation > TIGHT)).nonzero().flatten()
+    if rows.numel() == 0:
+        return
+    part, found = problem.take(rows), (solution.X[rows], solution.U[rows])
+    guess = open_loop(part.held_at(found[0][:, 0]), U0[rows]), U0[rows]
+    place = dwarfed(part, guess, found)
+    large = (place != NONE).nonzero().flatten().tolist()
+    if large:
+        b, i = int(rows[large[0]]), int(place[large[0]])
+        warnings.warn(
+            f"{len(large)} of {problem.B} trajectories count as feasible although a violation is over {SHARE:.0%} of the "
+            f"constraint's own values: problem {b}, constraints[{i}] ({kind_of(problem.constraints[i])}), by up to "
+            f"{float(solution.violation[b]):.2g}; choose units in which the constraint is larger, or a smaller "
+            "violation_tolerance of the solver",
+            ScaleWarning,
+            stacklevel=3,
+        )
 
 
 def touches(problem: Problem, solution: Solution) -> Tensor:

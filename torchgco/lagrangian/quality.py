@@ -34,7 +34,7 @@ def violation(constraints: Sequence[Constraint], X: Tensor, U: Tensor) -> Tensor
     return worst
 
 
-def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, limit: float) -> Tensor:
+def is_better(cost: Tensor, worst: Tensor, old_cost: Tensor, old_worst: Tensor, limit: float | Tensor) -> Tensor:
     """Whether a trajectory is better than an old one, (B,).
 
     Feasible is better than infeasible; of two feasible ones the cheaper, of two infeasible ones the less violated. What
@@ -67,7 +67,7 @@ def has_arrived(problem: Problem, X: Tensor, tolerances: float = 1.0) -> Tensor:
     return problem.goal.distance(X[:, -1, problem.position]) <= tolerances * near
 
 
-def is_preferred(problem: Problem, new: Rated, old: Rated, limit: float, by_arrival: bool = True) -> Tensor:
+def is_preferred(problem: Problem, new: Rated, old: Rated, limit: float | Tensor, by_arrival: bool = True) -> Tensor:
     """Whether a trajectory should replace an old one, (B,) bool: feasible arrival counts first, then `is_better`."""
     better = is_better(new.cost, new.violation, old.cost, old.violation, limit)
     if not by_arrival:

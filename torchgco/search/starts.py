@@ -97,7 +97,10 @@ class Starts:
 
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
         """Keep results that are better than the best so far, by more than rounding, and as feasible as tolerated."""
-        old, new, limit = take(search.best.end.best, rows), end.best, search.solver.violation_tolerance
+        old, new = take(search.best.end.best, rows), end.best
+        # A solve that failed counts as lost where it violates by more than those that succeed.
+        solved = is_over(search.best.end.status[rows])
+        limit = torch.where(solved, search.solver.violation_tolerance, self.solver.violation_tolerance)
         lost = ~(old.violation <= limit)
         cheaper = new.cost < old.cost - STATIONARY * old.cost.abs()
         tight = (end.status == SOLVED) & (new.violation <= old.violation.clamp(min=self.solver.violation_tolerance))
