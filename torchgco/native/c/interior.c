@@ -9,7 +9,7 @@ static void settle(Barrier *t, Track *k, I of, int anew) {
     if (anew) {
         sort_rows(t, of);
         ROWS(t, 0, {
-            V slack = most(-t->c[q], SET(how->push));
+            V slack = most(-t->c[q], SET(how->push) * t->room[q]);
             if (t->some_out) slack = tgco_choose(t->out[q], SET(1.0), slack);
             t->s[q] = tgco_choose(of, slack, t->s[q]);
         })

@@ -25,7 +25,12 @@ static void find_fixed(Barrier *t, I of, int64_t i, int64_t k) {
     if (con->kind != BOUNDS) return;
     for (int j = 0; j < con->rows; j++) for (int l = j + 1; l < con->rows; l++) {
         if (!are_a_pair(con, j, l)) continue;
-        I same = of & (t->c[q + j] + t->c[q + l] == SET(0.0));
+        V half = SET(-0.5) * (t->c[q + j] + t->c[q + l]);
+        for (int m = 0; m < 2; m++) {
+            V *room = t->room + q + (m ? l : j);
+            *room = tgco_choose(of, least(half, SET(1.0)), *room);
+        }
+        I same = of & (half == SET(0.0));
         t->out[q + j] |= same; t->out[q + l] |= same; t->fixes[q + j] |= same;
     }
 }
@@ -120,7 +125,10 @@ static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
 /* Which rows of the lanes `of`, whose iterate and values c are new, stay out of the barrier. */
 static void sort_rows(Barrier *t, I of) {
     const Problem *p = t->lanes.of;
-    for (int64_t q = 0; q < t->rows; q++) { t->out[q] &= ~of; t->fixes[q] &= ~of; }
+    for (int64_t q = 0; q < t->rows; q++) {
+        t->out[q] &= ~of; t->fixes[q] &= ~of;
+        t->room[q] = tgco_choose(of, SET(1.0), t->room[q]);
+    }
     for (int64_t k = 0; k <= p->N; k++)
         for (int64_t i = 0; i < p->constraints; i++)
             if (p->constraint[i].place[k] != NOWHERE && !p->constraint[i].equality) find_fixed(t, of, i, k);

@@ -18,6 +18,7 @@ typedef struct {
     V *is_free, *L_start;        /* (NX): 1 where the start is free; (NX, NX): its factor. None where none is free */
     V *dx, *du;                  /* (N+1, NX), (N, NU) */
     V *c, *cn, *s, *sn, *z, *r, *ds, *dz; /* (rows): values, slacks, multipliers, residuals, and of trial and step */
+    V *room; /* (rows): half the range between two bounds, 1 at most */
     I *out, *fixes; /* (rows): rows of inequalities outside the barrier, and those of them that hold as equalities */
     int some_out;   /* whether there are any in a lane; see interior_fixed.c */
     int64_t *first, rows;        /* the first row of each constraint, and how many there are */
