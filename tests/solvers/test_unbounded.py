@@ -66,3 +66,34 @@ def test_a_reward_far_away(solver: str) -> None:
     form = problem(lambda x, u: reward(x) + 1e-14 * u[..., 0].square(), reward)
     found = torchgco.solve(form, torch.full((2, 20, 1), 0.1, dtype=D), solver)
     assert Status.UNBOUNDED not in found.statuses, found
+
+
+# Logarithms -----------------------------------------------------------------------------------------------------------
+
+
+def cake(*constraints: Constraint) -> Problem:
+    """Consumption of a capital that grows by 3 % a year, valued by its logarithm, from 64 capitals."""
+    model = FunctionDynamics(lambda x, u: 0.03 * x - u, 1, 1, 1.0)
+    cost = FunctionCost(lambda x, u, k: -(0.95**k) * u[..., 0].log(), lambda x: 0 * x[..., 0])
+    return Problem(model, cost, constraints, torch.linspace(0.5, 100, 64, dtype=D).unsqueeze(-1), 30)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("guess", [0.01, 1.0])
+def test_a_cost_that_falls_like_a_logarithm(solver: str, guess: float) -> None:
+    """Its slopes vanish against those of the guess, and a fall is never deep; nothing keeps the capital above 0."""
+    for constraints in ((), (ControlBounds(1e-3, INF),)):
+        found = torchgco.solve(cake(*constraints), torch.full((64, 30, 1), guess, dtype=D), solver)
+        assert found.statuses == [Status.UNBOUNDED] * 64, found
+
+
+@pytest.mark.parametrize("solver", ["interior_point", "gco"])
+def test_a_logarithm_with_an_end(solver: str) -> None:
+    """The capital is spent at the end: c_k = c_0 (0.95 * 1.03)^k, all of it."""
+    problem = cake(StateBounds(0.0, INF, knots=[30]), ControlBounds(1e-3, INF))
+    found = torchgco.solve(problem, torch.full((64, 30, 1), 0.01, dtype=D), solver)
+    assert found.statuses == [Status.CONVERGED] * 64, found
+    k = torch.arange(30, dtype=D)
+    prices = 1.03 ** (29 - k)
+    first = 1.03**30 * problem.x0 / (prices * (0.95 * 1.03) ** k).sum()
+    torch.testing.assert_close(found.U[..., 0], first * (0.95 * 1.03) ** k, rtol=2e-3, atol=1e-4)

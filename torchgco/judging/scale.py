@@ -9,14 +9,14 @@ from torchgco.judging.worst import NONE
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem
 
-SHARE = 0.05  # of a row's values: a larger violation leaves little of the constraint
+SHARE = 0.05  # of a constraint's values: a larger violation leaves little of the constraint
 TIGHT = 1e-6  # no violation below it counts as large: that of solves by the interior point
 
 
 def dwarfed(problem: Problem, guess: tuple[Tensor, Tensor], found: tuple[Tensor, Tensor]) -> Tensor:
     """The place (B,) of a constraint whose violation is large beside all its values, `NONE` where there is none.
 
-    A row's size is its largest value along the guess. Rows that have the value of the guess still, such as those of a
+    A constraint's size is the largest value of its rows along the guess. Rows that have the value of the guess still, such as those of a
     given start, say nothing; obstacles have sizes of their own.
 
     Args:
@@ -29,7 +29,7 @@ def dwarfed(problem: Problem, guess: tuple[Tensor, Tensor], found: tuple[Tensor,
         before, now = constraint.value(*guess), constraint.value(*found)
         if before.numel() == 0:
             continue
-        size = before.abs().amax(1, keepdim=True)
+        size = before.abs().flatten(1).amax(-1).view(-1, 1, 1)
         large = (constraint.violation(*found) > (SHARE * size).clamp(min=TIGHT)) & (now != before)
         place[large.flatten(1).any(-1)] = number
     return place
