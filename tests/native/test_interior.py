@@ -143,7 +143,31 @@ def maps(seed: int) -> Problem:
     return Problem(plain.dynamics, plain.cost, [field, plain.constraints[1]], plain.x0, plain.N)
 
 
-MAKERS = {"curved": curved, "obstacles": obstacles, "rates": rates, "apart": apart, "maps": maps}
+def narrow(seed: int) -> Problem:
+    """Bounds so close that a slack has less room than it is usually given."""
+    problem = curved(seed)
+    high = torch.tensor([0.02, 1.5], dtype=D) * (1 + 0.5 * draw(seed)(B, problem.N, 2).abs())
+    slow = ControlBounds(-high, high)
+    return Problem(problem.dynamics, problem.cost, [slow, *problem.constraints[1:]], problem.x0, problem.N)
+
+
+def with_rows_without_room(seed: int) -> tuple[Problem, Problem]:
+    """A problem with bounds that coincide and rows that nothing moves, and the same with equalities, without rows."""
+    problem, value = curved(seed), 0.3 * draw(seed + 1)(B, 1, 1)
+    low, high = (torch.full((B, problem.N, 2), bound, dtype=D) for bound in (-1.3, 1.2))
+    others = [0, 1, 3, 4]
+    plain = [ControlBounds(low[:, others], high[:, others], knots=others), *problem.constraints[1:]]
+    low[:, 2:3, :], high[:, 2:3, :] = value, value
+    both = lambda x, u, v: u - v
+    equal = FunctionConstraint(both, "equality", of="xu", knots=[2], values={"v": value[:, 0].repeat(1, 2)})
+    start = StateBounds(problem.x0.unsqueeze(1), problem.x0.unsqueeze(1) + 1.0, knots=[0])
+    flat = FunctionConstraint(lambda x, u: torch.stack((0 * u[..., 0], 0 * x[..., 1] - 1e-3), dim=-1), of="xu")
+    parts = [ControlBounds(low, high), *problem.constraints[1:], start, flat]
+    of = lambda rows: Problem(problem.dynamics, problem.cost, rows, problem.x0, problem.N)
+    return of(parts), of([*plain, equal])
+
+
+MAKERS = {"curved": curved, "obstacles": obstacles, "rates": rates, "apart": apart, "maps": maps, "narrow": narrow}
 
 
 def guess(problem: Problem, seed: int) -> tuple[Tensor, Tensor]:
@@ -223,3 +247,19 @@ def assert_same(point: Point, w: Array, multipliers: tuple[Array, Array], mu: fl
     np.testing.assert_allclose(w, point.w, rtol=1e-6, atol=1e-7)
     for mine, theirs in zip(multipliers, (point.z, point.e), strict=True):
         np.testing.assert_allclose(point.scale * mine, theirs, rtol=1e-5, atol=1e-6)
+
+
+def test_rows_without_room_take_the_steps_of_the_problem_without_them() -> None:
+    """Bounds that coincide are equalities; a tight bound on the start and constant rows have no part in any step."""
+    given, plain = with_rows_without_room(3)
+    X, U = guess(plain, 1)
+    U[:, 2] = given.constraints[0].by_knot[0][:, 2]
+    for count in (1, 2, 3, 4):
+        mine, theirs = (
+            iterates(problem, X, U, multipliers(problem, X, U, None), 0.1, count, False) for problem in (given, plain)
+        )
+        for name in ("X", "U", "mu"):
+            torch.testing.assert_close(mine[name], theirs[name], rtol=1e-9, atol=1e-10)
+        upper, lower = mine["lam"][0][:, 2].split(2, dim=-1)
+        torch.testing.assert_close(upper - lower, theirs["lam"][-1][:, 0], rtol=1e-7, atol=1e-9)
+        assert not bool(mine["lam"][-1].any()) and not bool(mine["lam"][-2][..., 3:].any())

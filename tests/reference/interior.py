@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco import Problem
+from torchgco import ControlBounds, Problem, StateBounds
 
 Array = np.ndarray
 
@@ -145,7 +145,7 @@ def begin(
     ]  # fmt: skip
     largest = max(float(part.abs().max()) for part in parts)
     scale = how["steepest"] / largest if largest > 0 else 1.0
-    s = np.maximum(-at.c, how["push"])
+    s = np.maximum(-at.c, how["push"] * room(program))
     z, e = (mu / s, np.zeros_like(at.e)) if warm is None else (scale * warm[0], scale * warm[1])
     z = np.maximum(z, mu / (how["central"] * s))
     point = Point(w, np.zeros_like(at.gap), e, z, s, mu, scale)
@@ -154,6 +154,22 @@ def begin(
     states = slice(0, program.problem.N * program.problem.n)
     y = np.linalg.solve(at.G[:, states].T, -residual(at, point)[states])
     return replace(point, y=y if abs(y).max() <= how["largest_multiplier"] else 0 * y)
+
+
+def room(program: Program) -> Array:
+    """Of every inequality, half the range between two bounds of a variable, 1 at most and for all other rows."""
+    X, U = program.problem.x0.unsqueeze(1).repeat(1, program.problem.N + 1, 1), None
+    U = X.new_zeros(1, program.problem.N, program.problem.m)
+    found = [torch.zeros(0)]
+    for part in program.problem.constraints:
+        if part.sense != "inequality":
+            continue
+        rows = torch.ones_like(part.value(X, U))
+        if isinstance(part, ControlBounds | StateBounds):
+            half = 0.5 * torch.broadcast_to(torch.sub(*reversed(part.by_knot)), (1, rows.shape[1], part.lower.shape[-1]))
+            rows = torch.cat((half[..., part.above], half[..., part.below]), dim=-1).clamp(max=1.0)
+        found.append(rows.flatten())
+    return torch.cat(found).numpy()
 
 
 def _stage_cost(program: Program, x: Tensor, u: Tensor) -> Tensor:
