@@ -33,7 +33,7 @@ class Status(IntEnum):
 STOPPED = -1  # ended by guidance, for another attempt
 STALLED = -2  # neither the violation nor the cost of a feasible trajectory falls any more
 SOLVED = -3  # the optimality conditions hold to the solver's own tolerance
-BARRED = -4  # the same without rows that are violated whatever the controls: no solve makes them better
+UNMOVED = -4  # the same but for violated rows that no variable moves: nothing that is tried could mend them
 
 _SENTENCES = {
     Status.RUNNING: "The solve has not ended.",
@@ -57,4 +57,4 @@ _SENTENCES = {
 
 def is_over(status: Tensor) -> Tensor:
     """Whether nothing is left to solve, by statuses within a solve, of any shape."""
-    return (status == SOLVED) | (status == BARRED)
+    return (status == SOLVED) | (status == UNMOVED)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import Count, Positive, check_options
-from torchgco.base.status import BARRED, SOLVED, Status, is_over
+from torchgco.base.status import UNMOVED, SOLVED, Status, is_over
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import is_preferred
 from torchgco.search.attempts import Search
@@ -72,7 +72,7 @@ class Starts:
             return torch.arange(search.call.problem.B, device=search.call.ids.device)
         first = search.caught.status
         failed = ~is_over(first) & (first != Status.CONVERGED)
-        lost = ~(search.best.end.best.violation <= search.solver.violation_tolerance) & (first != BARRED)
+        lost = ~(search.best.end.best.violation <= search.solver.violation_tolerance) & (first != UNMOVED)
         return (failed | lost).nonzero().flatten()
 
     def _solve(self, search: Search, rows: Tensor) -> None:

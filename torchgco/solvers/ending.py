@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.base.status import BARRED, STALLED, Status, is_over
+from torchgco.base.status import UNMOVED, STALLED, Status, is_over
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.dispatch import cost_unit, engine_of
@@ -96,7 +96,7 @@ def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: floa
     reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED) | over, limit, ended)
     status = torch.where(fits & constrained, int(Status.FEASIBLE), reason)
     status = torch.where(stationary & fits, int(Status.CONVERGED), status)
-    status = torch.where(~fits & ((ended == STALLED) | (ended == BARRED)), int(Status.INFEASIBLE), status)
+    status = torch.where(~fits & ((ended == STALLED) | (ended == UNMOVED)), int(Status.INFEASIBLE), status)
     status = torch.where(torch.isinf(left) & ~over, int(Status.NOT_POSITIVE_DEFINITE), status)
     status = torch.where((ended == Status.TIME_LIMIT) & ~fits, ended, status)  # more time might find more
     failed = (ended == Status.NON_FINITE) | (ended == Status.NOT_POSITIVE_DEFINITE) | (ended == Status.INVALID_START)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.shapes import check_shape, check_tensor
-from torchgco.base.status import BARRED, SOLVED, STALLED, Status, is_over
+from torchgco.base.status import UNMOVED, SOLVED, STALLED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -204,7 +204,7 @@ class InteriorPoint(Solver):
         put(end.last, rows, found)
         status = out["status"].long()
         status = torch.where(status == Status.CONVERGED, SOLVED, status)
-        status = torch.where(status == Status.INFEASIBLE, BARRED, status)
+        status = torch.where(status == Status.INFEASIBLE, UNMOVED, status)
         sound = torch.isfinite(found.cost) & torch.isfinite(found.violation)
         end.status[rows] = torch.where(sound, status, int(Status.NON_FINITE))
         end.iterations[rows] = out["iterations"]
