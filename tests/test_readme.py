@@ -1,4 +1,4 @@
-"""The README's example runs as printed, and it stays short; test_documents.py tests links and commands."""
+"""The README's example runs as printed; test_documents.py tests links and commands."""
 
 import re
 from pathlib import Path
@@ -24,7 +24,3 @@ def test_the_python_example() -> None:
 def test_every_status_is_explained() -> None:
     for status in Status:
         assert status is Status.RUNNING or f"| `{status.name}` |" in WORDS
-
-
-def test_it_is_read_in_a_few_minutes() -> None:
-    assert len(README.split()) <= 900

@@ -22,6 +22,7 @@ from torchgco.api import plot as plot
 from torchgco.api import solve as solve
 from torchgco.base.errors import ContactWarning as ContactWarning
 from torchgco.base.errors import GuidanceWarning as GuidanceWarning
+from torchgco.base.errors import HorizonWarning as HorizonWarning
 from torchgco.base.errors import InputError as InputError
 from torchgco.base.errors import ScaleWarning as ScaleWarning
 from torchgco.base.errors import StartWarning as StartWarning
@@ -94,7 +95,8 @@ __all__ = [  # noqa: RUF022
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors
-    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "ScaleWarning", "StartWarning",
+    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning", "ScaleWarning",
+    "StartWarning",
 ]  # fmt: skip
 
 __version__ = VERSION

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import ContactWarning, InputError, ScaleWarning, shown
+from torchgco.base.errors import ContactWarning, HorizonWarning, InputError, ScaleWarning, shown
 from torchgco.base.options import check_value
 from torchgco.base.shapes import check_shape, computing_on
 from torchgco.base.status import Status
@@ -23,6 +23,7 @@ from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.search import Restarts
+from torchgco.search.reach import short_horizons
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 from torchgco.solvers.watching import Watcher
@@ -48,8 +49,9 @@ def solve(
 ) -> Solution:
     """Solve every problem of the batch.
 
-    A ContactWarning names the trajectories whose status says feasible although they touch an obstacle between knots, a
-    ScaleWarning those whose violation is tolerated but large beside the values of the constraint.
+    A ContactWarning names the trajectories whose status says feasible although they touch an obstacle between knots; a
+    ScaleWarning those whose violation is tolerated but large beside the values of the constraint; a HorizonWarning,
+    before the solve, the horizons that are too short for the way to a stated goal at the limits on speed.
 
     Args:
         problem: B problems.
@@ -81,6 +83,8 @@ def solve(
         problem, U0 = _start(problem, warm, solver)
     multipliers = None if warm is None else warm.multipliers
     verbose = check_value(verbose, bool | None, "verbose")
+    if warm is None and (told := short_horizons(problem)) is not None:
+        warnings.warn(told, HorizonWarning, stacklevel=2)
     watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
     more: dict[str, Any] = {"callback": watcher} if watcher.shows else {}
     try:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from torch import Tensor
@@ -22,6 +23,7 @@ from torchgco import Boxes, ControlBounds, Goal, InputError, Problem, Separation
 from torchgco.constraints.base import Constraint
 from torchgco.obstacles import Obstacles
 from torchgco.plotting.problems import LIMIT
+from torchgco.plotting.style import PALETTE
 from torchgco.plotting.world import distances, world_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -71,6 +73,37 @@ def test_each_has_a_scene_where_obstacles_differ() -> None:
     problem, U0 = planar_batch(B=3, N=10, obstacles=3)
     axes = axes_of(torchgco.plot(problem, flown(problem, U0), b=[0, 1]))
     assert len(axes) == 2 + problem.n + problem.m
+
+
+def test_each_trajectory_has_its_own_ring_where_it_passes_a_moving_disc() -> None:
+    """Drawn at one time alone, a disc would seem to be crossed by the others."""
+    base, _ = planar_batch(B=1, N=20, obstacles=1)
+    start = torch.tensor([[-1.0, 0, 0, 0, 0, 0], [-1.0, 0.3, 0, 0, 0, 0]]).double()
+    discs = Spheres([[0.0, 0.9]], [0.1], 0.06, velocities=[[0.0, -0.8]])
+    problem = Problem(base.dynamics, base.cost, [discs], start, 20, Goal([1.0, 0.4], 0.1))
+    share = torch.linspace(0, 1, 21).double()
+    X = start.unsqueeze(1).repeat(1, 21, 1)
+    X[0, :, 0], X[1, :, 0] = -1 + 2 * share, -1 + 2 * share.square()  # the second is slower at first
+    found = replace(flown(problem), X=X)
+    figure = torchgco.plot(problem, found)
+    scene, colours = axes_of(figure)[0], PALETTE[:2]
+    times = np.asarray(found.t)
+    for b, colour in enumerate(colours):
+        centers = np.stack((0 * times, 0.9 - 0.8 * times), axis=-1)
+        k = int(np.linalg.norm(X[b, :, :2].numpy() - centers, axis=1).argmin())
+        rings = [held for held in scene.collections if to_hex(held.get_edgecolor()[0]) == colour.lower()]
+        assert len(rings) == 2, "the disc, and the same grown by the vehicle's radius"
+        for ring, radius in zip(sorted(rings, key=reach), (0.1, 0.16), strict=True):
+            (outline,) = ring.get_paths()
+            np.testing.assert_allclose(np.linalg.norm(outline.vertices - centers[k], axis=1), radius, atol=1e-9)
+        (place,) = [line for line in scene.lines if line.get_marker() == "o" and line.get_color() == colour]
+        np.testing.assert_allclose(np.column_stack(place.get_data()), X[b, k : k + 1, :2].numpy())
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "moving obstacle as the trajectory of its colour passes (number: time [s])" in words
+
+
+def reach(held: Any) -> float:
+    return float(np.ptp(held.get_paths()[0].vertices[:, 0]))
 
 
 def test_in_space_there_are_two_views_cut_where_it_flies() -> None:

@@ -182,4 +182,4 @@ def test_pictures_show_the_map(d: int, tmp_path: Path) -> None:
     for place, colour in (([3.125, 2.75], STONE), ([3.0, 5.5], "#FFFFFF")):  # in the wall, and in a room
         x, y = figure.axes[0].transData.transform(place)
         assert to_hex(image[len(image) - int(y) - 1, int(x)] / 255).upper() == colour
-    assert "obstacle" in figure.legends[0].get_texts()[3].get_text()
+    assert any(text.get_text().startswith("obstacle") for text in figure.legends[0].get_texts())

@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from tests.view.scenes import DT, RADIUS, SOLVERS, N, problem, trajectories
 from torchgco import Boxes, Field, FunctionDynamics, Planar, Problem, QuadraticCost
+from torchgco.judging.contact import contacts
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.view.cells import merged
-from torchgco.view.flights import contacts, flights_of, violated, whole
+from torchgco.view.flights import flights_of, violated, whole
 from torchgco.view.shapes import SHAPES, Shapes, once, shapes_of, turns
 from torchgco.view.vehicles import Look
 

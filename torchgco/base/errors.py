@@ -1,4 +1,4 @@
-"""The error for malformed input, and the warnings: unused guidance, held starts, contacts, lengths too small."""
+"""The error for malformed input, and the warnings: on guidance, starts, horizons, contacts, lengths."""
 
 from __future__ import annotations
 
@@ -34,6 +34,10 @@ class StartWarning(UserWarning):
 
 class ScaleWarning(UserWarning):
     """A problem's lengths are so small that the tolerances, which are in metres, don't see them."""
+
+
+class HorizonWarning(UserWarning):
+    """A horizon is shorter than the way to the goal needs at the limits on speed."""
 
 
 class ContactWarning(UserWarning):

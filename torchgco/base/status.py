@@ -47,7 +47,7 @@ _SENTENCES = {
     Status.NOT_POSITIVE_DEFINITE: "The regularised control Hessian stayed indefinite up to the largest regularisation.",
     Status.NON_FINITE: "A state, cost or derivative became NaN or infinite.",
     Status.INFEASIBLE: "No iterate met the constraints, and nothing that was tried lowers the violation further; the "
-    "least violated trajectory is returned. Another guess may still lead to a feasible one.",
+    "least violated trajectory is returned. `solution.explain` says what may help.",
     Status.TIME_LIMIT: "The time limit ended the solve before the trajectory was stationary or feasible.",
     Status.UNBOUNDED: "The cost falls without end, so there is no optimum; bound the controls or states that grow, or "
     "add a cost that keeps them small.",

@@ -27,6 +27,10 @@ BY_STATUS = {
     Status.UNBOUNDED: "Bounds on what grows, or a cost that keeps it small.",
     Status.INVALID_START: "A start x0 outside the obstacles, whose radii here include the vehicle's.",
 }
+UNKNOWN = (
+    "A start where the map knows that it is free; or let unknown cells, which count as occupied, count as free: "
+    'DistanceField.of(grid, unknown="free"), on the command line scenario.unknown=free.'
+)
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,9 @@ class Facts:
         clearance: m, between knots too; None where it can't be judged.
         pathless: whether the record shows searches for paths, none of which found any.
         could_record: whether the solver can record more than it did.
+        radius: of the vehicle, m, where no way through the map leads it to the goal.
+        passage: the largest radius, m, that some way has room for; 0: none.
+        in_unknown: whether the start is invalid for unknown cells of a map alone.
     """
 
     status: Status
@@ -52,10 +59,27 @@ class Facts:
     clearance: float | None = None
     pathless: bool = False
     could_record: bool = False
+    radius: float | None = None
+    passage: float = 0.0
+    in_unknown: bool = False
+
+    @property
+    def told(self) -> list[str]:
+        """Why the solve ended so, in sentences."""
+        if self.radius is None:
+            return [self.status.sentence]
+        room = "none of any radius" if self.passage == 0.0 else f"the widest has room for {self.passage:.3g} m"
+        no_way = f"No way through the map leads a vehicle of radius {self.radius:.3g} m to the goal: {room}."
+        return [self.status.sentence, no_way]
 
 
 def advice(facts: Facts) -> list[str]:
     """Sentences, the most useful first; none where nothing is amiss."""
+    if facts.in_unknown:
+        return [UNKNOWN]
+    if facts.radius is not None:
+        smaller = f", or a vehicle_radius of at most {facts.passage:.3g} m" if facts.passage > 0 else ""
+        return [f"A goal on the start's side of the walls, or a map with a wider way{smaller}."]
     found = list[str]()
     if facts.among_obstacles and facts.seeks_paths is False and not (facts.status in FITS and facts.reached):
         found.append('solver="gco", the default, which seeks paths around obstacles on a roadmap.')

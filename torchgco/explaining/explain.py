@@ -13,6 +13,7 @@ from torchgco.base.shapes import check_shape
 from torchgco.base.status import Status
 from torchgco.explaining.account import Account
 from torchgco.explaining.advice import Facts, advice, tells_to_record
+from torchgco.explaining.barred import map_facts
 from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
 from torchgco.explaining.places import caught_told, number, place_told
 from torchgco.explaining.record import SearchRecord
@@ -74,7 +75,7 @@ def explanation(solution: Any, b: int, problem: Problem | None = None, what: str
         ("Caught", _caught(solved, b, one)),
         ("Passes", _passes(solved, b, account, facts)),
         ("Iterations", _iterations(solved, b)),
-        ("Why it ended", [facts.status.sentence]),
+        ("Why it ended", facts.told),
         ("What to try", advice(facts)),
     ]
     return Explanation("\n".join(_block(title, lines) for title, lines in parts if lines))
@@ -124,16 +125,19 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
     if one is None:
         return Facts(status, solver, could_record=could)
     verdict = one.verdict()
+    reached = bool(verdict["reached"]) if "reached" in verdict else None
+    clearance = float(verdict["clearance"]) if "clearance" in verdict else None
     return Facts(
         status=status,
         solver=solver,
         seeks_paths=None if solver is None else hasattr(solver, "passes"),
         among_obstacles=bool(one.problem.obstacles),
-        reached=bool(verdict["reached"]) if "reached" in verdict else None,
+        reached=reached,
         goal_distance=one.goal_distance,
-        clearance=float(verdict["clearance"]) if "clearance" in verdict else None,
+        clearance=clearance,
         pathless=solved.search is not None and is_pathless(solved.search, b),
         could_record=could,
+        **map_facts(one.problem, status, bool(reached) and (clearance is None or clearance >= 0)),
     )
 
 

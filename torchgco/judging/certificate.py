@@ -201,7 +201,7 @@ def _sphere_chords(spheres: BoundSpheres, X: Tensor) -> Tensor:
 def _box_chords(boxes: BoundBoxes, X: Tensor) -> Tensor:
     p, radii = X[None, :, boxes.position], torch.where(boxes.absent, -torch.inf, boxes.inflated_radii).unsqueeze(1)
     # Bounds are close up to a step's length above the smallest distance: the path hardly leaves a chord by more.
-    close = (box_distance(boxes, p) - radii).amin() + p.diff(dim=1).norm(dim=-1).amax()
+    close = ((box_distance(boxes, p) - radii).amin() + p.diff(dim=1).norm(dim=-1).amax()).clamp(min=0.0)
     return (box_segment_distance(boxes, p, close + radii) - radii)[0]
 
 
@@ -215,7 +215,7 @@ def _field_chords(field: BoundField, X: Tensor) -> Tensor:
 
 
 # By kind of obstacles: distances (N, M) of the chords of X (N+1, n) from the full surfaces of one problem, or lower
-# bounds of them.
+# bounds of them, which are close where they are below 0.
 CHORDS: dict[type[Constraint], Callable[[Any, Tensor], Tensor]] = {
     BoundSpheres: _sphere_chords,
     BoundBoxes: _box_chords,

@@ -51,7 +51,7 @@ def closest(axes: Tensor, center: Tensor, half: Tensor, a: Tensor, along: Tensor
 
 def oscillating_distances(swings: BoundOscillatingBoxes, p: Tensor) -> tuple[Tensor, Tensor]:
     """Signed distances (B, K, M) of points p (B, K, d) at the times k dt from boxes before rounding, and lower bounds
-    (B, K-1, M) of those along the straight ways between them, m; absent ones count too.
+    (B, K-1, M) of those along the straight ways between them, m, close beneath the full surface; absent ones count too.
 
     Seen from a box, the way between two knots leaves its chord by at most dt^2 / 8 of the box's acceleration.
     """
@@ -73,7 +73,7 @@ def oscillating_distances(swings: BoundOscillatingBoxes, p: Tensor) -> tuple[Ten
     least = 0.5 * (ends[:, :-1] + ends[:, 1:] - along.norm(dim=-1))
     near = (least - boxes.inflated_radii.unsqueeze(1)).masked_fill(boxes.absent.unsqueeze(1), torch.inf)
     known = (ends - boxes.inflated_radii.unsqueeze(1)).masked_fill(boxes.absent.unsqueeze(1), torch.inf)
-    within = known.flatten(1).amin(-1) + boxes.inflated_radii.amax(-1) + bulge.amax(-1)
+    within = (known.flatten(1).amin(-1) + boxes.inflated_radii.amax(-1) + bulge.amax(-1)).clamp(min=0.0)
     i, k, j = ((near < within.view(-1, 1, 1)) & (along != 0).any(-1)).nonzero(as_tuple=True)
     if i.numel() > 0:
         origin = torch.zeros_like(off[i, k, j])

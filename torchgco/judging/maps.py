@@ -59,11 +59,13 @@ def segment_distances(field: BoundField, p: Tensor) -> Tensor:
     where a segment enters one. Farther away they may be loose. Infinite where nothing is occupied, NaN at points that
     are NaN.
     """
-    solids = solids_of(field.field)
-    rows = []
-    for which, path in zip(field.which.tolist(), p.detach().cpu().double(), strict=True):
-        rows.append(_distances(solids[which], path))
-    return torch.stack(rows).to(p)
+    paths = zip(field.which.tolist(), p.detach().cpu().double(), strict=True)
+    return torch.stack([path_distances(field.field, which, path) for which, path in paths]).to(p)
+
+
+def path_distances(field: DistanceField, which: int, p: Tensor) -> Tensor:
+    """The same for points p (K, d), float64, and one of a field's maps, (K-1,)."""
+    return _distances(solids_of(field)[which], p)
 
 
 def _distances(solid: Solid, p: Tensor) -> Tensor:

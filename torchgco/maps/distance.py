@@ -101,6 +101,14 @@ class DistanceField:
         """The last node, (G, d), m."""
         return self.origin + self.spacing * (np.array(self.values.shape[1:]) - 1)
 
+    def single(self, which: int) -> DistanceField:
+        """The field of one of the maps alone, which all problems share."""
+        if self.batch is None:
+            return self
+        here = slice(which, which + 1)
+        source = self.source.single(which)
+        return DistanceField(self.values[here], self.origin[here], self.spacing, source, self.unknown)
+
     def nodes(self, device: torch.device) -> Tensor:
         """`values` as a tensor; on a CPU it shares their memory."""
         if device not in self._nodes:

@@ -96,6 +96,13 @@ class OccupancyGrid:
         """Whether cells are unknown, of the shape of `occupied`."""
         return np.zeros(1, bool) & self.occupied if self.occupied.dtype == np.bool_ else np.isnan(self.occupied)
 
+    def single(self, which: int) -> OccupancyGrid:
+        """The grid of one problem, which all share."""
+        if self.batch is None:
+            return self
+        origin = self.origin[which] if self.origin.ndim == 2 else self.origin
+        return OccupancyGrid(self.occupied[which], origin, self.resolution)
+
     def enclosed(self) -> OccupancyGrid:
         """The grid with one more occupied cell on every side, so that no way leads out of it."""
         rim = [(0, 0)] * (self.occupied.ndim - self.d) + [(1, 1)] * self.d

@@ -57,6 +57,10 @@ class PointCloud:
         """How many problems have a cloud of their own; None for one cloud that all share."""
         return None if self.points.ndim == 2 else len(self.points)
 
+    def single(self, which: int) -> PointCloud:
+        """The cloud of one problem, which all share."""
+        return self if self.batch is None else PointCloud(self.points[which], self.radius)
+
     def clouds(self) -> list[np.ndarray]:
         """The points (P', d) of each problem's cloud, or of the one that all share, without rows of NaN."""
         return [cloud[np.isfinite(cloud[:, 0])] for cloud in self.points.reshape(-1, *self.points.shape[-2:])]

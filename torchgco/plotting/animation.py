@@ -17,9 +17,10 @@ from PIL import Image
 
 from torchgco.base.errors import InputError
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.course import VEHICLE, VIEWS, Course, draw_instant, draw_still, flight, positions
+from torchgco.plotting.course import VEHICLE, VIEWS, Course, draw_instant, draw_still, flight, handles, positions
+from torchgco.plotting.maps import UNKNOWN
 from torchgco.plotting.missions import check_plans
-from torchgco.plotting.style import INK, PALETTE, TITLE, tidy
+from torchgco.plotting.style import INK, PALETTE, TITLE, legend, tidy
 
 FPS = 5
 MAX_FRAMES = 100  # frames of a mission
@@ -72,6 +73,8 @@ def mission_animation(
         draw.frame(ax, low.tolist(), high.tolist(), plane)
         tidy(ax, "", grid=None)
     axes[0].set_xlabel("")
+    if more := handles(course, len(course.contacts(track, period)) > 0):
+        legend(figure, more)
 
     def show(step: int) -> str:
         for ax, plane in zip(axes, VIEWS, strict=True):
@@ -179,7 +182,9 @@ def _write(axes: Sequence[Axes], show: Callable[[int], str], frames: Sequence[in
 def _palette() -> list[int]:
     """The colours of the drawings, full and paler, as bytes of red, green and blue; the rest is white."""
     times = [draw.NEAR_TO_FAR(share)[:3] for share in np.linspace(0.0, 1.0, 16)]
-    full = np.array([to_rgb(colour) for colour in (INK, VEHICLE, draw.CROSS, draw.EDGE, draw.STONE, PALE, *PALETTE)])
+    full = np.array(
+        [to_rgb(colour) for colour in (INK, VEHICLE, draw.CROSS, draw.EDGE, draw.STONE, UNKNOWN, PALE, *PALETTE)]
+    )
     full = np.concatenate((full, times))
     shades = [1.0 - share * (1.0 - full) for share in (1.0, 0.6, 0.3)]
     colours = np.round(255 * np.concatenate((np.ones((1, 3)), *shades))).astype(int)

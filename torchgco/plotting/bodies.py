@@ -7,7 +7,11 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+import torch
 from scipy.spatial import ConvexHull
+
+from torchgco.judging.distances import closest
+from torchgco.judging.judge import segment_distance
 
 Plane = tuple[int, int]  # the two coordinates that a map shows: (0, 1) from above, (0, 2) from the side
 ABOVE: Plane = (0, 1)
@@ -45,6 +49,11 @@ class Ball:
     def distance(self, points: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Distances (K,) of points (K, d) at times t (K,) from the centre."""
         return np.linalg.norm(points - self.at(t), axis=-1)
+
+    def along(self, points: np.ndarray, t: np.ndarray, within: float) -> np.ndarray:
+        """Distances (K-1,) of the centre from the ways between points (K, d) at times t (K,): both move straight."""
+        away = torch.from_numpy(points - self.at(t))
+        return segment_distance(away[:-1], away[1:]).numpy()
 
     def outline(self, margin: float = 0.0, plane: Plane = ABOVE, t: float = 0.0) -> np.ndarray:
         """The silhouette (P, 2) of all points within `margin`."""
@@ -95,6 +104,20 @@ class Box:
         """Signed distances (K,) of points (K, d) from the box before rounding."""
         over = np.abs((points - self.at(t)) @ self.sides.T) - self.half
         return np.linalg.norm(np.maximum(over, 0.0), axis=-1) + np.minimum(over.max(axis=-1), 0.0)
+
+    def along(self, points: np.ndarray, t: np.ndarray, within: float) -> np.ndarray:
+        """Signed distances (K-1,) of the box before rounding from the ways between points (K, d) at times t (K,).
+
+        Both move straight. Those above `within` (m) may be loose lower bounds.
+        """
+        away, ends = points - self.at(t), self.distance(points, t)
+        least = 0.5 * (ends[:-1] + ends[1:] - np.linalg.norm(np.diff(away, axis=0), axis=1))
+        near = np.flatnonzero(least < within)
+        if len(near):
+            starts, steps = (torch.from_numpy(part[near]) for part in (away[:-1], np.diff(away, axis=0)))
+            axes, half = (torch.from_numpy(part).expand(len(near), *part.shape) for part in (self.sides, self.half))
+            least[near] = closest(axes.double(), torch.zeros_like(starts), half.double(), starts, steps).numpy()
+        return least
 
     def outline(self, margin: float = 0.0, plane: Plane = ABOVE, t: float = 0.0) -> np.ndarray:
         """The silhouette (P, 2) of all points within `margin`; counterclockwise."""

@@ -8,22 +8,27 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from torchgco.base.errors import InputError
 from torchgco.maps.distance import DistanceField
 from torchgco.plotting import trajectory as draw
 from torchgco.plotting.bodies import Ball, Body
-from torchgco.plotting.maps import draw_map
-from torchgco.plotting.scene import Scene, view
+from torchgco.plotting.maps import draw_map, unknown_handles
+from torchgco.plotting.scene import Scene, contacts, view
 from torchgco.plotting.style import INK, PALETTE
 
 VEHICLE = PALETTE[5]
 VIEWS: tuple[draw.Plane, draw.Plane] = (draw.ABOVE, draw.SIDE)
 POSITION = ("x0", "x1", "x2")
 INSIDE = 1e-3  # m: knots deeper in an obstacle are crossed
+CONTACT: dict[str, Any] = {
+    "marker": "X", "color": draw.CROSS, "markeredgecolor": "white", "markersize": 9, "linestyle": "none",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -71,11 +76,18 @@ class Course:
         """Smallest of `distances` as a share of r_obs + r_veh, (T,), at times t (T,), s; inf without obstacles."""
         return (self.distances(positions, t) / self.reaches[:, None]).min(axis=0, initial=np.inf)
 
+    def contacts(self, track: np.ndarray, period: float) -> np.ndarray:
+        """Places (C, 3) where a track (T, 3) of control steps of `period` seconds touches an obstacle or the map."""
+        return contacts(self._scene(track[:1], period), 0, track)
+
+    def _scene(self, start: np.ndarray, period: float = 0.0) -> Scene:
+        own = (self.bodies,), start, self.goal[None], self.vehicle_radius, self.goal_radius
+        return Scene(*own, period, np.zeros(1), self.map)
+
     def limits(self, track: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of a box around goal and track (T, 3), a little wider where obstacles are."""
-        ends = track[:1], self.goal[None]
-        scene = Scene((self.bodies,), *ends, self.vehicle_radius, self.goal_radius, 0.0, np.zeros(1), self.map)
-        low, high = view(scene, [0], [track + side * self.vehicle_radius for side in (-1.0, 1.0)], [])
+        ways = [track + side * self.vehicle_radius for side in (-1.0, 1.0)]
+        low, high = view(self._scene(track[:1]), [0], ways, [])
         return low, high
 
 
@@ -98,14 +110,25 @@ def draw_instant(
     changing = [body for body in course.bodies if not _is_still(body)]
     _draw_bodies(ax, course, changing, t, float(np.delete(track[-1], plane)[0]), plane)
     if course.map is not None:
-        look = {"facecolor": draw.STONE, "edgecolor": draw.EDGE}
-        draw_map(ax, course.map, track[-1:], plane, course.vehicle_radius, look)
+        draw_map(ax, course.map, track[-1:], plane, course.vehicle_radius, (draw.STONE, draw.EDGE))
     draw.draw_ends(ax, track[0], course.goal, course.goal_radius, plane)
     ax.plot(*track[:, plane].T, color=INK, linewidth=1.4, zorder=3)
     infeasible = course.infeasible(plan, t + period * np.arange(len(plan)))
     draw.draw_trajectory(ax, plan, infeasible, plane, every=2, size=7.0)
+    draw_contacts(ax, course.contacts(track, period), plane)
     at = (float(track[-1, plane[0]]), float(track[-1, plane[1]]))
     ax.add_patch(Circle(at, course.vehicle_radius, facecolor=VEHICLE, edgecolor=INK, linewidth=0.8, zorder=6))
+
+
+def draw_contacts(ax: Axes, places: np.ndarray, plane: draw.Plane) -> None:
+    """Mark places (C, 3) where the vehicle touched something."""
+    ax.plot(*places[:, plane].T, **CONTACT, zorder=7)
+
+
+def handles(course: Course, touched: bool) -> list[Artist]:
+    """Entries of a legend: the contacts, where there are any, and what a map doesn't know."""
+    found: list[Artist] = [Line2D([], [], label="contact", **CONTACT)] if touched else []
+    return [*found, *unknown_handles(course.map)]
 
 
 def _is_still(body: Body) -> bool:

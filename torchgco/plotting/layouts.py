@@ -11,15 +11,16 @@ import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
-from torchgco.plotting.bodies import ABOVE, Plane
+from torchgco.plotting.bodies import ABOVE, Body, Plane
 from torchgco.plotting.grid import grid, put_head
-from torchgco.plotting.maps import draw_map
-from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, passes, scene_of, view
+from torchgco.plotting.maps import draw_map, unknown_handles
+from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, leaving, passes, scene_of, view
 from torchgco.plotting.style import INK, SMALL, TITLE, solver_colours, solver_dash, tasks_of
 
 STONE, EDGE = "#CFC8BA", "#A39B8B"
@@ -30,6 +31,9 @@ TRAIL = 1.0  # s of a moving obstacle's way that are drawn
 # and what hasn't moved.
 NEAR, FAR, STILL = 0.05, 0.15, 0.01
 INFEASIBLE, SHORT = "infeasible", "feasible, short of the goal"
+MARKED = {
+    "contact": "contact", "short": SHORT, "infeasible": "infeasible without contact", "away": "leaves the picture",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,8 @@ def layout_grid(
     Obstacles are filled as they are and outlined at the vehicle's radius from their sides, as the vehicle is drawn as a
     point. In space each is cut at the height (in the side view: at the y) that the first solver has at its x; those
     that this cut misses are dotted where they are near. A moving obstacle is drawn where it comes closest to the first
-    solver's trajectory, if it comes near. Crosses mark contact, at the knots and between them.
+    solver's trajectory, if it comes near, outlined in that solver's colour. Crosses mark contact, at the knots and
+    between them, with the map too.
 
     Raises:
         InputError: the trajectories don't fit the layouts, or one has no row in `trials`.
@@ -91,12 +96,11 @@ def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mappi
     """Draw layout i from one side or several; returns the kinds of drawn shapes and marks, for the legend."""
     here, drawn = {solver: row[i] for solver, row in flights.items()}, set()
     path = _leading(scene, i, [flight.path for flight in here.values()])
-    lead = passes(scene, i, path)
+    leads = {solver_colours(flights)[next(iter(flights), "")] if flights else EDGE: passes(scene, i, path)}
     for plane, ax in axes.items():
-        drawn |= draw_obstacles(ax, scene, i, lead, plane)
+        drawn |= draw_obstacles(ax, scene, i, leads, plane)
         if scene.map is not None:
-            draw_map(ax, scene.map, flown(path), plane, scene.margin, {"facecolor": STONE, "edgecolor": EDGE})
-            drawn |= {"own", "grown"} if scene.margin > 0 else {"own"}
+            drawn |= draw_map(ax, scene.map, flown(path), plane, scene.margin, (STONE, EDGE))
         drawn |= _paths(ax, scene, i, here, plane)
         draw_targets(ax, scene, i, plane)
     return drawn
@@ -152,38 +156,69 @@ def _leading(scene: Scene, i: int, paths: list[np.ndarray]) -> np.ndarray:
     return np.linspace(scene.start[i], scene.goal[i], 100)
 
 
-def draw_obstacles(ax: Axes, scene: Scene, i: int, lead: list[Pass], plane: Plane) -> set[str]:
-    """Draw a layout's obstacles; returns the kinds of drawn shapes, for the legend."""
-    own, grown, near = [], [], []
-    moving = False
-    for body, place in zip(scene.bodies[i], lead, strict=True):
-        if body.moving and place.distance > FAR * _way(scene, i):
-            continue
-        if scene.dimension == 2:
-            cut = [body.outline(margin, plane, place.t) for margin in (0.0, scene.margin)]
-        else:
-            at = float(np.delete(place.place, plane)[0])
-            cut = [body.section(plane, at, margin, place.t) for margin in (0.0, scene.margin)]
-        own += [shape for shape in cut[:1] if shape is not None]
-        grown += [shape for shape in cut[1:] if shape is not None and scene.margin > 0]
-        if cut[1] is None and place.distance < NEAR * _way(scene, i):
-            near.append(body.outline(0.0, plane, place.t))
-        if body.moving and (cut[1] is not None or place.distance < NEAR * _way(scene, i)):
-            moving = True
-            way = body.at(np.array([max(0.0, place.t - TRAIL), place.t]))[:, plane]
-            ax.plot(*way.T, color=EDGE, linewidth=0.9, zorder=1)
-            look: dict[str, Any] = {"ha": "center", "va": "center", "clip_on": True, "zorder": 5}
-            ax.text(float(way[-1, 0]), float(way[-1, 1]), f"{place.t:.1f}", fontsize=SMALL - 2, color=INK, **look)
-    looks: dict[str, dict[str, Any]] = {
-        "near": {"facecolor": "none", "edgecolor": EDGE, "linewidth": 0.7, "linestyle": ":"},
-        "own": {"facecolor": STONE, "linewidth": 0.0},
-        "grown": {"facecolor": "none", "edgecolor": EDGE, "linewidth": 0.6},
-    }
-    shapes = {"near": near, "own": own, "grown": grown}
-    for zorder, (kind, held) in enumerate(shapes.items()):
-        if held:
-            ax.add_collection(PolyCollection(held, zorder=0.2 + 0.1 * zorder, **looks[kind]), autolim=False)
-    return {kind for kind, held in shapes.items() if held} | ({"moving"} if moving else set())
+def draw_obstacles(ax: Axes, scene: Scene, i: int, leads: Mapping[str, list[Pass]], plane: Plane) -> set[str]:
+    """Draw a layout's obstacles; returns the kinds of drawn shapes, for the legend.
+
+    Args:
+        leads: where each of some trajectories passes them, by its colour. Obstacles at rest are cut where the first
+            passes, moving ones drawn where each comes closest to them, outlined in its colour.
+    """
+    kinds = set[str]()
+    for first, (colour, lead) in enumerate(leads.items()):
+        held: dict[str, list[np.ndarray]] = {"near": [], "own": [], "grown": [], "moving": [], "passed": []}
+        for body, place in zip(scene.bodies[i], lead, strict=True):
+            if (body.moving and place.distance > FAR * _way(scene, i)) or (first > 0 and not body.moving):
+                continue
+            own, grown = _shapes(body, scene, place, plane)
+            near = place.distance < NEAR * _way(scene, i)
+            if own is not None:
+                held["moving" if body.moving else "own"].append(own)
+            if grown is not None and scene.margin > 0:
+                held["passed" if body.moving else "grown"].append(grown)
+            if grown is None and near:
+                held["near"].append(body.outline(0.0, plane, place.t))
+            if body.moving and (grown is not None or near):
+                kinds.add("moving")
+                _draw_motion(ax, body, place, plane, colour)
+        looks: dict[str, dict[str, Any]] = {
+            "near": {"facecolor": "none", "edgecolor": EDGE, "linewidth": 0.7, "linestyle": ":"},
+            "own": {"facecolor": STONE, "linewidth": 0.0},
+            "grown": {"facecolor": "none", "edgecolor": EDGE, "linewidth": 0.6},
+            # Several trajectories pass a moving obstacle at several places, which may overlap.
+            "moving": {"facecolor": (*to_rgb(STONE), 0.6), "edgecolor": colour, "linewidth": 0.5},
+            "passed": {"facecolor": "none", "edgecolor": colour, "linewidth": 0.8, "linestyle": "-"},
+        }
+        for zorder, (kind, shapes) in enumerate(held.items()):
+            if shapes:
+                ax.add_collection(PolyCollection(shapes, zorder=0.2 + 0.1 * zorder, **looks[kind]), autolim=False)
+                kinds.add("grown" if kind == "passed" else kind)
+    return kinds
+
+
+def _shapes(body: Body, scene: Scene, place: Pass, plane: Plane) -> list[np.ndarray | None]:
+    """A body, and the same grown by the vehicle's radius: outlines, or cuts in space, None where there is nothing."""
+    if scene.dimension == 2:
+        return [body.outline(margin, plane, place.t) for margin in (0.0, scene.margin)]
+    at = float(np.delete(place.place, plane)[0])
+    return [body.section(plane, at, margin, place.t) for margin in (0.0, scene.margin)]
+
+
+def _draw_motion(ax: Axes, body: Body, place: Pass, plane: Plane, colour: str) -> None:
+    """A moving body's last second, the time when it is passed, and where the vehicle is then."""
+    way = body.at(np.array([max(0.0, place.t - TRAIL), place.t]))[:, plane]
+    ax.plot(*way.T, color=colour, linewidth=0.9, zorder=1)
+    at = place.place[list(plane)]
+    ring: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "markersize": 5, "linestyle": "none"}
+    ax.plot(*at, color=colour, zorder=5, **ring)
+    look: dict[str, Any] = {"ha": "center", "va": "center", "clip_on": True, "zorder": 5}
+    ax.text(float(way[-1, 0]), float(way[-1, 1]), f"{place.t:.1f}", fontsize=SMALL - 2, color=INK, **look)
+
+
+def moving_handles(whose: str, colour: str) -> list[Artist]:
+    """The legend's entries of moving obstacles, drawn when some trajectory passes them."""
+    ring: dict[str, Any] = {"marker": "o", "markerfacecolor": "none", "markersize": 8, "linestyle": "none"}
+    passed = Line2D([], [], color=colour, label=f"moving obstacle as {whose} passes (number: time [s])", **ring)
+    return [passed, Line2D([], [], color=colour, linewidth=0.9, label="its last second")]
 
 
 def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, Flight], plane: Plane) -> set[str]:
@@ -196,26 +231,54 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, Flight], plane:
             # The first is the thinnest: one of the same course shows at its sides.
             wide = 1.6 if level == len(flights) - 1 else 2.2
             ax.plot(*path[:, plane].T, linewidth=wide, linestyle=solver_dash(solver), **look)
-        marks = {"contact": flight.contacts}
+        away = leaving(*np.transpose([ax.get_xlim(), ax.get_ylim()]), path[:, plane])
+        ended = _ended(flight, away is not None)
         # A solver that returned nothing has its mark at the start.
         last = path[-1:] if len(path) else scene.start[i][None]
-        if flight.end == SHORT and not flight.still:
-            marks["short"] = last
-        if flight.end == INFEASIBLE and len(flight.contacts) == 0:
-            marks["infeasible"] = last
+        marks = {"contact": flight.contacts} | {
+            kind: last for kind in ended if kind == "infeasible" or (kind == "short" and not flight.still)
+        }
+        if away is not None:
+            drawn.add("away")
+            ax.plot(*away[0][:, None], **look | {"zorder": 6, "clip_on": False}, **marker("away", away[1]))
         for kind, places in marks.items():
             if len(places):
                 drawn.add(kind)
-                ax.plot(*places[:, plane].T, **look | {"zorder": 4 + level / len(flights)}, **_marker(kind))
+                ax.plot(*places[:, plane].T, **look | {"zorder": 4 + level / len(flights)}, **marker(kind))
     return drawn
 
 
-def _marker(kind: str) -> dict[str, Any]:
-    """The look of a mark, the same on the map and in the legend."""
+def ends(flights: Mapping[str, list[Flight]], boxes: list[np.ndarray], columns: int) -> list[Artist]:
+    """Entries of a legend for the ways in which flights end short of the goal without contact.
+
+    Args:
+        boxes: corners (2, d) of the maps in each row of `columns` layouts, seen from above.
+    """
+    kinds = set[str]()
+    for row in flights.values():
+        for i, flight in enumerate(row):
+            box, path = boxes[i // columns][:, ABOVE], flown(flight.path)
+            if not flight.still:
+                kinds |= _ended(flight, leaving(*box, path[:, ABOVE]) is not None)
+    return [Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in MARKED if kind in kinds]
+
+
+def _ended(flight: Flight, away: bool) -> set[str]:
+    """The marks at the end of a flight that moves; `away`: it ends outside of the picture."""
+    if away:
+        return {"away"}
+    if flight.end == SHORT:
+        return {"short"}
+    return {"infeasible"} if flight.end == INFEASIBLE and len(flight.contacts) == 0 else set()
+
+
+def marker(kind: str, angle: float = 0.0) -> dict[str, Any]:
+    """The look of a mark, the same on the map and in the legend; an arrow's angle, rad."""
     shapes: dict[str, dict[str, Any]] = {
         "contact": {"marker": "X", "markeredgecolor": "white", "markeredgewidth": 0.6, "markersize": 7},
         "short": {"marker": "o", "markerfacecolor": "white", "markersize": 5.5},
         "infeasible": {"marker": "D", "markeredgecolor": "white", "markersize": 6},
+        "away": {"marker": (3, 0, np.rad2deg(angle) - 90.0), "markeredgecolor": "white", "markersize": 9},
     }
     return {"linestyle": "none", **shapes[kind]}
 
@@ -251,10 +314,7 @@ def _handles(scene: Scene, flights: Mapping[str, list[Flight]], drawn: set[str])
     point: dict[str, Any] = {"color": INK, "linestyle": "none"}
     handles.append(Line2D([], [], marker="s", markersize=5, label="start", **point))
     handles.append(Line2D([], [], marker="*", markersize=10, label=f"goal{disc}", **point))
-    words = {"contact": "contact", "short": SHORT, "infeasible": "infeasible without contact"}
-    handles += [
-        Line2D([], [], color=INK, label=label, **_marker(kind)) for kind, label in words.items() if kind in drawn
-    ]
+    handles += [Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in MARKED if kind in drawn]
     first = next(iter(flights), "the flight")
     where = f", cut at the height (below: at the y) of {first}" if scene.dimension == 3 else ""
     outline: dict[str, Any] = {"facecolor": "none", "edgecolor": EDGE}
@@ -262,8 +322,7 @@ def _handles(scene: Scene, flights: Mapping[str, list[Flight]], drawn: set[str])
         "own": Patch(facecolor=STONE, label=f"obstacle{where}"),
         "grown": Patch(label="plus the vehicle's radius", **outline),
         "near": Patch(linestyle=":", label=f"near {first}, missed by this cut", **outline),
-        "moving": Line2D(
-            [], [], color=EDGE, linewidth=0.9, label=f"its last second; number: time [s] when {first} passes"
-        ),
     }
-    return [*handles, *(handle for kind, handle in shapes.items() if kind in drawn)]
+    handles += [handle for kind, handle in shapes.items() if kind in drawn]
+    handles += moving_handles(first, colours.get(first, EDGE)) if "moving" in drawn else []
+    return [*handles, *unknown_handles(scene.map)]

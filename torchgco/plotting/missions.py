@@ -22,7 +22,17 @@ from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.outcome import Outcome
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.course import POSITION, VEHICLE, VIEWS, Course, draw_instant, draw_still, flight, positions
+from torchgco.plotting.course import (
+    POSITION,
+    VEHICLE,
+    VIEWS,
+    Course,
+    draw_instant,
+    draw_still,
+    flight,
+    handles,
+    positions,
+)
 from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, legend, panels, solver_colours, tasks_of, tidy
 
 Frames = Mapping[str, pd.DataFrame]  # by solver
@@ -138,7 +148,8 @@ def snapshots_figure(
         Line2D([], [], color=INK, linewidth=1.4, label="flown"),
         Line2D([], [], color=VEHICLE, markeredgecolor=INK, marker="o", linestyle="none", label="vehicle"),
     ]
-    legend(figure, [*names[:2], *own, *names[2:]])
+    touched = any(len(course.contacts(track[: step + 1], period)) for step in steps)
+    legend(figure, [*names[:2], *own, *names[2:], *handles(course, touched)])
     return figure
 
 

@@ -9,17 +9,22 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_shape
 from torchgco.constraints import ControlBounds, Separation, StateBounds
+from torchgco.judging.contact import contacts
+from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting.bodies import ABOVE, Plane
-from torchgco.plotting.layouts import SIDE, STONE, draw_obstacles, draw_targets
-from torchgco.plotting.scene import contacts, flown, passes, view
-from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, NotebookFigure, tidy
+from torchgco.plotting.layouts import EDGE, MARKED, SIDE, STONE, draw_obstacles, draw_targets, marker, moving_handles
+from torchgco.plotting.maps import draw_map, unknown_handles
+from torchgco.plotting.scene import flown, leaving, passes, view
+from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
 from torchgco.plotting.world import World, distances, world_of
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.problem.times import times
@@ -45,6 +50,7 @@ class Course:
     paths: tuple[np.ndarray, ...]  # (N+1, d) each: of the position, and of further ones that keep apart
     colour: str
     label: str
+    keeps: bool  # whether its constraints hold
 
 
 def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:
@@ -60,16 +66,20 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
     rows = ceil((problem.n + problem.m) / COLUMNS)
     wide = WIDTH / len(maps) if maps else WIDTH
     high = max((one.height(wide) for one in maps), default=0.0)
-    figure = NotebookFigure(figsize=(WIDTH, high + PANEL * rows + 0.35), layout="constrained")
+    figure = NotebookFigure(figsize=(WIDTH, high + PANEL * rows), layout="constrained")
     lower: Figure | SubFigure = figure
+    lines: list[Artist] = [Line2D([], [], color=course.colour, label=course.label) for course in courses]
+    lines.append(Line2D([], [], color=LIMIT, linestyle="--", linewidth=0.9, label="bound, where it is near"))
     if maps:
         upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(high, PANEL * rows))[:, 0]
+        drawn = set[str]()
         for part, one in zip(upper.subfigures(1, len(maps), squeeze=False)[0], maps, strict=True):
-            one.draw(part)
+            drawn |= one.draw(part)
+        lines += maps[0].handles(drawn)
     _histories(lower, problem, courses, unit)
-    look: dict[str, Any] = {"fontsize": TEXT, "frameon": False, "ncols": min(3, len(courses) + 1)}
-    lines = [Line2D([], [], color=course.colour, label=course.label) for course in courses]
-    lines.append(Line2D([], [], color=LIMIT, linestyle="--", linewidth=0.9, label="bound, where it is near"))
+    across = legend_columns(lines, WIDTH)
+    figure.set_figheight(high + PANEL * rows + 0.1 + 0.23 * ceil(len(lines) / across))
+    look: dict[str, Any] = {"fontsize": TEXT, "frameon": False, "ncols": across}
     figure.legend(handles=lines, loc="outside upper left", **look)
     return figure
 
@@ -97,7 +107,8 @@ def _courses(problem: Problem, solution: Solution, places: list[int]) -> tuple[l
         at = (t if t.dim() == 1 else t[b]).cpu().double().numpy()
         X, U, at = X[: last + 1], U[:last], at[: last + 1]
         paths = tuple(X[:, part] for part in _positions(problem))
-        found.append(Course(b, X, U, at, paths, PALETTE[i % len(PALETTE)], label))
+        keeps = bool(solution.violation[b] <= ADMITTED)
+        found.append(Course(b, X, U, at, paths, PALETTE[i % len(PALETTE)], label, keeps))
     return found, unit
 
 
@@ -134,8 +145,8 @@ class _Map:
     @classmethod
     def of(cls, problem: Problem, courses: list[Course], planes: tuple[Plane, ...]) -> _Map:
         world = world_of(problem, courses[0].b)
-        paths = [flown(path) for course in courses for path in course.paths]
-        boxes = [view(scene, [0], paths, []) for scene in world.scenes]
+        kept, others = ([flown(p) for c in courses for p in c.paths if c.keeps == which] for which in (True, False))
+        boxes = [view(scene, [0], kept, others) for scene in world.scenes]
         return cls(world, courses, planes, np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]]))
 
     @property
@@ -148,35 +159,23 @@ class _Map:
         """Inches, for a width in inches."""
         return min(TALLEST, wide * sum(self.shares)) + 0.45 * len(self.planes)
 
-    def draw(self, figure: SubFigure) -> None:
-        """Draw each plane into axes of its own."""
+    def draw(self, figure: SubFigure) -> set[str]:
+        """Draw each plane into axes of its own; returns the kinds of what is drawn, for the legend."""
         ratios = {"height_ratios": self.shares}
         axes = figure.subplots(len(self.planes), 1, squeeze=False, gridspec_kw=ratios)[:, 0]
-        for ax, plane in zip(axes, self.planes, strict=True):
-            self._plane(ax, plane)
+        return set().union(*(self._plane(ax, plane) for ax, plane in zip(axes, self.planes, strict=True)))
 
-    def _plane(self, ax: Axes, plane: Plane) -> None:
+    def _plane(self, ax: Axes, plane: Plane) -> set[str]:
+        ax.set(xlim=self.box[:, plane[0]], ylim=self.box[:, plane[1]], aspect="equal")
         lead = flown(self.courses[0].paths[0])
-        for scene in self.world.scenes:
-            draw_obstacles(ax, scene, 0, passes(scene, 0, lead), plane)
-        hidden = [i for i in range(self.box.shape[1]) if i not in plane]
-        at = float(lead[:, hidden[0]].mean()) if hidden and len(lead) else 0.0
-        for part in self.world.others:
-            x, y, apart = distances(part, self.box[0], self.box[1], plane, at)
-            if bool((apart < 0).any()):
-                ax.contourf(x, y, apart, levels=[-np.inf, 0.0], colors=[STONE], zorder=0.3)
+        drawn = self._obstacles(ax, plane, lead)
         for course in self.courses:
-            look: dict[str, Any] = {"color": course.colour, "linewidth": 1.2, "marker": ".", "markersize": 3}
-            for path in course.paths:
-                ax.plot(*flown(path)[:, plane].T, zorder=3, **look)
-            touched = np.concatenate([contacts(scene, 0, course.paths[0]) for scene in self.world.scenes])
-            cross: dict[str, Any] = {"marker": "X", "markeredgecolor": "white", "markersize": 8, "linestyle": "none"}
-            ax.plot(*touched[:, plane].T, color=course.colour, zorder=4, **cross)
+            drawn |= self._course(ax, plane, course)
         draw_targets(ax, self.world.first, 0, plane)
         for course in self.courses[1:]:
             start: dict[str, Any] = {"marker": "s", "markersize": 5, "markeredgecolor": "white", "markeredgewidth": 0.5}
             ax.plot(*course.paths[0][:1, plane].T, color=INK, zorder=2.5, linestyle="none", **start)
-        ax.set(xlim=self.box[:, plane[0]], ylim=self.box[:, plane[1]], aspect="equal")
+        ax.set(xlim=self.box[:, plane[0]], ylim=self.box[:, plane[1]])
         ax.set(xlabel="x [m]" if plane == self.planes[-1] else "", ylabel=f"{'xyz'[plane[1]]} [m]")
         words = {ABOVE: "from above", SIDE: "from the side"}
         tidy(
@@ -184,6 +183,55 @@ class _Map:
             f"{words[plane]}, obstacles cut where problem {self.courses[0].b} flies" if len(self.planes) > 1 else "",
             grid=None,
         )
+        return drawn
+
+    def _obstacles(self, ax: Axes, plane: Plane, lead: np.ndarray) -> set[str]:
+        drawn = set[str]()
+        for scene in self.world.scenes:
+            leads = {course.colour: passes(scene, 0, course.paths[0]) for course in self.courses}
+            drawn |= draw_obstacles(ax, scene, 0, leads, plane)
+            if scene.map is not None:
+                drawn |= draw_map(ax, scene.map, lead if len(lead) else scene.start, plane, scene.margin, (STONE, EDGE))
+        hidden = [i for i in range(self.box.shape[1]) if i not in plane]
+        at = float(lead[:, hidden[0]].mean()) if hidden and len(lead) else 0.0
+        for part in self.world.others:
+            x, y, apart = distances(part, self.box[0], self.box[1], plane, at)
+            if bool((apart < 0).any()):
+                ax.contourf(x, y, apart, levels=[-np.inf, 0.0], colors=[STONE], zorder=0.3)
+                drawn.add("others")
+        return drawn
+
+    def _course(self, ax: Axes, plane: Plane, course: Course) -> set[str]:
+        """Draw a trajectory, where it touches something, and where it leaves the picture."""
+        drawn = set[str]()
+        look: dict[str, Any] = {"color": course.colour, "linewidth": 1.2, "marker": ".", "markersize": 3}
+        for path in course.paths:
+            shown = flown(path)[:, plane]
+            ax.plot(*shown.T, zorder=3, **look)
+            if (away := leaving(*self.box[:, plane], shown)) is not None:
+                ax.plot(*away[0][:, None], color=course.colour, zorder=6, clip_on=False, **marker("away", away[1]))
+                drawn.add("away")
+        touched = contacts(self.world.obstacles, flown(course.paths[0]), self.world.first.dt)
+        if len(touched):
+            ax.plot(*touched[:, plane].T, color=course.colour, zorder=4, **marker("contact"))
+            drawn.add("contact")
+        return drawn
+
+    def handles(self, drawn: set[str]) -> list[Artist]:
+        """Entries of the legend."""
+        shapes: dict[str, Artist] = {
+            "own": Patch(facecolor=STONE, label="obstacle"),
+            "grown": Patch(facecolor="none", edgecolor=EDGE, label="plus the vehicle's radius"),
+            "others": Patch(facecolor=STONE, label="obstacle, plus the vehicle's radius"),
+        }
+        points: list[Artist] = [
+            Line2D([], [], color=INK, label=MARKED[kind], **marker(kind))
+            for kind in ("contact", "away")
+            if kind in drawn
+        ]
+        unknown = [handle for scene in self.world.scenes for handle in unknown_handles(scene.map)]
+        moving = moving_handles("the trajectory of its colour", INK) if "moving" in drawn else []
+        return [*points, *(shape for kind, shape in shapes.items() if kind in drawn), *moving, *unknown[:1]]
 
 
 def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Course], unit: str) -> None:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchgco.judging.contact import deepest, map_depth, pieces
 from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.plotting.bodies import Body, bodies
@@ -16,7 +17,7 @@ from torchgco.scenarios.stored_maps import map_of
 Arrays = Mapping[str, np.ndarray]
 SLACK = 0.12  # share of the scene's size by which obstacles and flights that miss the goal may widen a map
 EDGE = 0.03  # share of the scene's size left free around it
-BETWEEN = 4  # places per stage at which contact is looked for
+STRAY = 1.0  # share of the scene's size by which a path may widen a map on each side; one that goes farther is cut
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,30 +106,29 @@ def passes(scene: Scene, i: int, path: np.ndarray) -> list[Pass]:
 
 
 def contacts(scene: Scene, i: int, path: np.ndarray) -> np.ndarray:
-    """Places (C, d) where a path (N+1, d) touches obstacles of layout i: the deepest of each contact.
+    """Places (C, d) where a path (N+1, d) touches obstacles or the map of layout i: the deepest of each contact.
 
-    Bodies touch at CONTACT_FACTOR of their radii, as the judge has it; between the knots the path is straight.
+    Bodies touch at CONTACT_FACTOR of their radii, and distances are measured as by the judge; between the knots the
+    path is straight.
     """
-    path = flown(path)
-    if len(path) == 0 or not scene.bodies[i]:
-        return np.empty((0, scene.dimension))
-    knots = np.arange(len(path))
-    fine = np.linspace(0, len(path) - 1, BETWEEN * (len(path) - 1) + 1)
-    places = np.stack([np.interp(fine, knots, column) for column in path.T], axis=-1)
-    depth = np.full(len(places), -np.inf)
+    places, knots = pieces(flown(path))
+    depth = np.full(max(len(places) - 1, 0), -np.inf)
+    if len(places) == 0:
+        return deepest(places, depth)
     for body in scene.bodies[i]:
         reach = CONTACT_FACTOR * (body.radius + scene.margin)
-        depth = np.maximum(depth, reach - body.distance(places, scene.dt * fine))
-    touching = np.flatnonzero(depth > 0)
-    runs = np.split(touching, np.flatnonzero(np.diff(touching) > 1) + 1)
-    return places[[run[depth[run].argmax()] for run in runs if len(run)]]
+        depth = np.maximum(depth, reach - body.along(places, scene.dt * knots, reach))
+    if scene.map is not None:
+        depth = np.maximum(depth, map_depth(scene.map, places, scene.margin))
+    return deepest(places, depth)
 
 
 def view(scene: Scene, shown: Iterable[int], whole: list[np.ndarray], others: list[np.ndarray]) -> np.ndarray:
     """Lower and upper corner (2, d), m, of a map of the layouts `shown`.
 
-    Starts, goals and the paths of `whole`, (N+1, d) each, are inside; obstacles and the paths of `others` widen the map
-    only by a share of its size, as a long wall or a diverged path would shrink all the rest to a dot.
+    Starts, goals and the paths of `whole`, (N+1, d) each, are inside, and of `others` those that stay near these or on
+    the map of cells or points. Obstacles and paths that go farther widen the picture only by a share of its size, as a
+    long wall or a diverged path would shrink all the rest to a dot.
     """
     shown = list(shown)
     ring = np.nan_to_num(scene.goal_radius)
@@ -144,10 +144,32 @@ def view(scene: Scene, shown: Iterable[int], whole: list[np.ndarray], others: li
     if corners is None:
         return np.stack([np.zeros(scene.dimension), np.ones(scene.dimension)])
     size = float(max(corners[1] - corners[0])) or 1.0
+    widest = corners + STRAY * size * np.array([[-1.0], [1.0]])
+    if scene.map is not None:
+        widest = np.stack([np.minimum(widest[0], scene.map.origin[0]), np.maximum(widest[1], scene.map.upper[0])])
+    near = [path for path in others if bool(((path >= widest[0]) & (path <= widest[1])).all())]
+    corners = _corners([*near, corners])
+    assert corners is not None
+    size = float(max(corners[1] - corners[0])) or 1.0
     reach = _corners([*edges, *others, corners])
     assert reach is not None
     box = np.clip(reach, corners[0] - SLACK * size, corners[1] + SLACK * size)
     return box + EDGE * size * np.array([[-1.0], [1.0]])
+
+
+def leaving(low: np.ndarray, high: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Where a path (K, 2) leaves a picture with corners `low`, `high` for good, (2,), and its angle there, rad.
+
+    None where it ends inside, or never was.
+    """
+    inside = ((path >= low) & (path <= high)).all(axis=1)
+    if len(path) == 0 or inside[-1] or not inside.any():
+        return None
+    k = int(np.flatnonzero(inside)[-1])
+    step = path[k + 1] - path[k]
+    room = np.where(step > 0, high, low) - path[k]
+    share = float(np.divide(room, step, out=np.full(2, np.inf), where=step != 0).min())
+    return path[k] + share * step, float(np.arctan2(step[1], step[0]))
 
 
 def _extent(body: Body, margin: float) -> np.ndarray:

@@ -7,20 +7,23 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.animation import PillowWriter
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
 from torchgco.missions.log import MissionLog
 from torchgco.missions.unknown.safety import SeenLog
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.course import VEHICLE, Course
-from torchgco.plotting.style import INK, PALETTE, tidy
+from torchgco.plotting.course import VEHICLE, Course, draw_contacts, handles
+from torchgco.plotting.style import INK, PALETTE, legend, tidy
 
-STATES = ListedColormap(["#9A9A9A", "#F4F4F4", "#3B3B3B"])  # unknown, free, occupied
+CELLS = ("unknown", "known to be free", "known to be occupied")
+STATES = ListedColormap(["#9A9A9A", "#F4F4F4", "#3B3B3B"])
 DPI = 80
 FPS = 10
 
@@ -41,6 +44,8 @@ def seen_figure(log: MissionLog, b: int, course: Course, step: int, reach: float
     width = 9.0
     figure = Figure(figsize=(width, 0.9 + width * (high[1] - low[1]) / (high[0] - low[0])), layout="constrained")
     _draw(figure.subplots(), log, b, course, step, seen.state(step), reach)
+    touched = len(course.contacts(_track(log, b, int(log.steps()[b]) - 1), log.period)) > 0
+    legend(figure, [*_handles(), *handles(course, touched)])
     return figure
 
 
@@ -77,8 +82,21 @@ def _seen(log: MissionLog, b: int, step: int) -> SeenLog:
     return log.seen[b]
 
 
+def _handles() -> list[Artist]:
+    """Entries of the legend."""
+    cells = [Patch(facecolor=STATES(i), edgecolor=INK, label=label) for i, label in enumerate(CELLS)]
+    rim = Patch(facecolor="none", edgecolor=PALETTE[0], label="obstacle as it is")
+    lines = {"flown": INK, "safe plan, to where it rests": PALETTE[2]}
+    return [*cells, rim, *(Line2D([], [], color=colour, label=label) for label, colour in lines.items())]
+
+
+def _track(log: MissionLog, b: int, step: int) -> np.ndarray:
+    """The positions (step + 1, 3) flown up to a control step, m."""
+    return log.x[b, : step + 1, 0, :3].numpy()
+
+
 def _draw(ax: Axes, log: MissionLog, b: int, course: Course, step: int, state: np.ndarray, reach: float) -> None:
-    seen, track = log.seen[b], log.x[b, : step + 1, 0, :3].numpy()
+    seen, track = log.seen[b], _track(log, b, step)
     low, high = seen.corner, seen.corner + seen.resolution * np.array(seen.shape)
     place, t = track[-1], step * log.period
     level = int(np.clip((place[2] - low[2]) / seen.resolution, 0, seen.shape[2] - 1))
@@ -93,6 +111,7 @@ def _draw(ax: Axes, log: MissionLog, b: int, course: Course, step: int, state: n
     ax.plot(*plan[-1, :2], "s", color=PALETTE[2], ms=4)
     ax.add_patch(Circle((place[0], place[1]), course.vehicle_radius, color=VEHICLE, zorder=5))
     ax.add_patch(Circle((course.goal[0], course.goal[1]), course.goal_radius, fill=False, color=INK, lw=1.2))
+    draw_contacts(ax, course.contacts(track, log.period), draw.ABOVE)
     if np.isfinite(reach):
         ax.add_patch(Circle((place[0], place[1]), reach, fill=False, color=VEHICLE, lw=0.6, ls=":"))
     ax.set_xlim(extent[:2])

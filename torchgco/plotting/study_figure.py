@@ -17,7 +17,8 @@ from matplotlib.ticker import PercentFormatter
 
 from torchgco.base.errors import InputError
 from torchgco.plotting.bodies import ABOVE
-from torchgco.plotting.layouts import Flight, draw_layout, flights_of, views
+from torchgco.plotting.layouts import draw_layout, ends, flights_of, views
+from torchgco.plotting.maps import unknown_handles
 from torchgco.plotting.rates import OUTCOMES
 from torchgco.plotting.scene import Arrays, Scene, scene_of
 from torchgco.plotting.style import INK, TEXT, legend_columns, solver_colours, solver_dash, tidy
@@ -73,8 +74,9 @@ def study_figure(
     form, scene = PRINTS[columns], scene_of(layouts)
     count = min(len(layouts["radii"]), 2 * form.maps)
     flights = flights_of(scene, {name: np.asarray(X[:count]) for name, X in trajectories.items()}, trials)
-    handles = _handles(summary, form)
-    figure, maps, charts = _frame(scene, flights, count, form, handles)
+    boxes = views(scene, flights, count, min(form.maps, count))
+    handles = _handles(summary, form, scene, ends(flights, boxes, min(form.maps, count)))
+    figure, maps, charts = _frame(boxes, count, form, handles)
     for i, ax in enumerate(maps):
         draw_layout({ABOVE: ax}, scene, i, flights)
         ax.set_title(f"layout {scene.ids[i]}", loc="left", color=INK, pad=2)
@@ -85,11 +87,10 @@ def study_figure(
 
 
 def _frame(
-    scene: Scene, flights: dict[str, list[Flight]], count: int, form: Print, handles: list[Artist]
+    boxes: list[np.ndarray], count: int, form: Print, handles: list[Artist]
 ) -> tuple[Figure, list[Axes], list[Axes]]:
     """The figure with its legend, and the axes of maps and charts, placed in inches: maps have equal scales."""
     across = min(form.maps, count)
-    boxes = views(scene, flights, count, across)
     wide = (form.width - LEFT - RIGHT - (across - 1) * GAP) / across
     highs = [wide * float(np.ptp(box[:, 1]) / np.ptp(box[:, 0])) for box in boxes]
     columns = legend_columns(handles, form.width * TEXT / form.font)
@@ -121,14 +122,15 @@ def _frame(
     return figure, maps, charts
 
 
-def _handles(summary: pd.DataFrame, form: Print) -> list[Artist]:
+def _handles(summary: pd.DataFrame, form: Print, scene: Scene, ends: list[Artist]) -> list[Artist]:
     look: dict[str, Any] = {"color": INK, "linestyle": "none", "markersize": 9 * form.thin}
     lines: list[Artist] = []
     for name, colour in solver_colours(summary["solver"]).items():
         dashed: dict[str, Any] = {"color": colour, "linestyle": solver_dash(name), "linewidth": 1.2}
         lines.append(Line2D([], [], label=name, **dashed))
     marks = {"s": "start", "*": "goal", "X": "contact"}
-    return [*lines, *(Line2D([], [], marker=mark, label=label, **look) for mark, label in marks.items())]
+    points = [Line2D([], [], marker=mark, label=label, **look) for mark, label in marks.items()]
+    return [*lines, *points, *ends, *unknown_handles(scene.map)]
 
 
 def _rates(ax: Axes, summary: pd.DataFrame) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
@@ -20,15 +21,17 @@ GRID = 160  # points along x at which the distance from other kinds of obstacles
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """The scenes of one problem, one for each radius of the vehicle, and its obstacles of other kinds.
+    """The scenes of one problem, one for each radius of the vehicle and each map, and its obstacles of other kinds.
 
     Args:
         scenes: at least one; all have the same start and goal.
-        others: bound obstacles that are neither spheres nor boxes, of this problem alone.
+        others: bound obstacles that are neither spheres nor boxes nor a map, of this problem alone.
+        obstacles: all of them, of this problem alone.
     """
 
     scenes: tuple[Scene, ...]
     others: tuple[Obstacles, ...]
+    obstacles: tuple[Obstacles, ...]
 
     @property
     def first(self) -> Scene:
@@ -43,10 +46,12 @@ def world_of(problem: Problem, b: int) -> World:
     """
     one = problem.take(torch.tensor([b], device=problem.x0.device))
     by_radius: dict[float, list[Body]] = {}
-    others = []
+    others, maps = [], []
     for part in one.obstacles:
         if isinstance(part, BoundSpheres | BoundBoxes | BoundOscillatingBoxes):
             by_radius.setdefault(float(part.vehicle_radius[0]), []).extend(_bodies(part))
+        elif isinstance(part, BoundField):
+            maps.append((float(part.vehicle_radius[0]), part.field.single(int(part.which[0]))))
         else:
             others.append(part)
     start = one.x0[:, one.position].cpu().numpy()
@@ -54,11 +59,13 @@ def world_of(problem: Problem, b: int) -> World:
     if one.goal is not None:
         goal, radius = one.goal.position.cpu().numpy(), float(one.goal.radius[0])
     dt = float(getattr(one.dynamics, "dt", None) or 0.0)
+    none: dict[float, list[Body]] = {} if maps else {0.0: []}
     scenes = [
         Scene((tuple(held),), start, goal, vehicle, radius, dt, np.array([b]))
-        for vehicle, held in (by_radius or {0.0: []}).items()
+        for vehicle, held in (by_radius or none).items()
     ]
-    return World(tuple(scenes), tuple(others))
+    scenes += [Scene(((),), start, goal, vehicle, radius, dt, np.array([b]), field) for vehicle, field in maps]
+    return World(tuple(scenes), tuple(others), tuple(one.obstacles))
 
 
 def _bodies(part: BoundSpheres | BoundBoxes | BoundOscillatingBoxes) -> list[Body]:

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.version import VERSION
+from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.style import solver_colours
 from torchgco.problem.problem import Problem
 from torchgco.view.flights import Flight
 from torchgco.view.packing import Packing, number
-from torchgco.view.shapes import Shapes, shapes_of
+from torchgco.view.shapes import Shapes, shapes_of, unknown_of
 from torchgco.view.vehicles import Look
 
 SHARED = 500  # obstacles of one kind from which on layouts with the same ones share them
@@ -73,6 +74,7 @@ class Document:
         part: dict[str, Any] = {
             "start": _numbers(start), "goal": None if goal is None else _numbers(goal),
             "goal_radius": None if problem.goal is None else number(problem.goal.radius[b]),
+            "map": _extent(problem, b),
             "obstacles": [self._placed(packing, shape, middle) for shape in self._shapes(problem.obstacles, b)],
             "flights": [flight.packed(packing, names.index(flight.solver)) for flight in flights],
             "search": None if search is None else search.packed(packing),
@@ -101,6 +103,8 @@ class Document:
                 self.notes += [] if note in self.notes else [note]
             elif len(shapes.center):
                 found.append(shapes)
+            if (unknown := unknown_of(part, b)) is not None:
+                found.append(unknown)
         return found
 
     def head(self) -> str:
@@ -113,6 +117,15 @@ class Document:
             "constraints": list(self.constraints), "layouts": self.labels, "notes": self.notes,
         }  # fmt: skip
         return Packing().sealed(text)
+
+
+def _extent(problem: Problem, b: int) -> list[list[float | None]] | None:
+    """Lower and upper corner of the maps of a problem, m; None without one."""
+    fields = [(part.field, int(part.which[b])) for part in problem.obstacles if isinstance(part, BoundField)]
+    if not fields:
+        return None
+    low, high = [field.origin[g] for field, g in fields], [field.upper[g] for field, g in fields]
+    return [_numbers(np.min(low, axis=0)), _numbers(np.max(high, axis=0))]
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:

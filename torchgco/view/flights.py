@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,13 +10,13 @@ import torch
 from torch import Tensor
 
 from torchgco.constraints.base import Constraint
-from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
+from torchgco.judging.contact import contacts
+from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.view.packing import LARGEST, Packing, number
 from torchgco.view.sensed import Sensed
 from torchgco.view.vehicles import Look
 
-BETWEEN = 4  # places per stage at which contact is looked for
 Rows = list[tuple[str, str]]
 
 
@@ -98,41 +97,6 @@ def violated(problem: Problem, X: Tensor, U: Tensor, admitted: float) -> Knots:
         most[:, knots] = torch.where(more, largest, most[:, knots])
         worst[:, knots] = torch.where(more, place, worst[:, knots])
     return Knots(torch.where(worst < 0, 0.0, most).cpu().numpy(), worst.cpu().numpy())
-
-
-def contacts(obstacles: Sequence[Obstacles], path: np.ndarray, dt: float) -> np.ndarray:
-    """Places (C, d) where a path (K, d) touches obstacles of a batch of one: the deepest of each contact.
-
-    Bodies touch at CONTACT_FACTOR of their radii, as the judge has it; between the knots the path is straight.
-    """
-    if len(path) == 0:
-        return path
-    path = np.array(path, dtype=float)  # a table's own array may not be written to, which PyTorch warns of
-    fine = np.linspace(0, len(path) - 1, BETWEEN * (len(path) - 1) + 1)
-    places = np.stack([np.interp(fine, np.arange(len(path)), column) for column in path.T], axis=-1)
-    depth = torch.full((len(places),), -torch.inf, dtype=torch.float64)
-    for part in obstacles:
-        at = _near(part, path, dt)
-        p, t = torch.from_numpy(places[at]).unsqueeze(0), torch.from_numpy(dt * fine[at])
-        distance = part.signed_distance(p, t) + (1.0 - CONTACT_FACTOR) * part.margins.unsqueeze(1)
-        if distance.numel() > 0:
-            depth[at] = torch.maximum(depth[at], -distance[0].amin(-1))
-    touching = np.flatnonzero(depth.numpy() > 0)
-    runs = np.split(touching, np.flatnonzero(np.diff(touching) > 1) + 1)
-    return places[[run[depth.numpy()[run].argmax()] for run in runs if len(run)]]
-
-
-def _near(part: Obstacles, path: np.ndarray, dt: float) -> np.ndarray:
-    """Which places of `contacts` may touch these obstacles: none between knots that are farther away than apart."""
-    places, segments = np.arange(BETWEEN * (len(path) - 1) + 1), len(path) - 1
-    if part.moving or segments == 0:
-        return places
-    knots = part.signed_distance(torch.from_numpy(path).unsqueeze(0), torch.arange(len(path)) * dt)[0]
-    if knots.numel() == 0:
-        return places[:0]
-    clear = knots.amin(-1).numpy()
-    near = np.minimum(clear[:-1], clear[1:]) < np.linalg.norm(np.diff(path, axis=0), axis=1)
-    return places[np.append(near.repeat(BETWEEN), near[-1]) | np.append(False, near.repeat(BETWEEN))]
 
 
 def constraint_name(part: Constraint) -> str:

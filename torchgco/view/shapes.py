@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from torchgco.maps.distance import Unknown
 from torchgco.maps.field import BoundField
+from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.points import PointCloud
 from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.obstacles.box_geometry import Cuboids
@@ -40,6 +42,7 @@ class Shapes:
         velocity: (M | 1, d), m/s; None: at rest.
         until: s, when they stop to move and to count; None: never.
         cells: of a map, which may have a ceiling that the page cuts off at first.
+        unknown: what they count as, of the cells that a map doesn't know; None: others.
     """
 
     center: np.ndarray
@@ -49,11 +52,12 @@ class Shapes:
     velocity: np.ndarray | None = None
     until: float | None = None
     cells: bool = False
+    unknown: Unknown | None = None
 
     def packed(self, packing: Packing, middle: np.ndarray) -> dict[str, Any]:
         """As the page reads them; centres count from `middle` (d,), near which half precision is finest."""
         held: dict[str, Any] = {"count": len(self.center), "until": self.until, "middle": middle.tolist()}
-        held["cells"] = self.cells
+        held |= {"cells": self.cells, "unknown": self.unknown}
         arrays = {"center": self.center - middle, "half": self.half, "radius": self.radius, "turn": self.turn}
         arrays["velocity"] = self.velocity
         return held | {name: packing.put(once(part)) for name, part in arrays.items() if part is not None}
@@ -101,15 +105,27 @@ def _solids(part: Obstacles, solids: Solids, b: int) -> Shapes:
 
 
 def _map(part: BoundField, b: int) -> Shapes:
-    """The occupied cells of a grid, or the balls of a cloud; unknown cells aren't drawn, whatever they count as."""
+    """The occupied cells of a grid, or the balls of a cloud."""
     field, g = part.field, int(part.which[b])
     if isinstance(field.source, PointCloud):
         points = field.source.clouds()[g]
         return Shapes(points, np.zeros((1, field.d)), np.array([field.source.radius]))
-    grid = field.source
-    low, high = merged(grid.is_occupied if grid.batch is None else grid.is_occupied[g])
-    center = np.broadcast_to(grid.origin, (max(1, grid.batch or 1), field.d))[g] + 0.5 * grid.resolution * (low + high)
-    return Shapes(center, 0.5 * grid.resolution * (high - low), np.zeros(1), cells=True)
+    grid = field.source.single(g)
+    return _cells(grid, grid.is_occupied)
+
+
+def unknown_of(part: Obstacles, b: int) -> Shapes | None:
+    """The unknown cells of a map; None where there are none."""
+    if not isinstance(part, BoundField) or not isinstance(part.field.source, OccupancyGrid):
+        return None
+    grid = part.field.source.single(int(part.which[b]))
+    return _cells(grid, grid.is_unknown, part.field.unknown) if bool(grid.is_unknown.any()) else None
+
+
+def _cells(grid: OccupancyGrid, cells: np.ndarray, unknown: Unknown | None = None) -> Shapes:
+    low, high = merged(cells)
+    center = grid.origin + 0.5 * grid.resolution * (low + high)
+    return Shapes(center, 0.5 * grid.resolution * (high - low), np.zeros(1), cells=True, unknown=unknown)
 
 
 # What the page draws for obstacles of each kind, once bound to a problem, and the place of a problem in its batch.

@@ -13,6 +13,7 @@ from tests.maps.files import samples
 from tests.maps.files.samples import ROOM, WHITE_ROOM, png, yaml
 from torchgco import InputError
 from torchgco.maps import OccupancyGrid, read
+from torchgco.scenarios.maps import MapFile
 
 POST = (2, 1)  # the room's post, in cells from the lower left
 
@@ -232,11 +233,42 @@ def test_options_that_are_missing_or_wrong(
     assert error.value.field == f"scenario.{field}"
 
 
-def test_a_plan_beside_its_yaml_says_so(tmp_path: Path) -> None:
-    samples.write(tmp_path, "map.yaml")
-    (tmp_path / "plan.yaml").write_bytes(samples.SAMPLES["map.yaml"][0])
-    with pytest.raises(InputError, match=r"or the path .*plan\.yaml"):
-        read(tmp_path / "plan.pgm")
+def described(folder: Path, image: str = "map.pgm") -> Path:
+    """An image of map_server with a column of unknown cells (205), and its yaml file beside it."""
+    from PIL import Image
+
+    pixels = WHITE_ROOM.copy()
+    pixels[:, -1] = 205
+    Image.fromarray(pixels).save(folder / "map.pgm")
+    text = f"image: {image}\nresolution: 0.05\norigin: [-1.0, 2.0, 0]\nnegate: 0\n"
+    (folder / "map.yaml").write_text(text + "occupied_thresh: 0.65\nfree_thresh: 0.196\n")
+    return folder / "map.pgm"
+
+
+@pytest.mark.parametrize("image", ["map.pgm", "/elsewhere/map.pgm"])
+def test_an_image_is_read_as_the_yaml_beside_it_says(image: str, tmp_path: Path) -> None:
+    path = described(tmp_path, image)
+    for options in ({}, {"resolution": 0.05}, {"resolution": 0.05, "origin": [-1, 2]}):
+        grid = grid_of(path, **options)
+        assert grid.origin.tolist() == [-1, 2] and grid.resolution == 0.05
+        assert grid.is_unknown[-1].all() and grid.is_unknown.sum() == 4, "unknown cells stay unknown"
+    source = MapFile(path=str(path), resolution=0.05).map.source
+    assert isinstance(source, OccupancyGrid) and source.is_unknown.sum() == 4, "and so in scenario=map"
+    for options, said in (({"resolution": 0.1}, "0.05, as .*map.yaml"), ({"origin": [0, 0]}, "-1.0, 2.0.* as .*yaml")):
+        with pytest.raises(InputError, match=said) as error:
+            read(path, field="scenario", **options)
+        assert error.value.field == f"scenario.{next(iter(options))}"
+    assert not grid_of(path, resolution=0.1, height=2.0).is_unknown.any(), "a map of heights is another thing"
+
+
+def test_a_yaml_of_another_image_or_program_is_left_alone(tmp_path: Path) -> None:
+    path = described(tmp_path, "other.pgm")
+    assert not grid_of(path, resolution=1).is_unknown.any()
+    for text in ("resolution: 0.05", "[1, 2", "", "image: [map.pgm]"):
+        (tmp_path / "map.yaml").write_text(text)
+        assert grid_of(path, resolution=1).resolution == 1
+        with pytest.raises(InputError, match="the side of a pixel"):
+            read(path)
 
 
 @pytest.mark.parametrize("path", ["map.step", "map", "", None, 3, "gone.npz", "gone.pcd", "gone.yaml", "gone.png"])

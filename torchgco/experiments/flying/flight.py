@@ -28,6 +28,7 @@ from torchgco.native.dispatch import engine_of
 from torchgco.native.kernels import use_native
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts
+from torchgco.search.reach import short_horizons
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Progress
 from torchgco.solvers.memory import is_out_of_memory, plan_batch
@@ -117,6 +118,8 @@ class Flight:
         setup, layouts = self.setup, self.layouts
         task = setup.vehicle.task(layouts, setup.device, setup.dtype)
         ids = torch.as_tensor(layouts.ids, device=setup.device)
+        if (told := short_horizons(task.problem)) is not None:
+            self.bar.write(f"{self.name}: {told.replace('problem', 'layout')} (scenario.stages)", sys.stderr)
         solution, seconds, together = self._solve(task.problem, task.U0, ids)
         self.bar.update(layouts.count - self.shown)
         statuses = [status.name for status in solution.statuses]

@@ -25,7 +25,7 @@ from torchgco.experiments.flying.flight import Flight, Plan, fly, plan_of, prepa
 from torchgco.experiments.flying.mission_flight import FEW, MissionFlight
 from torchgco.experiments.flying.progress import LAYOUT, Bar, Lines
 from torchgco.experiments.flying.workers import Shared, run_all
-from torchgco.experiments.reports.explained import explained
+from torchgco.experiments.reports.explained import advised, explained, where_to_start
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
 from torchgco.experiments.reports.report import write_report
 from torchgco.experiments.reports.view import write_view
@@ -120,12 +120,14 @@ def _fly_and_report(study: _Study, records: Records, show: Callable[[str], None]
     records.close()
     if study.plan.explain:
         show(explained(study.setup, study.layouts, read_trials(folder / TRIALS)))
+    elif study.setup.mission is None and (told := advised(study.setup, study.layouts, read_trials(folder / TRIALS))):
+        show(told)
     show(f"\nTable, arrays and figures: {folder}")
     if study.plan.view:
         show(f"Page: {write_view(folder)}")
     trials = pd.read_parquet(folder / TRIALS)
     if (trials["status"] == Status.INVALID_START.name).all():
-        raise InputError("scenario", "a layout whose start is outside its obstacles", "none")
+        raise InputError("scenario", where_to_start(study.setup, study.layouts), "none")
 
 
 @dataclass(frozen=True)

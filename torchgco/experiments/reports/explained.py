@@ -2,16 +2,56 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import replace
 
 import pandas as pd
 import torch
 
+from torchgco.base.status import Status
 from torchgco.experiments.config.build import Setup
-from torchgco.explaining.explain import explanation
+from torchgco.explaining.advice import Facts, advice
+from torchgco.explaining.barred import map_facts
+from torchgco.explaining.explain import WIDTH, explanation
 from torchgco.scenarios import Layouts
 
 EXPLAINED = 8  # layouts at most
+
+
+def advised(setup: Setup, layouts: Layouts, trials: pd.DataFrame) -> str:
+    """What to try for the layouts whose goal the solver under study didn't reach; "" where it reached all.
+
+    As `Solution.explain` has it, without solving again: of the first layouts, each sentence with those that it is for.
+    """
+    own = trials[trials["solver"] == setup.solver_name]
+    short = own[~own["reached"].astype("boolean").fillna(False).astype(bool)]
+    if len(short) == 0:
+        return ""
+    shown = short.head(EXPLAINED)
+    problem = setup.vehicle.task(layouts.take(shown["layout"].tolist()), setup.device, setup.dtype).problem
+    found: dict[str, list[str]] = {}
+    for i, row in enumerate(shown.to_dict("records")):
+        one, status = problem.take(torch.tensor([i], device=problem.x0.device)), Status[str(row["status"])]
+        facts = Facts(
+            status, setup.solver, hasattr(setup.solver, "passes"), bool(one.obstacles), False, None,
+            float(row["clearance"]), **map_facts(one, status, False),
+        )  # fmt: skip
+        for sentence in [*facts.told[1:], *advice(facts)]:
+            found.setdefault(sentence, []).append(str(row["layout"]))
+    more = f", the first {len(shown)} of them here" if len(short) > len(shown) else ""
+    lines = [f"\n{setup.solver_name} did not reach {len(short)} of {len(own)} goals{more}. What to try:"]
+    for sentence, places in found.items():
+        layouts_told = f"layout{'s' if len(places) > 1 else ''} {', '.join(places)}: "
+        lines.append(textwrap.fill(layouts_told + sentence, WIDTH, initial_indent="  ", subsequent_indent="    "))
+    return "\n".join([*lines, "study.explain=true tells what was tried."])
+
+
+def where_to_start(setup: Setup, layouts: Layouts) -> str:
+    """What a study needs all of whose layouts begin inside an obstacle."""
+    problem = setup.vehicle.task(layouts.take([0])).problem
+    unknown = map_facts(problem, Status.INVALID_START, False)["in_unknown"]
+    free = ", or scenario.unknown=free, as unknown cells count as occupied" if unknown else ""
+    return f"a layout whose start is outside its obstacles{free}"
 
 
 def explained(setup: Setup, layouts: Layouts, trials: pd.DataFrame) -> str:

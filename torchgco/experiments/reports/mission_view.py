@@ -15,13 +15,14 @@ from torchgco.base.errors import InputError
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_report import PLANS
 from torchgco.experiments.results.records import MISSION
+from torchgco.judging.contact import contacts
 from torchgco.missions import Mission
 from torchgco.missions.replay import replayed
 from torchgco.missions.tables import STATES
 from torchgco.native.compiler import NativeError
 from torchgco.problem.problem import Problem
 from torchgco.view.document import Document, SearchPart
-from torchgco.view.flights import Flight, Rows, contacts, whole
+from torchgco.view.flights import Flight, Rows, whole
 from torchgco.view.sensed import Sensed
 from torchgco.view.vehicles import Look
 

@@ -23,8 +23,7 @@ def read_image(
 
     The lower left pixel is the first cell, x goes to the right and y up.
     """
-    beside = next((name for e in (".yaml", ".yml") if (name := source.path.with_suffix(e)).exists()), None)
-    source.needs("resolution", resolution, "the side of a pixel, m" + (f" (or the path {beside})" if beside else ""))
+    source.needs("resolution", resolution, "the side of a pixel, m")
     brightness, alpha = load(source)
     if height is not None:
         return above_ground(source, turned(brightness).astype(np.float64) * height, resolution, origin)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchgco.base.errors import shown
+from torchgco.base.errors import InputError, shown
 from torchgco.maps.files.images import load, turned
 from torchgco.maps.files.rotated import rotated
 from torchgco.maps.files.source import Source, check_far, made
@@ -22,12 +23,47 @@ FULL = 2.0 * math.pi + 1e-3  # rad
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
 
 
-def read_map_server(source: Source) -> OccupancyGrid:
+def beside(source: Source) -> Source | None:
+    """The yaml file of the same stem that describes an image as a map of map_server; None where there is none."""
+    for ending in (".yaml", ".yml"):
+        found = replace(source, path=source.path.with_suffix(ending))
+        if not found.path.is_file():
+            continue
+        try:
+            image = _keys(found)["image"]
+        except InputError:  # of another program
+            continue
+        if isinstance(image, str) and Path(image).name == source.path.name:
+            return found
+    return None
+
+
+def read_described(source: Source, by: Source, resolution: float | None, origin: np.ndarray | None) -> OccupancyGrid:
+    """An image as the yaml file `by` describes it: with thresholds, unknown cells and the origin.
+
+    Raises:
+        InputError: another resolution or origin than the file's, and as `read_map_server`.
+    """
+    keys = _keys(by)
+    own = _number(by, keys, "resolution")
+    if resolution is not None and not math.isclose(resolution, own, rel_tol=1e-9):
+        raise InputError(f"{source.name}.resolution", f"{own:g}, as {by.path} says of this image", resolution)
+    grid = read_map_server(by, source.path)
+    there = keys["origin"][:2]
+    if origin is not None and not np.allclose(origin[:2], np.array(there, float), rtol=1e-9, atol=1e-9):
+        raise InputError(f"{source.name}.origin", f"{there}, as {by.path} says of this image", origin.tolist())
+    return grid
+
+
+def read_map_server(source: Source, image: Path | None = None) -> OccupancyGrid:
     """The map as map_server publishes it, turned by the origin's yaw into cells along the axes.
 
     A pixel's darkness in [0, 1] (brightness where `negate`) is occupied from `occupied_thresh`, free below
     `free_thresh`, and in between unknown (`mode: trinary`) or a probability that grows evenly (`scale`: transparent
     pixels are unknown). In `raw`, brightness 0 to 100 of 255 is a probability in percent, and above unknown.
+
+    Args:
+        image: read in place of the one that the yaml file names.
 
     Raises:
         InputError: a yaml or an image that can't be read, keys that are missing or out of range.
@@ -45,10 +81,10 @@ def read_map_server(source: Source) -> OccupancyGrid:
     x, y, yaw = (_number(source, {"origin": value}, "origin") for value in origin)
     if abs(yaw) > FULL:
         source.refuse("a yaw of the origin in radians, at most a full turn", f"{yaw:g}")
-    image = keys["image"]
-    if not isinstance(image, str) or not image:
-        source.refuse("image, the path of an image file", shown(image))
-    brightness, alpha = load(replace(source, path=source.path.parent / image))
+    named = keys["image"]
+    if not isinstance(named, str) or not named:
+        source.refuse("image, the path of an image file", shown(named))
+    brightness, alpha = load(replace(source, path=source.path.parent / named if image is None else image))
     negate = keys["negate"]
     if negate not in (0, 1):
         source.refuse("negate 0 or 1", shown(negate))

@@ -14,7 +14,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.maps.files.arrays import read_npy, read_npz
 from torchgco.maps.files.images import read_image
 from torchgco.maps.files.layer import checked_layer, flat
-from torchgco.maps.files.map_server import read_map_server
+from torchgco.maps.files.map_server import beside, read_described, read_map_server
 from torchgco.maps.files.octomap import read_octomap
 from torchgco.maps.files.pcd import read_pcd
 from torchgco.maps.files.ply import read_ply
@@ -44,8 +44,18 @@ def _read_bag(source: Source, topic: str | None) -> OccupancyGrid | np.ndarray:
     return read_bag(source, topic)
 
 
+def _read_image(
+    source: Source, resolution: float | None, origin: np.ndarray | None, height: float | None
+) -> OccupancyGrid:
+    """An image, as a yaml file of map_server beside it describes it, where there is one."""
+    described = None if height is not None else beside(source)
+    if described is not None:
+        return read_described(source, described, resolution, origin)
+    return read_image(source, resolution, origin, height)
+
+
 METADATA = "metadata.yaml"  # is in the folder of each bag of ROS 2
-IMAGE = Format(read_image, ("resolution", "origin", "height"))
+IMAGE = Format(_read_image, ("resolution", "origin", "height"))
 BAG = Format(_read_bag, ("topic",))
 FORMATS = {
     ".npz": Format(read_npz),
@@ -81,7 +91,8 @@ def read(
 
     Args:
         path: a file of one of `FORMATS`; of ROS 2 also a bag's folder.
-        resolution: side of a cell, m: for images, and cells or heights in npy files, which don't state theirs.
+        resolution: side of a cell, m: for images, and cells or heights in npy files, which don't state theirs. An image
+            that a map_server's yaml file of the same stem beside it describes is read as that says, unknown cells too.
         radius: of the ball around each point, m: for files of points.
         origin: lowest corner of the first cell, m, by default 0: for images, and cells or heights in npy files.
         height: makes an image or numbers (X, Y) in an npy file a heightmap: metres of white above black, or of 1.

@@ -84,15 +84,19 @@ export class Flights {
       if (red) found.push(red);
     }
     if (flight.contacts.length) {
-      const size = 3.2 * this.thick;
-      const shapes = new THREE.InstancedMesh(new THREE.OctahedronGeometry(size), paint, flight.contacts.length);
-      const at = new THREE.Matrix4();
-      flight.contacts.forEach((place, i) => {
-        const { x, y, z } = this.place(...place);
-        shapes.setMatrixAt(i, at.makeTranslation(x, y, z));
-      });
-      shapes.frustumCulled = false;
-      found.push(shapes);
+      // They lie within what is touched: seen through it.
+      const through = new THREE.MeshBasicMaterial({ color: BAD, transparent: true, opacity: 0.6, depthTest: false, depthWrite: false });
+      for (const [look, order] of [[paint, 0], [through, 6]]) {
+        const shapes = new THREE.InstancedMesh(new THREE.OctahedronGeometry(3.2 * this.thick), look, flight.contacts.length);
+        const at = new THREE.Matrix4();
+        flight.contacts.forEach((place, i) => {
+          const { x, y, z } = this.place(...place);
+          shapes.setMatrixAt(i, at.makeTranslation(x, y, z));
+        });
+        shapes.frustumCulled = false;
+        shapes.renderOrder = order;
+        found.push(shapes);
+      }
     }
     return found;
   }

@@ -8,7 +8,7 @@ import { PARTS } from "./missions.js";
 import { Flights } from "./flights.js";
 import { Search } from "./search.js";
 import { linesOf, pick, showHover } from "./hover.js";
-import { build, by, showLayout, showParts, showSearch, showTime } from "./panel.js";
+import { build, by, showLayout, showParts, showSearch, showTime, showUnknown } from "./panel.js";
 
 const SLOW = 1 / 31; // s a frame, above which the picture gets coarser while it moves
 const TOLD = 100; // ms between two updates of the text while playing
@@ -40,7 +40,8 @@ class Page {
     this.visible = new Set(head.solvers.map(({ name }) => name));
     this.layers = new Set(["path", "caught", "refined"]);
     const parts = Object.fromEntries(PARTS.map((name) => [name, true]));
-    this.shown = { follow: false, through: false, grown: false, searched: false, ...parts };
+    // In space unknown cells would hide all the rest.
+    this.shown = { follow: false, through: false, unknown: head.dimension === 2, grown: false, searched: false, ...parts };
     this.time = 0;
     this.speed = 1;
     this.playing = false;
@@ -139,6 +140,7 @@ class Page {
     this.cut(Number(by("cut").value));
     this.flights.setVisible(this.visible);
     showParts(this.flights.partNames);
+    showUnknown(this.obstacles.unknown);
     for (const [name, on] of Object.entries(this.shown)) this.toggle(name, on);
     this.setTime(this.time);
   }
@@ -189,6 +191,7 @@ class Page {
     this.shown[name] = on;
     by(name).checked = on;
     if (name === "grown") this.obstacles.setGrown(on);
+    if (name === "unknown") this.obstacles.setUnknown(on);
     if (name === "through") this.obstacles.setSeeThrough(on);
     if (PARTS.includes(name)) this.flights.setPart(name, on);
     if (name === "searched") this.setSearch({});

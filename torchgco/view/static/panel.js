@@ -49,7 +49,7 @@ export function build(head, act) {
   );
   by("cut-label").hidden = head.dimension === 2;
   by("cut").addEventListener("input", (event) => act.cut(Number(event.target.value)));
-  for (const name of ["follow", "through", "grown", "searched", ...PARTS]) {
+  for (const name of ["follow", "through", "unknown", "grown", "searched", ...PARTS]) {
     by(name).addEventListener("change", (event) => act.toggle(name, event.target.checked));
   }
   by("play").addEventListener("click", act.play);
@@ -94,6 +94,12 @@ export function showTime(t, duration, playing) {
   by("time").setAttribute("aria-valuetext", `${t.toFixed(2)} seconds`);
   by("play").textContent = playing ? "Pause" : "Play";
   by("play").setAttribute("aria-pressed", String(playing));
+}
+
+/** The switch of the cells that a map doesn't know, and what they count as; hidden where there are none. */
+export function showUnknown(counts) {
+  by("unknown-label").hidden = !counts;
+  by("counts").textContent = counts ?? "";
 }
 
 /** The switches of a mission's parts, those that this layout has. */

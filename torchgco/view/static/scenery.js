@@ -7,10 +7,18 @@ const SIDEWAYS = 0.25; // shares of the scene's size that are kept around the tr
 const UPWARDS = 0.1;
 const AROUND = 0.06; // that are in view around them at first
 
-export const LIGHT = { sky: 0xf7f8f9, obstacle: 0xcfc3ae, ground: 0xe9ebee, line: 0xc9ced6 };
-export const DARK = { sky: 0x16191d, obstacle: 0x8d8676, ground: 0x20242a, line: 0x3a414b };
+const STRAY = 1; // share of the size by which a path that ends badly may widen the scene, on each side
 
-/** The box around start, goal and the trajectories that end well, what is in view at first, where long obstacles end. */
+export const LIGHT = { sky: 0xf7f8f9, obstacle: 0xcfc3ae, unknown: 0x7fa8d9, ground: 0xe9ebee, line: 0xc9ced6 };
+export const DARK = { sky: 0x16191d, obstacle: 0x8d8676, unknown: 0x5f86b8, ground: 0x20242a, line: 0x3a414b };
+
+/** The longest side of a box, at least as long as the vehicle is. */
+function longest(box, head) {
+  const { x, y, z } = box.getSize(new THREE.Vector3());
+  return Math.max(x, y, z, 4 * head.radius, 1e-6);
+}
+
+/** The box around start, goal and trajectories, far ones that end badly left out; what is in view at first; where long obstacles end. */
 export function spaceOf(layout, head) {
   const flat = head.dimension === 2;
   const box = new THREE.Box3();
@@ -20,9 +28,15 @@ export function spaceOf(layout, head) {
   const good = layout.flights.filter((flight) => flight.result !== "failed");
   const shown = layout.goal || good.length ? good : layout.flights;
   for (const { path } of shown) for (let k = 0; k < path.rows; k++) add(point(path, k));
+  const rest = layout.flights.filter((flight) => !shown.includes(flight));
+  const widest = box.clone().expandByScalar(STRAY * longest(box, head));
+  if (layout.map) for (const [x, y, z] of layout.map) widest.expandByPoint(new THREE.Vector3(x, y, z ?? 0));
+  for (const { path } of rest) {
+    const places = Array.from({ length: path.rows }, (_, k) => point(path, k));
+    if (places.every(([x, y, z]) => widest.containsPoint(new THREE.Vector3(x, y, z ?? 0)))) places.forEach(add);
+  }
   if (layout.goal && layout.goal_radius) box.expandByScalar(0.2 * layout.goal_radius);
-  const extent = box.getSize(new THREE.Vector3());
-  const size = Math.max(extent.x, extent.y, extent.z, 4 * head.radius, 1e-6);
+  const size = longest(box, head);
   const margin = new THREE.Vector3(SIDEWAYS, SIDEWAYS, UPWARDS).multiplyScalar(size).addScalar(head.radius);
   const low = box.min.clone().sub(margin);
   const high = box.max.clone().add(margin);

@@ -154,13 +154,15 @@ export function obstacles(parts, space, colours, still) {
   );
   const colour = new THREE.Color(colours.obstacle);
   const straight = parts.every((part) => !part.turn);
+  const unknown = plain(new THREE.Color(colours.unknown), 0.45, uniforms, straight);
   const solids = still ? shaded("MeshLambertMaterial", { color: colour }, uniforms) : plain(colour, 1, uniforms, straight);
   const clear = plain(colour, 0.3, uniforms, straight);
   const hull = plain(colour, 0.18, { ...uniforms, grown: { value: space.radius } }, straight);
   const shadow = shaded("MeshDepthMaterial", { depthPacking: THREE.RGBADepthPacking }, uniforms);
   const meshes = [];
   const shells = [];
-  for (const part of parts) {
+  const unseen = parts.filter((part) => part.unknown).map((part) => new THREE.Mesh(geometryOf(part, space, still), unknown));
+  for (const part of parts.filter((one) => !one.unknown)) {
     const geometry = geometryOf(part, space, still);
     const mesh = new THREE.Mesh(geometry, solids);
     mesh.castShadow = mesh.receiveShadow = true;
@@ -171,7 +173,7 @@ export function obstacles(parts, space, colours, still) {
     more.forEach((one) => (one.frustumCulled = false));
     group.add(...more);
   };
-  add(...meshes);
+  add(...meshes, ...unseen);
   const until = Math.min(...parts.map((part) => part.until ?? Infinity), Infinity);
   return {
     group,
@@ -179,15 +181,18 @@ export function obstacles(parts, space, colours, still) {
     setTime: (t) => (uniforms.time.value = Math.min(t, until)),
     setGrown: (on) => {
       if (on && !shells.length) {
-        shells.push(...parts.map((part) => new THREE.Mesh(geometryOf(part, space, still, true), hull)));
+        const counted = parts.filter((part) => part.unknown !== "free");
+        shells.push(...counted.map((part) => new THREE.Mesh(geometryOf(part, space, still, true), hull)));
         add(...shells);
       }
       shells.forEach((shell) => (shell.visible = on));
     },
+    unknown: parts.find((part) => part.unknown)?.unknown ?? null,
+    setUnknown: (on) => unseen.forEach((mesh) => (mesh.visible = on)),
     setSeeThrough: (on) => meshes.forEach((mesh) => (mesh.material = on ? clear : solids)),
     dispose: () => {
-      [solids, clear, hull, shadow].forEach((one) => one.dispose());
-      [...meshes, ...shells].forEach((mesh) => mesh.geometry.dispose());
+      [solids, clear, hull, shadow, unknown].forEach((one) => one.dispose());
+      [...meshes, ...shells, ...unseen].forEach((mesh) => mesh.geometry.dispose());
     },
   };
 }

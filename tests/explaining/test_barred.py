@@ -1,0 +1,104 @@
+"""What a map says of a goal that no path reaches, and of a start in unknown cells."""
+
+import heapq
+
+import numpy as np
+import pytest
+import torch
+
+import torchgco
+from torchgco import ControlBounds, Field, Goal, OccupancyGrid, Problem, QuadraticCost, Status, Unicycle
+from torchgco.maps import DistanceField
+from torchgco.maps.passage import widest_passage
+
+RESOLUTION = 0.05
+Node = tuple[int, ...]
+
+
+def room(door: int = 8) -> np.ndarray:
+    """10 m by 6 m behind walls, with a wall across that has a door of so many cells."""
+    held = np.zeros((200, 120), np.float32)
+    held[0] = held[-1] = held[:, 0] = held[:, -1] = held[100:102] = 1
+    held[100:102, 60 - door // 2 : 60 + (door + 1) // 2] = 0
+    return held
+
+
+def problem(cells: np.ndarray, radius: float, goal: tuple[float, float] = (8.0, 3.0)) -> Problem:
+    cost = QuadraticCost([1, 1, 0, 2], [0.5, 0.5], [200, 200, 0, 10], [*goal, 0, 0])
+    parts = [Field(OccupancyGrid(cells, [0, 0], RESOLUTION), radius), ControlBounds([-2, -1.5], [2, 1.5])]
+    x0 = torch.tensor([[2.0, 3.0, 0, 0]]).double()
+    return Problem(Unicycle(dt=0.1), cost, parts, x0, 60, Goal(list(goal), 0.3))
+
+
+def told(task: Problem) -> str:
+    return " ".join(torchgco.solve(task, solver="hold").explain(0).split())
+
+
+def test_a_door_that_is_too_narrow_is_named_with_the_radius_that_passes() -> None:
+    text = told(problem(room(), 0.3))
+    no_way = "No way through the map leads a vehicle of radius 0.3 m to the goal: the widest has room for 0.2 m."
+    assert no_way in text and "a vehicle_radius of at most 0.2 m" in text and "longer horizon" not in text
+    for radius in (0.2, 0.19):
+        assert "No way" not in told(problem(room(), radius)), "this vehicle passes"
+
+
+def test_a_goal_that_no_vehicle_reaches_is_told_apart() -> None:
+    text = told(problem(room(), 0.3, (50.0, 0.5)))
+    assert "none of any radius" in text and "vehicle_radius of at most" not in text
+    open_room = room()
+    open_room[-1, 40:60] = 0
+    assert "has room for 0.2 m" in told(problem(open_room, 0.3, (50.0, 0.5))), "through both doors, then outside"
+    assert "another guess" not in Status.INFEASIBLE.sentence.lower()
+
+
+def test_a_start_in_unknown_cells_is_no_start_in_a_wall() -> None:
+    unknown, wall = room(), room()
+    unknown[30:50, 50:70], wall[30:50, 50:70] = np.nan, 1
+    for cells, named in ((unknown, True), (wall, False)):
+        task = problem(cells, 0.15)
+        solution = torchgco.solve(task, solver="hold")
+        assert solution.statuses == [Status.INVALID_START]
+        assert ("scenario.unknown=free" in " ".join(solution.explain(0).split())) == named
+
+
+def bottleneck(values: np.ndarray, starts: list[Node], goals: list[Node]) -> float:
+    """The widest way by a plain search from node to node, which takes the clearest node next."""
+    best, heap = dict[Node, float](), [(-float(values[node]), node) for node in starts]
+    heapq.heapify(heap)
+    while heap:
+        width, node = heapq.heappop(heap)
+        if node in best:
+            continue
+        best[node] = -width
+        for step in np.ndindex(*([3] * values.ndim)):
+            other = tuple(a + b - 1 for a, b in zip(node, step, strict=True))
+            if other not in best and all(0 <= a < n for a, n in zip(other, values.shape, strict=True)):
+                heapq.heappush(heap, (max(width, -float(values[other])), other))
+    return max(best[goal] for goal in goals)
+
+
+def beside(node: Node, shape: tuple[int, ...]) -> list[Node]:
+    """A node and its neighbours along the axes: the vehicle may begin and end within a node's distance."""
+    around = [
+        node,
+        *(tuple(np.add(node, sign * row).tolist()) for row in np.eye(len(node), dtype=int) for sign in (1, -1)),
+    ]
+    return [one for one in around if all(0 <= a < n for a, n in zip(one, shape, strict=True))]
+
+
+@pytest.mark.parametrize("shape", [(10, 10), (3, 2, 2)])
+def test_the_widest_way_is_that_of_a_plain_search(shape: tuple[int, ...]) -> None:
+    rng, found = np.random.default_rng(1), []
+    for _ in range(12):
+        cells = rng.random(shape) < 0.35
+        for axis in range(len(shape)):
+            cells = cells.repeat(3, axis)
+        field = DistanceField.of(OccupancyGrid(cells, [0.0] * len(shape), 0.1).enclosed(), refine=1)
+        values = field.values[0]
+        free = np.argwhere(values > 0)
+        start, goal = (tuple(free[j].tolist()) for j in rng.integers(len(free), size=2))
+        ends = (field.origin[0] + field.spacing * np.array(node) for node in (start, goal))
+        found.append(widest_passage(field, 0, *ends, 1e-9, 10.0))
+        wide = bottleneck(values, *(beside(node, values.shape) for node in (start, goal)))
+        assert found[-1] == pytest.approx(max(wide, 0.0), abs=1e-6)
+    assert len(set(found)) > 1

@@ -1,0 +1,77 @@
+"""Horizons that are too short for the way to the goal, said before the solve."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import torchgco
+from torchgco import (
+    ControlBounds,
+    Field,
+    FunctionDynamics,
+    Goal,
+    HorizonWarning,
+    OccupancyGrid,
+    Problem,
+    QuadraticCost,
+    StateBounds,
+    Unicycle,
+)
+from torchgco.dynamics import Dynamics
+from torchgco.search.reach import longest_step, short_horizons
+
+FREE = float("inf")
+POINT = FunctionDynamics(lambda x, u: u, 2, 2, 0.1, "euler", slice(0, 2))
+SPEED = ControlBounds([-1.0, 0.0], [1.0, 0.0])  # along x alone
+
+
+def task(model: Dynamics, parts: list, N: int, x0: list[list[float]], goal: Goal | None) -> Problem:
+    n = model.n
+    cost = QuadraticCost([1.0] * n, [1.0] * 2, [1.0] * n, [8.0, 1.0, *[0.0] * (n - 2)])
+    start = torch.tensor(x0, dtype=torch.float64)
+    return Problem(model, cost, parts, start, N, goal)
+
+
+def test_the_number_of_stages_that_would_do_is_named() -> None:
+    starts = [[2.0, 1.0], [7.0, 1.0]]
+    for N, count in ((56, 1), (57, 0)):  # 5.7 m to the edge of the goal, 0.1 m a stage
+        said = short_horizons(task(POINT, [SPEED], N, starts, Goal([8.0, 1.0], 0.3)))
+        assert (said is not None) == bool(count)
+        assert said is None or (said.startswith("1 of 2 horizons") and "N = 57 would do" in said and "6 m long" in said)
+
+
+def test_through_a_map_the_way_is_the_roadmaps() -> None:
+    cells = np.zeros((100, 100), bool)
+    cells[50:52, :90] = True
+    field = Field(OccupancyGrid(cells, [0, 0], 0.1).enclosed(), 0.3)
+    both = ControlBounds([-0.7, -0.7], [0.7, 0.7])  # 0.99 m/s along a diagonal
+    problem = task(POINT, [field, both], 100, [[2.0, 1.0]], Goal([8.0, 1.0], 0.3))
+    detour = 2 * np.hypot(3.0, 8.4)  # past the end of the wall, at 0.3 m from it
+    said = short_horizons(problem)
+    assert said is not None and short_horizons(task(POINT, [field, both], 190, [[2.0, 1.0]], problem.goal)) is None
+    length = float(said.split("first is ")[1].split(" m")[0])
+    assert detour <= length < 1.1 * detour
+    with pytest.warns(HorizonWarning, match="N = "):
+        solution = torchgco.solve(problem, solver="hold")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", HorizonWarning)
+        torchgco.solve(problem, solver="hold", warm=solution)  # the horizon of an MPC ends before the goal
+        torchgco.solve(task(POINT, [both], 10, [[2.0, 1.0]], None), solver="hold")  # a goal that nobody stated
+
+
+def test_a_limit_is_seen_where_there_is_one_alone() -> None:
+    def longest(model: Dynamics, parts: list) -> float | None:
+        found = longest_step(task(model, parts, 5, [[0.0] * model.n], None))
+        return None if found is None else float(found[0])
+
+    turns = ControlBounds([-2.0, -1.5], [2.0, 1.5])
+    speeds = StateBounds([-FREE, -FREE, -FREE, -1.0], [FREE, FREE, FREE, 1.5])
+    assert longest(Unicycle(dt=0.1), [turns]) is None, "it may go on accelerating"
+    assert longest(Unicycle(dt=0.1), [speeds]) == pytest.approx(0.15), "whatever its heading"
+    assert longest(POINT, [SPEED]) == pytest.approx(0.1) and longest(POINT, []) is None
+    jump = FunctionDynamics(lambda x, u: x + 0.2 * u, 2, 2, 0.1, "none", slice(0, 2))
+    assert longest(jump, [SPEED]) == pytest.approx(0.2), "of a step without a field"
+    flow = FunctionDynamics(lambda x, u: u + x[..., :1] * 0.5, 2, 2, 0.1, "euler", slice(0, 2))
+    assert longest(flow, [SPEED]) is None, "a flow that grows with the place"

@@ -1,0 +1,45 @@
+"""What a map says of a problem that wasn't solved: no way to the goal, or a start among unknown cells."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchgco.base.status import Status
+from torchgco.constraints.base import CONTACT_FACTOR
+from torchgco.maps.exact import distance_within
+from torchgco.maps.field import BoundField
+from torchgco.maps.grid import OccupancyGrid
+from torchgco.maps.passage import widest_passage
+from torchgco.problem.problem import Problem
+
+
+def map_facts(problem: Problem, status: Status, arrived: bool) -> dict[str, Any]:
+    """Those of `Facts` that maps know, for a batch of one; none where the vehicle arrived without contact."""
+    fields = [part for part in problem.obstacles if isinstance(part, BoundField)]
+    if status is Status.INVALID_START:
+        return {"in_unknown": any(_is_unknown(problem, field) for field in fields)}
+    if arrived or problem.goal is None:
+        return {}
+    found = [fact for field in fields if field.holds_at(problem.N) and (fact := _barred(problem, field)) is not None]
+    return min(found, key=lambda fact: fact["passage"], default={})
+
+
+def _barred(problem: Problem, field: BoundField) -> dict[str, float] | None:
+    """The vehicle's radius and the largest that gets to the goal, where this one touches the map on every way."""
+    assert problem.goal is not None
+    start, goal = problem.x0[0, problem.position], problem.goal.position[0]
+    ends = (end.detach().cpu().double().numpy() for end in (start, goal))
+    radius, goal_radius = float(field.vehicle_radius[0]), float(problem.goal.radius[0])
+    passage = widest_passage(field.field, int(field.which[0]), *ends, goal_radius, CONTACT_FACTOR * radius)
+    return None if passage is None else {"radius": radius, "passage": passage}
+
+
+def _is_unknown(problem: Problem, field: BoundField) -> bool:
+    """Whether the vehicle touches unknown cells at the start, and no others of this map."""
+    source = field.field.source
+    if not isinstance(source, OccupancyGrid) or bool(field.start_is_clear(problem.x0)[0]):
+        return False
+    p = problem.x0[0, problem.position].detach().cpu().double().numpy()
+    least = CONTACT_FACTOR * float(field.vehicle_radius[0])
+    known = distance_within(source, "free", int(field.which[0]), p, least + source.resolution)
+    return known >= least and known > 0

@@ -1,0 +1,81 @@
+"""Where trajectories touch obstacles, by the distances of judge and certificate: what pictures mark."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.constraints.base import CONTACT_FACTOR
+from torchgco.judging.certificate import CHORDS
+from torchgco.judging.judge import by_kind
+from torchgco.judging.maps import path_distances
+from torchgco.maps.distance import DistanceField
+from torchgco.obstacles.base import Obstacles
+
+BETWEEN = 4  # pieces of a stage, each of which has a contact of its own or none
+ALIKE = 1e-9  # m: depths that differ less are one, as of a way through equal cells
+
+
+def contacts(obstacles: Sequence[Obstacles], path: np.ndarray, dt: float) -> np.ndarray:
+    """Places (C, d) where a path (K, d), m, touches obstacles of a batch of one: the deepest of each contact.
+
+    Bodies touch at CONTACT_FACTOR of their radii, as the judge has it; between the knots, `dt` seconds apart, the path
+    is straight.
+    """
+    places, _ = pieces(path)
+    depth = np.full(max(len(places) - 1, 0), -np.inf)
+    for part in obstacles if len(places) else ():
+        depth = np.maximum(depth, _depth(part, places, dt / BETWEEN if len(path) > 1 else 0.0))
+    return deepest(places, depth)
+
+
+def pieces(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The ends (P+1, d) of the pieces of a path (K, d), and which knots they are, (P+1,), whole numbers at knots.
+
+    The path of a single knot is one piece without length.
+    """
+    path = np.array(path, dtype=float)  # a table's own array may not be written to, which PyTorch warns of
+    if len(path) == 1:
+        return path.repeat(2, axis=0), np.zeros(2)
+    knots = np.linspace(0, len(path) - 1, BETWEEN * (len(path) - 1) + 1) if len(path) else np.zeros(0)
+    columns = [np.interp(knots, np.arange(len(path)), column) for column in path.T] if len(path) else path.T
+    return np.stack(list(columns), axis=-1), knots
+
+
+def map_depth(field: DistanceField, places: np.ndarray, radius: float) -> np.ndarray:
+    """How deep (P,), m, a vehicle of this radius is in contact with a map on the pieces between places (P+1, d)."""
+    return CONTACT_FACTOR * radius - path_distances(field, 0, torch.from_numpy(places)).numpy()
+
+
+def deepest(places: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """The deepest places (C, d) of each run of pieces, with ends (P+1, d), whose depth (P,) is above 0."""
+    middle, touching = 0.5 * (places[1:] + places[:-1]), np.flatnonzero(depth > 0)
+    runs = np.split(touching, np.flatnonzero(np.diff(touching) > 1) + 1)
+    found = [middle[run[depth[run] > depth[run].max() - ALIKE]].mean(axis=0) for run in runs if len(run)]
+    return np.array(found).reshape(-1, places.shape[1])
+
+
+def _depth(part: Obstacles, places: np.ndarray, dt: float) -> np.ndarray:
+    """How deep (P,), m, the pieces between places (P+1, d), `dt` seconds apart, are in contact with a part."""
+    one = replace(part, dt=dt) if part.moving else part
+    X = torch.zeros(len(places), part.position.stop, dtype=torch.float64)
+    X[:, part.position] = torch.from_numpy(places)
+    beneath = _beneath(one, X) - (1.0 - CONTACT_FACTOR) * part.margins[0].double().cpu()
+    beneath = beneath.masked_fill(part.absent[0].cpu(), -torch.inf)
+    return beneath.amax(-1).numpy() if beneath.shape[-1] else np.full(len(places) - 1, -np.inf)
+
+
+def _beneath(part: Obstacles, X: Tensor) -> Tensor:
+    """The same (P, M) beneath the full surfaces; of a kind that can't be judged, by its own distances at the ends."""
+    X = X.to(part.vehicle_radius.device, part.vehicle_radius.dtype)
+    try:
+        gaps = by_kind(CHORDS, part)(part, X)
+    except InputError:
+        ends = part.signed_distance(X[None, :, part.position], part.dt * torch.arange(len(X)).to(X))[0]
+        gaps = torch.minimum(ends[:-1], ends[1:])
+    return -gaps.detach().double().cpu()
