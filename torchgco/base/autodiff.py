@@ -7,6 +7,7 @@ may use parameters per problem. `vmap` over the batch would not allow that.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,17 +24,18 @@ class WithoutReading(TorchFunctionMode):
     """Raises ReadsMemory where a function leaves PyTorch with a tensor that is differentiated or recorded.
 
     Such a tensor has no memory of its own: reading it may crash, and what is made of the numbers is a constant. Other
-    tensors may be read; `seen` keeps by which methods.
+    tensors may be read; `seen` keeps by which methods. `called` is the function of PyTorch that was called last.
     """
 
-    READERS = ("numpy", "__array__", "__dlpack__", "tolist", "data_ptr", "storage", "untyped_storage")
+    READERS = ("numpy", "__array__", "__dlpack__", "tolist", "data_ptr", "storage", "untyped_storage", "__repr__")
 
     def __init__(self) -> None:
         super().__init__()
         self.seen: set[str] = set()
+        self.called: Any = None
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
-        name = getattr(func, "__name__", "")
+        self.called, name = func, getattr(func, "__name__", "")
         if name in self.READERS:
             self.seen.add(name)
             if _stands_for_another(args[0]):

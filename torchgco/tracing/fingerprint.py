@@ -11,7 +11,7 @@ import numpy as np
 
 from torchgco.tracing.recorder import Operation, Slot
 
-FORMAT = 1  # to be raised when the digested text changes, or its meaning in a replay
+FORMAT = 2  # to be raised when the digested text changes, or its meaning in a replay
 
 
 def fingerprint(
@@ -32,7 +32,7 @@ def fingerprint(
     # A slot's own number may differ between recordings: here, slots are numbered in the order in which they occur.
     order = count()
     made = (slot for operation in operations for slot in operation.outputs)
-    names = {slot: f"${next(order)}" for slot in (*variables, *own, *constants, *made)}
+    names = {slot: f"${next(order)} {slot.dtype}" for slot in (*variables, *own, *constants, *made)}
     digest = hashlib.sha256(f"format {FORMAT}\n".encode())
     for kind, shapes in (("variable", variables), ("own", own)):
         for slot, shape in shapes.items():

@@ -57,8 +57,9 @@ def _choose(condition: Any, a: Any, b: Any) -> Any:
 _where = _elementwise(_choose, 3)
 _add, _sub, _mul = _binary(operator.add), _binary(operator.sub), _binary(operator.mul)
 _truediv, _floor = _binary(operator.truediv), _unary("floor")
+_power = _binary(operator.pow)
 _sqrt = _unary("sqrt")
-_fmin, _fmax = _binary("fmin"), _binary("fmax")
+_fmin, _fmax = _binary("fmin"), _binary("fmax")  # in C, NaN where one of the two is
 
 
 def _divide(a: Any, b: Any, rounding_mode: str | None = None) -> np.ndarray:
@@ -150,12 +151,6 @@ def _cumsum(a: np.ndarray, dim: int, **_: Any) -> np.ndarray:
     return np.cumsum(a, axis=dim)
 
 
-def _to_copy(a: np.ndarray, dtype: torch.dtype | None = None, **_: Any) -> np.ndarray:
-    if dtype is not None and not dtype.is_floating_point:
-        raise NoCounterpart  # conversion to integers or booleans
-    return a
-
-
 def _filled(value: float) -> Callable:
     return lambda a, **_: np.full(a.shape, value, dtype=object)
 
@@ -172,6 +167,56 @@ def _same(a: np.ndarray, **_: Any) -> np.ndarray:
     return a
 
 
+def is_logical(element: Any) -> bool:
+    """Whether an expression is 0 or 1 by its own form."""
+    return isinstance(element, _casadi().SX) and element.op() in _logical()
+
+
+@functools.cache
+def _logical() -> frozenset[int]:
+    return frozenset(getattr(_casadi(), f"OP_{name}") for name in ("LT", "LE", "EQ", "NE", "NOT", "AND", "OR"))
+
+
+def to_truth(element: Any) -> Any:
+    """1 where an element isn't 0, NaN too, and else 0."""
+    if not isinstance(element, _casadi().SX):
+        return 1.0 if element != 0 else 0.0
+    return element if is_logical(element) else _casadi().ne(element, 0)
+
+
+def to_single(element: Any) -> Any:
+    """An element rounded to single precision.
+
+    CasADi has no such operation: its remainder by infinity, which no counterpart makes and which is the number itself,
+    stands for it, and is a conversion in C.
+    """
+    if not isinstance(element, _casadi().SX):
+        return float(np.float32(element))
+    return element if is_logical(element) else _casadi().remainder(element, math.inf)
+
+
+def wrapped(element: Any, low: int, size: int) -> Any:
+    """The whole number from `low` to `low + size - 1` that differs from a whole number by a multiple of `size`."""
+    return element - size * _casadi().floor((element - low) / size)
+
+
+def _refused(*_: Any, **__: Any) -> Any:
+    raise NoCounterpart("bits of integers")
+
+
+def _whole_power(a: np.ndarray, exponent: Any) -> np.ndarray:
+    if not isinstance(exponent, int):
+        raise NoCounterpart("an integer's power that may be a fraction")
+    return _power(a, exponent)
+
+
+# The counterparts where the result is an integer.
+WHOLE: dict[str, Callable] = {
+    "aten.bitwise_and": _refused,
+    "aten.bitwise_or": _refused,
+    "aten.bitwise_not": _unary(lambda x: -x - 1),
+    "aten.pow": _whole_power,
+}
 # By name of the operation, without its overload. Others are first decomposed by PyTorch, where it can.
 OPERATIONS: dict[str, Callable] = {
     # arithmetic
@@ -182,7 +227,7 @@ OPERATIONS: dict[str, Callable] = {
     "aten.div": _divide,
     "aten.neg": _unary(operator.neg),
     "aten.reciprocal": _unary(lambda x: 1.0 / x),
-    "aten.pow": _binary(operator.pow),
+    "aten.pow": _power,
     "aten.square": _unary(lambda x: x * x),
     "aten.sqrt": _sqrt,
     "aten.rsqrt": _unary(lambda x: 1.0 / _casadi().sqrt(x)),
@@ -268,8 +313,8 @@ OPERATIONS: dict[str, Callable] = {
     "aten.alias": _same,
     "aten.detach": _same,
     "aten.lift_fresh_copy": _same,
-    "aten._to_copy": _to_copy,
-    "prims.convert_element_type": lambda a, dtype: _to_copy(a, dtype),
+    "aten._to_copy": _same,
+    "prims.convert_element_type": lambda a, dtype: a,
     "aten.copy": lambda a, source, *_: arrays.expand(source, a.shape),
     "aten.fill": lambda a, value: arrays.expand(boxed(value), a.shape),
     "aten.zeros_like": _filled(0.0),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import count
@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import resolve_name
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -17,12 +18,15 @@ from torchgco.base.autodiff import WithoutReading
 from torchgco.base.errors import InputError
 from torchgco.tracing.operations import OPERATIONS
 
+SHAPED_BY_VALUES = torch.Tag.dynamic_output_shape
+
 
 @dataclass(frozen=True)
 class Slot:
     """Stands for a tensor in a recording."""
 
     number: int
+    dtype: torch.dtype
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +37,7 @@ class Operation:
     args: tuple
     kwargs: dict[str, Any]
     result: Any  # a slot, or a sequence of them
+    called: Any = None  # the function of PyTorch that the user called
 
     @cached_property
     def inputs(self) -> list[Slot]:
@@ -42,10 +47,20 @@ class Operation:
     def outputs(self) -> list[Slot]:
         return [leaf for leaf in tree_leaves(self.result) if isinstance(leaf, Slot)]
 
-    def replay(self, function: Callable, known: dict[Slot, Any]) -> None:
-        """Apply `function` to known values, and add its result to `known`."""
-        args, kwargs = tree_map(lambda leaf: known[leaf] if isinstance(leaf, Slot) else leaf, (self.args, self.kwargs))
-        made = function(*args, **kwargs)
+    @property
+    def title(self) -> str:
+        """What the user called, and the operation of PyTorch's that this came to."""
+        name = None if self.called is None else resolve_name(self.called)
+        return f"{name} ({self.function})" if name else str(self.function)
+
+    def filled(self, known: dict[Slot, Any]) -> tuple[tuple, dict[str, Any]]:
+        """The arguments with known values in the place of slots."""
+        return tree_map(lambda leaf: known[leaf] if isinstance(leaf, Slot) else leaf, (self.args, self.kwargs))
+
+    def replay(self, known: dict[Slot, Any]) -> None:
+        """Apply PyTorch's operation to known tensors, and add its result to `known`."""
+        args, kwargs = self.filled(known)
+        made = self.function(*args, **kwargs)
         for slot, value in zip(self.outputs, made if isinstance(made, (list, tuple)) else [made], strict=True):
             known[slot] = value
 
@@ -53,8 +68,9 @@ class Operation:
 class Recording(TorchDispatchMode):
     """Records every operation that reaches PyTorch's kernels, and decomposes those that CasADi doesn't know."""
 
-    def __init__(self, inputs: Iterable[Tensor]) -> None:
+    def __init__(self, inputs: Iterable[Tensor], calls: WithoutReading) -> None:
         super().__init__()
+        self._calls = calls
         self._seen: dict[int, tuple[Slot, Tensor]] = {}  # holds the tensor: its id isn't reused
         self._numbers = count()
         self.operations: list[Operation] = []
@@ -70,7 +86,7 @@ class Recording(TorchDispatchMode):
         return self._seen[id(tensor)][0]
 
     def _new(self, tensor: Tensor) -> Slot:
-        self._seen[id(tensor)] = Slot(next(self._numbers)), tensor
+        self._seen[id(tensor)] = Slot(next(self._numbers), tensor.dtype), tensor
         return self._seen[id(tensor)][0]
 
     @classmethod
@@ -79,12 +95,16 @@ class Recording(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
-        if func is torch.ops.aten._local_scalar_dense.default:
-            if self.slot(args[0]) in self._followers:
-                raise _Unfit("one that looks at the values of its arguments")
-            return func(*args, **kwargs)  # a constant's value may be read
         if torch.Tag.nondeterministic_seeded in func.tags:
             raise _Unfit(f"one that draws at random ({name_of(func)})")
+        if func._schema.is_mutable:  # all that can be a write into a copy has become one
+            raise _Unfit(f"one that writes in place where that can't be followed ({name_of(func)})")
+        if not _makes_tensors(func):
+            if self._follows(args, kwargs):
+                raise _Unfit(f"one that looks at the values of its arguments ({name_of(func)})")
+            return func(*args, **kwargs)  # a constant's value may be read
+        if SHAPED_BY_VALUES in func.tags and self._follows(*_shaping(func, args), kwargs):
+            raise _Unfit(f"one with shapes that depend on the values of its arguments ({name_of(func)})")
         if name_of(func) not in OPERATIONS:
             with self:  # the parts are dispatched here in turn
                 parts = func.decompose(*args, **kwargs)
@@ -96,7 +116,7 @@ class Recording(TorchDispatchMode):
         inputs, options = tree_map(lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs))
         out = func(*args, **kwargs)
         made = tree_map(lambda leaf: self._new(leaf) if isinstance(leaf, Tensor) else leaf, out)
-        operation = Operation(func, inputs, options, made)
+        operation = Operation(func, inputs, options, made, self._calls.called)
         self.operations.append(operation)
         if not self._followers.isdisjoint(operation.inputs):
             self._followers.update(operation.outputs)
@@ -117,11 +137,12 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
     Raises:
         InputError: the function can't be traced.
     """
-    recording = Recording(examples)
+    calls = WithoutReading()
+    recording = Recording(examples, calls)
     # Writes in place become writes into a copy: PyTorch's part and CasADi's must not share memory.
     pure = torch.func.functionalize(function, remove="mutations")
     try:
-        with torch.no_grad(), recording, WithoutReading():
+        with torch.no_grad(), recording, calls:
             result = pure(*examples)
     except InputError:
         raise  # the function itself says what is wrong
@@ -130,6 +151,19 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
         raise InputError(field, "a function that can be traced", message) from error
     recording.result = recording.slot(result)
     return recording
+
+
+def _makes_tensors(operation: Any) -> bool:
+    """Whether an operation returns tensors alone; `torch.equal`, say, returns what Python code may branch on."""
+    returns = operation._schema.returns
+    return bool(returns) and all("Tensor" in str(value.type) for value in returns)
+
+
+def _shaping(operation: Any, args: Sequence[Any]) -> Sequence[Any]:
+    """The arguments whose values may decide the result's shape: of an indexed tensor, the masks."""
+    if name_of(operation) != "aten.index":
+        return args
+    return [place for place in args[1] if place is not None and place.dtype in (torch.bool, torch.uint8)]
 
 
 @cache

@@ -16,7 +16,8 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
 from torchgco.base.values import whole_numbers_become
-from torchgco.tracing.arrays import boxed
+from torchgco.tracing.arrays import NoCounterpart, boxed
+from torchgco.tracing.dtypes import replay
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.operations import OPERATIONS
 from torchgco.tracing.recorder import Operation, Slot, name_of, record
@@ -43,6 +44,7 @@ class Traced:
         self, field: str, function: Callable[..., Tensor], *examples: Tensor, own: Iterable[Tensor] = ()
     ) -> None:
         self.field = field
+        self._precision = max((example.dtype for example in examples), key=lambda dtype: torch.finfo(dtype).bits)
         index = torch.zeros(1, dtype=torch.int64, device=examples[0].device)
         recording = record(field, function, index, *examples)
         self._index, *self._variables = recording.inputs
@@ -150,7 +152,9 @@ class Traced:
             known |= _placed(constants, {slot: self._constants[slot].shape for slot in self._replaceable})
         for operation in self._symbolic:
             try:
-                operation.replay(OPERATIONS[name_of(operation.function)], known)
+                replay(operation, known, self._precision)
+            except NoCounterpart as error:
+                raise _unknown(self.field, operation, str(error)) from error
             except Exception as error:  # any error of CasADi or NumPy with these arguments
                 raise _unknown(self.field, operation) from error
         return boxed(known[self._result])
@@ -160,7 +164,7 @@ class Traced:
         known: dict[Slot, Any] = {self._index: index} | self._captured
         with torch.no_grad(), whole_numbers_become(torch.float64):
             for operation in self._plain:
-                operation.replay(operation.function, known)
+                operation.replay(known)
         return known
 
 
@@ -215,5 +219,6 @@ def _array(value: Tensor) -> np.ndarray:
     return plain.double().numpy().astype(object) if value.is_floating_point() else plain.numpy()
 
 
-def _unknown(field: str, operation: Operation) -> InputError:
-    return InputError(field, "operations that CasADi has a counterpart for", str(operation.function))
+def _unknown(field: str, operation: Operation, why: str = "") -> InputError:
+    expected = "operations with a counterpart in C (docs/extending.md lists them)"
+    return InputError(field, expected, f"{operation.title}{': ' if why else ''}{why}")

@@ -49,6 +49,14 @@ static inline V tgco_sign(V a) { return tgco_choose(tgco_is(a) & (a == a), tgco_
 /* Of a number and a NaN these return the number, like C's fmin and fmax. */
 static inline V tgco_fmin(V a, V b) { return tgco_choose((a < b) | (b != b), a, b); }
 static inline V tgco_fmax(V a, V b) { return tgco_choose((a > b) | (b != b), a, b); }
+/* These return NaN, like PyTorch's minimum and maximum. */
+static inline V tgco_minimum(V a, V b) { return tgco_choose((a < b) | (a != a), a, b); }
+static inline V tgco_maximum(V a, V b) { return tgco_choose((a > b) | (a != a), a, b); }
+static inline V tgco_single(V a) { /* rounded to single precision */
+    V r;
+    for (int i = 0; i < LANES; i++) r[i] = (REAL)(float)a[i];
+    return r;
+}
 
 #define TGCO_BY_LANE_1(name) \
     static inline V tgco_##name(V a) { \
@@ -67,7 +75,7 @@ TGCO_BY_LANE_1(tan) TGCO_BY_LANE_1(asin) TGCO_BY_LANE_1(acos) TGCO_BY_LANE_1(ata
 TGCO_BY_LANE_1(sinh) TGCO_BY_LANE_1(cosh) TGCO_BY_LANE_1(tanh)
 TGCO_BY_LANE_1(asinh) TGCO_BY_LANE_1(acosh) TGCO_BY_LANE_1(atanh)
 TGCO_BY_LANE_1(erf) TGCO_BY_LANE_1(sqrt) TGCO_BY_LANE_1(floor) TGCO_BY_LANE_1(ceil)
-TGCO_BY_LANE_2(pow) TGCO_BY_LANE_2(fmod) TGCO_BY_LANE_2(atan2) TGCO_BY_LANE_2(hypot) TGCO_BY_LANE_2(remainder)
+TGCO_BY_LANE_2(pow) TGCO_BY_LANE_2(fmod) TGCO_BY_LANE_2(atan2) TGCO_BY_LANE_2(hypot)
 
 /* Sine and cosine of all lanes at once: x = k pi/2 + r with |r| <= pi/4, and the Taylor series of both in r up to the
    first term that no longer counts. pi/2 comes in three parts, of which the first two are short enough for their

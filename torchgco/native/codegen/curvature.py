@@ -15,6 +15,7 @@ from torchgco.native.codegen.stages import StagesSource
 SMOOTH = (
     "INPUT", "CONST", "PARAMETER", "ASSIGN", "ADD", "SUB", "MUL", "NEG", "TWICE", "SQ", "SIN", "COS", "ATAN", "TANH",
     "ERF", "FABS", "FMIN", "FMAX", "SIGN", "FLOOR", "CEIL", "LT", "LE", "EQ", "NE", "NOT", "AND", "OR", "IF_ELSE_ZERO",
+    "REMAINDER",
 )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgco.dynamics import Dynamics
 from torchgco.native import store
 from torchgco.native.codegen import emit
-from torchgco.tracing import Traced, arrays, operations, own_tensors
+from torchgco.tracing import Traced, arrays, dtypes, operations, own_tensors
 
 STEP, JACOBIAN = "tgco_step", "tgco_jacobian"
 
@@ -139,7 +139,7 @@ def elements(column: Any) -> np.ndarray:
 @cache
 def makers(*more: str) -> Sequence[str]:
     """Versions of CasADi and PyTorch and the texts of the files that generate code, which cached code depends on."""
-    files = (operations.__file__, arrays.__file__, emit.__file__, __file__, *more)
+    files = (operations.__file__, arrays.__file__, dtypes.__file__, emit.__file__, __file__, *more)
     try:
         casadi = version("casadi")
     except PackageNotFoundError:

@@ -20,14 +20,15 @@ _OF_ONE = (
     "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh",
     "acosh", "atanh", "erf", "sqrt", "floor", "ceil", "fabs", "sign",
 )  # fmt: skip
-_OF_TWO = ("pow", "fmod", "atan2", "hypot", "remainder", "copysign", "fmin", "fmax")
+_OF_TWO = ("pow", "fmod", "atan2", "hypot", "copysign")
 
 
 def emit(name: str, function: ca.Function) -> str:
     """`static inline void NAME(const V *restrict in0, ..., V *restrict out0, ...)`, as straight-line code.
 
     An input is an array of its entries, an output one of its nonzeros in the order of its sparsity; outputs overlap
-    nothing else. A choice ignores the branch not taken, NaN included; minimum and maximum are C's fmin and fmax.
+    nothing else. A choice ignores the branch not taken, NaN included. Minimum and maximum are PyTorch's: NaN where one
+    of the two numbers is. The remainder stands for rounding to single precision (`tracing.operations.to_single`).
 
     Args:
         name: of the C function.
@@ -79,6 +80,7 @@ _OPERATORS = {
     "NE": "tgco_truth({0} != {1})", "NOT": "tgco_truth(~tgco_is({0}))",
     "AND": "tgco_truth(tgco_is({0}) & tgco_is({1}))", "OR": "tgco_truth(tgco_is({0}) | tgco_is({1}))",
     "IF_ELSE_ZERO": "tgco_if(tgco_is({0}), {1})", "CONSTPOW": "tgco_pow({0}, {1})",
+    "FMIN": "tgco_minimum({0}, {1})", "FMAX": "tgco_maximum({0}, {1})", "REMAINDER": "tgco_single({0})",
     **{name.upper(): f"tgco_{name}({{0}})" for name in _OF_ONE},
     **{name.upper(): f"tgco_{name}({{0}}, {{1}})" for name in _OF_TWO},
 }  # fmt: skip
