@@ -122,7 +122,7 @@ def _fly_and_report(study: _Study, records: Records, show: Callable[[str], None]
         show(explained(study.setup, study.layouts, read_trials(folder / TRIALS)))
     show(f"\nTable, arrays and figures: {folder}")
     if study.plan.view:
-        show(f"Page: {write_view(folder)}")
+        show(f"Page: {write_view(folder, trust=True)}")  # the folder is this very command's
     trials = pd.read_parquet(folder / TRIALS)
     if (trials["status"] == Status.INVALID_START.name).all():
         raise InputError("scenario", "a layout whose start is outside its obstacles", "none")

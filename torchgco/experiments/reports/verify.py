@@ -93,12 +93,17 @@ class Verification:
         return any(len(table.differences) for table in self.tables)
 
 
-def verify(folders: Iterable[str | os.PathLike[str]]) -> tuple[list[Verification], list[str]]:
+def verify(
+    folders: Iterable[str | os.PathLike[str]], trust: bool = False
+) -> tuple[list[Verification], list[str]]:
     """Confirm every finished study in and below some folders; also names the studies that aren't finished.
+
+    Args:
+        trust: whether the studies' files may name any class, which then runs, or torchgco's own alone.
 
     Raises:
         InputError: a missing folder, folders without a finished study, a damaged or missing file, a table that doesn't
-            have one row per solver and layout, a study of an older version.
+            have one row per solver and layout, a study of an older version, a class that `trust` alone admits.
     """
     given = [Path(folder) for folder in folders]
     for folder in given:
@@ -108,10 +113,11 @@ def verify(folders: Iterable[str | os.PathLike[str]]) -> tuple[list[Verification
     done = [folder for folder in studies.values() if (folder / DONE).is_file()]
     if not done:
         raise InputError("folders", "a finished study in or below them", ", ".join(map(str, given)))
-    return [verify_study(folder) for folder in done], [str(folder) for folder in studies.values() if folder not in done]
+    unfinished = [str(folder) for folder in studies.values() if folder not in done]
+    return [verify_study(folder, trust) for folder in done], unfinished
 
 
-def verify_study(folder: Path) -> Verification:
+def verify_study(folder: Path, trust: bool = False) -> Verification:
     """Confirm the table of one finished study. Raises InputError as `verify` does."""
     manifest = read_manifest(folder / MANIFEST)
     missions = manifest.configuration.get("mission") is not None
@@ -121,8 +127,8 @@ def verify_study(folder: Path) -> Verification:
     if not set(ROW) <= set(held.columns) or not held.set_index(ROW).index.sort_values().equals(rows.sort_values()):
         raise damaged(folder / TRIALS, "doesn't have one row per solver and layout")
     held = held.set_index(ROW)
+    vehicle = vehicle_of(manifest.configuration, trust)
     try:
-        vehicle = vehicle_of(manifest.configuration)
         judged = _missions if missions else _trajectories
         computed = judged(folder, vehicle, manifest, layouts, held).reindex(held.index)
     except (InputError, KeyError, IndexError, TypeError, AttributeError) as error:

@@ -113,6 +113,9 @@ class Manifest:
         made = cls(held["configuration"], held["solvers"], layouts)
         if held.pop("checksum") != digest(held):
             raise ValueError("its checksum differs from its content")
+        groups = [made.configuration["model"]["vehicle"], made.configuration["scenario"], *made.solvers.values()]
+        if not made.solvers or not all(isinstance(group, dict) for group in groups) or not made.constants:
+            raise ValueError("a group of its configuration is missing")
         return made
 
 
