@@ -48,7 +48,7 @@ class Study:
             raise InputError("RUN", f"the folder of a study, with its {MANIFEST}", folder)
         if not (folder / DONE).is_file():
             raise InputError("RUN", "a finished study (the same command resumes it)", folder)
-        manifest = read_manifest(folder / MANIFEST)
+        manifest = read_manifest(folder / MANIFEST, whole=True)
         layouts, trials = Layouts.load(folder / LAYOUTS), read_trials(folder / TRIALS)
         return cls(folder, manifest, vehicle_of(manifest.configuration, trust), layouts, trials, trust)
 

@@ -36,7 +36,7 @@ from torchgco.experiments.results.records import (
     read_manifest,
 )
 from torchgco.experiments.results.success import with_success
-from torchgco.experiments.statistics.tables import aligned
+from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.judging.judge import frame_columns, judge
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
@@ -119,7 +119,7 @@ def verify(
 
 def verify_study(folder: Path, trust: bool = False) -> Verification:
     """Confirm the table of one finished study. Raises InputError as `verify` does."""
-    manifest = read_manifest(folder / MANIFEST)
+    manifest = read_manifest(folder / MANIFEST, whole=True)
     missions = manifest.configuration.get("mission") is not None
     layouts = _read(folder / LAYOUTS, Layouts.load)
     held = _read(folder / TRIALS, pd.read_parquet)
@@ -154,7 +154,7 @@ def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str
         if not path.is_file():
             absent += [path.name] if len(table) else []
             continue
-        held, computed = _read(path, pd.read_csv), pd.read_csv(io.StringIO(table.to_csv(index=False)))
+        held, computed = _read(path, pd.read_csv), pd.read_csv(io.StringIO(csv_text(table)))
         if list(held.columns) != list(computed.columns) or len(held) != len(computed):
             shapes = (f"{len(some)} rows, {len(some.columns)} columns" for some in (held, computed))
             differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])

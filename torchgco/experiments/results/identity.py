@@ -113,10 +113,15 @@ class Manifest:
         made = cls(held["configuration"], held["solvers"], layouts)
         if held.pop("checksum") != digest(held):
             raise ValueError("its checksum differs from its content")
-        groups = [made.configuration["model"]["vehicle"], made.configuration["scenario"], *made.solvers.values()]
-        if not made.solvers or not all(isinstance(group, dict) for group in groups) or not made.constants:
-            raise ValueError("a group of its configuration is missing")
         return made
+
+    def check_whole(self) -> None:
+        """Raise ValueError, TypeError or KeyError where a group is missing that a study's own code writes."""
+        groups = [self.configuration["model"]["vehicle"], self.configuration["scenario"], *self.solvers.values()]
+        if not self.solvers or not self.layouts or not all(isinstance(group, dict) for group in groups):
+            raise ValueError("a group of its configuration is missing")
+        if not isinstance(self.constants["seed"], int):
+            raise ValueError("its seed is no number")
 
 
 def digest(value: Any) -> str:
