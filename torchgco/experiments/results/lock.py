@@ -98,7 +98,7 @@ class _Claim:
         if left <= 0:
             which = f"{self.folder}, in which {_holder(path)} flies it (no such process? remove {path})"
             raise InputError("hydra.run.dir", "a study that no other process flies", which)
-        if not self.told and Path(f"{path}{HOLDER}").exists():  # who takes a share holds the whole for a moment, unnamed
+        if not self.told and Path(f"{path}{HOLDER}").exists():  # not of who takes a share
             self.told = True
             told = f"torchgco: {_holder(path)} flies this study in {self.folder}; waiting {PATIENCE:g} s for it at most"
             print(told, file=sys.stderr, flush=True)
