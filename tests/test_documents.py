@@ -15,11 +15,13 @@ import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 from torch import Tensor
 
 import torchgco
@@ -177,6 +179,28 @@ def test_where_is_what_names_what_is_there() -> None:
 def test_every_command_is_accepted(page: Path) -> None:
     for command in commands(page):
         accept(command)
+
+
+def help_lines() -> list[str]:
+    """The commands and keys that `torchgco --help` shows, without what it says of them."""
+    held: Any = OmegaConf.to_container(OmegaConf.load(ROOT / "conf" / "config.yaml"), resolve=False)
+    template: str = held["hydra"]["help"]["template"]
+    examples = template[template.index("Examples") :]
+    return re.findall(r"^ {2,4}(torchgco\S*(?: \S+)*|[\w./]+=\S+(?: [\w./]+=\S+)*)(?: {2,}|$)", examples, re.MULTILINE)
+
+
+def test_every_command_and_key_of_the_help_page_is_accepted() -> None:
+    lines = help_lines()
+    assert len([line for line in lines if line.startswith("torchgco")]) >= 8 and len(lines) >= 20
+    for line in lines:
+        if line.startswith("torchgco"):
+            accept(line)
+    keys = [word for line in lines if not line.startswith(("torchgco", "mission=null")) for word in shlex.split(line)]
+    closed_loop = [word for word in keys if word.startswith(("mission.", "plant."))]
+    experiments = [word for word in keys if word.startswith("experiment=")]
+    accept_overrides([word for word in keys if word not in (*closed_loop, *experiments)])
+    for words in ([experiments[0], *closed_loop], experiments[1:], ["mission=null", "plant=null"]):
+        accept_overrides(words)
 
 
 def run(page: Path) -> dict[str, object]:

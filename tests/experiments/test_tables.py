@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 from pathlib import Path
@@ -12,13 +13,14 @@ import pytest
 
 from tests.experiments.commands import HOLD, problem_line
 from tests.trials import flights, manifest, trials
+from torchgco.experiments.ending import say
 from torchgco.experiments.reports import report
 from torchgco.experiments.reports.report import main
 from torchgco.experiments.results.kinds import format_report, parts_of
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import plain, summarise
-from torchgco.experiments.statistics.tables import FORMATS
+from torchgco.experiments.statistics.tables import FORMATS, format_frame
 
 HITS = [i < 30 for i in range(32)]
 
@@ -30,6 +32,31 @@ def study(folder: Path, *rows: dict, number: int | None = None) -> Path:
         given = manifest(scenario={"num_obstacles": number}, model={"vehicle": {"name": "quadrotor"}})
         (folder / "study.json").write_bytes(given)
     return folder
+
+
+NAMES = ['=cmd|" /C calc"!A0', "+x", "-x", "@SUM(A1)", "\t=x", "\r=x"]
+
+
+def test_no_cell_of_a_csv_is_a_formula() -> None:
+    """Names may be anybody's; numbers stay numbers, those held as text too."""
+    table = pd.DataFrame({"scenario": [*NAMES, "-0.5", "plain"], "cost": [-1.0, *range(7)], "=n": pd.NA})
+    table["mixed"] = pd.Series(["=a", -2, -2.5, None, "b", True, 1, "-"], dtype=object)
+    table["kind"] = pd.Categorical(["=k"] * 8)
+    lines = list(csv.reader(io.StringIO(format_frame(table, "csv"), newline="")))
+    assert lines[0] == ["scenario", "cost", "'=n", "mixed", "kind"]
+    assert [line[0] for line in lines[1:]] == [*(f"'{name}".replace("\r", "\n") for name in NAMES), "-0.5", "plain"]
+    assert [float(line[1]) for line in lines[1:]] == table["cost"].tolist()
+    assert [line[3] for line in lines[1:]] == ["'=a", "-2", "-2.5", "", "b", "True", "1", "'-"]
+    assert {line[4] for line in lines[1:]} == {"'=k"}
+    plain = table[["cost"]].assign(name="gco [max_outer_iterations=10]")
+    assert format_frame(plain, "csv") == plain.to_csv(index=False).rstrip("\n")
+
+
+def test_names_are_text_in_markdown_and_in_a_terminal(capsys) -> None:
+    table = pd.DataFrame({"solver": ["</script><img src=x>", "a|b\nc\\|d"]})
+    assert format_frame(table, "markdown").splitlines()[2:] == ["| \\</script>\\<img src=x> |", "| a\\|b c\\\\\\|d |"]
+    say("title \x1b]0;x\x07 of\n\ta\x9b table")
+    assert capsys.readouterr().out == "title ?]0;x? of\n\ta? table\n"
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from tests.experiments import commands
@@ -19,9 +20,11 @@ from tests.experiments.commands import HOLD, problem_line
 from tests.trials import flights, trials
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import build, compose, compose_config
+from torchgco.experiments.config.checks import hydra_words
 from torchgco.experiments.flying.flight import plan_of
 from torchgco.experiments.reports.report import main as report
 from torchgco.experiments.results import files
+from torchgco.maps import read
 from torchgco.scenarios import LayoutFile, Walls
 
 MISSION = ["mission=default", "plant=rotors"]
@@ -60,7 +63,13 @@ WRONG = {
     "--resolve": (["--resolve"], "command line: expected words that Hydra accepts, got The --resolve flag"),
     "a flag": (["--bogus"], "command line: expected KEY=VALUE, GROUP=OPTION and the flags of --hydra-help, got unrec"),
     "no key": (["=3"], "command line: expected words that Hydra accepts"),
-    "half a list": (["seed=["], "'seed=[': expected KEY=VALUE or GROUP=OPTION"),
+    "half a list": (["seed=["], "seed: expected a value, quoted where it has other letters than names: \"seed='...'\""),
+    "a word": (["list"], "command line: expected KEY=VALUE or GROUP=OPTION (--help lists them), got list"),
+    "an own class": (
+        ["model.vehicle.dynamics._target_=own.Cart"],
+        "model.vehicle.dynamics._target_: expected a class that Python can import (PYTHONPATH=. for a module of this "
+        "folder), got own.Cart (ModuleNotFoundError: No module named 'own')",
+    ),
     "interpolation": (["seed=${nope}"], "seed: expected a value that the configuration knows"),
     "folder in /proc": (["hydra.run.dir=/proc/nope"], "hydra.run.dir: expected a folder that can be made"),
     "folder that is a file": (["hydra.run.dir=/etc/passwd"], "hydra.run.dir: expected a folder that can be made"),
@@ -68,6 +77,28 @@ WRONG = {
     "refused in a folder": (["hydra.run.dir=a/b", "study.layouts=0"], "study.layouts: expected a whole number"),
     "a name as a path": (["solver.name=a/b"], f"solver.name: {NAME}"),
 }  # fmt: skip
+
+
+NAMES = ["a b", "a[1]", "[a]", "a(1)", "{a}", "a'b", "a\"b", "a=b", "grün", "a#&;b", "12", "a\\", "\\'a", "null.d"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_path_may_have_any_name(name: str, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for key in ("scenario.path", "+scenario.path"):
+        (word,) = hydra_words([f"{key}=~/{name}/f.npz"])
+        assert hydra_words([word]) == [word]  # jobs read it again
+        override = OverridesParser.create().parse_override(word)
+        assert override.value() == f"{tmp_path}/{name}/f.npz" and not override.is_sweep_override()
+    assert hydra_words(["scenario.path=~/a.npz,~/b.npz"]) == [f"scenario.path={tmp_path}/a.npz,{tmp_path}/b.npz"]
+
+
+def test_a_layout_file_and_a_map_are_found_at_home(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    Walls().draw(range(1), seed=0).save(tmp_path / "w.npz")
+    assert LayoutFile("~/w.npz").path == tmp_path / "w.npz"
+    np.save(tmp_path / "m.npy", np.zeros((5, 5), bool))
+    assert read("~/m.npy", resolution=1.0).occupied.shape == (5, 5)
 
 
 @pytest.mark.parametrize("case", WRONG)

@@ -17,6 +17,7 @@ from tests.problems import planar_batch
 from torchgco import presets
 from torchgco.native import compiler, kernels, store
 from torchgco.native.compiler import NativeError, build, find_compiler
+from torchgco.native.declarations import Structure, fields, head, load
 from torchgco.native.dispatch import engine_of
 
 pytestmark = pytest.mark.usefixtures("cache")
@@ -114,6 +115,103 @@ def test_without_a_folder_it_is_compiled_every_time(
         next_process()
         assert times(2) == 6.0 and len(compiled) == count
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def disown(place: Path, monkeypatch) -> None:
+    """Make another user's what is this one's."""
+    if os.geteuid() == 0:
+        os.chown(place, 12345, 12345)
+    else:
+        other = os.geteuid() + 1
+        monkeypatch.setattr(store.os, "geteuid", lambda: other)
+
+
+@needs_compiler
+@pytest.mark.parametrize("whose", ["folder of another", "file of another", "open folder", "group folder", "open file"])
+def test_what_others_may_have_written_is_not_loaded(cache: Path, monkeypatch, compiled: list[str], whose: str) -> None:
+    monkeypatch.setattr(store, "_warned", set())
+    times(2)
+    (file,) = cache.iterdir()
+    place = cache if "folder" in whose else file
+    if "of another" in whose:
+        disown(place, monkeypatch)
+    else:
+        place.chmod({"open folder": 0o757, "group folder": 0o775, "open file": 0o646}[whose])
+    before = file.read_bytes()
+    next_process()
+    with pytest.warns(store.CacheWarning) as told:
+        assert times(2) == 6.0 and len(compiled) == 2
+    expected = "belongs to another user" if "of another" in whose else f"can be written by others (chmod go-w {place})"
+    assert len(told) == 1 and str(place) in str(told[0].message) and expected in str(told[0].message)
+    assert file.read_bytes() == before
+    if "folder" in whose:  # nothing is written there
+        assert list(cache.iterdir()) == [file] and times(3) == 9.0 and list(cache.iterdir()) == [file]
+
+
+@needs_compiler
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+def test_a_folder_that_root_shares_is_read(cache: Path, monkeypatch, compiled: list[str]) -> None:
+    times(2)
+    next_process()
+    monkeypatch.setattr(store.os, "geteuid", lambda: 12345)
+    assert times(2) == 6.0 and len(compiled) == 1
+
+
+@needs_compiler
+def test_a_library_without_our_names_is_an_error_of_its_own(cache: Path) -> None:
+    class Half(Structure):
+        declared = (("double", "x"),)
+        _fields_ = fields(declared)
+
+    text = head([Half], [], {})
+    key = compiler._key(find_compiler(), text, (*find_compiler().flags, *find_compiler().further))
+    build(source(2))
+    (other,) = cache.iterdir()
+    store.save(key, ".so", other.read_bytes())
+    next_process()
+    with pytest.raises(NativeError, match="isn't compiled from this source: it has no Half"):
+        load(text, [Half])
+
+
+# What gcc, clang and their tools say where a disk is full or a source is wrong, and the telling line.
+SAID = {
+    "gcc": (
+        "kernels.c:7:1: fatal error: error writing to /tmp/ccX.s: No space left on device\ncompilation terminated.",
+        "kernels.c:7:1: fatal error: error writing to /tmp/ccX.s: No space left on device",
+    ),
+    "ld": (
+        "/usr/bin/ld: final link failed: No space left on device\ncollect2: error: ld returned 1 exit status",
+        "/usr/bin/ld: final link failed: No space left on device",
+    ),
+    "as": (
+        "/tmp/ccX.s: Assembler messages:\n/tmp/ccX.s: Fatal error: can't close /tmp/ccY.o: No space left on device",
+        "/tmp/ccX.s: Fatal error: can't close /tmp/ccY.o: No space left on device",
+    ),
+    "clang": (
+        "kernels.c:1:1: warning: unused\nkernels.c:2:1: error: unknown type name 'a'\n    2 | a error;\n      | ^\n"
+        "1 warning and 1 error generated.",
+        "kernels.c:2:1: error: unknown type name 'a'",
+    ),
+    "lld": (
+        "ld.lld: error: cannot open output file: No space left on device\n"
+        "clang: error: linker command failed with exit code 1 (use -v to see invocation)",
+        "ld.lld: error: cannot open output file: No space left on device",
+    ),
+    "another": ("first\nlast words\n\n", "last words"),
+}
+
+
+@pytest.mark.parametrize("said", SAID)
+def test_the_error_of_a_compiler_is_its_last_telling_line(said: str, tmp_path: Path, monkeypatch) -> None:
+    text, expected = SAID[said]
+    script = tmp_path / "cc"
+    (tmp_path / "said").write_text(text)
+    script.write_text(f'#!/bin/sh\ncase "$*" in *--version*) exit;; esac\ncat {tmp_path / "said"} >&2\nexit 1\n')
+    script.chmod(0o755)
+    monkeypatch.setenv("TORCHGCO_CC", str(script))
+    with pytest.raises(NativeError) as caught:
+        build(source(2))
+    assert str(caught.value).splitlines()[0] == f"{script} failed: {expected}"
 
 
 @needs_compiler

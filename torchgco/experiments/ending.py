@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -38,7 +39,7 @@ def ended(command: str, work: Callable[[], int]) -> int:
             return work()
     except (InputError, Refused) as error:
         for line in error.lines if isinstance(error, Refused) else (error,):
-            print(f"{command}: {line}", file=sys.stderr)
+            print(f"{command}: {_visible(str(line))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as error:
         terminated = isinstance(error, Terminated)
@@ -94,12 +95,17 @@ def say(text: str) -> None:
         InputError: the system refuses to write (disk full).
     """
     try:
-        print(text, flush=True)
+        print(_visible(text), flush=True)
     except BrokenPipeError:
         silence()
     except OSError as error:
         silence()
         raise InputError("standard output", "room to write", error.strerror or error) from None
+
+
+def _visible(text: str) -> str:
+    """A text without control characters: names in files of others could command the terminal."""
+    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", "?", text)
 
 
 def silence() -> None:

@@ -7,6 +7,7 @@ import functools
 import itertools
 import os
 import platform
+import re
 import shlex
 import shutil
 import signal
@@ -29,6 +30,9 @@ FLAGS = ("-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trappin
 # No warning where a vector type is wider than the registers: within one library that does no harm.
 _QUIET = ("-Wno-psabi",)
 _ERROR_LINES = 5
+_ERROR = re.compile(r"error|fail|cannot|can't|No space", re.IGNORECASE)
+# What drivers add when the reason has been said, and lines of the source that are shown beside it.
+_SUMMARY = re.compile(r"exit (code|status)|compilation terminated|errors? generated|^\d*\s*\|", re.IGNORECASE)
 _AMD_HALVES = 25  # family of AMD processors, at most, that compute vectors of 512 bits in two steps
 
 
@@ -141,9 +145,11 @@ def _compile(
     notice("compiling native kernels (once for this form of problem, some seconds) ...")
     returncode, errors = _finished(lambda: begun or _start(compiler, source, flags, room))
     if returncode:
-        said = errors.splitlines() or [_ended(returncode)]
-        shown = [line for line in said if "error" in line] or said
-        raise NativeError(f"{shlex.join(compiler.command)} failed:\n" + "\n".join(shown[:_ERROR_LINES]))
+        said = [line.strip() for line in errors.splitlines() if line.strip()] or [_ended(returncode)]
+        telling = [line for line in said if _ERROR.search(line) and not _SUMMARY.search(line)] or said
+        # The first line stands alone in warnings: it has the error that ended the compiler, the last one.
+        lines = [f"{shlex.join(compiler.command)} failed: {telling[-1]}", *telling[:-1][:_ERROR_LINES]]
+        raise NativeError("\n".join(lines))
     return room / "kernels.so"
 
 

@@ -100,13 +100,16 @@ def load(source: str, structures: Iterable[type[Structure]], flags: Sequence[str
     """The library that a source with the `head` of these structures is compiled to.
 
     Raises:
-        NativeError: see `build`; or a structure of another size in C.
+        NativeError: see `build`; or a structure of another size in C, or of none.
     """
     library = build(source, flags)
     for structure in structures:
-        size = getattr(library, f"tgco_size_of_{structure.__name__}")()
+        name = structure.__name__
+        try:
+            size = getattr(library, f"tgco_size_of_{name}")()
+        except AttributeError:
+            raise NativeError(f"{library._name} isn't compiled from this source: it has no {name}") from None
         if size != ctypes.sizeof(structure):
-            name = structure.__name__
             raise NativeError(f"{name} has {ctypes.sizeof(structure)} bytes in Python, {size} in the library")
     return library
 

@@ -3,6 +3,9 @@
 A file is called KEY-CHECKSUM and a suffix, with the checksum of its content. It is written under another name and
 renamed, so processes that write the same file at once do no harm; a damaged, truncated or swapped file is deleted.
 A folder that is missing or can't be written costs time, never correctness: nothing here raises OSError.
+
+Libraries are code, and the checksum is no signature: anybody can compute it. So a folder or file that others own or may
+write to is not used, which a CacheWarning says; root's own are, as on a cluster whose administrator shares a folder.
 """
 
 from __future__ import annotations
@@ -11,7 +14,9 @@ import hashlib
 import json
 import os
 import re
+import stat
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -22,6 +27,13 @@ from torchgco.base.files import PART, write_whole
 FILES = 1000  # at most, some 150 MB; the least recently used are removed
 _ABANDONED = 3600.0  # s after which a half-written file belongs to a process that was killed
 _OURS = re.compile(r"[0-9a-f]{32}-[0-9a-f]{32}\.[a-z]+")
+
+
+_warned: set[Path] = set()  # places that a CacheWarning has named
+
+
+class CacheWarning(UserWarning):
+    """The cache folder, or a file in it, might hold the code of somebody else, and is not used."""
 
 
 class Made(NamedTuple):
@@ -80,16 +92,35 @@ def _sound(key: str, suffix: str) -> Iterator[tuple[Path, bytes]]:
     """Files under a key that match their checksum, and their content; the others are removed."""
     paths: list[Path] = []
     with suppress(OSError):
-        paths = sorted(folder().glob(f"{key}-*{suffix}"))
+        if _is_ours(folder(), os.stat(folder())):
+            paths = sorted(folder().glob(f"{key}-*{suffix}"))
     for path in paths:
         with suppress(OSError):
-            content = path.read_bytes()
+            with open(path, "rb") as file:
+                if not _is_ours(path, os.fstat(file.fileno())):
+                    continue
+                content = file.read()
             if path.name != _name(key, suffix, content):
                 path.unlink()
                 continue
-            with suppress(OSError):  # another user's file can be read, but not its time changed
+            with suppress(OSError):  # root's file can be read, but not its time changed
                 os.utime(path)
             yield path, content
+
+
+def _is_ours(place: Path, about: os.stat_result) -> bool:
+    """Whether nobody but this user and root can have written there; a CacheWarning says once where it isn't so."""
+    if about.st_uid not in (os.geteuid(), 0):
+        reason = f"belongs to another user ({about.st_uid})"
+    elif about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        reason = f"can be written by others (chmod go-w {place})"
+    else:
+        return True
+    if place not in _warned:
+        _warned.add(place)
+        told = f"kernels are compiled again in every process: {place} {reason}; TORCHGCO_CACHE names another folder"
+        warnings.warn(told, CacheWarning, stacklevel=2)
+    return False
 
 
 def save(key: str, suffix: str, content: bytes) -> Path | None:
@@ -100,6 +131,8 @@ def save(key: str, suffix: str, content: bytes) -> Path | None:
     path = place / _name(key, suffix, content)
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not _is_ours(place, os.stat(place)):
+            return None
         write_whole(path, lambda file: file.write(content))
     except OSError:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,7 +28,7 @@ class LayoutFile(Scenario):
     def __post_init__(self) -> None:
         if not isinstance(self.path, str | Path) or not str(self.path):
             raise InputError("scenario.path", "the path of a layout file", repr(self.path))
-        object.__setattr__(self, "path", Path(self.path))
+        object.__setattr__(self, "path", Path(os.path.expanduser(self.path)))
         object.__setattr__(self, "layouts", Layouts.load(self.path))
         object.__setattr__(self, "name", self.layouts.name)
 

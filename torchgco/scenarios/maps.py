@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -69,6 +70,7 @@ class MapFile(Scenario):
 
         put("name", "map")
         check_options(self, "scenario")
+        put("path", os.path.expanduser(self.path))
         options = {key: getattr(self, key) for key in ("resolution", "radius", "origin", "height", "topic", "layer")}
         found = read(self.path, field="scenario", **options)
         if self.outside == "occupied":

@@ -20,6 +20,7 @@ from torchgco.base.options import Count, Within, check_options, check_value
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
 from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register, scenarios_for
 from torchgco.experiments.config.launching import allotted_cores
+from torchgco.experiments.config.stored import check_stored
 from torchgco.experiments.results.identity import plain
 from torchgco.missions import Mission
 from torchgco.native.kernels import use_native
@@ -195,13 +196,13 @@ def _mission(setup: Setup) -> Mission | None:
         raise InputError("device", "device=cpu in float64 for missions", f"{setup.device.type}, {setup.dtype}")
     if setup.scenario.dimension != 3:
         raise InputError("scenario", FLOWN, setup.scenario.name)
-    mission = _closed_loop(node, setup.config.plant, setup.solver)
+    made, plant = _instantiate(node, "mission"), _instantiate(setup.config.plant, "plant")
+    mission = _closed_loop(made, plant, setup.solver)
     mission.check(setup.vehicle.dynamics)
     return mission
 
 
-def _closed_loop(node: DictConfig, plant_node: DictConfig, solver: Any) -> Mission:
-    made, plant = _instantiate(node, "mission"), _instantiate(plant_node, "plant")
+def _closed_loop(made: Any, plant: Any, solver: Any) -> Mission:
     if not isinstance(made, partial) or "planner" not in made.keywords:
         raise InputError(
             "mission", "keys that extend those of mission=default", "a node without its _target_ or planner"
@@ -220,20 +221,34 @@ def solver_of(config: DictConfig) -> Any:
     return _instantiate(config.solver, "solver", leave_out="name")
 
 
-def solver_from(settings: Mapping[str, Any]) -> Any:
-    """A solver from its resolved settings in plain dicts, as study.json holds them."""
-    return _instantiate(OmegaConf.create(dict(settings)), "solver", leave_out="name")
+def solver_from(settings: Mapping[str, Any], trust: bool = False) -> Any:
+    """A solver from its resolved settings in plain dicts, as study.json holds them; see `_stored`."""
+    return _stored(settings, "solver", "solver", trust)
 
 
-def mission_from(configuration: Mapping[str, Any], solver: Any) -> Mission:
-    """The closed loop of a study of missions with a solver as its planner's, from its configuration in plain dicts."""
-    mission, plant = (OmegaConf.create(dict(configuration[part])) for part in ("mission", "plant"))
+def mission_from(configuration: Mapping[str, Any], solver: Any, trust: bool = False) -> Mission:
+    """The closed loop of a study of missions with a solver as its planner's, from its configuration; see `_stored`."""
+    mission, plant = (_stored(configuration.get(part), part, part, trust) for part in ("mission", "plant"))
     return _closed_loop(mission, plant, solver)
 
 
-def vehicle_of(configuration: Mapping[str, Any]) -> Vehicle:
-    """The planning model of a study, from its resolved configuration in plain dicts."""
-    return _instantiate(OmegaConf.create(dict(configuration["model"]["vehicle"])), "model.vehicle")
+def vehicle_of(configuration: Mapping[str, Any], trust: bool = False) -> Vehicle:
+    """The planning model of a study, from its resolved configuration in plain dicts; see `_stored`."""
+    return _stored(configuration["model"]["vehicle"], "model", "model.vehicle", trust)
+
+
+def _stored(tree: Any, group: str, field: str, trust: bool) -> Any:
+    """What a node of a study's file makes.
+
+    Args:
+        trust: whether it may name any class, function or module, which then runs.
+
+    Raises:
+        InputError: as `check_stored` without trust, or a value that a part refuses.
+    """
+    if not trust:
+        check_stored(tree, group, field)
+    return _instantiate(OmegaConf.create(tree) if isinstance(tree, dict) else tree, field)
 
 
 def _instantiate(node: DictConfig, field: str, leave_out: str | None = None) -> Any:

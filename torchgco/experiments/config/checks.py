@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any
 
-from hydra.errors import MissingConfigException, OverrideParseException
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
 from torchgco.base.errors import InputError
@@ -18,10 +20,11 @@ NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")  # part of the names of 
 MODEL = ("dimension", "vehicle")
 NO_CHOICES = ("null", "true", "false", "")  # values that Hydra reads as no name
 CLOSED_LOOP = ("mission", "plant")  # groups that only missions have
+PATHS = ("scenario.path", "hydra.run.dir", "hydra.sweep.dir")  # keys whose values are paths, of any letters
 
 
 def hydra_words(words: Iterable[str]) -> list[str]:
-    """The words of a command line as Hydra takes them: `~mission` for `mission=null`.
+    """The words of a command line as Hydra takes them: `~mission` for `mission=null`, paths without `~` and quoted.
 
     Raises:
         InputError: a value that is no name, where the word chooses an option of a group, or a row of a list to delete:
@@ -34,6 +37,8 @@ def _hydra_word(word: str) -> str:
     if re.fullmatch(r"~[\w.]+\.\d+", word):  # Hydra fails there, too
         raise InputError(word[1:], "a key: a row of a list can be changed by its index, but not deleted", word)
     key, equals, value = word.lstrip("+").partition("=")
+    if key in PATHS and equals:
+        return f"{word.partition('=')[0]}={_hydra_path(key, value)}"
     group = key.split("@")[0]
     if equals and re.fullmatch(r"[\w/]+", group) and (options := options_of(group)):
         if value.lower() == "null" and _default_options().get(key, "") is None:
@@ -41,6 +46,19 @@ def _hydra_word(word: str) -> str:
         if value.lower() in NO_CHOICES or re.fullmatch(r"[-+]?[\d.]+|\{.*\}", value):
             raise InputError(group, f"one of {', '.join(options)}", value or "nothing")
     return word
+
+
+def _hydra_path(key: str, value: str) -> str:
+    """A path, or several to sweep over, with homes in place of `~`; quoted where Hydra would read no text in it."""
+    value = ",".join(os.path.expanduser(part) for part in value.split(","))
+    try:
+        read = OverridesParser.create().parse_override(f"{key}={value}")
+        if "${" in value or read.is_sweep_override() or isinstance(read.value(), str | None):
+            return value
+    except HydraException:
+        pass
+    slashed = re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), value)
+    return f"'{slashed}'"
 
 
 def check_once(words: Iterable[str]) -> None:
@@ -124,7 +142,7 @@ def as_input_error(error: BaseException, field: str = "configuration") -> InputE
             return cause
         cause = cause.__cause__ or cause.__context__  # OmegaConf drops the cause of a failed interpolation
     if isinstance(error, OverrideParseException):
-        return InputError(repr(error.override), "KEY=VALUE or GROUP=OPTION", _joined(error))
+        return _unread(error.override)
     options = error.options if isinstance(error, MissingConfigException) else None
     if isinstance(error, MissingConfigException) and options:
         group, _, option = str(error.missing_cfg_file).rpartition("/")
@@ -137,9 +155,30 @@ def as_input_error(error: BaseException, field: str = "configuration") -> InputE
         return InputError(merged[1], "a value of the kind that the configuration has", merged[2] or _joined(error))
     inside = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("full_key:")), "")
     key = getattr(error, "full_key", None) or ".".join(filter(None, (field, inside)))
+    if absent := re.search(r"Error locating target '(.+?)'", str(error)):
+        return _not_found(error, key, absent[1])
     if extra := re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(.+?)'", str(error)):
         return InputError(f"{key}.{extra[2]}", f"an option that {extra[1]} has", extra[2])
     return InputError(str(key) or field, "a value that the configuration knows", _joined(error))
+
+
+def _unread(word: str) -> InputError:
+    """The error for a word that Hydra's grammar refuses."""
+    key, equals, value = word.partition("=")
+    if not equals or not re.fullmatch(r"[+~]*[\w./@-]+", key):
+        return InputError("command line", "KEY=VALUE or GROUP=OPTION (--help lists them)", word)
+    expected = f"a value, quoted where it has other letters than names: \"{key}='...'\""
+    return InputError(key.lstrip("+~"), expected, value)
+
+
+def _not_found(error: BaseException, key: str, target: str) -> InputError:
+    """The error for a `_target_` that can't be imported, with the reason of Python."""
+    reason = error
+    while (cause := reason.__cause__ or reason.__context__) is not None:
+        reason = cause
+    why = f"{target} ({type(reason).__name__}: {_joined(reason)})"
+    expected = "a class that Python can import (PYTHONPATH=. for a module of this folder)"
+    return InputError(f"{key}._target_", expected, why)
 
 
 def _unknown_key(error: BaseException, key: str) -> InputError:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,7 @@ FAMILIES: tuple[type[Any], ...] = (
 BY_DIMENSION = "torchgco.by_dimension"
 ALIKE = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each
 WIDTH = 100  # of the help page
+_targets: dict[str, set[str]] = {}  # paths of the classes that registered options make, by group
 
 
 def _version(package: Any) -> tuple[int, ...]:
@@ -107,15 +108,33 @@ def register() -> None:
         picked = {"defaults": [{"override /model@_global_.model": model}, "_self_"]}  # unless a command names another
         _store("scenario", made.name, picked | _fields_of(family))
     for name, make in PRESETS.items():
-        _store("solver", name, {"name": name} | _joined(_tree(make(2)), _tree(make(3))))
+        trees = _tree(make(2)), _tree(make(3))
+        _store("solver", name, {"name": name} | _joined(*trees), *trees)
     _store("plant", "rotors", _fields_of(RotorPlant, *ALIKE))
     planner = {"_partial_": True} | _fields_of(Planner, "solver", *ALIKE)  # its solver is the one under study
     parts = {"planner": planner, "tracker": _fields_of(Tracker, *ALIKE), "disturbance": _fields_of(Disturbance)}
     _store("mission", "default", {"_partial_": True} | _fields_of(Mission, "plant", *parts) | parts)
 
 
-def _store(group: str, name: str, node: dict[str, Any]) -> None:
+def classes_of(group: str) -> frozenset[type]:
+    """The classes that the options of a group make, parts included: registered options and files of conf/."""
+    trees = [OmegaConf.to_container(OmegaConf.load(path)) for path in (config_dir() / group).glob("*.yaml")]
+    named = {*_targets.get(group, ()), *(target for tree in trees for target in _named(tree))}
+    return frozenset(hydra.utils.get_class(target) for target in named)
+
+
+def _named(tree: Any) -> Iterator[str]:
+    """The `_target_`s in nested containers."""
+    if isinstance(tree, dict):
+        yield from (value for key, value in tree.items() if key == "_target_")
+    for value in tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ():
+        yield from _named(value)
+
+
+def _store(group: str, name: str, node: dict[str, Any], *trees: Any) -> None:
+    """Store an option of a group; `trees` are its nodes without interpolations, where it has some."""
     ConfigStore.instance().store(group=group, name=name, node=node)
+    _targets.setdefault(group, set()).update(_named(list(trees or (node,))))
 
 
 def _drawn(count: int, _root_: Any) -> int | None:

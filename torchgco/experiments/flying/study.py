@@ -38,6 +38,7 @@ from torchgco.experiments.results.identity import (
     plain,
     settings_of,
 )
+from torchgco.experiments.results.lock import held
 from torchgco.experiments.results.provenance import recorded
 from torchgco.experiments.results.records import DONE, JUDGED, TRIALS, Records
 from torchgco.experiments.results.runs import read_trials
@@ -61,7 +62,8 @@ def run_study(
 ) -> bool:
     """Fly, judge, write and report; returns False where a job flew its share of a study that others finish.
 
-    Started again on the same folder it resumes where it was stopped; a finished study only shows its table.
+    Started again on the same folder it resumes where it was stopped; a finished study only shows its table. Started
+    twice at once, the second waits for the first, and is refused where that takes too long.
 
     Args:
         recompose: makes the configuration of a baseline.
@@ -70,20 +72,22 @@ def run_study(
         collect: fly nothing, only judge, write and report what jobs flew.
 
     Raises:
-        InputError: malformed configuration, a folder that holds another study, damaged files, worker processes that
-            die again and again, no layout that could be flown at all, missing trials where `collect` is set.
+        InputError: malformed configuration, a folder that holds another study or in which another process flies this
+            one, damaged files, worker processes that die again and again, no layout that could be flown at all, missing
+            trials where `collect` is set.
     """
     study = _study(config, recompose)
     records = Records(folder, study.manifest, study.plan.repair)
-    records.claim()
-    accepted()
-    with recorded(folder, study.setup, study.plan, command) as ending:
-        if study.plan.job is not None:
-            _fly_share(study, records, show)
-            ending.append("share flown")
-            return False
-        _fly_and_report(study, records, show, collect)
-        return True
+    with held(folder, study.plan.job, study.plan.jobs):
+        records.claim()
+        accepted()
+        with recorded(folder, study.setup, study.plan, command) as ending:
+            if study.plan.job is not None:
+                _fly_share(study, records, show)
+                ending.append("share flown")
+                return False
+            _fly_and_report(study, records, show, collect)
+            return True
 
 
 def _fly_share(study: _Study, records: Records, show: Callable[[str], None]) -> None:
@@ -124,7 +128,7 @@ def _fly_and_report(study: _Study, records: Records, show: Callable[[str], None]
         show(told)
     show(f"\nTable, arrays and figures: {folder}")
     if study.plan.view:
-        show(f"Page: {write_view(folder)}")
+        show(f"Page: {write_view(folder, trust=True)}")  # the folder is this very command's
     trials = pd.read_parquet(folder / TRIALS)
     if (trials["status"] == Status.INVALID_START.name).all():
         raise InputError("scenario", where_to_start(study.setup, study.layouts), "none")

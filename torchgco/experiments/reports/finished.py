@@ -22,32 +22,35 @@ from torchgco.view.flights import constraint_name
 from torchgco.view.vehicles import Look
 
 BATCH = 64  # layouts whose trajectories are measured at once
+TRUST = "--trust", "let the run's own file name any class, such as a model of yours: its code runs"
 
 
 @dataclass(frozen=True)
 class Study:
-    """What a page needs of a finished study."""
+    """What a page needs of a finished study; `trust`: its file may name any class, which then runs."""
 
     folder: Path
     manifest: Manifest
     vehicle: Vehicle
     layouts: Layouts
     trials: pd.DataFrame
+    trust: bool = False
 
     @classmethod
-    def read(cls, folder: Path) -> Study:
+    def read(cls, folder: Path, trust: bool = False) -> Study:
         """The study in a folder.
 
         Raises:
-            InputError: a folder without a finished study, or with damaged files.
+            InputError: a folder without a finished study, with damaged files, or without `trust` one whose study.json
+                names more than classes of torchgco's own options.
         """
         if not (folder / MANIFEST).is_file():
             raise InputError("RUN", f"the folder of a study, with its {MANIFEST}", folder)
         if not (folder / DONE).is_file():
             raise InputError("RUN", "a finished study (the same command resumes it)", folder)
-        manifest = read_manifest(folder / MANIFEST)
+        manifest = read_manifest(folder / MANIFEST, whole=True)
         layouts, trials = Layouts.load(folder / LAYOUTS), read_trials(folder / TRIALS)
-        return cls(folder, manifest, vehicle_of(manifest.configuration), layouts, trials)
+        return cls(folder, manifest, vehicle_of(manifest.configuration, trust), layouts, trials, trust)
 
     @property
     def missions(self) -> bool:
@@ -70,7 +73,11 @@ class Study:
 
     def mission(self, solver: str) -> Mission:
         """The closed loop of a study of missions, as a solver's name flew it."""
-        return mission_from(self.manifest.configuration, solver_from(self.manifest.solvers[solver]))
+        return mission_from(self.manifest.configuration, self.solver(solver), self.trust)
+
+    def solver(self, name: str) -> Any:
+        """A solver of the study as it flew."""
+        return solver_from(self.manifest.solvers[name], self.trust)
 
 
 def document_of(study: Study, problem: Problem, look: Look) -> Document:

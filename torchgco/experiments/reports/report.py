@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from torchgco.base.errors import InputError
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.flying.progress import draw
+from torchgco.experiments.reports.finished import TRUST
 from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.kinds import MISSION, Part, format_report, parts_of, write_tables
@@ -155,6 +156,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     parser.add_argument("--format", choices=FORMATS, default="table", help="of the tables on stdout; default: table")
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
+    parser.add_argument(TRUST[0], action="store_true", help=f"with --verify: {TRUST[1]}")
     return parser
 
 
@@ -198,7 +200,7 @@ def _report(options: argparse.Namespace) -> int:
 
 def _verify(options: argparse.Namespace) -> int:
     """Print what was confirmed; returns 1 where anything differs."""
-    studies, unfinished = verify(options.folders)
+    studies, unfinished = verify(options.folders, options.trust)
     for folder in unfinished:
         print(f"unfinished, not verified: {folder}", file=sys.stderr)
     if options.format == "table":

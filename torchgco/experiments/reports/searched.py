@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.config.build import solver_from
 from torchgco.experiments.reports.finished import Study
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
@@ -29,8 +28,8 @@ def searches(study: Study, numbers: Sequence[int]) -> dict[int, SearchPart]:
         InputError: missions with a sensor, whose search is that for a path on the map.
     """
     found: dict[int, list[SearchPart]] = {number: [] for number in numbers}
-    for name, settings in study.manifest.solvers.items():
-        solver, seen = solver_from(settings).recording(), []
+    for name in study.manifest.solvers:
+        solver, seen = study.solver(name).recording(), []
         if isinstance(solver, AugmentedLagrangian):
             if solver.guidance is None:
                 continue

@@ -36,7 +36,7 @@ from torchgco.experiments.results.records import (
     read_manifest,
 )
 from torchgco.experiments.results.success import with_success
-from torchgco.experiments.statistics.tables import aligned
+from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.judging.judge import frame_columns, judge
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
@@ -93,12 +93,17 @@ class Verification:
         return any(len(table.differences) for table in self.tables)
 
 
-def verify(folders: Iterable[str | os.PathLike[str]]) -> tuple[list[Verification], list[str]]:
+def verify(
+    folders: Iterable[str | os.PathLike[str]], trust: bool = False
+) -> tuple[list[Verification], list[str]]:
     """Confirm every finished study in and below some folders; also names the studies that aren't finished.
+
+    Args:
+        trust: whether the studies' files may name any class, which then runs, or torchgco's own alone.
 
     Raises:
         InputError: a missing folder, folders without a finished study, a damaged or missing file, a table that doesn't
-            have one row per solver and layout, a study of an older version.
+            have one row per solver and layout, a study of an older version, a class that `trust` alone admits.
     """
     given = [Path(folder) for folder in folders]
     for folder in given:
@@ -108,12 +113,13 @@ def verify(folders: Iterable[str | os.PathLike[str]]) -> tuple[list[Verification
     done = [folder for folder in studies.values() if (folder / DONE).is_file()]
     if not done:
         raise InputError("folders", "a finished study in or below them", ", ".join(map(str, given)))
-    return [verify_study(folder) for folder in done], [str(folder) for folder in studies.values() if folder not in done]
+    unfinished = [str(folder) for folder in studies.values() if folder not in done]
+    return [verify_study(folder, trust) for folder in done], unfinished
 
 
-def verify_study(folder: Path) -> Verification:
+def verify_study(folder: Path, trust: bool = False) -> Verification:
     """Confirm the table of one finished study. Raises InputError as `verify` does."""
-    manifest = read_manifest(folder / MANIFEST)
+    manifest = read_manifest(folder / MANIFEST, whole=True)
     missions = manifest.configuration.get("mission") is not None
     layouts = _read(folder / LAYOUTS, Layouts.load)
     held = _read(folder / TRIALS, pd.read_parquet)
@@ -121,8 +127,8 @@ def verify_study(folder: Path) -> Verification:
     if not set(ROW) <= set(held.columns) or not held.set_index(ROW).index.sort_values().equals(rows.sort_values()):
         raise damaged(folder / TRIALS, "doesn't have one row per solver and layout")
     held = held.set_index(ROW)
+    vehicle = vehicle_of(manifest.configuration, trust)
     try:
-        vehicle = vehicle_of(manifest.configuration)
         judged = _missions if missions else _trajectories
         computed = judged(folder, vehicle, manifest, layouts, held).reindex(held.index)
     except (InputError, KeyError, IndexError, TypeError, AttributeError) as error:
@@ -148,7 +154,7 @@ def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str
         if not path.is_file():
             absent += [path.name] if len(table) else []
             continue
-        held, computed = _read(path, pd.read_csv), pd.read_csv(io.StringIO(table.to_csv(index=False)))
+        held, computed = _read(path, pd.read_csv), pd.read_csv(io.StringIO(csv_text(table)))
         if list(held.columns) != list(computed.columns) or len(held) != len(computed):
             shapes = (f"{len(some)} rows, {len(some.columns)} columns" for some in (held, computed))
             differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from torchgco.base.errors import InputError
 from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.ending import ended, say
-from torchgco.experiments.reports.finished import Study, document_of
+from torchgco.experiments.reports.finished import TRUST, Study, document_of
 from torchgco.experiments.reports.mission_view import missions
 from torchgco.experiments.reports.searched import searches
 from torchgco.experiments.results.files import damaged, write
@@ -29,13 +29,16 @@ NAME = "view.html"
 SLOW = 256  # layouts from which on a bar shows how far the page is
 
 
-def study_page(folder: Path, searched: Sequence[int] = ()) -> str:
+def study_page(folder: Path, searched: Sequence[int] = (), trust: bool = False) -> str:
     """The page of a finished study, with the search on the layouts of some numbers, which are solved again.
+
+    Args:
+        trust: whether the study's file may name any class, which then runs, or torchgco's own alone.
 
     Raises:
         InputError: as `Study.read`; a number of no layout, or one of a mission with a sensor.
     """
-    study = Study.read(folder)
+    study = Study.read(folder, trust)
     missing = sorted(set(searched) - set(study.layouts.ids.tolist()))
     if missing:
         raise InputError("--search", "numbers of layouts of the study", missing[0])
@@ -101,15 +104,18 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", metavar="FILE", type=Path, help=f"default: {NAME} in RUN")
     words = "solve the layouts of these numbers again, and show the search"
     parser.add_argument("--search", metavar="N", type=int, nargs="+", default=[], help=words)
+    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser
 
 
-def write_view(folder: Path, output: Path | None = None, searched: Sequence[int] = ()) -> Path:
+def write_view(
+    folder: Path, output: Path | None = None, searched: Sequence[int] = (), trust: bool = False
+) -> Path:
     """Write the page of a finished study; returns where it lies. Raises InputError as `study_page` does."""
     path = folder / NAME if output is None else output
     if path.is_dir():
         raise InputError("--output", "a file", f"{path}, which is a folder")
-    text = study_page(folder, searched)
+    text = study_page(folder, searched, trust)
     write(path, lambda file: file.write(text.encode()))
     return path
 
@@ -119,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def work() -> int:
         options = _parser().parse_args(arguments)
-        path = write_view(options.run, options.output, list(dict.fromkeys(options.search)))
+        path = write_view(options.run, options.output, list(dict.fromkeys(options.search)), options.trust)
         say(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
         return 0
 

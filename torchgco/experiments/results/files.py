@@ -53,14 +53,15 @@ def _write(path: Path, save: Callable[[IO[bytes]], Any], move: Callable[[str, Pa
         except FileExistsError:
             if move is not None:
                 raise
-            raise _refused(path, "a file in place of a folder") from None
+            raise refused(path, "a file in place of a folder") from None
         except OSError as error:
             if isinstance(error, FileNotFoundError) and not last:
                 continue  # another process that finished the study removed the part, or its folder, as left over
-            raise _refused(path, error.strerror or error) from None
+            raise refused(path, error.strerror or error) from None
 
 
-def _refused(path: Path, reason: object) -> InputError:
+def refused(path: Path, reason: object) -> InputError:
+    """The error for a file that the system refuses to write."""
     expected = "a folder (hydra.run.dir, --output of a report) with room that may be written to"
     return InputError(str(path), expected, reason)
 

@@ -115,6 +115,14 @@ class Manifest:
             raise ValueError("its checksum differs from its content")
         return made
 
+    def check_whole(self) -> None:
+        """Raise ValueError, TypeError or KeyError where a group is missing that a study's own code writes."""
+        groups = [self.configuration["model"]["vehicle"], self.configuration["scenario"], *self.solvers.values()]
+        if not self.solvers or not self.layouts or not all(isinstance(group, dict) for group in groups):
+            raise ValueError("a group of its configuration is missing")
+        if not isinstance(self.constants["seed"], int):
+            raise ValueError("its seed is no number")
+
 
 def digest(value: Any) -> str:
     """A digest of plain data: 1 and 1.0 are the same, the order of keys doesn't matter."""

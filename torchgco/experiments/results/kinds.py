@@ -14,7 +14,7 @@ from torchgco.experiments.statistics.mission_statistics import summarise_mission
 from torchgco.experiments.statistics.mission_tables import format_missions, printed_missions
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import TASK, are_missions, summarise, task_columns
-from torchgco.experiments.statistics.tables import format_frame, format_table, printed
+from torchgco.experiments.statistics.tables import csv_text, format_frame, format_table, printed
 
 KIND = "kind"  # first column of summary.csv and paired.csv
 TRAJECTORY, MISSION = "trajectory", "mission"
@@ -65,7 +65,7 @@ def write_tables(folder: Path, parts: Sequence[Part]) -> None:
     """Write summary.csv, and paired.csv where solvers are compared."""
     for name, table in joined(parts).items():
         if name == "summary" or len(table):
-            write(folder / f"{name}.csv", lambda file, table=table: table.to_csv(file, index=False))
+            write(folder / f"{name}.csv", lambda file, table=table: file.write(csv_text(table).encode()))
 
 
 def _stacked(tables: Sequence[tuple[str, pd.DataFrame]]) -> pd.DataFrame:

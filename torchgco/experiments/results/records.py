@@ -238,10 +238,13 @@ class Records:
         )
 
 
-def read_manifest(path: Path) -> Manifest:
-    """The manifest in a study.json; InputError where it is damaged."""
+def read_manifest(path: Path, whole: bool = False) -> Manifest:
+    """The manifest in a study.json; InputError where it is damaged, with `whole` also where a group is missing."""
     try:
-        return Manifest.from_json(path.read_bytes())
+        manifest = Manifest.from_json(path.read_bytes())
+        if whole:
+            manifest.check_whole()
+        return manifest
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise damaged(path, f"is damaged ({_first_line(error)})") from None
 

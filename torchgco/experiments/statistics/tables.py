@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from typing import Any
 
 import pandas as pd
 
 from torchgco.experiments.statistics.statistics import OUTCOMES, STATUS, TASK, task_columns
 
 FORMATS = ("table", "csv", "markdown", "latex", "json")
+FORMULA = ("=", "+", "-", "@", "\t", "\n")  # how a cell begins that spreadsheets compute
 
 
 def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
@@ -34,9 +37,9 @@ def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
 
 
 def format_frame(table: pd.DataFrame, form: str) -> str:
-    """One table in one of FORMATS, its cells as they are."""
+    """One table in one of FORMATS, its cells as they are but for what the format itself would read."""
     if form == "csv":
-        return table.to_csv(index=False).rstrip("\n")
+        return csv_text(table).rstrip("\n")
     if form == "json":
         return table.to_json(orient="records", double_precision=15, indent=1) or "[]"
     if form == "latex":
@@ -45,8 +48,35 @@ def format_frame(table: pd.DataFrame, form: str) -> str:
     left = sum(not pd.api.types.is_numeric_dtype(kind) for kind in table.dtypes[:1])
     if form == "table":
         return aligned(text, left)
-    text = [[cell.replace("|", "\\|") for cell in row] for row in text]
+    text = [[re.sub(r"[\\|<]", r"\\\g<0>", " ".join(cell.split())) for cell in row] for row in text]
     return "\n".join("| " + " | ".join(row) + " |" for row in [text[0], ["---"] * len(text[0]), *text[1:]])
+
+
+def csv_text(table: pd.DataFrame) -> str:
+    """A table as CSV.
+
+    Names come from configurations and files of others: a text that a spreadsheet would compute begins with an
+    apostrophe. Numbers, also those held as text, stay what they are.
+    """
+    texts = {name: table[name].astype(object).map(_inert) for name in table.columns if _holds_text(table[name])}
+    return table.assign(**texts).rename(columns=_inert).to_csv(index=False)
+
+
+def _holds_text(column: pd.Series) -> bool:
+    return not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column))
+
+
+def _inert(cell: Any) -> Any:
+    if not isinstance(cell, str):
+        return cell
+    cell = cell.replace("\r", "\n")  # which is quoted; a carriage return would begin another row
+    if not cell.startswith(FORMULA):
+        return cell
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}"
+    return cell
 
 
 def aligned(rows: Sequence[Sequence[str]], left: int) -> str:

@@ -90,7 +90,7 @@ def read(
     """The map in a file: a grid, or a cloud where the file holds points. What has no unit is in metres.
 
     Args:
-        path: a file of one of `FORMATS`; of ROS 2 also a bag's folder.
+        path: a file of one of `FORMATS`; of ROS 2 also a bag's folder; `~` is your home.
         resolution: side of a cell, m: for images, and cells or heights in npy files, which don't state theirs. An image
             that a map_server's yaml file of the same stem beside it describes is read as that says, unknown cells too.
         radius: of the ball around each point, m: for files of points.
@@ -130,7 +130,7 @@ def read(
 def _find(path: Any, field: str) -> tuple[Source, Format]:
     if not isinstance(path, (str, os.PathLike)) or not str(path):
         raise InputError(f"{field}.path", "the path of a map", shown(path))
-    source = Source(Path(path), field)
+    source = Source(Path(os.path.expanduser(path)), field)
     ending = source.path.suffix.lower()
     if ending not in FORMATS and (source.path / METADATA).is_file():
         return source, BAG
