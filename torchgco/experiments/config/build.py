@@ -17,11 +17,12 @@ from omegaconf.errors import OmegaConfBaseException
 from torchgco.base.errors import InputError
 from torchgco.base.memory import free_memory
 from torchgco.base.options import Count, Within, check_options, check_value
+from torchgco.dynamics import QuadrotorPlanning
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
 from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register, scenarios_for
 from torchgco.experiments.config.launching import allotted_cores
 from torchgco.experiments.results.identity import plain
-from torchgco.missions import Mission
+from torchgco.missions import Mission, RotorPlant
 from torchgco.native.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 from torchgco.scenarios.vehicle import BUILT_IN, fitting
@@ -195,13 +196,15 @@ def _mission(setup: Setup) -> Mission | None:
         raise InputError("device", "device=cpu in float64 for missions", f"{setup.device.type}, {setup.dtype}")
     if setup.scenario.dimension != 3:
         raise InputError("scenario", FLOWN, setup.scenario.name)
-    mission = _closed_loop(node, setup.config.plant, setup.solver)
+    mission = _closed_loop(node, setup.config.plant, setup.solver, setup.vehicle)
     mission.check(setup.vehicle.dynamics)
     return mission
 
 
-def _closed_loop(node: DictConfig, plant_node: DictConfig, solver: Any) -> Mission:
+def _closed_loop(node: DictConfig, plant_node: DictConfig, solver: Any, vehicle: Vehicle) -> Mission:
     made, plant = _instantiate(node, "mission"), _instantiate(plant_node, "plant")
+    if isinstance(plant, RotorPlant) and isinstance(vehicle.dynamics, QuadrotorPlanning):
+        plant = replace(plant, airframe=vehicle.dynamics.airframe)  # said once, in the model
     if not isinstance(made, partial) or "planner" not in made.keywords:
         raise InputError(
             "mission", "keys that extend those of mission=default", "a node without its _target_ or planner"
@@ -228,7 +231,7 @@ def solver_from(settings: Mapping[str, Any]) -> Any:
 def mission_from(configuration: Mapping[str, Any], solver: Any) -> Mission:
     """The closed loop of a study of missions with a solver as its planner's, from its configuration in plain dicts."""
     mission, plant = (OmegaConf.create(dict(configuration[part])) for part in ("mission", "plant"))
-    return _closed_loop(mission, plant, solver)
+    return _closed_loop(mission, plant, solver, vehicle_of(configuration))
 
 
 def vehicle_of(configuration: Mapping[str, Any]) -> Vehicle:
