@@ -11,8 +11,10 @@ from benchmarks.paper.runs import FOREST, FOREST_LAYOUT, PAPERS_LOOP
 from torchgco import compose
 from torchgco.constraints import ControlBounds
 from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.dynamics import Airframe
 from torchgco.experiments.config.build import Setup
 from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.missions.planning_problem import airframe_of
 from torchgco.missions.plant import hovering
 from torchgco.missions.tracker import RATES, THRUST, Reference
 from torchgco.problem.problem import Problem
@@ -42,8 +44,9 @@ class Ours:
         """Of a first call of the tracker."""
         mission = self.flight.mission
         assert mission is not None
-        x = hovering(mission.planner.airframe, self.space_problem.x0[:, :3])
-        return mission.tracker.track(x, Reference(x.new_zeros(1, 2, 14), 0.05), 0.0).problem
+        airframe = airframe_of(self.space_problem.dynamics)
+        x = hovering(airframe, self.space_problem.x0[:, :3])
+        return mission.tracker.track(x, Reference(x.new_zeros(1, 2, 14), 0.05, airframe), 0.0).problem
 
 
 def problem(setup: Setup, layout: int) -> Problem:
@@ -77,7 +80,7 @@ def saturation(ours: Ours) -> list[float]:
 def reference(part: str) -> str:
     """What the tracker follows at the knots of a plan with different values everywhere."""
     X = torch.arange(42, dtype=torch.float64).view(1, 3, 14)
-    rates, acceleration = Reference(X, 0.05).at(0.05 * torch.arange(3, dtype=torch.float64))
+    rates, acceleration = Reference(X, 0.05, Airframe()).at(0.05 * torch.arange(3, dtype=torch.float64))
     followed, planned = (rates, X[..., RATES]) if part == "w" else (acceleration, X[..., THRUST])
     return "optimal states in path planning" if torch.allclose(followed, planned) else "others"
 

@@ -23,6 +23,7 @@ from torchgco.experiments.config.build import Setup
 from torchgco.guidance import GCO
 from torchgco.guidance.mppi import COLLISION_PENALTY
 from torchgco.missions import plant
+from torchgco.missions.planning_problem import airframe_of
 from torchgco.missions.plant import RotorPlant, hovering
 from torchgco.obstacles.base import CONTACT_FACTOR
 from torchgco.obstacles.spheres import BoundSpheres
@@ -88,7 +89,7 @@ def _table_1(ours: Ours) -> list[Line]:
     planner = "in the first control step; later the former plan, one stage later"
     return [
         Line("prediction method", "Euler method", "Euler method", NAMES[str(model.integrator)]),
-        Line("gravity g (m/s²)", "9.81", 9.81, model.gravity),
+        Line("gravity g (m/s²)", "9.81", 9.81, model.airframe.gravity),
         Line("number of predictions N", "100", 100, problem.N),
         Line("S", "diag 1, 1, 10, 1, ...", [1, 1, 10, *[1] * 11], cost.Qf),
         Line("Q", "diag 1, 1, 100, 1, ..., 10, 10, 10, 10", [1, 1, 100, *[1] * 7, *[10] * 4], cost.Q),
@@ -102,7 +103,7 @@ def _table_1(ours: Ours) -> list[Line]:
 def _table_2(ours: Ours) -> list[Line]:
     mission, bounds, model = ours.flight.mission, settings.bounds(ours.space_problem), ours.space_problem.dynamics
     assert mission is not None and isinstance(model, QuadrotorPlanning)
-    body = mission.planner.airframe
+    body = model.airframe
     inertia = [0.0366, 0, 0.0065, 0, 0.0327, 0.0046, 0.0065, 0.0046, 0.0187]
     hover = "reading: with m g / 5000² the rotors would hover at 2500 rpm, and Table 5 starts at 5000 rpm for hovering"
     mirrored = "reading: signs of the products of inertia may be lost in our copy"
@@ -131,7 +132,7 @@ def _table_3(ours: Ours) -> list[Line]:
     assert mission is not None and isinstance(mission.plant, RotorPlant)
     spheres, dt = problem.geometric[0], float(problem.dynamics.dt)
     assert isinstance(spheres, BoundSpheres)
-    vehicle, x = float(spheres.vehicle_radius), hovering(mission.planner.airframe, problem.x0[:, :3])
+    vehicle, x = float(spheres.vehicle_radius), hovering(airframe_of(problem.dynamics), problem.x0[:, :3])
     obstacle = float(spheres.inflated_radii[0, 0]) - vehicle
     start = "reading: our copy has lost its minus signs; the quadrotor's open-loop scenarios start at (-1, 1, 0)"
     limits = "the plant also limits the thrusts and renormalises q in every step"
@@ -178,9 +179,10 @@ def _solver_lines(setup: Setup, problem: Problem, printed: str, tolerance: float
 def _table_5(ours: Ours) -> list[Line]:
     mission, cost = ours.flight.mission, settings.cost(ours.tracking_problem)
     assert mission is not None
-    tracker, b = mission.tracker, mission.planner.airframe.thrust_coefficient
+    tracker, airframe = mission.tracker, airframe_of(ours.space_problem.dynamics)
+    b = airframe.thrust_coefficient
     weights, plan = [1, 1, 1, *[b * b] * 4], "optimal states in path planning"
-    speeds = [mission.planner.airframe.hover_speed] * 4
+    speeds = [airframe.hover_speed] * 4
     zero = 0 if tracker.multipliers == "reset" else "the former call's"
     squared, call = "reading: b²", "in every call; the text doesn't say whether later calls start there, too"
     return [

@@ -31,7 +31,7 @@ class QuadrotorAmongSpheres:
         self.lag = self.dt / model.rate_time_constant
         if model.rate_time_constant != model.thrust_time_constant or model.integrator != "euler":
             raise ValueError("written for one time constant of rates and thrust, and for Euler steps")
-        self.fall = cast(problem.x0.new_tensor([0.0, 0.0, model.gravity]) * self.dt)
+        self.fall = cast(problem.x0.new_tensor([0.0, 0.0, model.airframe.gravity]) * self.dt)
         self.x_ref, self.u_ref = cast(cost.x_ref[0, 0]), cast(cost.u_ref[0, 0])
         self.half_Q, self.half_R = cast(0.5 * cost.Q[0, 0]), cast(0.5 * cost.R[0, 0])
         centers, contact = spheres.centers[0], spheres.inflated_radii[0]

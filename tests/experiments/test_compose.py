@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from tests.experiments.commands import HOLD, ROOT, problem_line
-from torchgco import InputError, compose, presets
+from torchgco import Airframe, InputError, compose, presets
 from torchgco.experiments.config.build import Setup, config_dir
 from torchgco.experiments.config.groups import FAMILIES, options_of
 from torchgco.experiments.flying.flight import plan_of
 from torchgco.experiments.flying.study import check_mission
-from torchgco.missions import Mission, Planner
+from torchgco.missions import Mission, Planner, RotorPlant
 
 DATA = ROOT / "benchmarks" / "data"
 WALLS = f"scenario.path={DATA / 'walls.npz'}"
@@ -105,6 +105,17 @@ def test_a_model_that_cannot_fly_a_scenario_is_refused_with_one_that_can(scenari
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_registered_scenario_is_its_class(family: type) -> None:
     assert compose([f"scenario={family().name}", "solver=hold"]).scenario == family()
+
+
+def test_one_key_says_the_gravity_of_models_plants_and_states_at_rest() -> None:
+    key = "model.vehicle.dynamics.airframe"
+    for plant in ("rotors", *(["drone_models"] if find_spec("drone_models") else [])):
+        setup = checked("experiment=mission", f"{key}.gravity=1.62", f"+{key}.mass=1.2", f"plant={plant}")
+        task = setup.task(setup.layouts(1))
+        assert setup.mission is not None and isinstance(setup.mission.plant, RotorPlant)
+        assert setup.mission.plant.airframe == setup.vehicle.dynamics.airframe == Airframe(mass=1.2, gravity=1.62)
+        assert task.U0[..., 3].unique().item() == task.problem.x0[0, 13].item() == 1.62
+        assert task.problem.cost.u_ref[..., 3].unique().item() == task.problem.cost.xf_ref[..., 13].unique().item()
 
 
 def test_a_registered_mission_is_its_class() -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.missions.missions import DOUBLE, DT, SOLVER, Recording, far, mission, scene, varied
+from tests.missions.missions import DOUBLE, DT, REST, SOLVER, Recording, far, mission, scene, varied
 from tests.obstacles.test_obstacles import HalfPlane
 from torchgco import Airframe, Cost, Goal, InputError, Planar, Problem, QuadraticCost, QuadrotorPlanning
 from torchgco.missions.contact import Contact
@@ -16,6 +16,7 @@ from torchgco.missions.disturbance import Disturbance
 from torchgco.missions.log import MissionLog
 from torchgco.missions.mission import Mission
 from torchgco.missions.outcome import Ending, Outcome
+from torchgco.missions.planner import Planner
 from torchgco.missions.planning_problem import planning_state
 from torchgco.missions.plant import RotorPlant, hovering
 from torchgco.missions.tables import ending
@@ -160,7 +161,7 @@ def test_commands_follow_the_plan_of_their_period(latency: int) -> None:
     log = mission(solver, 0.2, latency=latency).fly(problem)
     tracker, before = Tracker(), None
     for step in range(4):
-        reference = Reference(solver.solutions[step].X, DT)
+        reference = Reference(solver.solutions[step].X, DT, Airframe())
         for j in range(5):
             before = tracker.track(log.x[:, step, j], reference, 0.01 * j, before)
             assert torch.equal(log.commands[:, step, j], before.commands)
@@ -269,6 +270,36 @@ def test_bad_fields_are_named(field: str) -> None:
     with pytest.raises(InputError) as caught:
         mission(**FIELDS[field])
     assert caught.value.field == field
+
+
+def on_the_moon(airframe: Airframe) -> Problem:
+    """From rest to a point ahead, planned for a vehicle."""
+    g, there = airframe.gravity, far(N=40)
+    rest = torch.tensor([*REST[:13], g], **DOUBLE)
+    goal = rest + torch.tensor([2.0, *[0.0] * 13], **DOUBLE)
+    cost = QuadraticCost([20, 20, 50, *[1] * 11], [1] * 4, [100] * 3 + [1] * 11, x_ref=goal, u_ref=[0, 0, 0, g])
+    return replace(there, dynamics=QuadrotorPlanning(dt=DT, airframe=airframe), cost=cost, x0=rest.repeat(1, 1))
+
+
+def test_a_mission_flies_where_it_is_planned() -> None:
+    """On the moon plans, tracker and plant weigh a sixth: the plant goes where the first plan leads."""
+    moon = Airframe(gravity=1.62)
+    plan = Planner(SOLVER, margin=0.0, estimation=0.0)
+    log = Mission(plan, plant=RotorPlant(moon), duration=0.5).fly(on_the_moon(moon))
+    assert bool((log.x[0, :, 0, 2].abs() < 0.02).all())  # it doesn't fall, nor rise: 8.19 / 2 m in a second
+    torch.testing.assert_close(log.x[0, -1, -1, :3], log.plan[0, 0, 10], rtol=0, atol=0.02)
+    assert float(log.x[0, 0, 0, 13:].sum()) == pytest.approx(moon.mass * 1.62)
+
+
+def test_a_plant_of_another_airframe_than_the_planned_one_is_refused() -> None:
+    moon = Airframe(gravity=1.62)
+    line = r"plant.airframe: expected that of the planning model, gravity 1.62, got gravity 9.81"
+    with pytest.raises(InputError, match=line):
+        mission().fly(on_the_moon(moon))
+    with pytest.raises(InputError, match=r"mass 1.608, arm 0.216, got mass 1.2, arm 0.2"):
+        mission(plant=RotorPlant(Airframe(mass=1.2, arm=0.2))).fly(far())
+    errors = RotorPlant(mass_error=0.1, thrust_error=-0.1, drag=0.1)  # deviations, not another vehicle
+    assert mission(plant=errors, duration=0.05).fly(far()).x.isfinite().all()
 
 
 @pytest.mark.slow

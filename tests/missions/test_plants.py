@@ -16,7 +16,6 @@ from torch import Tensor
 
 from tests.problems import HOVER, quadrotor_batch
 from torchgco import Airframe, Goal, InputError, Problem, QuadraticCost, QuadrotorPlanning, QuadrotorPlant, presets
-from torchgco.dynamics.quadrotor import GRAVITY
 from torchgco.missions import drone_models
 from torchgco.missions.drone_models import DroneModelsPlant
 from torchgco.missions.mission import Mission
@@ -27,6 +26,7 @@ needs_drone_models = pytest.mark.skipif(find_spec("drone_models") is None, reaso
 PLANTS = [RotorPlant, DroneModelsPlant]
 each_plant = pytest.mark.parametrize("make", [RotorPlant, pytest.param(DroneModelsPlant, marks=needs_drone_models)])
 FRAME = Airframe()
+GRAVITY = FRAME.gravity
 DOUBLE = torch.float64
 STEP = torch.tensor([[100.0, -50.0, -120.0, 90.0], [400.0, 300.0, 420.0, 380.0]], dtype=DOUBLE)  # rpm
 
@@ -134,6 +134,19 @@ def test_half_the_time_step_leaves_a_sixteenth_of_the_error(make) -> None:
 def test_without_errors_it_is_the_papers_plant() -> None:
     x, u, _ = random_states(20)
     assert torch.equal(RotorPlant().advance(x, u, torch.zeros(20, 3, dtype=DOUBLE)), QuadrotorPlant().step(x, u))
+
+
+@each_plant
+def test_a_vehicle_hovers_under_its_own_gravity(make) -> None:
+    moon = replace(FRAME, gravity=1.62)
+    x = hovering(moon, torch.zeros(1, 3, dtype=DOUBLE))
+    assert float(x[0, 13:].sum()) == pytest.approx(moon.mass * 1.62)
+    torch.testing.assert_close(fly(make(airframe=moon), x, hover_commands(50))[-1], x, rtol=0, atol=1e-9)
+    free = x.clone()
+    free[:, 13:] = moon.thrust_min
+    fallen = fly(make(airframe=moon), free, torch.zeros(50, 1, 4, dtype=DOUBLE))[-1]
+    lift = 4 * moon.thrust_min / moon.mass
+    torch.testing.assert_close(fallen[:, 5], torch.full_like(x[:, 0], 0.5 * (lift - 1.62)), rtol=1e-6, atol=1e-9)
 
 
 @each_plant

@@ -38,7 +38,7 @@ def plan(rates: list[list[float]], acceleration: list[float], B: int = 1) -> Ref
     """A plan with these rates and thrust accelerations at its knots, the same for B vehicles."""
     X = torch.zeros(B, len(rates), 14, **DOUBLE)
     X[..., 10:13], X[..., 13] = torch.tensor(rates, **DOUBLE), torch.tensor(acceleration, **DOUBLE)
-    return Reference(X, PERIOD)
+    return Reference(X, PERIOD, FRAME)
 
 
 def turning(B: int = 1, size: float = 0.4) -> Reference:
@@ -49,7 +49,7 @@ def turning(B: int = 1, size: float = 0.4) -> Reference:
         for i in range(3):
             X[b, :, 10 + i] = size * torch.sin((2.0 + i + b) * t) * (0.2 if i == 2 else 1.0)
         X[b, :, 13] = 9.81 + 2.0 * torch.sin((3.0 + b) * t)
-    return Reference(X, PERIOD)
+    return Reference(X, PERIOD, FRAME)
 
 
 def fly(reference: Reference, x: Tensor, steps: int, tracker: Tracker) -> tuple[list[Tensor], list[Tracking]]:
@@ -182,14 +182,15 @@ def test_a_batch_equals_its_parts() -> None:
     x[:, 10:13] = 0.3 * torch.randn(4, 3, generator=torch.Generator().manual_seed(1), **DOUBLE)
     states, answers = fly(reference, x, 4, tracker)
     for rows in ([2], [3, 1], [3, 2, 1, 0]):
-        part, own = fly(Reference(reference.X[rows], PERIOD), x[rows], 4, tracker)
+        part, own = fly(Reference(reference.X[rows], PERIOD, FRAME), x[rows], 4, tracker)
         for k in range(4):
             assert torch.equal(own[k].U, answers[k].U[rows]) and torch.equal(
                 own[k].violation, answers[k].violation[rows]
             )
             assert torch.equal(part[k + 1], states[k + 1][rows])
     index = torch.tensor([3, 1])
-    later = tracker.track(states[-1][index], Reference(reference.X[index], PERIOD), 0.04, answers[-1].take(index))
+    some = Reference(reference.X[index], PERIOD, FRAME)
+    later = tracker.track(states[-1][index], some, 0.04, answers[-1].take(index))
     assert torch.equal(later.U, tracker.track(states[-1], reference, 0.04, answers[-1]).U[index])
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from torchgco import compose
 from torchgco.base.errors import InputError
 from torchgco.scenarios import Forest, ForestMoving, Layouts, PlanarRandom, PlanarTrap, Scenario, Walls, Yard
 from torchgco.scenarios.base import generator
@@ -75,10 +76,11 @@ def test_stream_of_a_number():
 
 @pytest.mark.parametrize(("family", "scenario"), PUBLIC.items(), ids=PUBLIC)
 def test_task_is_the_public_one(family, scenario):
-    """Start, goal, radii and horizon are equal; control bounds too in the plane, else the model sets them."""
+    """Start, goal, radii and horizon are equal; the rest of the states, and control bounds, in space the model's."""
     file, drawn = Layouts.load(DATA / f"{family}.npz"), scenario.draw(range(32), seed=0)
+    stated = drawn if scenario.dimension == 2 else compose(["model=quadrotor"]).vehicle.at_rest(drawn)
     for name in ("start", "goal", "vehicle_radius", "goal_radius", "dt", "stages"):
-        assert np.array_equal(getattr(drawn, name), getattr(file, name)), name
+        assert np.array_equal(getattr(stated, name), getattr(file, name)), name
     assert np.nanmin(drawn.radii) == pytest.approx(np.nanmax(file.radii)) == pytest.approx(np.nanmin(file.radii))
     for name in ("control_lower", "control_upper"):
         ours = getattr(drawn, name)
@@ -218,8 +220,8 @@ def test_a_yard_may_lack_discs_or_boxes():
 
 @pytest.mark.parametrize("scenario", FAMILIES, ids=names)
 def test_a_family_knows_the_number_of_its_states(scenario):
-    start = scenario.draw([0], seed=0).start
-    assert start is not None and scenario.states == start.shape[1]
+    start = compose([f"scenario={scenario.name}"]).vehicle.at_rest(scenario.draw([0], seed=0)).start
+    assert start is not None and start.shape == (1, scenario.states)
 
 
 ERRORS = {

@@ -18,14 +18,13 @@ from torchgco.base.shapes import components, lead, vectors
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
 
-GRAVITY = 9.81  # m/s^2
 Components = tuple[Tensor, ...]
 Row = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Airframe:
-    """The quadrotor's parameters (Table 2), shared by plant, tracking model and `FirstStepRates`.
+    """The quadrotor's parameters and its weight (Table 2), shared by the three models and all parts of a mission.
 
     Raises:
         InputError: a field out of its range or of another kind, thrust limits crossed, an inertia that can't be.
@@ -44,6 +43,7 @@ class Airframe:
     thrust_min: NonNegative = 0.1046  # N per rotor
     thrust_max: Positive = 6.0  # N per rotor
     hover_speed: Positive = 5000.0  # rpm at which the rotors carry the weight
+    gravity: Annotated[float, Above(0, "m/s^2")] = 9.81  # g
 
     def __post_init__(self) -> None:
         check_options(self, "airframe")
@@ -53,13 +53,18 @@ class Airframe:
             raise InputError("airframe.thrust_min", f"less than thrust_max {self.thrust_max}", self.thrust_min)
 
     @property
+    def hover_thrust(self) -> float:
+        """Of each rotor where the four carry the weight, m g / 4, N."""
+        return self.mass * self.gravity / 4.0
+
+    @property
     def thrust_coefficient(self) -> float:
         """b in F = b Omega^2, N/rpm^2: four rotors at `hover_speed` carry the weight, b = m g / (4 hover_speed^2).
 
         A reading of a damaged text: Table 2 has m g / 5000^2 in the copy at hand, which would hover at 2500 rpm, but
         Table 5 starts from 5000 rpm "for hovering".
         """
-        return self.mass * GRAVITY / (4.0 * self.hover_speed**2)
+        return self.mass * self.gravity / (4.0 * self.hover_speed**2)
 
     @property
     def rotor_speeds(self) -> tuple[float, float]:
@@ -124,7 +129,8 @@ class QuadrotorPlanning(Dynamics):
 
         p' = v,  v' = a R(q) e3 - g e3,  q' = 1/2 Qx(w) q,  w' = (w_c - w)/T_w,  a' = (a_c - a)/T_a
 
-    q isn't renormalised, as in the paper's planner. The time constants may be tensors (B,).
+    q isn't renormalised, as in the paper's planner. The time constants may be tensors (B,). Of the airframe the model
+    takes g alone; a mission takes all of it, for the vehicle that follows the plans.
 
     Raises:
         InputError: a field out of its range or of another kind.
@@ -134,7 +140,7 @@ class QuadrotorPlanning(Dynamics):
     integrator: Integrator = "euler"
     rate_time_constant: Seconds | Tensor = 1.5  # T_w, s
     thrust_time_constant: Seconds | Tensor = 1.5  # T_a, s
-    gravity: float = GRAVITY
+    airframe: Airframe = Airframe()
 
     n: ClassVar[int] = 14
     m: ClassVar[int] = 4
@@ -149,7 +155,7 @@ class QuadrotorPlanning(Dynamics):
         v, q, w, a = states[3:6], states[6:10], states[10:13], states[13]
         T_w, T_a = (lead(T, a) for T in (self.rate_time_constant, self.thrust_time_constant))
         turning = ((w_c - w_i) / T_w for w_c, w_i in zip(controls[:3], w, strict=True))
-        return vectors(*pose_rates(v, q, w, a, self.gravity), *turning, (controls[3] - a) / T_a)
+        return vectors(*pose_rates(v, q, w, a, self.airframe.gravity), *turning, (controls[3] - a) / T_a)
 
 
 @dataclass(frozen=True)
@@ -166,7 +172,6 @@ class QuadrotorPlant(Dynamics):
     dt: Seconds = 0.01
     integrator: Integrator = "rk4"
     airframe: Airframe = Airframe()
-    gravity: float = GRAVITY
 
     n: ClassVar[int] = 17
     m: ClassVar[int] = 4
@@ -178,7 +183,7 @@ class QuadrotorPlant(Dynamics):
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
         lift = F.sum(-1) / self.airframe.mass
-        pose = pose_rates(components(v), components(q), components(w), lift, self.gravity)
+        pose = pose_rates(components(v), components(q), components(w), lift, self.airframe.gravity)
         rates = self.airframe.angular_acceleration(w, F), self.airframe.thrust_rate(F, u)
         return torch.cat((vectors(*pose), *rates), dim=-1)
 

@@ -20,15 +20,15 @@ from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances
 from torchgco.judging.maps import segment_distances
 from torchgco.maps.field import BoundField
-from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.oscillating import BoundOscillatingBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem, check_problem
 
-OTHERS_WITHIN = 1e-3  # how far all constraints but the obstacles may be violated by a feasible trajectory
-SUCCESS_VIOLATION = 1e-3  # full radii, in metres
+OTHERS_WITHIN = ADMITTED  # how far all constraints but the obstacles may be violated by a feasible trajectory
+SUCCESS_VIOLATION = ADMITTED  # full radii, in metres
 SUCCESS_COST = 0.05  # by how much a success may exceed the best known cost, as a share of its amount
 BLOCK = 2**18  # numbers held at once where distances from spheres are measured: 2 MB
 

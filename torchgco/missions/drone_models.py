@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.dynamics.integrators import rk4
-from torchgco.dynamics.quadrotor import GRAVITY, within_limits
+from torchgco.dynamics.quadrotor import within_limits
 from torchgco.missions.plant import RotorPlant, column
 
 # Body torques of the four rotors about x, y and z, in units of arm / sqrt(2) and of the rotors' own torque.
@@ -84,7 +84,7 @@ class DroneModelsPlant(RotorPlant):
             "mass": frame.mass * (1.0 + mass_error),
             "L": frame.arm / math.sqrt(2.0),
             "prop_inertia": 0.0,
-            "gravity_vec": np.array([0.0, 0.0, -GRAVITY]),
+            "gravity_vec": np.array([0.0, 0.0, -frame.gravity]),
             "J": J,
             "J_inv": np.linalg.inv(J),
             "rpm2thrust": np.stack((none, none, b)),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated
 
 import torch
@@ -19,12 +19,13 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
 from torchgco.base.tree import take
 from torchgco.dynamics.base import Dynamics
+from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.contact import Contact
 from torchgco.missions.disturbance import Disturbance, measured
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import FARTHEST
 from torchgco.missions.planner import Plan, Planner
-from torchgco.missions.planning_problem import check_model
+from torchgco.missions.planning_problem import airframe_of
 from torchgco.missions.plant import Plant, RotorPlant, hovering
 from torchgco.missions.sensing.sensors import Depth, Lidar
 from torchgco.missions.tracker import Reference, Tracker, Tracking
@@ -46,7 +47,8 @@ class Mission:
     Args:
         planner: makes a plan in every control period, which is a time step of the planning problems.
         tracker: its time step divides the control period, and is the plant's.
-        plant: the vehicle; parameters that differ between missions are (B,).
+        plant: the vehicle; parameters that differ between missions are (B,). Its airframe is the one of the planning
+            model, which planner and tracker use; its errors are deviations from that.
         disturbance: wind and noise.
         duration: s, after which a mission ends with TIMEOUT.
         goal_radius: m, within which the goal counts as reached; None: the problems' own.
@@ -84,7 +86,11 @@ class Mission:
 
     def check(self, dynamics: Dynamics) -> None:
         """Raise InputError unless these dynamics of a planning problem can be flown."""
-        check_model(dynamics)
+        frame, flown = airframe_of(dynamics), getattr(self.plant, "airframe", None)
+        if isinstance(flown, Airframe) and flown != frame:
+            named = [f.name for f in fields(frame) if getattr(frame, f.name) != getattr(flown, f.name)]
+            planned, given = (", ".join(f"{name} {getattr(one, name)}" for name in named) for one in (frame, flown))
+            raise InputError("plant.airframe", f"that of the planning model, {planned}", given)
         if self.substeps(float(dynamics.dt)) is None:
             raise InputError("scenario.dt", f"a multiple of the plant's {self.plant.dt} s", dynamics.dt)
 
@@ -147,6 +153,7 @@ class _Flight:
         if problem.horizon is not None:
             raise InputError("horizon", "None for a mission, which replans over N stages", "horizons of each problem")
         mission.check(problem.dynamics)
+        self.airframe = airframe_of(problem.dynamics)
         if problem.x0.dtype != torch.float64:
             raise InputError("x0", "torch.float64 for a mission", problem.x0.dtype)
         self.period = float(problem.dynamics.dt)
@@ -157,7 +164,7 @@ class _Flight:
         self.goal = problem.goal.position
         radius = mission.goal_radius
         self.radius = problem.goal.radius if radius is None else torch.full_like(problem.x0[:, 0], radius)
-        x = hovering(mission.planner.airframe, problem.x0[:, :3])
+        x = hovering(self.airframe, problem.x0[:, :3])
         self.start = x[:, :3]
         self.problem, self.planned = problem, self.planner.problem(problem, x)
         self.force, self.noise = mission.disturbance.draw(seed, ids.tolist(), self.steps, self.period)
@@ -208,7 +215,7 @@ class _Flight:
 
     def _fly_period(self, step: int, plan: Plan, tracking: Tracking | None) -> tuple[Tracking, Tensor]:
         """One control period along a plan; and which vehicles have ended in it, (B,) bool."""
-        reference = Reference(plan.X, self.period)
+        reference = Reference(plan.X, self.period, self.airframe)
         ended = torch.zeros_like(self.rows, dtype=torch.bool)
         for j in range(self.substeps):
             seen = measured(self.x, self.noise[self.rows, step])

@@ -14,13 +14,12 @@ from torchgco.base.options import NonNegative, PositiveOrInfinite, Seconds, Shar
 from torchgco.base.tree import Rows, put, take
 from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.quadrotor import Airframe
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
 from torchgco.missions.planning_problem import (
     Margin,
     acceleration,
+    airframe_of,
     biased,
-    check_model,
     first_step,
     follows,
     planning_state,
@@ -85,7 +84,6 @@ class Planner:
 
     Args:
         solver: any solver of the library.
-        airframe: as the planner knows it.
         feedback: a former plan is continued by its controls and their feedback gains, which bring the measured state
             back to it. Without, by its controls alone, as in the paper: over a long horizon a small difference of the
             state then leads metres away.
@@ -106,7 +104,6 @@ class Planner:
     """
 
     solver: Solver
-    airframe: Airframe = Airframe()
     feedback: bool = True
     multipliers: Literal["shifted", "reset"] = "shifted"
     max_seconds: Seconds | None = None
@@ -125,8 +122,7 @@ class Planner:
         Raises:
             InputError: another model than the quadrotor's planning model.
         """
-        check_model(problem.dynamics)
-        x0, none = planning_state(x, self.airframe), torch.zeros_like(x[:, :3])
+        x0, none = planning_state(x, airframe_of(problem.dynamics)), torch.zeros_like(x[:, :3])
         constraints = self._constraints(problem, 0.0, x, self._margin(x, None), none[:, 0])
         dynamics = problem.dynamics if self.estimation == 0 else biased(problem.dynamics, none)
         return replace(problem, dynamics=dynamics, x0=x0, constraints=constraints)
@@ -167,7 +163,7 @@ class Planner:
         self, whole: Problem, now: Problem, x: Tensor, step: int, before: Plan | None, measured: Tensor
     ) -> tuple[Problem, Margin, Tensor, Tensor]:
         """The problems of a control step, their margin, the estimated acceleration (B, 3), controls to begin with."""
-        t, x0 = step * float(whole.dynamics.dt), planning_state(x, self.airframe)
+        t, x0 = step * float(whole.dynamics.dt), planning_state(x, airframe_of(whole.dynamics))
         U0 = now.cost.rest_controls(x0.new_zeros(now.B, now.N, now.m)) if before is None else shifted(before.U)
         bias = self.estimated(measured, before, float(whole.dynamics.dt))
         dynamics = whole.dynamics if self.estimation == 0 else biased(whole.dynamics, bias)
@@ -178,11 +174,12 @@ class Planner:
 
     def predicted(self, x: Tensor, plan: Plan) -> Tensor:
         """The plants (B, 17) one period later, from x (B, 17) at the plan's first knot: as the plan's model leads."""
-        now = planning_state(x, self.airframe)
+        airframe = airframe_of(plan.model)
+        now = planning_state(x, airframe)
         later = plan.model.at(0).step(now, plan.U[:, 0])
         q = later[:, 6:10] / later[:, 6:10].square().sum(-1, keepdim=True).sqrt()
-        more = (later[:, 13:] - now[:, 13:]) * self.airframe.mass / 4.0
-        F = (x[:, 13:] + more).clamp(self.airframe.thrust_min, self.airframe.thrust_max)
+        more = (later[:, 13:] - now[:, 13:]) * airframe.mass / 4.0
+        F = (x[:, 13:] + more).clamp(airframe.thrust_min, airframe.thrust_max)
         return torch.cat((later[:, :6], q, later[:, 10:13], F), dim=-1)
 
     def _margin(self, x: Tensor, before: Plan | None) -> Margin:
@@ -201,14 +198,15 @@ class Planner:
                 parts += margin.around(later, whole.N, float(whole.dynamics.dt), depth, x[:, :3])
             else:
                 parts.append(later)
-        return [*parts, *([first_step(whole, x, self.airframe)] if self.first_step else [])]
+        return [*parts, *([first_step(whole, x)] if self.first_step else [])]
 
     def estimated(self, x: Tensor, before: Plan | None, dt: float) -> Tensor:
         """The acceleration (B, 3) that the planning model lacks: a low-pass of what the last period has shown."""
         if before is None or self.estimation == 0:
             return torch.zeros_like(x[:, :3])
         shown = (x[:, 3:6] - before.measured[:, 3:6]) / dt
-        expected = 0.5 * (acceleration(x, self.airframe) + acceleration(before.measured, self.airframe))
+        airframe = airframe_of(before.model)
+        expected = 0.5 * (acceleration(x, airframe) + acceleration(before.measured, airframe))
         return before.bias + self.estimation * (shown - expected - before.bias)
 
 

@@ -12,7 +12,7 @@ from torchgco.base.errors import InputError
 from torchgco.constraints import ControlBounds
 from torchgco.constraints.base import Constraint
 from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.quadrotor import GRAVITY, Airframe, QuadrotorPlanning, pose_rates
+from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning, pose_rates
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.native.dispatch import open_loop
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
@@ -38,10 +38,15 @@ class BiasedPlanning(QuadrotorPlanning):
         return torch.cat((rates[..., :3], rates[..., 3:6] + bias.to(x.dtype), rates[..., 6:]), dim=-1)
 
 
-def check_model(dynamics: Dynamics) -> None:
-    """Raise InputError unless a mission can fly on these dynamics."""
+def airframe_of(dynamics: Dynamics) -> Airframe:
+    """The vehicle of a planning model.
+
+    Raises:
+        InputError: dynamics on which no mission can fly.
+    """
     if not isinstance(dynamics, QuadrotorPlanning):
         raise InputError("model", "quadrotor: a mission flies its planning model", type(dynamics).__name__)
+    return dynamics.airframe
 
 
 def biased(dynamics: Dynamics, bias: Tensor) -> BiasedPlanning:
@@ -59,7 +64,7 @@ def acceleration(x: Tensor, airframe: Airframe) -> Tensor:
     """v' (B, 3) of the planning model for plants x (B, 17), m/s^2."""
     _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
     lift = F.sum(-1) / airframe.mass
-    return torch.stack(pose_rates(v.unbind(-1), q.unbind(-1), w.unbind(-1), lift, GRAVITY)[3:6], dim=-1)
+    return torch.stack(pose_rates(v.unbind(-1), q.unbind(-1), w.unbind(-1), lift, airframe.gravity)[3:6], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -131,7 +136,7 @@ def follows(first: Any, second: Any) -> bool:
     return first.knots.stop == second.knots.start and torch.equal(first.absent, second.absent)
 
 
-def first_step(problem: Problem, x: Tensor, airframe: Airframe) -> FirstStepRates:
+def first_step(problem: Problem, x: Tensor) -> FirstStepRates:
     """The body rates that the rotors lead to in the first period, as far as the planning model can follow."""
     model, reachable = problem.dynamics, None
     assert isinstance(model, QuadrotorPlanning)
@@ -141,7 +146,7 @@ def first_step(problem: Problem, x: Tensor, airframe: Airframe) -> FirstStepRate
             share = model.dt / torch.as_tensor(model.rate_time_constant, dtype=x.dtype).reshape(-1, 1)
             lower, upper = (w + share * (bound[:, 0, :3] - w) for bound in bounds.by_knot)
             reachable = lower, upper
-    return FirstStepRates(x[:, 13:], model.dt, airframe, reachable)
+    return FirstStepRates(x[:, 13:], model.dt, model.airframe, reachable)
 
 
 def _at(obstacles: Any, knots: slice) -> Constraint:

@@ -12,7 +12,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Seconds, check_options
 from torchgco.base.tree import PerElement, Rows
 from torchgco.dynamics.integrators import rk4
-from torchgco.dynamics.quadrotor import GRAVITY, Airframe, QuadrotorPlant, within_limits
+from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlant, within_limits
 
 
 @runtime_checkable
@@ -40,7 +40,7 @@ class RotorPlant(PerElement):
     Rotors turn no slower and no faster than the airframe's limits of thrust ask for: commands beyond are cut off.
 
     Args:
-        airframe: as the planner knows it.
+        airframe: that of the planning model, which has no such errors.
         mass_error, thrust_error: share by which mass and thrust coefficient differ from the airframe's, number or (B,).
         drag: force against the velocity, N s/m, a number or (B,).
 
@@ -69,7 +69,7 @@ class RotorPlant(PerElement):
 
         def rates(x: Tensor) -> Tensor:
             planned = model.field(x, speed)
-            lift = planned[:, 3:6] + planned.new_tensor([0.0, 0.0, model.gravity])
+            lift = planned[:, 3:6] + planned.new_tensor([0.0, 0.0, self.airframe.gravity])
             push = (force - drag * x[:, 3:6]) / self.airframe.mass
             error = (push - mass_error * lift) / (1.0 + mass_error)
             return torch.cat((planned[:, :3], planned[:, 3:6] + error, planned[:, 6:]), dim=-1)
@@ -105,5 +105,5 @@ def hovering(airframe: Airframe, position: Tensor) -> Tensor:
     x = position.new_zeros(position.shape[0], 17)
     x[:, :3] = position
     x[:, 6] = 1.0
-    x[:, 13:] = airframe.mass * GRAVITY / 4.0
+    x[:, 13:] = airframe.hover_thrust
     return x

@@ -14,7 +14,7 @@ from torchgco.base.tree import Rows, take
 from torchgco.constraints import StateBounds
 from torchgco.costs import QuadraticCost
 from torchgco.costs.quadratic import BoundQuadratic
-from torchgco.dynamics.quadrotor import GRAVITY, Airframe, RotorTracking
+from torchgco.dynamics.quadrotor import Airframe, RotorTracking
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted, update_and_raise_penalty
 from torchgco.missions.constraints import RotorLimits, ThrustSum
 from torchgco.native.dispatch import measured
@@ -28,10 +28,11 @@ FIRST_ROUNDS = 3  # inner solves of the first call
 
 @dataclass(frozen=True)
 class Reference:
-    """A plan that is tracked: states X (B, N+1, 14) at knots `period` apart, s."""
+    """A plan that is tracked: states X (B, N+1, 14) at knots `period` apart, s, and the vehicle that it is for."""
 
     X: Tensor
     period: float
+    airframe: Airframe
 
     def at(self, times: Tensor) -> tuple[Tensor, Tensor]:
         """Body rates (B, K, 3), rad/s, and thrust accelerations (B, K), m/s^2, at times (K,) after the first knot, s.
@@ -70,7 +71,6 @@ class Tracker:
     The paper's tracker (Table 5, `mission=paper`) solves every problem from the beginning.
 
     Args:
-        airframe: as the planner knows it.
         inner: iLQR; with `inner.as_printed`, inequalities have the printed form, too (`lagrangian.penalty_weights`).
         limits: of the "commands", the speeds that rotors can turn at; or as printed of the "thrusts", which leaves the
             commands free: where a plan turns faster than rotors speed up, the vehicle then loses thrust and sinks.
@@ -88,7 +88,6 @@ class Tracker:
         InputError: a field out of its range.
     """
 
-    airframe: Airframe = Airframe()
     inner: ILQR = ILQR(tolerance=1e-4, max_iterations=10)
     limits: Literal["commands", "thrusts"] = "commands"
     effort: NonNegative = 1e3
@@ -107,7 +106,7 @@ class Tracker:
         x_ref, acceleration = self._reference(x, reference, offset)
         x0 = x[:, RATES.start :].contiguous()
         if before is None:
-            problem = self._problem(x0, x_ref, acceleration)
+            problem = self._problem(x0, x_ref, acceleration, reference.airframe)
         else:
             cost, (thrust_sum, limits) = before.problem.cost, before.problem.constraints
             assert isinstance(cost, BoundQuadratic) and isinstance(thrust_sum, ThrustSum)
@@ -115,7 +114,7 @@ class Tracker:
             problem = before.problem.started_at(x0, [sums, limits], cost.toward(x_ref))
         reset = self.multipliers == "reset"
         if before is None or reset:
-            U = x.new_full((problem.B, self.stages, 4), self.airframe.hover_speed)
+            U = x.new_full((problem.B, self.stages, 4), reference.airframe.hover_speed)
             multipliers, rounds = Multipliers.zero(problem, self.penalty), FIRST_ROUNDS
         else:
             U, multipliers, rounds = shifted(before.U), before.multipliers.shifted(), 1
@@ -129,13 +128,11 @@ class Tracker:
     def _reference(self, x: Tensor, reference: Reference, offset: float) -> tuple[Tensor, Tensor]:
         """The states (B, N+1, 7) and thrust accelerations (B, N) at knots 1..N that are tracked."""
         rates, acceleration = reference.at(offset + self.dt * torch.arange(self.stages + 1, dtype=x.dtype))
-        hover = self.airframe.mass * GRAVITY / 4.0
-        thrusts = rates.new_full((*rates.shape[:2], 4), hover)
+        thrusts = rates.new_full((*rates.shape[:2], 4), reference.airframe.hover_thrust)
         return torch.cat((rates, thrusts), dim=-1), acceleration[:, 1:].contiguous()
 
-    def _problem(self, x0: Tensor, x_ref: Tensor, acceleration: Tensor) -> Problem:
+    def _problem(self, x0: Tensor, x_ref: Tensor, acceleration: Tensor, frame: Airframe) -> Problem:
         """The tracking problems of Table 5 from states x0 (B, 7)."""
-        frame = self.airframe
         b = frame.thrust_coefficient
         weight = [1.0] * 3 + [b * b] * 4
         cost = QuadraticCost(weight, [self.effort * b * b] * 4, weight, x_ref, [frame.hover_speed] * 4)

@@ -189,7 +189,9 @@ def least(distances: Tensor) -> Tensor:
 
 
 def picked(values: Tensor, at: Tensor) -> Tensor:
-    """Values (B, M, ...) at places (B, M'), those of the first where a place is -1."""
+    """Values (B, M, ...) at places (B, M'); where a place is -1 those of the first, or zeros where M = 0."""
+    if values.shape[1] == 0:
+        return values.new_zeros(*at.shape, *values.shape[2:])
     index = at.clamp(min=0).view(*at.shape, *([1] * (values.dim() - 2)))
     return values.gather(1, index.expand(*at.shape, *values.shape[2:]))
 

@@ -56,6 +56,8 @@ class OscillatingBoxes(Constraint):
             if not bool(torch.isfinite(part).all()):
                 raise InputError(f"boxes.{name}", "finite numbers for every box that is there", "NaN or infinity")
             sines.append(part)
+        if M == 0:
+            return boxes  # none of them moves: what is asked of moving obstacles alone isn't asked of none
         amplitudes, rates, phases = sines
         return BoundOscillatingBoxes(boxes, amplitudes, rates, phases, boxes.knots, boxes.dt)
 

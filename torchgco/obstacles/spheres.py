@@ -62,6 +62,8 @@ class Spheres(Constraint):
                 raise InputError("obstacles.velocities", "finite velocities of every sphere", "NaN or infinity")
         if velocities is not None and dims.dt is None:
             raise InputError("obstacles.velocities", "dynamics with a time step dt", "dynamics without one")
+        if centers.shape[1] == 0:
+            velocities = None  # none of them moves: what is asked of moving obstacles alone isn't asked of none
         knots = slice(dims.obstacles_from, dims.N + 1) if self.knots is None else self.knots
         return BoundSpheres.prepare(
             torch.where(absent.unsqueeze(-1), 0.0, centers),

@@ -23,7 +23,7 @@ from torchgco.roadmap import blocks as searched
 from torchgco.roadmap.blocks import Blocks, blocks_of
 from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.lattice import Array, Lattice, lattice_of
-from torchgco.roadmap.search import HOPS
+from torchgco.roadmap.search import DIVERSITY, HOPS
 
 # The most cells of a search, the clearance of free ones in spacings of the nodes, and whether free ones are merged; of
 # further searches where there is no path yet. Through gaps with less clearance than the nodes are apart no trajectory
@@ -42,7 +42,6 @@ WINDOWS = (8, 16, 64, 10**6)  # points ahead that are looked at together
 POINTS = 96  # of a path that is drawn taut
 SHORT = 10  # segments, at least, of a path that keeps off others, which it would be drawn onto
 STEPS = 0.5  # units between points at which it is looked for what is near a path
-DIVERSITY = 1.0  # extra price of later paths, as a share, next to an earlier one
 ROUNDING = 1e-9  # m
 KEY = 0x5DEECE66D  # seed of the numbers that stand for blocked regions
 

@@ -22,7 +22,7 @@ from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.known import Course, Known
 from torchgco.roadmap.mapped import paths_in_maps
 from torchgco.roadmap.native import NativeSearch
-from torchgco.roadmap.search import HOPS, TorchSearch
+from torchgco.roadmap.search import DIVERSITY, HOPS, TorchSearch
 
 PROBLEMS_AT_ONCE = 4  # problems searched together by PyTorch: memory holds distances of all edges from all obstacles
 NODES = 128  # points around obstacles: those of the shortest detours
@@ -34,7 +34,6 @@ LONG = 1.25
 MANY_NEIGHBOURS = 96  # in the second search: two doors of a maze lie farther apart than the points around each
 NEIGHBOURS, HALTON_NEIGHBOURS = 12, 6  # edges of a point to its nearest of all points and of the Halton points
 MARGIN = 0.15  # distance from an obstacle, in largest inflated radii, below which an edge costs up to double
-DIVERSITY = 1.0  # extra cost of later paths, as a share, within the largest inflated radius of an earlier path
 PRIMES = (2, 3, 5)  # bases of the low-discrepancy sequence
 
 

@@ -20,6 +20,7 @@ from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.points import around_spheres, between_spheres, of_boxes
 
 HOPS = 64  # edges of a path, at most
+DIVERSITY = 1.0  # extra cost of later paths, as a share, next to an earlier one
 CLEAR = 0.001  # smallest gap between a point and all obstacles, as a share of the largest r_obs + r_veh
 TIE = 1e-12  # share of the cost by which equally cheap paths may differ
 EDGE_COST = 1e-6  # share of the distance from start to goal that is added to every edge: no edge may cost nothing

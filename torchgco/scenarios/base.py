@@ -98,7 +98,7 @@ class Family(Scenario):
 
     @abstractmethod
     def _at_rest(self, position: Sequence[float]) -> np.ndarray:
-        """The vehicle's state (n,) at rest in `position` (d,)."""
+        """The vehicle's state (n,) at rest in `position` (d,), or the position where that is the model's to say."""
 
     def _layout(self, **obstacles: Any) -> Layouts:
         """One layout with these fields of Layouts; without `centers` there are no spheres."""

@@ -14,15 +14,15 @@ from torchgco.scenarios import checks
 from torchgco.scenarios.base import Family, equal_spheres, uniform_clear
 from torchgco.scenarios.layouts import Layouts
 
-HOVER = 9.81  # thrust acceleration that holds the vehicle, m/s^2
+STATES = 14  # [p, v, q, w, a]
 MOST_HOLES = 1000  # in a wall
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quadrotor(Family):
-    """Base of the quadrotor families: state n = 14 [p, v, q, w, a], at rest upright and hovering.
+    """Base of the quadrotor families: positions of start and goal.
 
-    Control bounds are the model's.
+    What a vehicle is like at rest there, and its control bounds, are the model's: a hovering thrust depends on g.
     """
 
     vehicle_radius: checks.Length = 0.36
@@ -37,9 +37,13 @@ class Quadrotor(Family):
         """3."""
         return 3
 
+    @property
+    def states(self) -> int:
+        """n of the model that flies among them."""
+        return STATES
+
     def _at_rest(self, position: Sequence[float]) -> np.ndarray:
-        velocity, upright, rates = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        return np.array([*position, *velocity, *upright, *rates, HOVER])
+        return np.array(position, np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native.dispatch import engine_of, measured, open_loop, value
 from torchgco.native.structures import End, Options
+from torchgco.obstacles.base import ADMITTED
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.ending import start_status
@@ -29,7 +30,6 @@ ROUNDING = 1e-14  # share of L_M: a smaller expected change is rounding error
 REGULARISATION_FIRST, REGULARISATION_GROWTH, REGULARISATION_MAX = 1e-6, 10.0, 1e10
 # mu_r after a failed line search: first value in units of `Problem.cost_unit`, factor per failure, divisor per success.
 DAMPING, DAMPING_GROWTH, DAMPING_DECAY = 0.02, 10.0, 3.0
-VIOLATION_TOLERANCE = 1e-3  # metres for lengths, for the status of iLQR without an outer loop
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class ILQR(Solver):
         status = torch.where(done, STALLED, status)
         none = torch.zeros_like(status)
         ended = SolveEnd(end, end, status, s.iterations, (s.iterations > 0).long(), none)
-        return session.finished(ended, VIOLATION_TOLERANCE)
+        return session.finished(ended, ADMITTED)
 
     def one_iteration(self, s: InnerState, lagrangian: Lagrangian) -> PassEnd:
         """One iteration of every running problem, in place, by PyTorch's kernels; `advance` prefers native ones."""

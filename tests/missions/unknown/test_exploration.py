@@ -16,7 +16,7 @@ from torchgco.missions import Mission, Planner
 from torchgco.missions.contact import Contact
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import Outcome
-from torchgco.missions.plant import hovering
+from torchgco.missions.plant import RotorPlant, hovering
 from torchgco.missions.safe import safe_arrays
 from torchgco.missions.sensing import Depth, Lidar
 from torchgco.missions.tables import SENSED, ending, mission_frame, mission_row, packed, unpacked
@@ -83,7 +83,7 @@ def test_the_log_is_kept_whole_and_becomes_tables(flown: tuple[Problem, MissionL
     parts = frame[["map_seconds", "field_seconds", "search_seconds"]].sum(axis=1)
     assert (parts <= 2.0 * frame["planner_seconds"]).all() and (frame["search_seconds"] > 0).all()
     end = ending(arrays, 0, log.period, Contact.among(problem), GOALS[0].numpy(), 0.5)
-    row = mission_row(arrays, 0, log.period, end, mission().planner.airframe)
+    row = mission_row(arrays, 0, log.period, end, Airframe())
     assert row["safe_share"] == 1.0
 
 
@@ -150,7 +150,7 @@ def test_a_depth_camera_flies_too() -> None:
 def test_scans_and_searches_take_turns(rate: float) -> None:
     problem, planner = walled(), Planner(presets.gco(3))
     exploration = Exploration(EXPLORER, planner, replace(LIDAR, rate=rate), "occupied", problem, 0, torch.arange(2))
-    x, plan, searched, scanned = hovering(planner.airframe, problem.x0[:, :3]), None, [], []
+    x, plan, searched, scanned = hovering(Airframe(), problem.x0[:, :3]), None, [], []
     for step in range(6):
         exploration.sense(step, x, x)
         before = [scout.search._round for scout in exploration.scouts]
@@ -173,14 +173,23 @@ def test_known_moving_bodies_are_made_way_for() -> None:
     assert end.outcome is not Outcome.COLLISION and end.clearance > 0.1 and end.goal_distance < 2.0
 
 
+def test_plans_in_unknown_space_weigh_what_the_vehicle_weighs() -> None:
+    """On the moon, too: it neither falls nor rises in the first half second."""
+    moon = Airframe(gravity=1.62)
+    task = replace(walled(), dynamics=QuadrotorPlanning(dt=0.05, airframe=moon))
+    log = mission(plant=RotorPlant(moon), duration=0.5).fly(task, seed=1)
+    assert bool((log.x[:, :, 0, 2].abs() < 0.05).all())
+    assert bool((log.x[:, -1, -1, 0] > 0.0).all())  # on their way
+
+
 def test_plans_yaw_no_faster_than_costs_no_thrust() -> None:
     """From turning one way to turning the other in a period, the rotors that rise do so by half of what they can."""
     airframe, model = Airframe(), QuadrotorPlanning(dt=0.05)
-    most = float(steady_yaw(airframe, model, torch.zeros(1).double()))
+    most = float(steady_yaw(model, torch.zeros(1).double()))
     turn = 2.0 * most / float(model.rate_time_constant)  # rad/s^2
     change = turn * airframe.inertia[2][2] / (4.0 * airframe.rotor_torque)  # N per rotor
     hover = torch.tensor(airframe.mass * 9.81 / 4.0).double()
     rise = 0.05 * airframe.thrust_rate(hover, torch.tensor(airframe.rotor_speeds[1]).double())
     assert change == pytest.approx(0.5 * float(rise)) and 0.5 < most < 2.0
     several = QuadrotorPlanning(dt=0.05, rate_time_constant=torch.tensor([1.5, 3.0]).double())
-    assert steady_yaw(airframe, several, torch.zeros(1).double()).flatten().tolist() == pytest.approx([most, 2 * most])
+    assert steady_yaw(several, torch.zeros(1).double()).flatten().tolist() == pytest.approx([most, 2 * most])

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from tests.missions.missions import REST
 from torchgco import Boxes, ControlBounds, Goal, Problem, QuadraticCost, QuadrotorPlanning, presets
+from torchgco.dynamics import Airframe
 from torchgco.missions import Planner
 from torchgco.missions.plant import hovering
 from torchgco.missions.sensing import Lidar
@@ -33,8 +34,8 @@ def exploring(height: float) -> tuple[Exploration, Tensor]:
     explorer = Explorer(region=((-2.0, 14.0), (-2.0, 2.0), (LOW, HIGH)), known=20.0)
     planner = Planner(presets.gco(3))
     exploration = Exploration(explorer, planner, Lidar(), "occupied", problem, 0, torch.tensor([0]))
-    exploration.sense(0, hovering(planner.airframe, start[:, :3]), hovering(planner.airframe, start[:, :3]))
-    x = hovering(planner.airframe, start[:, :3])
+    exploration.sense(0, hovering(Airframe(), start[:, :3]), hovering(Airframe(), start[:, :3]))
+    x = hovering(Airframe(), start[:, :3])
     x[:, 13:] *= 0.85
     return exploration, x
 

@@ -17,12 +17,13 @@ from omegaconf.errors import OmegaConfBaseException
 from torchgco.base.errors import InputError
 from torchgco.base.memory import free_memory
 from torchgco.base.options import Count, Within, check_options, check_value
+from torchgco.dynamics import QuadrotorPlanning
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
 from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, register, scenarios_for
 from torchgco.experiments.config.launching import allotted_cores
 from torchgco.experiments.config.stored import check_stored
 from torchgco.experiments.results.identity import plain
-from torchgco.missions import Mission
+from torchgco.missions import Mission, RotorPlant
 from torchgco.native.kernels import use_native
 from torchgco.scenarios import Layouts, Scenario, Task, Vehicle
 from torchgco.scenarios.vehicle import BUILT_IN, fitting
@@ -197,12 +198,14 @@ def _mission(setup: Setup) -> Mission | None:
     if setup.scenario.dimension != 3:
         raise InputError("scenario", FLOWN, setup.scenario.name)
     made, plant = _instantiate(node, "mission"), _instantiate(setup.config.plant, "plant")
-    mission = _closed_loop(made, plant, setup.solver)
+    mission = _closed_loop(made, plant, setup.solver, setup.vehicle)
     mission.check(setup.vehicle.dynamics)
     return mission
 
 
-def _closed_loop(made: Any, plant: Any, solver: Any) -> Mission:
+def _closed_loop(made: Any, plant: Any, solver: Any, vehicle: Vehicle) -> Mission:
+    if isinstance(plant, RotorPlant) and isinstance(vehicle.dynamics, QuadrotorPlanning):
+        plant = replace(plant, airframe=vehicle.dynamics.airframe)  # said once, in the model
     if not isinstance(made, partial) or "planner" not in made.keywords:
         raise InputError(
             "mission", "keys that extend those of mission=default", "a node without its _target_ or planner"
@@ -229,7 +232,7 @@ def solver_from(settings: Mapping[str, Any], trust: bool = False) -> Any:
 def mission_from(configuration: Mapping[str, Any], solver: Any, trust: bool = False) -> Mission:
     """The closed loop of a study of missions with a solver as its planner's, from its configuration; see `_stored`."""
     mission, plant = (_stored(configuration.get(part), part, part, trust) for part in ("mission", "plant"))
-    return _closed_loop(mission, plant, solver)
+    return _closed_loop(mission, plant, solver, vehicle_of(configuration, trust))
 
 
 def vehicle_of(configuration: Mapping[str, Any], trust: bool = False) -> Vehicle:

@@ -15,11 +15,11 @@ from omegaconf import DictConfig, OmegaConf
 from torchgco.base.errors import InputError
 from torchgco.base.options import Seed, check_value
 from torchgco.experiments.config.groups import config_dir, options_of
+from torchgco.experiments.results.identity import CLOSED_LOOP
 
 NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")  # part of the names of files and folders
 MODEL = ("dimension", "vehicle")
 NO_CHOICES = ("null", "true", "false", "")  # values that Hydra reads as no name
-CLOSED_LOOP = ("mission", "plant")  # groups that only missions have
 PATHS = ("scenario.path", "hydra.run.dir", "hydra.sweep.dir")  # keys whose values are paths, of any letters
 
 

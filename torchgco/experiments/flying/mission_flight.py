@@ -15,6 +15,7 @@ from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.progress import Bar
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
+from torchgco.missions.planning_problem import airframe_of
 from torchgco.missions.safe import safe_arrays
 from torchgco.missions.tables import clearances, ending, mission_row, packed
 from torchgco.scenarios import Layouts
@@ -55,7 +56,7 @@ class MissionFlight:
         for b in range(layouts.count):
             near = float(radius[b]) if mission.goal_radius is None else mission.goal_radius
             end = ending(arrays, b, log.period, contact, goal[b], near)
-            flown = mission_row(arrays, b, log.period, end, mission.planner.airframe)
+            flown = mission_row(arrays, b, log.period, end, airframe_of(problem.dynamics))
             rows.append({**self._row(b, end.outcome), "clearance_knots": float(nearest[b]), **flown})
         return pd.DataFrame(rows), packed(arrays)
 

@@ -21,6 +21,7 @@ from torchgco.experiments.results.records import LAYOUTS, MISSION, TRIALS
 from torchgco.experiments.results.runs import read_trials
 from torchgco.experiments.statistics.mission_tables import mission_lines
 from torchgco.missions.contact import Contact
+from torchgco.missions.planning_problem import airframe_of
 from torchgco.missions.tables import clearances, mission_frame, time_step_frame, unpacked
 from torchgco.plotting import missions as draw
 from torchgco.plotting.animation import mission_animation
@@ -52,7 +53,7 @@ def mission_table(
         frames.append(frame)
         if "plan" in arrays:
             plans.append(arrays["plan"])
-            fine.append(time_step_frame(arrays, layouts.ids.tolist(), period, setup.mission.planner.airframe))
+            fine.append(time_step_frame(arrays, layouts.ids.tolist(), period, airframe_of(problem.dynamics)))
             fine[-1].insert(0, "solver", name)
     if plans:
         steps = pd.concat(fine, ignore_index=True)
@@ -97,7 +98,7 @@ def _drawings(folder: Path, trials: pd.DataFrame, setup: Setup) -> dict[str, Cal
             plan, label = flown.plans[name][i][: len(frame)], f"{number}-{name}"
             steps = np.linspace(0, 0.8 * (len(frame) - 1), SNAPSHOTS).round().astype(int).tolist()
             add(f"{label}-snapshots", partial(draw.snapshots_figure, frame, plan, course, steps, period))
-            add(f"{label}-commands", partial(draw.commands_figure, fine[name]))
+            add(f"{label}-commands", partial(draw.commands_figure, fine[name], airframe_of(setup.vehicle.dynamics)))
             add(f"{label}-states", partial(draw.states_figure, fine[name], course.goal))
             add(f"{label}-tracking", partial(draw.tracking_figure, frame))
             gif = folder / "figures" / f"{label}.gif"

@@ -17,6 +17,7 @@ from scipy.stats import binomtest
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
+from torchgco.judging.judge import SUCCESS_VIOLATION
 
 OUTCOMES = ("feasible", "reached", "success")
 TASK = ["scenario", "model"]
@@ -26,7 +27,6 @@ COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, "violation", "cost", *EFFORT]
 NUMBERS = [*EFFORT, "violation", "cost", "best_cost", "clearance", "clearance_knots", "goal_distance"]
 INVALID = Status.INVALID_START.name
 STATUS = "status_"  # prefix of the columns that count statuses
-VIOLATION_TOLERANCE = 1e-3  # metres for lengths, inputs in their units
 CONFIDENCE = 0.95
 
 
@@ -128,7 +128,7 @@ class _Values:
         for name in OUTCOMES:
             row |= _rate(name, self.hits[name][rows])
         row |= {
-            "violation_ok": float(np.mean(held["violation"] <= VIOLATION_TOLERANCE)),
+            "violation_ok": float(np.mean(held["violation"] <= SUCCESS_VIOLATION)),
             "violation_median": float(np.median(held["violation"])),
             "cost_median_reached": _quantiles("", cost[reached])["_median"],
             "cost_median": _quantiles("", cost[np.isfinite(cost)])["_median"],

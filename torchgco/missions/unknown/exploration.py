@@ -20,6 +20,7 @@ from torchgco.base.errors import InputError
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, shifted
 from torchgco.missions.log import PARTS
 from torchgco.missions.planner import Plan, Planner
+from torchgco.missions.planning_problem import EARLY, airframe_of
 from torchgco.missions.sensing.grid import NOT_FREE, SEEN_OCCUPIED
 from torchgco.missions.sensing.search import Search
 from torchgco.missions.sensing.sensors import Sensor
@@ -27,9 +28,7 @@ from torchgco.missions.sensing.world import World
 from torchgco.missions.unknown.evading import evaded
 from torchgco.missions.unknown.explorer import (
     CORRIDOR,
-    EARLY,
     FLYABLE,
-    HOVER,
     PLANES,
     Explorer,
     PlanningForm,
@@ -166,7 +165,7 @@ class Exploration:
     def _reference(self, x: Tensor) -> Tensor:
         """States (B, N+1, 14) that the plans are to follow."""
         N, found = self.explorer.stages, x.new_zeros(x.shape[0], self.explorer.stages + 1, 14)
-        found[..., 6], found[..., 13] = 1.0, HOVER
+        found[..., 6], found[..., 13] = 1.0, airframe_of(self.whole.dynamics).gravity
         for b, scout in enumerate(self.scouts):
             p, v = scout.motion(x[b, 3:6].numpy(), N)
             found[b, :, :3], found[b, :, 3:6] = torch.from_numpy(p), torch.from_numpy(v)

@@ -17,7 +17,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.costs.quadratic import QuadraticCost
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
 from torchgco.missions.planner import Planner
-from torchgco.missions.planning_problem import biased, first_step, planning_state
+from torchgco.missions.planning_problem import airframe_of, biased, first_step, planning_state
 from torchgco.missions.sensing.grid import SeenMap
 from torchgco.missions.unknown.halfspaces import HalfSpaces, stacked
 from torchgco.missions.unknown.reference import Pace
@@ -33,11 +33,9 @@ CORRIDOR = 2.5  # m around a knot, within which cells make half-spaces
 REST = {3: 0.05, 4: 0.05, 5: 0.05, 7: 0.03, 8: 0.03, 10: 0.05, 11: 0.05, 12: 0.05, 13: 0.3}  # of the last two states
 FLYABLE = 0.02  # at most, by which a plan exceeds controls, misses its first step or doesn't rest, in their units
 PLACES = (0, 2)  # of a form's constraints: those of positions
-EARLY = 10  # knots in which a vehicle may leave a margin that it has entered
 # Weights of a plan: positions and velocities along the reference, attitude with yaw, body rates, thrust; controls.
 STATE = [4.0, 4.0, 8.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 8.0, 0.5, 0.5, 0.5, 0.1]
 CONTROL = [0.5, 0.5, 0.5, 0.05]
-HOVER = 9.81  # m/s^2
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,7 @@ class PlanningForm:
 
     Args:
         explorer: options.
-        planner: of which airframe, estimation and first step are used.
+        planner: of which estimation and first step are used.
         whole: the problems of the missions, of which model and control bounds are used; each C times.
     """
 
@@ -134,9 +132,9 @@ class PlanningForm:
             region: (B, 2, 3), m: the lowest and the highest point of the map, which half-spaces don't know.
         """
         whole, N = self.whole, self.explorer.stages
-        x0 = planning_state(x, self.planner.airframe)
+        x0, g = planning_state(x, self.airframe), self.airframe.gravity
         dynamics = whole.dynamics if self.planner.estimation == 0 else biased(whole.dynamics, bias)
-        cost = QuadraticCost(Q=STATE, R=CONTROL, Qf=[2.0 * w for w in STATE], x_ref=reference, u_ref=[0, 0, 0, HOVER])
+        cost = QuadraticCost(Q=STATE, R=CONTROL, Qf=[2.0 * w for w in STATE], x_ref=reference, u_ref=[0, 0, 0, g])
         normals, offsets = stacked(planes, allowed.unsqueeze(-1))
         constraints: list[Constraint] = [
             HalfSpaces(normals, offsets),
@@ -148,13 +146,18 @@ class PlanningForm:
             constraints.append(self._first_step(x, x0))
         return Problem(dynamics, cost, constraints, x0, N)
 
+    @property
+    def airframe(self) -> Airframe:
+        """The vehicle."""
+        return airframe_of(self.whole.dynamics)
+
     def _controls(self) -> ControlBounds:
         """The bounds, and yaw that costs no thrust from the second stage on; the first stage is the rotors'."""
         bounds, N = self.whole.control_bounds, self.explorer.stages
         assert bounds is not None
         lower, upper = (bound[:, :1].repeat(1, N, 1) for bound in bounds.by_knot)
         assert isinstance(self.whole.dynamics, QuadrotorPlanning)
-        most = steady_yaw(self.planner.airframe, self.whole.dynamics, lower)
+        most = steady_yaw(self.whole.dynamics, lower)
         lower[:, 1:, 2] = torch.maximum(lower[:, 1:, 2], -most)
         upper[:, 1:, 2] = torch.minimum(upper[:, 1:, 2], most)
         return ControlBounds(lower, upper)
@@ -173,7 +176,7 @@ class PlanningForm:
 
     def _first_step(self, x: Tensor, x0: Tensor) -> StateBounds:
         """`FirstStepRates` as bounds, which native kernels know."""
-        asked = first_step(self.whole, x, self.planner.airframe).bind(self._dimensions(x0)).target
+        asked = first_step(self.whole, x).bind(self._dimensions(x0)).target
         assert asked is not None
         upper = x0.new_full((x0.shape[0], 1, 14), torch.inf)
         lower = -upper
@@ -188,18 +191,19 @@ class PlanningForm:
         upper = torch.full((14,), torch.inf, dtype=torch.float64)
         lower = -upper
         for i, size in REST.items():
-            middle = HOVER if i == 13 else 0.0
+            middle = self.airframe.gravity if i == 13 else 0.0
             lower[i], upper[i] = middle - size, middle + size
         return StateBounds(lower, upper, knots=[N - 1, N])
 
 
-def steady_yaw(airframe: Airframe, model: QuadrotorPlanning, like: Tensor) -> Tensor:
+def steady_yaw(model: QuadrotorPlanning, like: Tensor) -> Tensor:
     """The commanded yaw rate (B, 1) or (1, 1), rad/s, that half of one period's change of thrusts gives.
 
     A rotor's thrust falls at once, but rises slowly: a vehicle asked to yaw more loses thrust, and sinks. Yawing takes
     five times the thrust that tilting does.
     """
-    hover = like.new_tensor(airframe.mass * HOVER / 4.0)
+    airframe = model.airframe
+    hover = like.new_tensor(airframe.hover_thrust)
     rise = float(model.dt) * airframe.thrust_rate(hover, like.new_tensor(airframe.rotor_speeds[1]))
     turn = 0.5 * rise * airframe.allocation(like)[2].abs().sum() / airframe.inertia[2][2]  # rad/s^2, from none
     constant = torch.as_tensor(model.rate_time_constant, dtype=like.dtype).reshape(-1, 1)

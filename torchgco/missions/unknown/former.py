@@ -5,9 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchgco.dynamics.quadrotor import Airframe
 from torchgco.lagrangian.lagrangian import Multipliers, shifted
 from torchgco.missions.planner import Plan
-from torchgco.missions.unknown.explorer import HOVER, Explorer, within_bounds
+from torchgco.missions.planning_problem import airframe_of
+from torchgco.missions.unknown.explorer import Explorer, within_bounds
 from torchgco.missions.unknown.safety import AT_REST
 from torchgco.problem.problem import Problem
 
@@ -22,7 +24,8 @@ def former_plans(problem: Problem, before: Plan | None) -> Plan:
     else:
         C = problem.B // before.X.shape[0]
         X, U, K = (shifted(part).repeat(C, *[1] * (part.dim() - 1)) for part in (before.X, before.U, before.K))
-        X[:, -1], U[:, -1] = resting(X[:, -1]), problem.cost.rest_controls(U[:, -1:])[:, 0]
+        X[:, -1] = resting(X[:, -1], airframe_of(problem.dynamics))
+        U[:, -1] = problem.cost.rest_controls(U[:, -1:])[:, 0]
         X, U = within_bounds(problem, X, U, K)
         penalty = before.penalty.repeat(C)
     none = torch.zeros(problem.B, dtype=torch.int64)
@@ -47,10 +50,10 @@ def ends_at_rest(X: Tensor) -> Tensor:
     return X[:, -1, 3:6].abs().amax(-1) <= 3.0 * AT_REST
 
 
-def resting(x: Tensor) -> Tensor:
+def resting(x: Tensor, airframe: Airframe) -> Tensor:
     """States (B, 14) at rest and upright in the same positions, with the same yaw."""
     rest = torch.zeros_like(x)
-    rest[:, :3], rest[:, 13] = x[:, :3], HOVER
+    rest[:, :3], rest[:, 13] = x[:, :3], airframe.gravity
     yaw = torch.hypot(x[:, 6], x[:, 9]).clamp(min=1e-9)
     rest[:, 6], rest[:, 9] = x[:, 6] / yaw, x[:, 9] / yaw
     return rest

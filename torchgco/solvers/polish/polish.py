@@ -20,6 +20,7 @@ from torchgco.base.status import Status
 from torchgco.base.tree import copied, put
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, binding
 from torchgco.native.dispatch import chord_clearance, current, measured
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.ending import final_status, optimality
@@ -27,7 +28,6 @@ from torchgco.solvers.polish.active_set import multipliers, projected
 from torchgco.solvers.polish.condensed import Condensed
 from torchgco.solvers.polish.line_search import NOISE, descend
 
-VIOLATION_TOLERANCE = 1e-3  # metres for lengths, for the status
 STIFFNESS = 1e4  # curvature added across the active rows, times the Hessian's mean diagonal; no solution changes
 # Shares of the mean of `_mean_along`, added to the diagonal until the model is convex.
 SHIFTS = (0.0, 1e-3, 1e-2, 1e-1, 1.0)
@@ -189,7 +189,7 @@ class _Point:
         cost, worst = torch.full_like(solution.cost, self.cost), torch.full_like(solution.violation, self.worst)
         # The status follows from the new trajectory, not from the limit that ended the solve before.
         ended = torch.full_like(solution.status, Status.MAX_ITERATIONS)
-        status = final_status(ended, left, worst, VIOLATION_TOLERANCE, bool(problem.constraints))
+        status = final_status(ended, left, worst, ADMITTED, bool(problem.constraints))
         return replace(solution, X=X, U=U, K=K, d=d, multipliers=fitted, cost=cost, violation=worst, status=status)
 
 
