@@ -152,8 +152,8 @@ def _warn_of_scale(problem: Problem, U0: Tensor, solution: Solution) -> None:
     if large:
         b, i = int(rows[large[0]]), int(place[large[0]])
         warnings.warn(
-            f"{len(large)} of {problem.B} trajectories count as feasible although a violation is over {SHARE:.0%} of the "
-            f"constraint's own values: problem {b}, constraints[{i}] ({kind_of(problem.constraints[i])}), by up to "
+            f"{len(large)} of {problem.B} trajectories count as feasible although a violation is over {SHARE:.0%} of "
+            f"the constraint's own values: problem {b}, constraints[{i}] ({kind_of(problem.constraints[i])}), by up to "
             f"{float(solution.violation[b]):.2g}; choose units in which the constraint is larger, or a smaller "
             "violation_tolerance of the solver",
             ScaleWarning,

@@ -158,15 +158,16 @@ def begin(
 
 def room(program: Program) -> Array:
     """Of every inequality, half the range between two bounds of a variable, 1 at most and for all other rows."""
-    X, U = program.problem.x0.unsqueeze(1).repeat(1, program.problem.N + 1, 1), None
-    U = X.new_zeros(1, program.problem.N, program.problem.m)
+    problem = program.problem
+    X, U = problem.x0.unsqueeze(1).repeat(1, problem.N + 1, 1), problem.x0.new_zeros(1, problem.N, problem.m)
     found = [torch.zeros(0)]
-    for part in program.problem.constraints:
+    for part in problem.constraints:
         if part.sense != "inequality":
             continue
         rows = torch.ones_like(part.value(X, U))
         if isinstance(part, ControlBounds | StateBounds):
-            half = 0.5 * torch.broadcast_to(torch.sub(*reversed(part.by_knot)), (1, rows.shape[1], part.lower.shape[-1]))
+            lower, upper = part.by_knot
+            half = 0.5 * (upper - lower).expand(1, rows.shape[1], -1)
             rows = torch.cat((half[..., part.above], half[..., part.below]), dim=-1).clamp(max=1.0)
         found.append(rows.flatten())
     return torch.cat(found).numpy()

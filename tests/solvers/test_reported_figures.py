@@ -155,8 +155,8 @@ def test_violations_of_ordinary_problems_are_no_matter_of_units() -> None:
         goal = FunctionConstraint(lambda x: x, "equality", knots=[20])
         bounds = StateBounds([-INF, 0.0 if x0[1] else -1.0], [INF, 1.5], knots=slice(0, 21))
         problem = Problem(
-            FunctionDynamics(cart, 2, 1, 0.1), QuadraticCost([1, 0], [0.1], [1, 1]), [ControlBounds(-2, 2), bounds, goal],
-            [x0], 20,
+            FunctionDynamics(cart, 2, 1, 0.1), QuadraticCost([1, 0], [0.1], [1, 1]),
+            [ControlBounds(-2, 2), bounds, goal], [x0], 20,
         )  # fmt: skip
         for solver in ("gco", "al_ilqr"):
             torchgco.solve(problem, solver=solver)

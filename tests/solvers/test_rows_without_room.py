@@ -174,14 +174,16 @@ def test_bounds_that_coincide_are_equalities(solver: str) -> None:
         lambda x, u, v: u - v, "equality", of="xu", knots=slice(10, 14), values={"v": value[:, 0]}
     )
     expected = torchgco.solve(of([*own, held]), solver=solver)
-    for more in ([], [FunctionConstraint(lambda x, u, v: u - v, of="xu", knots=slice(10, 14), values={"v": value[:, 0]})]):
+    tight = FunctionConstraint(lambda x, u, v: u - v, of="xu", knots=slice(10, 14), values={"v": value[:, 0]})
+    for more in ([], [tight]):
         assert_same_answer(torchgco.solve(of([ControlBounds(low, high), own[1], *more]), solver=solver), expected)
 
 
 def test_a_warm_start_keeps_the_multipliers_of_bounds_that_coincide() -> None:
     of, own = cart()
     goal = torch.stack((drawn(7, 0.5, 1.8), torch.zeros(B, dtype=D)), dim=-1).unsqueeze(1)
-    problem = of([own[0], StateBounds([-INF, 0.0], [INF, 1.5], knots=slice(1, 40)), StateBounds(goal, goal, knots=[40])])
+    before = StateBounds([-INF, 0.0], [INF, 1.5], knots=slice(1, 40))
+    problem = of([own[0], before, StateBounds(goal, goal, knots=[40])])
     cold = torchgco.solve(problem, solver="interior_point")
     again = torchgco.solve(problem, solver="interior_point", warm=cold)
     assert_same_answer(again, cold)

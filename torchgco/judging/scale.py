@@ -16,8 +16,8 @@ TIGHT = 1e-6  # no violation below it counts as large: that of solves by the int
 def dwarfed(problem: Problem, guess: tuple[Tensor, Tensor], found: tuple[Tensor, Tensor]) -> Tensor:
     """The place (B,) of a constraint whose violation is large beside all its values, `NONE` where there is none.
 
-    A constraint's size is the largest value of its rows along the guess. Rows that have the value of the guess still, such as those of a
-    given start, say nothing; obstacles have sizes of their own.
+    A constraint's size is the largest value of its rows along the guess. Rows that have the value of the guess still,
+    such as those of a given start, say nothing; obstacles have sizes of their own.
 
     Args:
         guess, found: states (B, N+1, n) and controls (B, N, m).

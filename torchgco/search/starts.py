@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import Count, Positive, check_options
-from torchgco.base.status import UNMOVED, SOLVED, Status, is_over
+from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import is_preferred
 from torchgco.search.attempts import Search

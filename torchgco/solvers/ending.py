@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchgco.base.status import UNMOVED, STALLED, Status, is_over
+from torchgco.base.status import STALLED, UNMOVED, Status, is_over
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.dispatch import cost_unit, engine_of

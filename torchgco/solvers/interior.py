@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.shapes import check_shape, check_tensor
-from torchgco.base.status import UNMOVED, SOLVED, STALLED, Status, is_over
+from torchgco.base.status import SOLVED, STALLED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -49,7 +49,7 @@ FILTER: dict[str, Any] = {
     "steepest": 1.0,  # slope or curvature of the cost, to which it is scaled
     "pivot": 1e-14, "noise": 10.0,  # least pivot, as a share of its entry; rounding of phi, in units of its last bit
     "soft": 1e-8, "softest": 1e-2, "explodes": 1e6,  # dual regularisation (delta_c), raised where multipliers explode
-    "relaxes": 0.01,  # by how much rows are relaxed there, as a share of the violation tolerance (1e-8: IPOPT's bound_relax_factor)
+    "relaxes": 0.01,  # of the violation tolerance, by which rows are relaxed there (1e-8: IPOPT's bound_relax_factor)
     "soft_growth": 100.0, "soft_decay": 0.1,
     "crawl": 0.13, "shift_crawl": 1e-8, "recovery_growth": 4.0, "recovery_decay": 1.0 / 3.0,  # ours: see interior.c
     "shift_recovery": 1e-3, "forced_growth": 10.0, "restored": 0.9, "failures": 6,

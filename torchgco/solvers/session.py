@@ -75,7 +75,7 @@ class Session:
         )  # fmt: skip
 
     def trajectories(self, end: SolveEnd, gains: Callable[[Tensor], Tensor] | None = None) -> Iterate:
-        """The best trajectories in the user's units, as PyTorch's rollouts give them, with their own cost and violation.
+        """The best trajectories in the user's units, as PyTorch's rollouts give them; their own costs and violations.
 
         Args:
             gains: those of some rows (b,), (b, N, m, n), where they are known.

@@ -23,7 +23,7 @@ def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor
     It does where the controls that have moved most from the guess U0 (B, N, m) go on in their directions, at no
     violation, and the cost falls as it did, or by as much for every power of ten, as a logarithm does. That is tried
     where the cost lies deep below that of the guess, for this may also be a reward that ends, such as one at wide
-    bounds; and where a Newton step would still save a share `left` (B,) of the cost, or controls have gone far beyond all sizes.
+    bounds; where a Newton step would still save a share `left` (B,) of the cost; and where controls have gone very far.
     """
     unit = problem.N * cost_unit(problem)
     open_ended = (left > STATIONARY) | ((found.U - U0).abs().flatten(1).amax(-1) >= BOTTOMLESS)

@@ -47,7 +47,8 @@ BOXES, FIELDS = ("box.h", "boxes.c"), ("field.c",)  # left out where there are n
 TERMS = ("problem.c", COST, "penalty.c", *BOXES, *FIELDS, "knot.c")
 SOLVER = (*TERMS, "cholesky.h", "passes.c", "ilqr.c", "trajectories.c", "outer.c")
 SAMPLER = (*TERMS, "normal.c", "mppi.c")
-INTERIOR = (*TERMS, "cholesky.h", *(f"interior{part}.c" for part in ("_rows", "_step", "_memory", "_fixed", "_search", "")))
+PHASES = "_rows", "_step", "_memory", "_fixed", "_search", ""
+INTERIOR = (*TERMS, "cholesky.h", *(f"interior{phase}.c" for phase in PHASES))
 
 
 _sources: dict[tuple[Any, ...], str] = {}  # reading and joining the files takes longer than a small solve
