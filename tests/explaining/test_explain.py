@@ -13,7 +13,19 @@ import torch
 import torchgco
 from tests.problems import planar_batch, quick_gco
 from tests.search.gates import CLOSED, FREE, PASSES, SHORT, gates
-from torchgco import AugmentedLagrangian, FunctionConstraint, FunctionCost, InputError, Problem, Solution, Status
+from torchgco import (
+    AugmentedLagrangian,
+    ControlBounds,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    InputError,
+    Problem,
+    QuadraticCost,
+    Solution,
+    StateBounds,
+    Status,
+)
 from torchgco.explaining.advice import BY_STATUS, Facts, advice
 from torchgco.explaining.places import knots_told
 from torchgco.solution import Fate
@@ -217,3 +229,16 @@ def test_knots_are_told_in_runs() -> None:
     assert knots_told([3], t) == "knot 3 (t = 0.3 s)"
     assert knots_told([1, 2, 3, 7], None) == "knots 1 to 3, 7"
     assert knots_told([0, 2, 4, 6, 8], None).endswith("0, 2, 4, 6 and 1 more")
+
+
+def test_a_row_that_the_start_breaks_is_named_as_the_starts() -> None:
+    """And only such a row: one that the controls could have kept isn't."""
+    cart = FunctionDynamics(lambda x, u: torch.stack((x[..., 1], u[..., 0]), dim=-1), 2, 1, 0.1)
+    cost = QuadraticCost([1.0, 0.0], [0.1], [10.0, 1.0], [1.0, 0.0])
+    slow = StateBounds([-torch.inf, 0.0], [torch.inf, 0.02], knots=slice(0, 21))
+    wall = FunctionConstraint(lambda x: 5.0 - x[..., :1], knots=[20])
+    start = Problem(cart, cost, [ControlBounds(-1, 1), slow], [[0.0, -0.05]], 20)
+    told = " ".join(str(torchgco.solve(start).explain(0)).split())
+    assert "lower bound of state 1, knot 0" in told and "no control moves" in told and "knots=slice(1" in told
+    told = str(torchgco.solve(Problem(cart, cost, [ControlBounds(-1, 1), wall], [[0.0, 0.0]], 20)).explain(0))
+    assert "no control moves" not in told and "Another guess" in told

@@ -27,6 +27,11 @@ BY_STATUS = {
     Status.UNBOUNDED: "Bounds on what grows, or a cost that keeps it small.",
     Status.INVALID_START: "A start x0 outside the obstacles, whose radii here include the vehicle's.",
 }
+UNMOVED = (
+    "The start x0 breaks the row named above, which no control moves. The controls returned are those found for all "
+    "other rows."
+)
+MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=slice(1, N + 1)."
 UNKNOWN = (
     "A start where the map knows that it is free; or let unknown cells, which count as occupied, count as free: "
     'DistanceField.of(grid, unknown="free"), on the command line scenario.unknown=free.'
@@ -48,6 +53,7 @@ class Facts:
         radius: of the vehicle, m, where no way through the map leads it to the goal.
         passage: the largest radius, m, that some way has room for; 0: none.
         in_unknown: whether the start is invalid for unknown cells of a map alone.
+        unmoved: whether the row that is violated most has the same value for all controls.
     """
 
     status: Status
@@ -62,10 +68,13 @@ class Facts:
     radius: float | None = None
     passage: float = 0.0
     in_unknown: bool = False
+    unmoved: bool = False
 
     @property
     def told(self) -> list[str]:
         """Why the solve ended so, in sentences."""
+        if self.unmoved and self.status is Status.INFEASIBLE:
+            return [UNMOVED]
         if self.radius is None:
             return [self.status.sentence]
         room = "none of any radius" if self.passage == 0.0 else f"the widest has room for {self.passage:.3g} m"
@@ -77,6 +86,8 @@ def advice(facts: Facts) -> list[str]:
     """Sentences, the most useful first; none where nothing is amiss."""
     if facts.in_unknown:
         return [UNKNOWN]
+    if facts.unmoved and facts.status is Status.INFEASIBLE:
+        return [MOVED]
     if facts.radius is not None:
         smaller = f", or a vehicle_radius of at most {facts.passage:.3g} m" if facts.passage > 0 else ""
         return [f"A goal on the start's side of the walls, or a map with a wider way{smaller}."]

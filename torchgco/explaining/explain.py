@@ -15,7 +15,7 @@ from torchgco.explaining.account import Account
 from torchgco.explaining.advice import Facts, advice, tells_to_record
 from torchgco.explaining.barred import map_facts
 from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
-from torchgco.explaining.places import caught_told, number, place_told
+from torchgco.explaining.places import caught_told, is_unmoved, number, place_told
 from torchgco.explaining.record import SearchRecord
 from torchgco.judging.judge import columns as judged
 from torchgco.obstacles.base import ADMITTED
@@ -137,6 +137,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
         clearance=clearance,
         pathless=solved.search is not None and is_pathless(solved.search, b),
         could_record=could,
+        unmoved=is_unmoved(one.problem, one.X, one.U),
         **map_facts(one.problem, status, bool(reached) and (clearance is None or clearance >= 0)),
     )
 

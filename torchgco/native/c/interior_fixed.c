@@ -18,8 +18,8 @@ static inline int are_a_pair(const Constraint *con, int j, int l) {
     return con->variable[j] == con->variable[l] && con->sign[j] > 0 && con->sign[l] < 0;
 }
 
-/* The lanes whose bounds of a variable coincide: the upper ones of knot k hold as equalities. */
-static void find_fixed(Barrier *t, I of, int64_t i, int64_t k) {
+/* The room between two bounds of a variable at knot k; where they coincide, the upper one holds as an equality. */
+static void measure_room(Barrier *t, I of, int64_t i, int64_t k) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
     if (con->kind != BOUNDS) return;
@@ -131,7 +131,7 @@ static void sort_rows(Barrier *t, I of) {
     }
     for (int64_t k = 0; k <= p->N; k++)
         for (int64_t i = 0; i < p->constraints; i++)
-            if (p->constraint[i].place[k] != NOWHERE && !p->constraint[i].equality) find_fixed(t, of, i, k);
+            if (p->constraint[i].place[k] != NOWHERE && !p->constraint[i].equality) measure_room(t, of, i, k);
     visit_tight(t, of, leave_out);
     I some = of & ~of;
     for (int64_t q = 0; q < t->rows; q++) some |= t->out[q];
