@@ -143,6 +143,18 @@ def test_a_start_outside_a_row(solver: str) -> None:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
+def test_no_later_pass_hides_that_problems_are_infeasible(solver: str) -> None:
+    """Starts so far outside that the next knots are, too; and two rows that contradict each other."""
+    of, own = cart(drawn(10, -3.0, -0.3))
+    also = StateBounds([-INF, 0.0], [INF, 1.5], knots=slice(0, 41))
+    place = drawn(11, 0.0, 1.0)
+    apart = lambda x, a: torch.stack((x[..., 0] - a, a + 0.2 - x[..., 0]), dim=-1)
+    both = FunctionConstraint(apart, knots=[10, 20], values={"a": place})
+    for problem in (of([own[0], also]), cart()[0]([own[0], both])):
+        assert torchgco.solve(problem, solver=solver).statuses == [Status.INFEASIBLE] * B
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_rows_that_leave_one_point(solver: str) -> None:
     """From -0.1 m/s with 1 m/s^2 the first speed can only be 0: relaxed rows have room there."""
     of, own = cart(-0.1)

@@ -25,6 +25,7 @@ from torchgco.search.table import rows_of
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Guidance, Solver
+from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.session import Session
 
 if TYPE_CHECKING:
@@ -65,14 +66,19 @@ class Restarts(Solver):
         passes = tuple(one for one in self.passes if not isinstance(one, Converge | Finish | Starts))
         return replace(self, passes=passes), replace(self.local, guidance=None, max_outer_iterations=rounds)
 
+    @property
+    def _finishes(self) -> bool:
+        """Whether a pass is the interior point's: in closed loop there is none, and no time for a verdict."""
+        return any(isinstance(one, Converge) for one in self.passes)
+
     def announce(self, problem: Problem) -> None:
         """Where a pass is the interior point's."""
-        if any(isinstance(one, Converge) for one in self.passes) and Converge.worth(problem):
+        if self._finishes and Converge.worth(problem):
             expect_interior(problem)
 
     def frees_start(self, problem: Problem) -> bool:
         """Where a pass is the interior point's, and there are native kernels."""
-        return any(isinstance(one, Converge) for one in self.passes) and interior_of(problem) is not None
+        return self._finishes and interior_of(problem) is not None
 
     def take_states(self, problem: Problem) -> bool:
         """Where the first solve is the interior point's: without obstacles, where there are native kernels."""
@@ -102,7 +108,10 @@ class Restarts(Solver):
         passes, guidance = self._suited(session.call.problem)
         search = Search(session.call, solver, passes, guidance, session.recorder)
         self._run(search, passes)
-        solution = session.finished(search.best.end, solver.violation_tolerance, solver.slots)
+        end = search.best.end
+        if self._finishes:
+            end = least_violated(session.call, end, solver.violation_tolerance)
+        solution = session.finished(end, solver.violation_tolerance, solver.slots)
         return replace(solution, search=search.finish_record(*session.scales))
 
     def _run(self, search: Search, passes: Sequence[Pass | None]) -> None:

@@ -5,18 +5,39 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchgco.base.status import Status
+from torchgco.base.status import STALLED, Status
+from torchgco.base.tree import put, take
 from torchgco.lagrangian.expansion import linearise
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.native.dispatch import cost_unit
+from torchgco.native.dispatch import cost_unit, measured
 from torchgco.problem.problem import Problem
+from torchgco.solvers.contracts import Call
 from torchgco.solvers.ilqr import ILQR, descend
 from torchgco.solvers.riccati import backward
+from torchgco.solvers.state import Iterate, SolveEnd
 
+GAVE_UP = Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, Status.NOT_POSITIVE_DEFINITE, Status.NON_FINITE
 HEAVY = 1e11  # penalty beside which a cost of one unit counts for nothing
 STUCK = 1e-3  # share of the squared violation that one Gauss-Newton step could save: about 1 where it can be closed
 LEAST = 1e-9  # regularisation of that step, as a share of the largest entry of its Hessians
 SEARCH = ILQR(max_iterations=200, tolerance=1e-12)
+
+
+def least_violated(call: Call, end: SolveEnd, tolerance: float) -> SolveEnd:
+    """The same, with STALLED where a solve failed and no step from its end lowers the violation any further."""
+    failed = torch.stack([end.status == status for status in GAVE_UP]).any(0)
+    rows = (failed & ~(end.best.violation <= tolerance)).nonzero().flatten()
+    if rows.numel() == 0 or call.late:
+        return end
+    problem, old = call.problem.take(rows).held_at(end.best.X[rows, 0]), take(end.best, rows)
+    X, U, stuck = least_violation(problem, old.U)
+    violation = measured(problem, X, U)
+    stuck &= violation > tolerance
+    less = (stuck & (violation < old.violation)).nonzero().flatten()
+    new = Iterate(X, U, old.multipliers, problem.cost.total(X, U), violation)
+    put(end.best, rows[less], take(new, less))
+    end.status[rows[stuck]] = STALLED
+    return end
 
 
 def least_violation(problem: Problem, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.shapes import check_shape, check_tensor
-from torchgco.base.status import SOLVED, STALLED, UNMOVED, Status, is_over
+from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -24,12 +24,11 @@ from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Progress, Solver
 from torchgco.solvers.ending import start_status
 from torchgco.solvers.ilqr import ILQR
-from torchgco.solvers.infeasible import least_violation
+from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
 from torchgco.solvers.state import Iterate, SolveEnd
 
-GAVE_UP = Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, Status.NOT_POSITIVE_DEFINITE, Status.NON_FINITE
 AT_ONCE = 256  # problems between two looks at the clock
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
 # Waechter and Biegler (2006), in whose words these have the names in brackets; where no name is given, ours.
@@ -90,8 +89,8 @@ class InteriorPoint(Solver):
         if interior_of(call.problem) is None:
             return self._without_kernels().run(call)
         session = Session(call, RAW)
-        end = self._least_violated(session.call, self._no_worse(session.call, self.solved(session.call)))
-        return session.finished(end, self.violation_tolerance)
+        end = self._no_worse(session.call, self.solved(session.call))
+        return session.finished(least_violated(session.call, end, self.violation_tolerance), self.violation_tolerance)
 
     def announce(self, problem: Problem) -> None:
         """For every problem."""
@@ -165,22 +164,6 @@ class InteriorPoint(Solver):
             multipliers = take(found.multipliers, rows)
             none = Multipliers(tuple(torch.zeros_like(lam) for lam in multipliers.lam), multipliers.mu)
             put(found, rows, Iterate(X[rows], call.U0[rows], none, cost[rows], worst[rows]))
-        return end
-
-    def _least_violated(self, call: Call, end: SolveEnd) -> SolveEnd:
-        """The same, with STALLED where a solve failed and no step from its end lowers the violation any further."""
-        failed = torch.stack([end.status == status for status in GAVE_UP]).any(0)
-        rows = (failed & ~(end.best.violation <= self.violation_tolerance)).nonzero().flatten()
-        if rows.numel() == 0 or call.late:
-            return end
-        problem, old = call.problem.take(rows).held_at(end.best.X[rows, 0]), take(end.best, rows)
-        X, U, stuck = least_violation(problem, old.U)
-        violation = measured(problem, X, U)
-        stuck &= violation > self.violation_tolerance
-        less = (stuck & (violation < old.violation)).nonzero().flatten()
-        new = Iterate(X, U, old.multipliers, problem.cost.total(X, U), violation)
-        put(end.best, rows[less], take(new, less))
-        end.status[rows[stuck]] = STALLED
         return end
 
     def _some(self, kernels: InteriorEngine, call: Call, X: Tensor, rows: Tensor, end: SolveEnd) -> None:
