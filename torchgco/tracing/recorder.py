@@ -49,9 +49,7 @@ class Operation:
 
     @property
     def title(self) -> str:
-        """What the user called, and the operation of PyTorch's that this came to."""
-        name = None if self.called is None else resolve_name(self.called)
-        return f"{name} ({self.function})" if name else str(self.function)
+        return title(self.function, self.called)
 
     def filled(self, known: dict[Slot, Any]) -> tuple[tuple, dict[str, Any]]:
         """The arguments with known values in the place of slots."""
@@ -96,15 +94,15 @@ class Recording(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         if torch.Tag.nondeterministic_seeded in func.tags:
-            raise _Unfit(f"one that draws at random ({name_of(func)})")
+            raise self._unfit("one that draws at random", func)
         if func._schema.is_mutable:  # all that can be a write into a copy has become one
-            raise _Unfit(f"one that writes in place where that can't be followed ({name_of(func)})")
+            raise self._unfit("one that writes in place where that can't be followed", func)
         if not _makes_tensors(func):
             if self._follows(args, kwargs):
-                raise _Unfit(f"one that looks at the values of its arguments ({name_of(func)})")
+                raise self._unfit("one that looks at the values of its arguments", func)
             return func(*args, **kwargs)  # a constant's value may be read
         if SHAPED_BY_VALUES in func.tags and self._follows(*_shaping(func, args), kwargs):
-            raise _Unfit(f"one with shapes that depend on the values of its arguments ({name_of(func)})")
+            raise self._unfit("one with shapes that depend on the values of its arguments", func)
         if name_of(func) not in OPERATIONS:
             with self:  # the parts are dispatched here in turn
                 parts = func.decompose(*args, **kwargs)
@@ -121,6 +119,9 @@ class Recording(TorchDispatchMode):
         if not self._followers.isdisjoint(operation.inputs):
             self._followers.update(operation.outputs)
         return out
+
+    def _unfit(self, what: str, operation: Any) -> _Unfit:
+        return _Unfit(f"{what}: {title(operation, self._calls.called)}")
 
     def _follows(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on the function's arguments."""
@@ -151,6 +152,12 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
         raise InputError(field, "a function that can be traced", message) from error
     recording.result = recording.slot(result)
     return recording
+
+
+def title(operation: Any, called: Any) -> str:
+    """What the user called, and the operation of PyTorch's that it came to."""
+    name = None if called is None else resolve_name(called)
+    return f"{name} ({operation})" if name else str(operation)
 
 
 def _makes_tensors(operation: Any) -> bool:
