@@ -97,6 +97,7 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
     _check_values("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, (X[:, -1],), (2,), wanted)
 
     _check_apart("cost.stage", stage, rows, X[:, :-1], U)
+    _check_apart("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, X[:, 0], U[:, 0])
     _check_apart("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, X[:, -1])
     part = cost.take(rows)
     if type(cost).expand is Cost.expand:

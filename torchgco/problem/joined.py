@@ -1,8 +1,8 @@
 """Whether a user's function keeps problems, and knots, apart: no row may change with the content of another one.
 
 Content that a function reads without effect at the points that are tried (beneath a `relu`, say) shows itself where it
-is no number, or infinite. Code that branches on values is exempt from this: it can't be traced, and so is solved as it
-is.
+is no number, or infinite. Python code that branches on values is exempt from this: it reads those of all rows by its
+nature, can't be traced, and so is solved as it is.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError
 from torchgco.base.shapes import MISTAKES
-from torchgco.tracing.recorder import record
+from torchgco.tracing.recorder import looks_at_values
 
 FOREIGN = (torch.nan, torch.inf, -torch.inf)
 SIZES = (1.0, 1e3, 1e6)  # of drawn numbers
@@ -24,12 +23,13 @@ Rows = Callable[..., Tensor]  # of problems (b,) int64, knots (K,) int64 and arg
 
 
 def mixes_problems(function: Callable[..., Tensor], rows: Tensor, *arguments: Tensor) -> bool:
-    """Whether a third problem beside two changes function(rows, *arguments) of these."""
-    found, three = function(rows, *arguments), torch.cat((rows, rows[:1]))
+    """Whether a third problem between two changes function(rows, *arguments) of these."""
+    found, three = function(rows, *arguments), rows[[0, 0, 1]]
     for value in FOREIGN:
-        beside = _tried(function, three, *(torch.cat((z, torch.full_like(z[:1], value))) for z in arguments))
-        if beside is not None and bool(unlike(beside[:2], found).any()):
-            return _is_traceable(function, rows, *arguments)
+        strange = [torch.cat((z[:1], torch.full_like(z[:1], value), z[1:])) for z in arguments]
+        beside = _tried(function, three, *strange)
+        if beside is not None and bool(unlike(beside[::2], found).any()):
+            return not looks_at_values(function, rows, *arguments)
     return False
 
 
@@ -44,7 +44,7 @@ def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments
         arguments: (2, K, ...).
     """
     place = _suspect(together, alone, rows, k, arguments)
-    if place is None or _is_traceable(together, rows, k, *arguments):
+    if place is None or not looks_at_values(together, rows, k, *arguments):
         return place
     return _place(alone(rows, k, *arguments), together(rows, k, *arguments))
 
@@ -69,18 +69,6 @@ def _suspect(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments: Se
         if other is not None and (place := _place(other, found[:1], kept)) is not None:
             return place
     return None
-
-
-def _is_traceable(function: Callable[..., Tensor], *arguments: Tensor) -> bool:
-    """Whether a function consists of operations alone.
-
-    One that branches on values reads those of all rows by its nature: PyTorch's kernels solve it as it is.
-    """
-    try:
-        record("", function, *arguments)
-    except InputError:
-        return False
-    return True
 
 
 def _tried(function: Callable[..., Tensor], *arguments: Tensor) -> Tensor | None:
