@@ -27,7 +27,17 @@ class WithoutReading(TorchFunctionMode):
     tensors may be read; `seen` keeps by which methods. `called` is the function of PyTorch that was called last.
     """
 
-    READERS = ("numpy", "__array__", "__dlpack__", "tolist", "data_ptr", "storage", "untyped_storage", "__repr__")
+    READERS = (
+        "numpy",
+        "__array__",
+        "__dlpack__",
+        "tolist",
+        "data_ptr",
+        "storage",
+        "untyped_storage",
+        "__repr__",
+        "__format__",
+    )
 
     def __init__(self) -> None:
         super().__init__()

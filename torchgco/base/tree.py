@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, ClassVar, Self, TypeAlias
 
@@ -73,10 +74,28 @@ def cast(tree: Any, dtype: torch.dtype) -> Any:
     if isinstance(tree, tuple):
         return tuple(cast(leaf, dtype) for leaf in tree)
     if is_dataclass(tree) and not isinstance(tree, type):
-        copy = object.__new__(type(tree))  # parts are checked and bound already
+        other = object.__new__(type(tree))  # parts are checked and bound already
         for name, value in vars(tree).items():
-            object.__setattr__(copy, name, cast(value, dtype))
-        return copy
+            object.__setattr__(other, name, cast(value, dtype))
+        return other
+    return tree
+
+
+def apart(tree: Any) -> Any:
+    """The same with a tensor object of its own for every tensor, of the same memory, in tuples and `PerElement`s.
+
+    What else holds one of these tensors can then be told from the tree.
+    """
+    if isinstance(tree, Tensor):
+        return tree.detach()
+    if isinstance(tree, tuple):
+        leaves = (apart(leaf) for leaf in tree)
+        return type(tree)(*leaves) if hasattr(tree, "_fields") else tuple(leaves)
+    if isinstance(tree, PerElement) and (tree.batched or tree.per_element):
+        twin = copy(tree)  # parts are checked and bound already
+        for name in (*tree.batched, *tree.per_element):
+            object.__setattr__(twin, name, apart(getattr(tree, name)))
+        return twin
     return tree
 
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.tree import PerElement
+from torchgco.base.tree import PerElement, apart
 from torchgco.constraints.bounds import LOOSE
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
@@ -130,6 +130,7 @@ def _traces(problem: Problem) -> tuple[Traced, Traced, list[Traced]]:
     X, U = problem.x0.new_zeros(1, problem.N + 1, problem.n), problem.x0.new_zeros(1, problem.N, problem.m)
 
     def trace(field: str, part: PerElement, method: str, *examples: Tensor) -> Traced:
+        part = apart(part)
         return Traced(field, lambda i, *z: getattr(part.take(i), method)(*z), *examples, own=own_tensors(part))
 
     return (

@@ -175,15 +175,19 @@ class FunctionConstraint(Constraint):
 
     @property
     def reads_knots(self) -> bool:
-        """Whether the function takes more than states and controls: values, or the number of the knot."""
-        return bool(self.values.names or self.values.knot_names) or asks_for_knot(self.function)
+        """Whether the function takes the number of the knot, or values of it."""
+        return bool(self.values.knot_names) or asks_for_knot(self.function)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self._along(X)(*self._arguments(X, U))
 
+    def rows_at(self, k: Tensor, *arguments: Tensor) -> Tensor:
+        """Rows (B, K, p) for the arguments (B, K, n|m) of the function at knots k (K,)."""
+        return self.values.call(self.function, *arguments, k=k)
+
     def _along(self, X: Tensor) -> Callable[..., Tensor]:
         k = torch.arange(X.shape[1], device=X.device)[self.knots]
-        return lambda *z: self.values.call(self.function, *z, k=k)
+        return lambda *z: self.rows_at(k, *z)
 
     def at(self, x: Tensor, k: int) -> Tensor:
         return self.values.call(self.function, x, k=k)

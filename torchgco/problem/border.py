@@ -19,11 +19,17 @@ from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
+from torchgco.problem.joined import joined_knots, mixes_problems, scattered, unlike
 
 OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
 LOST = 1e-2  # share of a derivative by which differences may disagree
 NOISE = 8.0  # times the rounding error of a difference, or its change with the step
 APART = "values of a problem that depend on its own row alone; numbers per problem belong in `values` or `batched`"
+
+ONE_KNOT = (
+    "rows of one knot (sums along knots: an extra state; changes of controls: RateBounds; numbers per knot: "
+    "`knot_values`, or an argument k)"
+)
 
 
 def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
@@ -36,13 +42,16 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
         return
     n, rows = dynamics.n, _ends(x0)
     x, u = _states(x0, 3), _controls(x0, 3, dynamics.m)
-    several, one = dynamics.at(torch.arange(3, device=x0.device).clamp(max=N - 1)), dynamics.at(0)
+    k = torch.arange(3, device=x0.device).clamp(max=N - 1)
+    several, one = dynamics.at(k), dynamics.at(0)
     for name in ("field", "step") if dynamics.is_integrated else ("step",):
         method = lambda model, name=name: lambda i, x, u: getattr(model.take(i), name)(x, u)
         wanted = f"{'derivatives' if name == 'field' else 'states'} (..., {n}) in {x0.dtype}, shaped as its states"
         _check_values(f"dynamics.{name}", method(one), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
-        _check_values(f"dynamics.{name}", method(several), rows, (x, u), (2, 3, n), wanted)
-    weights = 1.0 + 0.5 * _direction(x)
+        of_stages = _called(f"dynamics.{name}", wanted, method(several), rows, x, u)
+        _check_tensor(f"dynamics.{name}", of_stages, (2, 3, n), x.dtype, wanted)
+    _check_stages(dynamics, rows, k, (x, u))
+    weights = 1.0 + 0.5 * scattered(x)
     step = lambda x, u: (weights * several.take(rows).step(x, u)).flatten(1).sum(-1)
 
     def own(dx: Tensor, du: Tensor) -> Tensor:
@@ -51,6 +60,25 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
         return (weights * ahead).flatten(1).sum(-1)
 
     _check_slope("dynamics.step", step, x, u, None if type(dynamics).jacobians is Dynamics.jacobians else own)
+
+
+def _check_stages(dynamics: Dynamics, rows: Tensor, k: Tensor, arguments: tuple[Tensor, ...]) -> None:
+    """Check that the states after several stages k (K,) at once are those after each stage."""
+
+    def together(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
+        return dynamics.at(k).take(i).step(*z)
+
+    def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
+        if dynamics.at(k) is dynamics:  # the same at every stage: all states as problems of their own
+            ahead = dynamics.take(i.repeat_interleave(len(k))).step(*(part.flatten(0, 1) for part in z))
+            return ahead.unflatten(0, (-1, len(k)))
+        each = [dynamics.at(int(j)).take(i).step(*(part[:, at] for part in z)) for at, j in enumerate(k)]
+        return torch.stack(each, dim=1)
+
+    expected = "states (B, K, n) after each of which depends on its own state, control and stage, as for (B, n)"
+    place = _called("dynamics.step", expected, joined_knots, together, alone, rows, k, arguments)
+    if place is not None:
+        raise InputError("dynamics.step", expected, f"others where K = {len(k)}, or where other states lie beside")
 
 
 def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
@@ -68,6 +96,9 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
     _check_values("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, (X[:, 0], U[:, 0]), (2,), wanted)
     _check_values("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, (X[:, -1],), (2,), wanted)
 
+    _check_apart("cost.stage", stage, rows, X[:, :-1], U)
+    _check_apart("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, X[:, 0], U[:, 0])
+    _check_apart("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, X[:, -1])
     part = cost.take(rows)
     if type(cost).expand is Cost.expand:
         _check_slope("cost.stage", lambda x, u: part.stage(x, u, k).sum(-1), X[:, :-1], U)
@@ -97,7 +128,13 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
         return
     wanted = f"rows (2, {K}, p) in {x0.dtype} of two problems"
     shape = _check_values(field, value, rows, (X, U), (2, K, None), wanted)
-    weights = 1.0 + 0.5 * _direction(X.new_empty(shape))
+    if 0 in shape:
+        return
+    if isinstance(constraint, FunctionConstraint):
+        _check_rows(constraint, field, rows, X, U)
+    else:
+        _check_apart(field, value, rows, X, U)
+    weights = 1.0 + 0.5 * scattered(X.new_empty(shape))
 
     def own(dX: Tensor, dU: Tensor) -> Tensor:
         H = _blocks(X, U)
@@ -107,6 +144,27 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
     weighted = lambda X, U: (weights * value(rows, X, U)).flatten(1).sum(-1)
     by_pytorch = type(constraint).accumulate in (Constraint.accumulate, FunctionConstraint.accumulate)
     _check_slope(field, weighted, X, U, None if by_pytorch else own)
+
+
+def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, X: Tensor, U: Tensor) -> None:
+    """Check that the rows of each knot are those of its own state and controls."""
+
+    def together(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
+        return constraint.take(i).rows_at(k, *z)
+
+    def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
+        if constraint.reads_knots:
+            each = [together(i, k[at : at + 1], *(part[:, at : at + 1] for part in z)) for at in range(len(k))]
+            return torch.cat(each, dim=1)
+        K, single = len(k), (part.flatten(0, 1).unsqueeze(1) for part in z)
+        return together(i.repeat_interleave(K), k[:1], *single).squeeze(1).unflatten(0, (-1, K))
+
+    knots = torch.arange(X.shape[1], device=X.device)[constraint.knots]
+    arguments = tuple((X if a == "x" else U)[:, constraint.knots] for a in constraint.of)
+    place = _called(field, ONE_KNOT, joined_knots, together, alone, rows, knots, arguments)
+    if place is not None:
+        got = f"rows of knot {int(knots[place])} that depend on other knots or problems, or on how many there are"
+        raise InputError(field, ONE_KNOT, got)
 
 
 def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint], x0: Tensor, N: int) -> None:
@@ -143,14 +201,20 @@ def _check_values(
     again = _called(field, wanted, function, rows, *arguments)
     if not torch.equal(both.nan_to_num(), again.nan_to_num()):
         raise InputError(field, "the same values for the same arguments", "others at a second call: it draws at random")
-    scale = both.abs().nan_to_num(0.0, 0.0, 0.0).amax() if both.numel() > 0 else 0.0
-    near = torch.finfo(both.dtype).eps ** 0.5 * (1.0 + scale)
+    if both.numel() == 0:
+        return both.shape
     for i in (0, 1):
         alone = _called(field, APART, function, rows[i : i + 1], *(z[i : i + 1] for z in arguments))
         _check_tensor(field, alone, (1, *both.shape[1:]), both.dtype, APART)
-        if bool(((alone - both[i : i + 1]).abs() > near).any()):
+        if bool(unlike(alone, both[i : i + 1]).any()):
             raise InputError(field, APART, "other values for a problem alone than beside another one")
     return both.shape
+
+
+def _check_apart(field: str, function: Callable[..., Tensor], rows: Tensor, *arguments: Tensor) -> None:
+    """Check that function(rows, *arguments) of two problems is the same beside a third one, whatever that holds."""
+    if mixes_problems(function, rows, *arguments):
+        raise InputError(field, APART, "values that change with those of another problem")
 
 
 def _check_tensor(field: str, value: Any, shape: tuple[int | None, ...], dtype: torch.dtype, wanted: str) -> None:
@@ -215,24 +279,18 @@ def _states(x0: Tensor, K: int) -> Tensor:
     """States (2, K, n) close to the first and the last start; no two of them are equal."""
     x = x0[_ends(x0)].unsqueeze(1).repeat(1, K, 1)
     x = torch.where(torch.isfinite(x), x, torch.zeros_like(x))
-    return x + OFFSET * (1.0 + x.abs()) * (1.0 + 0.5 * _direction(x))
+    return x + OFFSET * (1.0 + x.abs()) * (1.0 + 0.5 * scattered(x))
 
 
 def _controls(x0: Tensor, K: int, m: int) -> Tensor:
     """Controls (2, K, m) close to zero; no two of them are equal."""
     u = x0.new_zeros(2, K, m)
-    return u + OFFSET * (1.0 + 0.5 * _direction(u))
-
-
-def _direction(like: Tensor) -> Tensor:
-    """Numbers between -1 and 1 in the shape of `like`, without a pattern, the same in every process."""
-    place = torch.arange(1, like.numel() + 1, dtype=like.dtype, device=like.device)
-    return (place * 1.618).cos().reshape(like.shape)
+    return u + OFFSET * (1.0 + 0.5 * scattered(u))
 
 
 def _steps(z: Tensor) -> Tensor:
     """A direction of differences, larger where the values are."""
-    return _direction(z) * (1.0 + z.abs())
+    return scattered(z) * (1.0 + z.abs())
 
 
 def _blocks(X: Tensor, U: Tensor) -> Tensor:

@@ -232,7 +232,7 @@ OPERATIONS: dict[str, Callable] = {
     "aten.sqrt": _sqrt,
     "aten.rsqrt": _unary(lambda x: 1.0 / _casadi().sqrt(x)),
     "aten.abs": _unary("fabs"),
-    "aten.sign": _unary("sign"),
+    "aten.sign": lambda a: _sub(_binary(operator.gt)(a, 0.0), _binary(operator.lt)(a, 0.0)),  # of NaN it is 0
     "aten.floor": _floor,
     "aten.ceil": _unary("ceil"),
     "aten.fmod": _binary("fmod"),

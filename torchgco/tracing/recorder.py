@@ -14,8 +14,9 @@ from torch.overrides import resolve_name
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-from torchgco.base.autodiff import WithoutReading
+from torchgco.base.autodiff import ReadsMemory, WithoutReading
 from torchgco.base.errors import InputError
+from torchgco.base.shapes import MISTAKES
 from torchgco.tracing.operations import OPERATIONS
 
 SHAPED_BY_VALUES = torch.Tag.dynamic_output_shape
@@ -49,9 +50,7 @@ class Operation:
 
     @property
     def title(self) -> str:
-        """What the user called, and the operation of PyTorch's that this came to."""
-        name = None if self.called is None else resolve_name(self.called)
-        return f"{name} ({self.function})" if name else str(self.function)
+        return title(self.function, self.called)
 
     def filled(self, known: dict[Slot, Any]) -> tuple[tuple, dict[str, Any]]:
         """The arguments with known values in the place of slots."""
@@ -74,6 +73,7 @@ class Recording(TorchDispatchMode):
         self._seen: dict[int, tuple[Slot, Tensor]] = {}  # holds the tensor: its id isn't reused
         self._numbers = count()
         self.operations: list[Operation] = []
+        self.lenient = False  # whether what can't be followed is recorded nevertheless
         self.captured: dict[Slot, Tensor] = {}
         self.inputs = [self._new(tensor) for tensor in inputs]
         self._followers = set(self.inputs)
@@ -95,16 +95,16 @@ class Recording(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
-        if torch.Tag.nondeterministic_seeded in func.tags:
-            raise _Unfit(f"one that draws at random ({name_of(func)})")
-        if func._schema.is_mutable:  # all that can be a write into a copy has become one
-            raise _Unfit(f"one that writes in place where that can't be followed ({name_of(func)})")
+        if torch.Tag.nondeterministic_seeded in func.tags and not self.lenient:
+            raise self._unfit("one that draws at random", func)
+        if func._schema.is_mutable and not self.lenient:  # all that can be a write into a copy has become one
+            raise self._unfit("one that writes in place where that can't be followed", func)
         if not _makes_tensors(func):
             if self._follows(args, kwargs):
-                raise _Unfit(f"one that looks at the values of its arguments ({name_of(func)})")
+                raise self._unfit("one that looks at the values of its arguments", func, _Looks)
             return func(*args, **kwargs)  # a constant's value may be read
         if SHAPED_BY_VALUES in func.tags and self._follows(*_shaping(func, args), kwargs):
-            raise _Unfit(f"one with shapes that depend on the values of its arguments ({name_of(func)})")
+            raise self._unfit("one with shapes that depend on the values of its arguments", func, _Looks)
         if name_of(func) not in OPERATIONS:
             with self:  # the parts are dispatched here in turn
                 parts = func.decompose(*args, **kwargs)
@@ -122,13 +122,35 @@ class Recording(TorchDispatchMode):
             self._followers.update(operation.outputs)
         return out
 
+    def _unfit(self, what: str, operation: Any, kind: type[_Unfit] | None = None) -> _Unfit:
+        return (kind or _Unfit)(f"{what}: {title(operation, self._calls.called)}")
+
     def _follows(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on the function's arguments."""
         return any(isinstance(leaf, Tensor) and self.slot(leaf) in self._followers for leaf in tree_leaves(tree))
 
 
-class _Unfit(Exception):
+class _Unfit(RuntimeError):
     """A function does what a recording can't hold."""
+
+
+class _Looks(_Unfit):
+    """A function's Python code reads the values of its arguments."""
+
+
+def looks_at_values(function: Callable[..., Tensor], *examples: Tensor) -> bool:
+    """Whether Python code or NumPy reads values of tensors that depend on the arguments, to branch on them, say."""
+    calls = WithoutReading()
+    recording = Recording(examples, calls)
+    recording.lenient = True
+    try:
+        with torch.no_grad(), recording, calls:
+            torch.func.functionalize(function, remove="mutations")(*examples)
+    except (_Looks, ReadsMemory):
+        return True
+    except MISTAKES:
+        return False
+    return False
 
 
 def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Recording:
@@ -151,6 +173,12 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
         raise InputError(field, "a function that can be traced", message) from error
     recording.result = recording.slot(result)
     return recording
+
+
+def title(operation: Any, called: Any) -> str:
+    """What the user called, and the operation of PyTorch's that it came to."""
+    name = None if called is None else resolve_name(called)
+    return f"{name} ({operation})" if name else str(operation)
 
 
 def _makes_tensors(operation: Any) -> bool:

@@ -32,8 +32,9 @@ class Traced:
         field: the function's name in errors.
         function: tensors in, one tensor out.
         examples: variables of the shapes that the function is called with.
-        own: tensors that are treated as one problem's own even where all problems of the batch share them: the
-            expressions, and with them the last bits, then don't depend on the other problems of the batch.
+        own: tensors, objects that nothing else holds (`base.tree.apart`), that are treated as one problem's own even
+            where all problems of the batch share them: the expressions, and with them the last bits, then don't depend
+            on the other problems of the batch.
 
     Raises:
         InputError: the function can't be traced (it branches on values of its arguments, say), or holds an operation

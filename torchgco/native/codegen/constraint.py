@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.tree import apart
 from torchgco.constraints.base import FunctionConstraint
 from torchgco.native.codegen import emit
 from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
@@ -33,19 +34,10 @@ def rows_numbers(problem: Problem, i: int, source: KnotSource) -> Tensor:
 
 
 def span_of_rows(problem: Problem, i: int) -> Span:
-    """Constraint i, traced: at one knot where it is given as a function of one, else along whole trajectories."""
-    constraint, n, m, N = problem.constraints[i], problem.n, problem.m, problem.N
-    if type(constraint) is FunctionConstraint and not constraint.reads_knots:
-
-        def of_knot(index: Tensor, X: Tensor, U: Tensor) -> Tensor:
-            rows = constraint.function(*(X if a == "x" else U for a in constraint.of))
-            if rows.dim() != 3 or tuple(rows.shape[:2]) != (1, 1):
-                raise InputError(f"{constraint.name}.function", "rows (1, 1, p) of one problem", tuple(rows.shape))
-            return rows
-
-        X, U = problem.x0.new_zeros(1, 1, n), problem.x0.new_zeros(1, 1, m)
-        return Span(Traced(constraint.name, of_knot, X, U), (), n, m, 1, 1, [0])
-    name = f"constraints[{i}] ({type(constraint).__name__})"
+    """Constraint i, traced along whole trajectories, as PyTorch calls it."""
+    constraint, n, m, N = apart(problem.constraints[i]), problem.n, problem.m, problem.N
+    called = isinstance(constraint, FunctionConstraint)
+    name = constraint.name if called else f"constraints[{i}] ({type(constraint).__name__})"
     try:
         knots = torch.arange(N + 1)[constraint.knots].tolist()
     except (AttributeError, IndexError, TypeError) as error:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.tree import apart
 from torchgco.costs.base import Cost, ScaledCost, ShiftedCost
 from torchgco.native.codegen import emit
 from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
@@ -78,6 +79,7 @@ def cost_arrays(problem: Problem, source: CostSource) -> list[Array]:
 def spans_of_cost(problem: Problem) -> tuple[Span, Span]:
     """Stages and last knot, traced: the value, followed by the block (s, s) of the cost's own `expand`, if any."""
     (cost, *_), N, n, m = unscaled(problem), problem.N, problem.n, problem.m
+    cost = apart(cost)
     own = own_tensors(cost)
 
     def stage(i: Tensor, X: Tensor, U: Tensor) -> Tensor:

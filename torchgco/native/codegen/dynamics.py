@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.tree import apart
 from torchgco.dynamics import Dynamics
 from torchgco.native import store
 from torchgco.native.codegen import emit
@@ -87,6 +88,7 @@ def trace_dynamics(
     """
     n, m = n or dynamics.n, m or dynamics.m
     x, u = (torch.zeros(1, size, dtype=dtype, device=device) for size in (n, m))
+    dynamics = apart(dynamics)
     own = own_tensors(dynamics)
     traced = Traced("dynamics.step", lambda i, x, u: dynamics.take(i).step(x, u), x, u, own=own)
     parts = store.made(("model", traced.fingerprint(), *makers()), lambda _: _made(traced, n, m))

@@ -56,7 +56,7 @@ class KnotSource:
     """
 
     code: str
-    key: str  # says what `code` computes, the same in every process
+    key: str  # says what `code` computes, the same in every process and for every number of knots
     size: int
     places: Tensor = field(compare=False)
     span: Span = field(repr=False, compare=False)
@@ -90,7 +90,7 @@ class KnotSource:
 
 
 def knot_source(kind: str, span: Span, code_of: Callable[[Knot, str], str], *files: str) -> KnotSource:
-    """The C that `code_of` makes of a knot and a key, taken from the cache folder if it was made before.
+    """The C that `code_of` makes of a knot and a name, taken from the cache folder if it was made before.
 
     Args:
         kind: the word of the key that names the kind of code.
@@ -108,13 +108,17 @@ def knot_parts(
     """`knot_source` of parts, of which "code" is one, and these parts."""
     shape = str((span.n, span.m, span.states, span.controls, list(span.knots)))
 
-    def make(key: str) -> dict[str, Any]:
-        knot, places = _one_knot(span)
-        return {**parts_of(knot, key[:16]), "size": knot.rows.numel(), "places": places}
+    def make(_: str) -> dict[str, Any]:
+        import casadi as ca
 
-    key, parts = store.made((kind, shape, span.traced.fingerprint(), *makers(__file__, *files)), make)
+        knot, places = _one_knot(span)
+        function = ca.Function("knot", [knot.x, knot.u, knot.numbers], [knot.rows])
+        name = store.key_of((kind, str((span.n, span.m, *_form(function))), *makers(__file__, *files)))[:16]
+        return {**parts_of(knot, name), "name": name, "size": knot.rows.numel(), "places": places}
+
+    _, parts = store.made((kind, shape, span.traced.fingerprint(), *makers(__file__, *files)), make)
     places = torch.tensor(parts["places"], dtype=torch.int64).reshape(len(parts["places"]), -1)
-    return KnotSource(parts["code"], key[:16], parts["size"], places, span), parts
+    return KnotSource(parts["code"], parts["name"], parts["size"], places, span), parts
 
 
 def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
@@ -133,22 +137,27 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
         elements(U).reshape(1, span.controls, span.m),
         constants=each[count:],
     ).reshape(len(span.knots), -1)
-    functions, places, first = [], [], None
+    x, u = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m)
+    functions, places, forms, first = [], [], {}, None
     for k, row in zip(span.knots, found, strict=True):
-        x = X[k * span.n : (k + 1) * span.n]
-        u = U[k * span.m : (k + 1) * span.m] if k < span.controls else ca.SX.sym("u", span.m)
+        x_k, u_k = X[k * span.n : (k + 1) * span.n], U[k * span.m : (k + 1) * span.m] if k < span.controls else u
         column = ca.densify(ca.vertcat(ca.SX(0, 1), *row))
-        functions.append(ca.Function("knot", [x, u, numbers], [column], {"allow_free": True}))
-        if functions[-1].has_free():
+        function = ca.Function("knot", [x_k, u_k, numbers], [column], {"allow_free": True})
+        if function.has_free():
             raise InputError(traced.field, "rows that read their own knot alone", f"rows of knot {k} that read others")
-        form, used = _form(functions[-1])
+        # Of the same symbols: most knots have the same text, and reading its instructions one by one takes long.
+        functions.append(ca.Function("knot", [x, u, numbers], function.call([x, u, numbers])))
+        text = functions[-1].serialize()
+        if text not in forms:
+            forms[text] = _form(functions[-1])
+        form, used = forms[text]
         places.append(used)
         first = first or form
         if form != first:
             raise InputError(traced.field, "the same operations at every knot", f"others at knot {k}")
     differ = [len(set(column)) > 1 for column in zip(*places, strict=True)]
     own = [i for i, place in enumerate(places[0]) if place < count or differ[i]]
-    x, u, p = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m), ca.SX.sym("p", len(own))
+    p = ca.SX.sym("p", len(own))
     values: list[Any] = [0.0] * count + constants.tolist()
     for i, place in enumerate(own):
         values[places[0][place]] = p[i]

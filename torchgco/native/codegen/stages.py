@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchgco.base.tree import apart
 from torchgco.dynamics import Dynamics
 from torchgco.native.codegen import dynamics as code
 from torchgco.native.codegen.dynamics import DynamicsSource, step_parts, trace_dynamics
@@ -49,7 +50,8 @@ def trace_model(problem: Problem) -> DynamicsSource:
 
 def _span(model: Dynamics, N: int) -> Span:
     """The steps of all stages of one problem, traced together."""
-    own, stages = own_tensors(model), torch.arange(N)
+    model, stages = apart(model), torch.arange(N)
+    own = own_tensors(model)
     X, U = (torch.zeros(1, N, size, dtype=torch.float64) for size in (model.n, model.m))
     traced = Traced("dynamics.step", lambda i, X, U: model.take(i).at(stages).step(X, U), X, U, own=own)
     return Span(traced, own, model.n, model.m, N, N, range(N))

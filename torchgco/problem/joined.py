@@ -1,0 +1,104 @@
+"""Whether a user's function keeps problems, and knots, apart: no row may change with the content of another one.
+
+Content that a function reads without effect at the points that are tried (beneath a `relu`, say) shows itself where it
+is no number, or infinite. Python code that branches on values is exempt from this: it reads those of all rows by its
+nature, can't be traced, and so is solved as it is.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from torchgco.base.shapes import MISTAKES
+from torchgco.tracing.recorder import looks_at_values
+
+FOREIGN = (torch.nan, torch.inf, -torch.inf)
+SIZES = (1.0, 1e3, 1e6)  # of drawn numbers
+
+Rows = Callable[..., Tensor]  # of problems (b,) int64, knots (K,) int64 and arguments (b, K, ...): rows (b, K, ...)
+
+
+def mixes_problems(function: Callable[..., Tensor], rows: Tensor, *arguments: Tensor) -> bool:
+    """Whether a third problem between two changes function(rows, *arguments) of these."""
+    found, three = function(rows, *arguments), rows[[0, 0, 1]]
+    for value in FOREIGN:
+        strange = [torch.cat((z[:1], torch.full_like(z[:1], value), z[1:])) for z in arguments]
+        beside = _tried(function, three, *strange)
+        if beside is not None and bool(unlike(beside[::2], found).any()):
+            return not looks_at_values(function, rows, *arguments)
+    return False
+
+
+def joined_knots(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor]) -> int | None:
+    """The place of a knot whose rows depend on other knots or problems, or on their number; None: none is found.
+
+    Args:
+        together: of all knots.
+        alone: the same of each knot by itself.
+        rows: two problems.
+        k: the numbers of the knots (K,).
+        arguments: (2, K, ...).
+    """
+    place = _suspect(together, alone, rows, k, arguments)
+    if place is None or not looks_at_values(together, rows, k, *arguments):
+        return place
+    return _place(alone(rows, k, *arguments), together(rows, k, *arguments))
+
+
+def _suspect(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments: Sequence[Tensor]) -> int | None:
+    """`joined_knots`, and the place of one that changes where the function branches on values."""
+    K, one = len(k), rows[:1]
+    drawn = [torch.cat((z, *(size * scattered(z[:1]) for size in SIZES))) for z in arguments]
+    more = torch.cat((rows, one.expand(len(SIZES))))
+    found, each = _tried(together, more, k, *drawn), _tried(alone, more, k, *drawn)
+    if found is None or each is None:  # it refuses such states
+        found, each = together(rows, k, *arguments), alone(rows, k, *arguments)
+    if (place := _place(each, found)) is not None:
+        return place
+    # Any two knots differ in a digit of their places, so that one of them is kept where the other is foreign. The last
+    # two rows are kept as a whole, and foreign as a whole: another problem.
+    digits = torch.arange(K, device=k.device) >> torch.arange((K - 1).bit_length(), device=k.device).unsqueeze(-1) & 1
+    kept = torch.cat((digits == 0, digits == 1, torch.tensor([[True], [False]], device=k.device).expand(2, K)))
+    for value in FOREIGN:
+        strange = [torch.where(kept.view(*kept.shape, *[1] * (z.dim() - 2)), z[:1], value) for z in arguments]
+        other = _tried(together, one.expand(len(kept)), k, *strange)
+        if other is not None and (place := _place(other, found[:1], kept)) is not None:
+            return place
+    return None
+
+
+def _tried(function: Callable[..., Tensor], *arguments: Tensor) -> Tensor | None:
+    """The function's values; None where it refuses such arguments."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return function(*arguments)
+    except MISTAKES:
+        return None
+
+
+def unlike(some: Tensor, others: Tensor) -> Tensor:
+    """Where values (b, ...) differ by more than another order of sums explains; NaN is like infinity."""
+    size = others.abs().nan_to_num(0.0, 0.0, 0.0).reshape(len(others), -1).amax(-1)
+    near = torch.finfo(others.dtype).eps ** 0.5 * (1.0 + size.view(-1, *[1] * (others.dim() - 1)))
+    finite = torch.isfinite(some)
+    return ((some - others).abs() > near) & finite | (finite != torch.isfinite(others))
+
+
+def _place(some: Tensor, others: Tensor, kept: Tensor | None = None) -> int | None:
+    """The first place of the second axis at which values (b, K, ...) differ, among those `kept` (b, K)."""
+    if some.dim() != others.dim() or some.shape[1:] != others.shape[1:]:
+        return 0
+    wrong = unlike(some, others.expand_as(some)).flatten(2).any(-1)
+    found = (wrong if kept is None else wrong & kept).any(0).nonzero()
+    return int(found[0]) if found.numel() > 0 else None
+
+
+def scattered(like: Tensor) -> Tensor:
+    """Numbers between -1 and 1 in the shape of `like`, without an order, the same in every process."""
+    place = torch.arange(1, like.numel() + 1, dtype=like.dtype, device=like.device)
+    return (place * 1.618).cos().reshape(like.shape)
