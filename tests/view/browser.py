@@ -18,8 +18,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
@@ -134,7 +132,8 @@ class Tab:
         return value
 
     def open(self, page: Path, fragment: str = "") -> None:
-        """Open a file, and wait for its first picture."""
+        """Open a file, and wait for its first picture. The tab comes to the front: others draw nothing."""
+        self.call("Page.bringToFront")
         self.call("Page.navigate", url="about:blank")
         self.wait("location.href === 'about:blank'")
         self.call("Page.navigate", url=page.resolve().as_uri() + fragment)
@@ -199,15 +198,3 @@ def browser(program: str) -> Iterator[Callable[[], Tab]]:
         finally:
             process.terminate()
             process.wait(timeout=PATIENCE)
-
-
-@contextmanager
-def one_tab(width: int, height: int) -> Iterator[Tab]:
-    """A tab of that many pixels in a browser of its own; where there is no Chromium, the test is skipped."""
-    program = found()
-    if program is None:
-        pytest.skip("there is no Chromium")
-    with browser(program) as new:
-        tab = new()
-        tab.size(width, height)
-        yield tab

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.view.browser import Tab, browser, found
+from tests.view.browser import Tab
 from tests.view.scenes import DT, SOLVERS, UNEVEN, WORDS, N, document, trajectories
 from torchgco.plotting.style import solver_colours
 from torchgco.view.document import Line, SearchPart
 from torchgco.view.page import page
 
-pytestmark = pytest.mark.skipif(found() is None, reason="there is no Chromium")
 SIZE = (900, 600)
 PICTURE = "document.getElementById('picture')"
 RED = (208, 32, 32)
@@ -36,13 +35,10 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def opened(file: Path) -> Iterator[Tab]:
-    program = found()
-    assert program is not None
-    with browser(program) as new:
-        tab = new()
-        tab.size(*SIZE)
-        yield tab
+def opened(chromium: Callable[[], Tab]) -> Tab:
+    tab = chromium()
+    tab.size(*SIZE)
+    return tab
 
 
 @pytest.fixture
@@ -52,8 +48,23 @@ def tab(opened: Tab, file: Path) -> Iterator[Tab]:
     opened.requests.clear()
     opened.open(file)
     yield opened
-    assert opened.errors == []
-    assert [url for url in opened.requests if not url.startswith(("file:", "blob:null/", "about:"))] == []
+    check_quiet(opened)
+
+
+def check_quiet(tab: Tab) -> None:
+    """Assert that the page complained of nothing, and asked for nothing from elsewhere."""
+    assert tab.errors == []
+    assert [url for url in tab.requests if not url.startswith(("file:", "blob:null/", "about:"))] == []
+
+
+@pytest.fixture(scope="module")
+def untouched(chromium: Callable[[], Tab], file: Path) -> Iterator[Tab]:
+    """A page that is opened once, for tests that only read it."""
+    tab = chromium()
+    tab.size(*SIZE)
+    tab.open(file)
+    yield tab
+    check_quiet(tab)
 
 
 def pixels(tab: Tab) -> np.ndarray:
@@ -173,8 +184,8 @@ def test_keys_play_step_and_choose(tab: Tab) -> None:
     assert tab.evaluate("torchgcoView.playing") is False
 
 
-def test_a_screen_reader_has_a_name_for_every_control(tab: Tab) -> None:
-    nodes = [one for one in tab.call("Accessibility.getFullAXTree")["nodes"] if not one.get("ignored")]
+def test_a_screen_reader_has_a_name_for_every_control(untouched: Tab) -> None:
+    nodes = [one for one in untouched.call("Accessibility.getFullAXTree")["nodes"] if not one.get("ignored")]
     controls = [one for one in nodes if one["role"]["value"] in ("button", "checkbox", "slider", "combobox", "image")]
     assert len(controls) > 15 and all(len(one["name"]["value"].strip()) > 1 for one in controls)
     told = " ".join(one["name"]["value"] for one in nodes if "name" in one)
@@ -222,9 +233,9 @@ def test_the_search_is_shown_on_demand(tab: Tab) -> None:
     assert (np.abs(pixels(tab) - before).max(axis=-1) > 25).sum() < 20
 
 
-def test_a_trajectory_along_another_has_gaps(tab: Tab) -> None:
+def test_a_trajectory_along_another_has_gaps(untouched: Tab) -> None:
     script = """torchgcoView.flights.all.map(({ line }) => Array.from(line.geometry.index.array))"""
-    first, second = (np.reshape(corners, (N, -1)) for corners in tab.evaluate(script))
+    first, second = (np.reshape(corners, (N, -1)) for corners in untouched.evaluate(script))
     first, second = (int((pieces == 0).all(axis=1).sum()) for pieces in (first, second))
     assert first == 0 and 0 < second < 0.2 * N  # they share their start and their end alone
 
@@ -264,20 +275,20 @@ def test_light_and_dark(tab: Tab) -> None:
     assert tab.evaluate("getComputedStyle(document.body).color") == "rgb(232, 234, 237)"
 
 
-def test_nothing_of_the_data_ran(tab: Tab) -> None:
-    assert tab.evaluate("document.title") == WORDS
-    assert tab.evaluate("document.querySelectorAll('img, #panel script').length") == 0
-    assert WORDS in tab.evaluate("document.getElementById('layout').innerText")
-    assert WORDS in tab.evaluate("document.getElementById('solvers').innerText")
+def test_nothing_of_the_data_ran(untouched: Tab) -> None:
+    assert untouched.evaluate("document.title") == WORDS
+    assert untouched.evaluate("document.querySelectorAll('img, #panel script').length") == 0
+    assert WORDS in untouched.evaluate("document.getElementById('layout').innerText")
+    assert WORDS in untouched.evaluate("document.getElementById('solvers').innerText")
 
 
-def test_half_precision_is_read_as_numpy_writes_it(tab: Tab) -> None:
+def test_half_precision_is_read_as_numpy_writes_it(untouched: Tab) -> None:
     bits = np.random.default_rng(0).integers(0, 2**16, 300, dtype=np.uint16)
     bits[:6] = 0, 1, 0x8001, 0x7BFF, 0x3C00, 0x0400
     values = bits.view(np.float16)
     finite = np.isfinite(values)
     script = "torchgcoView.half.map ? null : " + json.dumps(bits[finite].tolist()) + ".map(torchgcoView.half)"
-    np.testing.assert_array_equal(np.array(tab.evaluate(script)), values[finite].astype(float))
+    np.testing.assert_array_equal(np.array(untouched.evaluate(script)), values[finite].astype(float))
 
 
 def test_a_damaged_page_says_so(opened: Tab, file: Path, tmp_path: Path) -> None:

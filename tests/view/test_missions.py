@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.view.browser import Tab, one_tab
+from tests.view.browser import Tab
 from tests.view.scenes import DT, SOLVERS, N, document, sensed, trajectories
 from tests.view.test_browser import alike, pixels, place
 from tests.view.test_packing import part
@@ -28,9 +28,10 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def opened() -> Iterator[Tab]:
-    with one_tab(900, 600) as tab:
-        yield tab
+def opened(chromium: Callable[[], Tab]) -> Tab:
+    tab = chromium()
+    tab.size(900, 600)
+    return tab
 
 
 @pytest.fixture

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.view.browser import Tab, one_tab
+from tests.view.browser import Tab
 from tests.view.test_browser import pixels, stony
 from torchgco.experiments import app
 from torchgco.experiments.config.groups import options_of
@@ -33,9 +33,10 @@ MISSIONS = {
 
 
 @pytest.fixture(scope="module")
-def opened() -> Iterator[Tab]:
-    with one_tab(*SIZE) as tab:
-        yield tab
+def opened(chromium: Callable[[], Tab]) -> Tab:
+    tab = chromium()
+    tab.size(*SIZE)
+    return tab
 
 
 @pytest.fixture

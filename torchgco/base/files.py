@@ -45,14 +45,19 @@ def write_whole(
 
 
 def read_arrays(
-    path: str | os.PathLike[str], field: str, kind: str, needed: Collection[str] = (), room: float = math.inf
+    path: str | os.PathLike[str],
+    field: str,
+    kind: str,
+    needed: Collection[str] = (),
+    room: float = math.inf,
+    limit: str = "of free memory",
 ) -> dict[str, np.ndarray]:
     """The arrays of an npz file by name.
 
     Args:
         field, kind: the argument and the kind of file that errors name.
         needed: arrays that the file must hold.
-        room: bytes of memory that the arrays may take.
+        room, limit: bytes of memory that the arrays may take, and what errors say of them.
 
     Raises:
         InputError: no such file, one that isn't a readable npz file without pickles, one that lacks an array or takes
@@ -63,9 +68,9 @@ def read_arrays(
     try:
         # Opened here, because np.load leaves a damaged file open.
         with open(path, "rb") as file:
-            size = _size(file)
+            size = npz_size(file)
             if size > room:
-                expected = f"arrays that fit into the {room / 1e9:.3g} GB of free memory"
+                expected = f"arrays that fit into the {room / 1e9:.3g} GB {limit}"
                 raise InputError(field, expected, f"{path}, whose arrays take {size / 1e9:.3g} GB")
             with np.load(file, allow_pickle=False) as held:
                 arrays = {name: held[name] for name in held.files}
@@ -83,7 +88,7 @@ def read_arrays(
     return arrays
 
 
-def _size(file: IO[bytes]) -> int:
+def npz_size(file: IO[bytes]) -> int:
     """Bytes of all arrays in a zip file; 0 for another kind of file, which np.load refuses."""
     if not zipfile.is_zipfile(file):
         file.seek(0)

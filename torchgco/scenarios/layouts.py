@@ -6,6 +6,7 @@ rows of NaN. Lengths in metres, times in seconds.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -171,13 +172,20 @@ class Layouts:
         write_whole(path, lambda file: np.savez_compressed(file, **self.arrays()))  # type: ignore[arg-type]
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Layouts:
+    def load(
+        cls, path: str | os.PathLike[str], room: float = math.inf, limit: str = "of free memory"
+    ) -> Layouts:
         """The layouts of a file, named by its stem.
+
+        Args:
+            room, limit: bytes of memory that the arrays may take at most, and what errors say of them.
 
         Raises InputError: `scenario.path` if there is no readable npz file, `layouts.<array>` if an array is
         missing, unknown or malformed.
         """
-        held = read_arrays(path, "scenario.path", "a layout file", room=free_memory())
+        free = free_memory()
+        limit = limit if room < free else "of free memory"
+        held = read_arrays(path, "scenario.path", "a layout file", room=min(room, free), limit=limit)
         path = Path(path)
         held = _without_spheres(held) | held
         for name in REQUIRED:

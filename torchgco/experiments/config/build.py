@@ -251,18 +251,21 @@ def _stored(tree: Any, group: str, field: str, trust: bool) -> Any:
     """
     if not trust:
         check_stored(tree, group, field)
-    return _instantiate(OmegaConf.create(tree) if isinstance(tree, dict) else tree, field)
+    return _instantiate(tree, field)
 
 
-def _instantiate(node: DictConfig, field: str, leave_out: str | None = None) -> Any:
-    if not OmegaConf.is_dict(node):
+def _instantiate(node: Any, field: str, leave_out: str | None = None) -> Any:
+    if not isinstance(node, dict | DictConfig):
         raise InputError(field, "a group of keys", repr(node))
     try:
+        node = OmegaConf.create(node) if isinstance(node, dict) else node
         # Containers become lists here: no part of the library knows OmegaConf.
         plain = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
         assert isinstance(plain, dict)
         parts = {key: value for key, value in plain.items() if key != leave_out}
         return hydra.utils.instantiate(parts, _convert_="all", **ANY_CLASS)
+    except RecursionError:
+        raise InputError(field, "less deeply nested keys", "more than Python can follow") from None
     except (InstantiationException, OmegaConfBaseException, TypeError) as error:  # Hydra 1.4 wraps no TypeError
         raise as_input_error(error, field) from None
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import mission_from, solver_from, vehicle_of
+from torchgco.experiments.results.files import damaged
 from torchgco.experiments.results.identity import Manifest
+from torchgco.experiments.results.limits import check_stages, read_layouts, read_npz, read_table
 from torchgco.experiments.results.records import DONE, LAYOUTS, MANIFEST, TRIALS, read_manifest
 from torchgco.experiments.results.runs import read_trials
 from torchgco.missions import Mission
@@ -22,12 +25,16 @@ from torchgco.view.flights import constraint_name
 from torchgco.view.vehicles import Look
 
 BATCH = 64  # layouts whose trajectories are measured at once
-TRUST = "--trust", "let the run's own file name any class, such as a model of yours: its code runs"
+TRUST = "--trust", "admit any size in a run's files, and any class, such as a model of yours: its code runs"
 
 
 @dataclass(frozen=True)
 class Study:
-    """What a page needs of a finished study; `trust`: its file may name any class, which then runs."""
+    """What a page needs of a finished study.
+
+    Args:
+        trust: whether its files may have any size and name any class, whose code runs.
+    """
 
     folder: Path
     manifest: Manifest
@@ -49,8 +56,28 @@ class Study:
         if not (folder / DONE).is_file():
             raise InputError("RUN", "a finished study (the same command resumes it)", folder)
         manifest = read_manifest(folder / MANIFEST, whole=True)
-        layouts, trials = Layouts.load(folder / LAYOUTS), read_trials(folder / TRIALS)
-        return cls(folder, manifest, vehicle_of(manifest.configuration, trust), layouts, trials, trust)
+        vehicle = vehicle_of(manifest.configuration, trust)
+        layouts, trials = read_layouts(folder / LAYOUTS, trust), read_trials(folder / TRIALS, trust)
+        if not trust:
+            check_stages(folder, vehicle, layouts, BATCH)
+        return cls(folder, manifest, vehicle, layouts, trials, trust)
+
+    def arrays(self, name: str) -> dict[str, np.ndarray]:
+        """The arrays of one of its npz files; InputError where it is damaged, or takes more than it may."""
+        return self._held(name, read_npz)
+
+    def table(self, name: str) -> pd.DataFrame:
+        """The table of one of its parquet files; InputError likewise."""
+        return self._held(name, read_table)
+
+    def _held(self, name: str, reader: Callable[[Path, bool], Any]) -> Any:
+        try:
+            return reader(self.folder / name, self.trust)
+        except InputError:
+            raise
+        except Exception as error:  # damaged bytes make readers raise nearly anything
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise damaged(self.folder / name, f"is damaged ({reason})") from None
 
     @property
     def missions(self) -> bool:

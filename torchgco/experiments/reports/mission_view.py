@@ -68,12 +68,12 @@ class _Log:
 
     @classmethod
     def read(cls, study: Study) -> _Log:
-        table = pd.read_parquet(study.folder / MISSION)
+        table = study.table(MISSION)
         steps = dict(iter(table.groupby(["solver", "mission"], sort=False)))
         if not (study.folder / PLANS).is_file():
             return cls(steps, study.rows, {}, {})  # type: ignore[arg-type]
-        with np.load(study.folder / PLANS, allow_pickle=False) as held:
-            names, numbers, plans = held["solver"].tolist(), held["layout"].tolist(), held["plan"]
+        held = study.arrays(PLANS)
+        names, numbers, plans = held["solver"].tolist(), held["layout"].tolist(), held["plan"]
         kept = {(name, i): plans[s, b] for s, name in enumerate(names) for b, i in enumerate(numbers)}
         if study.manifest.configuration["mission"].get("sensor", "full") == "full":
             return cls(steps, study.rows, kept, {})  # type: ignore[arg-type]

@@ -156,7 +156,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     parser.add_argument("--format", choices=FORMATS, default="table", help="of the tables on stdout; default: table")
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
-    parser.add_argument(TRUST[0], action="store_true", help=f"with --verify: {TRUST[1]}")
+    parser.add_argument(TRUST[0], action="store_true", help=TRUST[1])
     return parser
 
 
@@ -174,7 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _report(options: argparse.Namespace) -> int:
     output = options.output or options.folders[0] / "report"
-    merged = merge(options.folders)
+    merged = merge(options.folders, options.trust)
     if output.exists() and not output.is_dir():
         raise InputError("--output", "a folder", f"{output}, which is a file")
     is_study = (output / TRIALS).exists() and not is_merged(output / TRIALS)

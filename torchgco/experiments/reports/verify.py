@@ -12,6 +12,7 @@ import os
 import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from torchgco.experiments.flying.mission_flight import LOST
 from torchgco.experiments.results.files import checksum, damaged
 from torchgco.experiments.results.identity import Manifest, closed_loop, layout_digests
 from torchgco.experiments.results.kinds import joined, parts_of
+from torchgco.experiments.results.limits import check_stages, read_layouts, read_npz, read_table
 from torchgco.experiments.results.records import (
     DONE,
     LAYOUTS,
@@ -121,18 +123,20 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     """Confirm the table of one finished study. Raises InputError as `verify` does."""
     manifest = read_manifest(folder / MANIFEST, whole=True)
     missions = manifest.configuration.get("mission") is not None
-    layouts = _read(folder / LAYOUTS, Layouts.load)
-    held = _read(folder / TRIALS, pd.read_parquet)
+    layouts = _read(folder / LAYOUTS, partial(read_layouts, trust=trust))
+    held = _read(folder / TRIALS, partial(read_table, trust=trust))
     rows = pd.MultiIndex.from_product([list(manifest.solvers), list(manifest.layouts)], names=ROW)
     if not set(ROW) <= set(held.columns) or not held.set_index(ROW).index.sort_values().equals(rows.sort_values()):
         raise damaged(folder / TRIALS, "doesn't have one row per solver and layout")
     held = held.set_index(ROW)
     vehicle = vehicle_of(manifest.configuration, trust)
+    if not trust:
+        check_stages(folder, vehicle, layouts, BATCH)
     try:
-        judged = _missions if missions else _trajectories
+        judged = partial(_missions if missions else _trajectories, trust)
         computed = judged(folder, vehicle, manifest, layouts, held).reindex(held.index)
     except (InputError, KeyError, IndexError, TypeError, AttributeError) as error:
-        if isinstance(error, InputError) and error.field == "hydra.run.dir":
+        if isinstance(error, InputError) and error.field in ("hydra.run.dir", "RUN"):
             raise
         raise damaged(folder, f"can't be simulated again ({error})") from None
     computed = computed.join(_identity(manifest, vehicle, layouts, held.index))
@@ -169,18 +173,16 @@ def _read(path: Path, reader: Any) -> Any:
     if not path.is_file():
         raise damaged(path, "is missing")
     try:
+        found = reader(path)  # first, as it refuses sizes
         if path.suffix == ".npz":
             with zipfile.ZipFile(path) as members:
                 if members.testzip() is not None:  # np.load alone doesn't check every member's checksum
                     raise ValueError("a checksum differs")
-        return reader(path)
+        return found
     except Exception as error:  # damaged bytes make readers raise nearly anything
+        if isinstance(error, InputError) and "--trust" in error.expected:
+            raise
         raise damaged(path, f"is damaged ({(str(error).splitlines() or [type(error).__name__])[0]})") from None
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as held:
-        return dict(held)
 
 
 def _check_checksums(folder: Path) -> None:
@@ -200,10 +202,10 @@ def _identity(manifest: Manifest, vehicle: Vehicle, layouts: Layouts, index: pd.
 
 
 def _trajectories(
-    folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame
+    trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame
 ) -> pd.DataFrame:
     """The judged columns of single trajectories, by (solver, layout)."""
-    arrays = _read(folder / SOLUTIONS, _arrays)
+    arrays = _read(folder / SOLUTIONS, partial(read_npz, trust=trust))
     names, place = arrays["solver"].tolist(), {number: i for i, number in enumerate(arrays["layout"].tolist())}
     parts = []
     for name in manifest.solvers:
@@ -219,13 +221,15 @@ def _trajectories(
     return rows.set_index(ROW)[[*frame_columns(verdict), "success", "best_cost", "best_from"]]
 
 
-def _missions(folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame) -> pd.DataFrame:
+def _missions(
+    trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, held: pd.DataFrame
+) -> pd.DataFrame:
     """The columns of missions that the log decides, by (solver, layout).
 
     The log has the plant's state at the start of every control step, and a flight is judged at all time steps: the
     outcome itself, and what belongs to the end of a flight, can't be confirmed.
     """
-    log = _read(folder / MISSION, pd.read_parquet)
+    log = _read(folder / MISSION, partial(read_table, trust=trust))
     log["shifted"] = log["source"] == "shifted"
     problem = vehicle.task(layouts).problem
     contact, period = Contact.among(problem), float(problem.dynamics.dt)

@@ -48,8 +48,8 @@ def study_page(folder: Path, searched: Sequence[int] = (), trust: bool = False) 
 
 def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
     """Single trajectories, rolled out from the controls that the study kept."""
-    with np.load(study.folder / SOLUTIONS, allow_pickle=False) as held:
-        names, numbers, controls = held["solver"].tolist(), held["layout"].tolist(), held["U"]
+    held = study.arrays(SOLUTIONS)
+    names, numbers, controls = held["solver"].tolist(), held["layout"].tolist(), held["U"]
     if numbers != study.layouts.ids.tolist():
         raise damaged(study.folder / SOLUTIONS, "has other layouts")
     document, rows = None, study.rows

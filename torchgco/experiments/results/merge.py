@@ -31,7 +31,7 @@ OWN = [RUN, VARIANT]
 TEXT = (*TASK, "solver", "status", "device", "dtype", "version", "best_from", *DIGESTS)
 
 
-def merge(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
+def merge(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> pd.DataFrame:
     """All trials found in and below `folders`, as one table with the columns of a study, those of TEXT as categories.
 
     - Keys of scenario and vehicle in which runs of one (scenario, model) differ become columns, named as on the
@@ -45,10 +45,11 @@ def merge(folders: Iterable[str | os.PathLike[str]]) -> pd.DataFrame:
     The table's `attrs` hold `merged_from`, the folders read, `repeated`, how many rows were left out, and `unfinished`.
 
     Raises:
-        InputError: a missing folder, folders without trials, a damaged file, and rows with different content for one
+        InputError: a missing folder, folders without trials, a damaged file, without `trust` one that takes more memory
+            than a run's file may, and rows with different content for one
             flight.
     """
-    found = find_runs(folders)
+    found = find_runs(folders, trust)
     unfinished = [run for run in found if run.planned is not None]
     runs = [run for run in found if len(run.trials)]
     if not runs:

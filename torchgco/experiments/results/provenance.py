@@ -95,7 +95,7 @@ def _held(path: Path) -> list[dict[str, Any]]:
     """The entries of earlier starts; none where they can't be read."""
     try:
         held = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return []
     return held if isinstance(held, list) else []
 

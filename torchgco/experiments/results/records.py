@@ -25,6 +25,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.files import PART
 from torchgco.experiments.results.files import checksum, create, damaged, write
 from torchgco.experiments.results.identity import Manifest, difference
+from torchgco.experiments.results.limits import read_npz
 from torchgco.scenarios import Layouts
 
 COLUMNS = (
@@ -245,7 +246,7 @@ def read_manifest(path: Path, whole: bool = False) -> Manifest:
         if whole:
             manifest.check_whole()
         return manifest
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise damaged(path, f"is damaged ({_first_line(error)})") from None
 
 
@@ -256,18 +257,18 @@ def read_checksums(path: Path) -> dict[str, list[str]]:
         if not all(isinstance(held, list) for held in sums.values()):
             raise ValueError("no checksums")
         return sums
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise damaged(path, f"is damaged ({_first_line(error)})") from None
 
 
 def read_shard(path: Path) -> Flown:
     """The rows and controls in a shard; InputError where it can't be read."""
     try:
+        held = read_npz(path)  # first, as it refuses sizes
         with zipfile.ZipFile(path) as members:
             if members.testzip() is not None:  # np.load alone doesn't check every member's checksum
                 raise ValueError("a checksum differs")
-        with np.load(path, allow_pickle=False) as held:
-            rows, U = pd.DataFrame(json.loads(str(held["rows"]))), held["U"]
+        rows, U = pd.DataFrame(json.loads(str(held["rows"]))), held["U"]
         absent = {*COLUMNS, "sound"} - {*JUDGED, *rows.columns}
         if absent or U.ndim != 3 or len(U) != len(rows):
             raise ValueError(f"{len(rows)} rows, controls {U.shape}, no {', '.join(sorted(absent)) or 'more'}")

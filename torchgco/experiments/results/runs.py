@@ -13,6 +13,7 @@ import pandas as pd
 from torchgco.base.errors import InputError
 from torchgco.experiments.results.files import checksum, damaged
 from torchgco.experiments.results.identity import Manifest
+from torchgco.experiments.results.limits import read_layouts, read_table
 from torchgco.experiments.results.records import (
     COLUMNS,
     DONE,
@@ -49,34 +50,36 @@ class Run:
     planned: int | None = None
 
 
-def find_runs(folders: Iterable[str | os.PathLike[str]]) -> list[Run]:
+def find_runs(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> list[Run]:
     """The runs in and below `folders`, each once, in the order of the folders and by name below each.
 
     Tables that a merge wrote are passed over below a folder, and read where the folder itself is given. The trials of
     an unfinished study come from its shards; their success is provisional.
 
     Raises:
-        InputError: a missing folder, folders without trials, a damaged file, a table that is no study's.
+        InputError: a missing folder, folders without trials, a damaged file, a table that is no study's, without
+            `trust` one that takes more memory than a run's file may.
     """
     given = [Path(folder) for folder in folders]
     found = {folder.resolve(): (folder, folder in given) for folder in _below(given)}
-    runs = [run for folder, is_given in found.values() if (run := _run(folder, is_given)) is not None]
+    runs = [run for folder, is_given in found.values() if (run := _run(folder, is_given, trust)) is not None]
     if not runs:
         raise InputError("folders", f"a {TRIALS} in or below them", ", ".join(map(str, given)) or "no folder")
     return runs
 
 
-def read_trials(path: str | os.PathLike[str]) -> pd.DataFrame:
+def read_trials(path: str | os.PathLike[str], trust: bool = False) -> pd.DataFrame:
     """The table in a `trials.parquet`.
 
     Raises:
-        InputError: it can't be read, doesn't name its trials, or isn't as the study left it.
+        InputError: it can't be read, doesn't name its trials, isn't as the study left it, or without `trust` takes more
+            memory than a run's file may.
     """
     mark = Path(path).parent / DONE
     sums = read_checksums(mark).get(TRIALS, []) if mark.is_file() else []
     if sums and Path(path).is_file() and checksum(Path(path)) not in sums:
         raise damaged(Path(path), "isn't as the study wrote it")
-    trials = _read(path)
+    trials = _read(path, trust)
     missing = [name for name in NEEDED if name not in trials.columns]
     if missing:
         raise InputError("trials", f"columns {', '.join(NEEDED)}", f"{path} without {', '.join(missing)}")
@@ -85,13 +88,14 @@ def read_trials(path: str | os.PathLike[str]) -> pd.DataFrame:
 
 def is_merged(path: Path) -> bool:
     """Whether a table comes out of a merge rather than out of a study. Raises InputError if it can't be read."""
-    return MERGED in _read(path, columns=[]).attrs
+    return MERGED in _read(path, trust=True, columns=[]).attrs
 
 
-def _read(path: str | os.PathLike[str], **options: Any) -> pd.DataFrame:
+def _read(path: str | os.PathLike[str], trust: bool, **options: Any) -> pd.DataFrame:
     try:
-        # Most tables are small: threads cost more than they save.
-        return pd.read_parquet(path, use_threads=False, **options)
+        return read_table(Path(path), trust, **options)
+    except InputError:
+        raise
     except Exception as error:  # damaged bytes make the reader raise nearly anything
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError("trials", "a readable parquet file", f"{path} ({reason})") from None
@@ -104,10 +108,10 @@ def _below(folders: list[Path]) -> Iterator[Path]:
         yield from sorted({path.parent for name in (TRIALS, MANIFEST) for path in folder.rglob(name)})
 
 
-def _run(folder: Path, given: bool) -> Run | None:
+def _run(folder: Path, given: bool, trust: bool) -> Run | None:
     """The run in a folder; None for a table that a merge wrote, unless the folder itself was given."""
     if (folder / TRIALS).is_file():
-        trials = read_trials(folder / TRIALS)
+        trials = read_trials(folder / TRIALS, trust)
         check_trials(trials, folder / TRIALS)
         if MERGED in trials.attrs and not given:
             return None
@@ -131,4 +135,4 @@ def _run(folder: Path, given: bool) -> Run | None:
 def _layouts(manifest: Manifest) -> Layouts | None:
     """The layouts of a study's file, for their best costs; None where they were drawn, or the file has moved."""
     path = manifest.configuration["scenario"].get("path")
-    return Layouts.load(path) if path and Path(path).is_file() else None
+    return read_layouts(Path(path)) if path and Path(path).is_file() else None

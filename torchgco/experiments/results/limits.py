@@ -1,0 +1,97 @@
+"""Reads files of a run, which comes from anybody: a small file can promise any size.
+
+What a file takes when it is read is known before it is read, from its own headers; `trust` admits any size.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import pandas as pd
+import pyarrow.compute
+import pyarrow.parquet
+
+from torchgco.base.errors import InputError
+from torchgco.base.files import npz_size
+from torchgco.scenarios import Layouts, Vehicle
+
+LARGEST = 2**30  # bytes of one file when it is read; the files of 10,000 layouts and ten solvers take a third
+NUMBER = 8  # bytes of a number in a table
+MORE = "that a run's file may take (--trust admits more)"
+
+
+def read_npz(path: Path, trust: bool = False) -> dict[str, np.ndarray]:
+    """The arrays in a run's npz file.
+
+    Raises:
+        InputError: they take more than they may.
+        Exception: nearly any, where the file is damaged.
+    """
+    with open(path, "rb") as file:
+        if not trust and (size := npz_size(file)) > LARGEST:
+            refuse(path, f"arrays of {size / 1e9:.3g} GB")
+        with np.load(file, allow_pickle=False) as held:
+            return {name: held[name] for name in held.files}
+
+
+def read_layouts(path: Path, trust: bool = False) -> Layouts:
+    """The layouts of a run. Raises InputError as `Layouts.load`, or where they take more than they may."""
+    return Layouts.load(path) if trust else Layouts.load(path, room=LARGEST, limit=MORE)
+
+
+def read_table(path: Path, trust: bool = False, **options: Any) -> pd.DataFrame:
+    """The table in a run's parquet file.
+
+    Raises:
+        InputError: it takes more than it may.
+        Exception: nearly any, where the file is damaged.
+    """
+    if not trust and (size := _size(path)) > LARGEST:
+        refuse(path, f"a table of {size / 1e9:.3g} GB")
+    # Most tables are small: threads cost more than they save.
+    return pd.read_parquet(path, use_threads=False, **options)
+
+
+def check_stages(folder: Path, vehicle: Vehicle, layouts: Layouts, most: int) -> None:
+    """Check that `most` trajectories of a run, which are simulated at once, take no more than they may.
+
+    Raises:
+        InputError: they do.
+    """
+    count, stages = min(most, layouts.count), vehicle.stages if layouts.stages is None else layouts.stages
+    size = count * stages * (vehicle.dynamics.n + vehicle.dynamics.m) * NUMBER
+    if size > LARGEST:
+        refuse(folder, f"{count} trajectories of {stages} stages, {size / 1e9:.3g} GB")
+
+
+def refuse(path: Path, got: str) -> NoReturn:
+    raise InputError("RUN", f"at most the {LARGEST / 1e9:.3g} GB {MORE}", f"{path} with {got}")
+
+
+def _size(path: Path) -> int:
+    """Bytes of a parquet file's table, from its headers; of texts that repeat also from their dictionaries."""
+    with pyarrow.parquet.ParquetFile(path) as file:
+        about = file.metadata
+        groups = [about.row_group(i) for i in range(about.num_row_groups)]
+        size = max(about.num_rows * about.num_columns * NUMBER, sum(group.total_byte_size for group in groups))
+        if size > LARGEST:
+            return size
+        texts = [i for i in range(about.num_columns) if about.schema.column(i).physical_type == "BYTE_ARRAY"]
+        for i in texts:
+            # At worst one text is the whole column, and every row repeats it.
+            chunks = [group.column(i) for group in groups]
+            if sum(chunk.total_uncompressed_size * chunk.num_values for chunk in chunks) > LARGEST:
+                size += _longest(path, about.schema.column(i).path) * about.num_rows
+    return size
+
+
+def _longest(path: Path, column: str) -> int:
+    """Bytes of the longest text in a column; repeated ones are held once."""
+    table = pyarrow.parquet.read_table(path, columns=[column], read_dictionary=[column], use_threads=False)
+    found = 0
+    for chunk in table.column(0).chunks:
+        held = chunk.dictionary if isinstance(chunk, pyarrow.DictionaryArray) else chunk
+        found = max(found, pyarrow.compute.max(pyarrow.compute.binary_length(held)).as_py() or 0)
+    return found
