@@ -151,8 +151,8 @@ class Traced:
         for operation in self._symbolic:
             try:
                 operation.replay(OPERATIONS[name_of(operation.function)], known)
-            except Exception as error:  # any error of CasADi or NumPy with these arguments
-                raise _unknown(self.field, operation) from error
+            except Exception:  # any error of CasADi or NumPy with these arguments
+                raise _unknown(self.field, operation) from None
         return boxed(known[self._result])
 
     def _computed(self, index: Tensor) -> dict[Slot, Any]:
