@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import torchgco
 from tests.problems import planar_batch
 from torchgco import (
     MPPI,
@@ -104,3 +105,75 @@ def test_the_knot_at_which_states_are_lost() -> None:
     found, finite = solution.worst_rows(problem), torch.isfinite(solution.X).all(-1)
     assert found.lost_at[0] == -1 and found.lost_at[1] == int(finite[1].long().sum()) and found.lost_at[1] in (4, 5, 6)
     assert found.violation[1] == torch.inf and found.name[1] == "StateBounds" and found.knot[1] == found.lost_at[1]
+
+
+def solved(B: int = 3) -> Solution:
+    problem, U0 = planar_batch(B=B, N=8)
+    return AugmentedLagrangian(max_outer_iterations=2).solve(problem, U0)
+
+
+def test_a_solution_is_indexed_and_looped_over_as_a_batch() -> None:
+    solution = solved()
+    assert len(solution) == 3 and bool(solution.take([])) and len(solution[[]]) == 0
+    mask = torch.tensor([True, False, True])
+    for index, places in ((0, [0]), (-1, [2]), ([2, 0], [2, 0]), (slice(1, None), [1, 2]), (mask, [0, 2]), ((1,), [1])):
+        part = solution[index]
+        assert torch.equal(part.X, solution.X[places]) and torch.equal(
+            part.multipliers.mu, solution.multipliers.mu[places]
+        )
+        assert torch.equal(solution.take(index if not isinstance(index, int) else [index]).U, part.U)
+    assert [one.cost.item() for one in solution] == solution.cost.tolist()
+    assert all(one.explain(0).startswith("Problem 0 of 1") for one in solution)
+    for wrong in (3, [-4], "first", [0.5], True, None, torch.tensor([[0]]), torch.tensor([True])):
+        with pytest.raises(InputError, match="index: expected places of problems, 0 to 2"):
+            solution[wrong]
+
+
+def test_a_solution_as_arrays_and_on_another_device() -> None:
+    solution = solved()
+    held = solution.to_dict()
+    assert held["status"] == [status.name for status in solution.statuses]
+    assert np.array_equal(held["X"], solution.X.numpy()) and np.array_equal(held["t"], solution.t.numpy())
+    assert solution.to("cpu") is solution
+    moved = solution.to("meta")
+    tensors = [getattr(moved, f.name) for f in fields(Solution) if isinstance(getattr(moved, f.name), torch.Tensor)]
+    assert {part.device.type for part in (*tensors, *moved.multipliers.lam, moved.multipliers.mu, moved.t)} == {"meta"}
+    with pytest.raises(InputError, match="device"):
+        solution.to("nowhere")
+
+
+def test_torch_saves_and_loads_a_solution_without_running_code(tmp_path) -> None:
+    solution = solved()
+    torch.save(solution, tmp_path / "solution.pt")
+    loaded = torch.load(tmp_path / "solution.pt")  # of weights alone, as by default
+    assert torch.equal(loaded.X, solution.X) and torch.equal(loaded.t, solution.t)
+    assert loaded.explain(0).splitlines()[0] == solution.explain(0).splitlines()[0]
+
+
+def test_transforms_of_pytorch_are_refused_by_name() -> None:
+    problem, U0 = planar_batch(B=2, N=8)
+    twice = torch.stack((U0, U0))
+    with pytest.raises(InputError, match=r"solve: expected a call outside of torch\.func\.vmap"):
+        torch.func.vmap(lambda U: torchgco.solve(problem, U, solver="hold").cost)(twice)
+    with pytest.raises(InputError, match=r"Problem: expected a call outside of torch\.func\.vmap"):
+        torch.func.vmap(lambda x: Problem(problem.dynamics, problem.cost, [], x, 8).x0)(problem.x0[None])
+    compiled = torch.compile(lambda U: torchgco.solve(problem, U, solver="hold").cost)
+    with pytest.raises(InputError, match=r"solve: expected a call outside of torch\.compile") as refused:
+        compiled(U0)
+    assert len(str(refused.value).splitlines()) == 1
+    assert torchgco.solve(problem, U0, solver="hold").cost.shape == (2,), "and outside all is as before"
+
+
+def test_the_cause_of_an_error_begins_in_the_users_code() -> None:
+    def model(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return x @ torch.zeros(3, 3, dtype=x.dtype)
+
+    problem, _ = planar_batch(B=2, N=8)
+    with pytest.raises(InputError, match=r"dynamics\.step") as refused:
+        Problem(FunctionDynamics(model, 6, 2, 0.1), problem.cost, [], problem.x0, 8)
+    cause = refused.value.__cause__
+    assert cause is not None and cause.__traceback__ is not None
+    assert cause.__traceback__.tb_frame.f_code.co_name == "model"
+    with pytest.raises(InputError, match="horizon") as refused:
+        Problem(problem.dynamics, problem.cost, [], problem.x0, 8, horizon="long")
+    assert refused.value.__cause__ is None and refused.value.__suppress_context__

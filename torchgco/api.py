@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgco.base.errors import ContactWarning, HorizonWarning, InputError, ScaleWarning, shown
 from torchgco.base.options import check_value
-from torchgco.base.shapes import check_shape, computing_on
+from torchgco.base.shapes import check_shape, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.constraints import ControlBounds
 from torchgco.judging.judge import CLEARANCES, by_kind
@@ -73,6 +73,7 @@ def solve(
         InputError: U0, ids, warm or X0 don't fit the problem, no preset has this name, the solver can't begin with
             states X0, or an argument is of another kind or out of its range.
     """
+    check_untransformed("solve")
     check_problem(problem)
     if warm is not None and not isinstance(warm, Solution):
         raise InputError("warm", "a Solution, or None", type(warm).__name__)

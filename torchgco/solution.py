@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
@@ -13,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, shown
 from torchgco.base.files import read_arrays, write_whole
-from torchgco.base.shapes import check_device, check_shape
+from torchgco.base.shapes import MISTAKES, check_device, check_shape
 from torchgco.base.status import Status
 from torchgco.base.tree import take
 from torchgco.explaining.account import Account
@@ -37,7 +38,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Solution:
-    """Trajectories, feedback gains, multipliers and how each problem ended. Saved and loaded as npz."""
+    """Trajectories, feedback gains, multipliers and how each problem ended.
+
+    It has the length B, and gives batches of one for `solution[b]` and in loops. Saved as npz by `save`, loaded by
+    `Solution.load`; torch.save and torch.load serve where nothing is recorded.
+    """
 
     X: Tensor  # (B, N+1, n)
     U: Tensor  # (B, N, m)
@@ -95,9 +100,55 @@ class Solution:
         """The statuses by name; `.sentence` explains one."""
         return [Status(s) for s in self.status.tolist()]
 
-    def take(self, index: Tensor) -> Solution:
-        """The problems in `index` (records are left behind)."""
-        return take(replace(self, trace=None, search=None), index)
+    def take(self, index: Any) -> Solution:
+        """The problems at some places, a tensor, list or slice; or at those that a mask (B,) marks. No records.
+
+        Raises:
+            InputError: places that aren't there, or no whole numbers.
+        """
+        rows = index if isinstance(index, slice) else _places(index, len(self), self.cost.device)
+        return take(replace(self, trace=None, search=None), rows)
+
+    def __getitem__(self, index: Any) -> Solution:
+        """As `take`; a single place gives a batch of one."""
+        return self.take([index] if isinstance(index, int) and not isinstance(index, bool) else index)
+
+    def __len__(self) -> int:
+        return self.U.shape[0]
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __iter__(self) -> Iterator[Solution]:
+        return (self.take(slice(b, b + 1)) for b in range(len(self)))
+
+    def to(self, device: str | torch.device) -> Solution:
+        """The same on another device, without the problem, which stays where it is, and without records.
+
+        Raises:
+            InputError: a device that isn't there.
+        """
+        where = check_device(device)
+        if where == self.U.device:
+            return self
+        account = self.account
+        if account is not None:
+            with suppress(InputError):  # dynamics without a time step
+                account = Account(name=account.name, t=account.times().to(where))
+        moved = {f.name: getattr(self, f.name).to(where) for f in fields(self) if f.name in _TENSORS}
+        multipliers = Multipliers(tuple(lam.to(where) for lam in self.multipliers.lam), self.multipliers.mu.to(where))
+        horizon = None if self.horizon is None else self.horizon.to(where)
+        return Solution(multipliers=multipliers, horizon=horizon, account=account, **moved)
+
+    def to_dict(self) -> dict[str, Any]:
+        """X, U and the numbers of each problem as NumPy arrays, by name; `status` as names, t where it is known."""
+        held: dict[str, Any] = {name: getattr(self, name).cpu().numpy() for name in _TENSORS}
+        held["status"] = [status.name for status in self.statuses]
+        if self.horizon is not None:
+            held["horizon"] = self.horizon.cpu().numpy()
+        with suppress(InputError):
+            held["t"] = self.t.cpu().numpy()
+        return held
 
     def of_first_states(self, n: int, horizon: Tensor | None = None) -> Solution:
         """The same with the first n states alone, of which K is then the feedback, and with these horizons."""
@@ -198,5 +249,22 @@ class Solution:
         return cls(multipliers=Multipliers(lam, tensors["mu"]), horizon=tensors.get("horizon"), account=account, **own)
 
 
+def _places(index: Any, B: int, device: torch.device) -> Tensor:
+    """Places as int64 (b,)."""
+    try:
+        rows = torch.as_tensor(index, device=device)
+    except MISTAKES:
+        raise InputError("index", f"places of problems, 0 to {B - 1}", shown(index)) from None
+    if rows.dtype == torch.bool and rows.shape == (B,):
+        return rows.nonzero().flatten()
+    rows = rows.long() if rows.numel() == 0 else rows
+    whole = not (rows.is_floating_point() or rows.is_complex()) and rows.dtype != torch.bool and rows.dim() == 1
+    if not whole or not bool(((rows >= -B) & (rows < B)).all()):
+        raise InputError("index", f"places of problems, 0 to {B - 1}", shown(index))
+    return torch.where(rows < 0, rows + B, rows).long()
+
+
 _OTHERS = ("multipliers", "trace", "search", "horizon", "account")
 _TENSORS = tuple(f.name for f in fields(Solution) if f.name not in _OTHERS)
+# What torch.load may make of a file of torch.save; they hold tensors, and run nothing.
+torch.serialization.add_safe_globals([Solution, Multipliers, Account, SearchRecord, Comparison, Standing])

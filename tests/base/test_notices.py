@@ -31,9 +31,10 @@ def shown(monkeypatch) -> io.StringIO:
     return terminal
 
 
-def test_nothing_is_shown_where_nobody_watches(capsys) -> None:
+def test_a_log_gets_the_line_and_no_bar(capsys) -> None:
+    """Whoever waits for a script in the background sees there why."""
     notices.notice("working")
-    assert capsys.readouterr().err == ""
+    assert capsys.readouterr().err == "torchgco: working\n" and not notices.watched()
 
 
 def test_a_terminal_shows_the_line_in_place_of_a_bar(shown) -> None:

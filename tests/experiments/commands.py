@@ -1,6 +1,7 @@
 """Commands that tests run."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -40,8 +41,8 @@ def begin(*words: str, cwd: Path) -> subprocess.Popen[str]:
 
 
 def problem_line(err: str) -> str:
-    """The line of an error: the only line of `err` but for the progress bars."""
-    bars = ("trial/s", "s/trial", "figure/s", "s/figure")
-    lines = [line for line in err.splitlines() if line.strip() and not any(bar in line for bar in bars)]
+    """The line of an error: the only line of `err` but for those on the progress."""
+    progress = re.compile(r": \d+/\d+ trials, |^drawing \d+ figures?|^torchgco: compiling ")
+    lines = [line for line in err.splitlines() if line.strip() and not progress.search(line)]
     assert len(lines) == 1, err
     return lines[0]

@@ -17,7 +17,7 @@ import torchgco
 from tests.experiments.commands import ENVIRONMENT, ROOT, TINY, command, problem_line
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.config.groups import options_of
-from torchgco.experiments.flying import study
+from torchgco.experiments.flying import progress, study
 from torchgco.experiments.results.identity import decisive, plain
 from torchgco.experiments.results.records import COLUMNS
 from torchgco.native import kernels
@@ -70,6 +70,7 @@ def test_a_study_writes_all_its_files(run, tmp_path) -> None:
 @pytest.mark.usefixtures("without_report")
 def test_the_bar_counts_the_solved_problems(workers: int, run, monkeypatch) -> None:
     monkeypatch.setattr(study, "tqdm", partial(tqdm, mininterval=0))
+    monkeypatch.setattr(progress, "watched", lambda: True)
     words = ["solver=al_ilqr", "study.baselines=[]", *TINY[:4], f"study.workers={workers}", "hydra.run.dir=out"]
     code, _, err = run(*words)
     assert code == 0 and ("solved 2/2" if workers == 1 else "solved 3/3") in err
@@ -80,6 +81,7 @@ def test_figures_may_be_left_out(run, tmp_path) -> None:
     words = ["solver=hold", "study.baselines=[]", *TINY[:4], "study.workers=1", "hydra.run.dir=out"]
     code, out, err = run(*words, "study.figures=false")
     assert code == 0 and "reached" in out and "drawing" not in err
+    assert "hold: 3/3 trials" in err and "\r" not in err, "a log has a line in place of a bar"
     assert (tmp_path / "out" / "summary.csv").exists() and not (tmp_path / "out" / "figures").exists()
     code, _, err = run(*words)
     assert code == 0 and "drawing 4 figures" in err and (tmp_path / "out" / "figures" / "rates.png").exists()

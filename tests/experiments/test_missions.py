@@ -14,7 +14,7 @@ from tqdm import tqdm
 from tests.experiments.commands import problem_line
 from tests.trials import missions
 from tests.trials import trials as hand_made
-from torchgco.experiments.flying import study
+from torchgco.experiments.flying import progress, study
 from torchgco.experiments.reports import report
 from torchgco.experiments.reports.verify import verify
 from torchgco.experiments.statistics.mission_tables import mission_lines
@@ -34,6 +34,7 @@ def trials(folder: Path) -> pd.DataFrame:
 
 def test_one_mission_writes_log_figures_and_animation(run, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(study, "tqdm", partial(tqdm, mininterval=0))
+    monkeypatch.setattr(progress, "watched", lambda: True)
     code, out, err = run("experiment=mission", *SHORT)
     assert code == 0 and "forest 0, gco: TIMEOUT after 0.20 s" in out
     assert "t = 0.1 of 0.2 s" in err and "step=" not in err and " 50%|" in err

@@ -39,8 +39,9 @@ def test_rates_are_written_with_counts_and_interval() -> None:
 def test_columns_are_aligned() -> None:
     text = table(*flights("gco", HITS), *flights("a_long_name", [False] * 32, cost=1e7))
     blocks = [block.splitlines() for block in text.split("\n\n")]
-    assert [len(block) for block in blocks] == [1, 3, 3, 3, 4]
-    for block in blocks:
+    assert [len(block) for block in blocks] == [1, 3, 3, 3, 4, 2]
+    assert "95 % Wilson" in blocks[-1][0] and "90 % quantile" in blocks[-1][1]
+    for block in blocks[:-1]:
         assert len({len(line) for line in block}) == 1
 
 
@@ -208,7 +209,8 @@ def test_missions_have_tables_of_their_own_next_to_trajectories() -> None:
     above, below = text.split("missions in forest (quadrotor), seed 0")
     assert "30/32 94 %" in above and "viol. ok" in above and "FEASIBLE" not in above
     assert "viol. ok" not in below and "cost" not in below and "success" not in below
-    outcomes, effort, pairs = below.strip().split("\n\n")
+    outcomes, effort, pairs, legend = below.strip().split("\n\n")
+    assert "95 % Wilson" in legend
     assert outcomes.splitlines()[0].split() == ["solver", "n", "REACHED", "COLLISION", "TIMEOUT", "DIVERGED"]
     assert " ".join(outcomes.splitlines()[1].split()).startswith(
         "gco 4 3/4 75 % [30, 95] 1/4 25 % [5, 70] 0/4 0 % [0, 49]"
@@ -275,5 +277,6 @@ def test_pairs_without_a_trial_are_not_printed_and_whole_numbers_have_no_point()
     pairs.insert(2, "scenario.num_obstacles", 10.0)
     summary.insert(2, "scenario.num_obstacles", 10.0)
     text = format_table(summary, pairs)
-    assert "reached" in text.split("\n\n")[-1] and "success" not in text.split("\n\n")[-1]
-    assert "10.0" not in text and text.split("\n\n")[-1].splitlines()[1].startswith("10 ")
+    paired = text.split("\n\n")[-2]
+    assert "reached" in paired and "success" not in paired
+    assert "10.0" not in text and paired.splitlines()[1].startswith("10 ")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 MAX_LETTERS = 300  # letters of a value in an error
 
 
@@ -22,6 +25,20 @@ def shown(value: object) -> str:
     """A value as an error shows it: its repr where that fits on a line, else its type."""
     text = repr(value)
     return text if len(text) <= 80 and "\n" not in text else type(value).__name__
+
+
+def theirs(error: BaseException) -> BaseException | None:
+    """An error with the part of its traceback that begins in a user's code, as the cause of an InputError.
+
+    None where no user's code raised it: how it came to pass within torchgco tells a user nothing.
+    """
+    import torch
+
+    ours = tuple(str(Path(file).parent) + os.sep for file in (Path(__file__).parent, torch.__file__))
+    part = error.__traceback__
+    while part is not None and part.tb_frame.f_code.co_filename.startswith(ours):
+        part = part.tb_next
+    return None if part is None else error.with_traceback(part)
 
 
 class GuidanceWarning(UserWarning):

@@ -1,7 +1,7 @@
-"""Lines on what takes some seconds, for people who watch.
+"""Lines on what takes some seconds.
 
-A program that has configured logging gets them from the logger `torchgco`, at INFO. Otherwise they go to stderr where
-somebody watches: in a terminal and in interactive Python, notebooks included, but not from worker processes.
+A program that has configured logging gets them from the logger `torchgco`, at INFO. Otherwise they go to stderr, be it
+a terminal, a notebook or a log, but not from worker processes. Bars are for people who watch.
 """
 
 from __future__ import annotations
@@ -27,14 +27,17 @@ def notice(text: str) -> None:
     if LOG.isEnabledFor(logging.INFO):
         LOG.info(text)
         return
-    if watched():
+    if _may_speak() and sys.stderr is not None:
         print(f"{CLEAR if _in_terminal() else ''}torchgco: {text}", file=sys.stderr, flush=True)
 
 
 def watched() -> bool:
     """Whether somebody watches stderr: in a terminal and in interactive Python, but not from worker processes."""
-    speaks = multiprocessing.parent_process() is None if _speaks is None else _speaks
-    return speaks and (_in_terminal() or hasattr(sys, "ps1"))
+    return _may_speak() and (_in_terminal() or hasattr(sys, "ps1"))
+
+
+def _may_speak() -> bool:
+    return multiprocessing.parent_process() is None if _speaks is None else _speaks
 
 
 def _in_terminal() -> bool:

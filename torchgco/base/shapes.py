@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch._C._dynamo.eval_frame import get_eval_frame_callback  # type: ignore[import]
+from torch._C._functorch import peek_interpreter_stack  # type: ignore[import]
 
 from torchgco.base.errors import InputError, shown
 
@@ -50,6 +52,7 @@ def as_states(x0: Any) -> Tensor:
 
     Raises InputError (`x0`) where it isn't numeric.
     """
+    check_untransformed("Problem")
     if isinstance(x0, Tensor):
         whole = not x0.is_floating_point() and not x0.is_complex() and x0.dtype != torch.bool
         states = x0.double() if whole else x0
@@ -79,6 +82,17 @@ def check_tensor(value: Any, field: str, like: Tensor | None = None) -> Tensor:
     if like is not None and value.device != like.device:
         raise InputError(field, f"device {like.device} as in x0", value.device)
     return value
+
+
+def check_untransformed(what: str) -> None:
+    """Raise InputError inside torch.compile, and inside transforms of torch.func such as vmap and grad.
+
+    Kernels in C read memory, which tensors there don't have; and a batch is solved at once anyway.
+    """
+    if peek_interpreter_stack() is not None:
+        raise InputError(what, "a call outside of torch.func.vmap and grad: it takes a batch itself", "one inside")
+    if get_eval_frame_callback():
+        raise InputError(what, "a call outside of torch.compile: it makes kernels of its own", "one inside")
 
 
 def check_device(device: Any) -> torch.device:

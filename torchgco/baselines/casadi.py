@@ -74,7 +74,7 @@ class CasADiSolver(Solver):
         try:
             function = casadi.nlpsol("solver", self.plugin, nlp, self._options(problem, program))
         except RuntimeError as error:
-            raise _refused(self.plugin, error) from error
+            raise _refused(self.plugin, error) from None
         return PreparedCasADi(self, problem, program, function)
 
     def run(self, call: Call) -> Solution:
@@ -185,7 +185,7 @@ class PreparedCasADi(Solver):
             stats = self.function.stats()
         except RuntimeError as error:  # crossed bounds, for example; the other problems are still solved
             if "option" in str(error).lower():  # FATROP reads its options only here
-                raise _refused(self.solver.plugin, error) from error
+                raise _refused(self.solver.plugin, error) from None
             return X0[0], U0, (Status.LINE_SEARCH_FAILED, 0)
         v = torch.from_numpy(np.array(found["x"]).reshape(-1)[:-n]).to(U0)
         iterations = int(stats["iter_count"])

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
-from torchgco.base.errors import InputError, shown
+from torchgco.base.errors import InputError, shown, theirs
 from torchgco.base.options import check_options
 from torchgco.base.shapes import MISTAKES, Dimensions, check_shape
 from torchgco.base.tree import PerElement
@@ -167,7 +167,7 @@ class FunctionConstraint(Constraint):
             rows = one.value(*(dims.like.new_zeros(1, *size) for size in ((last + 1, dims.n), (dims.N, dims.m))))
         except MISTAKES as error:
             message = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError(where, f"a function of {' and '.join(self.of)}", message) from error
+            raise InputError(where, f"a function of {' and '.join(self.of)}", message) from theirs(error)
         check_shape(rows, (1, len(range(last + 1)[knots]) if isinstance(knots, slice) else len(knots), "p"), where)
         if rows.dtype != dims.like.dtype:
             raise InputError(where, f"rows of {dims.like.dtype} as x0", rows.dtype)

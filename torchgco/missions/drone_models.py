@@ -112,7 +112,7 @@ def _dynamics() -> Callable[..., tuple[np.ndarray, ...]]:
     try:
         from drone_models.first_principles import dynamics
     except ImportError as error:
-        raise InputError("plant", "drone-models (`pip install torchgco[plants]`)", error) from error
+        raise InputError("plant", "drone-models (`pip install torchgco[plants]`)", error) from None
     finally:
         if before is None:
             del os.environ["SCIPY_ARRAY_API"]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import WithoutReading, gradients_at_once
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, theirs
 from torchgco.base.shapes import MISTAKES, describe
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint
@@ -267,7 +267,7 @@ def _called(field: str, wanted: str, function: Callable[..., Any], *arguments: A
         raise
     except MISTAKES as error:
         message = (str(error).splitlines() or [""])[0] or type(error).__name__
-        raise InputError(field, wanted, message) from error
+        raise InputError(field, wanted, message) from theirs(error)
 
 
 def _ends(x0: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError, shown
+from torchgco.base.errors import InputError, shown, theirs
 from torchgco.base.options import Count, Seconds, check_value
 from torchgco.base.shapes import MISTAKES, Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, cast
@@ -391,7 +391,7 @@ class Problem:
             after = self.dynamics.at(0).step(self.x0, self.x0.new_zeros(self.B, self.m))
         except MISTAKES as error:
             message = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError("dynamics.step", f"a step for states {tuple(self.x0.shape)}", message) from error
+            raise InputError("dynamics.step", f"a step for states {tuple(self.x0.shape)}", message) from theirs(error)
         if not isinstance(after, Tensor) or after.shape != self.x0.shape or after.dtype != self.x0.dtype:
             raise InputError("dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", describe(after))
 
@@ -418,8 +418,8 @@ def checked_horizon(horizon: Any, x0: Tensor, N: int) -> Tensor:
     expected = f"whole numbers ({x0.shape[0]},) from 1 to N = {N}"
     try:
         given = torch.as_tensor(horizon, device=x0.device)
-    except MISTAKES as error:
-        raise InputError("horizon", expected, shown(horizon)) from error
+    except MISTAKES:
+        raise InputError("horizon", expected, shown(horizon)) from None
     if given.dtype == torch.bool or given.is_floating_point() or given.is_complex() or given.shape != x0.shape[:1]:
         raise InputError("horizon", expected, describe(given))
     if not bool(((given >= 1) & (given <= N)).all()):

@@ -15,7 +15,7 @@ from torchgco.base.brief import Brief
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError, StartWarning
 from torchgco.base.options import Seconds, Seed, check_value
-from torchgco.base.shapes import check_shape, check_tensor, computing_on, describe
+from torchgco.base.shapes import check_shape, check_tensor, check_untransformed, computing_on, describe
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.account import Account
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -170,6 +170,7 @@ class Solver(Brief):
             InputError: U0, ids, warm or X0 don't fit the problem, or an option of the solver doesn't; X0 where the
                 solver can't begin with states.
         """
+        check_untransformed("solve")
         check_problem(problem)
         with computing_on(problem.x0.device):
             if problem.B == 0:  # nothing to trace code with

@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from torchgco.base.autodiff import ReadsMemory, WithoutReading
-from torchgco.base.errors import InputError
+from torchgco.base.errors import InputError, theirs
 from torchgco.base.shapes import MISTAKES
 from torchgco.tracing.operations import OPERATIONS
 
@@ -170,7 +170,7 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
         raise  # the function itself says what is wrong
     except Exception as error:  # any error of the function
         message = next(iter(str(error).strip().splitlines()), type(error).__name__)
-        raise InputError(field, "a function that can be traced", message) from error
+        raise InputError(field, "a function that can be traced", message) from theirs(error)
     recording.result = recording.slot(result)
     return recording
 

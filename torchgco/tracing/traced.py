@@ -155,9 +155,9 @@ class Traced:
             try:
                 replay(operation, known, self._precision)
             except NoCounterpart as error:
-                raise _unknown(self.field, operation, str(error)) from error
-            except Exception as error:  # any error of CasADi or NumPy with these arguments
-                raise _unknown(self.field, operation) from error
+                raise _unknown(self.field, operation, str(error)) from None
+            except Exception:  # any error of CasADi or NumPy with these arguments
+                raise _unknown(self.field, operation) from None
         return boxed(known[self._result])
 
     def _computed(self, index: Tensor) -> dict[Slot, Any]:

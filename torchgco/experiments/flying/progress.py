@@ -1,4 +1,4 @@
-"""What a study shows while it flies: a bar, lines where several jobs share a terminal, or nothing."""
+"""What a study shows while it flies: a bar, lines in a log or where several jobs share a terminal, or nothing."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import IO, Any, Protocol, Self
 
 from tqdm import tqdm
 
+from torchgco.base.notices import watched
 from torchgco.experiments.config.launching import side_by_side
 
 # Parts of a trial count too: a mission is one, and takes seconds.
@@ -39,7 +40,10 @@ class NoBar:
 
 
 class Lines(NoBar):
-    """A line on stderr every PERIOD seconds, in place of a bar: bars of several jobs would overwrite each other."""
+    """A line on stderr every PERIOD seconds and one at the end, in place of a bar.
+
+    Bars of several jobs would overwrite each other, and a log would hold every state of a bar.
+    """
 
     def __init__(self, name: str, total: int, initial: int) -> None:
         self.name, self.total, self.done, self.solver = name, total, float(initial), ""
@@ -48,7 +52,10 @@ class Lines(NoBar):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None: ...
+    def __exit__(self, failure: object, *_: object) -> None:
+        """The last line, where all went well."""
+        if failure is None:
+            self._say()
 
     def set_description(self, desc: str) -> None:
         """The solver, or the number of processes, named in the next line."""
@@ -58,8 +65,16 @@ class Lines(NoBar):
         """Count trials, and print a line where the last one is old enough."""
         self.done += n
         if time.monotonic() - self.shown >= PERIOD:
-            self.shown = time.monotonic()
-            print(f"{self.name}: {self.done:.0f}/{self.total} trials, {self.solver}", file=sys.stderr, flush=True)
+            self._say()
+
+    def _say(self) -> None:
+        self.shown = time.monotonic()
+        print(f"{self.name}: {self.done:.0f}/{self.total} trials, {self.solver}", file=sys.stderr, flush=True)
+
+
+def lines_alone() -> bool:
+    """Whether a bar would be out of place: nobody watches, or other jobs write to the same terminal."""
+    return side_by_side() or not watched()
 
 
 def draw(drawings: Mapping[str, Callable[[], object]]) -> None:
@@ -67,7 +82,7 @@ def draw(drawings: Mapping[str, Callable[[], object]]) -> None:
     if not drawings:
         return
     text = f"drawing {len(drawings)} figure{'s' if len(drawings) > 1 else ''}"
-    if side_by_side():
+    if lines_alone():
         print(f"{text} ...", file=sys.stderr, flush=True)
-    for drawing in tqdm(drawings.values(), text, unit="figure", dynamic_ncols=True, disable=side_by_side()):
+    for drawing in tqdm(drawings.values(), text, unit="figure", dynamic_ncols=True, disable=lines_alone()):
         drawing()

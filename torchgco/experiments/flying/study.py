@@ -19,11 +19,10 @@ from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.config.build import Setup, build, solver_of
-from torchgco.experiments.config.launching import side_by_side
 from torchgco.experiments.ending import say
 from torchgco.experiments.flying.flight import Flight, Plan, fly, plan_of, prepare
 from torchgco.experiments.flying.mission_flight import FEW, MissionFlight
-from torchgco.experiments.flying.progress import LAYOUT, Bar, Lines
+from torchgco.experiments.flying.progress import LAYOUT, Bar, Lines, lines_alone
 from torchgco.experiments.flying.workers import Shared, run_all
 from torchgco.experiments.reports.explained import advised, explained, where_to_start
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
@@ -228,7 +227,7 @@ def _bar(study: _Study, left: int, name: str) -> tqdm | Lines:
     """Progress over the trials that this process flies, those flown before included."""
     layouts = len(study.plan.share(range(study.layouts.count), study.layouts.count))
     count = layouts * len(study.solvers)
-    if side_by_side():
+    if lines_alone():
         return Lines(name, count, count - left)
     return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True, bar_format=LAYOUT)
 

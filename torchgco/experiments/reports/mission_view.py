@@ -12,6 +12,7 @@ import torch
 from tqdm import tqdm
 
 from torchgco.base.errors import InputError
+from torchgco.base.notices import watched
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_report import PLANS
 from torchgco.experiments.results.records import MISSION
@@ -95,7 +96,9 @@ class _Log:
             return replace(flight, plan=None if plan is None else plan[: len(flight.path)])
         x = torch.tensor(steps[[f"x{i}" for i in range(STATES)]].to_numpy(dtype=float))
         try:
-            with tqdm(total=len(x), desc="map", unit="period", leave=False, disable=len(x) < SLOW) as bar:
+            with tqdm(
+                total=len(x), desc="map", unit="period", leave=False, disable=len(x) < SLOW or not watched()
+            ) as bar:
                 replay = replayed(loop, problem, x, study.seed, number, bar.update)
         except NativeError as error:
             notes += [] if notes else [f"no map: {str(error).splitlines()[0]}"]

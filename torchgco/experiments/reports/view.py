@@ -12,6 +12,7 @@ import torch
 from tqdm import tqdm
 
 from torchgco.base.errors import InputError
+from torchgco.base.notices import watched
 from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.finished import TRUST, Study, document_of
@@ -53,7 +54,8 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
     if numbers != study.layouts.ids.tolist():
         raise damaged(study.folder / SOLUTIONS, "has other layouts")
     document, rows = None, study.rows
-    bar = tqdm(total=study.layouts.count, unit="layout", leave=False, disable=study.layouts.count < SLOW)
+    hidden = study.layouts.count < SLOW or not watched()
+    bar = tqdm(total=study.layouts.count, unit="layout", leave=False, disable=hidden)
     for places, problem in study.batches():
         look = look_of(problem.dynamics)
         document = document or document_of(study, problem, look)

@@ -9,6 +9,7 @@ import pandas as pd
 from torchgco.experiments.statistics.mission_statistics import MISSIONS_AT_ONCE
 from torchgco.experiments.statistics.statistics import TASK
 from torchgco.experiments.statistics.tables import (
+    RATES,
     aligned,
     cells,
     headers,
@@ -71,7 +72,7 @@ def format_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
         rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
         if (rows["n"] > 0).any():
             blocks.append(paired_lines(rows, swept, costs=False))
-    return "\n\n".join(blocks)
+    return "\n\n".join([*blocks, RATES])
 
 
 def printed_missions(summary: pd.DataFrame, paired: pd.DataFrame) -> list[pd.DataFrame]:

@@ -12,6 +12,8 @@ from torchgco.experiments.statistics.statistics import OUTCOMES, STATUS, TASK, t
 
 FORMATS = ("table", "csv", "markdown", "latex", "json")
 FORMULA = ("=", "+", "-", "@", "\t", "\n")  # how a cell begins that spreadsheets compute
+RATES = "rates: attained of defined, share, [95 % Wilson interval]; -: undefined"
+EFFORTS = "effort: median (90 % quantile); costs: where the goal was reached, everywhere, over the best known one"
 
 
 def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
@@ -20,9 +22,7 @@ def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
     Args:
         summary, paired: as `summarise` and `compare` return them; `paired` may have no rows.
 
-    A rate reads "30/32 94 % [80, 98]": attained of defined, and the 95 % Wilson interval. "-" stands for an
-    undefined value. Costs are medians, over the trials that reached the goal and over all that are finite. Effort and
-    cost ratios are medians, with the 90 % quantile in parentheses.
+    A rate reads "30/32 94 % [80, 98]". Two lines at the end tell what the numbers in brackets and parentheses are.
     """
     blocks = []
     for (scenario, model), task in summary.groupby(TASK, sort=False, dropna=False):
@@ -33,7 +33,7 @@ def format_table(summary: pd.DataFrame, paired: pd.DataFrame) -> str:
         rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model)]
         if (rows["n"] > 0).any():
             blocks.append(paired_lines(rows, swept))
-    return "\n\n".join(blocks)
+    return "\n\n".join([*blocks, f"{RATES}\n{EFFORTS}"])
 
 
 def format_frame(table: pd.DataFrame, form: str) -> str:

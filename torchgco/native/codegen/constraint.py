@@ -40,8 +40,8 @@ def span_of_rows(problem: Problem, i: int) -> Span:
     name = constraint.name if called else f"constraints[{i}] ({type(constraint).__name__})"
     try:
         knots = torch.arange(N + 1)[constraint.knots].tolist()
-    except (AttributeError, IndexError, TypeError) as error:
-        raise InputError(f"{name}.knots", f"some of 0..{N}", getattr(constraint, "knots", "none")) from error
+    except (AttributeError, IndexError, TypeError):
+        raise InputError(f"{name}.knots", f"some of 0..{N}", getattr(constraint, "knots", "none")) from None
     if not knots:
         raise InputError(f"{name}.knots", "at least one knot", "none")
 
