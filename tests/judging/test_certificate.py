@@ -358,5 +358,21 @@ def test_bad_calls_are_named() -> None:
         certify(problem, X, U, multipliers=lams[:1])
     with pytest.raises(InputError, match=r"multipliers\[1\]: expected"):
         certify(problem, X, U, multipliers=[lams[0], lams[1][:1]])
-    with pytest.raises(InputError, match="float64"):
-        certify(problem.cast(torch.float32), X.float(), U.float())
+    with pytest.raises(InputError, match="X: expected a float64 or float32 tensor"):
+        certify(problem, X.half(), U)
+
+
+def test_single_precision_is_certified_in_double() -> None:
+    """The numbers are those of the trajectory as given: its rounding shows in the residual of the dynamics."""
+    problem, U = planar_batch(B=2, N=8)
+    single = problem.cast(torch.float32)
+    X = open_loop(single.dynamics, single.x0, U.float() + 0.1)
+    lams = [torch.rand(2, *shape, dtype=torch.float32) for shape in problem.row_shapes]
+    for multipliers in (None, lams):
+        given = None if multipliers is None else [lam.double() for lam in multipliers]
+        double = certify(single.cast(torch.float64), X.double(), (U.float() + 0.1).double(), multipliers=given)
+        for own in (single, single.cast(torch.float64)):
+            proof = certify(own, X, U.float() + 0.1, multipliers=multipliers)
+            assert all(torch.equal(a, b) for a, b in zip(vars(proof).values(), vars(double).values(), strict=True))
+        assert proof.kkt_residual.dtype == torch.float64
+        assert bool(((proof.dynamics_residual > 0) & (proof.dynamics_residual < 1e-6)).all())

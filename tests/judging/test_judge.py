@@ -6,12 +6,25 @@ import numpy as np
 import pytest
 import torch
 
+import torchgco
 from tests.problems import planar_batch, quadrotor_batch, reference_of
 from tests.reference.problem import cost as reference_cost
 from tests.reference.problem import rollout as reference_rollout
-from torchgco import ControlBounds, InputError, Planar, Problem, QuadraticCost, Spheres
+from torchgco import (
+    ControlBounds,
+    FunctionCost,
+    FunctionDynamics,
+    InputError,
+    Planar,
+    Problem,
+    QuadraticCost,
+    Spheres,
+    StateBounds,
+    certify,
+)
 from torchgco.judging.judge import judge, segment_distance, sphere_clearance
 
+DOUBLE = {"dtype": torch.float64}
 BATCHES = {"planar": planar_batch, "quadrotor": quadrotor_batch}
 
 
@@ -162,3 +175,55 @@ def test_bad_calls_are_named() -> None:
     goal = torch.tensor([1.0, 0.4], dtype=torch.float64)
     with pytest.raises(InputError, match="U: expected"):
         judge(problem, U[:1], goal, 0.3)
+
+
+def heater(**more: object) -> Problem:
+    """A room (K above outside) with a heater from 0 to 1, asked to stay between 15 and 25: no position."""
+    model = FunctionDynamics(lambda x, u: 20.0 * u - 0.5 * x, 1, 1, 0.25, "euler")
+    cost = FunctionCost(lambda x, u: u.square().sum(-1) + 0.01 * (x[..., 0] - 20.0).square(), lambda x: 0.0 * x[..., 0])
+    rows = [ControlBounds([0.0], [1.0]), StateBounds([15.0], [25.0])]
+    return Problem(model, cost, rows, torch.tensor([[18.0], [16.0]], **DOUBLE), 12, **more)
+
+
+def test_a_model_without_a_position_is_judged() -> None:
+    problem, U = heater(), torch.full((2, 12, 1), 0.45, **DOUBLE)
+    U[1, :6] = 0.0
+    verdict = judge(problem, U)
+    for b in range(2):
+        x, cost, worst = problem.x0[b, 0].item(), 0.0, 0.0
+        for u in U[b, :, 0].tolist():
+            cost += u * u + 0.01 * (x - 20.0) ** 2
+            x += 0.25 * (20.0 * u - 0.5 * x)
+            worst = max(worst, 15.0 - x, x - 25.0)
+        assert verdict.cost[b].item() == pytest.approx(cost) and verdict.violation[b].item() == pytest.approx(worst)
+    assert verdict.feasible.tolist() == [True, False]
+    assert not bool((verdict.reached | verdict.sound).any())
+    for name in ("clearance", "clearance_knots", "goal_distance"):
+        assert bool(getattr(verdict, name).isnan().all())
+    held = torchgco.solve(problem, U, solver="hold")
+    torch.testing.assert_close(verdict.cost, held.cost)
+    torch.testing.assert_close(verdict.violation, held.violation)
+    assert not bool(certify(problem, held.X, held.U).dynamics_residual.any())
+    with pytest.raises(InputError, match=r"goal: expected a model with a position, got FunctionDynamics"):
+        judge(problem, U, [20.0], 1.0)
+
+
+def test_without_a_goal_nothing_is_reached() -> None:
+    problem, U = planar_batch(B=2, N=5)
+    target = problem.goal.position[0]
+    free = FunctionCost(lambda x, u: u.square().sum(-1), lambda x: x[..., 0])
+    aimless = replace(problem, cost=free, goal=None)
+    given, verdict = judge(aimless, U, target, 5.0), judge(aimless, U)
+    assert given.reached.all() and not verdict.reached.any() and bool(verdict.goal_distance.isnan().all())
+    for name in ("cost", "violation", "clearance_knots", "clearance", "feasible"):
+        assert torch.equal(getattr(given, name), getattr(verdict, name))
+
+
+def test_single_precision_is_judged_in_double() -> None:
+    problem, U = planar_batch(B=2, N=8)
+    single, goal = problem.cast(torch.float32), torch.tensor([1.0, 0.4])
+    double = judge(single.cast(torch.float64), U.float().double(), goal.double(), 5.0)
+    for own in (single, single.cast(torch.float64)):
+        verdict = judge(own, U.float(), goal, 5.0)
+        assert all(torch.equal(a, b) for a, b in zip(vars(verdict).values(), vars(double).values(), strict=True))
+    assert verdict.cost.dtype == torch.float64 and bool(verdict.reached.all())

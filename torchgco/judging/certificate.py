@@ -18,12 +18,12 @@ from torch import Tensor
 
 from torchgco.base.autodiff import gradients
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import check_shape, check_tensor, computing_on
+from torchgco.base.shapes import check_shape, computing_on
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances
-from torchgco.judging.judge import by_kind, segment_distance
+from torchgco.judging.judge import by_kind, doubled, in_double, segment_distance
 from torchgco.judging.maps import segment_distances
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import Obstacles
@@ -86,38 +86,37 @@ def certify(
     far rows, too.
 
     Args:
-        problem: the planning problems, float64.
-        X, U: the trajectories that a solver returned.
+        problem: the planning problems; those in float32 are certified in float64, with their numbers as they are.
+        X, U: the trajectories that a solver returned, float64 or float32.
         asked: (B,) bool, the problems to certify; NaN for the others. None: all.
         multipliers: (B, K, p) of each constraint, such as `solution.multipliers.lam`; wherever they come from, they are
             tested. Below 0 they count as 0, but for equalities. None: fitted.
 
     Raises:
-        InputError: X, U, asked or multipliers don't fit the problem, or the problem isn't float64.
+        InputError: X, U, asked or multipliers don't fit the problem.
     """
     check_problem(problem)
+    problem, X, U = in_double(problem), doubled(X, "X", problem), doubled(U, "U", problem)
     problem.check_controls(U, "U")
     check_shape(X, (problem.B, problem.N + 1, problem.n), "X")
-    if problem.x0.dtype != torch.float64 or X.dtype != torch.float64:
-        raise InputError("X", "torch.float64 for the certificate", X.dtype)
-    check_tensor(X, "X", problem.x0)
     asked = torch.ones(problem.B, dtype=torch.bool, device=U.device) if asked is None else asked
     check_shape(asked, (problem.B,), "asked")
     if asked.dtype != torch.bool:
         raise InputError("asked", "a tensor of bool", asked.dtype)
     if multipliers is not None:
-        _check_multipliers(problem, multipliers)
+        multipliers = _checked_multipliers(problem, multipliers)
     with computing_on(problem.x0.device):
         return _certified(problem, X, U, asked, multipliers)
 
 
-def _check_multipliers(problem: Problem, multipliers: Sequence[Tensor]) -> None:
+def _checked_multipliers(problem: Problem, multipliers: Sequence[Tensor]) -> list[Tensor]:
     count = len(problem.constraints)
     if not isinstance(multipliers, list | tuple) or len(multipliers) != count:
         raise InputError("multipliers", f"{count} tensors, one per constraint", shown(multipliers))
-    for i, (lam, shape) in enumerate(zip(multipliers, problem.row_shapes, strict=True)):
-        check_tensor(lam, f"multipliers[{i}]", problem.x0)
+    given = [doubled(lam, f"multipliers[{i}]", problem) for i, lam in enumerate(multipliers)]
+    for i, (lam, shape) in enumerate(zip(given, problem.row_shapes, strict=True)):
         check_shape(lam, (problem.B, *shape), f"multipliers[{i}]")
+    return given
 
 
 def _certified(

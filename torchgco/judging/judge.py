@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.shapes import check_shape, computing_on, tensor
+from torchgco.base.shapes import check_shape, check_tensor, computing_on, tensor
 from torchgco.constraints.base import CONTACT_FACTOR, Constraint
 from torchgco.constraints.separation import Separation
 from torchgco.judging.distances import box_distance, box_segment_distance, oscillating_distances
@@ -41,12 +41,13 @@ class Verdict:
     violation: Tensor  # largest violation of the planning problem, full radii; lengths in metres
     # Smallest distance, m, to a surface of 0.95 (r_obs + r_veh), of a box grown by 0.95 (r + r_veh), where r rounds it,
     # at the knots; of positions that keep a distance from each other, above 0.95 of it; infinite without either. A
-    # constraint given as a function has no distance: its rows count only as violations.
+    # constraint given as a function has no distance: its rows count only as violations. NaN where the model has no
+    # position, and no positions keep a distance.
     clearance_knots: Tensor
     clearance: Tensor  # the same along the straight segments between the knots
-    goal_distance: Tensor  # m, last knot to goal, positions only
+    goal_distance: Tensor  # m, last knot to goal, positions only; NaN without a goal
     feasible: Tensor  # bool: clearance_knots >= 0, every other constraint within 1e-3
-    reached: Tensor  # bool: feasible, and closer to the goal than the goal radius
+    reached: Tensor  # bool: feasible, and closer to the goal than the goal radius; False without a goal
     sound: Tensor  # bool: reached, violation <= 1e-3, clearance >= 0: success without its condition on the cost
 
     def success(self, best_cost: Tensor) -> Tensor:
@@ -74,29 +75,30 @@ def judge(
     goal_radius: Tensor | float | None = None,
     start: Tensor | None = None,
 ) -> Verdict:
-    """Judge controls U (B, N, m) by their rollout from the start.
+    """Judge controls U (B, N, m) by their rollout from the start: any controls of any model, in float64.
 
     Args:
-        problem: the planning problems, float64.
-        U: controls; NaN where a solver returned none: such a problem is neither feasible nor reached.
-        goal: positions (B, d) or (d,), m. None: the problem's goal.
+        problem: the problems; of a model without a position cost, violation and feasibility are judged. Those in
+            float32 are judged in float64, with their numbers as they are.
+        U: controls, float64 or float32; NaN where a solver returned none: such a problem is neither feasible nor
+            reached.
+        goal: positions (B, d) or (d,), m. None: the problem's goal; where it has none, nothing is reached.
         goal_radius: number or (B,), m, above 0. None: that of the problem's goal.
         start: (B, n), the starts found, such as `solution.X[:, 0]`, where some are free. One that differs from x0 in a
             component that isn't free is not feasible. None: x0, where none is free.
 
     Raises:
-        InputError: U, goal, radius or start don't fit the problem, the problem isn't float64, the dynamics have no
-            position, no goal is given and the problem has none, starts are free and none are given, or obstacles are of
-            a kind that can't be judged.
+        InputError: U, goal, radius or start don't fit the problem, a goal is given without a radius, or for dynamics
+            without a position, starts are free and none are given, or obstacles are of a kind that can't be judged.
     """
     check_problem(problem)
+    problem, U = in_double(problem), doubled(U, "U", problem)
     problem.check_controls(U, "U")
-    if problem.x0.dtype != torch.float64:
-        raise InputError("x0", "torch.float64 for the judge", problem.x0.dtype)
-    if problem.dynamics.position is None:
-        raise InputError("dynamics.position", "a model with a position", type(problem.dynamics).__name__)
+    goal, goal_radius, start = (
+        value.double() if isinstance(value, Tensor) else value for value in (goal, goal_radius, start)
+    )
     with computing_on(problem.x0.device):
-        center, radius = _goal(problem, goal, goal_radius)
+        end = _goal(problem, goal, goal_radius)
         first = _start(problem, start)
         X, moved = [first], _moved(problem, first)
         cost = torch.zeros_like(problem.x0[:, 0])
@@ -105,7 +107,24 @@ def judge(
             cost = cost + torch.where(runs, problem.cost.stage(x, U[:, k], k), 0.0)
             X.append(torch.where(runs.unsqueeze(-1), problem.dynamics.at(k).step(x, U[:, k]), x))
         cost = cost + problem.cost.terminal(X[-1])
-        return _verdict(problem, torch.stack(X, dim=1), U, cost, center, radius, moved)
+        return _verdict(problem, torch.stack(X, dim=1), U, cost, end, moved)
+
+
+def in_double(problem: Problem) -> Problem:
+    """The problems in float64."""
+    return problem if problem.x0.dtype == torch.float64 else problem.cast(torch.float64)
+
+
+def doubled(value: Any, field: str, problem: Problem) -> Tensor:
+    """A tensor of float64 or float32 on the problems' device, in float64.
+
+    Raises:
+        InputError: anything else.
+    """
+    check_tensor(value, field)
+    if value.device != problem.x0.device:
+        raise InputError(field, f"device {problem.x0.device} as in x0", value.device)
+    return value.double()
 
 
 def _start(problem: Problem, start: Any) -> Tensor:
@@ -128,11 +147,17 @@ def _moved(problem: Problem, start: Tensor) -> Tensor:
     return (change if problem.free_start is None else change.masked_fill(problem.free_start, 0.0)).amax(-1)
 
 
-def _goal(problem: Problem, center: Any, radius: Any) -> tuple[Tensor, Tensor]:
-    """Position (B, d) or (d,) and radius, () or (B,), of the goal: those given, else the problem's."""
+def _goal(problem: Problem, center: Any, radius: Any) -> tuple[Tensor, Tensor] | None:
+    """Position (B, d) or (d,) and radius, () or (B,), of the goal: those given, else the problem's; None where there is
+    none.
+    """
+    if center is None and radius is None and problem.goal is None:
+        return None
     if center is None:
         center = _own_goal(problem).position
     else:
+        if problem.dynamics.position is None:
+            raise InputError("goal", "a model with a position", type(problem.dynamics).__name__)
         center = tensor(center, "goal", problem.x0)
         d = problem.position.stop - problem.position.start
         check_shape(center, (d,) if center.dim() == 1 else (problem.B, d), "goal")
@@ -155,7 +180,7 @@ def _own_goal(problem: Problem) -> Goal:
 
 
 def _verdict(
-    problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: Tensor, radius: Tensor | float, moved: Tensor
+    problem: Problem, X: Tensor, U: Tensor, cost: Tensor, goal: tuple[Tensor, Tensor] | None, moved: Tensor
 ) -> Verdict:
     far = torch.full_like(cost, torch.inf)
     clearance_knots, clearance, violation, others = far, far, moved, torch.zeros_like(cost)
@@ -168,12 +193,15 @@ def _verdict(
             clearance = torch.minimum(clearance, between)
         else:
             others = torch.maximum(others, worst)
-    position = X[:, -1, problem.dynamics.position]
-    goal_distance = (position - goal).square().sum(-1).sqrt()
     finite = torch.isfinite(X).flatten(1).all(-1)
     feasible = finite & (clearance_knots >= 0) & (others <= OTHERS_WITHIN) & (moved == 0)
-    reached = feasible & (goal_distance < radius)
+    goal_distance, reached = torch.full_like(cost, torch.nan), torch.zeros_like(feasible)
+    if goal is not None:
+        goal_distance = (X[:, -1, problem.position] - goal[0]).square().sum(-1).sqrt()
+        reached = feasible & (goal_distance < goal[1])
     sound = reached & (violation <= SUCCESS_VIOLATION) & (clearance >= 0)
+    if problem.dynamics.position is None and not any(isinstance(part, Separation) for part in problem.constraints):
+        clearance_knots = clearance = torch.full_like(cost, torch.nan)
     return Verdict(cost, violation, clearance_knots, clearance, goal_distance, feasible, reached, sound)
 
 
@@ -342,10 +370,5 @@ def columns(problem: Problem, U: Tensor, start: Tensor | None = None) -> dict[st
     names += ["reached"] if problem.goal is not None else []
     if not names:
         return {}
-    problem.check_controls(U, "U")
-    if problem.x0.dtype != torch.float64:
-        problem, U, start = problem.cast(torch.float64), U.double(), None if start is None else start.double()
-    # Without a goal any will do, as only the clearance is read.
-    at = (problem.x0[:, problem.position], 1.0) if problem.goal is None else (None, None)
-    verdict = judge(problem, U, *at, start)
+    verdict = judge(problem, U, start=start)
     return {name: getattr(verdict, name).cpu().numpy() for name in names}
