@@ -8,7 +8,6 @@ import pytest
 
 from tests.bombs import BOMBS, BYTES, SECONDS, attempt
 
-
 SLOW = {name for name in BOMBS if "100 MB" in name}  # a million records are read, some seconds
 CASES = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in BOMBS]
 
