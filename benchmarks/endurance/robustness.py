@@ -3,7 +3,7 @@
 Runs the tests of wrong input, damaged files, killed processes, batches and known answers, the slow ones too, and counts
 the cases and the random examples in them (some minutes on two cores); then tries mutants of the solver (mutation.py; an
 hour or more the first time, --mutants 0 for none). With --write the tables go into benchmarks/results/robustness.md and
-mutation.md.
+mutation.md. --bombs measures the small files that promise much alone (a minute).
 """
 
 from __future__ import annotations
@@ -41,6 +41,9 @@ KINDS: dict[str, tuple[str, ...]] = {
     "batch contract: order, slots, neighbours, broken problems": ("tests/solvers/test_batch_contract.py",),
     "known answers: dense KKT systems, convex problems, ALTRO's problems": ("tests/golden",),
     "random values, files, calls and batches": ("tests/fuzz",),
+    "small files that promise much": ("tests/test_bombs.py",),
+    "runs of others: classes, CSV": ("tests/experiments/test_stored.py", "tests/experiments/test_tables.py"),
+    "the same study several times at once": ("tests/experiments/test_lock.py",),
 }  # fmt: skip
 
 
@@ -83,13 +86,44 @@ def example_table(examples: Mapping[tuple[str, str], int]) -> list[str]:
     return ["| random examples | outcome | count |", "| --- | --- | --- |", *rows]
 
 
+def bomb_table() -> tuple[list[str], bool]:
+    """A row per small file that promises much, and whether each was refused within the limits."""
+    sys.path.insert(0, str(ROOT))
+    from tests.bombs import BOMBS, BYTES, SECONDS, attempt
+
+    lines = ["| file | bytes | refused | seconds | MB |", "| --- | --- | --- | --- | --- |"]
+    right = True
+    for name in BOMBS:
+        with tempfile.TemporaryDirectory() as folder:
+            told, seconds, memory, size = attempt(name, Path(folder))
+        refused = ": expected " in told and "\n" not in told
+        right &= refused and seconds < SECONDS and memory < BYTES / 1e6
+        lines.append(f"| {name} | {size:,} | {'in one line' if refused else told} | {seconds:.1f} | {memory:.0f} |")
+    return lines, right
+
+
+def put_bombs(write: bool) -> bool:
+    """Print the table of bombs, and with `write` put it into the page; whether all is as it should be."""
+    lines, right = bomb_table()
+    origin = provenance("cpu")
+    text = "\n".join([f"Run on {origin['date']} at commit {origin['commit']}.", "", *lines])
+    print(text)
+    if write:
+        put_between(PAGE, "<!-- bombs -->", "<!-- end bombs -->", text)
+    return right
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.endurance.robustness", description=(__doc__ or "").split("\n")[0]
     )
     parser.add_argument("--write", action="store_true", help="put the tables into results/*.md")
     parser.add_argument("--mutants", type=int, default=60, help="of each language, for benchmarks.endurance.mutation")
+    parser.add_argument("--bombs", action="store_true", help="the small files that promise much alone")
     options, more = parser.parse_known_args(arguments)
+    right = put_bombs(options.write)
+    if options.bombs:
+        return 0 if right else 1
     with tempfile.TemporaryDirectory() as folder:
         cases, examples = run_tests(Path(folder), more)
     origin = provenance("cpu")
@@ -101,7 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         put_between(PAGE, "<!-- robustness -->", "<!-- end robustness -->", text)
     if options.mutants > 0:
         mutation.main(["--each", str(options.mutants), *(["--write"] if options.write else [])])
-    return 0 if all(end in ("passed", "skipped") for _, end in cases) else 1
+    return 0 if right and all(end in ("passed", "skipped") for _, end in cases) else 1
 
 
 if __name__ == "__main__":

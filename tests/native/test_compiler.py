@@ -17,7 +17,6 @@ from tests.problems import planar_batch
 from torchgco import presets
 from torchgco.native import compiler, kernels, store
 from torchgco.native.compiler import NativeError, build, find_compiler
-from torchgco.native.declarations import Structure, fields, head, load
 from torchgco.native.dispatch import engine_of
 
 pytestmark = pytest.mark.usefixtures("cache")
@@ -158,63 +157,6 @@ def test_a_folder_that_root_shares_is_read(cache: Path, monkeypatch, compiled: l
 
 
 @needs_compiler
-def test_a_library_without_our_names_is_an_error_of_its_own(cache: Path) -> None:
-    class Half(Structure):
-        declared = (("double", "x"),)
-        _fields_ = fields(declared)
-
-    text = head([Half], [], {})
-    key = compiler._key(find_compiler(), text, (*find_compiler().flags, *find_compiler().further))
-    build(source(2))
-    (other,) = cache.iterdir()
-    store.save(key, ".so", other.read_bytes())
-    next_process()
-    with pytest.raises(NativeError, match="isn't compiled from this source: it has no Half"):
-        load(text, [Half])
-
-
-# What gcc, clang and their tools say where a disk is full or a source is wrong, and the telling line.
-SAID = {
-    "gcc": (
-        "kernels.c:7:1: fatal error: error writing to /tmp/ccX.s: No space left on device\ncompilation terminated.",
-        "kernels.c:7:1: fatal error: error writing to /tmp/ccX.s: No space left on device",
-    ),
-    "ld": (
-        "/usr/bin/ld: final link failed: No space left on device\ncollect2: error: ld returned 1 exit status",
-        "/usr/bin/ld: final link failed: No space left on device",
-    ),
-    "as": (
-        "/tmp/ccX.s: Assembler messages:\n/tmp/ccX.s: Fatal error: can't close /tmp/ccY.o: No space left on device",
-        "/tmp/ccX.s: Fatal error: can't close /tmp/ccY.o: No space left on device",
-    ),
-    "clang": (
-        "kernels.c:1:1: warning: unused\nkernels.c:2:1: error: unknown type name 'a'\n    2 | a error;\n      | ^\n"
-        "1 warning and 1 error generated.",
-        "kernels.c:2:1: error: unknown type name 'a'",
-    ),
-    "lld": (
-        "ld.lld: error: cannot open output file: No space left on device\n"
-        "clang: error: linker command failed with exit code 1 (use -v to see invocation)",
-        "ld.lld: error: cannot open output file: No space left on device",
-    ),
-    "another": ("first\nlast words\n\n", "last words"),
-}
-
-
-@pytest.mark.parametrize("said", SAID)
-def test_the_error_of_a_compiler_is_its_last_telling_line(said: str, tmp_path: Path, monkeypatch) -> None:
-    text, expected = SAID[said]
-    script = tmp_path / "cc"
-    (tmp_path / "said").write_text(text)
-    script.write_text(f'#!/bin/sh\ncase "$*" in *--version*) exit;; esac\ncat {tmp_path / "said"} >&2\nexit 1\n')
-    script.chmod(0o755)
-    monkeypatch.setenv("TORCHGCO_CC", str(script))
-    with pytest.raises(NativeError) as caught:
-        build(source(2))
-    assert str(caught.value).splitlines()[0] == f"{script} failed: {expected}"
-
-
-@needs_compiler
 def test_a_full_disk(monkeypatch, cache: Path) -> None:
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -266,14 +208,6 @@ def test_in_children(method: str) -> None:
     with context.Pool(2) as pool:
         assert pool.starmap(times, [(2, 1.0), (3, 1.0), (2, 4.0), (3, 4.0)]) == [2.0, 3.0, 8.0, 12.0]
     assert times(3) == 9.0
-
-
-@needs_compiler
-def test_errors_are_the_compilers_own(cache: Path) -> None:
-    with pytest.raises(NativeError, match="no_such_type") as caught:
-        build("no_such_type tgco_times;")
-    assert len(str(caught.value).splitlines()) <= 6
-    assert not cache.exists()
 
 
 # A compiler that starts a process, as gcc does, and waits for it; both write their numbers.

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from torchgco.base.errors import InputError
-from torchgco.maps.files.source import MOST_BYTES, Source
+from torchgco.maps.files.source import MOST_POINTS, Source
 
 MOST_RECORDS = 2**23  # of a file
+MOST_INSIDE = 2**20  # records in chunks, which may be far larger than the file: some seconds
+MOST_MESSAGE = 16 * MOST_POINTS  # bytes of a message, or of a chunk of them: a cloud of four floats per point
 CLOUD, GRID = "sensor_msgs/PointCloud2", "nav_msgs/OccupancyGrid"
 
 
@@ -50,7 +52,7 @@ def choose(source: Source, topics: dict[str, str], wanted: str | None) -> str:
 
 def unpack(source: Source, data: memoryview, compression: str, size: int, at: int) -> bytes | memoryview:
     """`size` bytes that were packed by bz2, lz4, zstd or not at all; `at` is where they lie, for errors."""
-    source.limit(size, MOST_BYTES, "bytes of a chunk")
+    source.limit(size, MOST_MESSAGE, "bytes of a chunk")
     if compression in ("", "none"):
         unpacked: Any = data
     elif compression not in ("bz2", "lz4", "zstd"):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchgco.maps.files.bags.container import MOST_RECORDS, Message, choose, unpack
-from torchgco.maps.files.source import MOST_BYTES, Cursor, Source
+from torchgco.maps.files.bags.container import MOST_INSIDE, MOST_MESSAGE, MOST_RECORDS, Message, choose, unpack
+from torchgco.maps.files.source import Cursor, Source
 
 MCAP = "an mcap file"
 MAGIC = b"\x89MCAP0\r\n"
@@ -35,6 +35,7 @@ class Contents:
         default_factory=dict
     )  # latest times by channel, by the chunk's first byte
     records: int = 0
+    unpacked: int = 0  # records in chunks
 
     def topics(self) -> dict[str, str]:
         """Types by topic."""
@@ -78,9 +79,11 @@ def _walk(cursor: Cursor, contents: Contents, chunk: int | None = None) -> None:
     """Note what the records of a file, or of an unpacked chunk, say."""
     latest: dict[int, int] = {}
     while cursor.left:
-        contents.records += 1
-        if contents.records > MOST_RECORDS:
-            cursor.source.refuse(f"at most {MOST_RECORDS:,} records", "more")
+        contents.records += chunk is None
+        contents.unpacked += chunk is not None
+        if contents.records > MOST_RECORDS or contents.unpacked > MOST_INSIDE:
+            most = MOST_RECORDS if chunk is None else MOST_INSIDE
+            cursor.source.refuse(f"at most {most:,} records", "more")
         if chunk is None and cursor.left == len(MAGIC):
             break
         kind, length = cursor.number("B", "a record's kind"), cursor.number("Q", "a record's length")
@@ -119,7 +122,7 @@ def _chunk(cursor: Cursor, at: int) -> Cursor:
     """The unpacked chunk whose record begins at a byte."""
     cursor.at = at + 16  # its times
     size, _ = cursor.number("Q", "a chunk's size"), cursor.number("I", "a checksum")
-    cursor.source.limit(size, MOST_BYTES, "bytes of a chunk")
+    cursor.source.limit(size, MOST_MESSAGE, "bytes of a chunk")
     compression = cursor.text(min(cursor.number("I", "a length"), 64), "a name")
     packed = cursor.take(cursor.number("Q", "a length"), "a chunk")
     return Cursor(cursor.source, unpack(cursor.source, packed, compression, size, at), f"a sound chunk at byte {at:,}")

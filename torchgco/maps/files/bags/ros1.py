@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass, field
 
 from torchgco.base.errors import shown
-from torchgco.maps.files.bags.container import MOST_RECORDS, Message, choose, unpack
+from torchgco.maps.files.bags.container import MOST_INSIDE, MOST_RECORDS, Message, choose, unpack
 from torchgco.maps.files.source import Cursor, Source
 
 BAG = "a bag of ROS 1, version 2.0"
@@ -87,11 +87,15 @@ def _last(source: Source, chunk: bytes | memoryview, ids: set[int], at: int) -> 
     """The last message of these connections in an unpacked chunk."""
     inside = Cursor(source, chunk, f"a sound chunk at byte {at:,}")
     found = None
-    while inside.left:
+    for _ in range(MOST_INSIDE):
+        if not inside.left:
+            break
         header = _header(inside)
         data = inside.take(inside.number("I", "a record's length"), "a record")
         if header.get(b"op") == bytes([MESSAGE]) and _number(inside, header, b"conn") in ids:
             found = data
+    else:
+        source.refuse(f"at most {MOST_INSIDE:,} records in the chunk at byte {at:,}", "more")
     if found is None:
         source.refuse("the message that the index names", f"none in the chunk at byte {at:,}")
     return found

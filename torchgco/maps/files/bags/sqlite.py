@@ -6,12 +6,11 @@ import sqlite3
 from contextlib import closing
 from urllib.request import pathname2url
 
-from torchgco.maps.files.bags.container import Message, choose
+from torchgco.maps.files.bags.container import MOST_MESSAGE, Message, choose
 from torchgco.maps.files.source import Source
 
 DB3 = "a db3 bag of ROS 2, with tables topics and messages"
 MOST_TOPICS = 10_000
-MOST_MESSAGE = 2**29  # bytes
 STEPS, MOST_CALLS = 10_000, 200_000  # of SQLite's machine between two looks at them, and how many looks: some minutes
 
 
