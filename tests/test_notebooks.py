@@ -50,6 +50,14 @@ def test_outputs_hold_no_warning_and_no_path(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_code_needs_no_file_of_the_repository(path: Path) -> None:
+    """A notebook may be copied elsewhere."""
+    for cell in cells(path):
+        code = "".join(cell["source"]) if cell["cell_type"] == "code" else ""
+        assert "../" not in code and "benchmarks" not in code, code
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_every_cell_has_an_id_of_its_own(path: Path) -> None:
     ids = [cell.get("id") for cell in cells(path)]
     assert None not in ids and len(set(ids)) == len(ids)

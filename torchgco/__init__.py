@@ -18,6 +18,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from torchgco import presets as presets
+from torchgco.api import compare as compare
 from torchgco.api import plot as plot
 from torchgco.api import solve as solve
 from torchgco.base.errors import ContactWarning as ContactWarning
@@ -90,8 +91,9 @@ __all__ = [  # noqa: RUF022
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "Solution", "plot", "Status", "presets", "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian",
-    "ILQR", "InteriorPoint", "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
+    "solve", "compare", "Solution", "plot", "Status", "presets", "plan_batch", "Restarts", "MultiStart",
+    "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI",
+    "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors

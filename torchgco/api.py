@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,8 @@ from torchgco.constraints import ControlBounds
 from torchgco.judging.judge import CLEARANCES, by_kind
 from torchgco.judging.scale import SHARE, TIGHT, dwarfed
 from torchgco.judging.worst import NONE, kind_of
-from torchgco.native.dispatch import current, open_loop
+from torchgco.native.dispatch import current, engine_of, open_loop
+from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, check_problem
@@ -29,6 +31,7 @@ from torchgco.solvers.contracts import Solver
 from torchgco.solvers.watching import Watcher
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 CLAIMS = (Status.CONVERGED, Status.FEASIBLE)  # that the constraints hold
@@ -97,6 +100,73 @@ def solve(
         found = replace(found, account=found.account.of_preset(name))
     _warn_of_scale(problem, U0, found)
     return _warned_of_contact(problem, found)
+
+
+def compare(
+    problem: Problem,
+    solvers: Sequence[Solver | str] | Mapping[str, Solver | str],
+    U0: Tensor | None = None,
+    seed: int = 0,
+    max_seconds: float | None = None,
+) -> pd.DataFrame:
+    """Solve the same problems by several solvers, one after the other: one table.
+
+    Args:
+        solvers: names of presets, or solvers; a mapping gives them names of its own.
+        U0, seed, max_seconds: of every solve, as in `solve`.
+
+    Returns:
+        A row per solver and problem, with index `solver` and `element`: the columns of `Solution.to_frame(problem)`;
+        `cost_ratio` to the cheapest trajectory of the problem that is as good (its goal reached, where that is judged,
+        else its constraints kept), NaN for those that aren't; `seconds` per problem, those of the whole solve divided
+        by B. The first call for a form of problem compiles; the times of a second one are those to compare.
+
+    Raises:
+        InputError: as `solve`; no solver, or two of the same name.
+    """
+    import pandas as pd
+
+    check_untransformed("compare")
+    check_problem(problem)
+    made = _named_solvers(problem, solvers)
+    frames = []
+    for name, solver in made.items():
+        engine_of(problem)
+        prepared = solver.prepare(problem)
+        began = time.perf_counter()
+        found = solve(problem, U0, prepared, seed, max_seconds=max_seconds, verbose=False)
+        if problem.x0.device.type == "cuda":
+            torch.cuda.synchronize(problem.x0.device)
+        seconds = (time.perf_counter() - began) / max(1, problem.B)
+        frames.append(_judged_frame(problem, found).assign(solver=name, seconds=seconds).reset_index())
+    table = pd.concat(frames, ignore_index=True)
+    good = table["reached"] if "reached" in table else table["violation"] <= ADMITTED
+    cost = table["cost"].where(good.astype(bool))
+    best = cost.groupby(table["element"]).transform("min")
+    table.insert(table.columns.get_loc("cost") + 1, "cost_ratio", (cost / best).where(best > 0))
+    return table.set_index(["solver", "element"])
+
+
+def _named_solvers(problem: Problem, solvers: Any) -> dict[str, Solver]:
+    """The solvers by name, in their order."""
+    if isinstance(solvers, Mapping):
+        pairs = [(str(name), solver) for name, solver in solvers.items()]
+    elif isinstance(solvers, Sequence) and not isinstance(solvers, str):
+        pairs = [(one if isinstance(one, str) else type(one).__name__, one) for one in solvers]
+    else:
+        pairs = []
+    made = {name: _solver(solver, problem, False) for name, solver in pairs}
+    if not made or len(made) < len(pairs):
+        got = [name for name, _ in pairs] or shown(solvers)
+        raise InputError("solvers", 'a list of different ones, such as ["gco", "al_ilqr"], or a dict by name', got)
+    return made
+
+
+def _judged_frame(problem: Problem, solution: Solution) -> pd.DataFrame:
+    try:
+        return solution.to_frame(problem)
+    except InputError:  # obstacles of a kind that can't be judged
+        return solution.to_frame()
 
 
 def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:

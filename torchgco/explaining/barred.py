@@ -27,10 +27,10 @@ def map_facts(problem: Problem, status: Status, arrived: bool) -> dict[str, Any]
 def _barred(problem: Problem, field: BoundField) -> dict[str, float] | None:
     """The vehicle's radius and the largest that gets to the goal, where this one touches the map on every way."""
     assert problem.goal is not None
-    start, goal = problem.x0[0, problem.position], problem.goal.position[0]
-    ends = (end.detach().cpu().double().numpy() for end in (start, goal))
+    start = problem.x0[0, problem.position].detach().cpu().double().numpy()
+    goal = problem.goal.position[0].detach().cpu().double().numpy()
     radius, goal_radius = float(field.vehicle_radius[0]), float(problem.goal.radius[0])
-    passage = widest_passage(field.field, int(field.which[0]), *ends, goal_radius, CONTACT_FACTOR * radius)
+    passage = widest_passage(field.field, int(field.which[0]), start, goal, goal_radius, CONTACT_FACTOR * radius)
     return None if passage is None else {"radius": radius, "passage": passage}
 
 

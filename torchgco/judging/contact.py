@@ -62,7 +62,7 @@ def deepest(places: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 def _depth(part: Obstacles, places: np.ndarray, dt: float) -> np.ndarray:
     """How deep (P,), m, the pieces between places (P+1, d), `dt` seconds apart, are in contact with a part."""
-    one = replace(part, dt=dt) if part.moving else part
+    one = replace(part, dt=dt) if part.moving else part  # type: ignore[type-var]
     X = torch.zeros(len(places), part.position.stop, dtype=torch.float64)
     X[:, part.position] = torch.from_numpy(places)
     beneath = _beneath(one, X) - (1.0 - CONTACT_FACTOR) * part.margins[0].double().cpu()

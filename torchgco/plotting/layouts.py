@@ -231,7 +231,7 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, Flight], plane:
             # The first is the thinnest: one of the same course shows at its sides.
             wide = 1.6 if level == len(flights) - 1 else 2.2
             ax.plot(*path[:, plane].T, linewidth=wide, linestyle=solver_dash(solver), **look)
-        away = leaving(*np.transpose([ax.get_xlim(), ax.get_ylim()]), path[:, plane])
+        away = leaving(np.transpose([ax.get_xlim(), ax.get_ylim()]), path[:, plane])
         ended = _ended(flight, away is not None)
         # A solver that returned nothing has its mark at the start.
         last = path[-1:] if len(path) else scene.start[i][None]
@@ -259,7 +259,7 @@ def ends(flights: Mapping[str, list[Flight]], boxes: list[np.ndarray], columns: 
         for i, flight in enumerate(row):
             box, path = boxes[i // columns][:, ABOVE], flown(flight.path)
             if not flight.still:
-                kinds |= _ended(flight, leaving(*box, path[:, ABOVE]) is not None)
+                kinds |= _ended(flight, leaving(box, path[:, ABOVE]) is not None)
     return [Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in MARKED if kind in kinds]
 
 

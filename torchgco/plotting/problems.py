@@ -208,7 +208,7 @@ class _Map:
         for path in course.paths:
             shown = flown(path)[:, plane]
             ax.plot(*shown.T, zorder=3, **look)
-            if (away := leaving(*self.box[:, plane], shown)) is not None:
+            if (away := leaving(self.box[:, plane], shown)) is not None:
                 ax.plot(*away[0][:, None], color=course.colour, zorder=6, clip_on=False, **marker("away", away[1]))
                 drawn.add("away")
         touched = contacts(self.world.obstacles, flown(course.paths[0]), self.world.first.dt)

@@ -157,17 +157,17 @@ def view(scene: Scene, shown: Iterable[int], whole: list[np.ndarray], others: li
     return box + EDGE * size * np.array([[-1.0], [1.0]])
 
 
-def leaving(low: np.ndarray, high: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Where a path (K, 2) leaves a picture with corners `low`, `high` for good, (2,), and its angle there, rad.
+def leaving(box: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Where a path (K, 2) leaves a picture with corners `box` (2, 2) for good, (2,), and its angle there, rad.
 
     None where it ends inside, or never was.
     """
-    inside = ((path >= low) & (path <= high)).all(axis=1)
+    inside: np.ndarray = np.all((path >= box[0]) & (path <= box[1]), axis=1)
     if len(path) == 0 or inside[-1] or not inside.any():
         return None
     k = int(np.flatnonzero(inside)[-1])
     step = path[k + 1] - path[k]
-    room = np.where(step > 0, high, low) - path[k]
+    room = np.where(step > 0, box[1], box[0]) - path[k]
     share = float(np.divide(room, step, out=np.full(2, np.inf), where=step != 0).min())
     return path[k] + share * step, float(np.arctan2(step[1], step[0]))
 

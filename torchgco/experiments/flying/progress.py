@@ -47,14 +47,14 @@ class Lines(NoBar):
 
     def __init__(self, name: str, total: int, initial: int) -> None:
         self.name, self.total, self.done, self.solver = name, total, float(initial), ""
-        self.shown = time.monotonic()
+        self.shown, self.told = time.monotonic(), -1.0
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, failure: object, *_: object) -> None:
-        """The last line, where all went well."""
-        if failure is None:
+        """The last line, where all went well, and it says more than the one before."""
+        if failure is None and self.done != self.told:
             self._say()
 
     def set_description(self, desc: str) -> None:
@@ -68,7 +68,7 @@ class Lines(NoBar):
             self._say()
 
     def _say(self) -> None:
-        self.shown = time.monotonic()
+        self.shown, self.told = time.monotonic(), self.done
         print(f"{self.name}: {self.done:.0f}/{self.total} trials, {self.solver}", file=sys.stderr, flush=True)
 
 
