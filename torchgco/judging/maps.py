@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.shapes import computing_on
 from torchgco.judging.distances import closest
 from torchgco.maps.distance import DistanceField
 from torchgco.maps.field import BoundField
@@ -60,9 +61,9 @@ def segment_distances(field: BoundField, p: Tensor) -> Tensor:
     are NaN.
     """
     solids = solids_of(field.field)
-    rows = []
-    for which, path in zip(field.which.tolist(), p.detach().cpu().double(), strict=True):
-        rows.append(_distances(solids[which], path))
+    places = zip(field.which.tolist(), p.detach().cpu().double(), strict=True)
+    with computing_on(torch.device("cpu")):  # as the trees of solids do, wherever the problem lies
+        rows = [_distances(solids[which], path) for which, path in places]
     return torch.stack(rows).to(p)
 
 
