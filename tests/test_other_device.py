@@ -94,7 +94,8 @@ def solved(problem: Problem, U0: Tensor, solver: Any = LOCAL) -> tuple[Solution,
     return found, [found.X, found.U, found.K, found.d, found.cost, found.violation, found.status, found.iterations]
 
 
-SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("spheres", "boxes", "capsules", "oscillating", "function")]
+OTHERS = ("spheres", "boxes", "capsules", "oscillating", "function")
+SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in OTHERS]
 
 
 @pytest.mark.parametrize("kind", ["map", "states", *SLOW])
