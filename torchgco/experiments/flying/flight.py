@@ -135,7 +135,7 @@ class Flight:
                 "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": together,
                 "threads": torch.get_num_threads(), "device": setup.device.type,
                 "dtype": str(setup.dtype).removeprefix("torch."),
-                "kernels": None if solution.account is None else solution.account.kernels, "version": VERSION,
+                "kernels": (solution.account and solution.account.kernels) or "", "version": VERSION,
             }
         )  # fmt: skip
         return rows, U.numpy()
