@@ -36,6 +36,7 @@ PLAIN = {
     "threads": 1,
     "device": "cpu",
     "dtype": "float64",
+    "kernels": "native",
     "version": "0.1.0",
     "best_from": "file",
     "layout_digest": "one",

@@ -167,6 +167,8 @@ class Solution:
     def to_frame(self, problem: Problem | None = None) -> pd.DataFrame:
         """One row per problem: status, cost, violation and the iteration counts; the horizon where they differ.
 
+        Where it is known, `kernels` says what solved: "native", "pytorch", or another library's name.
+
         Args:
             problem: the problem that was solved. With it come the columns of `judge.columns`, from a re-simulation:
                 `clearance` where it has obstacles (m, the smallest distance to where bodies touch, also between
@@ -182,6 +184,8 @@ class Solution:
             columns[name] = getattr(self, name).cpu().numpy()
         if self.horizon is not None:
             columns["horizon"] = self.horizon.cpu().numpy()
+        if self.account is not None and self.account.kernels is not None:
+            columns["kernels"] = self.account.kernels
         if problem is not None:
             columns |= judged(problem, self.U, None if problem.free_start is None else self.X[:, 0])
         return pd.DataFrame(columns).rename_axis("element")
@@ -220,6 +224,8 @@ class Solution:
             arrays["horizon"] = self.horizon.cpu().numpy()
         with suppress(InputError):  # dynamics without a time step
             arrays["t"] = self.t.cpu().numpy()
+        if self.account is not None and self.account.kernels is not None:
+            arrays["kernels"] = np.array(self.account.kernels)
         for i, lam in enumerate(self.multipliers.lam):
             arrays[f"lam{i}"] = lam.cpu().numpy()
         write_whole(path, lambda file: np.savez_compressed(file, **arrays))
@@ -245,7 +251,8 @@ class Solution:
         tensors: dict[str, Any] = {name: torch.from_numpy(arrays[name]).to(where) for name in names}
         lam = tuple(tensors[f"lam{i}"] for i in range(count))
         own = {name: tensors[name] for name in _TENSORS}
-        account = Account(t=tensors["t"]) if "t" in tensors else None
+        kernels = str(arrays["kernels"]) if "kernels" in arrays else None
+        account = Account(t=tensors.get("t"), kernels=kernels) if "t" in tensors or kernels is not None else None
         return cls(multipliers=Multipliers(lam, tensors["mu"]), horizon=tensors.get("horizon"), account=account, **own)
 
 

@@ -224,6 +224,6 @@ def test_single_precision_is_judged_in_double() -> None:
     single, goal = problem.cast(torch.float32), torch.tensor([1.0, 0.4])
     double = judge(single.cast(torch.float64), U.float().double(), goal.double(), 5.0)
     for own in (single, single.cast(torch.float64)):
-        verdict = judge(own, U.float(), goal, 5.0)
+        verdict = judge(own, U.float(), goal.to(own.x0.dtype), 5.0)
         assert all(torch.equal(a, b) for a, b in zip(vars(verdict).values(), vars(double).values(), strict=True))
     assert verdict.cost.dtype == torch.float64 and bool(verdict.reached.all())

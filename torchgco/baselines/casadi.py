@@ -46,6 +46,8 @@ class CasADiSolver(Solver):
         InputError: a field out of its range; CasADi isn't installed.
     """
 
+    kernels: ClassVar[str | None] = "casadi"
+
     plugin: Literal["ipopt", "fatrop"] = "ipopt"
     max_iterations: Count = 1000
     tolerance: Positive = 1e-8
@@ -119,6 +121,7 @@ class PreparedCasADi(Solver):
     function: Any  # casadi.Function
 
     joins_knots: ClassVar[bool] = True
+    kernels: ClassVar[str | None] = "casadi"
 
     def frees_start(self, problem: Problem) -> bool:
         """As the solver."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -83,6 +83,8 @@ class PreparedGuided(Solver):
 
     guided: GuidedCasADi
     prepared: Solver
+
+    kernels: ClassVar[str | None] = "casadi"
 
     def run(self, call: Call) -> Solution:
         """As `GuidedCasADi.run`; InputError for another problem than the prepared one."""

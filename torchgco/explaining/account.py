@@ -16,7 +16,7 @@ from torchgco.problem.times import times
 class Account(PerElement):
     """The problem that was solved, and the solver; no dataclass, so that nothing is copied with a solution's tensors.
 
-    Of a solution that was loaded or sent to another process, only the times of the knots are left.
+    Of a solution that was loaded or sent to another process, only the times of the knots and the kernels are left.
 
     Args:
         problem: as the user gave it.
@@ -24,6 +24,7 @@ class Account(PerElement):
         name: of the preset that the user named; None: the solver's class.
         rows: the problems (b,) of the account; None: all.
         t: times, where the problem isn't there.
+        kernels: that solved: "native", "pytorch", or another library's name; None where that isn't known.
     """
 
     def __init__(
@@ -33,8 +34,10 @@ class Account(PerElement):
         name: str | None = None,
         rows: Tensor | None = None,
         t: Tensor | None = None,
+        kernels: str | None = None,
     ) -> None:
         self._whole, self.solver, self._name, self._rows, self._t = problem, solver, name, rows, t
+        self.kernels = kernels
 
     @property
     def problem(self) -> Problem | None:
@@ -48,7 +51,7 @@ class Account(PerElement):
 
     def of_preset(self, name: str) -> Account:
         """The same, solved by a preset of this name."""
-        return Account(self._whole, self.solver, name, self._rows, self._t)
+        return Account(self._whole, self.solver, name, self._rows, self._t, self.kernels)
 
     def times(self) -> Tensor:
         """The times of the knots, (N+1,) or (b, N+1), s.
@@ -74,7 +77,7 @@ class Account(PerElement):
         else:
             index = index.nonzero().flatten() if index.dtype == torch.bool else index
             rows = index if self._rows is None else self._rows[index]
-        return Account(self._whole, self.solver, self._name, rows, self._t)
+        return Account(self._whole, self.solver, self._name, rows, self._t, self.kernels)
 
     def __getstate__(self) -> dict[str, Any]:
         """Times and name alone: a problem may hold functions that no other process can read."""
@@ -82,4 +85,4 @@ class Account(PerElement):
             t = self.times()
         except InputError:
             t = None
-        return {"_whole": None, "solver": None, "_name": self.name, "_rows": None, "_t": t}
+        return {"_whole": None, "solver": None, "_name": self.name, "_rows": None, "_t": t, "kernels": self.kernels}

@@ -92,14 +92,14 @@ def judge(
             without a position, starts are free and none are given, or obstacles are of a kind that can't be judged.
     """
     check_problem(problem)
+    single = problem.x0.dtype == torch.float32
     problem, U = in_double(problem), doubled(U, "U", problem)
     problem.check_controls(U, "U")
-    goal, goal_radius, start = (
-        value.double() if isinstance(value, Tensor) else value for value in (goal, goal_radius, start)
-    )
+    more = goal, goal_radius, start
+    given: list[Any] = [value.double() if single and isinstance(value, Tensor) else value for value in more]
     with computing_on(problem.x0.device):
-        end = _goal(problem, goal, goal_radius)
-        first = _start(problem, start)
+        end = _goal(problem, *given[:2])
+        first = _start(problem, given[2])
         X, moved = [first], _moved(problem, first)
         cost = torch.zeros_like(problem.x0[:, 0])
         for k in range(problem.N):

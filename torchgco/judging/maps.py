@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.shapes import computing_on
 from torchgco.judging.distances import closest
 from torchgco.maps.distance import DistanceField
 from torchgco.maps.field import BoundField
@@ -60,7 +61,9 @@ def segment_distances(field: BoundField, p: Tensor) -> Tensor:
     are NaN.
     """
     paths = zip(field.which.tolist(), p.detach().cpu().double(), strict=True)
-    return torch.stack([path_distances(field.field, which, path) for which, path in paths]).to(p)
+    with computing_on(torch.device("cpu")):  # as the trees of solids do, wherever the problem lies
+        rows = [path_distances(field.field, which, path) for which, path in paths]
+    return torch.stack(rows).to(p)
 
 
 def path_distances(field: DistanceField, which: int, p: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 
 import torch
 from torch import Tensor
@@ -28,13 +28,14 @@ NUDGE = 1e-14  # relative change of the controls that tests a rollout's sensitiv
 CURRENT = "current"  # marks the form of problems that a solve works on
 INTERIOR = "interior"  # marks the library of the interior point
 EXPECTED = "expected"  # marks that the interior point will be asked for
+REASON = "reason"  # why there is no engine
 WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
 KEPT = 64  # engines of problems without a user's code, the most recent ones
 AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
 
 
 class EagerWarning(UserWarning):
-    """Native kernels can't be used for a problem; PyTorch's are, which takes longer."""
+    """Native kernels can't be used for a problem; PyTorch's are, which takes longer and may leave passes out."""
 
 
 def current(problem: Problem) -> Problem:
@@ -65,12 +66,38 @@ def engine_of(problem: Problem) -> Engine | None:
         except (InputError, NativeError) as error:
             problem.form["engine"] = None
             check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
-            reason = str(error).splitlines()[0]
+            problem.form[REASON] = reason = str(error).splitlines()[0]
             warned = problem.form.setdefault(WARNED, set())
             if reason not in warned:
                 warned.add(reason)
                 warnings.warn(f"solved by PyTorch's kernels, many times slower: {reason}", EagerWarning, stacklevel=4)
     return problem.form["engine"]
+
+
+def why_eager(problem: Problem) -> str | None:
+    """Why PyTorch's kernels solve these problems, in words; None where native ones do."""
+    if engine_of(problem) is not None:
+        return None
+    if problem.x0.device.type != "cpu":
+        return f"x0 is on the device {problem.x0.device.type}"
+    if problem.x0.dtype != torch.float64:
+        return f"x0 is {str(problem.x0.dtype).removeprefix('torch.')}"
+    return "this process has chosen them" if not native() else problem.form[REASON]
+
+
+def kernels_of(problem: Problem) -> str:
+    """The kernels that have worked on problems of this form: "native" or "pytorch"."""
+    return "pytorch" if problem.form.get("engine") is None or not native() else "native"
+
+
+def warn_of_left_out(problem: Problem, parts: Sequence[str]) -> None:
+    """An EagerWarning that names what a solver leaves out for these problems without native kernels, once for them."""
+    reason = why_eager(problem) if parts else None
+    warned = problem.form.setdefault(WARNED, set())
+    if reason is not None and (told := (reason, *parts)) not in warned:
+        warned.add(told)
+        text = f"solved by PyTorch's kernels, as {reason}. Without native ones (float64 on a CPU, with a C compiler) "
+        warnings.warn(f"{text}the solver leaves out: {'; '.join(parts)}", EagerWarning, stacklevel=4)
 
 
 def expect_interior(problem: Problem) -> None:

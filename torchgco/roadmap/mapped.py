@@ -18,7 +18,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchgco.base.tree import take
+from torchgco.base.shapes import computing_on
+from torchgco.base.tree import on_cpu, take
 from torchgco.roadmap import blocks as searched
 from torchgco.roadmap.blocks import Blocks, blocks_of
 from torchgco.roadmap.geometry import Inflated, Scene
@@ -55,15 +56,18 @@ def paths_in_maps(scene: Scene, count: int, overlap: float) -> tuple[Tensor, Ten
     found = torch.zeros_like(start[:, 0], dtype=torch.bool)
     for b in range(len(start)):
         row = torch.tensor([b], device=start.device)
-        obstacles = take(scene.obstacles, row).reduced(overlap)
+        obstacles = on_cpu(take(scene.obstacles, row)).reduced(overlap)
 
         def price(points: Array, row: Tensor = row) -> Array:
-            return scene.traversal_cost(start.new_tensor(points)[None], row)[0].double().cpu().numpy()
+            with computing_on(start.device):
+                return scene.traversal_cost(start.new_tensor(points)[None], row)[0].double().cpu().numpy()
 
         ends = torch.stack((start[b], goal[b])).double().cpu().numpy()
-        lattice = lattice_of(obstacles.maps, obstacles.kinds, ends)
-        radius = float(obstacles.maps[0].vehicle_radius[0])
-        for k, path in enumerate(paths(lattice, ends, price, count, radius, float(obstacles.largest), HOPS + 1)):
+        with computing_on(torch.device("cpu")):  # the search is of NumPy's arrays, wherever the problem lies
+            lattice = lattice_of(obstacles.maps, obstacles.kinds, ends)
+            radius = float(obstacles.maps[0].vehicle_radius[0])
+            ways = list(paths(lattice, ends, price, count, radius, float(obstacles.largest), HOPS + 1))
+        for k, path in enumerate(ways):
             corners[b, k, : len(path)] = start.new_tensor(path)
             if k == 0:
                 corners[b, 1:], found[b] = corners[b, :1], True  # the first stands in for those that there aren't
@@ -74,10 +78,12 @@ def sweep_alike(paths: Tensor, obstacles: Inflated) -> Tensor:
     """Whether paths (B, K, P, 2) wind around every blocked region of the maps by the same angle, (B, K, K)."""
     same = torch.ones(*paths.shape[:2], paths.shape[1], dtype=torch.bool, device=paths.device)
     for b, some in enumerate(paths.double().cpu().numpy()):
-        own = take(obstacles, torch.tensor([b], device=paths.device))
+        own = on_cpu(take(obstacles, torch.tensor([b], device=paths.device)))
         for field in own.maps:
-            lattice = lattice_of([field], [], some[0, [0, -1]])
-            sums = torch.tensor([swept(lattice, path) for path in some], device=paths.device)
+            with computing_on(torch.device("cpu")):
+                lattice = lattice_of([field], [], some[0, [0, -1]])
+                angles = [swept(lattice, path) for path in some]
+            sums = torch.tensor(angles, device=paths.device)
             same[b] &= sums.unsqueeze(0) == sums.unsqueeze(1)
     return same
 

@@ -16,6 +16,7 @@ from torchgco.base.status import is_over
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import has_arrived
 from torchgco.native.dispatch import chord_clearance, interior_of, measured
+from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.converge import continued
 from torchgco.solvers.interior import InteriorPoint
@@ -72,6 +73,10 @@ class ClearChords:
             clearance[rows] = torch.where(serves, now[rows], clearance[rows])
             rows = rows[clearance[rows] < 0]
         best.restore(touching, clearance[touching] < 0)
+
+    def left_out(self, problem: Problem) -> str | None:
+        """As of `Converge`."""
+        return "the interior point's ends of trajectories that touched between knots" if problem.geometric else None
 
     def _kept(self, search: Search, rows: Tensor, new: SolveEnd, least: Tensor) -> tuple[Tensor, Tensor]:
         """Where new trajectories of `rows` serve, with more clearance than `least`, they replace the best.

@@ -21,6 +21,10 @@ from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
 from torchgco.solvers.state import Iterate, SolveEnd
 
+LEFT_OUT = {
+    "first": "the first solve by the interior point", "mapped": "the interior point's solves in maps",
+    "last": "the interior point at the end",
+}  # fmt: skip
 WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
 
 
@@ -55,7 +59,7 @@ class Converge:
         if self.when == "last":
             self._tighten(search)
         elif self.when == "mapped":
-            if any(isinstance(part, BoundField) for part in problem.geometric):
+            if _mapped(problem):
                 self._continue(search, search.best.limited)
         elif self.begins(problem) and not search.begun:
             search.begin(self.solver.solved(search.call))
@@ -63,6 +67,13 @@ class Converge:
                 search.record.passes[-1][2].extend(search.call.rows.tolist())
             rows = _unsolved(search)
             search.best.improve(rows, search.call.take(rows))
+
+    def left_out(self, problem: Problem) -> str | None:
+        """What these problems lose without native kernels, in words; None: nothing."""
+        of_these = {"first": not problem.geometric, "mapped": _mapped(problem), "last": True}[self.when]
+        if not (of_these and self.worth(problem)):
+            return None
+        return f"{LEFT_OUT[self.when]} (violation {self.solver.violation_tolerance:g})"
 
     @staticmethod
     def serves(problem: Problem) -> bool:
@@ -106,6 +117,11 @@ class Converge:
         clear = (chord_clearance(problem, new.X) >= 0) | ~(chord_clearance(problem, old.X) >= 0)
         clear |= old.violation > limit
         search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
+
+
+def _mapped(problem: Problem) -> bool:
+    """Whether there are maps among the obstacles."""
+    return any(isinstance(part, BoundField) for part in problem.geometric)
 
 
 def _unsolved(search: Search) -> Tensor:

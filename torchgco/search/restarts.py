@@ -76,6 +76,11 @@ class Restarts(Solver):
         if self._finishes and Converge.worth(problem):
             expect_interior(problem)
 
+    def left_out(self, problem: Problem) -> list[str]:
+        """What the passes say of themselves."""
+        said = (one.left_out(problem) for one in self.passes if isinstance(one, Converge | ClearChords | Starts))
+        return [part for part in said if part is not None]
+
     def frees_start(self, problem: Problem) -> bool:
         """Where a pass is the interior point's, and there are native kernels."""
         return self._finishes and interior_of(problem) is not None

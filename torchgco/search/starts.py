@@ -13,6 +13,7 @@ from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import take
 from torchgco.lagrangian.quality import is_preferred
+from torchgco.problem.problem import Problem
 from torchgco.search.attempts import Search
 from torchgco.search.converge import Converge
 from torchgco.search.finish import STREAM, half_ranges
@@ -65,6 +66,11 @@ class Starts:
             if search.call.late:
                 return
             self._solve(search, rows)
+
+    def left_out(self, problem: Problem) -> str | None:
+        """As of `Converge`."""
+        serves = Converge.worth(problem) and not problem.geometric
+        return f"{self.count} further starts by the interior point" if serves else None
 
     def _rows(self, search: Search) -> Tensor:
         """The problems to solve again, (b,)."""

@@ -20,7 +20,7 @@ from torchgco.base.tree import Rows, take
 from torchgco.explaining.account import Account
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
-from torchgco.native.dispatch import cost_unit, current, open_loop
+from torchgco.native.dispatch import cost_unit, current, kernels_of, open_loop, warn_of_left_out
 from torchgco.problem.horizons import at_rest_after, for_solvers
 from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
@@ -136,9 +136,11 @@ class Solver(Brief):
     Attributes:
         joins_knots: whether `run` takes rows of two knots (`RateBounds`) as they are; else the controls of the stage
             before are further states of `call.problem`.
+        kernels: another library that solves; None: ours, native or PyTorch's.
     """
 
     joins_knots: ClassVar[bool] = False
+    kernels: ClassVar[str | None] = None
 
     def solve(
         self,
@@ -187,9 +189,10 @@ class Solver(Brief):
                 expected = "InteriorPoint, also within gco, does where there are native kernels (float64 on a CPU)"
                 held = f"free_start: the start is held at x0, as {type(self).__name__} doesn't choose it; {expected}"
                 warnings.warn(held, StartWarning, stacklevel=2)
+            warn_of_left_out(call.problem, self.left_out(call.problem))
             found = self.run(call)
             found = found if whole is problem else found.of_first_states(problem.n, problem.horizon)
-            return replace(found, account=Account(problem, self))
+            return replace(found, account=Account(problem, self, kernels=self.kernels or kernels_of(call.problem)))
 
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
@@ -197,6 +200,10 @@ class Solver(Brief):
 
     def announce(self, problem: Problem) -> None:
         """Say which libraries `run` will ask for, so that they are compiled side by side; called before any is."""
+
+    def left_out(self, problem: Problem) -> list[str]:
+        """What `run` does with these problems by native kernels alone, in words: left out where there are none."""
+        return []
 
     def take_states(self, problem: Problem) -> bool:
         """Whether `run` can begin these problems with states that their controls don't lead to."""

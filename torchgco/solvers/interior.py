@@ -96,6 +96,10 @@ class InteriorPoint(Solver):
         """For every problem."""
         expect_interior(problem)
 
+    def left_out(self, problem: Problem) -> list[str]:
+        """All of it."""
+        return ["the interior point, in whose place AL-iLQR solves"]
+
     def frees_start(self, problem: Problem) -> bool:
         """Where there are native kernels."""
         return interior_of(problem) is not None

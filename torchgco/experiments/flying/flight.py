@@ -137,7 +137,8 @@ class Flight:
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),
                 "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": together,
                 "threads": torch.get_num_threads(), "device": setup.device.type,
-                "dtype": str(setup.dtype).removeprefix("torch."), "version": VERSION,
+                "dtype": str(setup.dtype).removeprefix("torch."),
+                "kernels": (solution.account and solution.account.kernels) or "", "version": VERSION,
             }
         )  # fmt: skip
         return rows, U.numpy()

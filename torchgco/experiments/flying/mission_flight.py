@@ -68,7 +68,7 @@ class MissionFlight:
             "feasible": outcome not in LOST, "reached": outcome == Outcome.REACHED, "sound": False,
             **dict.fromkeys(SINGLE, np.nan),
             "batch_size": self.layouts.count, "threads": torch.get_num_threads(), "device": setup.device.type,
-            "dtype": str(setup.dtype).removeprefix("torch."), "version": VERSION,
+            "dtype": str(setup.dtype).removeprefix("torch."), "kernels": "", "version": VERSION,
         }  # fmt: skip
 
     def _progress(self, period: float, duration: float, step: int, flying: int) -> None:

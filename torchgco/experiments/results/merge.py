@@ -28,7 +28,7 @@ INCIDENTAL = {"seconds", "batch_size", "threads", "best_cost", "best_from", "suc
 RUN, VARIANT, LAYOUT = "_run", "_variant", "_layout"
 OWN = [RUN, VARIANT]
 # Columns of text that become categories: comparing and copying text would take most of a large report's time.
-TEXT = (*TASK, "solver", "status", "device", "dtype", "version", "best_from", *DIGESTS)
+TEXT = (*TASK, "solver", "status", "device", "dtype", "kernels", "version", "best_from", *DIGESTS)
 
 
 def merge(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> pd.DataFrame:
