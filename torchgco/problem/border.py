@@ -47,7 +47,8 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     several, one = dynamics.at(k), dynamics.at(0)
     for name in ("field", "step") if dynamics.is_integrated else ("step",):
         method = lambda model, name=name: lambda i, x, u: getattr(model.take(i), name)(x, u)
-        wanted = f"{'derivatives' if name == 'field' else 'states'} (..., {n}) in {x0.dtype}, the type of x0, shaped as its states"
+        what = "derivatives" if name == "field" else "states"
+        wanted = f"{what} (..., {n}) in {x0.dtype}, the type of x0, shaped as its states"
         _check_values(f"dynamics.{name}", method(one), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
         of_stages = _called(f"dynamics.{name}", wanted, method(several), rows, x, u)
         _check_tensor(f"dynamics.{name}", of_stages, (2, 3, n), x.dtype, wanted)
