@@ -221,5 +221,5 @@ def _array(value: Tensor) -> np.ndarray:
 
 
 def _unknown(field: str, operation: Operation, why: str = "") -> InputError:
-    expected = "operations that can be compiled (docs/extending.md, What is compiled)"
+    expected = "operations that can be compiled (torchgco.tracing.operations.OPERATIONS lists them)"
     return InputError(field, expected, f"{operation.title}{': ' if why else ''}{why}")
