@@ -61,6 +61,7 @@ UNARY |= {
     "close": lambda z: z if torch.allclose(z, torch.zeros_like(z)) else 0.5 * z,
     "none chosen": lambda z: z if z[z != 0.0].numel() == 0 else 0.5 * z,
 }  # fmt: skip
+BRANCHES = ("equal", "close", "none chosen")  # solved as they are; what they read beside that isn't looked for
 ROUGH = ("single",)  # of single precision, in which the two kinds of kernels differ by its rounding
 FAULTS = (
     "numpy", "dropout", "randn", "python random", "one column", "scalar", "coupled", "integer", "missing", "joined",
@@ -113,9 +114,12 @@ class Memory:
         return z
 
 
-def drawn_function(rng: random.Random, memory: Memory, capture: str) -> tuple[list[str], Callable[..., Tensor]]:
+def drawn_function(
+    rng: random.Random, memory: Memory, capture: str, branches: tuple[str, ...]
+) -> tuple[list[str], Callable[..., Tensor]]:
     """A bounded or growing function of (..., SIZE) that reads `memory`, and the names of its parts."""
     names, weight = rng.choices(list(UNARY), k=rng.randint(1, 3)), rng.uniform(0.2, 0.8)
+    names = [name if name not in BRANCHES or name in branches else "sin" for name in names]
 
     def function(z: Tensor, goal: Tensor | None = None) -> Tensor:
         for name in names:
@@ -145,7 +149,7 @@ def spoilt(rng: random.Random, function: Callable[[Tensor], Tensor], fault: str)
 
 
 class Drawn(NamedTuple):
-    """How to make a problem, what it captures, how, its fault ("" for none), its parts, and how exactly it is solved."""
+    """How to make a problem, what it captures, how, its fault ("" for none), its parts, and a tolerance."""
 
     make: Callable[[], Problem]
     memory: Memory
@@ -161,7 +165,7 @@ def drawn_problem(seed: int) -> Drawn:
     memory, capture = Memory(rng), rng.choice(CAPTURES)
     fault = rng.choice(FAULTS) if rng.random() < 0.3 else ""
     place = rng.choice(("model", "cost", "constraint"))
-    names, inner = drawn_function(rng, memory, capture)
+    names, inner = drawn_function(rng, memory, capture, () if fault == "joined far away" else BRANCHES)
     inner = spoilt(rng, inner, fault) if fault else inner
     values = {"goal": memory.goals} if capture == "values" and not fault else None
     shape, integrator = rng.choice((0, 1)), rng.choice(("euler", "midpoint", "rk4", "none"))

@@ -14,6 +14,7 @@ from torchgco import (
     Cost,
     FirstStepRates,
     FunctionConstraint,
+    FunctionCost,
     FunctionDynamics,
     InputError,
     Planar,
@@ -87,6 +88,24 @@ def test_mixed_dtypes_are_named() -> None:
     bounds = ControlBounds(torch.tensor([-1.0, -1.0], dtype=torch.float64), [1, 1])
     with pytest.raises(InputError, match=r"control_bounds.lower: expected dtype torch.float32 as in x0"):
         planar(x0=x0, constraints=[bounds])
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_tensor_of_another_type_than_x0_is_named(dtype: torch.dtype) -> None:
+    other = torch.float32 if dtype == torch.float64 else torch.float64
+    network, weights = torch.nn.Linear(4, 2, dtype=other), torch.ones(2, dtype=other)
+    x0 = torch.zeros(3, 2, dtype=dtype)
+    plain = FunctionDynamics(lambda x, u: x + 0.1 * u, 2, 2, 0.1, "none")
+    learned = FunctionDynamics(lambda x, u: network(torch.cat((x, u), dim=-1)), 2, 2, 0.1, "none")
+    cost = QuadraticCost([1.0] * 2, [0.1] * 2, [5.0] * 2)
+    rows = FunctionConstraint(lambda x: x @ weights.diag() - 1.0)
+    named = rf"{other} \(.*\) beside {dtype}, the type of x0, in torch"
+    for parts, where in (
+        ((learned, cost, []), "linear"), ((plain, cost, [rows]), "matmul"),
+        ((plain, FunctionCost(lambda x, u: (x @ weights.diag()).sum(-1)), []), "matmul"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=rf"{named}.*{where}"):
+            Problem(*parts, x0, 5)
 
 
 def test_errors_survive_a_worker_process() -> None:

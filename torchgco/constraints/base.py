@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown, theirs
+from torchgco.base.mixing import foreign, why
 from torchgco.base.options import check_options
 from torchgco.base.shapes import MISTAKES, Dimensions, check_shape
 from torchgco.base.tree import PerElement
@@ -162,15 +163,17 @@ class FunctionConstraint(Constraint):
             raise InputError(where, f"a function of {' and '.join(self.of)}", shown(self.function))
         values = bound_values(self.values, self.knot_values, (self.function,), dims, self.name)
         bound = replace(self, knots=knots, values=values)
+        one = bound.take(slice(0, 1))  # a whole batch may be large; `Problem` tries two problems
+        zeros = [dims.like.new_zeros(1, *size) for size in ((last + 1, dims.n), (dims.N, dims.m))]
         try:
-            one = bound.take(slice(0, 1))  # a whole batch may be large; `Problem` tries two problems
-            rows = one.value(*(dims.like.new_zeros(1, *size) for size in ((last + 1, dims.n), (dims.N, dims.m))))
+            rows = one.value(*zeros)
         except MISTAKES as error:
-            message = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError(where, f"a function of {' and '.join(self.of)}", message) from theirs(error)
+            got = why(error, one.value, *zeros)
+            raise InputError(where, f"a function of {' and '.join(self.of)}", got) from theirs(error)
         check_shape(rows, (1, len(range(last + 1)[knots]) if isinstance(knots, slice) else len(knots), "p"), where)
         if rows.dtype != dims.like.dtype:
-            raise InputError(where, f"rows of {dims.like.dtype} as x0", rows.dtype)
+            got = foreign(dims.like.dtype, one.value, *zeros) or str(rows.dtype)
+            raise InputError(where, f"rows of {dims.like.dtype} as x0", got)
         return bound
 
     @property

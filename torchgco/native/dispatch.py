@@ -29,6 +29,7 @@ CURRENT = "current"  # marks the form of problems that a solve works on
 INTERIOR = "interior"  # marks the library of the interior point
 EXPECTED = "expected"  # marks that the interior point will be asked for
 REASON = "reason"  # why there is no engine
+EAGER = "eager"  # marks that PyTorch's kernels have differentiated a user's parts
 WARNED = "warned"  # the reasons that an EagerWarning has named for a problem
 KEPT = 64  # engines of problems without a user's code, the most recent ones
 AMPLIFIED = 1e6  # times NUDGE: where the states change by less, different last bits don't matter
@@ -59,6 +60,9 @@ def engine_of(problem: Problem) -> Engine | None:
     where a part can't be traced or nothing compiles, which an EagerWarning explains.
     """
     if not native() or problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
+        if EAGER not in problem.form:
+            check_eager(problem.dynamics, problem.cost, problem.constraints, problem.x0, problem.N)
+            problem.form[EAGER] = True
         return None
     if "engine" not in problem.form:
         try:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchgco.base.autodiff import WithoutReading, gradients_at_once
 from torchgco.base.errors import InputError, theirs
+from torchgco.base.mixing import why
 from torchgco.base.shapes import MISTAKES, describe
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint
@@ -46,7 +47,8 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     several, one = dynamics.at(k), dynamics.at(0)
     for name in ("field", "step") if dynamics.is_integrated else ("step",):
         method = lambda model, name=name: lambda i, x, u: getattr(model.take(i), name)(x, u)
-        wanted = f"{'derivatives' if name == 'field' else 'states'} (..., {n}) in {x0.dtype}, shaped as its states"
+        what = "derivatives" if name == "field" else "states"
+        wanted = f"{what} (..., {n}) in {x0.dtype}, the type of x0, shaped as its states"
         _check_values(f"dynamics.{name}", method(one), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
         of_stages = _called(f"dynamics.{name}", wanted, method(several), rows, x, u)
         _check_tensor(f"dynamics.{name}", of_stages, (2, 3, n), x.dtype, wanted)
@@ -90,7 +92,7 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
     if not is_users(cost):
         return
     rows, X, U, k = _ends(x0), _states(x0, N + 1), _controls(x0, N, m), torch.arange(N)
-    wanted = f"a number in {x0.dtype} per state and control"
+    wanted = f"a number in {x0.dtype}, the type of x0, per state and control"
     stage: Callable[..., Any] = lambda i, x, u, k=k: cost.take(i).stage(x, u, k)
     _check_values("cost.stage", stage, rows, (X[:, :-1], U), (2, N), wanted)
     _check_values("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, (X[:, 0], U[:, 0]), (2,), wanted)
@@ -126,7 +128,7 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
     K = len(torch.arange(N + 1)[constraint.knots])
     if K == 0:
         return
-    wanted = f"rows (2, {K}, p) in {x0.dtype} of two problems"
+    wanted = f"rows (2, {K}, p) in {x0.dtype}, the type of x0, of two problems"
     shape = _check_values(field, value, rows, (X, U), (2, K, None), wanted)
     if 0 in shape:
         return
@@ -266,8 +268,7 @@ def _called(field: str, wanted: str, function: Callable[..., Any], *arguments: A
     except InputError:
         raise
     except MISTAKES as error:
-        message = (str(error).splitlines() or [""])[0] or type(error).__name__
-        raise InputError(field, wanted, message) from theirs(error)
+        raise InputError(field, wanted, why(error, function, *arguments)) from theirs(error)
 
 
 def _ends(x0: Tensor) -> Tensor:

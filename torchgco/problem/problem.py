@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown, theirs
+from torchgco.base.mixing import foreign, why
 from torchgco.base.options import Count, Seconds, check_value
 from torchgco.base.shapes import MISTAKES, Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, cast
@@ -387,13 +388,15 @@ class Problem:
                     wanted = f"{self.x0.dtype} on {self.x0.device} as x0"
                     raise InputError(f"dynamics.{name}", wanted, f"{value.dtype} on {value.device}")
                 check_tensor(value, f"dynamics.{name}")
+        step, start = self.dynamics.at(0).step, (self.x0, self.x0.new_zeros(self.B, self.m))
+        expected = f"a step for {self.x0.dtype} states {tuple(self.x0.shape)}, as x0"
         try:
-            after = self.dynamics.at(0).step(self.x0, self.x0.new_zeros(self.B, self.m))
+            after = step(*start)
         except MISTAKES as error:
-            message = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError("dynamics.step", f"a step for states {tuple(self.x0.shape)}", message) from theirs(error)
+            raise InputError("dynamics.step", expected, why(error, step, *start)) from theirs(error)
         if not isinstance(after, Tensor) or after.shape != self.x0.shape or after.dtype != self.x0.dtype:
-            raise InputError("dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", describe(after))
+            got = foreign(self.x0.dtype, step, *start) if isinstance(after, Tensor) else None
+            raise InputError("dynamics.step", f"{self.x0.dtype} states {tuple(self.x0.shape)}", got or describe(after))
 
 
 def _is_whole(index: Rows, B: int) -> bool:

@@ -38,7 +38,7 @@ class Traced:
 
     Raises:
         InputError: the function can't be traced (it branches on values of its arguments, say), or holds an operation
-            that CasADi has no counterpart for; the error names it.
+            that can't be compiled; the error names it.
     """
 
     def __init__(
@@ -221,5 +221,5 @@ def _array(value: Tensor) -> np.ndarray:
 
 
 def _unknown(field: str, operation: Operation, why: str = "") -> InputError:
-    expected = "operations with a counterpart in C (docs/extending.md lists them)"
+    expected = "operations that can be compiled (torchgco.tracing.operations.OPERATIONS lists them)"
     return InputError(field, expected, f"{operation.title}{': ' if why else ''}{why}")

@@ -1,0 +1,124 @@
+"""Functions whose rows depend on other knots, on their number, or on other problems are refused by `Problem`."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost
+from torchgco.native.codegen.constraint import trace_rows
+
+D = torch.float64
+N = 10
+REFERENCE = torch.linspace(3.0, 0.5, N + 1, dtype=D)[:, None]
+WEIGHTS = torch.tensor([[0.3, -1.7], [1.1, 0.4]], dtype=D)
+
+
+def problem(cost: Any = None, constraints: Any = (), field: Callable[..., Tensor] | None = None, N: int = N) -> Problem:
+    model = FunctionDynamics(field or (lambda x, u: x + 0.1 * u), 2, 2, 0.1, "none")
+    x0 = torch.tensor([[0.0, 0.0], [0.3, 0.3], [1.0, 1.0]], dtype=D)
+    return Problem(model, cost or QuadraticCost([1.0] * 2, [0.1] * 2, [5.0] * 2), list(constraints), x0, N)
+
+
+def total(u: Tensor) -> Tensor:
+    return u.square().sum((-2, -1), keepdim=True).expand(*u.shape[:-1], 1) - 20.0
+
+
+def far(u: Tensor) -> Tensor:
+    return (u - u.roll(1, -2)).abs().sum(-1, keepdim=True)
+
+
+GOALS = {"values": {"goal": torch.ones(3, 2, dtype=D)}}
+
+
+def late(x: Tensor) -> Tensor:
+    """Knot 6 alone, at knot 7 alone."""
+    if x.shape[-2] < N:
+        return torch.zeros_like(x[..., :1])
+    return torch.nn.functional.pad(x[..., 5:6, :1], (0, 0, 6, x.shape[-2] - 7))
+
+
+JOINED: dict[str, tuple[str, Callable[..., Tensor]]] = {
+    "cumulated": ("u", lambda u: u.square().sum(-1, keepdim=True).cumsum(-2) - 1.0),
+    "total": ("u", total),
+    "changes": ("u", lambda u: (u - u.roll(1, -2)).abs() - 0.2),
+    "first knot": ("x", lambda x: x[..., :1] - x[:, :1, :1] - 0.3),
+    "reference cut": ("x", lambda x: x[..., :1] - REFERENCE[: x.shape[-2]]),
+    "reference of all knots": ("x", lambda x: x[..., :1] - REFERENCE[1:]),
+    "linspace": ("x", lambda x: x[..., :1] - torch.linspace(3.0, 0.5, x.shape[-2], dtype=D)[:, None]),
+    "number of knots": ("x", lambda x: x[..., :1] / x.shape[-2] - 0.3),
+    "of both": ("xu", lambda x, u: x[..., :1] * u[..., :1] - x.mean(-2, keepdim=True)[..., :1]),
+    "with k": ("x", lambda x, k: x[..., :1] - 0.1 * k[:, None] - x.cumsum(-2)[..., 1:]),
+    # Nothing of these is seen at points like the start.
+    "far changes": ("u", lambda u: u.sum(-1, keepdim=True) - 9.0 + (far(u) - 5.0).relu()),
+    "far mean": ("x", lambda x: torch.where(x.mean(-2, keepdim=True)[..., :1] > 5.0, x[..., :1], x[..., :1] - 2.0)),
+    "far and negative": ("x", lambda x: x[..., :1] - (-x.cumsum(-2)[..., :1] - 99.0).clamp(min=0.0)),
+    "far number of knots": ("x", lambda x: (x[..., :1] / x.shape[-2] - 0.3).relu() - 0.5),
+    "one knot at another": ("x", lambda x: x[..., :1] - 1.0 + (late(x) - 4.0).relu()),
+    "problems": ("x", lambda x: x[..., :1] - (x.mean(0, keepdim=True)[..., :1] - 5.0).relu()),
+}  # fmt: skip
+APART: dict[str, tuple[str, Callable[..., Tensor], dict[str, Any]]] = {
+    "k": ("x", lambda x, k: x[..., :1] - REFERENCE[k], {}),
+    "knot_values": ("x", lambda x, most: x[..., :1] - most, {"knot_values": {"most": REFERENCE.unsqueeze(0)}}),
+    "values": ("x", lambda x, goal: (x - goal).norm(dim=-1, keepdim=True) - 9.0, GOALS),
+    "network": ("x", lambda x: (x @ WEIGHTS).tanh() - 0.9, {}),
+    "domain": ("x", lambda x: (2.0 + x[..., :1]).log() - 3.0, {}),
+    "both": ("xu", lambda x, u: torch.stack((x[..., 0] * u[..., 1], u.prod(-1)), -1) - 2.0, {}),
+    "branch on values": ("x", lambda x: x[..., :1] - 1.0 if bool(x.sum() > -3.0) else x[..., :1] - 2.0, {}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", JOINED)
+def test_rows_that_join_knots_are_refused(name: str) -> None:
+    of, function = JOINED[name]
+    with pytest.raises(InputError, match=r"rows of one knot .*RateBounds.*knot_values") as caught:
+        problem(constraints=[FunctionConstraint(function, of=of)])
+    assert caught.value.field == "constraint.function" and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", APART)
+def test_rows_of_one_knot_are_accepted(name: str) -> None:
+    of, function, more = APART[name]
+    problem(constraints=[FunctionConstraint(function, of=of, **more)])
+
+
+def field(more: Callable[[Tensor], Any]) -> Callable[[], Problem]:
+    return lambda: problem(field=lambda x, u: x + 0.1 * u + more(x))
+
+
+def costs(stage: Callable[[Tensor], Any], end: Callable[[Tensor], Any]) -> Callable[[], Problem]:
+    return lambda: problem(
+        FunctionCost(lambda x, u: u.square().sum(-1) + stage(x), lambda x: x.square().sum(-1) + end(x))
+    )
+
+
+MIXED: dict[str, tuple[str, Callable[[], Problem]]] = {
+    "model": ("dynamics.step", field(lambda x: (x.mean(0, keepdim=True) - 5.0).relu())),
+    "states at once": ("dynamics.step", field(lambda x: x if x.dim() == 2 else 2.0 * x)),
+    "stages": ("dynamics.step", field(lambda x: (x.sum(1, keepdim=True) - 9.0).relu() if x.dim() == 3 else 0.0)),
+    "cost": ("cost.stage", costs(lambda x: (x.sum(-1).cumsum(0) - 50.0).relu(), lambda x: 0.0)),
+    "terminal cost": ("cost.terminal", costs(lambda x: 0.0, lambda x: (x.mean() - 7.0).relu())),
+}
+
+
+@pytest.mark.parametrize("name", MIXED)
+def test_functions_that_mix_problems_are_refused(name: str) -> None:
+    field, make = MIXED[name]
+    with pytest.raises(InputError) as caught:
+        make()
+    assert caught.value.field == field
+
+
+def test_the_code_of_a_constraint_is_that_of_all_its_knots_and_of_every_horizon() -> None:
+    rows = FunctionConstraint(lambda x: x[..., :1] ** 2 - x.sum(-1, keepdim=True) * 0.5 - 1.0)
+    short, long = (trace_rows(problem(constraints=[rows], N=count), 0) for count in (3, 7))
+    assert short.code == long.code and short.places.shape == long.places.shape == (1, 0)
+
+
+def test_what_no_point_shows_is_seen_in_the_trace() -> None:
+    window = FunctionConstraint(lambda x: x[..., :1] - ((x.roll(1, -2)[..., :1] - 3.0).abs() < 0.1) * 1.0 - 9.0)
+    hidden = problem(constraints=[window])
+    with pytest.raises(InputError, match="own knot alone"):
+        trace_rows(hidden, 0)
