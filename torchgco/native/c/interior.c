@@ -47,7 +47,8 @@ static void begin(Barrier *t, Track *k, I of) {
     k->made = tgco_choose(of, zero, k->made);
     k->least = tgco_choose(of, SET(INFINITY), k->least);
     k->restoring &= ~of; k->watching &= ~of;
-    t->relaxed = tgco_choose(of, zero, t->relaxed);
+    k->relaxed &= ~of;
+    if (t->some_relaxed) for (int64_t q = 0; q < t->rows; q++) t->relaxed[q] = tgco_choose(of, zero, t->relaxed[q]);
     t->soft = tgco_choose(of, SET(how->soft), t->soft);
     for (int l = 0; l < LANES; l++) if (of[l]) k->failures[l] = k->shortened[l] = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
@@ -173,39 +174,41 @@ static int is_solved(const Barrier *t, Track *k, int l, double error, double pri
     return k->idle[l] >= how->idle && error <= how->rounding && error <= 2.0 * k->least[l];
 }
 
-/* Where a multiplier of an inequality explodes, rows leave each other no room: all are relaxed, as IPOPT's bounds are. */
+/* Where a multiplier of an inequality explodes, rows leave each other no room: they are relaxed, as IPOPT's bounds are. */
 static void relax(Barrier *t, Track *k, I running) {
-    V largest = SET(0.0), room = SET(t->how->relaxes * t->how->violation);
+    V largest = SET(0.0);
     ROWS(t, 0, largest = most(t->z[q], largest))
-    I lacks = running & (largest > SET(t->how->explodes)) & (t->relaxed == SET(0.0)) & ~k->watching;
+    I lacks = running & (largest > SET(t->how->explodes)) & ~k->relaxed & ~k->watching;
     if (!any(lacks)) return;
-    t->relaxed = tgco_choose(lacks, room, t->relaxed);
-    ROWS(t, 0, t->s[q] += by_role(t, q, tgco_if(lacks, room), SET(0.0)))
+    k->relaxed |= lacks;
+    visit_rows(t, lacks, 1, loosen);
     settle(t, k, lacks, 0);
     renew(t, lacks);
 }
 
-/* Whether lane l, solved without rows that it breaks, goes on with those of them that something moves now. */
-static int readmitted(Barrier *t, Track *k, int l) {
-    I one = t->mu != t->mu;
-    int count = 0;
-    if (!breaks_rows_left_out(t, l)) return 0;
-    one[l] = -1;
-    ROWS(t, 0, count += t->out[q][l] != 0)
-    visit_tight(t, one, come_in);
-    ROWS(t, 0, count -= t->out[q][l] != 0)
-    if (!count) return 0;
-    t->mu[l] = t->how->barrier[t->lanes.element[l]];
-    k->least[l] = INFINITY;
-    settle(t, k, one, 0);
-    renew(t, one);
-    return 1;
+/* Rows that were left out of the lanes `running`, but that are broken and that something moves now, come in. */
+static void readmit(Barrier *t, Track *k, I running) {
+    I broken = running & ~running, changed = broken;
+    ROWS(t, 0, broken |= running & is_broken(t, q))
+    if (!any(broken)) return;
+    ROWS(t, 0, t->r[q] = tgco_truth(t->out[q]))
+    visit_rows(t, broken, 0, come_in);
+    ROWS(t, 0, changed |= t->r[q] != tgco_truth(t->out[q]))
+    if (!any(changed)) return;
+    for (int l = 0; l < LANES; l++) if (changed[l]) {
+        t->mu[l] = t->how->barrier[t->lanes.element[l]];
+        k->watching[l] = k->shortened[l] = 0;
+    }
+    k->least = tgco_choose(changed, SET(INFINITY), k->least);
+    settle(t, k, changed, 0);
+    renew(t, changed);
 }
 
 /* One iteration of the lanes `running`; returns those that end, with their status. */
 static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     const Interior *how = t->how;
     V dual, primal, scale_z;
+    if (t->some_out) readmit(t, k, running);
     relax(t, k, running);
     residuals(t, t->c, t->s, t->r);
     memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
@@ -218,10 +221,7 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     if (any(astray)) go_back(t, k, astray);
     for (int l = 0; l < LANES; l++) {
         if (!running[l] || astray[l]) continue;
-        if (is_solved(t, k, l, (*error)[l], primal[l])) {
-            if (readmitted(t, k, l)) continue;
-            status[l] = CONVERGED;
-        }
+        if (is_solved(t, k, l, (*error)[l], primal[l])) status[l] = CONVERGED;
         else if (!((*error)[l] - (*error)[l] == 0)) status[l] = NON_FINITE;
         else if (k->made[l] >= how->max_iterations) status[l] = small[l] ? CONVERGED : MAX_ITERATIONS;
         else continue;

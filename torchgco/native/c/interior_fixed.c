@@ -68,11 +68,11 @@ static int is_tight(const Barrier *t, I of, int64_t q, int rows) {
     return any(tight);
 }
 
-/* What to do with the tight rows of constraint i at knot k in the lanes `of`, where z is how they vary. */
+/* What to do with the rows of constraint i at knot k in the lanes `of`, where z is how they vary. */
 typedef void Visit(Barrier *t, I of, int64_t i, int64_t k, const V *z);
 
-/* Visits the tight rows of all knots, with the change that a change of all free variables brings along. */
-static void visit_tight(Barrier *t, I of, Visit *visit) {
+/* Visits the tight rows of all knots, or `all`, with the change that a change of all free variables brings along. */
+static void visit_rows(Barrier *t, I of, int all, Visit *visit) {
     Lanes *s = &t->lanes;
     const Problem *p = s->of;
     V z[S], next[NX];
@@ -84,7 +84,7 @@ static void visit_tight(Barrier *t, I of, Visit *visit) {
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *con = p->constraint + i;
             if (con->equality || con->place[k] == NOWHERE) continue;
-            if (is_tight(t, of, row_of(t, i, k), con->rows)) visit(t, of, i, k, z);
+            if (all || is_tight(t, of, row_of(t, i, k), con->rows)) visit(t, of, i, k, z);
         }
         if (!u) break;
         tgco_jacobian(x, u, model_at(s, k), t->f + k * NJ);
@@ -108,6 +108,11 @@ static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     }
 }
 
+/* Where row q, which was left out, is violated. Of bounds that coincide none is: an equality stands for both. */
+static inline I is_broken(const Barrier *t, int64_t q) {
+    return t->out[q] & (t->room[q] > SET(0.0)) & (t->c[q] > SET(t->how->violation));
+}
+
 /* Violated rows that were left out, but that something moves now, come into the barrier. */
 static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
@@ -116,10 +121,26 @@ static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     I moves[con->rows];
     find_moved(t, i, k, x, u, z, moves);
     for (int j = 0; j < con->rows; j++) {
-        I in = of & t->out[q + j] & ~t->fixes[q + j] & moves[j] & (t->c[q + j] > SET(t->how->violation));
+        I in = of & is_broken(t, q + j) & moves[j];
         t->out[q + j] &= ~in;
         t->s[q + j] = tgco_choose(in, SET(t->how->push), t->s[q + j]);
     }
+}
+
+/* Rows are relaxed by a share of the violation tolerance, and by less where the controls change them little. */
+static void loosen(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    const V *x = t->lanes.X + k * NX, *u = k < t->lanes.of->N ? t->lanes.U + k * NU : 0;
+    int64_t q = row_of(t, i, k);
+    V change[con->rows], most_room = SET(t->how->relaxes * t->how->violation);
+    along(t, i, k, x, u, z, change);
+    for (int j = 0; j < con->rows; j++, q++) {
+        V room = most_room * least(tgco_fabs(change[j]), SET(1.0));
+        room = tgco_if(of & ~t->out[q] & finite(room), room);
+        t->relaxed[q] = tgco_choose(of, room, t->relaxed[q]);
+        t->s[q] += room;
+    }
+    t->some_relaxed = 1;
 }
 
 /* Which rows of the lanes `of`, whose iterate and values c are new, stay out of the barrier. */
@@ -132,7 +153,7 @@ static void sort_rows(Barrier *t, I of) {
     for (int64_t k = 0; k <= p->N; k++)
         for (int64_t i = 0; i < p->constraints; i++)
             if (p->constraint[i].place[k] != NOWHERE && !p->constraint[i].equality) measure_room(t, of, i, k);
-    visit_tight(t, of, leave_out);
+    visit_rows(t, of, 0, leave_out);
     I some = of & ~of;
     for (int64_t q = 0; q < t->rows; q++) some |= t->out[q];
     t->some_out = any(some);

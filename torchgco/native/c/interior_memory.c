@@ -10,7 +10,7 @@ typedef struct {
     V least, idle; /* the smallest error of the end test so far, and the iterations since it fell by half */
     Pair filter[LANES][PAIRS];
     int pairs[LANES], failures[LANES], shortened[LANES], ahead[LANES];
-    I restoring, crawls;
+    I restoring, crawls, relaxed; /* relaxed: the rows are */
     I watching; /* a step was taken on trial; theta, phi, slope and alpha are those before it */
 } Track;
 
@@ -28,7 +28,7 @@ static int64_t shape(Barrier *t, V *memory) {
     t->dx = cut(&m, (N + 1) * NX); t->du = cut(&m, N * NU);
     t->c = cut(&m, rows); t->cn = cut(&m, rows); t->s = cut(&m, rows); t->sn = cut(&m, rows); t->z = cut(&m, rows);
     t->r = cut(&m, rows); t->ds = cut(&m, rows); t->dz = cut(&m, rows);
-    t->room = cut(&m, rows);
+    t->room = cut(&m, rows); t->relaxed = cut(&m, rows);
     t->out = (I *)cut(&m, rows); t->fixes = (I *)cut(&m, rows);
     t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
     return m - memory;

@@ -18,13 +18,13 @@ typedef struct {
     V *is_free, *L_start;        /* (NX): 1 where the start is free; (NX, NX): its factor. None where none is free */
     V *dx, *du;                  /* (N+1, NX), (N, NU) */
     V *c, *cn, *s, *sn, *z, *r, *ds, *dz; /* (rows): values, slacks, multipliers, residuals, and of trial and step */
-    V *room; /* (rows): half the range between two bounds, 1 at most */
+    V *room, *relaxed; /* (rows): half the range between two bounds, 1 at most; by how much a row is relaxed */
+    int some_relaxed;  /* whether any is, in a lane */
     I *out, *fixes; /* (rows): rows of inequalities outside the barrier, and those of them that hold as equalities */
     int some_out;   /* whether there are any in a lane; see interior_fixed.c */
     int64_t *first, rows;        /* the first row of each constraint, and how many there are */
     V mu, shift, scale;
     V objective; /* 0 where feasibility alone is sought */
-    V relaxed;   /* by how much inequalities are relaxed */
     V soft;      /* dual regularisation: a step fulfils equalities up to so much of the change of their multipliers */
     V *kept; /* the iterate before the steps on trial */
     V *memory;

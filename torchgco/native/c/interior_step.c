@@ -11,7 +11,7 @@ static V values(const Barrier *t, const V *X, const V *U, V *c, V *gap) {
             if (p->constraint[i].place[k] == NOWHERE) continue;
             int64_t q = row_of(t, i, k), end = q + p->constraint[i].rows;
             rows_at(s, i, k, x, u, c + q);
-            if (!p->constraint[i].equality) for (; q < end; q++) c[q] -= by_role(t, q, t->relaxed, SET(0.0));
+            if (t->some_relaxed) for (; q < end; q++) c[q] -= t->relaxed[q];
         }
         total += cost_value(s, k, x, u);
         if (!u) break;
