@@ -186,15 +186,17 @@ static void relax(Barrier *t, Track *k, I running) {
     renew(t, lacks);
 }
 
-/* Rows that were left out of the lanes `running`, but that are broken and that something moves now, come in. */
-static void readmit(Barrier *t, Track *k, I running) {
-    I broken = running & ~running, changed = broken;
-    ROWS(t, 0, broken |= running & is_broken(t, q))
-    if (!any(broken)) return;
+/* Rows that were left out of the lanes `of` come in where they are broken by more than `admitted` and something moves
+   them now; returns the lanes with such rows. */
+static I readmit(Barrier *t, Track *k, I of, double admitted) {
+    I broken = of & ~of, changed = broken;
+    t->admitted = admitted;
+    ROWS(t, 0, broken |= of & is_broken(t, q))
+    if (!any(broken)) return changed;
     ROWS(t, 0, t->r[q] = tgco_truth(t->out[q]))
     visit_rows(t, broken, 0, come_in);
     ROWS(t, 0, changed |= t->r[q] != tgco_truth(t->out[q]))
-    if (!any(changed)) return;
+    if (!any(changed)) return changed;
     for (int l = 0; l < LANES; l++) if (changed[l]) {
         t->mu[l] = t->how->barrier[t->lanes.element[l]];
         k->watching[l] = k->shortened[l] = 0;
@@ -202,13 +204,14 @@ static void readmit(Barrier *t, Track *k, I running) {
     k->least = tgco_choose(changed, SET(INFINITY), k->least);
     settle(t, k, changed, 0);
     renew(t, changed);
+    return changed;
 }
 
 /* One iteration of the lanes `running`; returns those that end, with their status. */
 static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     const Interior *how = t->how;
     V dual, primal, scale_z;
-    if (t->some_out) readmit(t, k, running);
+    if (t->some_out) readmit(t, k, running, how->highest); /* beyond which no residual is accepted */
     relax(t, k, running);
     residuals(t, t->c, t->s, t->r);
     memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
@@ -221,7 +224,12 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     if (any(astray)) go_back(t, k, astray);
     for (int l = 0; l < LANES; l++) {
         if (!running[l] || astray[l]) continue;
-        if (is_solved(t, k, l, (*error)[l], primal[l])) status[l] = CONVERGED;
+        if (is_solved(t, k, l, (*error)[l], primal[l])) {
+            I one = running & ~running;
+            one[l] = -1;
+            if (t->some_out && any(readmit(t, k, one, how->violation))) continue;
+            status[l] = CONVERGED;
+        }
         else if (!((*error)[l] - (*error)[l] == 0)) status[l] = NON_FINITE;
         else if (k->made[l] >= how->max_iterations) status[l] = small[l] ? CONVERGED : MAX_ITERATIONS;
         else continue;

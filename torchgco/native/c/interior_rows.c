@@ -22,6 +22,7 @@ typedef struct {
     int some_relaxed;  /* whether any is, in a lane */
     I *out, *fixes; /* (rows): rows of inequalities outside the barrier, and those of them that hold as equalities */
     int some_out;   /* whether there are any in a lane; see interior_fixed.c */
+    double admitted; /* violation of rows outside, up to which they stay there */
     int64_t *first, rows;        /* the first row of each constraint, and how many there are */
     V mu, shift, scale;
     V objective; /* 0 where feasibility alone is sought */
