@@ -46,7 +46,7 @@ def layouts(**change: Any) -> Layouts:
 CASES: dict[str, list[Callable[[], object]]] = {
     "overrides": [lambda o=o: compose(o) for o in (5, "solver=gco", [5], None, {"solver": "gco"})],
     "model": [lambda: compose(["model=5"])],
-    "'a=b=c'": [lambda: compose(["a=b=c"])],
+    "a": [lambda: compose(["a=b=c"])],
     "model.vehicle": [lambda: compose(["model.vehicle=5"])],
     "samples.redraws": [lambda: compose(["solver.passes.11.redraws=1.5"])],
     "solver.guidance": [

@@ -98,7 +98,8 @@ def solve(
         watcher.close()
     if name is not None and found.account is not None:
         found = replace(found, account=found.account.of_preset(name))
-    _warn_of_scale(problem, U0, found)
+    if warm is None:  # the guess of a warm start keeps the constraints already: its values are no size
+        _warn_of_scale(problem, U0, found)
     return _warned_of_contact(problem, found)
 
 

@@ -45,7 +45,8 @@ def test_every_problem_has_its_own_values(native: bool) -> None:
     kernels.use_native(native)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", EagerWarning)
+            if native:
+                warnings.simplefilter("error", EagerWarning)
             whole = torchgco.solve(problem())
             for b in range(B):
                 alone, part = problem(slice(b, b + 1)), problem().take(torch.tensor([b]))

@@ -154,6 +154,34 @@ def test_no_later_pass_hides_that_problems_are_infeasible(solver: str) -> None:
         assert torchgco.solve(problem, solver=solver).statuses == [Status.INFEASIBLE] * B
 
 
+def test_a_row_that_is_flat_where_it_is_broken_is_not_called_the_starts() -> None:
+    """At the guess it has no slope and is broken; farther away it is kept."""
+    of, own = cart()
+    far = FunctionConstraint(lambda x: 0.2 - (x[..., :1].abs() - 0.3).relu(), knots=[20])
+    found = torchgco.solve(of([own[0], far]).take(slice(0, 8)))
+    for b, status in enumerate(found.statuses):
+        assert status is not Status.INFEASIBLE or "No control moves" not in str(found.explain(b))
+    assert Status.CONVERGED in found.statuses
+
+
+def test_rows_in_small_units_are_not_relaxed_away() -> None:
+    """Their multipliers are as large as those that explode."""
+    of, own = cart()
+    expected = torchgco.solve(of([own[0], StateBounds([-INF, -INF], [INF, 0.5])]))
+    small = FunctionConstraint(lambda x: 1e-7 * (x[..., 1:] - 0.5))
+    assert_same_answer(torchgco.solve(of([own[0], small])), expected, 1e-4)
+
+
+def test_a_row_without_which_there_is_no_optimum_comes_in() -> None:
+    """It is flat at the guess, and nothing else bounds a linear cost."""
+    model = FunctionDynamics(lambda x, u: u, 1, 1, 0.1)
+    cost = FunctionCost(lambda x, u: -u[..., 0], lambda x: 0 * x[..., 0])
+    row = FunctionConstraint(lambda x, u: (u - 0.02).relu().square() - 1e-4, of="xu")
+    found = torchgco.solve(Problem(model, cost, [row], torch.zeros(1, 1, dtype=D), 40))
+    assert found.statuses == [Status.CONVERGED]
+    torch.testing.assert_close(found.U, torch.full_like(found.U, 0.03), rtol=1e-4, atol=0)
+
+
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_rows_that_leave_one_point(solver: str) -> None:
     """From -0.1 m/s with 1 m/s^2 the first speed can only be 0: relaxed rows have room there."""

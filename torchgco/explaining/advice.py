@@ -28,8 +28,8 @@ BY_STATUS = {
     Status.INVALID_START: "A start x0 outside the obstacles, whose radii here include the vehicle's.",
 }
 UNMOVED = (
-    "The start x0 breaks the row named above, which no control moves. The controls returned are those found for all "
-    "other rows."
+    "No control moves the row named above: the start x0 breaks it. The controls returned are those found for all other "
+    "rows."
 )
 MOVED = "A start x0 that keeps this row, or the row from a later knot on: knots=slice(1, N + 1)."
 UNKNOWN = (
@@ -53,7 +53,7 @@ class Facts:
         radius: of the vehicle, m, where no way through the map leads it to the goal.
         passage: the largest radius, m, that some way has room for; 0: none.
         in_unknown: whether the start is invalid for unknown cells of a map alone.
-        unmoved: whether the row that is violated most has the same value for all controls.
+        unmoved: whether all violated rows have the same values for all controls.
     """
 
     status: Status
@@ -73,7 +73,7 @@ class Facts:
     @property
     def told(self) -> list[str]:
         """Why the solve ended so, in sentences."""
-        if self.unmoved and self.status is Status.INFEASIBLE:
+        if self.unmoved:
             return [UNMOVED]
         if self.radius is None:
             return [self.status.sentence]
@@ -86,7 +86,7 @@ def advice(facts: Facts) -> list[str]:
     """Sentences, the most useful first; none where nothing is amiss."""
     if facts.in_unknown:
         return [UNKNOWN]
-    if facts.unmoved and facts.status is Status.INFEASIBLE:
+    if facts.unmoved:
         return [MOVED]
     if facts.radius is not None:
         smaller = f", or a vehicle_radius of at most {facts.passage:.3g} m" if facts.passage > 0 else ""

@@ -15,9 +15,10 @@ from torchgco.explaining.account import Account
 from torchgco.explaining.advice import Facts, advice, tells_to_record
 from torchgco.explaining.barred import map_facts
 from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
-from torchgco.explaining.places import caught_told, is_unmoved, number, place_told
+from torchgco.explaining.places import caught_told, number, place_told
 from torchgco.explaining.record import SearchRecord
 from torchgco.judging.judge import columns as judged
+from torchgco.judging.unmoved import unmoved
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem, check_problem
@@ -137,7 +138,7 @@ def _facts(solved: Solved, b: int, account: Account, one: _One | None) -> Facts:
         clearance=clearance,
         pathless=solved.search is not None and is_pathless(solved.search, b),
         could_record=could,
-        unmoved=is_unmoved(one.problem, one.X, one.U),
+        unmoved=status is Status.INFEASIBLE and bool(unmoved(one.held, one.X, one.U, ADMITTED)),
         **map_facts(one.problem, status, bool(reached) and (clearance is None or clearance >= 0)),
     )
 

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
-from torchgco.dynamics.rollout import open_loop
 from torchgco.judging.worst import NONE, kind_of, worst_rows
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
@@ -83,19 +82,6 @@ def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str 
     where = knots_told([worst["knot"]], t)
     row = row_told(constraint, worst["row"])
     return f"{constraint_told(constraint, worst['constraint'])}, {row}{where}, by {number(worst['violation'])}{length}"
-
-
-def is_unmoved(problem: Problem, X: Tensor, U: Tensor) -> bool:
-    """Whether the row that X (1, N+1, n), U (1, N, m) violates most has the same value for other controls."""
-    place, knot, row = (worst_rows(problem, X, U)[name][0] for name in ("constraint", "knot", "row"))
-    if place == NONE:
-        return False
-    other = U + 0.1 * (1.0 + U.abs()) * torch.arange(U.numel(), dtype=U.dtype, device=U.device).view_as(U).cos()
-    constraint = problem.constraints[place]
-    at = torch.arange(problem.N + 1)[constraint.knots].tolist().index(knot)
-    whole = problem.held_at(X[:, 0])
-    before, after = (constraint.value(open_loop(whole.dynamics, whole.x0, u), u)[0, at, row] for u in (U, other))
-    return bool(before == after)
 
 
 def constraint_told(constraint: Constraint, i: int) -> str:

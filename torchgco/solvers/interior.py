@@ -13,6 +13,7 @@ from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.judging.unmoved import unmoved
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
 from torchgco.native.dispatch import cost_unit, expect_interior, followed, interior_of, measured, open_loop
@@ -191,7 +192,10 @@ class InteriorPoint(Solver):
         put(end.last, rows, found)
         status = out["status"].long()
         status = torch.where(status == Status.CONVERGED, SOLVED, status)
-        status = torch.where(status == Status.INFEASIBLE, UNMOVED, status)
+        broken = (status == Status.INFEASIBLE).nonzero().flatten()  # rows that were left out
+        if broken.numel() > 0:
+            fixed = unmoved(problem.take(broken), X[broken], U[broken], self.violation_tolerance)
+            status[broken] = torch.where(fixed, UNMOVED, int(Status.LINE_SEARCH_FAILED))
         sound = torch.isfinite(found.cost) & torch.isfinite(found.violation)
         end.status[rows] = torch.where(sound, status, int(Status.NON_FINITE))
         end.iterations[rows] = out["iterations"]

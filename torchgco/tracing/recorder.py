@@ -184,7 +184,7 @@ def title(operation: Any, called: Any) -> str:
 def _makes_tensors(operation: Any) -> bool:
     """Whether an operation returns tensors alone; `torch.equal`, say, returns what Python code may branch on."""
     returns = operation._schema.returns
-    return bool(returns) and all("Tensor" in str(value.type) for value in returns)
+    return all("Tensor" in str(value.type) for value in returns)
 
 
 def _shaping(operation: Any, args: Sequence[Any]) -> Sequence[Any]:

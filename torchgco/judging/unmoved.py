@@ -1,0 +1,41 @@
+"""Whether violated rows are what they are whatever the controls."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.dynamics.rollout import open_loop
+from torchgco.problem.problem import Problem
+
+SIZES = 0.1, 1.0, 10.0, 1e3  # of changes of the controls, beside their own size and one
+
+
+def unmoved(problem: Problem, X: Tensor, U: Tensor, tolerance: float) -> Tensor:
+    """Whether rows are violated by more than `tolerance`, and all of these keep their values for other controls, (B,).
+
+    Small and large changes of the controls are tried, of one sign and of both: a row may be flat where it is violated,
+    and not elsewhere. Never where a part of the start is free.
+
+    Args:
+        X, U: (B, N+1, n), (B, N, m).
+    """
+    problem = problem.held_at(X[:, 0])
+    kept, broken, later = torch.ones(problem.B, dtype=torch.bool, device=X.device), False, False
+    rows = [(part, part.value(X, U), part.violation(X, U) > tolerance) for part in problem.constraints]
+    for part, _, bad in rows:
+        knots = torch.arange(problem.N + 1, device=X.device)[part.knots]
+        broken = broken | bad.flatten(1).any(-1)
+        later = later or bool(bad[:, knots > 0].any())
+    wave = torch.arange(1.0, U[0].numel() + 1, dtype=U.dtype, device=U.device).mul(1.618).cos().view_as(U[0])
+    for way in (wave, torch.ones_like(wave), -torch.ones_like(wave)):
+        for size in SIZES:
+            other = U + size * (1.0 + U.abs()) * way
+            # Rows of the first knot ask for no rollout.
+            there = open_loop(problem.dynamics, problem.x0, other) if later else X
+            for part, before, bad in rows:
+                now = part.value(there, other)
+                kept &= ~((now != before) & torch.isfinite(now) & bad).flatten(1).any(-1)
+    if problem.free_start is not None:
+        kept &= ~problem.free_start.any(-1)
+    return kept & broken
