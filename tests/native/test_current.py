@@ -223,7 +223,10 @@ MISTAKES: dict[str, tuple[Callable[[], Problem], str]] = {
     "one derivative for four": (
         lambda: boat(lambda x, u: u[..., :1]), r"dynamics.field: expected derivatives \(..., 4\)",
     ),
-    "one cost for all": (lambda: boat(cost=Scalar()), "cost.stage: expected a number in torch.float64, the type of x0, per state"),
+    "one cost for all": (
+        lambda: boat(cost=Scalar()),
+        "cost.stage: expected a number in torch.float64, the type of x0, per state",
+    ),
     "no tensor": (lambda: boat(cost=WithoutEnd()), "cost.terminal: .* got float"),
     "problems coupled": (lambda: boat(cost=Coupled()), "cost.stage: expected values of a problem that depend on its"),
     "wrong Jacobian": (
