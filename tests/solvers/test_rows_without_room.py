@@ -240,3 +240,15 @@ def test_batches_with_some_such_rows_keep_the_bits_of_all_problems() -> None:
         index = torch.tensor(list(rows))
         part = torchgco.solve(problem.take(index))
         assert torch.equal(part.U, whole.U[index]) and torch.equal(part.cost, whole.cost[index])
+
+
+def test_problems_beside_one_that_its_start_spoils_keep_their_bits() -> None:
+    """That one ends in the middle of the others' iterations."""
+    speed = torch.where(torch.arange(B) % 4 == 1, -0.05, 0.2)
+    of, own = cart(speed)
+    problem = of([own[0], StateBounds([-INF, 0.0], [INF, 1.5], knots=slice(0, 41))])
+    whole = torchgco.solve(problem, solver="interior_point")
+    assert whole.statuses.count(Status.INFEASIBLE) == 16 and whole.statuses.count(Status.CONVERGED) == 48
+    for b in (0, 1, 2, 3, 30, 63):
+        alone = torchgco.solve(problem.take(slice(b, b + 1)), solver="interior_point")
+        assert torch.equal(alone.U[0], whole.U[b]) and int(alone.iterations[0]) == int(whole.iterations[b])

@@ -18,7 +18,7 @@ from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
 from torchgco.explaining.places import caught_told, number, place_told
 from torchgco.explaining.record import SearchRecord
 from torchgco.judging.judge import columns as judged
-from torchgco.judging.unmoved import unmoved
+from torchgco.lagrangian.unmoved import unmoved
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.problem import Problem, check_problem

@@ -13,9 +13,9 @@ from torchgco.base.shapes import check_shape, check_tensor
 from torchgco.base.status import SOLVED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import ControlBounds, StateBounds
-from torchgco.judging.unmoved import unmoved
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import is_better
+from torchgco.lagrangian.unmoved import unmoved
 from torchgco.native.dispatch import cost_unit, expect_interior, followed, interior_of, measured, open_loop
 from torchgco.native.interior import InteriorEngine
 from torchgco.problem.horizons import for_solvers

@@ -193,9 +193,9 @@ static I readmit(Barrier *t, Track *k, I of, double admitted) {
     t->admitted = admitted;
     ROWS(t, 0, broken |= of & is_broken(t, q))
     if (!any(broken)) return changed;
-    ROWS(t, 0, t->r[q] = tgco_truth(t->out[q]))
+    ROWS(t, 0, t->dz[q] = tgco_truth(t->out[q])) /* no step is under way */
     visit_rows(t, broken, 0, come_in);
-    ROWS(t, 0, changed |= t->r[q] != tgco_truth(t->out[q]))
+    ROWS(t, 0, changed |= t->dz[q] != tgco_truth(t->out[q]))
     if (!any(changed)) return changed;
     for (int l = 0; l < LANES; l++) if (changed[l]) {
         t->mu[l] = t->how->barrier[t->lanes.element[l]];

@@ -108,7 +108,8 @@ static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     }
 }
 
-/* Where row q, which was left out, is violated by more than is admitted. Of bounds that coincide none is: an equality stands for both. */
+/* Where row q, which was left out, is violated by more than is admitted. Of bounds that coincide none is, as an equality
+   stands for both. */
 static inline I is_broken(const Barrier *t, int64_t q) {
     return t->out[q] & (t->room[q] > SET(0.0)) & (t->c[q] > SET(t->admitted));
 }
