@@ -72,10 +72,7 @@ def test_chords_are_cleared_and_nothing_else_changes(make) -> None:
     cut = old.feasible & (old.clearance < 0)
     assert bool(cut.any()) and int(new.sound.sum()) > int(old.sound.sum())
     assert bool((new.sound | ~old.sound).all()) and bool((new.reached | ~old.reached).all())
-    cleared_now = cut & new.sound
-    assert bool((new.clearance >= old.clearance)[cleared_now | ~cut].all())
-    # What isn't cleared ends with the last pass of the interior point, which knows knots alone.
-    assert bool((new.clearance > old.clearance - 1e-5).all())
+    assert bool((new.clearance >= old.clearance).all())
     assert torch.equal(solution.U[~cut], before[~cut])
 
 

@@ -114,6 +114,41 @@ def test_rows_that_are_constant(solver: str) -> None:
         assert_same_answer(torchgco.solve(of([*own, more]), solver=solver), expected)
 
 
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_rows_of_a_state_that_nothing_moves(solver: str) -> None:
+    """A mass, bounded from above by itself; guesses are moved inside of their bounds."""
+    mass, of_all = 1.0 + drawn(10, 0.0, 9.0), torch.zeros(B, 3, dtype=D)
+    goal = torch.stack((drawn(4, 0.5, 4.0), 0 * mass, 0 * mass), -1).unsqueeze(1)
+    of_all[:, 2] = mass
+    model = FunctionDynamics(
+        lambda x, u: torch.stack((x[..., 1], u[..., 0] / x[..., 2], 0 * x[..., 2]), -1), 3, 1, 0.1, "rk4"
+    )
+    own = [ControlBounds(-1.0, 1.0), StateBounds([-INF, 0.0, -INF], [INF, 1.5, INF])]
+    of = lambda parts: Problem(model, QuadraticCost([1.0, 0, 0], [0.1], [10.0, 1.0, 0.0], goal), parts, of_all, 40)
+    heaviest = torch.full((B, 1, 3), INF, dtype=D)
+    heaviest[:, 0, 2] = mass
+    expected = torchgco.solve(of(own), solver=solver)
+    for knots in (slice(0, 41), slice(1, 41)):
+        more = StateBounds([-INF] * 3, heaviest, knots=knots)
+        assert_same_answer(torchgco.solve(of([*own, more]), solver=solver), expected)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_rows_that_move_by_rounding_alone(solver: str) -> None:
+    """The length of what is turned."""
+    angle = drawn(11, 0.3, 3.0)
+
+    def turned(x: Tensor, u: Tensor) -> Tensor:
+        cos, sin = (0.1 * u[..., 0]).cos(), (0.1 * u[..., 0]).sin()
+        return torch.stack((cos * x[..., 0] - sin * x[..., 1], sin * x[..., 0] + cos * x[..., 1]), -1)
+
+    cost = FunctionCost(lambda x, u: (x[..., 0] - 1).square() + x[..., 1].square() + 0.1 * u[..., 0].square())
+    model, x0 = FunctionDynamics(turned, 2, 1, 0.1, "none"), torch.stack((angle.cos(), angle.sin()), -1)
+    expected = torchgco.solve(Problem(model, cost, [ControlBounds(-2.0, 2.0)], x0, 40), solver=solver)
+    parts = [ControlBounds(-2.0, 2.0), FunctionConstraint(lambda x: x.square().sum(-1, keepdim=True) - 1)]
+    assert_same_answer(torchgco.solve(Problem(model, cost, parts, x0, 40), solver=solver), expected, 1e-5)
+
+
 def test_a_row_that_is_flat_only_where_the_guess_is() -> None:
     """It is left out at first, and comes in where it turns out to be broken."""
     of, own = battery(0.5)

@@ -97,3 +97,27 @@ def test_a_logarithm_with_an_end(solver: str) -> None:
     prices = 1.03 ** (29 - k)
     first = 1.03**30 * problem.x0 / (prices * (0.95 * 1.03) ** k).sum()
     torch.testing.assert_close(found.U[..., 0], first * (0.95 * 1.03) ** k, rtol=2e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("solver", ["interior_point", "gco"])
+def test_a_logarithm_that_ends_far_away_is_not_called_solved_on_the_way(solver: str) -> None:
+    """Its slope falls under every tolerance long before u = 1e10, where it is 0."""
+    model = FunctionDynamics(lambda x, u: u, 1, 1, 0.1, "none")
+    cost = FunctionCost(lambda x, u: -u[..., 0].log() + 1e-10 * u[..., 0])
+    given = Problem(model, cost, [ControlBounds(1e-3, INF)], torch.zeros(64, 1, dtype=D), 8)
+    found = torchgco.solve(given, drawn_guesses(), solver)
+    optimum = 8 * (1 - torch.tensor(1e10, dtype=D).log())
+    far = found.cost > optimum + 1e-2 * optimum.abs()
+    assert bool(far.any()) and not any(found.statuses[b] == Status.CONVERGED for b in far.nonzero().flatten())
+
+
+@pytest.mark.parametrize("solver", ["interior_point", "gco"])
+def test_a_logarithm_below_a_large_constant(solver: str) -> None:
+    model = FunctionDynamics(lambda x, u: u, 1, 1, 0.1, "none")
+    cost = FunctionCost(lambda x, u: 1e5 - (1 + u[..., 0].square()).log())
+    given = Problem(model, cost, [ControlBounds(-1e12, INF)], torch.zeros(64, 1, dtype=D), 8)
+    assert torchgco.solve(given, drawn_guesses(), solver).statuses == [Status.UNBOUNDED] * 64
+
+
+def drawn_guesses() -> Tensor:
+    return 0.5 + 4.5 * torch.rand(64, 8, 1, dtype=D, generator=torch.Generator().manual_seed(3))

@@ -150,11 +150,13 @@ class Interior(Structure):
     declared = (
         ("const Problem *", "of"),
         ("double *", "barrier error theta"),  # (E): mu, in and out; error of the end test and sum of residuals, out
+        ("const double *", "constant least_cost"),  # (E): what of the cost does not count, and its least size
         ("const double *", "free_start"),  # (E, NX): 1 where a component of the start is a variable; NULL: nowhere
         ("int64_t", "max_iterations failures patience trials idle"),
         ("int32_t", "corrects warm"),
         ("double", "tolerance violation push steepest boundary closest central smallest restored"),
-        ("double", "barrier_error barrier_share barrier_floor usual_multiplier largest_multiplier"),
+        ("double", "barrier_error barrier_share barrier_floor barrier_least counts usual_multiplier"),
+        ("double", "largest_multiplier"),
         ("double", "highest lowest gain_theta gain_phi armijo switching power_theta power_phi"),
         ("double", "shift_first shift_least shift_decay shift_growth shift_growth_first shift_max"),
         ("double", "shift_recovery recovery_decay recovery_growth shift_crawl crawl soft softest explodes relaxes"),

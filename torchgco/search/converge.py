@@ -107,14 +107,14 @@ class Converge:
     def _keep(self, search: Search, rows: Tensor, end: SolveEnd) -> None:
         """Keep solved trajectories, unless the old ones are better by more than a small violation is worth.
 
-        Better are those that arrive, that are clear between knots, or that cost less.
+        Better are those that arrive, that are clear between knots or touch less there, or that cost less.
         """
         problem, limit = search.call.problem.take(rows), search.solver.violation_tolerance
         old, new = take(search.best.end.best, rows), end.best
         arrives = has_arrived(problem, new.X) | ~has_arrived(problem, old.X)
         near = new.cost <= old.cost + WORTH * old.cost.abs()
         serves = is_preferred(problem, new, old, limit) | (is_over(end.status) & arrives & near)
-        clear = (chord_clearance(problem, new.X) >= 0) | ~(chord_clearance(problem, old.X) >= 0)
+        clear = ~(chord_clearance(problem, new.X) < chord_clearance(problem, old.X).clamp(max=0.0))
         clear |= old.violation > limit
         search.best.replace(rows, serves & clear & torch.isfinite(new.cost), new, end)
 

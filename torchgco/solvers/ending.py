@@ -20,6 +20,7 @@ from torchgco.problem.problem import Problem
 from torchgco.solvers.riccati import BackwardPass, backward
 
 STATIONARY = 1e-4  # share of the cost that may be left to save in a stationary trajectory
+DOUBTED = 1e-3  # the same where the interior point met its tolerances, as slopes of a flat cost do far away
 LEAST_COST = 1e-6  # the cost counts as at least this share of the cost of staying at the start
 FIRST, GROWTH, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pass fails, as a share of the cost unit
 
@@ -55,9 +56,14 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Optimality:
         mu = torch.where(step.failed, FIRST * GROWTH**i * cost_unit(problem), mu)
         step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
-    cost = problem.cost.total(X, U).abs() + LEAST_COST * problem.N * cost_unit(problem)
+    cost = (problem.cost.total(X, U) - problem.cost_scale.constant).abs() + least_cost(problem)
     G = torch.where(step.failed.view(-1, 1, 1, 1), torch.nan, step.gains.movedim(0, 1))
     return Optimality(G[..., :-1], G[..., -1], torch.where(step.failed, torch.inf, saved / cost))
+
+
+def least_cost(problem: Problem) -> Tensor:
+    """As how much each problem's cost counts at least where a share of it is meant, (B,)."""
+    return LEAST_COST * problem.N * cost_unit(problem)
 
 
 def _backward(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Callable[[Tensor], BackwardPass]:
@@ -87,11 +93,10 @@ def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: floa
 
     CONVERGED: stationary and feasible. FEASIBLE: feasible but not stationary, for problems with constraints.
     INFEASIBLE: not feasible, although higher penalties were tried for as long as they gained anything, or for rows that
-    no control moves. Where neither
-    holds, and where a solve failed, the reason stays.
+    no control moves. Where neither holds, and where a solve failed, the reason stays.
     """
     over, fits = is_over(ended), violation <= tolerance
-    stationary = (left <= STATIONARY) | over
+    stationary = (left <= STATIONARY) | (over & ((left <= DOUBTED) | torch.isinf(left)))
     limit = torch.full_like(ended, int(Status.MAX_ITERATIONS))
     reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED) | over, limit, ended)
     status = torch.where(fits & constrained, int(Status.FEASIBLE), reason)

@@ -23,7 +23,7 @@ from torchgco.problem.problem import Problem, check_problem
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Progress, Solver
-from torchgco.solvers.ending import start_status
+from torchgco.solvers.ending import STATIONARY, least_cost, start_status
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.rules import RAW
@@ -38,6 +38,7 @@ FILTER: dict[str, Any] = {
     "boundary": 0.99, "closest": 1.0 - 1e-12,  # share of the way to where a slack is 0 (tau_min), and at most: above 0
     "central": 1e10,  # factor by which s z may leave mu (kappa_Sigma)
     "barrier_error": 10.0, "barrier_share": 0.2, "barrier_floor": 0.1,  # kappa_epsilon, kappa_mu; tolerance times this
+    "barrier_least": 1e-20, "counts": STATIONARY,  # where complementarity makes up more than this share of the cost
     "usual_multiplier": 100.0, "largest_multiplier": 1e3,  # s_max; costates at the start are 0 where larger
     "highest": 1e4, "lowest": 1e-4,  # theta_max, theta_min, as multiples of theta at the start, of 1 at least
     "gain_theta": 1e-5, "gain_phi": 1e-8, "armijo": 1e-4,  # gamma_theta, gamma_phi, eta_phi
@@ -181,12 +182,13 @@ class InteriorPoint(Solver):
             multipliers = tuple(lam.clone(memory_format=torch.contiguous_format) for lam in warm.lam)
         X, U = inside(problem, X, call.U0, how["push"])
         X[:, 0] = problem.start_in(X[:, 0])  # a given start isn't moved
+        fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
         out = kernels.solve(
             problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None),
+            constant=problem.cost_scale.constant, least_cost=least_cost(problem),
             max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **how,
         )  # fmt: skip
         X, U = followed(problem, X, U, out["gains"][..., :-1])
-        fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
         found = Iterate(X, U, fitted, problem.cost.total(X, U), measured(problem, X, U))
         put(end.best, rows, found)
         put(end.last, rows, found)

@@ -39,7 +39,8 @@ def falls_without_end(problem: Problem, U0: Tensor, found: Iterate, left: Tensor
     fall, size, times = before - costs, before.abs() + unit, cost.new_tensor([1.0, *FARTHER]).unsqueeze(-1)
     linear = (fall >= 0.5 * times * fall[0]).all(0) & (fall[0] >= DEEP * size)
     rate = (costs[:-1] - costs[1:]) / times.log10().diff(dim=0)
-    by_decades = (rate >= 0.5 * rate[0]).all(0) & (rate[0] > STATIONARY * (cost.abs() + unit)) & open_ended[rows]
+    without = (cost - held.cost_scale.constant).abs() + unit
+    by_decades = (rate >= 0.5 * rate[0]).all(0) & (rate[0] > STATIONARY * without) & open_ended[rows]
     falls[rows] = (fall[0] >= BOTTOMLESS * size) | ((linear | by_decades) & clear)
     return falls
 

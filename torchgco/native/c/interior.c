@@ -47,7 +47,7 @@ static void begin(Barrier *t, Track *k, I of) {
     k->made = tgco_choose(of, zero, k->made);
     k->least = tgco_choose(of, SET(INFINITY), k->least);
     k->restoring &= ~of; k->watching &= ~of;
-    k->relaxed &= ~of;
+    k->relaxed &= ~of; k->presses &= ~of;
     if (t->some_relaxed) for (int64_t q = 0; q < t->rows; q++) t->relaxed[q] = tgco_choose(of, zero, t->relaxed[q]);
     t->soft = tgco_choose(of, SET(how->soft), t->soft);
     for (int l = 0; l < LANES; l++) if (of[l]) k->failures[l] = k->shortened[l] = 0;
@@ -79,7 +79,8 @@ static void begin(Barrier *t, Track *k, I of) {
 /* The next mu of the lanes whose barrier problem is solved well enough; their filter begins anew. */
 static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V scale_z) {
     const Interior *how = t->how;
-    V smallest = SET(how->tolerance * how->barrier_floor), base = most(dual, primal);
+    V base = most(dual, primal), usual = SET(how->tolerance * how->barrier_floor);
+    V smallest = tgco_choose(k->presses, SET(how->barrier_least), usual);
     I lowered = running & ~running;
     for (int tries = 0; tries < LONGEST_FALL; tries++) {
         V error = most(base, complementarity(t, t->mu) * scale_z);
@@ -163,15 +164,34 @@ static void resume(Barrier *t, Track *k) {
     settle(t, k, done, 0);
 }
 
-/* Whether lane l ends here. Tolerances below the usual rounding are met as well as the iterate can be, as the rollout of
-   its controls amplifies gaps: it goes on while the error falls, and ends above them where rounding keeps it there. */
-static int is_solved(const Barrier *t, Track *k, int l, double error, double primal) {
+/* Lanes `of` whose barrier is a part of their cost that counts: where the units are small, so is the scaled cost, and a
+   complementarity within its tolerance isn't small beside it. */
+static I barrier_counts(Barrier *t, I of) {
+    if (!any(of)) return of;
+    V cost = values(t, t->lanes.X, t->lanes.U, t->cn, t->gapn), left = SET(0.0), size;
+    ROWS(t, 0, left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)))
+    for (int l = 0; l < LANES; l++) {
+        int64_t e = t->lanes.element[l];
+        size[l] = __builtin_fabs(cost[l] - t->scale[l] * t->how->constant[e]) + t->scale[l] * t->how->least_cost[e];
+    }
+    return of & (left > SET(t->how->counts) * size);
+}
+
+/* Lanes of `running` that end here. Tolerances below the usual rounding are met as well as the iterate can be, as the
+   rollout of its controls amplifies gaps: a lane goes on while the error falls, and ends above them where rounding keeps
+   it there. So does one whose barrier counts. */
+static I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
     const Interior *how = t->how;
-    k->idle[l] = error <= 0.5 * k->least[l] ? 0 : k->idle[l] + 1;
-    if (error < k->least[l]) k->least[l] = error;
-    if (k->restoring[l] || !(primal <= how->violation)) return 0;
-    if (error <= how->tolerance) return how->tolerance >= how->rounding || error <= 2.0 * t->mu[l] || k->idle[l] >= 1;
-    return k->idle[l] >= how->idle && error <= how->rounding && error <= 2.0 * k->least[l];
+    V zero = SET(0.0), one = SET(1.0);
+    V idle = tgco_choose(error <= SET(0.5) * k->least, zero, k->idle + one);
+    k->idle = tgco_choose(running, idle, k->idle);
+    k->least = tgco_choose(running & (error < k->least), error, k->least);
+    I feasible = running & ~k->restoring & (primal <= SET(how->violation)), rests = k->idle >= SET((double)how->idle);
+    I met = feasible & (error <= SET(how->tolerance)), counts = barrier_counts(t, met);
+    k->presses |= counts;
+    met &= ~counts | rests;
+    met &= ((SET(how->tolerance) >= SET(how->rounding)) & ~k->presses) | (error <= SET(2.0) * t->mu) | (k->idle >= one);
+    return met | (feasible & rests & (error <= SET(how->rounding)) & (error <= SET(2.0) * k->least));
 }
 
 /* Where a multiplier of an inequality explodes, rows leave each other no room: they are relaxed, as IPOPT's bounds are. */
@@ -222,9 +242,10 @@ static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     I small = (*error <= most(SET(how->tolerance), SET(how->rounding))) & (primal <= SET(how->violation));
     small &= ~k->restoring; /* no step that can't be taken matters there */
     if (any(astray)) go_back(t, k, astray);
+    I solved = find_solved(t, k, running & ~astray, *error, primal);
     for (int l = 0; l < LANES; l++) {
         if (!running[l] || astray[l]) continue;
-        if (is_solved(t, k, l, (*error)[l], primal[l])) {
+        if (solved[l]) {
             I one = running & ~running;
             one[l] = -1;
             if (t->some_out && any(readmit(t, k, one, how->violation))) continue;

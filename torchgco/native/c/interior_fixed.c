@@ -6,6 +6,7 @@
    upper one becomes an equality, and the lower one stays out. */
 
 #define NUDGE 1e-3 /* how far from the iterate a row's slope is looked at again: it may vanish in one point alone */
+#define ROUNDED 0x1p-40 /* share of its terms, up to which a change may be due to rounding along the stages */
 
 /* A number in [1, 2) for variable i: no row and no model is likely to let a sum of these cancel. */
 static inline double uneven(int64_t i) {
@@ -49,59 +50,100 @@ static void vary_controls(const Barrier *t, int64_t k, V *du) {
     }
 }
 
-/* The rows of constraint i at knot k that a change z of states and controls moves, at x, u or near them, into `moves`. */
-static void find_moved(const Barrier *t, int64_t i, int64_t k, const V *x, const V *u, const V *z, I *moves) {
+/* States and controls of a knot, and how a change of all free variables changes them. */
+typedef struct { V x[S], z[S]; } Response;
+
+/* The rows of constraint i at knot k that a change moves in one of two trajectories close together, into `moves`: a row
+   may be flat in one point alone. A change that is within rounding of its terms is none. */
+static void find_moved(const Barrier *t, int64_t i, int64_t k, const Response *at, I *moves) {
     int rows = t->lanes.of->constraint[i].rows;
-    V near[S], change[rows];
-    for (int j = 0; j < NX; j++) near[j] = x[j] + SET(NUDGE) * z[j];
-    for (int j = 0; j < NU; j++) near[NX + j] = u ? u[j] + SET(NUDGE) * z[NX + j] : SET(0.0);
-    along(t, i, k, x, u, z, change);
-    for (int j = 0; j < rows; j++) moves[j] = tgco_is(change[j]);
-    along(t, i, k, near, u ? near + NX : 0, z, change);
-    for (int j = 0; j < rows; j++) moves[j] |= tgco_is(change[j]);
+    V change[rows], part[rows], terms[rows], own[S];
+    for (int j = 0; j < rows; j++) moves[j] = SET(0.0) != SET(0.0);
+    for (int near = 0; near < 2; near++, at++) {
+        const V *u = k < t->lanes.of->N ? at->x + NX : 0;
+        along(t, i, k, at->x, u, at->z, change);
+        for (int j = 0; j < rows; j++) terms[j] = SET(0.0);
+        for (int v = 0; v < (u ? S : NX); v++) {
+            for (int w = 0; w < S; w++) own[w] = w == v ? at->z[v] : SET(0.0);
+            along(t, i, k, at->x, u, own, part);
+            for (int j = 0; j < rows; j++) terms[j] += tgco_fabs(part[j]);
+        }
+        for (int j = 0; j < rows; j++) moves[j] |= ~(tgco_fabs(change[j]) <= SET(ROUNDED) * terms[j]);
+    }
 }
 
-/* Whether rows of a knot have less room than a slack is given at first, in a lane of `of`. */
-static int is_tight(const Barrier *t, I of, int64_t q, int rows) {
+/* Rows j of constraint i at knot k, in the lanes `of`, with less room than a slack is given at first, or than a guess is
+   moved inside of its bounds. */
+static I is_tight(const Barrier *t, I of, int64_t i, int64_t k, int j) {
+    const Constraint *con = t->lanes.of->constraint + i;
+    V room = SET(t->how->push);
+    if (con->kind == BOUNDS) {
+        int v = con->variable[j];
+        V at = v < NX ? t->lanes.X[k * NX + v] : t->lanes.U[k * NU + v - NX];
+        room *= SET(2.0) * most(tgco_fabs(at), SET(1.0));
+    }
+    return of & (t->c[row_of(t, i, k) + j] > -room);
+}
+
+/* Whether any row of constraint i at knot k is tight in a lane of `of`. */
+static int has_tight(const Barrier *t, I of, int64_t i, int64_t k) {
     I tight = of & ~of;
-    for (int j = 0; j < rows; j++) tight |= of & (t->c[q + j] > SET(-t->how->push));
+    for (int j = 0; j < t->lanes.of->constraint[i].rows; j++) tight |= is_tight(t, of, i, k, j);
     return any(tight);
 }
 
-/* What to do with the rows of constraint i at knot k in the lanes `of`, where z is how they vary. */
-typedef void Visit(Barrier *t, I of, int64_t i, int64_t k, const V *z);
+/* What to do with the rows of constraint i at knot k in the lanes `of`, which respond in two trajectories as it says. */
+typedef void Visit(Barrier *t, I of, int64_t i, int64_t k, const Response *at);
 
-/* Visits the tight rows of all knots, or `all`, with the change that a change of all free variables brings along. */
+/* The next states of the trajectory nearby, and of both how they respond. */
+static void respond(Barrier *t, int64_t k, Response *at) {
+    V f[NJ + 1], next[NX], moved[NX];
+    const V *parameters = model_at(&t->lanes, k);
+    tgco_jacobian(at[1].x, at[1].x + NX, parameters, f);
+    tgco_push(f, at[1].z, next);
+    model_step(at[1].x, at[1].x + NX, parameters, moved);
+    for (int i = 0; i < NX; i++) at[1].z[i] = next[i];
+    model_step(at->x, at->x + NX, parameters, next);
+    for (int i = 0; i < NX; i++) at[1].x[i] = t->lanes.X[(k + 1) * NX + i] + (moved[i] - next[i]);
+    tgco_jacobian(at->x, at->x + NX, parameters, f);
+    tgco_push(f, at->z, next);
+    for (int i = 0; i < NX; i++) at->z[i] = next[i];
+}
+
+/* Visits the tight rows of all knots, or `all`. */
 static void visit_rows(Barrier *t, I of, int all, Visit *visit) {
-    Lanes *s = &t->lanes;
+    const Lanes *s = &t->lanes;
     const Problem *p = s->of;
-    V z[S], next[NX];
-    for (int i = 0; i < NX; i++) z[i] = t->is_free ? tgco_if(tgco_is(t->is_free[i]), SET(uneven(~i))) : SET(0.0);
+    Response at[2];
+    for (int i = 0; i < NX; i++) {
+        at->z[i] = at[1].z[i] = t->is_free ? tgco_if(tgco_is(t->is_free[i]), SET(uneven(~i))) : SET(0.0);
+        at[1].x[i] = s->X[i] + SET(NUDGE) * at->z[i];
+    }
     for (int64_t k = 0; k <= p->N; k++) {
-        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
-        if (u) vary_controls(t, k, z + NX);
-        else for (int j = 0; j < NU; j++) z[NX + j] = SET(0.0);
+        memcpy(at->x, s->X + k * NX, NX * sizeof(V));
+        for (int j = NX; j < S; j++) at->x[j] = at->z[j] = at[1].x[j] = at[1].z[j] = SET(0.0);
+        if (k < p->N) {
+            memcpy(at->x + NX, s->U + k * NU, NU * sizeof(V));
+            vary_controls(t, k, at->z + NX);
+            for (int j = NX; j < S; j++) { at[1].z[j] = at->z[j]; at[1].x[j] = at->x[j] + SET(NUDGE) * at->z[j]; }
+        }
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *con = p->constraint + i;
             if (con->equality || con->place[k] == NOWHERE) continue;
-            if (all || is_tight(t, of, row_of(t, i, k), con->rows)) visit(t, of, i, k, z);
+            if (all || has_tight(t, of, i, k)) visit(t, of, i, k, at);
         }
-        if (!u) break;
-        tgco_jacobian(x, u, model_at(s, k), t->f + k * NJ);
-        tgco_push(t->f + k * NJ, z, next);
-        for (int i = 0; i < NX; i++) z[i] = next[i];
+        if (k < p->N) respond(t, k, at);
     }
 }
 
 /* Rows that nothing moves leave the barrier, and so do bounds that coincide but that nothing moves. */
-static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
+static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
     const Constraint *con = t->lanes.of->constraint + i;
-    const V *x = t->lanes.X + k * NX, *u = k < t->lanes.of->N ? t->lanes.U + k * NU : 0;
     int64_t q = row_of(t, i, k);
     I moves[con->rows];
-    find_moved(t, i, k, x, u, z, moves);
+    find_moved(t, i, k, at, moves);
     for (int j = 0; j < con->rows; j++) {
-        I tight = of & (t->c[q + j] > SET(-t->how->push)), is_state = of & ~of;
+        I tight = is_tight(t, of, i, k, j), is_state = of & ~of;
         if (con->kind == BOUNDS && con->variable[j] < NX) is_state = ~is_state;
         t->out[q + j] |= tight & ~moves[j];
         t->fixes[q + j] &= ~of | moves[j] | ~is_state; /* controls that are fixed weren't varied */
@@ -115,12 +157,11 @@ static inline I is_broken(const Barrier *t, int64_t q) {
 }
 
 /* Violated rows that were left out, but that something moves now, come into the barrier. */
-static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
+static void come_in(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
     const Constraint *con = t->lanes.of->constraint + i;
-    const V *x = t->lanes.X + k * NX, *u = k < t->lanes.of->N ? t->lanes.U + k * NU : 0;
     int64_t q = row_of(t, i, k);
     I moves[con->rows];
-    find_moved(t, i, k, x, u, z, moves);
+    find_moved(t, i, k, at, moves);
     for (int j = 0; j < con->rows; j++) {
         I in = of & is_broken(t, q + j) & moves[j];
         t->out[q + j] &= ~in;
@@ -129,12 +170,11 @@ static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
 }
 
 /* Rows are relaxed by a share of the violation tolerance, and by less where the controls change them little. */
-static void loosen(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
+static void loosen(Barrier *t, I of, int64_t i, int64_t k, const Response *at) {
     const Constraint *con = t->lanes.of->constraint + i;
-    const V *x = t->lanes.X + k * NX, *u = k < t->lanes.of->N ? t->lanes.U + k * NU : 0;
     int64_t q = row_of(t, i, k);
     V change[con->rows], most_room = SET(t->how->relaxes * t->how->violation);
-    along(t, i, k, x, u, z, change);
+    along(t, i, k, at->x, k < t->lanes.of->N ? at->x + NX : 0, at->z, change);
     for (int j = 0; j < con->rows; j++, q++) {
         V room = most_room * least(tgco_fabs(change[j]), SET(1.0));
         room = tgco_if(of & ~t->out[q] & finite(room), room);

@@ -11,6 +11,7 @@ typedef struct {
     Pair filter[LANES][PAIRS];
     int pairs[LANES], failures[LANES], shortened[LANES], ahead[LANES];
     I restoring, crawls, relaxed; /* relaxed: the rows are */
+    I presses; /* mu falls further than the tolerance asks for: see barrier_counts */
     I watching; /* a step was taken on trial; theta, phi, slope and alpha are those before it */
 } Track;
 
