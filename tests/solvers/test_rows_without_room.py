@@ -80,9 +80,10 @@ def assert_same_answer(found: Solution, expected: Solution, tolerance: float = 1
     torch.testing.assert_close(found.cost, expected.cost, rtol=tolerance, atol=1e-9)
 
 
-def test_the_plain_problems_have_the_costs_of_ipopt() -> None:
+@pytest.mark.parametrize("count", [2, pytest.param(B, marks=pytest.mark.slow)])
+def test_the_plain_problems_have_the_costs_of_ipopt(count: int) -> None:
     for plain in (battery(), cart(), rocket()):
-        problem = plain[0](plain[1]).take(slice(0, 8))
+        problem = plain[0](plain[1]).take(slice(0, count))
         ours, theirs = (torchgco.solve(problem, solver=name).cost for name in ("gco", "ipopt"))
         torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-8)
 
