@@ -1,20 +1,25 @@
 """Reads files of a run, which comes from anybody: a small file can promise any size.
 
-What a file takes when it is read is known before it is read, from its own headers; `trust` admits any size.
+What a file takes when it is read is known before it is read, from its own headers; where these can lie, memory is
+limited while it is read. `trust` admits any size.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import pandas as pd
+import pyarrow
 import pyarrow.compute
 import pyarrow.parquet
 
 from torchgco.base.errors import InputError
 from torchgco.base.files import npz_size
+from torchgco.base.memory import limited
 from torchgco.scenarios import Layouts, Vehicle
 
 LARGEST = 2**30  # bytes of one file when it is read; the files of 10,000 layouts and ten solvers take a third
@@ -42,16 +47,21 @@ def read_layouts(path: Path, trust: bool = False) -> Layouts:
 
 
 def read_table(path: Path, trust: bool = False, **options: Any) -> pd.DataFrame:
-    """The table in a run's parquet file.
+    """The table in a run's parquet file: columns of numbers, texts and truths, each of its own name.
 
     Raises:
         InputError: it takes more than it may.
-        Exception: nearly any, where the file is damaged.
+        Exception: nearly any, where the file is damaged or has other columns.
     """
-    if not trust and (size := _size(path)) > LARGEST:
-        refuse(path, f"a table of {size / 1e9:.3g} GB")
-    # Most tables are small: threads cost more than they save.
-    return pd.read_parquet(path, use_threads=False, **options)
+    if trust:
+        return _table(path, options)
+    try:
+        with _counted(), limited(LARGEST):
+            if (size := _size(path)) > LARGEST:
+                refuse(path, f"a table of {size / 1e9:.3g} GB")
+            return _table(path, options)
+    except MemoryError:  # a page that is longer than its headers say, or a text in many rows
+        refuse(path, "a table that takes more")
 
 
 def check_stages(folder: Path, vehicle: Vehicle, layouts: Layouts, most: int) -> None:
@@ -70,8 +80,32 @@ def refuse(path: Path, got: str) -> NoReturn:
     raise InputError("RUN", f"at most the {LARGEST / 1e9:.3g} GB {MORE}", f"{path} with {got}")
 
 
+@contextmanager
+def _counted() -> Iterator[None]:
+    """In this block Arrow takes memory from the system as it needs it.
+
+    Its own pool takes a GiB of addresses at once: before the block, as few parts of Arrow know no other pool.
+    """
+    usual = pyarrow.default_memory_pool()
+    pyarrow.allocate_buffer(1, memory_pool=usual)
+    pyarrow.set_memory_pool(pyarrow.system_memory_pool())
+    try:
+        yield
+    finally:
+        pyarrow.set_memory_pool(usual)
+
+
+def _table(path: Path, options: Mapping[str, Any]) -> pd.DataFrame:
+    schema = pyarrow.parquet.read_schema(path)
+    for field in schema:
+        if pyarrow.types.is_nested(field.type) or schema.names.count(field.name) > 1:
+            raise ValueError(f"column {field.name} of {field.type}")
+    # Most tables are small: threads cost more than they save.
+    return pd.read_parquet(path, use_threads=False, **options)
+
+
 def _size(path: Path) -> int:
-    """Bytes of a parquet file's table, from its headers; of texts that repeat also from their dictionaries."""
+    """Bytes of a parquet file's table as its headers say; of texts that repeat also from their dictionaries."""
     with pyarrow.parquet.ParquetFile(path) as file:
         about = file.metadata
         groups = [about.row_group(i) for i in range(about.num_row_groups)]

@@ -30,7 +30,6 @@ from torchgco.scenarios import Layouts
 MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
 ROW = [*PAIR, "solver"]
 DIGESTS = ("layout_digest", "settings_digest")
-NEEDED = (*ROW, *DIGESTS, "best_from")  # columns that tell trials apart, and how they were judged
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def read_trials(path: str | os.PathLike[str], trust: bool = False) -> pd.DataFra
     """The table in a `trials.parquet`.
 
     Raises:
-        InputError: it can't be read, doesn't name its trials, isn't as the study left it, or without `trust` takes more
+        InputError: it can't be read, lacks columns of a study, isn't as the study left it, or without `trust` takes more
             memory than a run's file may.
     """
     mark = Path(path).parent / DONE
@@ -80,9 +79,10 @@ def read_trials(path: str | os.PathLike[str], trust: bool = False) -> pd.DataFra
     if sums and Path(path).is_file() and checksum(Path(path)) not in sums:
         raise damaged(Path(path), "isn't as the study wrote it")
     trials = _read(path, trust)
-    missing = [name for name in NEEDED if name not in trials.columns]
+    missing = [name for name in COLUMNS if name not in trials.columns]
     if missing:
-        raise InputError("trials", f"columns {', '.join(NEEDED)}", f"{path} without {', '.join(missing)}")
+        raise InputError("trials", "the columns of a study", f"{path} without {', '.join(missing)}")
+    check_trials(trials, path)
     return trials
 
 
@@ -112,7 +112,6 @@ def _run(folder: Path, given: bool, trust: bool) -> Run | None:
     """The run in a folder; None for a table that a merge wrote, unless the folder itself was given."""
     if (folder / TRIALS).is_file():
         trials = read_trials(folder / TRIALS, trust)
-        check_trials(trials, folder / TRIALS)
         if MERGED in trials.attrs and not given:
             return None
         if not (folder / MANIFEST).is_file():
@@ -134,5 +133,5 @@ def _run(folder: Path, given: bool, trust: bool) -> Run | None:
 
 def _layouts(manifest: Manifest) -> Layouts | None:
     """The layouts of a study's file, for their best costs; None where they were drawn, or the file has moved."""
-    path = manifest.configuration["scenario"].get("path")
-    return read_layouts(Path(path)) if path and Path(path).is_file() else None
+    path = (manifest.configuration.get("scenario") or {}).get("path")
+    return read_layouts(Path(path)) if isinstance(path, str) and Path(path).is_file() else None
