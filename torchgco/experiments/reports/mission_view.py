@@ -15,7 +15,6 @@ from torchgco.base.errors import InputError
 from torchgco.base.notices import watched
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_report import PLANS
-from torchgco.experiments.results.records import MISSION
 from torchgco.judging.contact import contacts
 from torchgco.missions import Mission
 from torchgco.missions.replay import replayed
@@ -69,27 +68,27 @@ class _Log:
 
     @classmethod
     def read(cls, study: Study) -> _Log:
-        table = study.table(MISSION)
-        steps = dict(iter(table.groupby(["solver", "mission"], sort=False)))
+        steps = dict(iter(study.log.groupby(["solver", "mission"], sort=False)))
         if not (study.folder / PLANS).is_file():
             return cls(steps, study.rows, {}, {})  # type: ignore[arg-type]
-        held = study.arrays(PLANS)
-        names, numbers, plans = held["solver"].tolist(), held["layout"].tolist(), held["plan"]
-        kept = {(name, i): plans[s, b] for s, name in enumerate(names) for b, i in enumerate(numbers)}
+        held, numbers = study.flown(PLANS, "plan"), study.layouts.ids.tolist()
+        kept = {(name, i): plan for name, plans in held.items() for i, plan in zip(numbers, plans, strict=True)}
         if study.manifest.configuration["mission"].get("sensor", "full") == "full":
             return cls(steps, study.rows, kept, {})  # type: ignore[arg-type]
         try:
-            return cls(steps, study.rows, kept, {name: study.mission(name) for name in names})  # type: ignore[arg-type]
+            return cls(steps, study.rows, kept, {name: study.mission(name) for name in held})  # type: ignore[arg-type]
         except InputError as error:  # an option that another version knew
             return cls(steps, study.rows, kept, {}, f"no map: {error}")  # type: ignore[arg-type]
 
     def flight(self, study: Study, problem: Problem, solver: str, number: int, notes: list[str]) -> Flight | None:
-        """The flight of a mission, the problem of which is given; None where it ended at its start."""
+        """The flight of a mission, the problem of which is given; None without a finite state."""
         key = solver, number
         steps, plan, loop = self.steps.get(key), self.plans.get(key), self.loops.get(solver)
         if steps is None or not len(steps):
             return None
         flight = _flight(problem, solver, steps, self.rows[key])
+        if not len(flight.path):
+            return None
         plan = None if plan is None else plan[: len(steps)]
         notes += [self.missing] if self.missing and self.missing not in notes else []
         if plan is None or loop is None:

@@ -20,9 +20,14 @@ import pyarrow.parquet
 from torchgco.base.errors import InputError
 from torchgco.base.files import npz_size
 from torchgco.base.memory import limited
+from torchgco.missions.tables import STATES
 from torchgco.scenarios import Layouts, Vehicle
 
 LARGEST = 2**30  # bytes of one file when it is read; the files of 10,000 layouts and ten solvers take a third
+LOG = (
+    "mission", "step", "cost", "violation", "clearance", "planner_seconds", "tracker_seconds", "tracking_violation",
+    "guided",
+)  # fmt: skip
 NUMBER = 8  # bytes of a number in a table
 MORE = "that a run's file may take (--trust admits more)"
 
@@ -62,6 +67,25 @@ def read_table(path: Path, trust: bool = False, **options: Any) -> pd.DataFrame:
             return _table(path, options)
     except MemoryError:  # a page that is longer than its headers say, or a text in many rows
         refuse(path, "a table that takes more")
+
+
+def read_log(path: Path, trust: bool = False) -> pd.DataFrame:
+    """The log of a study of missions, a row per control step: numbers, but for `solver` and `source`.
+
+    Raises:
+        InputError: it takes more than it may.
+        Exception: nearly any, where the file is damaged or no such log.
+    """
+    log = read_table(path, trust)
+    for name in ("solver", "source", *LOG, *(f"x{i}" for i in range(STATES))):
+        if name not in log.columns:
+            raise ValueError(f"no column {name}")
+    for name, column in log.items():
+        if name not in ("solver", "source") and not pd.api.types.is_numeric_dtype(column):
+            raise ValueError(f"no numbers in column {name}")
+    if not log["step"].between(0, len(log) - 1).all():
+        raise ValueError("a step beyond its rows")
+    return log
 
 
 def check_stages(folder: Path, vehicle: Vehicle, layouts: Layouts, most: int) -> None:

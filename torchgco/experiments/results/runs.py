@@ -25,7 +25,7 @@ from torchgco.experiments.results.records import (
 )
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.statistics import PAIR, check_trials
-from torchgco.scenarios import Layouts
+from torchgco.scenarios import LayoutFile, Layouts
 
 MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
 ROW = [*PAIR, "solver"]
@@ -132,6 +132,8 @@ def _run(folder: Path, given: bool, trust: bool) -> Run | None:
 
 
 def _layouts(manifest: Manifest) -> Layouts | None:
-    """The layouts of a study's file, for their best costs; None where they were drawn, or the file has moved."""
-    path = (manifest.configuration.get("scenario") or {}).get("path")
-    return read_layouts(Path(path)) if isinstance(path, str) and Path(path).is_file() else None
+    """The layouts of a study's file, for their best costs; None where there is none, or it has moved."""
+    scenario = manifest.configuration.get("scenario") or {}
+    path = scenario.get("path")
+    of_layouts = scenario.get("_target_") == f"{LayoutFile.__module__}.{LayoutFile.__qualname__}"
+    return read_layouts(Path(path)) if of_layouts and isinstance(path, str) and Path(path).is_file() else None
