@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Iterator
@@ -18,13 +19,13 @@ def free_memory() -> int:
 
 
 @contextmanager
-def limited(size: int) -> Iterator[None]:
+def limited(size: float) -> Iterator[None]:
     """In this block the process gets `size` bytes of memory on top of its own: more is a MemoryError.
 
     For libraries that take what a file promises. Linux counts data alone, no stacks and no mapped files, of all
     threads; on other systems nothing is limited.
     """
-    if sys.platform != "linux":
+    if sys.platform != "linux" or size == math.inf:
         yield
         return
     import resource
@@ -32,7 +33,7 @@ def limited(size: int) -> Iterator[None]:
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     with open("/proc/self/status") as lines:
         held = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData"))
-    limit = held + size if soft == resource.RLIM_INFINITY else min(held + size, soft)
+    limit = held + int(size) if soft == resource.RLIM_INFINITY else min(held + int(size), soft)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
     try:
         yield

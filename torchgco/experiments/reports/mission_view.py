@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,9 +13,11 @@ import torch
 from tqdm import tqdm
 
 from torchgco.base.errors import InputError
+from torchgco.base.memory import limited
 from torchgco.base.notices import watched
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_report import PLANS
+from torchgco.experiments.results.limits import LARGEST
 from torchgco.judging.contact import contacts
 from torchgco.missions import Mission
 from torchgco.missions.replay import replayed
@@ -95,15 +98,18 @@ class _Log:
             return replace(flight, plan=None if plan is None else plan[: len(flight.path)])
         x = torch.tensor(steps[[f"x{i}" for i in range(STATES)]].to_numpy(dtype=float))
         try:
-            with tqdm(
-                total=len(x), desc="map", unit="period", leave=False, disable=len(x) < SLOW or not watched()
-            ) as bar:
+            with limited(math.inf if study.trust else LARGEST), _bar(len(x)) as bar:
                 replay = replayed(loop, problem, x, study.seed, number, bar.update)
-        except NativeError as error:
+        except (NativeError, MemoryError) as error:  # a map of any size can be asked for
             notes += [] if notes else [f"no map: {str(error).splitlines()[0]}"]
             return replace(flight, plan=plan[: len(flight.path)])
         safe = steps["safe"].to_numpy() == 1
         return replace(flight, plan=plan[: len(flight.path)], sensed=Sensed(replay.seen, replay.sought, safe))
+
+
+def _bar(periods: int) -> tqdm:
+    hidden = periods < SLOW or not watched()
+    return tqdm(total=periods, desc="map", unit="period", leave=False, disable=hidden)
 
 
 def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str, Any]) -> Flight:

@@ -71,8 +71,8 @@ def read_trials(path: str | os.PathLike[str], trust: bool = False) -> pd.DataFra
     """The table in a `trials.parquet`.
 
     Raises:
-        InputError: it can't be read, lacks columns of a study, isn't as the study left it, or without `trust` takes more
-            memory than a run's file may.
+        InputError: it can't be read, lacks columns of a study, isn't as the study left it, or without `trust` takes
+            more memory than a run's file may.
     """
     mark = Path(path).parent / DONE
     sums = read_checksums(mark).get(TRIALS, []) if mark.is_file() else []
