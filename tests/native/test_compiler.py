@@ -148,39 +148,6 @@ def test_what_others_may_have_written_is_not_loaded(cache: Path, monkeypatch, co
 
 
 @needs_compiler
-def test_the_library_that_was_read_is_loaded(cache: Path, monkeypatch, compiled: list[str]) -> None:
-    """Also where another one lies in its place by then: others may write to a folder above."""
-    times(2)
-    (file,) = cache.iterdir()
-    next_process()
-    plain = ctypes.CDLL
-
-    def swapping(name: str) -> ctypes.CDLL:
-        file.write_bytes(b"of somebody else")
-        return plain(name)
-
-    monkeypatch.setattr(compiler.ctypes, "CDLL", swapping)
-    assert times(2) == 6.0 and len(compiled) == 1
-
-
-@needs_compiler
-def test_a_folder_of_temporary_files_that_libraries_cannot_be_loaded_from(
-    cache: Path, monkeypatch, compiled: list[str]
-) -> None:
-    times(2)
-    next_process()
-    plain = ctypes.CDLL
-
-    def forbidding(name: str) -> ctypes.CDLL:
-        if not name.startswith(str(cache)):
-            raise OSError("failed to map segment from shared object")
-        return plain(name)
-
-    monkeypatch.setattr(compiler.ctypes, "CDLL", forbidding)
-    assert times(2) == 6.0 and len(compiled) == 1
-
-
-@needs_compiler
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
 def test_a_folder_that_root_shares_is_read(cache: Path, monkeypatch, compiled: list[str]) -> None:
     times(2)
