@@ -116,6 +116,13 @@ def empty_layouts(folder: Path) -> Read:
     return lambda: Study.read(folder)
 
 
+def far_points(folder: Path) -> Read:
+    """A map of two points, and of distances at 10^8 places."""
+    held = {"map_points": np.array([[0.0] * 3, [50.0] * 3]), "map_radius": np.array(0.1)}
+    np.savez(run(folder) / "layouts.npz", centers=np.zeros((1, 0, 3)), radii=np.zeros((1, 0)), **held)
+    return lambda: Study.read(folder)
+
+
 def solutions(folder: Path) -> Read:
     (folder / "solutions.npz").write_bytes(zipped("U.npy", 2**32 - 1))
     return lambda: read_npz(folder / "solutions.npz")
@@ -191,6 +198,7 @@ LAUGHS = b"a: &a [x,x,x,x,x,x,x,x,x]\n" + b"".join(
 BOMBS: dict[str, Callable[[Path], Read]] = {
     "layouts.npz that names 4 GB": partial(run_with, "layouts.npz", zipped("centers.npy", 2**32 - 1)),
     "layouts.npz, 10^12 layouts without obstacles": empty_layouts,
+    "layouts.npz, two points 87 m from each other": far_points,
     "layouts.npz, an array of 8 TB": partial(run_with, "layouts.npz", zipped("centers.npy", 10**6, f"({10**12},)")),
     "study.json, 100,000 lists": partial(run_with, "study.json", b"[" * 10**5),
     "done, 100,000 lists": partial(run_with, "done", b"[" * 10**5),

@@ -47,8 +47,17 @@ def read_npz(path: Path, trust: bool = False) -> dict[str, np.ndarray]:
 
 
 def read_layouts(path: Path, trust: bool = False) -> Layouts:
-    """The layouts of a run. Raises InputError as `Layouts.load`, or where they take more than they may."""
-    return Layouts.load(path) if trust else Layouts.load(path, room=LARGEST, limit=MORE)
+    """The layouts of a run, with the distances of their map.
+
+    Raises InputError as `Layouts.load`, or where they take more than they may.
+    """
+    if trust:
+        return Layouts.load(path)
+    try:
+        with limited(LARGEST):
+            return Layouts.load(path, room=LARGEST, limit=MORE)
+    except MemoryError:  # distances take a multiple of a map's cells, and any multiple of its points
+        refuse(path, "a map that takes more")
 
 
 def read_table(path: Path, trust: bool = False, **options: Any) -> pd.DataFrame:
