@@ -87,6 +87,42 @@ def texts(folder: Path) -> Read:
     return lambda: read_trials(folder / "trials.parquet")
 
 
+def long_pages(folder: Path) -> Read:
+    """Pages of texts, each longer than the footer says."""
+    path, text = folder / "trials.parquet", pa.array(["a" * 300_000_000])
+    table = pa.table({str(i): text for i in range(4)})
+    pq.write_table(table, path, compression="zstd", use_dictionary=False, write_statistics=False)
+    raw = path.read_bytes()
+    at = len(raw) - 8 - struct.unpack("<I", raw[-8:-4])[0]
+    about = pq.read_metadata(path).row_group(0)
+    foot = raw[at:]
+    for size in (about.total_byte_size, about.column(0).total_uncompressed_size):
+        foot = foot.replace(varint(size), varint(100, len(varint(size))))
+    path.write_bytes(raw[:at] + foot)
+    return lambda: read_trials(path)
+
+
+def varint(number: int, length: int = 1) -> bytes:
+    """A whole number as Thrift packs it, in so many bytes or more."""
+    left, held = 2 * number, []
+    while left or len(held) < length:
+        held.append(left & 127)
+        left >>= 7
+    return bytes([*(one | 128 for one in held[:-1]), held[-1]])
+
+
+def empty_layouts(folder: Path) -> Read:
+    np.savez(run(folder) / "layouts.npz", centers=np.zeros((10**12, 0, 3)), radii=np.zeros((10**12, 0)))
+    return lambda: Study.read(folder)
+
+
+def far_points(folder: Path) -> Read:
+    """A map of two points, and of distances at 10^8 places."""
+    held = {"map_points": np.array([[0.0] * 3, [50.0] * 3]), "map_radius": np.array(0.1)}
+    np.savez(run(folder) / "layouts.npz", centers=np.zeros((1, 0, 3)), radii=np.zeros((1, 0)), **held)
+    return lambda: Study.read(folder)
+
+
 def solutions(folder: Path) -> Read:
     (folder / "solutions.npz").write_bytes(zipped("U.npy", 2**32 - 1))
     return lambda: read_npz(folder / "solutions.npz")
@@ -161,6 +197,8 @@ LAUGHS = b"a: &a [x,x,x,x,x,x,x,x,x]\n" + b"".join(
 )
 BOMBS: dict[str, Callable[[Path], Read]] = {
     "layouts.npz that names 4 GB": partial(run_with, "layouts.npz", zipped("centers.npy", 2**32 - 1)),
+    "layouts.npz, 10^12 layouts without obstacles": empty_layouts,
+    "layouts.npz, two points 87 m from each other": far_points,
     "layouts.npz, an array of 8 TB": partial(run_with, "layouts.npz", zipped("centers.npy", 10**6, f"({10**12},)")),
     "study.json, 100,000 lists": partial(run_with, "study.json", b"[" * 10**5),
     "done, 100,000 lists": partial(run_with, "done", b"[" * 10**5),
@@ -168,6 +206,7 @@ BOMBS: dict[str, Callable[[Path], Read]] = {
     "study.json, 10^9 stages": lambda folder: partial(Study.read, run(folder, stages=10**9)),
     "trials.parquet, 160 million cells": rows,
     "trials.parquet, a text of 1 MB in 4,000 rows": texts,
+    "trials.parquet, pages of 1.2 GB that name 100 bytes": long_pages,
     "solutions.npz that names 4 GB": solutions,
     "yaml of a map, aliases of aliases": partial(map_of, "a.yaml", samples.yaml("plan.pgm") + LAUGHS),
     "yaml of a map, 4,000 lists": partial(map_of, "a.yaml", samples.yaml("plan.pgm") + b"more: " + b"[" * 4000),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +35,16 @@ from torchgco import (
     judge,
 )
 from torchgco.base.shapes import computing_on
+from torchgco.experiments.config.build import compose
 from torchgco.maps import Field, OccupancyGrid
+from torchgco.maps.distance import DistanceField
+from torchgco.missions import RotorPlant
 from torchgco.native.kernels import use_native
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
 
 N, R = 3, 0.06
-DOUBLE: dict[str, Any] = {"dtype": torch.float64}
+DOUBLE: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
 WALL = np.pad(np.ones((3, 6), bool), 8)
 LOCAL = AugmentedLagrangian(ILQR(max_iterations=1), max_outer_iterations=1)
 
@@ -150,3 +154,42 @@ def test_mixed_devices_are_refused_here() -> None:
                 mixed()
         with pytest.raises((RuntimeError, TypeError)):
             there.numpy()
+
+
+@pytest.mark.parametrize("kind", ["spheres", "map", "states"])
+def test_another_default_device_changes_nothing(kind: str, tmp_path: Path) -> None:
+    """Problems of the CPU are solved, judged, explained and kept there, whatever PyTorch makes elsewhere."""
+
+    def work() -> list[Any]:
+        problem, U0 = problem_of(kind, "cpu")
+        found, parts = solved(problem, U0)
+        found.save(tmp_path / "solution.npz")
+        part, loaded = found[1:], Solution.load(tmp_path / "solution.npz")
+        verdicts = *vars(judge(problem, found.U)).values(), *vars(certify(problem, found.X, found.U)).values()
+        texts = str(found.explain(1)), str(part.explain(0)), str(loaded.explain(0, problem)), found.to_frame(problem)
+        tables = found.worst_rows(problem), loaded[:1].t.tolist(), problem.take(torch.tensor([1], device="cpu")).x0
+        return [str(one.tolist() if isinstance(one, Tensor) else one) for one in (*parts, *verdicts, *texts, *tables)]
+
+    expected = work()
+    with OTHER:
+        assert work() == expected
+
+
+def test_maps_and_vehicles_are_made_on_the_cpu() -> None:
+    def work() -> list[Any]:
+        field = DistanceField.of(OccupancyGrid(WALL, [-1.7, -2.0], 0.15))
+        plant = RotorPlant(mass_error=0.1)
+        problem = compose(["scenario=forest", "study.layouts=1"]).task().problem
+        return [field.distance([[0.1, 0.2]]).tolist(), plant.mass_error, problem.x0.tolist()]
+
+    expected = work()
+    with OTHER:
+        assert work() == expected
+
+
+def test_times_of_a_part_of_a_loaded_solution(tmp_path: Path) -> None:
+    problem, U0 = problem_of("states", "cpu")
+    found, _ = solved(replace(problem, horizon=torch.tensor([2, 3])), U0)
+    found.save(tmp_path / "solution.npz")
+    loaded = Solution.load(tmp_path / "solution.npz")
+    assert loaded[1:].t.tolist() == found[1:].t.tolist() and loaded[1:].t.shape == (1, N + 1)

@@ -51,7 +51,7 @@ def test_a_study_cut_over_jobs_equals_one_in_a_single_piece(line: str, whole: Pa
     same(whole, tmp_path / "cut")
     (folder,) = (tmp_path / "cut" / "outputs").glob("forest*")
     jobs = int(re.findall(r"study.jobs=(\d+)", line)[0])
-    records = [json.loads((folder / f"run-{job}.json").read_text())[0] for job in range(jobs)]
+    records = [json.loads((folder / f"run-{job}-of-{jobs}.json").read_text())[0] for job in range(jobs)]
     assert [record["ended"] for record in records] == ["share flown"] * jobs
     assert all(record["workers"] * record["threads"] == 1 for record in records if "joblib" in line)
 

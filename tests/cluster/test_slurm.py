@@ -71,7 +71,7 @@ def test_jobs_that_reach_their_time_limit_resume(workers: int, submit, tmp_path)
     assert done.returncode == 0, done.stderr
     (study,) = (tmp_path / "outputs").glob("forest*")
     assert (study / "summary.csv").is_file()
-    starts = [json.loads((study / f"run-{job}.json").read_text()) for job in range(2)]
+    starts = [json.loads((study / f"run-{job}-of-2.json").read_text()) for job in range(2)]
     endings = [[start["ended"] for start in held] for held in starts]
     assert all(ended[-1] == "share flown" for ended in endings)
     assert any("interrupted" in ended for ended in endings)

@@ -135,6 +135,16 @@ def test_a_study_is_held_until_its_command_ends(run, tmp_path) -> None:
     assert not list((tmp_path / "out").glob(".lock*"))
 
 
+@pytest.mark.usefixtures("without_report")
+def test_each_share_has_a_record_of_its_own(run, tmp_path) -> None:
+    """Shares 0 of 2 and 0 of 3 are flown side by side, and would change the same file."""
+    words = [*HOLD, "hydra.run.dir=out"]
+    with held(tmp_path / "out", 0, 3):
+        assert run(*words, "study.jobs=2", "study.job=0")[0] == 0
+    names = {path.name for path in (tmp_path / "out").glob("run*.json")}
+    assert names == {"run-0-of-2.json"}
+
+
 @pytest.mark.slow
 def test_the_same_command_thrice_at_once_makes_one_whole_study(run, tmp_path) -> None:
     words = [*HOLD, "hydra.run.dir=out"]

@@ -34,7 +34,10 @@ def study(folder: Path, *rows: dict, number: int | None = None) -> Path:
     return folder
 
 
-NAMES = ['=cmd|" /C calc"!A0', "+x", "-x", "@SUM(A1)", "\t=x", "\r=x"]
+NAMES = ['=cmd|" /C calc"!A0', "+x", "-x", "@SUM(A1)", " =x", "＝x"]
+WITHIN = {  # with other separators of cells
+    "\t=x": "\t'=x", "\r=x": "\n'=x", "a;=x": "a;'=x", "a;b=x": "a;b=x", "a\r\n=x": "a\n\n'=x", "a\t-x": "a\t'-x",
+}  # fmt: skip
 
 
 def test_no_cell_of_a_csv_is_a_formula() -> None:
@@ -44,10 +47,12 @@ def test_no_cell_of_a_csv_is_a_formula() -> None:
     table["kind"] = pd.Categorical(["=k"] * 8)
     lines = list(csv.reader(io.StringIO(format_frame(table, "csv"), newline="")))
     assert lines[0] == ["scenario", "cost", "'=n", "mixed", "kind"]
-    assert [line[0] for line in lines[1:]] == [*(f"'{name}".replace("\r", "\n") for name in NAMES), "-0.5", "plain"]
+    assert [line[0] for line in lines[1:]] == [*(f"'{name}" for name in NAMES), "-0.5", "plain"]
     assert [float(line[1]) for line in lines[1:]] == table["cost"].tolist()
     assert [line[3] for line in lines[1:]] == ["'=a", "-2", "-2.5", "", "b", "True", "1", "'-"]
     assert {line[4] for line in lines[1:]} == {"'=k"}
+    text = format_frame(pd.DataFrame({"name": list(WITHIN)}), "csv")
+    assert [line[0] for line in csv.reader(io.StringIO(text, newline=""))][1:] == list(WITHIN.values())
     plain = table[["cost"]].assign(name="gco [max_outer_iterations=10]")
     assert format_frame(plain, "csv") == plain.to_csv(index=False).rstrip("\n")
 

@@ -143,6 +143,18 @@ def test_plots_and_pages_of_a_problem_do_the_same() -> None:
     assert abs(area - 0.01 * np.isnan(cells()).sum()) < 1e-2
 
 
+def test_maps_of_their_own_share_a_legend() -> None:
+    """The first problem's map is known, the second one's isn't."""
+    known, problem = np.nan_to_num(cells()), planned()
+    maps = Field(OccupancyGrid(np.stack([known, cells(), cells()]), [0, 0], 0.1), RADIUS)
+    own = Problem(problem.dynamics, problem.cost, [maps], problem.x0, N, problem.goal)
+    found = solution(own, torch.from_numpy(PATHS))
+    figure = torchgco.plot(own, found, [0, 1])
+    assert words(figure).count("unknown, counts as occupied") == 1 and blue(figure) > 100
+    figure = torchgco.plot(own, found, 0)
+    assert not any("unknown" in word for word in words(figure)) and blue(figure) == 0
+
+
 def test_pictures_of_missions_do_the_same(tmp_path: Path) -> None:
     room = np.repeat(cells()[:, :, None], 20, axis=2)
     field = DistanceField.of(OccupancyGrid(room, [0.0, 0.0, -1.0], 0.1))

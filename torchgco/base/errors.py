@@ -23,7 +23,10 @@ class InputError(ValueError):
 
 def shown(value: object) -> str:
     """A value as an error shows it: its repr where that fits on a line, else its type."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # a whole number of more digits than Python writes
+        return type(value).__name__
     return text if len(text) <= 80 and "\n" not in text else type(value).__name__
 
 

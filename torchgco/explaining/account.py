@@ -70,10 +70,13 @@ class Account(PerElement):
     def take(self, index: Rows) -> Account:
         """The account of some problems."""
         if isinstance(index, slice):
-            count = 0 if self._whole is None else self._whole.B
-            rows = torch.arange(count) if self._rows is None else self._rows
-            index = rows[index] if self._whole is not None else index
-            rows = index if isinstance(index, Tensor) else None
+            like = self._t if self._whole is None else self._whole.x0
+            if self._rows is not None:
+                rows = self._rows[index]
+            elif like is None or like.dim() == 1:  # times alone, which all problems share
+                rows = None
+            else:
+                rows = torch.arange(len(like), device=like.device)[index]
         else:
             index = index.nonzero().flatten() if index.dtype == torch.bool else index
             rows = index if self._rows is None else self._rows[index]

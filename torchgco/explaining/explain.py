@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import check_shape
+from torchgco.base.shapes import check_shape, computing_on
 from torchgco.base.status import Status
 from torchgco.explaining.account import Account
 from torchgco.explaining.advice import Facts, advice, tells_to_record
@@ -57,7 +57,11 @@ class Explanation(str):
 
 def explanation(solution: Any, b: int, problem: Problem | None = None, what: str | None = None) -> Explanation:
     """What happened to the problem at place b of a solution; see `Solution.explain`. `what` names it, by default b."""
-    solved: Solved = solution
+    with computing_on(solution.U.device):
+        return _explanation(solution, b, problem, what)
+
+
+def _explanation(solved: Solved, b: int, problem: Problem | None, what: str | None) -> Explanation:
     B = solved.U.shape[0]
     if isinstance(b, bool) or not isinstance(b, int) or not 0 <= b < B:
         raise InputError("b", f"the place of a problem, 0 to {B - 1}", shown(b))

@@ -63,7 +63,7 @@ def deepest(places: np.ndarray, depth: np.ndarray) -> np.ndarray:
 def _depth(part: Obstacles, places: np.ndarray, dt: float) -> np.ndarray:
     """How deep (P,), m, the pieces between places (P+1, d), `dt` seconds apart, are in contact with a part."""
     one = replace(part, dt=dt) if part.moving else part  # type: ignore[type-var]
-    X = torch.zeros(len(places), part.position.stop, dtype=torch.float64)
+    X = torch.zeros(len(places), part.position.stop, dtype=torch.float64, device="cpu")
     X[:, part.position] = torch.from_numpy(places)
     beneath = _beneath(one, X) - (1.0 - CONTACT_FACTOR) * part.margins[0].double().cpu()
     beneath = beneath.masked_fill(part.absent[0].cpu(), -torch.inf)
@@ -76,6 +76,6 @@ def _beneath(part: Obstacles, X: Tensor) -> Tensor:
     try:
         gaps = by_kind(CHORDS, part)(part, X)
     except InputError:
-        ends = part.signed_distance(X[None, :, part.position], part.dt * torch.arange(len(X)).to(X))[0]
+        ends = part.signed_distance(X[None, :, part.position], part.dt * torch.arange(len(X), device="cpu").to(X))[0]
         gaps = torch.minimum(ends[:-1], ends[1:])
     return -gaps.detach().double().cpu()

@@ -123,15 +123,17 @@ class DistanceField:
         Raises:
             InputError: points of another space, or another number of maps.
         """
-        p = torch.as_tensor(points, dtype=torch.float64)
+        place = points.device if isinstance(points, Tensor) else torch.device("cpu")
+        p = torch.as_tensor(points, dtype=torch.float64, device=place)
         G = len(self.values)
         if p.dim() < 1 or p.shape[-1] != self.d or (G > 1 and p.shape[0] != G):
             expected = f"({'' if G == 1 else f'{G}, '}..., {self.d})"
             raise InputError("points", expected, tuple(p.shape))
         flat = p.reshape(G, -1, self.d)
-        origins = torch.from_numpy(self.origin)
-        lattice = Lattice(self.nodes(p.device), torch.arange(G), origins, self.spacing, smooth)
-        return distances(lattice, flat, torch.full((G,), 0.5 * self.spacing, dtype=p.dtype)).reshape(p.shape[:-1])
+        origins, maps = torch.from_numpy(self.origin).to(p.device), torch.arange(G, device=p.device)
+        lattice = Lattice(self.nodes(p.device), maps, origins, self.spacing, smooth)
+        cores = torch.full((G,), 0.5 * self.spacing, dtype=p.dtype, device=p.device)
+        return distances(lattice, flat, cores).reshape(p.shape[:-1])
 
 
 def _of_grid(grid: OccupancyGrid, unknown: Unknown, refine: int | None) -> DistanceField:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtMost, Meters, Seed, Within, check_options, check_value
+from torchgco.base.shapes import computing_on
 from torchgco.base.tree import take
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe
@@ -120,7 +121,8 @@ class Mission:
                 period that isn't a multiple of the plant's time step, or an argument of another kind.
         """
         check_value(report, Callable | None, "report")
-        return self._flight(problem, seed, ids).run(report or (lambda step, flying: None))
+        with computing_on(torch.device("cpu")):
+            return self._flight(problem, seed, ids).run(report or (lambda step, flying: None))
 
     def first_plans(self, problem: Problem, seed: int = 0, ids: Tensor | None = None) -> tuple[Problem, Solution]:
         """The planning problems of the first control period, and the solutions that `fly` makes its first plans of.
@@ -130,8 +132,9 @@ class Mission:
         """
         if self.sensor != "full":
             raise InputError("mission.sensor", "full for first plans", self.sensor)
-        flight = self._flight(problem, seed, ids)
-        return flight.planner.first(problem, measured(flight.x, flight.noise[:, 0]), flight.seed, flight.ids)
+        with computing_on(torch.device("cpu")):
+            flight = self._flight(problem, seed, ids)
+            return flight.planner.first(problem, measured(flight.x, flight.noise[:, 0]), flight.seed, flight.ids)
 
     def _flight(self, problem: Problem, seed: int, ids: Tensor | None) -> _Flight:
         check_problem(problem)

@@ -29,7 +29,7 @@ KEPT = 0.25  # share of the clearance from contact that an entered margin leaves
 class BiasedPlanning(QuadrotorPlanning):
     """The planning model with an acceleration that is added to v'."""
 
-    bias: Tensor = torch.zeros(1, 3)  # (B, 3), m/s^2
+    bias: Tensor = torch.zeros(1, 3, device="cpu")  # (B, 3), m/s^2
 
     batched: ClassVar[tuple[str, ...]] = ("bias",)
 

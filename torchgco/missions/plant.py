@@ -86,18 +86,18 @@ def check_vehicle(mass_error: float | Tensor, thrust_error: float | Tensor, drag
     """
     shares = {"mass_error": mass_error, "thrust_error": thrust_error}
     for name, value in {**shares, "drag": drag}.items():
-        values = torch.as_tensor(value)
+        values = torch.as_tensor(value, device="cpu")
         if values.is_complex() or values.dim() > 1 or not bool(torch.isfinite(values).all()):
             raise InputError(f"plant.{name}", "a finite number or a tensor (B,) of such", value)
         if name in shares and not bool((values > -1.0).all()):
             raise InputError(f"plant.{name}", "a share above -1", value)
-    if not bool((torch.as_tensor(drag) >= 0).all()):
+    if not bool((torch.as_tensor(drag, device="cpu") >= 0).all()):
         raise InputError("plant.drag", "at least 0 N s/m", drag)
 
 
 def column(value: float | Tensor, like: Tensor) -> Tensor:
     """A number or (B,) as (1 or B, 1)."""
-    return torch.as_tensor(value).to(like).reshape(-1, 1)
+    return torch.as_tensor(value, device=like.device).to(like).reshape(-1, 1)
 
 
 def hovering(airframe: Airframe, position: Tensor) -> Tensor:

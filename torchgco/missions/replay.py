@@ -53,7 +53,7 @@ def replayed(
     """
     if problem.B != 1 or x.dim() != 2 or x.shape[1] != 17:
         raise InputError("x", "states (K, 17) of one mission", f"{tuple(x.shape)} of {problem.B}")
-    exploration = mission.exploration(problem, seed, torch.tensor([number]))
+    exploration = mission.exploration(problem, seed, torch.tensor([number], device="cpu"))
     if exploration is None:
         raise InputError("mission.sensor", "lidar or depth: only then is there something to see", mission.sensor)
     period = float(problem.dynamics.dt)

@@ -118,12 +118,12 @@ def _key(compiler: Compiler, source: str, flags: tuple[str, ...]) -> str:
 
 def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
     key = _key(compiler, source, flags)
-    kept = store.find(key, ".so")
-    if kept is not None:
-        try:
-            return ctypes.CDLL(str(kept))
-        except OSError:  # removed meanwhile, or in a folder mounted without execution rights
-            pass
+    held = store.read(key, ".so")
+    if held is not None:
+        with suppress(OSError):  # a full disk, or one mounted without execution rights
+            return _own(held)
+        with suppress(OSError):
+            return ctypes.CDLL(str(store.find(key, ".so")))
     begun = _begun.pop(key, None)
     if begun is not None and begun.owner != os.getpid():
         begun = None
@@ -132,11 +132,22 @@ def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDL
             made = _compile(compiler, source, flags, Path(room), None if begun is None else begun.process)
             kept = store.save(key, ".so", made.read_bytes())
             try:
-                return ctypes.CDLL(str(kept or made))
-            except OSError:
                 return ctypes.CDLL(str(made))  # stays loaded when its file is deleted
+            except OSError:
+                return ctypes.CDLL(str(kept or made))
     except OSError as error:
         raise NativeError(f"a compiled library can't be written or loaded: {error}") from error
+
+
+def _own(library: bytes) -> ctypes.CDLL:
+    """Load a library that was read, out of a folder that nobody else can look into.
+
+    By its path in the cache another file could be loaded than was read, where others may write to a folder above.
+    """
+    with TemporaryDirectory(prefix="torchgco-") as room:
+        path = Path(room) / "kernels.so"
+        path.write_bytes(library)
+        return ctypes.CDLL(str(path))
 
 
 def _compile(

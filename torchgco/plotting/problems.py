@@ -75,7 +75,7 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
         drawn = set[str]()
         for part, one in zip(upper.subfigures(1, len(maps), squeeze=False)[0], maps, strict=True):
             drawn |= one.draw(part)
-        lines += maps[0].handles(drawn)
+        lines += _handles(maps, drawn)
     _histories(lower, problem, courses, unit)
     across = legend_columns(lines, WIDTH)
     figure.set_figheight(high + PANEL * rows + 0.1 + 0.23 * ceil(len(lines) / across))
@@ -217,21 +217,21 @@ class _Map:
             drawn.add("contact")
         return drawn
 
-    def handles(self, drawn: set[str]) -> list[Artist]:
-        """Entries of the legend."""
-        shapes: dict[str, Artist] = {
-            "own": Patch(facecolor=STONE, label="obstacle"),
-            "grown": Patch(facecolor="none", edgecolor=EDGE, label="plus the vehicle's radius"),
-            "others": Patch(facecolor=STONE, label="obstacle, plus the vehicle's radius"),
-        }
-        points: list[Artist] = [
-            Line2D([], [], color=INK, label=MARKED[kind], **marker(kind))
-            for kind in ("contact", "away")
-            if kind in drawn
-        ]
-        unknown = [handle for scene in self.world.scenes for handle in unknown_handles(scene.map)]
-        moving = moving_handles("the trajectory of its colour", INK) if "moving" in drawn else []
-        return [*points, *(shape for kind, shape in shapes.items() if kind in drawn), *moving, *unknown[:1]]
+
+def _handles(maps: Sequence[_Map], drawn: set[str]) -> list[Artist]:
+    """Entries of the legend of all maps."""
+    shapes: dict[str, Artist] = {
+        "own": Patch(facecolor=STONE, label="obstacle"),
+        "grown": Patch(facecolor="none", edgecolor=EDGE, label="plus the vehicle's radius"),
+        "others": Patch(facecolor=STONE, label="obstacle, plus the vehicle's radius"),
+    }
+    points: list[Artist] = [
+        Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in ("contact", "away") if kind in drawn
+    ]
+    unknown = [handle for one in maps for scene in one.world.scenes for handle in unknown_handles(scene.map)]
+    moving = moving_handles("the trajectory of its colour", INK) if "moving" in drawn else []
+    known = {handle.get_label(): handle for handle in reversed(unknown)}
+    return [*points, *(shape for kind, shape in shapes.items() if kind in drawn), *moving, *known.values()]
 
 
 def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Course], unit: str) -> None:

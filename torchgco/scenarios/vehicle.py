@@ -161,7 +161,7 @@ class Vehicle:
         """start or goal (L, n): the layouts' own, or the vehicle's for all."""
         states = getattr(layouts, name)
         if states is None:
-            return torch.tensor([list(getattr(self, name))] * layouts.count, dtype=torch.float64).numpy()
+            return np.array([list(getattr(self, name))] * layouts.count, np.float64)
         if states.shape[1] != self.dynamics.n:
             wanted = f"{self.dynamics.n} states of model={self.name}, or {self.dimension} coordinates"
             raise InputError(f"layouts.{name}", wanted, states.shape[1])

@@ -271,6 +271,33 @@ def test_a_yaml_of_another_image_or_program_is_left_alone(tmp_path: Path) -> Non
             read(path)
 
 
+def test_an_image_is_read_by_a_yaml_of_any_name_that_names_it(tmp_path: Path) -> None:
+    path = described(tmp_path)
+    (tmp_path / "map.yaml").rename(tmp_path / "floor.yml")
+    (tmp_path / "big.yaml").write_bytes(b"image: map.pgm\n" + b"#" * 2**14)
+    assert grid_of(path, resolution=0.05).is_unknown.sum() == 4
+    (tmp_path / "other.yaml").write_bytes((tmp_path / "floor.yml").read_bytes())
+    with pytest.raises(InputError, match=r"one yaml file describes.*floor.yml, other.yaml"):
+        read(path, resolution=0.05)
+    assert not grid_of(path, resolution=0.1, height=2.0).is_unknown.any()
+
+
+def test_a_yaml_that_names_an_image_and_lacks_keys_is_refused(tmp_path: Path) -> None:
+    path = described(tmp_path)
+    more = "image: map.pgm\nresolution: 0.05"
+    for text, said in (("image: map.pgm", "none of resolution"), (more, "none of origin")):
+        (tmp_path / "map.yaml").write_text(text)
+        with pytest.raises(InputError, match=said):
+            read(path, resolution=0.05)
+
+
+def test_a_number_without_end_is_one_line(tmp_path: Path) -> None:
+    path = described(tmp_path).with_suffix(".yaml")
+    path.write_text(path.read_text().replace("0.05", "1" + ":59" * 5000))  # of base 60, as YAML 1.1 writes it
+    with pytest.raises(InputError, match="resolution, a finite number"):
+        read(path)
+
+
 @pytest.mark.parametrize("path", ["map.step", "map", "", None, 3, "gone.npz", "gone.pcd", "gone.yaml", "gone.png"])
 def test_paths_that_lead_nowhere(path: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,5 +1,7 @@
 """The vehicle's map against slow versions of the same: cells along rays, distances, corridors, paths."""
 
+import ctypes
+
 import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter
@@ -7,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from tests.reference.sensing import chords, cubes, distances, inside
-from torchgco.missions.sensing import Lidar, Scan, SeenMap, World
+from torchgco.missions.sensing import Lidar, Scan, SeenMap, World, library
 from torchgco.missions.sensing.grid import (
     CHORD,
     FREE,
@@ -239,3 +241,15 @@ def test_a_seen_world_is_free_where_it_is_free() -> None:
     assert len(free) > 1500 and hidden.mean() < 0.01
     slim = world.boxes - 0.5 * SIZE * (np.arange(16) == 15)
     assert not inside(free, slim).any()
+
+
+def test_a_whole_number_is_a_length() -> None:
+    """In place of a double it shifted all arguments, and memory was read that isn't the map's."""
+    made = [SeenMap(CORNER, (5, 4, 3), size) for size in (1, 1.0)]
+    scan = Scan(np.zeros(3), np.eye(3), np.full(3, 1.5))
+    changed = [seen.add(scan, 2).tolist() for seen in made]
+    for seen in made:
+        seen.remeasure(np.arange(60, dtype=np.int32))
+    assert changed[0] == changed[1] and np.array_equal(made[0].from_occupied, made[1].from_occupied)
+    with pytest.raises(ctypes.ArgumentError):
+        library.call("tgco_gaps", np.zeros(3), np.zeros(3), 1.0, np.zeros(1), 0.5, 1.0, 0, np.zeros(3), np.zeros(1))

@@ -14,8 +14,8 @@ from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import mission_from, solver_from, vehicle_of
 from torchgco.experiments.results.files import damaged
 from torchgco.experiments.results.identity import Manifest
-from torchgco.experiments.results.limits import check_stages, read_layouts, read_npz, read_table
-from torchgco.experiments.results.records import DONE, LAYOUTS, MANIFEST, TRIALS, read_manifest
+from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz
+from torchgco.experiments.results.records import DONE, LAYOUTS, MANIFEST, MISSION, TRIALS, read_manifest
 from torchgco.experiments.results.runs import read_trials
 from torchgco.missions import Mission
 from torchgco.problem.problem import Problem
@@ -62,13 +62,26 @@ class Study:
             check_stages(folder, vehicle, layouts, BATCH)
         return cls(folder, manifest, vehicle, layouts, trials, trust)
 
-    def arrays(self, name: str) -> dict[str, np.ndarray]:
-        """The arrays of one of its npz files; InputError where it is damaged, or takes more than it may."""
-        return self._held(name, read_npz)
+    def flown(self, name: str, part: str) -> dict[str, np.ndarray]:
+        """The numbers (L, ...) of each solver in one of its npz files.
 
-    def table(self, name: str) -> pd.DataFrame:
-        """The table of one of its parquet files; InputError likewise."""
-        return self._held(name, read_table)
+        Raises:
+            InputError: the file is damaged, takes more than it may, or has other solvers or layouts.
+        """
+        held = self._held(name, read_npz)
+        solvers, ids = list(self.manifest.solvers), self.layouts.ids
+        named = {"solver", "layout", part} <= held.keys() and held["solver"].tolist() == solvers
+        if not named or not np.array_equal(held["layout"], ids):
+            raise damaged(self.folder / name, "has other layouts")
+        values = held[part]
+        if values.shape[:2] != (len(solvers), len(ids)) or values.dtype != np.float64:
+            raise damaged(self.folder / name, f"has {part} {values.shape}")
+        return dict(zip(solvers, values, strict=True))
+
+    @property
+    def log(self) -> pd.DataFrame:
+        """The control steps of its missions; InputError where the file is damaged, or takes more than it may."""
+        return self._held(MISSION, read_log)
 
     def _held(self, name: str, reader: Callable[[Path, bool], Any]) -> Any:
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,10 +13,11 @@ import torch
 from tqdm import tqdm
 
 from torchgco.base.errors import InputError
+from torchgco.base.memory import limited
 from torchgco.base.notices import watched
 from torchgco.experiments.reports.finished import Study, document_of
 from torchgco.experiments.reports.mission_report import PLANS
-from torchgco.experiments.results.records import MISSION
+from torchgco.experiments.results.limits import LARGEST
 from torchgco.judging.contact import contacts
 from torchgco.missions import Mission
 from torchgco.missions.replay import replayed
@@ -69,42 +71,45 @@ class _Log:
 
     @classmethod
     def read(cls, study: Study) -> _Log:
-        table = study.table(MISSION)
-        steps = dict(iter(table.groupby(["solver", "mission"], sort=False)))
+        steps = dict(iter(study.log.groupby(["solver", "mission"], sort=False)))
         if not (study.folder / PLANS).is_file():
             return cls(steps, study.rows, {}, {})  # type: ignore[arg-type]
-        held = study.arrays(PLANS)
-        names, numbers, plans = held["solver"].tolist(), held["layout"].tolist(), held["plan"]
-        kept = {(name, i): plans[s, b] for s, name in enumerate(names) for b, i in enumerate(numbers)}
+        held, numbers = study.flown(PLANS, "plan"), study.layouts.ids.tolist()
+        kept = {(name, i): plan for name, plans in held.items() for i, plan in zip(numbers, plans, strict=True)}
         if study.manifest.configuration["mission"].get("sensor", "full") == "full":
             return cls(steps, study.rows, kept, {})  # type: ignore[arg-type]
         try:
-            return cls(steps, study.rows, kept, {name: study.mission(name) for name in names})  # type: ignore[arg-type]
+            return cls(steps, study.rows, kept, {name: study.mission(name) for name in held})  # type: ignore[arg-type]
         except InputError as error:  # an option that another version knew
             return cls(steps, study.rows, kept, {}, f"no map: {error}")  # type: ignore[arg-type]
 
     def flight(self, study: Study, problem: Problem, solver: str, number: int, notes: list[str]) -> Flight | None:
-        """The flight of a mission, the problem of which is given; None where it ended at its start."""
+        """The flight of a mission, the problem of which is given; None without a finite state."""
         key = solver, number
         steps, plan, loop = self.steps.get(key), self.plans.get(key), self.loops.get(solver)
         if steps is None or not len(steps):
             return None
         flight = _flight(problem, solver, steps, self.rows[key])
+        if not len(flight.path):
+            return None
         plan = None if plan is None else plan[: len(steps)]
         notes += [self.missing] if self.missing and self.missing not in notes else []
         if plan is None or loop is None:
             return replace(flight, plan=None if plan is None else plan[: len(flight.path)])
         x = torch.tensor(steps[[f"x{i}" for i in range(STATES)]].to_numpy(dtype=float))
         try:
-            with tqdm(
-                total=len(x), desc="map", unit="period", leave=False, disable=len(x) < SLOW or not watched()
-            ) as bar:
+            with limited(math.inf if study.trust else LARGEST), _bar(len(x)) as bar:
                 replay = replayed(loop, problem, x, study.seed, number, bar.update)
-        except NativeError as error:
+        except (NativeError, MemoryError) as error:  # a map of any size can be asked for
             notes += [] if notes else [f"no map: {str(error).splitlines()[0]}"]
             return replace(flight, plan=plan[: len(flight.path)])
         safe = steps["safe"].to_numpy() == 1
         return replace(flight, plan=plan[: len(flight.path)], sensed=Sensed(replay.seen, replay.sought, safe))
+
+
+def _bar(periods: int) -> tqdm:
+    hidden = periods < SLOW or not watched()
+    return tqdm(total=periods, desc="map", unit="period", leave=False, disable=hidden)
 
 
 def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str, Any]) -> Flight:

@@ -26,7 +26,7 @@ from torchgco.experiments.flying.mission_flight import LOST
 from torchgco.experiments.results.files import checksum, damaged
 from torchgco.experiments.results.identity import Manifest, closed_loop, layout_digests
 from torchgco.experiments.results.kinds import joined, parts_of
-from torchgco.experiments.results.limits import check_stages, read_layouts, read_npz, read_table
+from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz, read_table
 from torchgco.experiments.results.records import (
     DONE,
     LAYOUTS,
@@ -135,7 +135,7 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     try:
         judged = partial(_missions if missions else _trajectories, trust)
         computed = judged(folder, vehicle, manifest, layouts, held).reindex(held.index)
-    except (InputError, KeyError, IndexError, TypeError, AttributeError) as error:
+    except (InputError, KeyError, IndexError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         if isinstance(error, InputError) and error.field in ("hydra.run.dir", "RUN"):
             raise
         raise damaged(folder, f"can't be simulated again ({error})") from None
@@ -229,7 +229,7 @@ def _missions(
     The log has the plant's state at the start of every control step, and a flight is judged at all time steps: the
     outcome itself, and what belongs to the end of a flight, can't be confirmed.
     """
-    log = _read(folder / MISSION, partial(read_table, trust=trust))
+    log = _read(folder / MISSION, partial(read_log, trust=trust))
     log["shifted"] = log["source"] == "shifted"
     problem = vehicle.task(layouts).problem
     contact, period = Contact.among(problem), float(problem.dynamics.dt)

@@ -18,7 +18,7 @@ from torchgco.experiments.ending import ended, say
 from torchgco.experiments.reports.finished import TRUST, Study, document_of
 from torchgco.experiments.reports.mission_view import missions
 from torchgco.experiments.reports.searched import searches
-from torchgco.experiments.results.files import damaged, write
+from torchgco.experiments.results.files import write
 from torchgco.experiments.results.records import SOLUTIONS
 from torchgco.judging.judge import OTHERS_WITHIN
 from torchgco.view.document import Document, SearchPart
@@ -49,10 +49,7 @@ def study_page(folder: Path, searched: Sequence[int] = (), trust: bool = False) 
 
 def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
     """Single trajectories, rolled out from the controls that the study kept."""
-    held = study.arrays(SOLUTIONS)
-    names, numbers, controls = held["solver"].tolist(), held["layout"].tolist(), held["U"]
-    if numbers != study.layouts.ids.tolist():
-        raise damaged(study.folder / SOLUTIONS, "has other layouts")
+    controls = study.flown(SOLUTIONS, "U")
     document, rows = None, study.rows
     hidden = study.layouts.count < SLOW or not watched()
     bar = tqdm(total=study.layouts.count, unit="layout", leave=False, disable=hidden)
@@ -61,7 +58,7 @@ def _trajectories(study: Study, found: Mapping[int, SearchPart]) -> Document:
         document = document or document_of(study, problem, look)
         ids, flown = study.layouts.ids[places].tolist(), []
         for name in document.solvers:
-            U = torch.from_numpy(controls[names.index(name)][places])
+            U = torch.from_numpy(controls[name][places])
             X, here = open_loop(problem.dynamics, problem.x0, U), [rows[name, number] for number in ids]
             touching = np.array([not row["clearance"] >= 0 for row in here])
             said = [result_of(row) for row in here], [told(row) for row in here]

@@ -27,6 +27,7 @@ OVERRULED = {
     "control_lower": "control_lower", "control_upper": "control_upper",
 }  # fmt: skip
 CLOSED_LOOP = ("mission", "plant")  # nodes of missions
+GROUPS = ("scenario", "model", "device", *CLOSED_LOOP)
 DIGITS = 16  # hexadecimal, of a digest: 64 bits
 EXACT = 2**53  # above it neighbouring integers, such as seeds, become the same float
 LONGEST = 40  # letters of a value in a message
@@ -113,6 +114,9 @@ class Manifest:
         made = cls(held["configuration"], held["solvers"], layouts)
         if held.pop("checksum") != digest(held):
             raise ValueError("its checksum differs from its content")
+        groups = [made.configuration, *made.solvers.values(), *map(made.configuration.get, GROUPS)]
+        if not all(group is None or isinstance(group, dict) for group in groups):
+            raise ValueError("a group of its configuration holds no keys")
         return made
 
     def check_whole(self) -> None:

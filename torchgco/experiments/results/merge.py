@@ -95,7 +95,7 @@ def _variant(run: Run, settings: Mapping[str, dict[str, Any]], code: str, device
     Args:
         settings: of all solvers whose manifest was found, by digest.
     """
-    kernels = run.configuration.get("device", {}).get("kernels", "native")
+    kernels = (run.configuration.get("device") or {}).get("kernels", "native")
     held = flat(settings.get(code, {"settings": code}))
     held |= {f"device.{name}": value for name, value in zip(ARITHMETIC, (device, dtype, kernels), strict=True)}
     return json.dumps(held | {"version": version}, sort_keys=True, default=str)

@@ -1,4 +1,6 @@
-"""Records of how a study was run: run.json in its folder, and run-JOB.json of every job that flew a share.
+"""Records of how a study was run: run.json in its folder, and run-JOB-of-JOBS.json of every job that flew a share.
+
+Each is written by who holds the study, or that very share (`lock.held`): nobody else reads and changes it meanwhile.
 
 Each file is a list with an entry per start, the oldest first. An entry is a dict of
 
@@ -49,7 +51,7 @@ PATIENCE = 10.0  # s, for git
 @contextmanager
 def recorded(folder: Path, setup: Setup, plan: Plan, command: Sequence[str]) -> Iterator[list[str]]:
     """Record a start in the study's folder, and how it ended: the last word that the block appends, or "finished"."""
-    path = folder / (RECORD if plan.job is None else f"run-{plan.job}.json")
+    path = folder / (RECORD if plan.job is None else f"run-{plan.job}-of-{plan.jobs}.json")
     began, used = time.perf_counter(), _processor_seconds()
     entries: list[dict[str, Any]] = []
     with suppress(Exception):

@@ -25,7 +25,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.files import PART
 from torchgco.experiments.results.files import checksum, create, damaged, write
 from torchgco.experiments.results.identity import Manifest, difference
-from torchgco.experiments.results.limits import read_npz
+from torchgco.experiments.results.limits import read_npz, read_table
 from torchgco.scenarios import Layouts
 
 COLUMNS = (
@@ -224,7 +224,7 @@ class Records:
         wanted = self.manifest.settings
         for path in [self.folder / TRIALS, *self.folder.glob("shards/*.npz")]:
             try:
-                rows = pd.read_parquet(path) if path.name == TRIALS else read_shard(path)[0]
+                rows = read_table(path) if path.name == TRIALS else read_shard(path)[0]
             except Exception:  # unreadable: to be redone
                 continue
             allowed = {"solver": wanted.keys(), "settings_digest": wanted.values()}

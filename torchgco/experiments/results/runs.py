@@ -25,12 +25,11 @@ from torchgco.experiments.results.records import (
 )
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.statistics import PAIR, check_trials
-from torchgco.scenarios import Layouts
+from torchgco.scenarios import LayoutFile, Layouts
 
 MERGED = "merged_from"  # in the attributes of a merged table: the folders it came from
 ROW = [*PAIR, "solver"]
 DIGESTS = ("layout_digest", "settings_digest")
-NEEDED = (*ROW, *DIGESTS, "best_from")  # columns that tell trials apart, and how they were judged
 
 
 @dataclass(frozen=True)
@@ -72,17 +71,18 @@ def read_trials(path: str | os.PathLike[str], trust: bool = False) -> pd.DataFra
     """The table in a `trials.parquet`.
 
     Raises:
-        InputError: it can't be read, doesn't name its trials, isn't as the study left it, or without `trust` takes more
-            memory than a run's file may.
+        InputError: it can't be read, lacks columns of a study, isn't as the study left it, or without `trust` takes
+            more memory than a run's file may.
     """
     mark = Path(path).parent / DONE
     sums = read_checksums(mark).get(TRIALS, []) if mark.is_file() else []
     if sums and Path(path).is_file() and checksum(Path(path)) not in sums:
         raise damaged(Path(path), "isn't as the study wrote it")
     trials = _read(path, trust)
-    missing = [name for name in NEEDED if name not in trials.columns]
+    missing = [name for name in COLUMNS if name not in trials.columns]
     if missing:
-        raise InputError("trials", f"columns {', '.join(NEEDED)}", f"{path} without {', '.join(missing)}")
+        raise InputError("trials", "the columns of a study", f"{path} without {', '.join(missing)}")
+    check_trials(trials, path)
     return trials
 
 
@@ -112,7 +112,6 @@ def _run(folder: Path, given: bool, trust: bool) -> Run | None:
     """The run in a folder; None for a table that a merge wrote, unless the folder itself was given."""
     if (folder / TRIALS).is_file():
         trials = read_trials(folder / TRIALS, trust)
-        check_trials(trials, folder / TRIALS)
         if MERGED in trials.attrs and not given:
             return None
         if not (folder / MANIFEST).is_file():
@@ -133,6 +132,8 @@ def _run(folder: Path, given: bool, trust: bool) -> Run | None:
 
 
 def _layouts(manifest: Manifest) -> Layouts | None:
-    """The layouts of a study's file, for their best costs; None where they were drawn, or the file has moved."""
-    path = manifest.configuration["scenario"].get("path")
-    return read_layouts(Path(path)) if path and Path(path).is_file() else None
+    """The layouts of a study's file, for their best costs; None where there is none, or it has moved."""
+    scenario = manifest.configuration.get("scenario") or {}
+    path = scenario.get("path")
+    of_layouts = scenario.get("_target_") == f"{LayoutFile.__module__}.{LayoutFile.__qualname__}"
+    return read_layouts(Path(path)) if of_layouts and isinstance(path, str) and Path(path).is_file() else None

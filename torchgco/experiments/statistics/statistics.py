@@ -25,6 +25,7 @@ PAIR = [*TASK, "layout", "seed"]
 EFFORT = ["iterations", "outer_iterations", "guided", "seconds"]
 COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, "violation", "cost", *EFFORT]
 NUMBERS = [*EFFORT, "violation", "cost", "best_cost", "clearance", "clearance_knots", "goal_distance"]
+TEXTS = ("string", "categorical", "bytes")  # kinds of columns without numbers, as pandas calls them
 INVALID = Status.INVALID_START.name
 STATUS = "status_"  # prefix of the columns that count statuses
 CONFIDENCE = 0.95
@@ -185,6 +186,8 @@ def check_trials(trials: pd.DataFrame, source: object = "a table") -> None:
     ):
         for name in trials.columns.intersection(list(names)):
             try:
+                if types.infer_dtype(trials[name], skipna=True) in TEXTS:
+                    raise TypeError
                 if not is_right(trials[name].dtype):
                     convert(trials[name])
             except (TypeError, ValueError):

@@ -11,7 +11,9 @@ import pandas as pd
 from torchgco.experiments.statistics.statistics import OUTCOMES, STATUS, TASK, task_columns
 
 FORMATS = ("table", "csv", "markdown", "latex", "json")
-FORMULA = ("=", "+", "-", "@", "\t", "\n")  # how a cell begins that spreadsheets compute
+# Where a spreadsheet finds a formula: where a cell begins, and where it would begin with another separator than the
+# comma, which is read where the comma is that of decimals. The wide signs count in some languages.
+FORMULA = re.compile(r"(^|[;\n\t])([^\S\n\t]*[=+\-@＝＋－＠])")
 RATES = "rates: attained of defined, share, [95 % Wilson interval]; -: undefined"
 EFFORTS = "effort: median (90 % quantile); costs: where the goal was reached, everywhere, over the best known one"
 
@@ -55,8 +57,8 @@ def format_frame(table: pd.DataFrame, form: str) -> str:
 def csv_text(table: pd.DataFrame) -> str:
     """A table as CSV.
 
-    Names come from configurations and files of others: a text that a spreadsheet would compute begins with an
-    apostrophe. Numbers, also those held as text, stay what they are.
+    Names come from configurations and files of others: an apostrophe stands before what a spreadsheet would compute.
+    Numbers, also those held as text, stay what they are.
     """
     texts = {name: table[name].astype(object).map(_inert) for name in table.columns if _holds_text(table[name])}
     return table.assign(**texts).rename(columns=_inert).to_csv(index=False)
@@ -70,12 +72,10 @@ def _inert(cell: Any) -> Any:
     if not isinstance(cell, str):
         return cell
     cell = cell.replace("\r", "\n")  # which is quoted; a carriage return would begin another row
-    if not cell.startswith(FORMULA):
-        return cell
     try:
         float(cell)
     except ValueError:
-        return f"'{cell}"
+        return FORMULA.sub(r"\1'\2", cell)
     return cell
 
 

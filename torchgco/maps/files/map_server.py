@@ -24,18 +24,27 @@ NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", re.ASCII)
 
 
 def beside(source: Source) -> Source | None:
-    """The yaml file of the same stem that describes an image as a map of map_server; None where there is none."""
-    for ending in (".yaml", ".yml"):
-        found = replace(source, path=source.path.with_suffix(ending))
-        if not found.path.is_file():
-            continue
-        try:
-            image = _keys(found)["image"]
-        except InputError:  # of another program
-            continue
-        if isinstance(image, str) and Path(image).name == source.path.name:
-            return found
-    return None
+    """The yaml file in an image's folder that describes it as a map of map_server; None where there is none.
+
+    Raises:
+        InputError: several do, none of them with the image's stem.
+    """
+    found = [path for path in sorted(source.path.parent.glob("*.y*ml")) if _names(replace(source, path=path), source)]
+    own = [path for path in found if path.stem == source.path.stem] or found
+    if len(own) > 1:
+        source.refuse("an image that one yaml file describes, or that file", f"{', '.join(path.name for path in own)}")
+    return replace(source, path=own[0]) if own else None
+
+
+def _names(found: Source, source: Source) -> bool:
+    """Whether a yaml file is small, and a mapping whose image is this one."""
+    try:
+        if found.size(YAML) > MOST_YAML or source.path.name.encode() not in found.bytes(YAML, MOST_YAML):
+            return False
+        image = _mapping(found).get("image")
+    except InputError:  # of another program
+        return False
+    return isinstance(image, str) and Path(image).name == source.path.name
 
 
 def read_described(source: Source, by: Source, resolution: float | None, origin: np.ndarray | None) -> OccupancyGrid:
@@ -122,6 +131,15 @@ def _occupancy(
 
 
 def _keys(source: Source) -> dict[str, Any]:
+    """The mapping of the yaml file, with the keys of map_server."""
+    keys = _mapping(source)
+    needed = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+    if missing := [name for name in needed if name not in keys]:
+        source.refuse(YAML, f"none of {', '.join(missing)}" if len(missing) > 1 else f"no {missing[0]}")
+    return keys
+
+
+def _mapping(source: Source) -> dict[str, Any]:
     """The mapping of the yaml file: no tags beyond the plain ones, no aliases, which can multiply without end."""
     import yaml
 
@@ -136,9 +154,6 @@ def _keys(source: Source) -> dict[str, Any]:
         keys = yaml.load(text, Plain)
     if not isinstance(keys, dict):
         source.refuse(YAML, type(keys).__name__)
-    needed = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
-    if missing := [name for name in needed if name not in keys]:
-        source.refuse(YAML, f"none of {', '.join(missing)}" if len(missing) > 1 else f"no {missing[0]}")
     return keys
 
 
