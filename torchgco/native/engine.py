@@ -23,7 +23,7 @@ from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import LANES, Form
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.declarations import load
-from torchgco.native.packing import KINDS, constraint_of, guide_of, is_bounded, quadratic_arrays
+from torchgco.native.packing import KINDS, constraint_of, guide_of, is_bounded, numbers_of, quadratic_arrays
 from torchgco.native.structures import STRUCTURES, array
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
@@ -226,7 +226,7 @@ class Engine:
         for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
             source = self.functions.get(i)
             numbers = None if source is None else rows_numbers(problem, i, source)
-            rows.append(constraint_of(constraint, shape, numbers, problem))
+            rows.append(constraint_of(constraint, shape, numbers_of(constraint, numbers, problem), problem))
         problem.form[PACKED] = problem.constraints, rows
         return rows
 
