@@ -186,6 +186,8 @@ KINKS = {
     "norm": lambda x: x.norm(dim=-1),
     "where": lambda x: torch.where(x.abs() < 1.0, x.square(), x.abs()),
     "softplus": F.softplus,
+    "sigmoid": torch.sigmoid,
+    "logsigmoid": F.logsigmoid,
 }
 
 

@@ -52,7 +52,7 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
         _check_values(f"dynamics.{name}", method(one), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
         of_stages = _called(f"dynamics.{name}", wanted, method(several), rows, x, u)
         _check_tensor(f"dynamics.{name}", of_stages, (2, 3, n), x.dtype, wanted)
-    _check_stages(dynamics, rows, k, (x, u))
+    _check_stages(dynamics, rows, x0, N)
     weights = 1.0 + 0.5 * scattered(x)
     step = lambda x, u: (weights * several.take(rows).step(x, u)).flatten(1).sum(-1)
 
@@ -64,8 +64,9 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     _check_slope("dynamics.step", step, x, u, None if type(dynamics).jacobians is Dynamics.jacobians else own)
 
 
-def _check_stages(dynamics: Dynamics, rows: Tensor, k: Tensor, arguments: tuple[Tensor, ...]) -> None:
-    """Check that the states after several stages k (K,) at once are those after each stage."""
+def _check_stages(dynamics: Dynamics, rows: Tensor, x0: Tensor, N: int) -> None:
+    """Check that the states after all stages at once are those after each stage."""
+    k, arguments = torch.arange(N, device=x0.device), (_states(x0, N), _controls(x0, N, dynamics.m))
 
     def together(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
         return dynamics.at(k).take(i).step(*z)
@@ -80,7 +81,8 @@ def _check_stages(dynamics: Dynamics, rows: Tensor, k: Tensor, arguments: tuple[
     expected = "states (B, K, n) after each of which depends on its own state, control and stage, as for (B, n)"
     place = _called("dynamics.step", expected, joined_knots, together, alone, rows, k, arguments)
     if place is not None:
-        raise InputError("dynamics.step", expected, f"others where K = {len(k)}, or where other states lie beside")
+        got = f"others at stage {place} where K = {N}, or where other states lie beside"
+        raise InputError("dynamics.step", expected, got)
 
 
 def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:

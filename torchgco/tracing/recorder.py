@@ -39,6 +39,7 @@ class Operation:
     kwargs: dict[str, Any]
     result: Any  # a slot, or a sequence of them
     called: Any = None  # the function of PyTorch that the user called
+    default: torch.dtype = torch.float32  # the type that PyTorch's quotients and roots of integers have
 
     @cached_property
     def inputs(self) -> list[Slot]:
@@ -74,6 +75,7 @@ class Recording(TorchDispatchMode):
         self._numbers = count()
         self.operations: list[Operation] = []
         self.lenient = False  # whether what can't be followed is recorded nevertheless
+        self.unfit: _Unfit | None = None  # why the function can't be recorded; its own code may have caught it
         self.captured: dict[Slot, Tensor] = {}
         self.inputs = [self._new(tensor) for tensor in inputs]
         self._followers = set(self.inputs)
@@ -103,6 +105,10 @@ class Recording(TorchDispatchMode):
             if self._follows(args, kwargs):
                 raise self._unfit("one that looks at the values of its arguments", func, _Looks)
             return func(*args, **kwargs)  # a constant's value may be read
+        if not func._schema.returns:  # it raises where values don't suit it, which the function may catch
+            if self._follows(args, kwargs) and not self.lenient:
+                raise self._unfit("one that fails for some values of its arguments", func)
+            return func(*args, **kwargs)
         if SHAPED_BY_VALUES in func.tags and self._follows(*_shaping(func, args), kwargs):
             raise self._unfit("one with shapes that depend on the values of its arguments", func, _Looks)
         if name_of(func) not in OPERATIONS:
@@ -116,14 +122,16 @@ class Recording(TorchDispatchMode):
         inputs, options = tree_map(lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs))
         out = func(*args, **kwargs)
         made = tree_map(lambda leaf: self._new(leaf) if isinstance(leaf, Tensor) else leaf, out)
-        operation = Operation(func, inputs, options, made, self._calls.called)
+        operation = Operation(func, inputs, options, made, self._calls.called, torch.get_default_dtype())
         self.operations.append(operation)
         if not self._followers.isdisjoint(operation.inputs):
             self._followers.update(operation.outputs)
         return out
 
     def _unfit(self, what: str, operation: Any, kind: type[_Unfit] | None = None) -> _Unfit:
-        return (kind or _Unfit)(f"{what}: {title(operation, self._calls.called)}")
+        found = (kind or _Unfit)(f"{what}: {title(operation, self._calls.called)}")
+        self.unfit = self.unfit or found
+        return found
 
     def _follows(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on the function's arguments."""
@@ -146,11 +154,9 @@ def looks_at_values(function: Callable[..., Tensor], *examples: Tensor) -> bool:
     try:
         with torch.no_grad(), recording, calls:
             torch.func.functionalize(function, remove="mutations")(*examples)
-    except (_Looks, ReadsMemory):
-        return True
     except MISTAKES:
-        return False
-    return False
+        pass
+    return isinstance(recording.unfit, _Looks) or calls.refused is not None
 
 
 def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Recording:
@@ -166,6 +172,8 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
     try:
         with torch.no_grad(), recording, calls:
             result = pure(*examples)
+        if (caught := recording.unfit or calls.refused) is not None:
+            raise caught
     except InputError:
         raise  # the function itself says what is wrong
     except Exception as error:  # any error of the function

@@ -7,6 +7,7 @@ each problem. Only the rest needs a counterpart in CasADi.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -163,9 +164,11 @@ class Traced:
     def _computed(self, index: Tensor) -> dict[Slot, Any]:
         """PyTorch's part, for one problem."""
         known: dict[Slot, Any] = {self._index: index} | self._captured
-        with torch.no_grad(), whole_numbers_become(torch.float64):
-            for operation in self._plain:
-                operation.replay(known)
+        with torch.no_grad():
+            for default, operations in groupby(self._plain, key=lambda operation: operation.default):
+                with whole_numbers_become(default):
+                    for operation in operations:
+                        operation.replay(known)
         return known
 
 
