@@ -120,6 +120,13 @@ MIXED: dict[str, tuple[str, Callable[[], Problem]]] = {
     "model": ("dynamics.step", field(lambda x: (x.mean(0, keepdim=True) - 5.0).relu())),
     "states at once": ("dynamics.step", field(lambda x: x if x.dim() == 2 else 2.0 * x)),
     "stages": ("dynamics.step", field(lambda x: (x.sum(1, keepdim=True) - 9.0).relu() if x.dim() == 3 else 0.0)),
+    "number of problems": ("dynamics.step", field(lambda x: x * (x.shape[0] == 3))),
+    "number of rows": (
+        "constraint.function",
+        lambda: problem(constraints=[FunctionConstraint(lambda x: x * (x.shape[0] == 3) - 1.0)]),
+    ),
+    "number of costs": ("cost.stage", costs(lambda x: x.sum(-1) * (x.shape[0] == 3), lambda x: 0.0)),
+    "number of terminal costs": ("cost.terminal", costs(lambda x: 0.0, lambda x: x.sum(-1) * (x.shape[0] == 3))),
     "near states": ("dynamics.step", field(apart)),
     "late stages": ("dynamics.step", lambda: of_stages(late_stage)),
     "many stages": ("dynamics.step", field(lambda x: x if x.shape[1:-1] == (N,) else 2.0 * x)),
@@ -135,6 +142,25 @@ def test_functions_that_mix_problems_are_refused(name: str) -> None:
     field, make = MIXED[name]
     with pytest.raises(InputError) as caught:
         make()
+    assert caught.value.field == field
+
+
+def bounded(z: Tensor) -> Tensor:
+    return z.clamp_(-9.0, 9.0)
+
+
+WRITING: dict[str, Callable[[], Problem]] = {
+    "dynamics.step": lambda: of_stages(lambda x, u: x + 0.1 * bounded(u)),
+    "cost.stage": costs(lambda x: bounded(x).sum(-1), lambda x: 0.0),
+    "cost.terminal": costs(lambda x: 0.0, lambda x: bounded(x).sum(-1)),
+    "constraint.function": lambda: problem(constraints=[FunctionConstraint(lambda x: bounded(x) - 0.5)]),
+}
+
+
+@pytest.mark.parametrize("field", WRITING)
+def test_functions_that_write_into_their_arguments_are_refused(field: str) -> None:
+    with pytest.raises(InputError, match=r"leaves its arguments as they are.*writes into them") as caught:
+        WRITING[field]()
     assert caught.value.field == field
 
 

@@ -66,14 +66,14 @@ EXACT: dict[str, Callable[[Tensor], Tensor]] = {
     "finite": lambda z: torch.where(z.log().isfinite(), z, -1.0),
     "equal to itself": lambda z: (lambda y: torch.where(y == y, y, z) + torch.where(y != y, 2.0, z))(z.sqrt()),
     "a square": lambda z: torch.where(z.sqrt().square() >= 0.0, z, 5.0) + torch.where(z <= z, z, 0.0),
-    "grid": lambda z: torch.div(z, 0.1, rounding_mode="floor") + z // -0.7 + torch.div(z, W32[0, 0], rounding_mode="floor"),
+    "grid": lambda z: torch.div(z, 0.1, rounding_mode="floor") + z // -0.7 + z // W32[0, 0],
     "wrapped": lambda z: z % 0.1 + z % -0.7 + (z + torch.pi) % (2.0 * torch.pi),
     "limits without a number": lambda z: z.clamp(min=HOLES) + z.clamp(max=HOLES) + z.clamp(max=z.sqrt()),
     "log of a sigmoid": lambda z: (30.0 * z).sigmoid().log() + 1e-9 / (15.0 * z).sigmoid(),
     "bytes as a mask": lambda z: z * z[..., MASK.byte()].sum(-1, keepdim=True),
     "any of bytes": lambda z: z * torch.where(z > 0.0, 5, 0).byte()[..., :1].any(-1, keepdim=True),
-    "fewer gathered": lambda z: (z.unsqueeze(-1) * z.unsqueeze(-2)).gather(1, MASK.long().expand(len(z), 1, 3))[:, 0],
-    "quotients of whole numbers": lambda z: z * (torch.arange(3) / 7) + torch.arange(3).sqrt(),
+    "fewer gathered": lambda z: (z.unsqueeze(-1) * z.unsqueeze(-2)).gather(-1, MASK.long().expand(len(z), 1, 3)).sum(1),
+    "quotients of whole numbers": lambda z: z * (torch.arange(1, 4) / 7) + torch.arange(3).sqrt(),
 }  # fmt: skip
 ROUNDED: dict[str, Callable[[Tensor], Tensor]] = {  # sums in single precision, whose order isn't PyTorch's
     "network": lambda z: F.silu(z.float() @ W32).to(D),

@@ -1,8 +1,8 @@
 """Whether a user's function keeps problems, and knots, apart: no row may change with the content of another one.
 
 Content that a function reads without effect at the points that are tried (beneath a `relu`, say) shows itself where it
-is no number, or infinite, or close to the row's own content. Python code that branches on values is exempt from this: it reads those of all rows by its
-nature, can't be traced, and so is solved as it is.
+is no number, or infinite, or close to the row's own content. Python code that branches on values is exempt from this:
+it reads those of all rows by its nature, can't be traced, and so is solved as it is.
 """
 
 from __future__ import annotations

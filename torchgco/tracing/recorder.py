@@ -14,7 +14,7 @@ from torch.overrides import resolve_name
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-from torchgco.base.autodiff import ReadsMemory, WithoutReading
+from torchgco.base.autodiff import WithoutReading
 from torchgco.base.errors import InputError, theirs
 from torchgco.base.shapes import MISTAKES
 from torchgco.tracing.operations import OPERATIONS

@@ -219,7 +219,7 @@ def _placed(numbers: np.ndarray, shapes: Mapping[Slot, tuple[int, ...]]) -> dict
 
 def _array(value: Tensor) -> np.ndarray:
     """Floating-point numbers as objects; integers and booleans keep their type, so that they can index."""
-    plain = value.detach().cpu()
+    plain = value.detach().cpu().to_dense()
     return plain.double().numpy().astype(object) if value.is_floating_point() else plain.numpy()
 
 
