@@ -104,6 +104,16 @@ def test_values_in_c_are_those_of_pytorch() -> None:
         )
 
 
+BUFFER = np.zeros(3)
+
+
+def written_by_numpy(z: Tensor) -> Tensor:
+    for i in range(3):
+        BUFFER[:] = i
+        z = z * (1.0 + torch.from_numpy(BUFFER))
+    return z
+
+
 def caught(z: Tensor, look: Callable[[Tensor], object]) -> Tensor:
     try:
         return z if look(z) else 2.0 * z
@@ -127,6 +137,7 @@ REFUSED: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "integers made of numbers": (lambda z: z + torch.zeros(z.shape, dtype=torch.int64).copy_(4 * z), "other numbers"),
     "sum to integers": (lambda z: z * z.sum(-1, keepdim=True, dtype=torch.int64), "other numbers"),
     "half": (lambda z: z.half().to(z.dtype), "float16"),
+    "written by NumPy": (written_by_numpy, "changes the memory of a captured tensor or array"),
     "caught number": (lambda z: caught(z, lambda z: float(z.sum()) > 0.0), "looks at.*Tensor.__float__"),
     "caught array": (lambda z: caught(z, lambda z: z.numpy().any()), "Tensor.numpy"),
     "caught failure": (lambda z: caught(z, lambda z: torch.linalg.cholesky(z * torch.eye(3))), "fails for some values"),

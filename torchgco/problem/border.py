@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import WithoutReading, gradients_at_once
+from torchgco.base.draws import scattered
 from torchgco.base.errors import InputError, theirs
 from torchgco.base.mixing import why
 from torchgco.base.shapes import MISTAKES, describe
@@ -20,7 +21,7 @@ from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
-from torchgco.problem.joined import joined_knots, mixes_problems, scattered, unlike
+from torchgco.problem.joined import joined_knots, mixes_problems, unlike
 
 OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
 LOST = 1e-2  # share of a derivative by which differences may disagree

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import scattered
 from torchgco.base.shapes import MISTAKES
 from torchgco.tracing.recorder import looks_at_values
 
@@ -108,9 +109,3 @@ def _place(some: Tensor, others: Tensor, kept: Tensor | None = None) -> int | No
     wrong = unlike(some, others.expand_as(some)).flatten(2).any(-1)
     found = (wrong if kept is None else wrong & kept).any(0).nonzero()
     return int(found[0]) if found.numel() > 0 else None
-
-
-def scattered(like: Tensor) -> Tensor:
-    """Numbers between -1 and 1 in the shape of `like`, without an order, the same in every process."""
-    place = torch.arange(1, like.numel() + 1, dtype=like.dtype, device=like.device)
-    return (place * 1.618).cos().reshape(like.shape)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from itertools import count
+from itertools import count, groupby
 from typing import Any
 
 import torch
@@ -17,6 +17,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from torchgco.base.autodiff import WithoutReading
 from torchgco.base.errors import InputError, theirs
 from torchgco.base.shapes import MISTAKES
+from torchgco.base.values import whole_numbers_become
 from torchgco.tracing.operations import OPERATIONS
 
 SHAPED_BY_VALUES = torch.Tag.dynamic_output_shape
@@ -77,7 +78,8 @@ class Recording(TorchDispatchMode):
         self.lenient = False  # whether what can't be followed is recorded nevertheless
         self.unfit: _Unfit | None = None  # why the function can't be recorded; its own code may have caught it
         self.captured: dict[Slot, Tensor] = {}
-        self.inputs = [self._new(tensor) for tensor in inputs]
+        self.examples = list(inputs)
+        self.inputs = [self._new(tensor) for tensor in self.examples]
         self._followers = set(self.inputs)
         self.result = self.inputs[0]
 
@@ -180,7 +182,31 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
         message = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise InputError(field, "a function that can be traced", message) from theirs(error)
     recording.result = recording.slot(result)
+    if not _is_reproduced(recording, result):
+        what = "one that changes the memory of a captured tensor or array while it runs"
+        raise InputError(field, "a function that can be traced", what)
     return recording
+
+
+def replay_all(operations: Iterable[Operation], known: dict[Slot, Any]) -> None:
+    """Apply PyTorch's operations in order, each with the default type that it was recorded with."""
+    with torch.no_grad():
+        for default, some in groupby(operations, key=lambda operation: operation.default):
+            with whole_numbers_become(default):
+                for operation in some:
+                    operation.replay(known)
+
+
+def _is_reproduced(recording: Recording, result: Tensor) -> bool:
+    """Whether the recorded operations give the function's result: what they read may have other content by now."""
+    known = dict(zip(recording.inputs, recording.examples, strict=True)) | recording.captured
+    replay_all(recording.operations, known)
+    again = known[recording.result]
+    if not result.is_floating_point():
+        return torch.equal(again, result)
+    # Not to the last bit, which may depend on where memory lies.
+    near, size = torch.finfo(result.dtype).eps ** 0.5, float(result.abs().nan_to_num(0.0, 0.0, 0.0).sum())
+    return torch.allclose(again, result, rtol=near, atol=near * size, equal_nan=True)
 
 
 def title(operation: Any, called: Any) -> str:

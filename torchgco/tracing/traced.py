@@ -7,21 +7,20 @@ each problem. Only the rest needs a counterpart in CasADi.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import groupby
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import scattered
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
-from torchgco.base.values import whole_numbers_become
 from torchgco.tracing.arrays import NoCounterpart, boxed
 from torchgco.tracing.dtypes import replay
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.operations import OPERATIONS
-from torchgco.tracing.recorder import Operation, Slot, name_of, record
+from torchgco.tracing.recorder import Operation, Slot, name_of, record, replay_all
 
 INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
 
@@ -32,7 +31,7 @@ class Traced:
     Args:
         field: the function's name in errors.
         function: tensors in, one tensor out.
-        examples: variables of the shapes that the function is called with.
+        examples: variables of the shapes and types that the function is called with; their numbers don't matter.
         own: tensors, objects that nothing else holds (`base.tree.apart`), that are treated as one problem's own even
             where all problems of the batch share them: the expressions, and with them the last bits, then don't depend
             on the other problems of the batch.
@@ -48,7 +47,7 @@ class Traced:
         self.field = field
         self._precision = max((example.dtype for example in examples), key=lambda dtype: torch.finfo(dtype).bits)
         index = torch.zeros(1, dtype=torch.int64, device=examples[0].device)
-        recording = record(field, function, index, *examples)
+        recording = record(field, function, index, *map(scattered, examples))
         self._index, *self._variables = recording.inputs
         self._result, self._captured = recording.result, recording.captured
         operations = _needed(recording.operations, self._result)
@@ -164,11 +163,7 @@ class Traced:
     def _computed(self, index: Tensor) -> dict[Slot, Any]:
         """PyTorch's part, for one problem."""
         known: dict[Slot, Any] = {self._index: index} | self._captured
-        with torch.no_grad():
-            for default, operations in groupby(self._plain, key=lambda operation: operation.default):
-                with whole_numbers_become(default):
-                    for operation in operations:
-                        operation.replay(known)
+        replay_all(self._plain, known)
         return known
 
 
