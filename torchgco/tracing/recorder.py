@@ -107,10 +107,6 @@ class Recording(TorchDispatchMode):
             if self._follows(args, kwargs):
                 raise self._unfit("one that looks at the values of its arguments", func, _Looks)
             return func(*args, **kwargs)  # a constant's value may be read
-        if not func._schema.returns:  # it raises where values don't suit it, which the function may catch
-            if self._follows(args, kwargs) and not self.lenient:
-                raise self._unfit("one that fails for some values of its arguments", func)
-            return func(*args, **kwargs)
         if SHAPED_BY_VALUES in func.tags and self._follows(*_shaping(func, args), kwargs):
             raise self._unfit("one with shapes that depend on the values of its arguments", func, _Looks)
         if name_of(func) not in OPERATIONS:
@@ -122,6 +118,9 @@ class Recording(TorchDispatchMode):
             if parts is not NotImplemented:
                 return parts
         inputs, options = tree_map(lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs))
+        if not func._schema.returns:  # it raises where values don't suit it, which the function may catch
+            self.operations.append(Operation(func, inputs, options, (), self._calls.called, torch.get_default_dtype()))
+            return func(*args, **kwargs)
         out = func(*args, **kwargs)
         made = tree_map(lambda leaf: self._new(leaf) if isinstance(leaf, Tensor) else leaf, out)
         operation = Operation(func, inputs, options, made, self._calls.called, torch.get_default_dtype())
@@ -200,7 +199,7 @@ def replay_all(operations: Iterable[Operation], known: dict[Slot, Any]) -> None:
 def _is_reproduced(recording: Recording, result: Tensor) -> bool:
     """Whether the recorded operations give the function's result: what they read may have other content by now."""
     known = dict(zip(recording.inputs, recording.examples, strict=True)) | recording.captured
-    replay_all(recording.operations, known)
+    replay_all((operation for operation in recording.operations if operation.outputs), known)
     again = known[recording.result]
     if not result.is_floating_point():
         return torch.equal(again, result)

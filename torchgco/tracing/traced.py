@@ -51,7 +51,11 @@ class Traced:
         self._index, *self._variables = recording.inputs
         self._result, self._captured = recording.result, recording.captured
         operations = _needed(recording.operations, self._result)
-        followers = _followers(operations, self._variables)
+        followers = _followers(recording.operations, self._variables)
+        for operation in recording.operations:
+            if not operation.outputs and not followers.isdisjoint(operation.inputs):
+                what = f"one that fails for some values of its arguments: {operation.title}"
+                raise InputError(field, "a function that can be traced", what)
         self._symbolic = [one for one in operations if followers.issuperset(one.outputs)]
         self._plain = [one for one in operations if not followers.issuperset(one.outputs)]
         for operation in self._symbolic:
