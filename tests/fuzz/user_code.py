@@ -86,6 +86,7 @@ FAULTS = (
     "numpy", "dropout", "randn", "python random", "one column", "scalar", "coupled", "integer", "missing", "joined",
     "joined far away", "pushed apart", "number of problems", "written",
 )  # fmt: skip
+HIDDEN = ("joined far away", "pushed apart")  # not looked for in code that branches on values
 MIXING = ("coupled", "joined", "joined far away", "pushed apart", "number of problems")
 CAPTURES = ("nothing", "number", "tensor", "data", "array", "module", "branch on a number", "list", "values")
 
@@ -201,7 +202,7 @@ def drawn_problem(seed: int) -> Drawn:
     memory, capture = Memory(rng), rng.choice(CAPTURES)
     fault = rng.choice(FAULTS) if rng.random() < 0.3 else ""
     place = rng.choice(("model", "cost", "constraint"))
-    names, inner = drawn_function(rng, memory, capture, () if fault == "joined far away" else BRANCHES)
+    names, inner = drawn_function(rng, memory, capture, () if fault in HIDDEN else BRANCHES)
     inner = spoilt(rng, inner, fault) if fault else inner
     values = {"goal": memory.goals} if capture == "values" and not fault else None
     shape, integrator = rng.choice((0, 1)), rng.choice(("euler", "midpoint", "rk4", "none"))
