@@ -101,6 +101,7 @@ def test_the_score_is_the_challenges() -> None:
     assert drives.score(np.full(4, 5.0)).tolist() == [0.5, 0.25, 0.125, 0.0]
 
 
+@pytest.mark.slow
 def test_four_worlds_from_end_to_end(capsys) -> None:
     """The first two test worlds and the first two others."""
     assert main(["--first", "2"]) == 0
@@ -108,6 +109,7 @@ def test_four_worlds_from_end_to_end(capsys) -> None:
     assert [row[2][:6] for row in rows] == ["2 of 2"] * 2 and [row[3] for row in rows] == ["0.500"] * 2
 
 
+@pytest.mark.slow
 def test_worlds_with_narrow_gaps_are_crossed_within_the_limit_on_speed() -> None:
     """The way takes as long as the limit allows: candidates that hurry leave their paths, and fall into the traps."""
     layouts, table = worlds(test=False)

@@ -38,6 +38,14 @@ from torchgco.native import kernels
 
 D = torch.float64
 B, N, SIZE = 3, 8, 3
+FIRST = torch.zeros(1, dtype=torch.int64)
+
+
+def squares(z: Tensor) -> Tensor:
+    """All products of two components, (..., SIZE, SIZE)."""
+    return z.unsqueeze(-1) * z.unsqueeze(-2)
+
+
 UNARY: dict[str, Callable[[Tensor], Tensor]] = {
     "sin": torch.sin, "tanh": torch.tanh, "softplus": torch.nn.functional.softplus, "square": torch.square,
     "root": lambda z: (1.0 + z * z).sqrt(), "bump": lambda z: torch.exp(-z * z), "flip": lambda z: z.flip(-1),
@@ -57,16 +65,29 @@ UNARY |= {
     "ring": lambda z: F.pad(z.reshape(-1, 1, SIZE), (1, 1), mode="circular")[..., :-2].reshape(z.shape),
     "greatest of roots": lambda z: torch.where(torch.maximum(z.sqrt(), z) > -9.0, z, -0.5 * z),
     "least of roots": lambda z: torch.where(torch.stack((z.sqrt(), z)).amin(0) < 9.0, z, -0.5 * z),
+    "finite": lambda z: torch.where(z.log().isfinite(), z, 0.5 * z),
+    "root of itself": lambda z: (lambda root: torch.where(root == root, z, -0.5 * z))(z.sqrt()),
+    "cells": lambda z: z + 0.1 * torch.div(z, 0.1, rounding_mode="floor"),
+    "turned": lambda z: (z + 1.0) % 2.0 - 1.0,
+    "log of a sigmoid": lambda z: 0.02 * (50.0 * z).sigmoid().log(),
+    "bytes as a mask": lambda z: z * z[..., torch.tensor([1, 0, 1], dtype=torch.uint8)].sum(-1, keepdim=True) / 3.0,
+    "fewer gathered": lambda z: z * squares(z).gather(-1, FIRST.expand(*z.shape[:-1], 1, 1))[..., 0],
+    "whole numbers": lambda z: z * (torch.arange(1, SIZE + 1) / 7),
+    "potential": lambda z: torch.func.grad(lambda q: (1.0 + q.square().sum(-1)).log().sum())(z),
+    "caught": lambda z: caught(lambda: z if float(z.abs().sum()) < 0.0 else 0.5 * z, z),
     "equal": lambda z: z if torch.equal(z, torch.zeros_like(z)) else 0.5 * z,
     "close": lambda z: z if torch.allclose(z, torch.zeros_like(z)) else 0.5 * z,
     "none chosen": lambda z: z if z[z != 0.0].numel() == 0 else 0.5 * z,
 }  # fmt: skip
-BRANCHES = ("equal", "close", "none chosen")  # solved as they are; what they read beside that isn't looked for
+# Solved as they are; what they read beside that isn't looked for.
+BRANCHES = ("caught", "equal", "close", "none chosen")
 ROUGH = ("single",)  # of single precision, in which the two kinds of kernels differ by its rounding
 FAULTS = (
     "numpy", "dropout", "randn", "python random", "one column", "scalar", "coupled", "integer", "missing", "joined",
-    "joined far away",
+    "joined far away", "pushed apart", "number of problems", "written",
 )  # fmt: skip
+HIDDEN = ("joined far away", "pushed apart")  # not looked for in code that branches on values
+MIXING = ("coupled", "joined", "joined far away", "pushed apart", "number of problems")
 CAPTURES = ("nothing", "number", "tensor", "data", "array", "module", "branch on a number", "list", "values")
 
 
@@ -130,6 +151,19 @@ def drawn_function(
     return names, function
 
 
+def caught(function: Callable[[], Tensor], otherwise: Tensor) -> Tensor:
+    try:
+        return function()
+    except Exception:
+        return otherwise
+
+
+def pushed(z: Tensor) -> Tensor:
+    """A push away from problems closer than 0.01."""
+    away = z[:, None] - z[None]
+    return torch.where(away.norm(dim=-1, keepdim=True) < 0.01, away, 0.0).sum(1)
+
+
 def spoilt(rng: random.Random, function: Callable[[Tensor], Tensor], fault: str) -> Callable[[Tensor], Any]:
     """The function with a fault."""
     dropout = torch.nn.Dropout(0.5)
@@ -144,6 +178,9 @@ def spoilt(rng: random.Random, function: Callable[[Tensor], Tensor], fault: str)
         "integer": lambda z: function(z).long(),
         "missing": lambda z: None,
         "joined": lambda z: function(z) - function(z).roll(1, -2),
+        "pushed apart": lambda z: function(z) + pushed(z),
+        "number of problems": lambda z: function(z) * (2.0 if z.shape[0] == B else 1.0),
+        "written": lambda z: function(z.clamp_(-9.0, 9.0)),
         "joined far away": lambda z: function(z) + (function(z).cumsum(-2) - 1e4).relu(),
     }[fault]
 
@@ -165,7 +202,7 @@ def drawn_problem(seed: int) -> Drawn:
     memory, capture = Memory(rng), rng.choice(CAPTURES)
     fault = rng.choice(FAULTS) if rng.random() < 0.3 else ""
     place = rng.choice(("model", "cost", "constraint"))
-    names, inner = drawn_function(rng, memory, capture, () if fault == "joined far away" else BRANCHES)
+    names, inner = drawn_function(rng, memory, capture, () if fault in HIDDEN else BRANCHES)
     inner = spoilt(rng, inner, fault) if fault else inner
     values = {"goal": memory.goals} if capture == "values" and not fault else None
     shape, integrator = rng.choice((0, 1)), rng.choice(("euler", "midpoint", "rk4", "none"))
@@ -188,7 +225,7 @@ def drawn_problem(seed: int) -> Drawn:
             return QuadraticCost([1.0] * SIZE, [0.1] * 2, [5.0] * SIZE)
         stage = lambda x, u, **more: inner(x, **more).square().sum(-1) + 0.1 * u.square().sum(-1)
         if fault:
-            stage = lambda x, u, **more: inner(x)[..., 0] if "ed" in fault else inner(x)
+            stage = lambda x, u, **more: inner(x)[..., 0] if fault in MIXING else inner(x)
         if values or not own:
             return FunctionCost(stage, lambda x: 3.0 * x.square().sum(-1), values)
         members = {"stage": lambda self, x, u, k: stage(x, u), "terminal": lambda self, x: x.square().sum(-1)}

@@ -70,6 +70,23 @@ def test_minima_and_maxima_hand_nan_on() -> None:
     assert bool(found.isnan().any()) and bool(found[:, -1].isfinite().any())
 
 
+@compiled
+def test_quotients_of_whole_numbers_have_the_type_that_they_have_in_pytorch() -> None:
+    """Single precision, or in costs and where k is asked for that of the problem."""
+    shares = lambda x: x * (torch.arange(3) / 7)
+    late = lambda x, k: k / 7 if isinstance(k, int) else (k / 7).unsqueeze(-1)
+    for step in (lambda x, u: shares(x) + 0.1 * u, lambda x, u, k: shares(x) + 0.1 * u + late(x, k)):
+        cost = FunctionCost(lambda x, u: shares(x).square().sum(-1) + u.square().sum(-1), lambda x: shares(x).sum(-1))
+        problem = Problem(model(step), cost, [FunctionConstraint(lambda x: shares(x) - 0.1)], drawn(B, 3), N)
+        U = drawn(B, N, 3)
+        X = rollout.open_loop(problem.dynamics, problem.x0, U)
+        assert engine_of(problem) is not None
+        torch.testing.assert_close(open_loop(problem, U), X, rtol=1e-14, atol=1e-14)
+        torch.testing.assert_close(measured(problem, X, U), violation(problem.constraints, X, U), rtol=1e-14, atol=0.0)
+        lagrangian = Lagrangian(problem, Multipliers.zero(problem, 3.0), None, True)
+        torch.testing.assert_close(value(lagrangian, X, U)[0], problem.cost.total(X, U), rtol=1e-14, atol=1e-14)
+
+
 def ring(x: Tensor) -> Tensor:
     return F.pad(x.reshape(-1, 1, 3), (1, 1), mode="circular")[..., 2:].reshape(x.shape)
 

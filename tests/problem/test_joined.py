@@ -40,6 +40,12 @@ def late(x: Tensor) -> Tensor:
     return torch.nn.functional.pad(x[..., 5:6, :1], (0, 0, 6, x.shape[-2] - 7))
 
 
+def apart(x: Tensor) -> Tensor:
+    """A push away from problems closer than 0.1."""
+    away = x[:, None] - x[None]
+    return torch.where(away.abs() < 0.1, away, 0.0).sum(1)
+
+
 JOINED: dict[str, tuple[str, Callable[..., Tensor]]] = {
     "cumulated": ("u", lambda u: u.square().sum(-1, keepdim=True).cumsum(-2) - 1.0),
     "total": ("u", total),
@@ -57,6 +63,7 @@ JOINED: dict[str, tuple[str, Callable[..., Tensor]]] = {
     "far and negative": ("x", lambda x: x[..., :1] - (-x.cumsum(-2)[..., :1] - 99.0).clamp(min=0.0)),
     "far number of knots": ("x", lambda x: (x[..., :1] / x.shape[-2] - 0.3).relu() - 0.5),
     "one knot at another": ("x", lambda x: x[..., :1] - 1.0 + (late(x) - 4.0).relu()),
+    "near problems": ("x", lambda x: x[..., :1] - 9.0 + apart(x)[..., :1]),
     "problems": ("x", lambda x: x[..., :1] - (x.mean(0, keepdim=True)[..., :1] - 5.0).relu()),
 }  # fmt: skip
 APART: dict[str, tuple[str, Callable[..., Tensor], dict[str, Any]]] = {
@@ -94,10 +101,37 @@ def costs(stage: Callable[[Tensor], Any], end: Callable[[Tensor], Any]) -> Calla
     )
 
 
+def late_stage(x: Tensor, u: Tensor, k: Any) -> Tensor:
+    """A step that is another one for stages at once than for each, but not for the first ones."""
+    return x + 0.1 * u + (0.1 * (k > 5) if isinstance(k, int) else 0.2 * (k > 5).unsqueeze(-1))
+
+
+def of_stages(step: Callable[..., Tensor]) -> Problem:
+    return Problem(
+        FunctionDynamics(step, 2, 2, 0.1, "none"),
+        QuadraticCost([1.0] * 2, [0.1] * 2, [5.0] * 2),
+        [],
+        torch.zeros(2, 2, dtype=D),
+        N,
+    )
+
+
 MIXED: dict[str, tuple[str, Callable[[], Problem]]] = {
     "model": ("dynamics.step", field(lambda x: (x.mean(0, keepdim=True) - 5.0).relu())),
     "states at once": ("dynamics.step", field(lambda x: x if x.dim() == 2 else 2.0 * x)),
     "stages": ("dynamics.step", field(lambda x: (x.sum(1, keepdim=True) - 9.0).relu() if x.dim() == 3 else 0.0)),
+    "number of problems": ("dynamics.step", field(lambda x: x * (x.shape[0] == 3))),
+    "number of rows": (
+        "constraint.function",
+        lambda: problem(constraints=[FunctionConstraint(lambda x: x * (x.shape[0] == 3) - 1.0)]),
+    ),
+    "number of costs": ("cost.stage", costs(lambda x: x.sum(-1) * (x.shape[0] == 3), lambda x: 0.0)),
+    "number of terminal costs": ("cost.terminal", costs(lambda x: 0.0, lambda x: x.sum(-1) * (x.shape[0] == 3))),
+    "near states": ("dynamics.step", field(apart)),
+    "late stages": ("dynamics.step", lambda: of_stages(late_stage)),
+    "many stages": ("dynamics.step", field(lambda x: x if x.shape[1:-1] == (N,) else 2.0 * x)),
+    "near costs": ("cost.stage", costs(lambda x: apart(x).sum(-1), lambda x: 0.0)),
+    "near terminal costs": ("cost.terminal", costs(lambda x: 0.0, lambda x: apart(x).sum(-1))),
     "cost": ("cost.stage", costs(lambda x: (x.sum(-1).cumsum(0) - 50.0).relu(), lambda x: 0.0)),
     "terminal cost": ("cost.terminal", costs(lambda x: 0.0, lambda x: (x.mean() - 7.0).relu())),
 }
@@ -108,6 +142,25 @@ def test_functions_that_mix_problems_are_refused(name: str) -> None:
     field, make = MIXED[name]
     with pytest.raises(InputError) as caught:
         make()
+    assert caught.value.field == field
+
+
+def bounded(z: Tensor) -> Tensor:
+    return z.clamp_(-9.0, 9.0)
+
+
+WRITING: dict[str, Callable[[], Problem]] = {
+    "dynamics.step": lambda: of_stages(lambda x, u: x + 0.1 * bounded(u)),
+    "cost.stage": costs(lambda x: bounded(x).sum(-1), lambda x: 0.0),
+    "cost.terminal": costs(lambda x: 0.0, lambda x: bounded(x).sum(-1)),
+    "constraint.function": lambda: problem(constraints=[FunctionConstraint(lambda x: bounded(x) - 0.5)]),
+}
+
+
+@pytest.mark.parametrize("field", WRITING)
+def test_functions_that_write_into_their_arguments_are_refused(field: str) -> None:
+    with pytest.raises(InputError, match=r"leaves its arguments as they are.*writes into them") as caught:
+        WRITING[field]()
     assert caught.value.field == field
 
 

@@ -94,6 +94,7 @@ def test_growth_counts_from_the_clearance_that_the_last_solve_missed() -> None:
     assert bool(judge(problem, solve(problem, solver=solver).U).sound.all())
 
 
+@pytest.mark.slow
 def test_more_effort_loses_no_clear_trajectory() -> None:
     """In this maze `gco_max` finds a cheaper trajectory than `gco`, which touches a wall and can't be cleared."""
     setup = compose(["scenario=mazes", "scenario.walls=3", "seed=21"])

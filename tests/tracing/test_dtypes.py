@@ -19,6 +19,8 @@ from torchgco.tracing import Traced
 
 D = torch.float64
 W32 = torch.tensor([[0.3, -1.7, 0.2], [1.1, 0.4, -0.6], [-0.9, 0.8, 0.5]])
+MASK = torch.tensor([True, False, True])
+HOLES = torch.tensor([torch.nan, 0.0, -1.0], dtype=D)
 POINTS = torch.cat(
     (
         torch.randn(40, 3, generator=torch.Generator().manual_seed(7), dtype=D),
@@ -61,6 +63,17 @@ EXACT: dict[str, Callable[[Tensor], Tensor]] = {
     "least": lambda z: torch.minimum(z.sqrt(), z) + torch.minimum(z, z.log()),
     "greatest of all": lambda z: z.sqrt().amax(-1, keepdim=True) + z.log().amin(-1, keepdim=True) + z,
     "sign": lambda z: z.sqrt().sign() + z.sign(),
+    "finite": lambda z: torch.where(z.log().isfinite(), z, -1.0),
+    "equal to itself": lambda z: (lambda y: torch.where(y == y, y, z) + torch.where(y != y, 2.0, z))(z.sqrt()),
+    "a square": lambda z: torch.where(z.sqrt().square() >= 0.0, z, 5.0) + torch.where(z <= z, z, 0.0),
+    "grid": lambda z: torch.div(z, 0.1, rounding_mode="floor") + z // -0.7 + z // W32[0, 0],
+    "wrapped": lambda z: z % 0.1 + z % -0.7 + (z + torch.pi) % (2.0 * torch.pi),
+    "limits without a number": lambda z: z.clamp(min=HOLES) + z.clamp(max=HOLES) + z.clamp(max=z.sqrt()),
+    "log of a sigmoid": lambda z: (30.0 * z).sigmoid().log() + 1e-9 / (15.0 * z).sigmoid(),
+    "bytes as a mask": lambda z: z * z[..., MASK.byte()].sum(-1, keepdim=True),
+    "any of bytes": lambda z: z * torch.where(z > 0.0, 5, 0).byte()[..., :1].any(-1, keepdim=True),
+    "fewer gathered": lambda z: (z.unsqueeze(-1) * z.unsqueeze(-2)).gather(-1, MASK.long().expand(len(z), 1, 3)).sum(1),
+    "quotients of whole numbers": lambda z: z * (torch.arange(1, 4) / 7) + torch.arange(3).sqrt(),
 }  # fmt: skip
 ROUNDED: dict[str, Callable[[Tensor], Tensor]] = {  # sums in single precision, whose order isn't PyTorch's
     "network": lambda z: F.silu(z.float() @ W32).to(D),
@@ -68,6 +81,7 @@ ROUNDED: dict[str, Callable[[Tensor], Tensor]] = {  # sums in single precision, 
 }
 
 
+@pytest.mark.filterwarnings("ignore:indexing with dtype torch.uint8")
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_values_in_c_are_those_of_pytorch() -> None:
     names = [*EXACT, *ROUNDED]
@@ -90,6 +104,23 @@ def test_values_in_c_are_those_of_pytorch() -> None:
         )
 
 
+BUFFER = np.zeros(3)
+
+
+def written_by_numpy(z: Tensor) -> Tensor:
+    for i in range(3):
+        BUFFER[:] = i
+        z = z * (1.0 + torch.from_numpy(BUFFER))
+    return z
+
+
+def caught(z: Tensor, look: Callable[[Tensor], object]) -> Tensor:
+    try:
+        return z if look(z) else 2.0 * z
+    except Exception:
+        return 3.0 * z
+
+
 REFUSED: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "equal": (lambda z: z if torch.equal(z, torch.zeros_like(z)) else 2.0 * z, "looks at.*torch.equal"),
     "allclose": (lambda z: z if torch.allclose(z, torch.zeros_like(z)) else 2.0 * z, "looks at.*torch.allclose"),
@@ -106,6 +137,10 @@ REFUSED: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "integers made of numbers": (lambda z: z + torch.zeros(z.shape, dtype=torch.int64).copy_(4 * z), "other numbers"),
     "sum to integers": (lambda z: z * z.sum(-1, keepdim=True, dtype=torch.int64), "other numbers"),
     "half": (lambda z: z.half().to(z.dtype), "float16"),
+    "written by NumPy": (written_by_numpy, "changes the memory of a captured tensor or array"),
+    "caught number": (lambda z: caught(z, lambda z: float(z.sum()) > 0.0), "looks at.*Tensor.__float__"),
+    "caught array": (lambda z: caught(z, lambda z: z.numpy().any()), "Tensor.numpy"),
+    "caught failure": (lambda z: caught(z, lambda z: torch.linalg.cholesky(z * torch.eye(3))), "fails for some values"),
     "layer_norm": (lambda z: F.layer_norm(z, (3,)), "torch.nn.functional.layer_norm.*native_layer_norm"),
 }  # fmt: skip
 

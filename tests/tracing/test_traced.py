@@ -178,6 +178,13 @@ def test_operations(name: str) -> None:
     torch.testing.assert_close(made, FUNCTIONS[name](x), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:Sparse CSR tensor support")
+def test_a_captured_matrix_may_be_sparse() -> None:
+    rates = torch.diag(torch.arange(1, 4, **DOUBLE), 1).to_sparse_csr()
+    x = torch.tensor([[0.3, -1.2, 1.7, 0.9]], **DOUBLE)
+    torch.testing.assert_close(by_casadi(lambda i, x: (rates @ x.mT).mT, [0], x), x @ rates.to_dense().mT)
+
+
 KINKS = {
     "abs": lambda x: x.abs() * (1.0 + x),
     "clamp": lambda x: x.clamp(min=0.0).square() + x.clamp(max=0.0) + x.clamp_min(0.0),
@@ -186,6 +193,8 @@ KINKS = {
     "norm": lambda x: x.norm(dim=-1),
     "where": lambda x: torch.where(x.abs() < 1.0, x.square(), x.abs()),
     "softplus": F.softplus,
+    "sigmoid": torch.sigmoid,
+    "logsigmoid": F.logsigmoid,
 }
 
 

@@ -24,7 +24,8 @@ class WithoutReading(TorchFunctionMode):
     """Raises ReadsMemory where a function leaves PyTorch with a tensor that is differentiated or recorded.
 
     Such a tensor has no memory of its own: reading it may crash, and what is made of the numbers is a constant. Other
-    tensors may be read; `seen` keeps by which methods. `called` is the function of PyTorch that was called last.
+    tensors may be read; `seen` keeps by which methods. `called` is the function of PyTorch that was called last,
+    `refused` the first error, which the function itself may have caught.
     """
 
     READERS = (
@@ -43,13 +44,16 @@ class WithoutReading(TorchFunctionMode):
         super().__init__()
         self.seen: set[str] = set()
         self.called: Any = None
+        self.refused: ReadsMemory | None = None
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         self.called, name = func, getattr(func, "__name__", "")
         if name in self.READERS:
             self.seen.add(name)
             if _stands_for_another(args[0]):
-                raise ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
+                found = ReadsMemory(f"one that hands its tensors to NumPy or Python (Tensor.{name})")
+                self.refused = self.refused or found
+                raise found
         return func(*args, **(kwargs or {}))
 
 

@@ -94,3 +94,9 @@ def _mix64(z: Tensor) -> Tensor:
     z = (z ^ ((z >> 30) & ((1 << 34) - 1))) * _MIX_1
     z = (z ^ ((z >> 27) & ((1 << 37) - 1))) * _MIX_2
     return z ^ ((z >> 31) & ((1 << 33) - 1))
+
+
+def scattered(like: Tensor) -> Tensor:
+    """Numbers between -1 and 1 in the shape of `like`, without an order, the same in every process."""
+    place = torch.arange(1, like.numel() + 1, dtype=like.dtype, device=like.device)
+    return (place * 1.618).cos().reshape(like.shape)

@@ -66,8 +66,9 @@ class Cost(PerElement):
         k, z = torch.arange(N, device=U.device), torch.cat((X[:, :-1], U), dim=-1)
         with whole_numbers_become(X.dtype):
             g, h = gradient_and_hessian(lambda z: self.stage(z[..., :n], z[..., n:], k), z)
+            last = gradient_and_hessian(self.terminal, X[:, -1])
         add_blocks(H[:, :-1], n, g[..., :n], g[..., n:], h[..., :n, :n], h[..., n:, n:], h[..., n:, :n])
-        g, h = gradient_and_hessian(self.terminal, X[:, -1])
+        g, h = last
         add_blocks(H[:, -1], n, g, None, h, None)
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import WithoutReading, gradients_at_once
+from torchgco.base.draws import scattered
 from torchgco.base.errors import InputError, theirs
 from torchgco.base.mixing import why
 from torchgco.base.shapes import MISTAKES, describe
@@ -20,7 +21,7 @@ from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
-from torchgco.problem.joined import joined_knots, mixes_problems, scattered, unlike
+from torchgco.problem.joined import joined_knots, mixes_problems, unlike
 
 OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
 LOST = 1e-2  # share of a derivative by which differences may disagree
@@ -50,9 +51,10 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
         what = "derivatives" if name == "field" else "states"
         wanted = f"{what} (..., {n}) in {x0.dtype}, the type of x0, shaped as its states"
         _check_values(f"dynamics.{name}", method(one), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
+        _check_among_all(f"dynamics.{name}", method(one), rows, len(x0), (x[:, 0], u[:, 0]))
         of_stages = _called(f"dynamics.{name}", wanted, method(several), rows, x, u)
         _check_tensor(f"dynamics.{name}", of_stages, (2, 3, n), x.dtype, wanted)
-    _check_stages(dynamics, rows, k, (x, u))
+    _check_stages(dynamics, rows, x0, N)
     weights = 1.0 + 0.5 * scattered(x)
     step = lambda x, u: (weights * several.take(rows).step(x, u)).flatten(1).sum(-1)
 
@@ -64,8 +66,9 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     _check_slope("dynamics.step", step, x, u, None if type(dynamics).jacobians is Dynamics.jacobians else own)
 
 
-def _check_stages(dynamics: Dynamics, rows: Tensor, k: Tensor, arguments: tuple[Tensor, ...]) -> None:
-    """Check that the states after several stages k (K,) at once are those after each stage."""
+def _check_stages(dynamics: Dynamics, rows: Tensor, x0: Tensor, N: int) -> None:
+    """Check that the states after all stages at once are those after each stage."""
+    k, arguments = torch.arange(N, device=x0.device), (_states(x0, N), _controls(x0, N, dynamics.m))
 
     def together(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
         return dynamics.at(k).take(i).step(*z)
@@ -80,7 +83,8 @@ def _check_stages(dynamics: Dynamics, rows: Tensor, k: Tensor, arguments: tuple[
     expected = "states (B, K, n) after each of which depends on its own state, control and stage, as for (B, n)"
     place = _called("dynamics.step", expected, joined_knots, together, alone, rows, k, arguments)
     if place is not None:
-        raise InputError("dynamics.step", expected, f"others where K = {len(k)}, or where other states lie beside")
+        got = f"others at stage {place} where K = {N}, or where other states lie beside"
+        raise InputError("dynamics.step", expected, got)
 
 
 def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
@@ -98,6 +102,8 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
     _check_values("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, (X[:, 0], U[:, 0]), (2,), wanted)
     _check_values("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, (X[:, -1],), (2,), wanted)
 
+    _check_among_all("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, len(x0), (X[:, 0], U[:, 0]))
+    _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
     _check_apart("cost.stage", stage, rows, X[:, :-1], U)
     _check_apart("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, X[:, 0], U[:, 0])
     _check_apart("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, X[:, -1])
@@ -133,7 +139,7 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
     if 0 in shape:
         return
     if isinstance(constraint, FunctionConstraint):
-        _check_rows(constraint, field, rows, X, U)
+        _check_rows(constraint, field, rows, len(x0), X, U)
     else:
         _check_apart(field, value, rows, X, U)
     weights = 1.0 + 0.5 * scattered(X.new_empty(shape))
@@ -148,8 +154,8 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
     _check_slope(field, weighted, X, U, None if by_pytorch else own)
 
 
-def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, X: Tensor, U: Tensor) -> None:
-    """Check that the rows of each knot are those of its own state and controls."""
+def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int, X: Tensor, U: Tensor) -> None:
+    """Check that the rows of each knot of B problems are those of its own state and controls."""
 
     def together(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
         return constraint.take(i).rows_at(k, *z)
@@ -163,6 +169,8 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, X: Ten
 
     knots = torch.arange(X.shape[1], device=X.device)[constraint.knots]
     arguments = tuple((X if a == "x" else U)[:, constraint.knots] for a in constraint.of)
+    first = [z[:, :1] for z in arguments]
+    _check_among_all(field, lambda i, *z: together(i, knots[:1], *z), rows, B, first)
     place = _called(field, ONE_KNOT, joined_knots, together, alone, rows, knots, arguments)
     if place is not None:
         got = f"rows of knot {int(knots[place])} that depend on other knots or problems, or on how many there are"
@@ -198,7 +206,12 @@ def _check_values(
     wanted: str,
 ) -> torch.Size:
     """Check function(rows, *arguments) for two problems, together and each on its own; returns the values' shape."""
+    before = _versions(arguments)
     both = _called(field, wanted, function, rows, *arguments)
+    if _versions(arguments) != before:
+        raise InputError(
+            field, "a function that leaves its arguments as they are", "one that writes into them in place"
+        )
     _check_tensor(field, both, shape, arguments[0].dtype, wanted)
     again = _called(field, wanted, function, rows, *arguments)
     if not torch.equal(both.nan_to_num(), again.nan_to_num()):
@@ -211,6 +224,24 @@ def _check_values(
         if bool(unlike(alone, both[i : i + 1]).any()):
             raise InputError(field, APART, "other values for a problem alone than beside another one")
     return both.shape
+
+
+def _versions(arguments: Sequence[Tensor]) -> list[int]:
+    """How often each of the tensors was written into; unknown to tensors of the inference mode."""
+    return [0 if z.is_inference() else z._version for z in arguments]
+
+
+def _check_among_all(
+    field: str, function: Callable[..., Tensor], rows: Tensor, B: int, arguments: Sequence[Tensor]
+) -> None:
+    """Check that function(rows, *arguments) of two problems is the same among all B."""
+    if B <= 2:
+        return
+    many = [torch.cat((z[:1].expand(B - 1, *z.shape[1:]), z[1:])) for z in arguments]
+    found = _called(field, APART, function, torch.arange(B, device=rows.device), *many)
+    two = _called(field, APART, function, rows, *arguments)
+    if found.shape != (B, *two.shape[1:]) or bool(unlike(found[[0, -1]], two).any()):
+        raise InputError(field, APART, f"other values among {B} problems than among two")
 
 
 def _check_apart(field: str, function: Callable[..., Tensor], rows: Tensor, *arguments: Tensor) -> None:

@@ -1,23 +1,25 @@
 """Whether a user's function keeps problems, and knots, apart: no row may change with the content of another one.
 
 Content that a function reads without effect at the points that are tried (beneath a `relu`, say) shows itself where it
-is no number, or infinite. Python code that branches on values is exempt from this: it reads those of all rows by its
-nature, can't be traced, and so is solved as it is.
+is no number, or infinite, or close to the row's own content. Python code that branches on values is exempt from this:
+it reads those of all rows by its nature, can't be traced, and so is solved as it is.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import scattered
 from torchgco.base.shapes import MISTAKES
 from torchgco.tracing.recorder import looks_at_values
 
 FOREIGN = (torch.nan, torch.inf, -torch.inf)
 SIZES = (1.0, 1e3, 1e6)  # of drawn numbers
+NEAR = 1e-3  # by which a neighbour of a row differs, as a share of 1 + |x|
 
 Rows = Callable[..., Tensor]  # of problems (b,) int64, knots (K,) int64 and arguments (b, K, ...): rows (b, K, ...)
 
@@ -25,8 +27,8 @@ Rows = Callable[..., Tensor]  # of problems (b,) int64, knots (K,) int64 and arg
 def mixes_problems(function: Callable[..., Tensor], rows: Tensor, *arguments: Tensor) -> bool:
     """Whether a third problem between two changes function(rows, *arguments) of these."""
     found, three = function(rows, *arguments), rows[[0, 0, 1]]
-    for value in FOREIGN:
-        strange = [torch.cat((z[:1], torch.full_like(z[:1], value), z[1:])) for z in arguments]
+    for others in _foreign(*arguments):
+        strange = [torch.cat((z[:1], other, z[1:])) for z, other in zip(arguments, others, strict=True)]
         beside = _tried(function, three, *strange)
         if beside is not None and bool(unlike(beside[::2], found).any()):
             return not looks_at_values(function, rows, *arguments)
@@ -63,12 +65,23 @@ def _suspect(together: Rows, alone: Rows, rows: Tensor, k: Tensor, arguments: Se
     # two rows are kept as a whole, and foreign as a whole: another problem.
     digits = torch.arange(K, device=k.device) >> torch.arange((K - 1).bit_length(), device=k.device).unsqueeze(-1) & 1
     kept = torch.cat((digits == 0, digits == 1, torch.tensor([[True], [False]], device=k.device).expand(2, K)))
-    for value in FOREIGN:
-        strange = [torch.where(kept.view(*kept.shape, *[1] * (z.dim() - 2)), z[:1], value) for z in arguments]
+    for others in _foreign(*(z[:1] for z in arguments)):
+        strange = [
+            torch.where(kept.view(*kept.shape, *[1] * (z.dim() - 2)), z[:1], other)
+            for z, other in zip(arguments, others, strict=True)
+        ]
         other = _tried(together, one.expand(len(kept)), k, *strange)
         if other is not None and (place := _place(other, found[:1], kept)) is not None:
             return place
     return None
+
+
+def _foreign(*rows: Tensor) -> Iterator[list[Tensor]]:
+    """Content (1, ...) that is put beside rows (b, ...): no numbers, and a neighbour of each row."""
+    for value in FOREIGN:
+        yield [torch.full_like(z[:1], value) for z in rows]
+    for z in zip(*(z.split(1) for z in rows), strict=True):
+        yield [part + NEAR * (1.0 + part.abs()) * scattered(part) for part in z]
 
 
 def _tried(function: Callable[..., Tensor], *arguments: Tensor) -> Tensor | None:
@@ -96,9 +109,3 @@ def _place(some: Tensor, others: Tensor, kept: Tensor | None = None) -> int | No
     wrong = unlike(some, others.expand_as(some)).flatten(2).any(-1)
     found = (wrong if kept is None else wrong & kept).any(0).nonzero()
     return int(found[0]) if found.numel() > 0 else None
-
-
-def scattered(like: Tensor) -> Tensor:
-    """Numbers between -1 and 1 in the shape of `like`, without an order, the same in every process."""
-    place = torch.arange(1, like.numel() + 1, dtype=like.dtype, device=like.device)
-    return (place * 1.618).cos().reshape(like.shape)

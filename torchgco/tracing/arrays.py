@@ -68,7 +68,8 @@ def _written(a: np.ndarray, place: tuple[Any, ...], source: np.ndarray) -> np.nd
 def _places(indices: Sequence[Any]) -> tuple[Any, ...]:
     if any(i is not None and i.dtype == object for i in indices):
         raise NoCounterpart  # an index that depends on the state, or differs from problem to problem
-    return tuple(slice(None) if i is None else i for i in indices)
+    # PyTorch takes bytes for a mask, NumPy for places.
+    return tuple(slice(None) if i is None else i.astype(bool) if i.dtype == np.uint8 else i for i in indices)
 
 
 def index(a: np.ndarray, indices: Sequence[Any]) -> np.ndarray:
@@ -90,7 +91,9 @@ def index_select(a: np.ndarray, dim: int, index: np.ndarray) -> np.ndarray:
 
 def gather(a: np.ndarray, dim: int, index: np.ndarray, **_: Any) -> np.ndarray:
     _places([index])
-    return np.take_along_axis(a, index, axis=dim)
+    # Along the other axes PyTorch reads as many places as the index has, where NumPy repeats an index of one.
+    read = tuple(slice(None) if axis == dim % a.ndim else slice(size) for axis, size in enumerate(index.shape))
+    return np.take_along_axis(a[read], index, axis=dim)
 
 
 def squeeze(a: np.ndarray, dim: Any = None) -> np.ndarray:

@@ -54,9 +54,32 @@ def _choose(condition: Any, a: Any, b: Any) -> Any:
     return ca.if_else(condition, a, b) if isinstance(condition, ca.SX) else (a if condition else b)
 
 
+def _itself(element: Any) -> Any:
+    """The same number, or NaN, which CasADi doesn't recognise as the same: |e| with the sign of e."""
+    return _casadi().copysign(element, element)
+
+
+def _comparison(compare: Callable) -> Callable:
+    """A comparison that is false where one of the two is NaN, `ne` true, as in PyTorch.
+
+    CasADi takes an expression for equal to itself, and a square for at least 0, which NaN is not.
+    """
+
+    def compared(a: Any, b: Any) -> Any:
+        found = compare(a, b)
+        if not isinstance(found, _casadi().SX) or not found.is_constant():
+            return found
+        return compare(_itself(a), b) if isinstance(a, _casadi().SX) else compare(a, _itself(b))
+
+    return _binary(compared)
+
+
 _where = _elementwise(_choose, 3)
 _add, _sub, _mul = _binary(operator.add), _binary(operator.sub), _binary(operator.mul)
-_truediv, _floor = _binary(operator.truediv), _unary("floor")
+_lt, _le, _gt, _ge, _eq, _ne = map(
+    _comparison, (operator.lt, operator.le, operator.gt, operator.ge, operator.eq, operator.ne)
+)
+_truediv, _floor, _fmod = _binary(operator.truediv), _unary("floor"), _binary("fmod")
 _power = _binary(operator.pow)
 _sqrt = _unary("sqrt")
 _fmin, _fmax = _binary("fmin"), _binary("fmax")  # in C, NaN where one of the two is
@@ -65,16 +88,42 @@ _fmin, _fmax = _binary("fmin"), _binary("fmax")  # in C, NaN where one of the tw
 def _divide(a: Any, b: Any, rounding_mode: str | None = None) -> np.ndarray:
     if rounding_mode == "trunc":
         raise NoCounterpart
-    return _truediv(a, b) if rounding_mode is None else _floor(_truediv(a, b))
+    return _truediv(a, b) if rounding_mode is None else _floor_divided(a, b)
+
+
+def _excess(a: Any, b: Any) -> tuple[np.ndarray, np.ndarray]:
+    """What is left of a / b rounded towards 0, exactly, and where rounding down leaves b more."""
+    left = _fmod(a, b)
+    return left, _where(_lt(b, 0.0), _gt(left, 0.0), _lt(left, 0.0))
+
+
+def _floor_divided(a: Any, b: Any) -> np.ndarray:
+    # As PyTorch: the quotient itself may round up to a whole number, as 1.0 / 0.1 does.
+    left, more = _excess(a, b)
+    whole = _sub(_truediv(_sub(a, left), b), more)
+    down = _floor(whole)
+    near = _add(down, _gt(_sub(whole, down), 0.5))
+    return _where(_eq(b, 0.0), _floor(_truediv(a, b)), near)  # by 0: infinite or NaN, with the derivative 0
+
+
+def _remainder(a: Any, b: Any) -> np.ndarray:
+    left, more = _excess(a, b)
+    return _where(more, _add(left, b), left)
 
 
 def _clamp(a: Any, min: Any = None, max: Any = None) -> np.ndarray:
     # Choices, not fmin and fmax: NaN stays NaN, and the derivative at a number is PyTorch's, at a tensor 1.
-    for bound, beyond, reached in ((min, operator.lt, operator.le), (max, operator.gt, operator.ge)):
+    for bound, beyond, reached in ((min, _lt, _le), (max, _gt, _ge)):
         if bound is not None:
             flat = not isinstance(bound, np.ndarray) and _flat_at_numbers()
-            a = _where(_binary(reached if flat else beyond)(a, bound), bound, a)
+            outside = (reached if flat else beyond)(a, bound)
+            a = _where(_binary(_either)(outside, _ne(bound, bound)), bound, a)  # a bound that is NaN is the result
     return a
+
+
+def _either(a: Any, b: Any) -> Any:
+    """Whether one of two truths holds; the other one itself where the second is a number and false."""
+    return a if not isinstance(b, _casadi().SX) and not b else _casadi().logic_or(a, b)
 
 
 @functools.cache
@@ -87,13 +136,28 @@ def _flat_at_numbers() -> bool:
 
 
 def _hardtanh(a: np.ndarray, low: float = -1.0, high: float = 1.0) -> np.ndarray:
-    a = _where(_binary(operator.le)(a, low), low, a)  # the derivative is 0 at the bounds
-    return _where(_binary(operator.ge)(a, high), high, a)
+    a = _where(_le(a, low), low, a)  # the derivative is 0 at the bounds
+    return _where(_ge(a, high), high, a)
 
 
 def _softplus(a: np.ndarray, beta: float = 1.0, threshold: float = 20.0) -> np.ndarray:
     scaled = _mul(a, beta)
-    return _where(_binary(operator.gt)(scaled, threshold), a, _truediv(_unary("log1p")(_unary("exp")(scaled)), beta))
+    return _where(_gt(scaled, threshold), a, _truediv(_unary("log1p")(_unary("exp")(scaled)), beta))
+
+
+def _falling(a: np.ndarray) -> np.ndarray:
+    """exp(-|a|), with the derivative from the right at 0."""
+    return _unary("exp")(_where(_lt(a, 0.0), a, _unary(operator.neg)(a)))
+
+
+def _sigmoid(a: np.ndarray) -> np.ndarray:
+    # Not by tanh: of large negative numbers, all digits would be lost.
+    e = _falling(a)
+    return _truediv(_where(_lt(a, 0.0), e, 1.0), _add(1.0, e))
+
+
+def _log_sigmoid(a: np.ndarray) -> np.ndarray:
+    return _sub(_where(_lt(a, 0.0), a, 0.0), _unary("log1p")(_falling(a)))
 
 
 def _matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -139,7 +203,7 @@ def _norm(a: np.ndarray, ord: float = 2, dim: Any = None, keepdim: bool = False,
     if ord != 2:
         raise NoCounterpart
     square = _sum(_mul(a, a), dim, keepdim)
-    return _where(_binary(operator.eq)(square, 0.0), 0.0, _sqrt(square))  # at zero the derivative is 0, as PyTorch's
+    return _where(_eq(square, 0.0), 0.0, _sqrt(square))  # at zero the derivative is 0, as PyTorch's
 
 
 def _cross(a: np.ndarray, b: np.ndarray, dim: int = -1) -> np.ndarray:
@@ -200,6 +264,11 @@ def wrapped(element: Any, low: int, size: int) -> Any:
     return element - size * _casadi().floor((element - low) / size)
 
 
+def _truths(reduce: Callable) -> Callable:
+    """A reduction whose result is 0 or 1 where it takes over a single element, too."""
+    return lambda *args, **options: _unary(to_truth)(reduce(*args, **options))
+
+
 def _refused(*_: Any, **__: Any) -> Any:
     raise NoCounterpart("bits of integers")
 
@@ -232,11 +301,11 @@ OPERATIONS: dict[str, Callable] = {
     "aten.sqrt": _sqrt,
     "aten.rsqrt": _unary(lambda x: 1.0 / _casadi().sqrt(x)),
     "aten.abs": _unary("fabs"),
-    "aten.sign": lambda a: _sub(_binary(operator.gt)(a, 0.0), _binary(operator.lt)(a, 0.0)),  # of NaN it is 0
+    "aten.sign": lambda a: _sub(_gt(a, 0.0), _lt(a, 0.0)),  # of NaN it is 0
     "aten.floor": _floor,
     "aten.ceil": _unary("ceil"),
-    "aten.fmod": _binary("fmod"),
-    "aten.remainder": lambda a, b: _sub(a, _mul(_floor(_truediv(a, b)), b)),
+    "aten.fmod": _fmod,
+    "aten.remainder": _remainder,
     # functions
     **{
         f"aten.{name}": _unary(name)
@@ -246,9 +315,10 @@ OPERATIONS: dict[str, Callable] = {
     "aten.log2": _unary(lambda x: _casadi().log(x) / math.log(2.0)),
     "aten.atan2": _binary("atan2"),
     "aten.hypot": _binary("hypot"),
-    "aten.sigmoid": _unary(lambda x: 0.5 + 0.5 * _casadi().tanh(0.5 * x)),
-    "aten.relu": lambda a: _where(_binary(operator.le)(a, 0.0), 0.0, a),
-    "aten.leaky_relu": lambda a, slope=0.01: _where(_binary(operator.gt)(a, 0.0), a, _mul(a, slope)),
+    "aten.sigmoid": _sigmoid,
+    "aten.log_sigmoid_forward": lambda a: [_log_sigmoid(a), a],
+    "aten.relu": lambda a: _where(_le(a, 0.0), 0.0, a),
+    "aten.leaky_relu": lambda a, slope=0.01: _where(_gt(a, 0.0), a, _mul(a, slope)),
     "aten.softplus": _softplus,
     "aten.gelu": _unary(lambda x: 0.5 * x * (1.0 + _casadi().erf(x / math.sqrt(2.0)))),
     # choices
@@ -259,7 +329,12 @@ OPERATIONS: dict[str, Callable] = {
     "aten.hardtanh": _hardtanh,
     "aten.maximum": _fmax,
     "aten.minimum": _fmin,
-    **{f"aten.{name}": _binary(getattr(operator, name)) for name in ("lt", "le", "gt", "ge", "eq", "ne")},
+    "aten.lt": _lt,
+    "aten.le": _le,
+    "aten.gt": _gt,
+    "aten.ge": _ge,
+    "aten.eq": _eq,
+    "aten.ne": _ne,
     "aten.logical_and": _binary("logic_and"),
     "aten.logical_or": _binary("logic_or"),
     "aten.logical_not": _unary("logic_not"),
@@ -277,8 +352,8 @@ OPERATIONS: dict[str, Callable] = {
     "aten.linalg_vector_norm": _norm,
     "aten.amax": _fold(_fmax),
     "aten.amin": _fold(_fmin),
-    "aten.any": _fold(_binary("logic_or")),
-    "aten.all": _fold(_binary("logic_and")),
+    "aten.any": _truths(_fold(_binary("logic_or"))),
+    "aten.all": _truths(_fold(_binary("logic_and"))),
     "aten.cumsum": _cumsum,
     # shapes
     "aten.view": lambda a, shape: a.reshape(tuple(shape)),

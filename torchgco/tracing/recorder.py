@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from itertools import count
+from itertools import count, groupby
 from typing import Any
 
 import torch
@@ -14,9 +14,10 @@ from torch.overrides import resolve_name
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-from torchgco.base.autodiff import ReadsMemory, WithoutReading
+from torchgco.base.autodiff import WithoutReading
 from torchgco.base.errors import InputError, theirs
 from torchgco.base.shapes import MISTAKES
+from torchgco.base.values import whole_numbers_become
 from torchgco.tracing.operations import OPERATIONS
 
 SHAPED_BY_VALUES = torch.Tag.dynamic_output_shape
@@ -39,6 +40,7 @@ class Operation:
     kwargs: dict[str, Any]
     result: Any  # a slot, or a sequence of them
     called: Any = None  # the function of PyTorch that the user called
+    default: torch.dtype = torch.float32  # the type that PyTorch's quotients and roots of integers have
 
     @cached_property
     def inputs(self) -> list[Slot]:
@@ -74,8 +76,10 @@ class Recording(TorchDispatchMode):
         self._numbers = count()
         self.operations: list[Operation] = []
         self.lenient = False  # whether what can't be followed is recorded nevertheless
+        self.unfit: _Unfit | None = None  # why the function can't be recorded; its own code may have caught it
         self.captured: dict[Slot, Tensor] = {}
-        self.inputs = [self._new(tensor) for tensor in inputs]
+        self.examples = list(inputs)
+        self.inputs = [self._new(tensor) for tensor in self.examples]
         self._followers = set(self.inputs)
         self.result = self.inputs[0]
 
@@ -114,16 +118,21 @@ class Recording(TorchDispatchMode):
             if parts is not NotImplemented:
                 return parts
         inputs, options = tree_map(lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs))
+        if not func._schema.returns:  # it raises where values don't suit it, which the function may catch
+            self.operations.append(Operation(func, inputs, options, (), self._calls.called, torch.get_default_dtype()))
+            return func(*args, **kwargs)
         out = func(*args, **kwargs)
         made = tree_map(lambda leaf: self._new(leaf) if isinstance(leaf, Tensor) else leaf, out)
-        operation = Operation(func, inputs, options, made, self._calls.called)
+        operation = Operation(func, inputs, options, made, self._calls.called, torch.get_default_dtype())
         self.operations.append(operation)
         if not self._followers.isdisjoint(operation.inputs):
             self._followers.update(operation.outputs)
         return out
 
     def _unfit(self, what: str, operation: Any, kind: type[_Unfit] | None = None) -> _Unfit:
-        return (kind or _Unfit)(f"{what}: {title(operation, self._calls.called)}")
+        found = (kind or _Unfit)(f"{what}: {title(operation, self._calls.called)}")
+        self.unfit = self.unfit or found
+        return found
 
     def _follows(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on the function's arguments."""
@@ -146,11 +155,9 @@ def looks_at_values(function: Callable[..., Tensor], *examples: Tensor) -> bool:
     try:
         with torch.no_grad(), recording, calls:
             torch.func.functionalize(function, remove="mutations")(*examples)
-    except (_Looks, ReadsMemory):
-        return True
     except MISTAKES:
-        return False
-    return False
+        pass
+    return isinstance(recording.unfit, _Looks) or calls.refused is not None
 
 
 def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Recording:
@@ -166,13 +173,39 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
     try:
         with torch.no_grad(), recording, calls:
             result = pure(*examples)
+        if (caught := recording.unfit or calls.refused) is not None:
+            raise caught
     except InputError:
         raise  # the function itself says what is wrong
     except Exception as error:  # any error of the function
         message = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise InputError(field, "a function that can be traced", message) from theirs(error)
     recording.result = recording.slot(result)
+    if not _is_reproduced(recording, result):
+        what = "one that changes the memory of a captured tensor or array while it runs"
+        raise InputError(field, "a function that can be traced", what)
     return recording
+
+
+def replay_all(operations: Iterable[Operation], known: dict[Slot, Any]) -> None:
+    """Apply PyTorch's operations in order, each with the default type that it was recorded with."""
+    with torch.no_grad():
+        for default, some in groupby(operations, key=lambda operation: operation.default):
+            with whole_numbers_become(default):
+                for operation in some:
+                    operation.replay(known)
+
+
+def _is_reproduced(recording: Recording, result: Tensor) -> bool:
+    """Whether the recorded operations give the function's result: what they read may have other content by now."""
+    known = dict(zip(recording.inputs, recording.examples, strict=True)) | recording.captured
+    replay_all((operation for operation in recording.operations if operation.outputs), known)
+    again = known[recording.result]
+    if not result.is_floating_point():
+        return torch.equal(again, result)
+    # Not to the last bit, which may depend on where memory lies.
+    near, size = torch.finfo(result.dtype).eps ** 0.5, float(result.abs().nan_to_num(0.0, 0.0, 0.0).sum())
+    return torch.allclose(again, result, rtol=near, atol=near * size, equal_nan=True)
 
 
 def title(operation: Any, called: Any) -> str:

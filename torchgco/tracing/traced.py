@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchgco.base.draws import scattered
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement
-from torchgco.base.values import whole_numbers_become
 from torchgco.tracing.arrays import NoCounterpart, boxed
 from torchgco.tracing.dtypes import replay
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.operations import OPERATIONS
-from torchgco.tracing.recorder import Operation, Slot, name_of, record
+from torchgco.tracing.recorder import Operation, Slot, name_of, record, replay_all
 
 INDEXING = ("aten.index", "aten.index_put", "aten.index_select", "aten.gather")
 
@@ -31,7 +31,7 @@ class Traced:
     Args:
         field: the function's name in errors.
         function: tensors in, one tensor out.
-        examples: variables of the shapes that the function is called with.
+        examples: variables of the shapes and types that the function is called with; their numbers don't matter.
         own: tensors, objects that nothing else holds (`base.tree.apart`), that are treated as one problem's own even
             where all problems of the batch share them: the expressions, and with them the last bits, then don't depend
             on the other problems of the batch.
@@ -47,11 +47,15 @@ class Traced:
         self.field = field
         self._precision = max((example.dtype for example in examples), key=lambda dtype: torch.finfo(dtype).bits)
         index = torch.zeros(1, dtype=torch.int64, device=examples[0].device)
-        recording = record(field, function, index, *examples)
+        recording = record(field, function, index, *map(scattered, examples))
         self._index, *self._variables = recording.inputs
         self._result, self._captured = recording.result, recording.captured
         operations = _needed(recording.operations, self._result)
-        followers = _followers(operations, self._variables)
+        followers = _followers(recording.operations, self._variables)
+        for operation in recording.operations:
+            if not operation.outputs and not followers.isdisjoint(operation.inputs):
+                what = f"one that fails for some values of its arguments: {operation.title}"
+                raise InputError(field, "a function that can be traced", what)
         self._symbolic = [one for one in operations if followers.issuperset(one.outputs)]
         self._plain = [one for one in operations if not followers.issuperset(one.outputs)]
         for operation in self._symbolic:
@@ -163,9 +167,7 @@ class Traced:
     def _computed(self, index: Tensor) -> dict[Slot, Any]:
         """PyTorch's part, for one problem."""
         known: dict[Slot, Any] = {self._index: index} | self._captured
-        with torch.no_grad(), whole_numbers_become(torch.float64):
-            for operation in self._plain:
-                operation.replay(known)
+        replay_all(self._plain, known)
         return known
 
 
@@ -216,7 +218,7 @@ def _placed(numbers: np.ndarray, shapes: Mapping[Slot, tuple[int, ...]]) -> dict
 
 def _array(value: Tensor) -> np.ndarray:
     """Floating-point numbers as objects; integers and booleans keep their type, so that they can index."""
-    plain = value.detach().cpu()
+    plain = value.detach().cpu().to_dense()
     return plain.double().numpy().astype(object) if value.is_floating_point() else plain.numpy()
 
 

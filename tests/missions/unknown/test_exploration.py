@@ -163,6 +163,7 @@ def test_scans_and_searches_take_turns(rate: float) -> None:
     assert searched == ([True] * 6 if rate == 20 else [True, True, False, True, False, True])
 
 
+@pytest.mark.slow
 def test_known_moving_bodies_are_made_way_for() -> None:
     """A sphere comes along the straight way towards the vehicle."""
     problem = walled(9.0)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.tree import apart
+from torchgco.base.values import whole_numbers_become
 from torchgco.dynamics import Dynamics
 from torchgco.native.codegen import dynamics as code
 from torchgco.native.codegen.dynamics import DynamicsSource, step_parts, trace_dynamics
@@ -53,7 +54,8 @@ def _span(model: Dynamics, N: int) -> Span:
     model, stages = apart(model), torch.arange(N)
     own = own_tensors(model)
     X, U = (torch.zeros(1, N, size, dtype=torch.float64) for size in (model.n, model.m))
-    traced = Traced("dynamics.step", lambda i, X, U: model.take(i).at(stages).step(X, U), X, U, own=own)
+    with whole_numbers_become(X.dtype):  # 0.3 * k as for a single stage, where k is an int
+        traced = Traced("dynamics.step", lambda i, X, U: model.take(i).at(stages).step(X, U), X, U, own=own)
     return Span(traced, own, model.n, model.m, N, N, range(N))
 
 
