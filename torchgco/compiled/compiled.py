@@ -9,16 +9,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.api import solve
 from torchgco.base.errors import InputError, shown
-from torchgco.base.options import Count, NonNegative, Positive, check_value
+from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import check_untransformed
 from torchgco.base.status import Status
-from torchgco.base.tree import put, take
-from torchgco.compiled.numbers import Floats, Number, Numbers, as_floats, numbers_of, with_own_numbers
+from torchgco.base.tree import put
+from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_own_numbers
+from torchgco.explaining.account import Account
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.dispatch import cost_unit, current, interior_of
@@ -34,6 +36,7 @@ from torchgco.solvers.ending import least_cost
 from torchgco.solvers.interior import FILTER, PENALTY, InteriorPoint
 
 SOLVERS = "gco", "interior_point"
+CONVERGED, FEASIBLE, TIME_LIMIT = (int(s) for s in (Status.CONVERGED, Status.FEASIBLE, Status.TIME_LIMIT))
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,16 +125,17 @@ class Compiled:
         every = Numbers(found, self._note)
         chosen = None if self.changes is None else {every.find(name).name for name in self.changes}
         self.numbers = Numbers([n for n in found if chosen is None or n.name in chosen], self._note)
-        self._problem, self._changed, self._moved = problem, set[str | int](), False
+        self._problem, self._changed = problem, set[str | int]()
         self._lock = threading.Lock()
-        self._warm = torch.zeros(problem.B, dtype=torch.bool)  # whether a problem has an answer to begin with
-        self._last: Solution | None = None
+        self._warm = np.zeros(problem.B, dtype=bool)  # which problems have an answer to begin with
+        self._found: Solution | None = None  # the last answer, where it isn't what C has left
+        self._unit = torch.ones(problem.B, dtype=problem.x0.dtype)
         form = current(for_solvers(problem))
         self._kept: Kept | None = None
         if form.free_start is None and form.B > 0 and for_solvers(problem) is problem:
             kernels = interior_of(form)
             if kernels is not None:
-                self._problem = form
+                self._problem, self._unit = form, cost_unit(form)
                 self._kept = Kept(kernels, form, **self._options(form))
 
     def _options(self, problem: Problem) -> dict[str, Any]:
@@ -181,14 +185,23 @@ class Compiled:
             self._lock.release()
 
     def solution(self) -> Solution:
-        """The last answer with multipliers, costs and all that a `Solution` offers.
+        """The last answer with multipliers, and with costs by the numbers as they are now.
 
         Raises:
             InputError: there is no answer yet.
         """
-        if self._last is None:
+        last = self._last
+        if last is None:
             raise InputError("mpc", "a call before its solution is asked for", "none")
-        return self._last
+        now = self._now()
+        return replace(last, cost=now.cost.total(last.X, last.U), account=Account(now, self.interior))
+
+    @property
+    def _last(self) -> Solution | None:
+        """The last answer; None before the first."""
+        if self._found is None and self._kept is not None and self._warm.any():
+            self._found = self._packed_solution(self._warm)
+        return self._found
 
     def stale(self) -> str | None:
         """What the compiled code would compute otherwise if it were compiled now, in a line; None: nothing.
@@ -200,7 +213,7 @@ class Compiled:
         then, now = self._kept.engine, Engine(self._now().renewed(), compiles=False)
         if then.form.source() == now.form.source():
             return None
-        return "the functions of the problem, or what they capture, have changed since it was compiled: compile it again"
+        return "the problem's functions, or what they capture, have changed since it was compiled: compile it again"
 
     def __getstate__(self) -> dict[str, Any]:
         """A process that loads it compiles again, and begins without an answer."""
@@ -216,8 +229,8 @@ class Compiled:
         self.numbers.write(values)
 
     def _note(self, number: Number) -> None:
-        self._changed.add(number.part)
-        self._moved = True
+        if number.derived:
+            self._changed.add(number.part)
 
     def _refresh(self) -> None:
         """Have C read what it doesn't share with the problem's tensors."""
@@ -245,22 +258,112 @@ class Compiled:
         return now
 
     def _solved(self, warm: bool, shift: int, began: float, until: float) -> Answer:
-        B, kept = self._problem.B, self._kept
-        able = self._warm if warm else torch.zeros_like(self._warm)
+        kept = self._kept
+        able = self._warm if warm else np.zeros_like(self._warm)
         if kept is None:
-            return self._answer(self._by_solver(shift if bool(able.all()) else None, until), able, began)
+            return self._by_solver_alone(able, shift, began, until)
         if shift:
             kept.shift(shift)
         self._refresh()
-        good, late = torch.zeros(B, dtype=torch.bool), torch.zeros(B, dtype=torch.bool)
-        if bool(able.any()):
+        good = late = np.zeros_like(able)
+        if able.any():
             left = math.inf if until == math.inf else max(0.0, until - time.perf_counter())
             kept.solve(able, self.interior.warm_barrier, seconds=left)
-            worst = self._violation()
-            late = able & (kept.status == Status.TIME_LIMIT)
-            good = able & (kept.status == Status.CONVERGED) & (worst <= self.interior.violation_tolerance)
-        found = self._packed_solution(good | late)
-        again = (~(good | late)).nonzero().flatten()
-        if again.numel() > 0:
-            self._again(found, again, until)
-        return self._answer(found, good, began)
+            status, worst = kept.statuses, kept.violations if kept.engine.measures else self._violation().numpy()
+            late = able & (status == TIME_LIMIT)
+            good = able & (status == CONVERGED) & (worst <= self.interior.violation_tolerance)
+        else:
+            kept.iterations.zero_()
+        self._found = None
+        if not good.all():
+            self._found = self._packed_solution(good)
+            again = torch.from_numpy(~(good | late)).nonzero().flatten()
+            if again.numel() > 0:
+                self._again(self._found, again, until)
+        return self._answer(good, began)
+
+    def _by_solver_alone(self, able: np.ndarray, shift: int, began: float, until: float) -> Answer:
+        """Where nothing is packed for C."""
+        self._found = self._by_solver(shift if able.all() else None, until)
+        return self._answer(able & able.all(), began)
+
+    def _violation(self) -> Tensor:
+        """The largest violations (B,) of the trajectories that C has rolled out."""
+        kept = self._kept
+        assert kept is not None
+        if kept.engine.measures:
+            return kept.worst
+        return violation(self._now().constraints, *kept.rolled)
+
+    def _packed_solution(self, good: np.ndarray) -> Solution:
+        """What C has found; CONVERGED where it is `good` (B,)."""
+        kept = self._kept
+        assert kept is not None
+        ended = kept.statuses
+        status = np.where(good | (ended == TIME_LIMIT), ended, Status.MAX_ITERATIONS)
+        multipliers = Multipliers(tuple(lam.clone() for lam in kept.lam), PENALTY * self._unit)
+        X, U = (part.clone() for part in kept.rolled)
+        none, cost = torch.zeros_like(kept.iterations), X.new_full((X.shape[0],), torch.nan)
+        return Solution(
+            X, U, kept.feedback.clone(), torch.zeros_like(U), multipliers, cost, self._violation().clone(),
+            torch.from_numpy(status.astype(np.int64)), kept.iterations.clone(), none, none,
+        )  # fmt: skip
+
+    def _again(self, found: Solution, rows: Tensor, until: float) -> None:
+        """Solve the problems `rows` from the start by the solver, into `found` and what the next call begins with."""
+        kept, tried = self._kept, found.iterations[rows]
+        assert kept is not None
+        now = self._now().take(rows)
+        solution = self._by_solver(None, until, now)
+        bare = replace(solution, trace=None, search=None, account=None)
+        put(found, rows, replace(bare, iterations=solution.iterations + tried))
+        kept.X[rows], kept.U[rows] = solution.X, solution.U
+        for lam, own in zip(kept.lam, solution.multipliers.lam, strict=True):
+            lam[rows] = own
+
+    def _by_solver(self, shift: int | None, until: float, problem: Problem | None = None) -> Solution:
+        """A solve by the solver that `compile` was given, from the last answer where a shift is given."""
+        now = self._now() if problem is None else problem
+        solver = self.interior if self.solver == "interior_point" else named("gco", now)
+        seconds = None if until == math.inf else max(1e-3, until - time.perf_counter())
+        warm = None if shift is None or self._last is None else _shifted(self._last, shift)
+        return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
+
+    def _answer(self, good: np.ndarray, began: float) -> Answer:
+        found, kept = self._found, self._kept
+        if found is not None:
+            X, U, K, worst, iterations, status = (
+                part.clone() for part in (found.X, found.U, found.K, found.violation, found.iterations, found.status)
+            )
+        else:
+            assert kept is not None
+            (X, U), K, status = (part.clone() for part in kept.rolled), kept.feedback.clone(), kept.status.long()
+            worst, iterations = self._violation().clone(), kept.iterations.clone()
+        # The next call may begin with solutions, and with what only the time was over for.
+        ended = status.numpy()
+        self._warm = (ended == CONVERGED) | (ended == FEASIBLE) | (ended == TIME_LIMIT)
+        return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), time.perf_counter() - began)
+
+
+def _shifted(last: Solution, by: int) -> Solution:
+    """The solution with everything `by` stages earlier, its last knots repeated."""
+    if by == 0:
+        return last
+
+    def moved(part: Tensor) -> Tensor:
+        K = part.shape[1]
+        return part[:, torch.arange(by, K + by).clamp(max=K - 1)] if K > 1 else part
+
+    multipliers = Multipliers(tuple(map(moved, last.multipliers.lam)), last.multipliers.mu)
+    return replace(last, X=moved(last.X), U=moved(last.U), multipliers=multipliers)
+
+
+def _renewed(part: Any) -> Any:
+    """A part of a problem with what was derived from its numbers made again."""
+    if not isinstance(part, BoundSpheres):
+        return part
+    made = BoundSpheres.prepare(
+        part.centers, part.inflated_radii, part.velocities, part.absent, part.vehicle_radius, part.knots,
+        part.position, part.dt,
+    )  # fmt: skip
+    return replace(made, stops=part.stops)

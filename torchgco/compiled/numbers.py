@@ -29,36 +29,34 @@ Floats = np.ndarray[Any, np.dtype[np.float64]]
 WEIGHTS = "Q", "R", "Qf"
 
 
-@dataclass
+@dataclass(slots=True)
 class Number:
     """One of them.
 
     Args:
         name: where it is in the problem, such as "constraints[1].centers".
-        views: memory that holds it, each (B, ...), one after the other along axis 1 where there are several.
+        views: the memory that holds it, (B, ...); or of all stages, (B, N, ...), and of the last knot, (B, ...).
         part: whose number it is: "x0", "cost", "dynamics", or the place of a constraint.
+        derived: whether kernels read what is computed from it, not the number itself.
         check: says what is wrong with new numbers, (expected, got), or None.
     """
 
     name: str
     views: tuple[Floats, ...]
     part: str | int
+    derived: bool
     check: Callable[[Floats], tuple[str, Any] | None]
+    shape: tuple[int, ...] = ()
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        first, *others = self.views
-        if not others:
-            return first.shape
-        return (len(first), sum(1 if v.ndim == first.ndim - 1 else v.shape[1] for v in self.views), *first.shape[2:])
+    def __post_init__(self) -> None:
+        first, *last = self.views
+        self.shape = first.shape if not last else (len(first), first.shape[1] + 1, *first.shape[2:])
 
     @property
     def value(self) -> Floats:
         """A copy, (B, ...)."""
-        first = self.views[0]
-        if len(self.views) == 1:
-            return first.copy()
-        return np.concatenate([v if v.ndim == first.ndim else v[:, None] for v in self.views], axis=1)
+        first, *last = self.views
+        return first.copy() if not last else np.concatenate((first, last[0][:, None]), axis=1)
 
     def checked(self, value: Any) -> Floats:
         """New numbers of this shape, or without the axis of problems for all of them.
@@ -172,7 +170,7 @@ def with_own_numbers(problem: Problem) -> Problem:
 
 def numbers_of(problem: Problem) -> list[Number]:
     """The numbers of a problem that has memory of its own for each, `with_own_numbers`."""
-    found = [Number("x0", (_view(problem.x0),), "x0", lambda new: None)]
+    found = [Number("x0", (_view(problem.x0),), "x0", False, lambda new: None)]
     found += _of_cost(problem)
     found += _of_part(problem.dynamics, "dynamics", "dynamics")
     for i, part in enumerate(problem.constraints):
@@ -204,12 +202,12 @@ def _of_cost(problem: Problem) -> list[Number]:
     cost = problem.cost
     if type(cost) is not BoundQuadratic:
         return _of_part(cost, "cost", "cost")
-    found = [Number("cost.x_ref", (_view(cost.x_ref), _view(cost.xf_ref)), "cost", _finite)]
+    found = [Number("cost.x_ref", (_view(cost.x_ref), _view(cost.xf_ref)), "cost", False, _finite)]
     for name in ("u_ref", *WEIGHTS, "q", "r", "qf", "H"):
         tensor = getattr(cost, name)
         if tensor is not None:
             check = _finite if name not in WEIGHTS else _weights if cost.diagonal else _matrices
-            found.append(Number(f"cost.{name}", (_view(tensor),), "cost", check))
+            found.append(Number(f"cost.{name}", (_view(tensor),), "cost", False, check))
     return found
 
 
@@ -230,7 +228,7 @@ def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Num
         return None
 
     return [
-        Number(f"{name}.{side}", (_view(getattr(part, side)),), i, lambda new, side=side: check(new, side))
+        Number(f"{name}.{side}", (_view(getattr(part, side)),), i, True, lambda new, side=side: check(new, side))
         for side in ("lower", "upper")
     ]
 
@@ -242,11 +240,11 @@ def _of_spheres(part: BoundSpheres, name: str, i: int) -> list[Number]:
     def lengths(new: Floats) -> tuple[str, Any] | None:
         return check(new) or (None if (new >= 0).all() else ("at least 0", float(new.min())))
 
-    found = [Number(f"{name}.centers", (_view(part.centers),), i, check)]
+    found = [Number(f"{name}.centers", (_view(part.centers),), i, False, check)]
     if not bool(part.absent.any()):
-        found.append(Number(f"{name}.inflated_radii", (_view(part.inflated_radii),), i, lengths))
+        found.append(Number(f"{name}.inflated_radii", (_view(part.inflated_radii),), i, True, lengths))
     if part.velocities is not None:
-        found.append(Number(f"{name}.velocities", (_view(part.velocities),), i, check))
+        found.append(Number(f"{name}.velocities", (_view(part.velocities),), i, False, check))
     return found
 
 
@@ -259,9 +257,9 @@ def _of_part(part: Any, name: str, place: str | int) -> list[Number]:
             names = (*value.names, *value.knot_names)
             for own, tensor in zip(names, (*value.rows, *value.knot_rows), strict=True):
                 if tensor.is_floating_point():
-                    found.append(Number(f"{name}.{own}", (_view(tensor),), place, _finite))
+                    found.append(Number(f"{name}.{own}", (_view(tensor),), place, True, _finite))
         elif isinstance(value, Tensor) and value.is_floating_point() and value.dim() > 0:
-            found.append(Number(f"{name}.{field}", (_view(value),), place, _finite))
+            found.append(Number(f"{name}.{field}", (_view(value),), place, True, _finite))
         elif isinstance(value, PerElement):
             found += _of_part(value, f"{name}.{field}", place)
     return found
@@ -290,4 +288,5 @@ def _matrices(new: Floats) -> tuple[str, Any] | None:
     size = float(np.abs(new).max())
     if float(np.abs(new - np.swapaxes(new, -1, -2)).max()) > 1e-9 * max(size, 1.0):
         return "symmetric matrices", "unsymmetric ones"
-    return None if lowest >= -1e-9 * max(size, 1.0) else ("positive semidefinite weights", f"an eigenvalue of {lowest:.3g}")
+    semidefinite = lowest >= -1e-9 * max(size, 1.0)
+    return None if semidefinite else ("positive semidefinite weights", f"an eigenvalue of {lowest:.3g}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -45,39 +46,50 @@ class Kept:
         self.packed.fill({"status": self.status, "iterations": self.iterations})
         self.rolled = self.X.clone(), self.U.clone()  # trajectories of the controls with their feedback
         self.worst = like.new_zeros(B)
+        # The same memory by NumPy, which takes a small share of PyTorch's time for a few numbers.
+        self._moving = [part.numpy() for part in (self.X, self.U, *self.lam)]
+        self._rolled = [part.numpy() for part in self.rolled]
+        self.statuses, self.violations = self.status.numpy(), self.worst.numpy()
+        self._barrier, self._iterations = self.barrier.numpy(), self.iterations.numpy()
         self._follow = self.packed.copy()
         self._follow.fill({"X": self.rolled[0], "U": self.rolled[1], "merit": self.worst})
         ends = {name: like.new_zeros(B) for name in ("error", "theta")}
         self.how = c.Interior.complete(of=self.packed, barrier=self.barrier, free_start=None, **ends, **options)
 
-    def solve(self, mu: float, **options: float) -> None:
-        """Solve from X, U and the multipliers `lam`, in place, with barrier parameters `mu` at the start.
+    def solve(self, rows: np.ndarray, mu: float, **options: float) -> None:
+        """Solve the problems that `rows` (B,) marks, from X, U and `lam`, in place, with `mu` as the first barrier.
 
         `options` are fields of `structures.Interior`. `rolled` then holds the rollouts that follow the solution by its
         feedback, and `worst` (B,) their violation.
         """
         B, library = self.problem.B, self.engine.library
         self.how.fill(options)
-        self.barrier.fill_(mu)
-        self.status.zero_()
-        self.iterations.zero_()
-        run(self.kernels.library.tgco_interior, B, LANES, self.how)
-        self.rolled[0].copy_(self.X)
-        self.rolled[1].copy_(self.U)
+        self._barrier[:] = mu
+        self.statuses[:] = 0
+        self._iterations[:] = 0
+        for first, last in _spans(rows):
+            run(self.kernels.library.tgco_interior, last - first, LANES, self.how, first)
+        self._rolled[0][:], self._rolled[1][:] = self._moving[:2]
         run(library.tgco_closed_loop, B, LANES, self._follow)
         if self.engine.measures:
             run(library.tgco_violation, B, LANES, self._follow)
 
+    @property
+    def feedback(self) -> Tensor:
+        """Gains K (B, N, m, n)."""
+        return self.gains[..., :-1]
+
     def shift(self, by: int) -> None:
         """Let all trajectories and multipliers begin `by` stages later; the last knots are repeated."""
-        for part in (self.X, self.U, *self.lam):
+        for part in self._moving:
             if 0 < by < part.shape[1]:
-                part[:, :-by] = part[:, by:].clone()
+                part[:, :-by] = part[:, by:]
 
     def refresh_constraint(self, i: int) -> None:
         """Read the numbers of constraint i again, after its tensors have changed."""
-        old, new = self._numbers[i], self._own_numbers(i)
-        _copy([old[name] for name in old if isinstance(old[name], c.Array)], [new[name] for name in old if name in new])
+        new = self._own_numbers(i)
+        arrays = [name for name, value in new.items() if isinstance(value, c.Array)]
+        _copy([self._numbers[i][name] for name in arrays], [new[name] for name in arrays])
 
     def refresh_cost(self) -> None:
         """The same of the cost."""
@@ -105,6 +117,14 @@ class Kept:
     def _model_array(self) -> c.Array:
         model, problem = self.engine.model, self.problem
         return c.Array() if model.count == 0 else c.array(model.numbers(problem.B, problem.dynamics), knots=True)
+
+
+def _spans(rows: np.ndarray) -> list[tuple[int, int]]:
+    """The first and the last place, plus one, of each run of rows that are marked, (B,) bool."""
+    if rows.all():
+        return [(0, len(rows))]
+    edges = np.diff(np.pad(rows.astype(np.int8), 1)).nonzero()[0].tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _copy(old: list[c.Array], new: list[c.Array]) -> None:
