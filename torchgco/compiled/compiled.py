@@ -94,7 +94,9 @@ def compile(
     if solver not in SOLVERS:
         raise InputError("solver", " or ".join(f'"{name}"' for name in SOLVERS), shown(solver))
     check_value(receding, bool, "receding")
-    interior = InteriorPoint() if tolerance is None else InteriorPoint(tolerance=check_value(tolerance, Positive, "tolerance"))
+    interior = InteriorPoint()
+    if tolerance is not None:
+        interior = replace(interior, tolerance=check_value(tolerance, Positive, "tolerance"))
     return Compiled(problem, solver, changes, receding, interior)
 
 
@@ -170,7 +172,7 @@ class Compiled:
         """
         began = time.perf_counter()
         if not self._lock.acquire(blocking=False):
-            raise InputError("mpc", "one call at a time: a compiled problem per thread", "a call while another one runs")
+            raise InputError("mpc", "one call at a time: a compiled problem per thread", "a call during another one")
         try:
             self._write({**(numbers or {}), **named})
             if shift is None:
@@ -185,7 +187,7 @@ class Compiled:
             self._lock.release()
 
     def solution(self) -> Solution:
-        """The last answer with multipliers, and with costs by the numbers as they are now.
+        """The last answer with multipliers, costs and statuses; costs of what C solved are by the numbers as they are.
 
         Raises:
             InputError: there is no answer yet.
@@ -193,8 +195,11 @@ class Compiled:
         last = self._last
         if last is None:
             raise InputError("mpc", "a call before its solution is asked for", "none")
+        if self._kept is None:
+            return last
         now = self._now()
-        return replace(last, cost=now.cost.total(last.X, last.U), account=Account(now, self.interior))
+        cost = torch.where(torch.isnan(last.cost), now.cost.total(last.X, last.U), last.cost)
+        return replace(last, cost=cost, account=Account(now, self.interior))
 
     @property
     def _last(self) -> Solution | None:

@@ -22,6 +22,7 @@ from torchgco.base.values import Values
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
 
@@ -39,6 +40,7 @@ class Number:
         part: whose number it is: "x0", "cost", "dynamics", or the place of a constraint.
         derived: whether kernels read what is computed from it, not the number itself.
         check: says what is wrong with new numbers, (expected, got), or None.
+        after: is called when new numbers have been written.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Number:
     part: str | int
     derived: bool
     check: Callable[[Floats], tuple[str, Any] | None]
+    after: Callable[[], object] | None = None
     shape: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -76,9 +79,11 @@ class Number:
         """Write numbers that are `checked`."""
         if len(self.views) == 1:
             self.views[0][...] = given
-            return
-        first, last = self.views  # of the stages, and of the last knot
-        first[...], last[...] = given[..., :-1, :], given[..., -1, :]
+        else:
+            first, last = self.views
+            first[...], last[...] = given[..., :-1, :], given[..., -1, :]
+        if self.after is not None:
+            self.after()
 
 
 class Numbers(Mapping[str, Floats]):
@@ -179,6 +184,8 @@ def numbers_of(problem: Problem) -> list[Number]:
             found += _of_bounds(part, name, i)
         elif isinstance(part, BoundSpheres):
             found += _of_spheres(part, name, i)
+        elif isinstance(part, BoundBoxes):
+            found.append(Number(f"{name}.centers", (_view(part.centers),), i, True, _present))
         elif not isinstance(part, Obstacles):
             found += _of_part(part, name, i)
     return found
@@ -234,17 +241,16 @@ def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Num
 
 
 def _of_spheres(part: BoundSpheres, name: str, i: int) -> list[Number]:
-    def check(new: Floats) -> tuple[str, Any] | None:
-        return None if np.isfinite(new).all() else ("finite numbers; an absent sphere is one far away", "NaN, infinity")
-
-    def lengths(new: Floats) -> tuple[str, Any] | None:
-        return check(new) or (None if (new >= 0).all() else ("at least 0", float(new.min())))
-
-    found = [Number(f"{name}.centers", (_view(part.centers),), i, False, check)]
-    if not bool(part.absent.any()):
-        found.append(Number(f"{name}.inflated_radii", (_view(part.inflated_radii),), i, True, lengths))
+    vehicle = part.vehicle_radius.unsqueeze(-1)
+    radii = part.inflated_radii - vehicle
+    inflate = lambda: torch.add(radii, vehicle, out=part.inflated_radii)
+    found = [
+        Number(f"{name}.centers", (_view(part.centers),), i, False, _present),
+        Number(f"{name}.radii", (_view(radii),), i, True, _lengths, inflate),
+        Number(f"{name}.vehicle_radius", (_view(part.vehicle_radius),), i, True, _lengths, inflate),
+    ]
     if part.velocities is not None:
-        found.append(Number(f"{name}.velocities", (_view(part.velocities),), i, False, check))
+        found.append(Number(f"{name}.velocities", (_view(part.velocities),), i, False, _present))
     return found
 
 
@@ -275,6 +281,14 @@ def _short(name: str) -> str:
 
 def _finite(new: Floats) -> tuple[str, Any] | None:
     return None if np.isfinite(new).all() else ("finite numbers", "NaN or infinity")
+
+
+def _present(new: Floats) -> tuple[str, Any] | None:
+    return None if np.isfinite(new).all() else ("finite numbers (put an obstacle far away to be rid of it)", "others")
+
+
+def _lengths(new: Floats) -> tuple[str, Any] | None:
+    return _finite(new) or (None if (new >= 0).all() else ("lengths of at least 0", float(new.min())))
 
 
 def _weights(new: Floats) -> tuple[str, Any] | None:
