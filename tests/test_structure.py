@@ -25,6 +25,7 @@ LAYERS = [
     ["baselines"],
     ["presets"],
     ["api", "experiments"],
+    ["compiled"],
 ]
 MODULES = sorted(
     p for p in PACKAGE.rglob("*.py") if (p.name != "__main__.py" and p.parent != PACKAGE) or p.stem != "__init__"

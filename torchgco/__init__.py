@@ -31,6 +31,9 @@ from torchgco.base.status import Status as Status
 from torchgco.base.version import VERSION
 from torchgco.baselines import Hold as Hold
 from torchgco.baselines import IteratedMPPI as IteratedMPPI
+from torchgco.compiled import Answer as Answer
+from torchgco.compiled import Compiled as Compiled
+from torchgco.compiled import compile as compile
 from torchgco.constraints import Constraint as Constraint
 from torchgco.constraints import ControlBounds as ControlBounds
 from torchgco.constraints import FunctionConstraint as FunctionConstraint

@@ -11,7 +11,7 @@ from pathlib import Path
 
 # The longest sections are last, as they take the time that is left; only `targets`, which reads the others, follows.
 SECTIONS = (
-    "first_use", "latency", "own_model", "paper", "mppi", "share", "growth", "cores", "batch", "scaling", "families",
+    "first_use", "latency", "loop", "own_model", "paper", "mppi", "share", "growth", "cores", "batch", "scaling", "families",
     "targets",
 )  # fmt: skip
 ON_GPU = ("mppi", "batch", "families")

@@ -18,6 +18,7 @@ from benchmarks.speed import (
     first_use,
     growth,
     latency,
+    loop,
     mppi,
     own_model,
     paper,
@@ -36,7 +37,8 @@ from torchgco.native import engine as native_engine
 
 TINY = Sizes(
     families=("forest30",), family_batch=2, large_batch=None, layouts=1, ipopt_layouts=1, ipopt_families=("forest30",),
-    latency_layouts=1, own_layouts=1, paper_layouts=1, models=1,
+    latency_layouts=1, loop_periods=9, loop_disturbed=7, loop_fleets=(2,), loop_compiled=False,
+    own_layouts=1, paper_layouts=1, models=1,
     whole_batches=(), limited_batches=(2,), fewest_layouts=2,
     world_batch=0, cores_batch=2, growth_batch=2, peers_layouts=1, stages=(6,), obstacles=(30,),
     samples=(16,), mppi_repeats=1,
@@ -70,7 +72,8 @@ def numbers(bench: Bench, quantity: str) -> list[float]:
 
 
 @pytest.mark.parametrize(
-    "section", [batch, cores, families, first_use, growth, latency, mppi, own_model, paper, scaling, share, targets]
+    "section",
+    [batch, cores, families, first_use, growth, latency, loop, mppi, own_model, paper, scaling, share, targets],
 )
 def test_a_section_gives_whole_rows(section, tmp_path: Path) -> None:
     bench = tiny(tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -43,6 +44,7 @@ LOOKED_AT = (0, 5, 8)  # the last one takes a lane that another problem has left
 PLAIN = FILTER | {
     "corrects": 0, "crawl": 0.0, "explodes": 1e300, "patience": 100, "tolerance": 1e-6, "violation": 1e-6, "push": 1e-2,
     "steepest": 100.0, "constant": torch.zeros(B, dtype=D), "least_cost": torch.zeros(B, dtype=D),
+    "seconds": math.inf,
 }  # fmt: skip
 
 

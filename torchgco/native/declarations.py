@@ -22,7 +22,7 @@ TENSORS = {
 }  # fmt: skip
 PLAIN = (int, float, bool)
 _set = ctypes.Structure.__setattr__
-INCLUDES = "#include <stdint.h>\n"
+INCLUDES = "#define _POSIX_C_SOURCE 199309L /* a clock that nobody sets */\n#include <stdint.h>\n"
 
 
 class Structure(ctypes.Structure):

@@ -23,7 +23,7 @@ from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import LANES, Form
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.declarations import load
-from torchgco.native.packing import KINDS, constraint_of, guide_of, is_bounded, quadratic_arrays
+from torchgco.native.packing import KINDS, constraint_of, guide_of, is_bounded, numbers_of, quadratic_arrays
 from torchgco.native.structures import STRUCTURES, array
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.problem.problem import Problem
@@ -37,13 +37,16 @@ class Engine:
 
     Args:
         ahead: is called when the form is known, before the library is compiled.
+        compiles: without it there is the form alone.
 
     Raises:
         InputError: not float64 on a CPU, too many states and controls, or a part without a counterpart in C.
         NativeError: no compiler, or it refuses the source.
     """
 
-    def __init__(self, problem: Problem, ahead: Callable[[Engine], None] | None = None) -> None:
+    def __init__(
+        self, problem: Problem, ahead: Callable[[Engine], None] | None = None, compiles: bool = True
+    ) -> None:
         if problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
             raise InputError("x0", "float64 on a CPU for native kernels", f"{problem.x0.dtype} on {problem.x0.device}")
         if problem.n + problem.m > MAX_VARIABLES:
@@ -61,7 +64,8 @@ class Engine:
         self.form = Form(self.model, at, self.cost, dense, functions, BoundBoxes in kinds, BoundField in kinds)
         if ahead is not None:
             ahead(self)
-        self.library = load(self.form.source(), STRUCTURES)
+        if compiles:
+            self.library = load(self.form.source(), STRUCTURES)
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         """X (B, N+1, n) from U (B, N, m)."""
@@ -226,13 +230,13 @@ class Engine:
         for i, (constraint, shape) in enumerate(zip(problem.constraints, problem.row_shapes, strict=True)):
             source = self.functions.get(i)
             numbers = None if source is None else rows_numbers(problem, i, source)
-            rows.append(constraint_of(constraint, shape, numbers, problem))
+            rows.append(constraint_of(constraint, shape, numbers_of(constraint, numbers, problem), problem))
         problem.form[PACKED] = problem.constraints, rows
         return rows
 
 
-def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> None:
-    """Call a function of a library on all problems, in whole groups, by as many threads as PyTorch uses.
+def run(function: Any, count: int, group: int, argument: ctypes.Structure, first: int = 0) -> None:
+    """Call a function of a library on `count` problems, in whole groups, by as many threads as PyTorch uses.
 
     Raises:
         MemoryError: the library could not allocate memory.
@@ -242,9 +246,9 @@ def run(function: Any, count: int, group: int, argument: ctypes.Structure) -> No
     groups = -(-count // group)
     parts = min(torch.get_num_threads(), groups)
     if parts <= 1:
-        done = [function(ctypes.byref(argument), ctypes.c_int64(0), ctypes.c_int64(count))]
+        done = [function(ctypes.byref(argument), ctypes.c_int64(first), ctypes.c_int64(first + count))]
     else:
-        edges = [group * (groups * i // parts) for i in range(parts)] + [count]
+        edges = [first + group * (groups * i // parts) for i in range(parts)] + [first + count]
         with ThreadPoolExecutor(parts) as pool:
             calls = [
                 pool.submit(function, ctypes.byref(argument), ctypes.c_int64(a), ctypes.c_int64(b))

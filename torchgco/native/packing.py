@@ -40,23 +40,26 @@ def is_bounded(cost: Any) -> bool:
 
 
 def constraint_of(
-    constraint: Constraint, shape: tuple[int, int], numbers: Tensor | None, problem: Problem
+    constraint: Constraint, shape: tuple[int, int], own: dict[str, Any], problem: Problem
 ) -> c.Constraint:
-    """A constraint without multipliers, with knots and rows as `shape` says.
-
-    `numbers` (B|1, K|1, count) are those of a traced one.
-    """
+    """A constraint without multipliers, with knots and rows as `shape` says, and the fields that `numbers_of` gives."""
     knots, rows = shape
     place = torch.full((problem.N + 1,), NOWHERE, dtype=torch.int32)
     if rows > 0:
         place[constraint.knots] = torch.arange(knots, dtype=torch.int32)
     kind = KINDS.get(type(constraint), Kind.FUNCTION)
+    equality, geometric = constraint.sense == "equality", constraint.geometric
+    return c.Constraint(kind=kind, equality=equality, geometric=geometric, knots=knots, rows=rows, place=place, **own)
+
+
+def numbers_of(constraint: Constraint, numbers: Tensor | None, problem: Problem) -> dict[str, Any]:
+    """The fields of a `Constraint` in C that hold the numbers of this one; `numbers` (B|1, K|1, count) if traced."""
+    if KINDS.get(type(constraint)) is None:
+        return {"bound": array(numbers, knots=True)}
+    if isinstance(constraint, ControlBounds | StateBounds):
+        return _bounds(constraint, problem)
     own: dict[str, Any] = {}
-    if kind == Kind.FUNCTION:
-        own = {"bound": array(numbers, knots=True)}
-    elif isinstance(constraint, ControlBounds | StateBounds):
-        own = _bounds(constraint, problem)
-    elif isinstance(constraint, BoundSpheres):
+    if isinstance(constraint, BoundSpheres):
         own = _spheres(constraint)
     elif isinstance(constraint, BoundBoxes):
         own = {"bound": array(_box_numbers(constraint), knots=False)}
@@ -64,8 +67,7 @@ def constraint_of(
         own = _field(constraint)
     if isinstance(constraint, BoundSpheres | BoundBoxes | BoundField) and constraint.stops is not None:
         own["stops"] = array(constraint.stops.unsqueeze(-1), knots=False)
-    equality, geometric = constraint.sense == "equality", constraint.geometric
-    return c.Constraint(kind=kind, equality=equality, geometric=geometric, knots=knots, rows=rows, place=place, **own)
+    return own
 
 
 def guide_of(guide: Penalty | None) -> dict[str, Any]:

@@ -161,6 +161,7 @@ class Interior(Structure):
         ("double", "shift_first shift_least shift_decay shift_growth shift_growth_first shift_max"),
         ("double", "shift_recovery recovery_decay recovery_growth shift_crawl crawl soft softest explodes relaxes"),
         ("double", "pivot noise rounding soft_growth soft_decay forced_growth"),
+        ("double", "seconds"),  # after which problems end with TIME_LIMIT; infinite: never
     )
     _fields_ = fields(declared)
 

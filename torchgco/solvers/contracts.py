@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable
@@ -108,6 +109,11 @@ class Call:
     def late(self) -> bool:
         """Whether the time limit has passed."""
         return self.deadline is not None and time.monotonic() >= self.deadline
+
+    @property
+    def seconds_left(self) -> float:
+        """Until the time limit, s, at least 0; infinite without one."""
+        return math.inf if self.deadline is None else max(0.0, self.deadline - time.monotonic())
 
     def take(self, index: Rows) -> Self:
         """The same call for the problems in `index`."""

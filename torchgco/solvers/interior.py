@@ -30,7 +30,7 @@ from torchgco.solvers.rules import RAW
 from torchgco.solvers.session import Session
 from torchgco.solvers.state import Iterate, SolveEnd
 
-AT_ONCE = 256  # problems between two looks at the clock
+AT_ONCE = 256  # problems between two reports of progress
 PENALTY = 10.0  # of the multipliers returned, for solvers that need one, as a multiple of the cost unit
 # Waechter and Biegler (2006), in whose words these have the names in brackets; where no name is given, ours.
 FILTER: dict[str, Any] = {
@@ -185,7 +185,7 @@ class InteriorPoint(Solver):
         fitted = Multipliers(multipliers, PENALTY * cost_unit(problem))
         out = kernels.solve(
             problem, X, U, multipliers, X.new_full((problem.B,), mu), warm=int(warm is not None),
-            constant=problem.cost_scale.constant, least_cost=least_cost(problem),
+            constant=problem.cost_scale.constant, least_cost=least_cost(problem), seconds=call.seconds_left,
             max_iterations=self.max_iterations, tolerance=self.tolerance, violation=self.violation_tolerance, **how,
         )  # fmt: skip
         X, U = followed(problem, X, U, out["gains"][..., :-1])

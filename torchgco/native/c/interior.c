@@ -316,6 +316,12 @@ static void enter_barrier(Barrier *t, int lane, int64_t e) {
     if (t->is_free) for (int i = 0; i < NX; i++) t->is_free[i][lane] = t->how->free_start[e * NX + i];
 }
 
+static double seconds_now(void) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
 int tgco_interior(const Interior *how, int64_t first, int64_t last) {
     Barrier barrier, *t = &barrier;
@@ -324,6 +330,7 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
     memset(k, 0, sizeof *k);
     I running = SET(0.0) != SET(0.0), fresh = ~running;
     int64_t next = first;
+    double until = seconds_now() + how->seconds;
     for (int l = 0; l < LANES; l++) {
         /* Lanes without a problem repeat the first problem, so that all lanes hold finite numbers. */
         enter_barrier(t, l, next < last ? next : first);
@@ -335,6 +342,8 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
         int32_t status[LANES];
         V error;
         I ended = iterate(t, k, running, status, &error);
+        int late = seconds_now() > until;
+        if (late) for (int l = 0; l < LANES; l++) if (running[l] && !ended[l]) { status[l] = TIME_LIMIT; ended[l] = -1; }
         fresh &= ~fresh;
         if (any(ended)) { /* gains along the trajectories that leave, whatever the other lanes do */
             expand(t);
@@ -343,11 +352,12 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
         for (int l = 0; l < LANES; l++) {
             if (!ended[l]) continue;
             leave_barrier(t, k, l, status[l], error[l]);
-            if (next < last) { enter_barrier(t, l, next++); fresh[l] = -1; }
+            if (next < last && !late) { enter_barrier(t, l, next++); fresh[l] = -1; }
             else running[l] = 0;
         }
         if (any(fresh)) begin(t, k, fresh);
     }
+    for (; next < last; next++) how->of->status[next] = TIME_LIMIT; /* not begun */
     finish_barrier(t);
     return 1;
 }

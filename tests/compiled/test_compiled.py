@@ -1,0 +1,321 @@
+"""A compiled problem gives what a fresh solve of the problem with the same numbers gives."""
+
+from __future__ import annotations
+
+import pickle
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco import (
+    Boxes,
+    ControlBounds,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    InputError,
+    InteriorPoint,
+    Problem,
+    QuadraticCost,
+    RateBounds,
+    Spheres,
+    StateBounds,
+    Status,
+)
+from torchgco.native import kept
+from torchgco.native.compiler import find_compiler
+from torchgco.native.kernels import use_native
+
+pytestmark = [
+    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
+    pytest.mark.filterwarnings("ignore::torchgco.ContactWarning"),
+]
+D, INF, N, DT = torch.float64, torch.inf, 20, 0.1
+Numbers = dict[str, Any]
+
+
+def bicycle(x: Tensor, u: Tensor) -> Tensor:
+    speed, heading = x[..., 3], x[..., 2]
+    rates = speed * heading.cos(), speed * heading.sin(), speed * u[..., 1].tan() / 2.5, u[..., 0]
+    return torch.stack(rates, -1)
+
+
+CAR = FunctionDynamics(bicycle, 4, 2, DT, "rk4", position=slice(0, 2))
+
+
+def path(t: float) -> np.ndarray:
+    times = t + DT * np.arange(N + 1)
+    return np.stack((3 * times, 2 * np.sin(0.5 * times), 0 * times, 3 + 0 * times), -1)
+
+
+def driven(n: Numbers) -> Problem:
+    """Cars that follow a reference between discs, all of whose numbers are given."""
+    parts = [ControlBounds(n["lower"], n["upper"]), Spheres(n["centers"], n["radii"], n["vehicle_radius"])]
+    cost = QuadraticCost(n["Q"], n["R"], n["Qf"], n["x_ref"], n["u_ref"])
+    return Problem(CAR, cost, parts, n["x0"], N)
+
+
+def of_driven(B: int, seed: int) -> Numbers:
+    random = np.random.default_rng(seed)
+    near = lambda value, share=0.2: np.asarray(value) * (1 + share * random.uniform(-1, 1, (B, *np.shape(value))))
+    weights = lambda value: np.stack([np.diag(row) for row in near(value)])[:, None]
+    return {
+        "x0": near([0.0, 0, 0, 3.0]) + 0.1 * random.standard_normal((B, 4)),
+        "x_ref": path(0.0) + 0.2 * random.standard_normal((B, N + 1, 4)),
+        "u_ref": 0.1 * random.standard_normal((B, N, 2)),
+        "Q": weights([1.0, 1, 0.1, 0.1]), "R": weights([0.1, 1.0]), "Qf": weights([10.0, 10, 1, 1])[:, 0],
+        "lower": near([-3.0, -0.5]), "upper": near([3.0, 0.5]),
+        "centers": near([[4.0, 1.6], [7.0, -1.4]]), "radii": near([0.5, 0.4]), "vehicle_radius": near(0.3),
+    }  # fmt: skip
+
+
+def as_diagonals(n: Numbers) -> Numbers:
+    """Numbers as calls take them: a compiled cost has its weights as diagonals."""
+    diagonals = {name: np.diagonal(n[name], axis1=-2, axis2=-1) for name in ("Q", "R", "Qf")}
+    return n | diagonals
+
+
+def heated(n: Numbers) -> Problem:
+    """Functions with values of every kind."""
+
+    def rate(x: Tensor, u: Tensor, loss: Tensor, outside: Tensor) -> Tensor:
+        return torch.stack((u[..., 0] - loss * (x[..., 0] - outside), x[..., 0] - 0.2 * x[..., 1].sin()), -1)
+
+    model = FunctionDynamics(
+        rate, 2, 1, DT, "midpoint", values={"loss": n["loss"]}, knot_values={"outside": n["outside"]}
+    )
+    cost = FunctionCost(
+        lambda x, u, goal, price: (x[..., 1] - goal).square() + price * u[..., 0].square(),
+        lambda x, goal: 10 * (x[..., 1] - goal).square(),
+        values={"goal": n["goal"]}, knot_values={"price": n["price"]},
+    )  # fmt: skip
+    row = FunctionConstraint(lambda x, most: (x[..., 0] / most).square().unsqueeze(-1) - 1, values={"most": n["most"]})
+    return Problem(model, cost, [ControlBounds(n["lower"], n["upper"]), row], n["x0"], N)
+
+
+def of_heated(B: int, seed: int) -> Numbers:
+    random = torch.Generator().manual_seed(seed)
+    drawn = lambda low, high, *shape: low + (high - low) * torch.rand(B, *shape, dtype=D, generator=random)
+    return {
+        "x0": drawn(-0.5, 0.5, 2), "loss": drawn(0.1, 0.5), "outside": drawn(-0.2, 0.2, N), "goal": drawn(0.5, 1.0),
+        "price": drawn(0.05, 0.2, N + 1), "most": drawn(0.6, 1.2), "lower": drawn(-4, -2, 1), "upper": drawn(2, 4, 1),
+    }  # fmt: skip
+
+
+KINDS: dict[str, tuple[Callable[[Numbers], Problem], Callable[[int, int], Numbers], Callable[[Numbers], Numbers]]] = {
+    "driven": (driven, of_driven, as_diagonals), "heated": (heated, of_heated, lambda n: n),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_other_numbers_give_what_a_fresh_solve_gives(kind: str) -> None:
+    make, draw, as_taken = KINDS[kind]
+    B, now = 3, draw(3, 0)
+    mpc = torchgco.compile(make(now), "interior_point", tolerance=1e-12)
+    exact, warm = InteriorPoint(tolerance=1e-12), 0
+    mpc()
+    names = sorted(now)
+    for seed in range(1, 14):
+        other = draw(B, seed)
+        changed = names if seed == 1 else [names[seed % len(names)], "x0"]
+        now = now | {name: other[name] for name in changed}
+        answer = mpc(**{name: as_taken(now)[name] for name in changed})
+        fresh = torchgco.solve(make(now), solver=exact)
+        assert answer.statuses == fresh.statuses == [Status.CONVERGED] * B
+        torch.testing.assert_close(answer.U, fresh.U, rtol=1e-7, atol=1e-7)
+        torch.testing.assert_close(mpc.solution().cost, fresh.cost, rtol=1e-9, atol=1e-12)
+        warm += int(answer.warm.sum())
+    assert warm > 30  # of 39
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_written_numbers_lie_in_memory_as_bound_ones_do(kind: str) -> None:
+    """Bit for bit, whatever way they came."""
+    make, draw, as_taken = KINDS[kind]
+    now, new = draw(3, 1), draw(3, 2)
+    written, bound = torchgco.compile(make(now)), torchgco.compile(make(new))
+    written.numbers.write(as_taken(new))
+    written._refresh()
+    bound._refresh()
+    for one, other in zip(memory(written), memory(bound), strict=True):
+        assert torch.equal(one, other)
+    for name in written.numbers:
+        np.testing.assert_allclose(written.numbers[name], bound.numbers[name], rtol=1e-14)
+
+
+def memory(mpc: torchgco.Compiled) -> list[Tensor]:
+    """All numbers that C reads."""
+    packed = mpc._kept
+    assert isinstance(packed, kept.Kept)
+    arrays = [packed._model, *packed._cost]
+    arrays += [value for numbers in packed._numbers for value in numbers.values() if hasattr(value, "size")]
+    return [tensor for array in arrays for tensor in getattr(array, "kept", [])] + [packed.X[:, 0]]
+
+
+def test_a_receding_horizon() -> None:
+    x, mpc = np.array([[0.0, 0, 0, 3.0]]), torchgco.compile(driven(of_driven(1, 0)), receding=True)
+    for k in range(60):
+        answer = mpc(x0=x, x_ref=path(DT * k), u_ref=np.zeros((N, 2)), centers=[[9.0, 2.8], [14.0, -0.5]])
+        assert answer.statuses == [Status.CONVERGED] and bool(answer.warm) == (k > 0)
+        torch.testing.assert_close(answer.X[:, 1], CAR.step(torch.tensor(x), answer.u))
+        x = answer.X[:, 1].numpy()
+    assert int(answer.iterations) < 10 and np.abs(x[0, :2] - path(6.0)[0, :2]).max() < 0.5
+
+
+def test_problems_of_a_batch_are_as_alone() -> None:
+    """Some of them jump, so that no warm start leads to their solutions."""
+    now, far = of_driven(12, 3), of_driven(12, 4)
+    jumps = np.arange(12) % 5 == 2
+    far["x0"][jumps] += [0, 0, 2.5, 0]
+    whole = torchgco.compile(driven(now), "interior_point")
+    whole()
+    answer = whole(**as_diagonals(far))
+    for b in (0, 2, 7, 11):
+        row = lambda numbers, b=b: {name: value[b : b + 1] for name, value in numbers.items()}
+        alone = torchgco.compile(driven(row(now)), "interior_point")
+        alone()
+        one = alone(**row(as_diagonals(far)))
+        assert torch.equal(one.U[0], answer.U[b]) and one.statuses[0] == answer.statuses[b]
+        assert bool(one.warm) == bool(answer.warm[b])
+
+
+def test_what_no_warm_start_solves_is_solved_again() -> None:
+    numbers = of_driven(2, 5)
+    mpc = torchgco.compile(driven(numbers))
+    mpc()
+    broken = numbers["x0"].copy()
+    broken[1, 3] = np.nan
+    answer = mpc(x0=broken)
+    assert answer.statuses == [Status.CONVERGED, Status.NON_FINITE] and answer.warm.tolist() == [True, False]
+    assert mpc(x0=numbers["x0"]).statuses == [Status.CONVERGED] * 2  # nothing of the failed solve is used
+
+
+def test_a_deadline_ends_a_call() -> None:
+    numbers = of_driven(64, 6)
+    mpc = torchgco.compile(driven(numbers), "interior_point")
+    began = time.monotonic()
+    answer = mpc(max_seconds=1e-6)
+    assert set(answer.statuses) <= {Status.TIME_LIMIT, Status.FEASIBLE, Status.CONVERGED}
+    assert time.monotonic() - began < 5.0 and torch.isfinite(answer.U).all()
+    mpc(warm=False)
+    jumped = mpc(x0=numbers["x0"] + 0.5, max_seconds=1e-6)
+    assert Status.TIME_LIMIT in jumped.statuses and torch.isfinite(jumped.U).all()
+    assert mpc().statuses == [Status.CONVERGED] * 64
+
+
+@pytest.fixture
+def native_again() -> Iterator[None]:
+    yield
+    use_native(True)
+
+
+@pytest.mark.parametrize("form", ["rates", "horizon", "free start", "pytorch", "boxes"])
+@pytest.mark.usefixtures("native_again")
+def test_problems_of_every_form(form: str) -> None:
+    """What isn't packed for C goes the long way, with the same answers."""
+    x0, more = torch.tensor([[0.0, 0.0], [0.3, 0.0]], dtype=D), {}
+    model = FunctionDynamics(lambda x, u: torch.stack((x[..., 1], u[..., 0]), -1), 2, 1, DT, "rk4", slice(0, 1))
+    parts: list[Any] = [ControlBounds(-2.0, 2.0), StateBounds([-INF, -1.0], [INF, 1.0])]
+    if form == "rates":
+        parts.append(RateBounds(-0.5, 0.5))
+    elif form == "horizon":
+        more = {"horizon": torch.tensor([N, N // 2])}
+    elif form == "free start":
+        more = {"free_start": [False, True]}
+    elif form == "boxes":
+        plane = lambda x, u: torch.cat((x[..., 2:], u), -1)
+        model, x0 = FunctionDynamics(plane, 4, 2, DT, "rk4", slice(0, 2)), torch.zeros(2, 4, dtype=D)
+        parts = [ControlBounds(-2.0, 2.0), Boxes([[0.5, 0.1]], [[0.1, 0.1]], 0.05)]
+    goal = torch.zeros(2, 1, x0.shape[1], dtype=D)
+    goal[:, 0, 0] = torch.tensor([1.0, 0.8])
+    of = lambda goal: Problem(
+        model, QuadraticCost([1.0] + [0.1] * (x0.shape[1] - 1), 0.1 * np.ones(model.m), [10.0] * x0.shape[1], goal),
+        parts, x0, N, **more,
+    )  # fmt: skip
+    use_native(form != "pytorch")
+    mpc = torchgco.compile(of(goal), "interior_point")
+    mpc()
+    answer = mpc(x_ref=(0.9 * goal).expand(2, N + 1, -1))
+    expected = torchgco.solve(of(0.9 * goal), solver="interior_point")
+    assert answer.statuses == expected.statuses
+    torch.testing.assert_close(mpc.solution().cost, expected.cost, rtol=1e-4, atol=1e-6)
+
+
+def test_what_a_function_captures_is_compiled_and_seen_to_change() -> None:
+    wind = torch.tensor([0.1], dtype=D)
+    model = FunctionDynamics(lambda x, u: torch.stack((x[..., 1], u[..., 0] + wind[0]), -1), 2, 1, DT, "rk4")
+    cost = QuadraticCost([1.0, 0.1], [0.1], [10.0, 1.0], [1.0, 0.0])
+    mpc = torchgco.compile(Problem(model, cost, [ControlBounds(-2.0, 2.0)], torch.zeros(1, 2, dtype=D), N))
+    assert mpc.stale() is None
+    wind += 0.5
+    assert "compile it again" in str(mpc.stale())
+
+
+def test_one_thread_at_a_time_and_processes_compile_their_own() -> None:
+    mpc = torchgco.compile(driven(of_driven(2, 7)))
+    first = mpc()
+    other = pickle.loads(pickle.dumps(mpc))
+    torch.testing.assert_close(other().U, first.U, rtol=1e-6, atol=1e-6)
+    errors, inside = list[Exception](), threading.Event()
+
+    def call() -> None:
+        try:
+            mpc()
+        except InputError as error:
+            errors.append(error)
+        inside.set()
+
+    with mpc._lock:
+        thread = threading.Thread(target=call)
+        thread.start()
+        inside.wait()
+        thread.join()
+    assert "one call at a time" in str(errors[0])
+    assert mpc().statuses == [Status.CONVERGED] * 2
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"x0": np.zeros((1, 5))}, "x0: expected shape (2, 4), or (4,) for all problems, got (1, 5)"),
+        ({"speed": 1.0}, "numbers: expected one of x0, x_ref, u_ref, Q, R, Qf, lower, upper, centers, radii"),
+        ({"upper": [np.inf, 1.0]}, None),
+        ({"upper": [-9.0, 1.0]}, "constraints[0].upper: expected lower bounds of at most the upper ones"),
+        ({"radii": [-1.0, 1.0]}, "constraints[1].radii: expected lengths of at least 0, got -1.0"),
+        ({"Q": [[-1.0, 1, 1, 1]]}, "cost.Q: expected weights of at least 0, got -1.0"),
+        ({"x_ref": np.nan * path(0.0)}, "cost.x_ref: expected finite numbers, got NaN or infinity"),
+        ({"x0": "fast"}, "x0: expected numbers, got str"),
+        ({"shift": -1}, "shift: expected a number of stages, at least 0, got -1"),
+        ({"max_seconds": 0.0}, "max_seconds: expected"),
+    ],
+)
+def test_a_mistake_changes_nothing_and_gets_one_line(numbers: Numbers, message: str | None) -> None:
+    mpc = torchgco.compile(driven(of_driven(2, 8)))
+    before = {name: mpc.numbers[name] for name in mpc.numbers}
+    if message is None:
+        assert mpc(**numbers).statuses == [Status.CONVERGED] * 2
+        return
+    with pytest.raises(InputError) as error:
+        mpc(**({"x0": np.ones(4)} | numbers))
+    assert str(error.value).startswith(message) and "\n" not in str(error.value)
+    assert all(np.array_equal(mpc.numbers[name], value) for name, value in before.items() if name != "x0")
+
+
+def test_numbers_are_listed_and_only_the_chosen_ones_change() -> None:
+    problem = driven(of_driven(2, 9))
+    mpc = torchgco.compile(problem, changes=["x0", "constraints[1].centers"])
+    assert list(mpc.numbers) == ["x0", "constraints[1].centers"] and "2x2x2" in repr(mpc.numbers)
+    mpc.numbers["centers"] = np.zeros((2, 2)) + 30.0
+    assert float(mpc.numbers["constraints[1].centers"].min()) == 30.0
+    assert float(problem.constraints[1].centers.min()) < 30.0  # the problem keeps its own
+    with pytest.raises(InputError, match="numbers: expected one of x0, centers, got radii"):
+        mpc(radii=[1.0, 1.0])
+    with pytest.raises(InputError, match="solver: expected"):
+        torchgco.compile(problem, "al_ilqr")

@@ -1,0 +1,374 @@
+"""compile: one problem compiled and packed once, and solved again and again with other numbers."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.api import solve
+from torchgco.base.errors import InputError, shown
+from torchgco.base.options import Positive, check_value
+from torchgco.base.shapes import check_untransformed
+from torchgco.base.status import Status
+from torchgco.base.tree import put
+from torchgco.compiled.numbers import Number, Numbers, numbers_of, with_own_numbers
+from torchgco.explaining.account import Account
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.quality import violation
+from torchgco.native.dispatch import cost_unit, current, interior_of
+from torchgco.native.engine import Engine
+from torchgco.native.kept import Kept
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.presets import named
+from torchgco.problem.goal import Goal
+from torchgco.problem.horizons import for_solvers
+from torchgco.problem.problem import Problem, check_problem
+from torchgco.solution import Solution
+from torchgco.solvers.ending import least_cost
+from torchgco.solvers.interior import FILTER, PENALTY, InteriorPoint
+
+SOLVERS = "gco", "interior_point"
+CONVERGED, FEASIBLE, TIME_LIMIT = (int(s) for s in (Status.CONVERGED, Status.FEASIBLE, Status.TIME_LIMIT))
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What one call of a compiled problem gives; all tensors are copies."""
+
+    X: Tensor  # (B, N+1, n)
+    U: Tensor  # (B, N, m)
+    K: Tensor  # (B, N, m, n): u = U + K (x - X)
+    status: Tensor  # (B,) int64, see Status
+    iterations: Tensor  # (B,) int64, of all solves of the call
+    violation: Tensor  # (B,): largest violation, metres for lengths
+    warm: Tensor  # (B,) bool: whether the solve from the last answer was enough
+    seconds: float  # that the call took
+
+    @property
+    def u(self) -> Tensor:
+        """The first controls, (B, m)."""
+        return self.U[:, 0]
+
+    @property
+    def statuses(self) -> list[Status]:
+        return [Status(status) for status in self.status.tolist()]
+
+
+def compile(
+    problem: Problem,
+    solver: str = "gco",
+    changes: Sequence[str] | None = None,
+    receding: bool = False,
+    tolerance: float | None = None,
+) -> Compiled:
+    """A problem whose code is traced, compiled and packed once, for solves with other numbers: a receding horizon, say.
+
+        mpc = torchgco.compile(problem, receding=True)
+        answer = mpc(x0=x, x_ref=reference)
+
+    The first call solves as `torchgco.solve` does. Later ones begin with the last trajectories and multipliers, by the
+    interior point in C; what that doesn't solve, `solver` solves again. What the problem's functions do, what they
+    capture, and which bounds are infinite stay as they are now: see `Compiled.stale`.
+
+    Args:
+        problem: B problems, on a CPU.
+        solver: "gco" or "interior_point": of the first call, and of what no warm start leads to.
+        changes: names of the numbers that calls may change; others keep what the problem has. None: all that
+            `Compiled.numbers` lists.
+        receding: each call's horizon begins a stage after that of the call before; its warm start is shifted as far.
+        tolerance: of the optimality conditions; None: that of `InteriorPoint`.
+
+    Raises:
+        InputError: another solver, a name that isn't there, or a problem on another device.
+    """
+    check_untransformed("compile")
+    check_problem(problem)
+    if solver not in SOLVERS:
+        raise InputError("solver", " or ".join(f'"{name}"' for name in SOLVERS), shown(solver))
+    check_value(receding, bool, "receding")
+    interior = InteriorPoint()
+    if tolerance is not None:
+        interior = replace(interior, tolerance=check_value(tolerance, Positive, "tolerance"))
+    return Compiled(problem, solver, changes, receding, interior)
+
+
+class Compiled:
+    """A compiled problem; `compile` makes it. One thread calls it at a time.
+
+    Attributes:
+        numbers: what a call may change: names, shapes and values, also to be read and written by name.
+    """
+
+    numbers: Numbers
+
+    def __init__(
+        self,
+        problem: Problem,
+        solver: str,
+        changes: Sequence[str] | None,
+        receding: bool,
+        interior: InteriorPoint,
+    ) -> None:
+        if problem.x0.device.type != "cpu":
+            raise InputError("problem", "one on the CPU", str(problem.x0.device))
+        self.solver, self.interior, self.receding, self.changes = solver, interior, receding, changes
+        self._begin(with_own_numbers(problem))
+
+    def _begin(self, problem: Problem) -> None:
+        found = numbers_of(problem)
+        every = Numbers(found, self._note)
+        chosen = None if self.changes is None else {every.find(name).name for name in self.changes}
+        self.numbers = Numbers([n for n in found if chosen is None or n.name in chosen], self._note)
+        self._problem, self._changed = problem, set[str | int]()
+        self._lock = threading.Lock()
+        self._warm = np.zeros(problem.B, dtype=bool)  # which problems have an answer to begin with
+        self._found: Solution | None = None  # the last answer, where it isn't what C has left
+        self._unit = torch.ones(problem.B, dtype=problem.x0.dtype)
+        form = current(for_solvers(problem))
+        self._kept: Kept | None = None
+        if form.free_start is None and form.B > 0 and for_solvers(problem) is problem:
+            kernels = interior_of(form)
+            if kernels is not None:
+                self._problem, self._unit = form, cost_unit(form)
+                self._kept = Kept(kernels, form, **self._options(form))
+
+    def _options(self, problem: Problem) -> dict[str, Any]:
+        interior = self.interior
+        return FILTER | {
+            "push": interior.warm_barrier, "warm": 1, "max_iterations": interior.max_iterations,
+            "tolerance": interior.tolerance, "violation": interior.violation_tolerance, "seconds": math.inf,
+            "constant": problem.cost_scale.constant, "least_cost": least_cost(problem),
+        }  # fmt: skip
+
+    def __call__(
+        self,
+        *,
+        warm: bool = True,
+        shift: int | None = None,
+        max_seconds: float | None = None,
+        numbers: Mapping[str, Any] | None = None,
+        **named: Any,
+    ) -> Answer:
+        """Solve with new numbers; those that aren't named keep their values.
+
+        Args:
+            warm: begin with the last answer, where that was a solution.
+            shift: by how many stages the horizon has moved since the last call; None: 1 if receding, else 0.
+            max_seconds: after which the iterate so far is returned; looked at in every iteration.
+            numbers: new numbers by name, for names that are no words, such as "constraints[1].centers".
+            named: the same.
+
+        Raises:
+            InputError: an unknown name, numbers of another shape or that the problem can't have, or a call while
+                another thread's runs. Nothing is changed then.
+        """
+        began = time.perf_counter()
+        if not self._lock.acquire(blocking=False):
+            raise InputError("mpc", "one call at a time: a compiled problem per thread", "a call during another one")
+        try:
+            self._write({**(numbers or {}), **named})
+            if shift is None:
+                shift = int(self.receding)
+            elif type(shift) is not int or shift < 0:
+                raise InputError("shift", "a number of stages, at least 0", shown(shift))
+            until = math.inf
+            if max_seconds is not None:
+                until = began + check_value(max_seconds, Positive, "max_seconds")
+            return self._solved(bool(warm), shift, began, until)
+        finally:
+            self._lock.release()
+
+    def solution(self) -> Solution:
+        """The last answer with multipliers, costs and statuses; costs of what C solved are by the numbers as they are.
+
+        Raises:
+            InputError: there is no answer yet.
+        """
+        last = self._last
+        if last is None:
+            raise InputError("mpc", "a call before its solution is asked for", "none")
+        if self._kept is None:
+            return last
+        now = self._now()
+        cost = torch.where(torch.isnan(last.cost), now.cost.total(last.X, last.U), last.cost)
+        return replace(last, cost=cost, account=Account(now, self.interior))
+
+    @property
+    def _last(self) -> Solution | None:
+        """The last answer; None before the first."""
+        if self._found is None and self._kept is not None and self._warm.any():
+            self._found = self._packed_solution(self._warm)
+        return self._found
+
+    def stale(self) -> str | None:
+        """What the compiled code would compute otherwise if it were compiled now, in a line; None: nothing.
+
+        It sees functions that do something else, and other contents of what they capture: tensors, modules, numbers.
+        """
+        if self._kept is None:
+            return None  # PyTorch's kernels call the functions themselves
+        then, now = self._kept.engine, Engine(self._now().renewed(), compiles=False)
+        if then.form.source() == now.form.source():
+            return None
+        return "the problem's functions, or what they capture, have changed since it was compiled: compile it again"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A process that loads it compiles again, and begins without an answer."""
+        names = "solver", "interior", "receding", "changes"
+        return {"problem": self._now()} | {name: getattr(self, name) for name in names}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        problem = state.pop("problem")
+        vars(self).update(state)
+        self._begin(with_own_numbers(problem))
+
+    def _write(self, values: Mapping[str, Any]) -> None:
+        self.numbers.write(values)
+
+    def _note(self, number: Number) -> None:
+        if number.derived:
+            self._changed.add(number.part)
+
+    def _refresh(self) -> None:
+        """Have C read what it doesn't share with the problem's tensors."""
+        kept, problem = self._kept, self._problem
+        assert kept is not None
+        for part in self._changed:
+            if part == "dynamics":
+                kept.refresh_model()
+            elif part == "cost" and kept.engine.cost is not None:
+                kept.refresh_cost()
+            elif isinstance(part, int):
+                kept.refresh_constraint(part)
+        self._changed.clear()
+        kept.X[:, 0] = problem.x0
+
+    def _now(self) -> Problem:
+        """The problem with its numbers as they are, and nothing that was computed from others."""
+        problem = self._problem
+        constraints = tuple(_renewed(part) for part in problem.constraints)
+        form = {key: value for key, value in problem.form.items() if key not in ("packed", "rows")}
+        now = problem._with({"constraints": constraints}, form)
+        if now.goal is None or now.goal.assumed:
+            dims = now._dimensions(now.x0)
+            now = now._with({"goal": Goal.derived(now.cost.goal(now.x0), dims)}, form)
+        return now
+
+    def _solved(self, warm: bool, shift: int, began: float, until: float) -> Answer:
+        kept = self._kept
+        able = self._warm if warm else np.zeros_like(self._warm)
+        if kept is None:
+            return self._by_solver_alone(able, shift, began, until)
+        if shift:
+            kept.shift(shift)
+        self._refresh()
+        good = late = np.zeros_like(able)
+        if able.any():
+            left = math.inf if until == math.inf else max(0.0, until - time.perf_counter())
+            kept.solve(able, self.interior.warm_barrier, seconds=left)
+            status, worst = kept.statuses, kept.violations if kept.engine.measures else self._violation().numpy()
+            late = able & (status == TIME_LIMIT)
+            good = able & (status == CONVERGED) & (worst <= self.interior.violation_tolerance)
+        else:
+            kept.iterations.zero_()
+        self._found = None
+        if not good.all():
+            self._found = self._packed_solution(good)
+            again = torch.from_numpy(~(good | late)).nonzero().flatten()
+            if again.numel() > 0:
+                self._again(self._found, again, until)
+        return self._answer(good, began)
+
+    def _by_solver_alone(self, able: np.ndarray, shift: int, began: float, until: float) -> Answer:
+        """Where nothing is packed for C."""
+        self._found = self._by_solver(shift if able.all() else None, until)
+        return self._answer(able & able.all(), began)
+
+    def _violation(self) -> Tensor:
+        """The largest violations (B,) of the trajectories that C has rolled out."""
+        kept = self._kept
+        assert kept is not None
+        if kept.engine.measures:
+            return kept.worst
+        return violation(self._now().constraints, *kept.rolled)
+
+    def _packed_solution(self, good: np.ndarray) -> Solution:
+        """What C has found; CONVERGED where it is `good` (B,)."""
+        kept = self._kept
+        assert kept is not None
+        ended = kept.statuses
+        status = np.where(good | (ended == TIME_LIMIT), ended, Status.MAX_ITERATIONS)
+        multipliers = Multipliers(tuple(lam.clone() for lam in kept.lam), PENALTY * self._unit)
+        X, U = (part.clone() for part in kept.rolled)
+        none, cost = torch.zeros_like(kept.iterations), X.new_full((X.shape[0],), torch.nan)
+        return Solution(
+            X, U, kept.feedback.clone(), torch.zeros_like(U), multipliers, cost, self._violation().clone(),
+            torch.from_numpy(status.astype(np.int64)), kept.iterations.clone(), none, none,
+        )  # fmt: skip
+
+    def _again(self, found: Solution, rows: Tensor, until: float) -> None:
+        """Solve the problems `rows` from the start by the solver, into `found` and what the next call begins with."""
+        kept, tried = self._kept, found.iterations[rows]
+        assert kept is not None
+        now = self._now().take(rows)
+        solution = self._by_solver(None, until, now)
+        bare = replace(solution, trace=None, search=None, account=None)
+        put(found, rows, replace(bare, iterations=solution.iterations + tried))
+        kept.X[rows], kept.U[rows] = solution.X, solution.U
+        for lam, own in zip(kept.lam, solution.multipliers.lam, strict=True):
+            lam[rows] = own
+
+    def _by_solver(self, shift: int | None, until: float, problem: Problem | None = None) -> Solution:
+        """A solve by the solver that `compile` was given, from the last answer where a shift is given."""
+        now = self._now() if problem is None else problem
+        solver = self.interior if self.solver == "interior_point" else named("gco", now)
+        seconds = None if until == math.inf else max(1e-3, until - time.perf_counter())
+        warm = None if shift is None or self._last is None else _shifted(self._last, shift)
+        return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
+
+    def _answer(self, good: np.ndarray, began: float) -> Answer:
+        found, kept = self._found, self._kept
+        if found is not None:
+            X, U, K, worst, iterations, status = (
+                part.clone() for part in (found.X, found.U, found.K, found.violation, found.iterations, found.status)
+            )
+        else:
+            assert kept is not None
+            (X, U), K, status = (part.clone() for part in kept.rolled), kept.feedback.clone(), kept.status.long()
+            worst, iterations = self._violation().clone(), kept.iterations.clone()
+        # The next call may begin with solutions, and with what only the time was over for.
+        ended = status.numpy()
+        self._warm = (ended == CONVERGED) | (ended == FEASIBLE) | (ended == TIME_LIMIT)
+        return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), time.perf_counter() - began)
+
+
+def _shifted(last: Solution, by: int) -> Solution:
+    """The solution with everything `by` stages earlier, its last knots repeated."""
+    if by == 0:
+        return last
+
+    def moved(part: Tensor) -> Tensor:
+        K = part.shape[1]
+        return part[:, torch.arange(by, K + by).clamp(max=K - 1)] if K > 1 else part
+
+    multipliers = Multipliers(tuple(map(moved, last.multipliers.lam)), last.multipliers.mu)
+    return replace(last, X=moved(last.X), U=moved(last.U), multipliers=multipliers)
+
+
+def _renewed(part: Any) -> Any:
+    """A part of a problem with what was derived from its numbers made again."""
+    if not isinstance(part, BoundSpheres):
+        return part
+    made = BoundSpheres.prepare(
+        part.centers, part.inflated_radii, part.velocities, part.absent, part.vehicle_radius, part.knots,
+        part.position, part.dt,
+    )  # fmt: skip
+    return replace(made, stops=part.stops)

@@ -1,0 +1,306 @@
+"""The numbers of a problem by name: where they lie, of which shape they are, and how new ones are written there.
+
+Shapes begin with the axis of problems. References have an axis of all knots; what a problem's parts share between
+stages stays shared.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from copy import copy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.tree import PerElement
+from torchgco.base.values import Values
+from torchgco.constraints.bounds import ControlBounds, StateBounds
+from torchgco.costs.quadratic import BoundQuadratic
+from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.problem.problem import Problem
+
+Floats = np.ndarray[Any, np.dtype[np.float64]]
+WEIGHTS = "Q", "R", "Qf"
+
+
+@dataclass(slots=True)
+class Number:
+    """One of them.
+
+    Args:
+        name: where it is in the problem, such as "constraints[1].centers".
+        views: the memory that holds it, (B, ...); or of all stages, (B, N, ...), and of the last knot, (B, ...).
+        part: whose number it is: "x0", "cost", "dynamics", or the place of a constraint.
+        derived: whether kernels read what is computed from it, not the number itself.
+        check: says what is wrong with new numbers, (expected, got), or None.
+        after: is called when new numbers have been written.
+    """
+
+    name: str
+    views: tuple[Floats, ...]
+    part: str | int
+    derived: bool
+    check: Callable[[Floats], tuple[str, Any] | None]
+    after: Callable[[], object] | None = None
+    shape: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        first, *last = self.views
+        self.shape = first.shape if not last else (len(first), first.shape[1] + 1, *first.shape[2:])
+
+    @property
+    def value(self) -> Floats:
+        """A copy, (B, ...)."""
+        first, *last = self.views
+        return first.copy() if not last else np.concatenate((first, last[0][:, None]), axis=1)
+
+    def checked(self, value: Any) -> Floats:
+        """New numbers of this shape, or without the axis of problems for all of them.
+
+        Raises:
+            InputError: another shape, no numbers, or numbers that the problem can't have.
+        """
+        given, shape = as_floats(value, self.name), self.shape
+        if given.shape != shape and given.shape != shape[1:]:
+            expected = f"shape {shape}" if len(shape) == 1 else f"shape {shape}, or {shape[1:]} for all problems"
+            raise InputError(self.name, expected, given.shape)
+        if (wrong := self.check(given)) is not None:
+            raise InputError(self.name, *wrong)
+        return given
+
+    def write(self, given: Floats) -> None:
+        """Write numbers that are `checked`."""
+        if len(self.views) == 1:
+            self.views[0][...] = given
+        else:
+            first, last = self.views
+            first[...], last[...] = given[..., :-1, :], given[..., -1, :]
+        if self.after is not None:
+            self.after()
+
+
+class Numbers(Mapping[str, Floats]):
+    """All numbers of a problem, by full names; a last part that only one of them has will do, too.
+
+    `numbers[name]` is a copy, and `numbers[name] = value` writes.
+    """
+
+    def __init__(self, found: list[Number], changed: Callable[[Number], None]) -> None:
+        self._all = {number.name: number for number in found}
+        short = [_short(number.name) for number in found]
+        self._by_name = dict(self._all)
+        for name, number in zip(short, found, strict=True):
+            if Counter(short)[name] == 1:
+                self._by_name.setdefault(name, number)
+        self._changed = changed
+
+    def find(self, name: str) -> Number:
+        """The number of this name.
+
+        Raises:
+            InputError: there is none, or there are several.
+        """
+        number = self._by_name.get(name)
+        if number is None:
+            alike = [full for full in self._all if _short(full) == name]
+            raise InputError("numbers", f"one of {', '.join(alike or map(self._named, self._all))}", name)
+        return number
+
+    def __getitem__(self, name: str) -> Floats:
+        return self.find(name).value
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self.write({name: value})
+
+    def write(self, values: Mapping[str, Any]) -> None:
+        """Write several; all are checked before the first is written."""
+        new = [(number := self.find(name), number.checked(value)) for name, value in values.items()]
+        for number, given in new:
+            number.write(given)
+            self._changed(number)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all)
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    def __repr__(self) -> str:
+        rows = [(self._named(name), "x".join(map(str, n.shape)), name) for name, n in self._all.items()]
+        widths = [max(len(row[i]) for row in rows) for i in (0, 1)]
+        return "\n".join(f"{a:{widths[0]}}  {b:{widths[1]}}  {c}" for a, b, c in [("name", "shape", "where"), *rows])
+
+    def _named(self, name: str) -> str:
+        short = _short(name)
+        return short if self._by_name.get(short) is self._all[name] else name
+
+
+def as_floats(value: Any, name: str) -> Floats:
+    """Numbers as an array in double precision.
+
+    Raises:
+        InputError: no numbers.
+    """
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
+    try:
+        return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(name, "numbers", type(value).__name__) from None
+
+
+def with_own_numbers(problem: Problem) -> Problem:
+    """The same problems, with memory of its own for every number of every problem."""
+    B = problem.B
+    cost = _own(problem.cost, B)
+    if type(cost) is BoundQuadratic:
+        for name, length in (("x_ref", problem.N), ("u_ref", problem.N)):
+            part = getattr(cost, name)
+            object.__setattr__(cost, name, part.expand(B, length, part.shape[-1]).clone())
+    parts = {
+        "x0": problem.x0.clone(),
+        "dynamics": _own(problem.dynamics, B),
+        "cost": cost,
+        "constraints": tuple(_own(part, B) for part in problem.constraints),
+    }
+    return problem._with(parts)
+
+
+def numbers_of(problem: Problem) -> list[Number]:
+    """The numbers of a problem that has memory of its own for each, `with_own_numbers`."""
+    found = [Number("x0", (_view(problem.x0),), "x0", False, lambda new: None)]
+    found += _of_cost(problem)
+    found += _of_part(problem.dynamics, "dynamics", "dynamics")
+    for i, part in enumerate(problem.constraints):
+        name = f"constraints[{i}]"
+        if isinstance(part, ControlBounds | StateBounds):
+            found += _of_bounds(part, name, i)
+        elif isinstance(part, BoundSpheres):
+            found += _of_spheres(part, name, i)
+        elif isinstance(part, BoundBoxes):
+            found.append(Number(f"{name}.centers", (_view(part.centers),), i, True, _present))
+        elif not isinstance(part, Obstacles):
+            found += _of_part(part, name, i)
+    return found
+
+
+def _own(part: Any, B: int) -> Any:
+    """A part of a problem with copies of all its numbers, one for every problem."""
+    if isinstance(part, Tensor):
+        return part.expand(B, *part.shape[1:]).clone(memory_format=torch.contiguous_format) if part.dim() else part
+    if isinstance(part, tuple):
+        return tuple(_own(leaf, B) for leaf in part)
+    if not isinstance(part, PerElement):
+        return part
+    twin = copy(part)
+    for name in (*part.batched, *part.per_element):
+        object.__setattr__(twin, name, _own(getattr(part, name), B))
+    return twin
+
+
+def _of_cost(problem: Problem) -> list[Number]:
+    cost = problem.cost
+    if type(cost) is not BoundQuadratic:
+        return _of_part(cost, "cost", "cost")
+    found = [Number("cost.x_ref", (_view(cost.x_ref), _view(cost.xf_ref)), "cost", False, _finite)]
+    for name in ("u_ref", *WEIGHTS, "q", "r", "qf", "H"):
+        tensor = getattr(cost, name)
+        if tensor is not None:
+            check = _finite if name not in WEIGHTS else _weights if cost.diagonal else _matrices
+            found.append(Number(f"cost.{name}", (_view(tensor),), "cost", False, check))
+    return found
+
+
+def _of_bounds(part: ControlBounds | StateBounds, name: str, i: int) -> list[Number]:
+    def check(new: Floats, side: str) -> tuple[str, Any] | None:
+        other, sign = (part.upper, 1.0) if side == "lower" else (part.lower, -1.0)
+        bounded = np.zeros(part.lower.shape[-1], dtype=bool)
+        bounded[part.below if side == "lower" else part.above] = True
+        free = new[..., ~bounded]
+        if np.isnan(new).any() or (new == sign * np.inf).any():
+            return f"numbers or {-sign * np.inf}", new.tolist()
+        if np.isfinite(free).any():
+            return "infinity in components that were infinite when the problem was compiled; give them 1e9 then", (
+                float(free[np.isfinite(free)][0])
+            )
+        if (sign * (new - other.numpy()) > 0).any():
+            return "lower bounds of at most the upper ones", new.tolist()
+        return None
+
+    return [
+        Number(f"{name}.{side}", (_view(getattr(part, side)),), i, True, lambda new, side=side: check(new, side))
+        for side in ("lower", "upper")
+    ]
+
+
+def _of_spheres(part: BoundSpheres, name: str, i: int) -> list[Number]:
+    vehicle = part.vehicle_radius.unsqueeze(-1)
+    radii = part.inflated_radii - vehicle
+    inflate = lambda: torch.add(radii, vehicle, out=part.inflated_radii)
+    found = [
+        Number(f"{name}.centers", (_view(part.centers),), i, False, _present),
+        Number(f"{name}.radii", (_view(radii),), i, True, _lengths, inflate),
+        Number(f"{name}.vehicle_radius", (_view(part.vehicle_radius),), i, True, _lengths, inflate),
+    ]
+    if part.velocities is not None:
+        found.append(Number(f"{name}.velocities", (_view(part.velocities),), i, False, _present))
+    return found
+
+
+def _of_part(part: Any, name: str, place: str | int) -> list[Number]:
+    """The floating numbers of any part, its `values` by their own names."""
+    found = []
+    for field in (*part.batched, *part.per_element) if isinstance(part, PerElement) else ():
+        value = getattr(part, field)
+        if isinstance(value, Values):
+            names = (*value.names, *value.knot_names)
+            for own, tensor in zip(names, (*value.rows, *value.knot_rows), strict=True):
+                if tensor.is_floating_point():
+                    found.append(Number(f"{name}.{own}", (_view(tensor),), place, True, _finite))
+        elif isinstance(value, Tensor) and value.is_floating_point() and value.dim() > 0:
+            found.append(Number(f"{name}.{field}", (_view(value),), place, True, _finite))
+        elif isinstance(value, PerElement):
+            found += _of_part(value, f"{name}.{field}", place)
+    return found
+
+
+def _view(tensor: Tensor) -> Floats:
+    return tensor.numpy()
+
+
+def _short(name: str) -> str:
+    return name.rpartition(".")[2]
+
+
+def _finite(new: Floats) -> tuple[str, Any] | None:
+    return None if np.isfinite(new).all() else ("finite numbers", "NaN or infinity")
+
+
+def _present(new: Floats) -> tuple[str, Any] | None:
+    return None if np.isfinite(new).all() else ("finite numbers (put an obstacle far away to be rid of it)", "others")
+
+
+def _lengths(new: Floats) -> tuple[str, Any] | None:
+    return _finite(new) or (None if (new >= 0).all() else ("lengths of at least 0", float(new.min())))
+
+
+def _weights(new: Floats) -> tuple[str, Any] | None:
+    return _finite(new) or (None if (new >= 0).all() else ("weights of at least 0", float(new.min())))
+
+
+def _matrices(new: Floats) -> tuple[str, Any] | None:
+    if (wrong := _finite(new)) is not None:
+        return wrong
+    lowest = float(np.linalg.eigvalsh(0.5 * (new + np.swapaxes(new, -1, -2))).min())
+    size = float(np.abs(new).max())
+    if float(np.abs(new - np.swapaxes(new, -1, -2)).max()) > 1e-9 * max(size, 1.0):
+        return "symmetric matrices", "unsymmetric ones"
+    semidefinite = lowest >= -1e-9 * max(size, 1.0)
+    return None if semidefinite else ("positive semidefinite weights", f"an eigenvalue of {lowest:.3g}")

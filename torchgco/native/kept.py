@@ -1,0 +1,135 @@
+"""Problems that stay packed for the interior point in C from call to call: only their numbers are written anew."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgco.native import structures as c
+from torchgco.native.codegen.constraint import rows_numbers
+from torchgco.native.codegen.cost import cost_arrays
+from torchgco.native.codegen.source import LANES
+from torchgco.native.engine import run
+from torchgco.native.interior import InteriorEngine
+from torchgco.native.packing import constraint_of, numbers_of, quadratic_arrays
+from torchgco.problem.problem import Problem
+
+
+class Kept:
+    """The interior point's library with problems whose numbers lie where it reads them.
+
+    Args:
+        kernels: of the problems' form.
+        problem: what is kept. Numbers that C reads as they are, such as the references of a quadratic cost and the
+            centres of spheres, are those of the problem's own tensors: written there in place, they count at once.
+        options: the fields of `structures.Interior` that don't change.
+    """
+
+    def __init__(self, kernels: InteriorEngine, problem: Problem, **options: Any) -> None:
+        B, N, n, m, like = problem.B, problem.N, problem.n, problem.m, problem.x0
+        self.kernels, self.engine, self.problem = kernels, kernels.engine, problem
+        self.X, self.U = like.new_zeros(B, N + 1, n), like.new_zeros(B, N, m)
+        self.lam = tuple(like.new_zeros(B, *shape) for shape in problem.row_shapes)
+        self.gains = like.new_zeros(B, N, m, n + 1)
+        self.status, self.iterations = torch.zeros(B, dtype=torch.int32), torch.zeros(B, dtype=torch.int64)
+        self.barrier = like.new_zeros(B)
+        self._numbers = [self._own_numbers(i) for i in range(len(problem.constraints))]
+        rows = [self._row(i, numbers) for i, numbers in enumerate(self._numbers)]
+        self.packed = c.Problem(N=N, constraints=len(rows), constraint=rows)
+        self._model = self._model_array()
+        self._cost = self._cost_arrays()
+        self.packed.fill({"parameters": self._model, "cost_data": self._cost})
+        self.packed.fill({"X": self.X, "U": self.U, "gains": self.gains})
+        self.packed.fill({"status": self.status, "iterations": self.iterations})
+        self.rolled = self.X.clone(), self.U.clone()  # trajectories of the controls with their feedback
+        self.worst = like.new_zeros(B)
+        # The same memory by NumPy, which takes a small share of PyTorch's time for a few numbers.
+        self._moving = [part.numpy() for part in (self.X, self.U, *self.lam)]
+        self._rolled = [part.numpy() for part in self.rolled]
+        self.statuses, self.violations = self.status.numpy(), self.worst.numpy()
+        self._barrier, self._iterations = self.barrier.numpy(), self.iterations.numpy()
+        self._follow = self.packed.copy()
+        self._follow.fill({"X": self.rolled[0], "U": self.rolled[1], "merit": self.worst})
+        ends = {name: like.new_zeros(B) for name in ("error", "theta")}
+        self.how = c.Interior.complete(of=self.packed, barrier=self.barrier, free_start=None, **ends, **options)
+
+    def solve(self, rows: np.ndarray, mu: float, **options: float) -> None:
+        """Solve the problems that `rows` (B,) marks, from X, U and `lam`, in place, with `mu` as the first barrier.
+
+        `options` are fields of `structures.Interior`. `rolled` then holds the rollouts that follow the solution by its
+        feedback, and `worst` (B,) their violation.
+        """
+        B, library = self.problem.B, self.engine.library
+        self.how.fill(options)
+        self._barrier[:] = mu
+        self.statuses[:] = 0
+        self._iterations[:] = 0
+        for first, last in _spans(rows):
+            run(self.kernels.library.tgco_interior, last - first, LANES, self.how, first)
+        self._rolled[0][:], self._rolled[1][:] = self._moving[:2]
+        run(library.tgco_closed_loop, B, LANES, self._follow)
+        if self.engine.measures:
+            run(library.tgco_violation, B, LANES, self._follow)
+
+    @property
+    def feedback(self) -> Tensor:
+        """Gains K (B, N, m, n)."""
+        return self.gains[..., :-1]
+
+    def shift(self, by: int) -> None:
+        """Let all trajectories and multipliers begin `by` stages later; the last knots are repeated."""
+        for part in self._moving:
+            if 0 < by < part.shape[1]:
+                part[:, :-by] = part[:, by:]
+
+    def refresh_constraint(self, i: int) -> None:
+        """Read the numbers of constraint i again, after its tensors have changed."""
+        new = self._own_numbers(i)
+        arrays = [name for name, value in new.items() if isinstance(value, c.Array)]
+        _copy([self._numbers[i][name] for name in arrays], [new[name] for name in arrays])
+
+    def refresh_cost(self) -> None:
+        """The same of the cost."""
+        _copy(self._cost, self._cost_arrays())
+
+    def refresh_model(self) -> None:
+        """The same of the dynamics."""
+        _copy([self._model], [self._model_array()])
+
+    def _row(self, i: int, numbers: dict[str, Any]) -> c.Constraint:
+        problem = self.problem
+        row = constraint_of(problem.constraints[i], problem.row_shapes[i], numbers, problem)
+        row.lam = self.lam[i]
+        return row
+
+    def _own_numbers(self, i: int) -> dict[str, Any]:
+        source = self.engine.functions.get(i)
+        numbers = None if source is None else rows_numbers(self.problem, i, source)
+        return numbers_of(self.problem.constraints[i], numbers, self.problem)
+
+    def _cost_arrays(self) -> list[c.Array]:
+        cost = self.engine.cost
+        return quadratic_arrays(self.problem.cost) if cost is None else cost_arrays(self.problem, cost)
+
+    def _model_array(self) -> c.Array:
+        model, problem = self.engine.model, self.problem
+        return c.Array() if model.count == 0 else c.array(model.numbers(problem.B, problem.dynamics), knots=True)
+
+
+def _spans(rows: np.ndarray) -> list[tuple[int, int]]:
+    """The first and the last place, plus one, of each run of rows that are marked, (B,) bool."""
+    if rows.all():
+        return [(0, len(rows))]
+    edges = np.diff(np.pad(rows.astype(np.int8), 1)).nonzero()[0].tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+def _copy(old: list[c.Array], new: list[c.Array]) -> None:
+    """Write the numbers of arrays into the memory of others, which keep their places and shapes."""
+    for before, after in zip(old, new, strict=True):
+        for there, here in zip(before.kept, after.kept, strict=True):
+            if there.data_ptr() != here.data_ptr():
+                there.copy_(here)
