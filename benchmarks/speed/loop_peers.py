@@ -1,4 +1,4 @@
-"""FATROP and IPOPT on the car of `loop`, written for them by hand: one program for all periods, its numbers a vector."""
+"""FATROP and IPOPT on the car of `loop`, by hand: one program for all periods, its numbers a vector."""
 
 from __future__ import annotations
 

@@ -21,10 +21,10 @@ WORDS = {
     "latency": "One quadrotor forest problem at a time. `warm` is the problem one stage later: both start from the\n"
     "rest of the solution, `gco` from its multipliers as well. Set-up does not count: `gco` traces the model and\n"
     "finds its kernels, FATROP's program is built.",
-    "loop": "A car (4 states, 2 controls, RK4) that follows a reference between two discs, 20 stages of 0.1 s: the\n"
-    "processor's time for a period, without the first five. FATROP and IPOPT are written by hand, to 1e-6, and keep\n"
-    "their multipliers; `compile` solves to 1e-8. Disturbed cars meet discs that are put into their way; `solved` of cars in one call\n"
-    "counts periods in which all are.",
+    "loop": "A car (4 states, 2 controls, RK4) follows a reference between two discs, 20 stages of 0.1 s: processor\n"
+    "time of a period, without the first five. FATROP and IPOPT are written by hand, to 1e-6, and keep their\n"
+    "multipliers; `compile` solves to 1e-8. Disturbed cars meet discs that are put into their way; `solved` of\n"
+    "several cars in one call counts periods in which all are.",
     "own_model": "A user's unicycle (4 states, 2 controls, a Python function, RK4), 100 stages, five discs,\n"
     "`torchgco.solve` without options.",
     "paper": "The paper's planar problem by the paper's method: a thousand stages, three circles;\n"
