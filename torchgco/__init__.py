@@ -94,9 +94,9 @@ __all__ = [  # noqa: RUF022
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "compare", "Solution", "plot", "Status", "presets", "plan_batch", "Restarts", "MultiStart",
-    "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch", "Polish", "Roadmap", "PathProposals", "GCO", "MPPI",
-    "IteratedMPPI", "Hold",
+    "solve", "compile", "Compiled", "Answer", "compare", "Solution", "plot", "Status", "presets", "plan_batch",
+    "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch", "Polish", "Roadmap",
+    "PathProposals", "GCO", "MPPI", "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, errors
