@@ -102,6 +102,19 @@ def test_a_cost_that_is_not_finite_is_no_solution(name: str, solver: str) -> Non
         assert math.isfinite(cost) or status is Status.NON_FINITE, (status, cost)
 
 
+@pytest.mark.parametrize("solver", ["gco", "interior_point", "al_ilqr"])
+def test_a_model_that_is_not_finite_has_no_solution(solver: str) -> None:
+    """A compiler knows that 0 times anything is 0; PyTorch knows better."""
+    bounded = lambda x, u: cart(x, u) + 0.0 * (1.2 - x[..., 1:]).log()
+    x0 = torch.stack((torch.linspace(0, 1, 8, dtype=D), torch.zeros(8, dtype=D)), dim=-1)
+    goal = QuadraticCost([1.0, 0.0], [0.1], [10.0, 1.0], [4.0, 0.0])
+    problem = Problem(FunctionDynamics(bounded, 2, 1, 0.1), goal, [ControlBounds(-2.0, 2.0)], x0, 30)
+    found = torchgco.solve(problem, solver=solver)
+    finite = torch.isfinite(problem.along.step(found.X[:, :-1], found.U)).flatten(1).all(-1)
+    assert not bool(finite.all())
+    assert [status is Status.NON_FINITE for status in found.statuses] == (~finite).tolist()
+
+
 def test_a_finite_trajectory_is_preferred_to_one_that_is_cheaper_in_no_number() -> None:
     """The interior point ends where the cost is NaN; what AL-iLQR finds is returned."""
     if find_compiler() is None:

@@ -7,11 +7,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchgco.base.errors import InputError
 from torchgco.base.status import STOPPED, Status, is_over
-from torchgco.base.tree import spread, take
+from torchgco.base.tree import is_users, spread, take
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import violation
-from torchgco.native.dispatch import reproducible
+from torchgco.native.dispatch import engine_of, reproducible
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import Optimality, final_status, optimality
@@ -19,6 +20,8 @@ from torchgco.solvers.history import Recorder
 from torchgco.solvers.rules import Rules
 from torchgco.solvers.state import Iterate, SolveEnd
 from torchgco.solvers.unbounded import falls_without_end
+
+UNLIKE = 1e-6  # difference of two rollouts' steps, as a share of the largest state, that no rounding explains
 
 
 class Session:
@@ -62,7 +65,7 @@ class Session:
         limit = Status.TIME_LIMIT if self.given.late else Status.MAX_ITERATIONS
         ended = torch.where(end.status == STOPPED, int(limit), end.status)
         constrained = bool(problem.constraints) or problem.free_start is not None
-        finite = torch.isfinite(found.cost) & torch.isfinite(found.violation)
+        finite = torch.isfinite(found.cost) & torch.isfinite(found.violation) & self._follows_dynamics(found)
         ended = torch.where(finite | (ended == Status.INVALID_START), ended, int(Status.NON_FINITE))
         status = final_status(ended, left, found.violation, tolerance, constrained)
         user = self.given.problem
@@ -73,6 +76,25 @@ class Session:
             end.iterations, end.outer, end.guided,
             None if self.recorder is None else self.recorder.frame(*self.scales),
         )  # fmt: skip
+
+    def _follows_dynamics(self, found: Iterate) -> Tensor:
+        """Whether a user's model gives finite states along trajectories, (B,), which compiled code may do without it.
+
+        Raises:
+            InputError: its states are others than those of the compiled code.
+        """
+        model = self.given.problem.dynamics
+        finite = torch.isfinite(found.X).flatten(1).all(-1)
+        if engine_of(self.given.problem) is None or not is_users(model):
+            return finite
+        ahead, X = self.given.problem.along.step(found.X[:, :-1], found.U), found.X[:, 1:]
+        sound = torch.isfinite(ahead).flatten(1).all(-1)
+        gap = (ahead - X).abs() / (1.0 + X.abs().amax(dim=(1, 2), keepdim=True))
+        worst = float(torch.where((sound & finite).view(-1, 1, 1), gap, 0.0).max()) if gap.numel() > 0 else 0.0
+        if worst > UNLIKE:
+            expected = "the states that its compiled code gives: a function of its arguments alone"
+            raise InputError("dynamics.step", expected, f"states that differ by a share of {worst:.2g}")
+        return finite & sound
 
     def trajectories(self, end: SolveEnd, gains: Callable[[Tensor], Tensor] | None = None) -> Iterate:
         """The best trajectories in the user's units, as PyTorch's rollouts give them; their own costs and violations.
