@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from contextlib import suppress
 from typing import Any
 
@@ -17,6 +18,8 @@ from torchgco.native.engine import Engine, run
 from torchgco.native.structures import STRUCTURES, Interior
 from torchgco.problem.problem import Problem
 
+FEW = 2, 4  # lanes of libraries for few problems
+
 
 class InteriorEngine:
     """The library of a form of problems; compiled when it is made.
@@ -29,6 +32,11 @@ class InteriorEngine:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self.library = load(_source(engine), STRUCTURES)
+
+    def for_few(self, B: int) -> tuple[ctypes.CDLL, int]:
+        """A library for B problems, and how many it solves side by side: lanes without a problem take time, too."""
+        lanes = next((lanes for lanes in FEW if B <= lanes < LANES), LANES)
+        return (self.library if lanes == LANES else load(_source(self.engine, lanes), STRUCTURES)), lanes
 
     def solve(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], barrier: Tensor, **options: Any
@@ -70,5 +78,5 @@ def begin_interior(engine: Engine) -> None:
         begin(_source(engine))
 
 
-def _source(engine: Engine) -> str:
-    return engine.form.source(INTERIOR, more=curvature_code(engine.model, engine.functions.items()))
+def _source(engine: Engine, lanes: int = LANES) -> str:
+    return engine.form.source(INTERIOR, lanes=lanes, more=curvature_code(engine.model, engine.functions.items()))

@@ -30,7 +30,8 @@ class Kept:
 
     def __init__(self, kernels: InteriorEngine, problem: Problem, **options: Any) -> None:
         B, N, n, m, like = problem.B, problem.N, problem.n, problem.m, problem.x0
-        self.kernels, self.engine, self.problem = kernels, kernels.engine, problem
+        self.engine, self.problem = kernels.engine, problem
+        self.library, self.lanes = kernels.for_few(B)
         self.X, self.U = like.new_zeros(B, N + 1, n), like.new_zeros(B, N, m)
         self.lam = tuple(like.new_zeros(B, *shape) for shape in problem.row_shapes)
         self.gains = like.new_zeros(B, N, m, n + 1)
@@ -68,7 +69,7 @@ class Kept:
         self.statuses[:] = 0
         self._iterations[:] = 0
         for first, last in _spans(rows):
-            run(self.kernels.library.tgco_interior, last - first, LANES, self.how, first)
+            run(self.library.tgco_interior, last - first, self.lanes, self.how, first)
         self._rolled[0][:], self._rolled[1][:] = self._moving[:2]
         run(library.tgco_closed_loop, B, LANES, self._follow)
         if self.engine.measures:
