@@ -22,6 +22,7 @@ CENTERS, RADIUS, VEHICLE = np.array([[12.0, 1.2], [30.0, -1.0]]), 0.8, 0.5  # m
 LOWER, UPPER = [-3.0, -0.5], [3.0, 0.5]
 START = np.array([0.0, 0.0, 0.0, 3.0])
 FIRST = 5  # periods that aren't timed
+ROOM = RADIUS + VEHICLE + 0.7  # m from a disc's centre that a car at 3 m/s needs to turn away; nearer discs vanish
 NOISE = np.array([0.1, 0.1, 0.05, 0.3])  # standard deviation of a disturbance, times its share
 Controller = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, int, bool]]
 
@@ -75,7 +76,7 @@ def drive(control: Controller, periods: int, noise: float = 0.0) -> Drive:
             passed = ahead < x[0] - 6
             ahead[passed] = x[0] + 14 + random.uniform(0, 6, int(passed.sum()))
             centers = np.stack((ahead, 2 * np.sin(0.5 * ahead / 3) + np.array([1.2, -1.0])), -1)
-            centers = centers - 10.0 * (np.linalg.norm(centers - x[:2], axis=1) < RADIUS + VEHICLE + 0.05)[:, None]
+            centers = centers - 10.0 * (np.linalg.norm(centers - x[:2], axis=1) < ROOM)[:, None]
         began = time.thread_time()
         u, iterations, solved = control(x, reference(t), centers)
         found.seconds.append(time.thread_time() - began)
