@@ -71,9 +71,10 @@ def check_code(
 
 
 def _check_once(part: Given, about: Hashable, check: Callable[[Any], None]) -> None:
-    if not is_users(part[1]) or any(one in _passed and about in _passed[one] for one in part):
+    if not is_users(part[1]):
         return
-    check(part[1])
+    if not any(one in _passed and about in _passed[one] for one in part):
+        check(part[1])
     for one in part:
         with suppress(TypeError):  # no weak reference to it
             _passed.setdefault(one, set()).add(about)
