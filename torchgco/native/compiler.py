@@ -25,8 +25,13 @@ from types import FrameType
 from torchgco.base.notices import notice
 from torchgco.native import store
 
-# NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact.
-FLAGS = ("-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
+# NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact. Below -O2 gcc clears the
+# upper halves of vector registers before calls of the C library only with -fexpensive-optimizations: otherwise such a
+# call, a tanh for instance, takes some thirty times as long on many processors.
+FLAGS = (
+    "-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
+    "-fexpensive-optimizations",
+)  # fmt: skip
 # No warning where a vector type is wider than the registers: within one library that does no harm.
 _QUIET = ("-Wno-psabi",)
 _ERROR_LINES = 5
