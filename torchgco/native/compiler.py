@@ -27,7 +27,7 @@ from torchgco.native import store
 
 # NaN and infinity carry meaning here, so no -ffast-math: only options that leave them intact. Below -O2 gcc clears the
 # upper halves of vector registers before calls of the C library only with -fexpensive-optimizations: otherwise such a
-# call, a tanh for instance, takes some thirty times as long on many processors.
+# call, a tanh for instance, takes many times as long on some processors.
 FLAGS = (
     "-O3", "-std=c11", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast",
     "-fexpensive-optimizations",
@@ -38,6 +38,11 @@ _ERROR_LINES = 5
 _ERROR = re.compile(r"error|fail|cannot|can't|No space", re.IGNORECASE)
 # What drivers add when the reason has been said, and lines of the source that are shown beside it.
 _SUMMARY = re.compile(r"exit (code|status)|compilation terminated|errors? generated|^\d*\s*\|", re.IGNORECASE)
+# What gcc 12 takes: s a line of the solvers' own text, loops over vectors, and of the straight code of a model, which is
+# what there is beyond _SOLVER lines; and the share of it at other levels of optimisation than -O3.
+_LOOPS, _GENERATED, _SOLVER = 1.0e-3, 0.2e-3, 2000
+_SHARES = {"-O0": 0.2, "-Og": 0.3, "-O1": 0.5, "-O2": 0.7, "-O3": 1.0}
+_BRIEF = 2.0  # s: compilations that are shorter are announced only to those who watch
 _AMD_HALVES = 25  # family of AMD processors, at most, that compute vectors of 512 bits in two steps
 
 
@@ -99,6 +104,7 @@ def begin(source: str) -> None:
     flags = (*compiler.flags, *compiler.further)
     key = _key(compiler, source, flags)
     if key not in _begun and store.find(key, ".so") is None:
+        _announce(source, flags)
         with suppress(OSError), _held():
             room = TemporaryDirectory(prefix="torchgco-")
             _begun[key] = _Begun(os.getpid(), room, _start(compiler, source, flags, Path(room.name)))
@@ -118,7 +124,9 @@ _begun: dict[str, _Begun] = {}
 
 
 def _key(compiler: Compiler, source: str, flags: tuple[str, ...]) -> str:
-    return store.key_of(("library 1", source, *flags, compiler.identity, _processor()))
+    # Libraries are of a kin whose sources differ in numbers alone, decimal or hexadecimal, be it in names.
+    kin = source.encode(errors="surrogateescape").translate(None, b"0123456789abcdefxp.+-").decode(errors="replace")
+    return store.key_of(("library 1", source, *flags, compiler.identity, _processor()), kin)
 
 
 def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
@@ -147,7 +155,8 @@ def _load(compiler: Compiler, source: str, flags: tuple[str, ...]) -> ctypes.CDL
 def _compile(
     compiler: Compiler, source: str, flags: tuple[str, ...], room: Path, begun: subprocess.Popen[str] | None = None
 ) -> Path:
-    notice("compiling native kernels (once for this form of problem, some seconds) ...")
+    if begun is None:
+        _announce(source, flags)
     returncode, errors = _finished(lambda: begun or _start(compiler, source, flags, room))
     if returncode:
         said = [line.strip() for line in errors.splitlines() if line.strip()] or [_ended(returncode)]
@@ -156,6 +165,23 @@ def _compile(
         lines = [f"{shlex.join(compiler.command)} failed: {telling[-1]}", *telling[:-1][:_ERROR_LINES]]
         raise NativeError("\n".join(lines))
     return room / "kernels.so"
+
+
+def _announce(source: str, flags: Sequence[str]) -> None:
+    """A line on a compiler that is to be started; none where another one runs, which has been announced."""
+    if any(begun.owner == os.getpid() and begun.process.poll() is None for begun in _begun.values()):
+        return
+    seconds = _expected(source, flags)
+    about = f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} minutes"
+    known = f"about {about}" if seconds >= 1.0 else "a moment"
+    notice(f"compiling native kernels (once for this form of problem, {known}) ...", brief=seconds <= _BRIEF)
+
+
+def _expected(source: str, flags: Sequence[str]) -> float:
+    """Seconds that gcc takes for a source, within a factor of two on a core of 2024 with nothing else to do."""
+    lines = source.count("\n")
+    level = next((flag for flag in reversed(flags) if flag in _SHARES), "-O3")
+    return _SHARES[level] * (_LOOPS * min(lines, _SOLVER) + _GENERATED * max(0, lines - _SOLVER))
 
 
 def _start(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) -> subprocess.Popen[str]:
