@@ -355,6 +355,7 @@ void tgco_both(const double *x, double *y) {{
 
 
 @needs_compiler
+@pytest.mark.usefixtures("as_shipped")
 def test_levels_of_optimisation_have_the_same_bits_within_a_function() -> None:
     """Products and sums are fused by -fexpensive-optimizations, which gcc leaves out below -O2 otherwise."""
     x, source = torch.linspace(-3.0, 3.0, 400, dtype=torch.float64), SINES.format(prelude=PRELUDE)
