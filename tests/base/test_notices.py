@@ -58,9 +58,9 @@ def test_something_brief_is_shown_to_those_who_watch(shown, capsys, monkeypatch)
         (1900, (), None),
         (2600, (), "about 2 s"),
         (2600, ("-O3", "-O1"), None),
-        (50_000, ("-O3",), "about 12 s"),
-        (50_000, ("-O1", "-g"), "about 6 s"),
-        (10**6, (), "about 3 minutes"),
+        (50_000, ("-O3",), "about 14 s"),
+        (50_000, ("-O1", "-g"), "about 7 s"),
+        (10**6, (), "about 23 minutes"),
     ],
 )
 def test_a_log_says_how_long_the_compiler_takes_where_that_is_long(lines, flags, said, capsys, monkeypatch) -> None:

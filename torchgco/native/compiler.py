@@ -39,8 +39,8 @@ _ERROR = re.compile(r"error|fail|cannot|can't|No space", re.IGNORECASE)
 # What drivers add when the reason has been said, and lines of the source that are shown beside it.
 _SUMMARY = re.compile(r"exit (code|status)|compilation terminated|errors? generated|^\d*\s*\|", re.IGNORECASE)
 # What gcc 12 takes: s a line of the solvers' own text, loops over vectors, and of the straight code of a model, which is
-# what there is beyond _SOLVER lines; and the share of it at other levels of optimisation than -O3.
-_LOOPS, _GENERATED, _SOLVER = 1.0e-3, 0.2e-3, 2000
+# what there is beyond _SOLVER lines, twice as long where these are _LONG; and the share of it at other levels than -O3.
+_LOOPS, _GENERATED, _SOLVER, _LONG = 1.0e-3, 0.2e-3, 2000, 170_000
 _SHARES = {"-O0": 0.2, "-Og": 0.3, "-O1": 0.5, "-O2": 0.7, "-O3": 1.0}
 _BRIEF = 2.0  # s: compilations that are shorter are announced only to those who watch
 _AMD_HALVES = 25  # family of AMD processors, at most, that compute vectors of 512 bits in two steps
@@ -178,10 +178,11 @@ def _announce(source: str, flags: Sequence[str]) -> None:
 
 
 def _expected(source: str, flags: Sequence[str]) -> float:
-    """Seconds that gcc takes for a source, within a factor of two on a core of 2024 with nothing else to do."""
+    """Seconds that gcc takes for a source, within a factor of two on an AMD EPYC that has nothing else to do."""
     lines = source.count("\n")
+    own, straight = min(lines, _SOLVER), max(0, lines - _SOLVER)
     level = next((flag for flag in reversed(flags) if flag in _SHARES), "-O3")
-    return _SHARES[level] * (_LOOPS * min(lines, _SOLVER) + _GENERATED * max(0, lines - _SOLVER))
+    return _SHARES[level] * (_LOOPS * own + _GENERATED * straight * (1.0 + straight / _LONG))
 
 
 def _start(compiler: Compiler, source: str, flags: tuple[str, ...], room: Path) -> subprocess.Popen[str]:
