@@ -122,15 +122,14 @@ class Solution:
             InputError: `steps` isn't a number of stages, 1 or more.
         """
         check_value(steps, Count, "steps")
-        problem = None if self.account is None else self.account.problem
-        last, lost = self.horizon, torch.full_like(self.cost, torch.nan)
+        last, problem = self.horizon, None if self.account is None else self.account.problem
         stage = None if last is None else last - 1
         U, K, d = (shifted(part, steps, last=stage) for part in (self.U, self.K, self.d))
-        none = torch.zeros_like(self.status)
+        X, multipliers = shifted(self.X, steps, last=last), self.multipliers.shifted(steps, problem)
+        lost, none = torch.full_like(self.cost, torch.nan), torch.zeros_like(self.status)
         return replace(
-            self, X=shifted(self.X, steps, last=last), U=U, K=K, d=d, multipliers=self.multipliers.shifted(steps, problem),
-            cost=lost, violation=lost, status=none, iterations=none, outer_iterations=none, guided=none, trace=None,
-            search=None,
+            self, X=X, U=U, K=K, d=d, multipliers=multipliers, cost=lost, violation=lost, status=none, iterations=none,
+            outer_iterations=none, guided=none, trace=None, search=None,
         )  # fmt: skip
 
     def __getitem__(self, index: Any) -> Solution:

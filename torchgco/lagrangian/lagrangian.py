@@ -71,9 +71,7 @@ class Multipliers:
             check_tensor(part, "warm", problem.x0)
 
 
-def shifted(
-    values: Tensor, steps: int = 1, knots: Sequence[int] | None = None, last: Tensor | None = None
-) -> Tensor:
+def shifted(values: Tensor, steps: int = 1, knots: Sequence[int] | None = None, last: Tensor | None = None) -> Tensor:
     """Values (B, K, ...) of knots some stages later: those beyond the last one are its own.
 
     Args:

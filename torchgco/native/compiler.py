@@ -38,8 +38,8 @@ _ERROR_LINES = 5
 _ERROR = re.compile(r"error|fail|cannot|can't|No space", re.IGNORECASE)
 # What drivers add when the reason has been said, and lines of the source that are shown beside it.
 _SUMMARY = re.compile(r"exit (code|status)|compilation terminated|errors? generated|^\d*\s*\|", re.IGNORECASE)
-# What gcc 12 takes: s a line of the solvers' own text, loops over vectors, and of the straight code of a model, which is
-# what there is beyond _SOLVER lines, twice as long where these are _LONG; and the share of it at other levels than -O3.
+# What gcc 12 takes: s a line of the solvers' own text, loops over vectors, and of the straight code of a model, beyond
+# _SOLVER lines, twice as long where there are _LONG of these; and the share of it at other levels than -O3.
 _LOOPS, _GENERATED, _SOLVER, _LONG = 1.0e-3, 0.2e-3, 2000, 170_000
 _SHARES = {"-O0": 0.2, "-Og": 0.3, "-O1": 0.5, "-O2": 0.7, "-O3": 1.0}
 _BRIEF = 2.0  # s: compilations that are shorter are announced only to those who watch
@@ -68,7 +68,7 @@ def find_compiler() -> Compiler | None:
     """The first that works of CC, cc, gcc, clang, and zig from the package ziglang; None where there is none.
 
     TORCHGCO_CC names the only compiler that is tried; a word such as "none" turns native kernels off. The words of
-    TORCHGCO_CFLAGS are further flags: with -O1 compiling takes a third of the time, and solves up to twice as long.
+    TORCHGCO_CFLAGS are further flags: with -O1 compiling takes half of the time, and solves up to twice as long.
     """
     return _find_compiler(*map(os.environ.get, ("TORCHGCO_CC", "CC", "PATH", "TORCHGCO_CFLAGS")))
 
